@@ -1,0 +1,1 @@
+"""One thin file per command; heavy imports stay inside the functions."""

@@ -1,0 +1,1 @@
+"""Control charts over day estimates, and which sensor moved."""

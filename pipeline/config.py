@@ -1,0 +1,249 @@
+"""fleet.toml as frozen values: validated as a whole, nothing repaired, every default a physical number with its unit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from pipeline.errors import ConfigError
+
+__all__ = [
+    "AuditConfig",
+    "CameraTopics",
+    "EgoTopics",
+    "FleetConfig",
+    "IngestConfig",
+    "LidarTopics",
+    "OnnxSemantics",
+    "PerceiveConfig",
+    "PriorConfig",
+    "RadarTopics",
+    "Rig",
+    "SelectConfig",
+    "SolveConfig",
+    "TopicSemantics",
+    "TriggerConfig",
+    "config_hash",
+    "load_fleet",
+]
+
+Positive = Annotated[float, Field(gt=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Topic = Annotated[str, Field(pattern=r"^/\S+$")]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class TopicSemantics(_Section):
+    """Semantics that the car already logged."""
+
+    source: Literal["topics"]
+    labels: Topic
+    detections: Topic
+    label_set: Literal["cityscapes", "ade20k", "coco"] = "cityscapes"
+
+
+class OnnxSemantics(_Section):
+    """Semantics computed here by ONNX models; paths of manifests, relative to fleet.toml."""
+
+    source: Literal["onnx"]
+    segmenter: str
+    detector: str
+
+
+class CameraTopics(_Section):
+    """The camera's topics."""
+
+    image: Topic
+    info: Topic
+    semantics: Annotated[TopicSemantics | OnnxSemantics, Field(discriminator="source")]
+
+
+class LidarTopics(_Section):
+    """The lidar's topic."""
+
+    points: Topic
+
+
+class RadarTopics(_Section):
+    """The radar's topic and what its Doppler means."""
+
+    points: Topic
+    doppler_field: str = "doppler"
+    doppler_positive: Literal["approaching", "receding"] = "receding"
+    doppler_period_mps: Positive | None = None
+    azimuth_positive: Literal["left", "right"] = "left"  # RadarScan drivers differ; PointCloud2 has x y z
+
+
+class EgoTopics(_Section):
+    """Optional ego motion."""
+
+    odometry: Topic
+
+
+class PriorConfig(_Section):
+    """Where the prior comes from and how far to trust it."""
+
+    source: Literal["tf_static", "file"] = "tf_static"
+    file: str | None = None  # JSON: {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}, relative to fleet.toml
+    rotation_sigma_deg: Positive = 2.0
+    translation_sigma_m: Positive = 0.05
+
+    @model_validator(mode="after")
+    def _file_goes_with_source(self) -> PriorConfig:
+        if (self.source == "file") != (self.file is not None):
+            raise ValueError('source = "file" needs file = "...", and file needs source = "file"')
+        return self
+
+
+class Rig(_Section):
+    """One rig model; a vehicle names its rig."""
+
+    camera: CameraTopics
+    lidar: LidarTopics
+    radar: RadarTopics
+    ego: EgoTopics | None = None
+    prior: PriorConfig = PriorConfig()
+
+
+class Vehicle(_Section):
+    """One vehicle."""
+
+    rig: str = "default"
+
+
+class FleetSection(_Section):
+    """The fleet's name."""
+
+    name: str
+
+
+class IngestConfig(_Section):
+    """Synchronisation and what to keep."""
+
+    sync_gate_s: Positive = 0.005  # paper, section 4.5.1
+    max_frames: Annotated[int, Field(gt=0)] | None = None  # per vehicle-day, evenly spread; None = all
+    min_lidar_points: Annotated[int, Field(ge=0)] = 500
+    min_radar_points: Annotated[int, Field(ge=0)] = 1
+    max_lidar_range_m: Positive = 120.0
+    deskew: bool = True
+
+
+class PerceiveConfig(_Section):
+    """Feature extraction."""
+
+    label_scale: Annotated[float, Field(gt=0, le=1)] = 0.5
+    voxel_m: Positive = 0.25
+    cluster_eps_m: Positive = 0.7
+    cluster_min_points: Annotated[int, Field(gt=1)] = 8
+    ground_inlier_m: Positive = 0.15
+    edge_jump_m: Positive = 0.8
+    edge_jump_fraction: Fraction = 0.06
+    radar_cluster_eps_m: Positive = 1.8
+    static_gate_mps: Positive = 0.45
+    detection_min_score: Fraction = 0.3
+
+
+class SelectConfig(_Section):
+    """The paper's frame selection, section 4.5.1, and how many frames a calibration takes."""
+
+    frames: Annotated[int, Field(gt=0)] = 100
+    holdout_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    min_sky: Fraction = 0.20
+    min_drivable: Fraction = 0.10
+    min_road_users: Annotated[int, Field(ge=0)] = 3
+    min_radar_clusters: Annotated[int, Field(ge=0)] = 3
+
+
+class TriggerConfig(_Section):
+    """The paper's triggers, section 4.5.2."""
+
+    when: Literal["always", "triggered"] = "always"
+    lidar_outside_fraction: Fraction = 0.01
+    radar_outside_image: Annotated[int, Field(ge=0)] = 1
+    radar_outside_lidar: Annotated[int, Field(ge=0)] = 1
+    drivable_outside_fraction: Fraction = 0.01
+
+
+class SolveConfig(_Section):
+    """Search range and effort; `paper_*` steer the paper's DE and Nelder-Mead."""
+
+    search_rotation_deg: Positive = 6.0
+    search_translation_m: Positive = 0.3
+    paper_population: Annotated[int, Field(gt=3)] = 90
+    paper_generations: Annotated[int, Field(gt=0)] = 60
+    bootstrap_blocks: Annotated[int, Field(gt=1)] = 24
+    time_offset_sigma_s: Positive = 0.05
+    seed: int = 0
+
+
+class AuditConfig(_Section):
+    """Control charts."""
+
+    method: str = "joint"
+    false_alarms_per_1000_vehicle_days: Positive = 1.0
+    baseline_days: Annotated[int, Field(gt=0)] = 2
+    camera_lidar_limit_deg: Positive = 0.1
+    radar_limit_deg: Positive = 0.25
+    translation_limit_m: Positive = 0.05
+
+
+class FleetConfig(_Section):
+    """The whole of fleet.toml."""
+
+    fleet: FleetSection
+    rigs: dict[str, Rig]
+    vehicles: dict[str, Vehicle] = {}
+    ingest: IngestConfig = IngestConfig()
+    perceive: PerceiveConfig = PerceiveConfig()
+    select: SelectConfig = SelectConfig()
+    trigger: TriggerConfig = TriggerConfig()
+    solve: SolveConfig = SolveConfig()
+    audit: AuditConfig = AuditConfig()
+
+    @model_validator(mode="after")
+    def _vehicles_name_known_rigs(self) -> FleetConfig:
+        for name, vehicle in self.vehicles.items():
+            if vehicle.rig not in self.rigs:
+                raise ValueError(f"vehicles.{name}.rig = {vehicle.rig!r}, but rigs has only {sorted(self.rigs)}")
+        return self
+
+    def rig_of(self, vehicle: str, *, file: str = "fleet.toml") -> Rig:
+        """The rig of a vehicle; ConfigError where the vehicle is not in the file."""
+        if vehicle not in self.vehicles:
+            raise ConfigError(file, f"vehicles.{vehicle}", f"unknown vehicle; the file has {sorted(self.vehicles)}")
+        return self.rigs[self.vehicles[vehicle].rig]
+
+
+def load_fleet(path: Path) -> FleetConfig:
+    """Read and validate fleet.toml.
+
+    Raises:
+        ConfigError: missing file, no TOML, unknown key, impossible value; the message names the key.
+    """
+    try:
+        raw = tomllib.loads(path.read_text())
+    except FileNotFoundError as err:
+        raise ConfigError(str(path), "", "no such file") from err
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as err:
+        raise ConfigError(str(path), "", f"not a TOML file: {err}") from err
+    try:
+        return FleetConfig.model_validate(raw)
+    except ValidationError as err:
+        problems = err.errors(include_url=False)
+        key = ".".join(str(part) for part in problems[0]["loc"])
+        text = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems)
+        raise ConfigError(str(path), key, text) from err
+
+
+def config_hash(*sections: BaseModel | dict[str, Any]) -> str:
+    """Hash of resolved config sections, for work keys."""
+    plain = [s.model_dump(mode="json") if isinstance(s, BaseModel) else s for s in sections]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,58 @@
+"""Errors that a user can act on. Fields, not strings: each error builds its message from what it knows."""
+
+from __future__ import annotations
+
+__all__ = ["BoresightError", "ConfigError", "ContractError", "LogError", "ModelError", "SolveError"]
+
+
+class BoresightError(Exception):
+    """Base of all errors that the commands report in one line; `exit_code` is what the command returns."""
+
+    exit_code = 1
+
+
+class ConfigError(BoresightError):
+    """fleet.toml, a manifest or a command line that cannot be right: `file`, `key`, what is wrong and what to do."""
+
+    exit_code = 2
+
+    def __init__(self, file: str, key: str, problem: str) -> None:
+        self.file, self.key, self.problem = file, key, problem
+        super().__init__(f"{file}: {key}: {problem}" if key else f"{file}: {problem}")
+
+
+class LogError(BoresightError):
+    """A log, topic or field that cannot be read."""
+
+    def __init__(self, file: str, problem: str, *, topic: str = "", field: str = "") -> None:
+        self.file, self.topic, self.field, self.problem = file, topic, field, problem
+        where = ", ".join(p for p in (file, topic and f"topic {topic}", field and f"field {field}") if p)
+        super().__init__(f"{where}: {problem}")
+
+
+class ContractError(BoresightError):
+    """A table that does not have the schema, version or content that its contract promises."""
+
+    def __init__(self, path: str, problem: str) -> None:
+        self.path, self.problem = path, problem
+        super().__init__(f"{path}: {problem}")
+
+
+class ModelError(BoresightError):
+    """A model file that does not do what its manifest says."""
+
+    exit_code = 2
+
+    def __init__(self, manifest: str, problem: str) -> None:
+        self.manifest, self.problem = manifest, problem
+        super().__init__(f"{manifest}: {problem}")
+
+
+class SolveError(BoresightError):
+    """A vehicle-day that cannot be calibrated; it becomes a refused record, not a crash."""
+
+    exit_code = 3
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+        super().__init__(reason)

@@ -1,0 +1,1 @@
+"""Many vehicle-days: executors and the nightly run."""

@@ -1,0 +1,1 @@
+"""Pure maths of frames, cameras and angles; conventions in CONVENTIONS.md."""

@@ -1,0 +1,1 @@
+"""Logs to table frames: read, synchronise, de-skew, keep what is needed."""

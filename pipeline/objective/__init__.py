@@ -1,0 +1,1 @@
+"""What is minimised: one definition that solvers and learning share."""

@@ -1,0 +1,1 @@
+"""Frames to table observations: semantics, clusters, edges, motion."""

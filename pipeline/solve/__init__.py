@@ -1,0 +1,1 @@
+"""How it is minimised: selection, triggers, solvers, covariance."""

@@ -1,0 +1,125 @@
+"""How a table is described once, and what follows from it: Arrow schema and JSON Schema.
+
+A table is a tuple of `Column`s. Arrays travel as `binary` blobs, one per attribute, little-endian and C-ordered
+(Parquet reads them 4-10x faster than list columns); the column's Arrow field metadata says dtype, shape and unit, so any
+engine can decode them: `numpy.frombuffer(blob, dtype).reshape(shape)`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import pyarrow as pa
+
+__all__ = ["Column", "TableSchema", "array", "scalar", "transform_columns"]
+
+ScalarKind = Literal["int64", "int32", "float64", "string", "bool", "binary", "list<string>", "list<float64>",
+                     "list<bool>", "map<string,float64>", "map<string,int64>"]  # fmt: skip
+
+_ARROW: dict[str, pa.DataType] = {
+    "int64": pa.int64(),
+    "int32": pa.int32(),
+    "float64": pa.float64(),
+    "string": pa.string(),
+    "bool": pa.bool_(),
+    "binary": pa.binary(),
+    "list<string>": pa.list_(pa.string()),
+    "list<float64>": pa.list_(pa.float64()),
+    "list<bool>": pa.list_(pa.bool_()),
+    "map<string,float64>": pa.map_(pa.string(), pa.float64()),
+    "map<string,int64>": pa.map_(pa.string(), pa.int64()),
+}
+_JSON: dict[str, dict[str, Any]] = {
+    "int64": {"type": "integer"},
+    "int32": {"type": "integer"},
+    "float64": {"type": "number"},
+    "string": {"type": "string"},
+    "bool": {"type": "boolean"},
+    "binary": {"type": "string", "contentEncoding": "base64"},
+    "list<string>": {"type": "array", "items": {"type": "string"}},
+    "list<float64>": {"type": "array", "items": {"type": "number"}},
+    "list<bool>": {"type": "array", "items": {"type": "boolean"}},
+    "map<string,float64>": {"type": "object", "additionalProperties": {"type": "number"}},
+    "map<string,int64>": {"type": "object", "additionalProperties": {"type": "integer"}},
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column: its name carries the unit; `shape` is set for arrays, with "N" for the free axis."""
+
+    name: str
+    kind: ScalarKind
+    doc: str
+    nullable: bool = False
+    dtype: str | None = None
+    shape: tuple[str | int, ...] = ()
+
+    @property
+    def is_array(self) -> bool:
+        """True for a blob that decodes to an array."""
+        return self.dtype is not None
+
+    def arrow_field(self) -> pa.Field:
+        """The Arrow field, with dtype and shape in its metadata where the column is an array."""
+        metadata = {"doc": self.doc}
+        if self.dtype is not None:
+            metadata |= {"dtype": self.dtype, "shape": ",".join(map(str, self.shape))}
+        return pa.field(self.name, _ARROW[self.kind], nullable=self.nullable, metadata=metadata)
+
+    def json_schema(self) -> dict[str, Any]:
+        """The JSON Schema of one value of this column."""
+        value = dict(_JSON[self.kind]) | {"description": self.doc}
+        if self.dtype is not None:
+            value |= {"x-dtype": self.dtype, "x-shape": list(self.shape)}
+        return {"anyOf": [value, {"type": "null"}]} if self.nullable else value
+
+
+@dataclass(frozen=True)
+class TableSchema:
+    """A table's name, version and columns. The version grows with every change that a reader can notice."""
+
+    name: str
+    version: int
+    columns: tuple[Column, ...]
+    doc: str = ""
+
+    def arrow_schema(self) -> pa.Schema:
+        """The Arrow schema that every file of the table has."""
+        return pa.schema([c.arrow_field() for c in self.columns])
+
+    def column(self, name: str) -> Column:
+        """The column of that name; KeyError where the table has none."""
+        for column in self.columns:
+            if column.name == name:
+                return column
+        raise KeyError(f"table {self.name} has no column {name}")
+
+    def json_schema(self) -> dict[str, Any]:
+        """JSON Schema (2020-12) of one row."""
+        return {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            "title": f"{self.name}/{self.version}",
+            "description": self.doc,
+            "type": "object",
+            "properties": {c.name: c.json_schema() for c in self.columns},
+            "required": [c.name for c in self.columns],
+            "additionalProperties": False,
+        }
+
+
+def scalar(name: str, kind: ScalarKind, doc: str, *, nullable: bool = False) -> Column:
+    """A plain column."""
+    return Column(name, kind, doc, nullable)
+
+
+def array(name: str, dtype: str, shape: tuple[str | int, ...], doc: str, *, nullable: bool = False) -> Column:
+    """A blob column: little-endian numpy `dtype` (as "<f4"), `shape` with "N" for the free axis."""
+    return Column(name, "binary", doc, nullable, dtype, shape)
+
+
+def transform_columns(prefix: str, doc: str, *, nullable: bool = False) -> tuple[Column, ...]:
+    """Seven columns `<prefix>qw ... <prefix>tz_m` of one `T_parent_child` (scalar-first quaternion, metres)."""
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    return tuple(scalar(f"{prefix}{n}", "float64", doc, nullable=nullable) for n in names)

@@ -1,0 +1,30 @@
+"""All tables and their versions, and the export as JSON Schema."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from schemas.calibrations import CALIBRATIONS
+from schemas.columns import TableSchema
+from schemas.drift import DRIFT
+from schemas.frames import FRAMES
+from schemas.observations import OBSERVATIONS
+
+__all__ = ["CODE_VERSION", "TABLES", "write_json_schemas"]
+
+# Enters every work key: raise it with every change that alters a number, so that stale partitions are made anew.
+CODE_VERSION = "0.1.0"
+
+TABLES: dict[str, TableSchema] = {t.name: t for t in (FRAMES, OBSERVATIONS, CALIBRATIONS, DRIFT)}
+
+
+def write_json_schemas(folder: Path) -> list[Path]:
+    """Write `<table>.schema.json` for every table into `folder` and return the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for table in TABLES.values():
+        path = folder / f"{table.name}.schema.json"
+        path.write_text(json.dumps(table.json_schema(), indent=2) + "\n")
+        paths.append(path)
+    return paths
