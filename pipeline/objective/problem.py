@@ -1,0 +1,70 @@
+"""What a calibration method is given and what it returns: shared by solve, learn and verify."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import adjoint
+
+__all__ = ["PairEstimate", "Prior", "Solution"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is believed before the day: two transforms, the third composed, with isotropic sigmas per transform."""
+
+    T_camera_lidar: np.ndarray
+    T_lidar_radar: np.ndarray
+    rotation_sigma_rad: float
+    translation_sigma_m: float
+
+    @property
+    def T_camera_radar(self) -> Float[np.ndarray, "4 4"]:
+        """T_camera_lidar @ T_lidar_radar."""
+        return self.T_camera_lidar @ self.T_lidar_radar
+
+    def of(self, pair: str) -> Float[np.ndarray, "4 4"]:
+        """Prior transform of camera_lidar, camera_radar or lidar_radar."""
+        return {"camera_lidar": self.T_camera_lidar, "camera_radar": self.T_camera_radar, "lidar_radar": self.T_lidar_radar}[pair]
+
+    def covariance(self, pair: str) -> Float[np.ndarray, "6 6"]:
+        """Prior covariance (rotation vector, translation; left perturbation); camera_radar composes the other two."""
+        base = np.diag([self.rotation_sigma_rad**2] * 3 + [self.translation_sigma_m**2] * 3)
+        if pair != "camera_radar":
+            return base
+        # Each prior is isotropic about its own sensor: only rotate the second one into camera axes, no lever arm.
+        A = adjoint(self.T_camera_lidar).copy()
+        A[3:, :3] = 0
+        return base + A @ base @ A.T
+
+
+@dataclass(frozen=True, eq=False)
+class PairEstimate:
+    """One pair's result: T, its 6x6 covariance (left perturbation, rad and m), and what the day determined."""
+
+    pair: str
+    T: np.ndarray
+    covariance: np.ndarray
+    observability: np.ndarray  # 6, 0..1
+    observable: np.ndarray  # 6, bool
+    frames_used: int
+    frames_rejected: dict[str, int] = field(default_factory=dict)
+    time_offset_s: float | None = None  # stamp_parent = stamp_child + dt
+    time_offset_sigma_s: float | None = None
+    diagnostics: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """All three pairs, and the loop of three independent pair estimates where the method made them."""
+
+    method: str
+    pairs: dict[str, PairEstimate]
+    loop_rotation_rad: float | None = None
+    loop_translation_m: float | None = None
+    # Reasons found while solving for not trusting a pair (restarts disagree, halves disagree, camera contradicts), by pair.
+    doubts: dict[str, list[str]] = field(default_factory=dict)
