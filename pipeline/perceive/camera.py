@@ -1,0 +1,194 @@
+"""What the camera saw: a Cityscapes label image and road users, from logged topics or from ONNX models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from pipeline.config import PerceiveConfig, TopicSemantics
+from pipeline.perceive.labels import ROAD_ID, SKY_ID, road_user_name, to_cityscapes
+from pipeline.perceive.rejections import FrameReason, FrameRejectedError
+from schemas.frames import Frame
+
+__all__ = [
+    "CameraSemantics",
+    "Detections",
+    "SemanticsSource",
+    "TopicSource",
+    "decode_colour",
+    "decode_grey",
+    "encode_png",
+    "label_size",
+    "resize_labels",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """Road users in the image: boxes x0 y0 x1 y1 in full-image pixels, names of ROAD_USERS, scores 0..1."""
+
+    boxes_px: Float32[np.ndarray, "N 4"]
+    classes: list[str]
+    scores: Float32[np.ndarray, " N"]
+
+    def at_least(self, min_score: float) -> Detections:
+        """Those with at least this score."""
+        keep = np.flatnonzero(self.scores >= min_score)
+        return Detections(self.boxes_px[keep], [self.classes[i] for i in keep], self.scores[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class CameraSemantics:
+    """One image's semantics; `labels` are Cityscapes train ids at label size."""
+
+    labels: UInt8[np.ndarray, "H W"]
+    detections: Detections
+
+    @property
+    def sky_fraction(self) -> float:
+        """Share of the image labelled sky."""
+        return float(np.mean(self.labels == SKY_ID))
+
+    @property
+    def drivable_fraction(self) -> float:
+        """Share of the image labelled road."""
+        return float(np.mean(self.labels == ROAD_ID))
+
+
+class SemanticsSource(Protocol):
+    """Where semantics come from."""
+
+    def read(self, frame: Frame) -> CameraSemantics:
+        """Semantics of one frame; FrameRejectedError where there are none."""
+        ...
+
+
+class TopicSource:
+    """Semantics that the car logged."""
+
+    def __init__(self, topics: TopicSemantics, config: PerceiveConfig) -> None:
+        self._table = to_cityscapes(topics.label_set)
+        self._config = config
+
+    def read(self, frame: Frame) -> CameraSemantics:
+        """Logged labels in Cityscapes ids at label size, and logged road users above the minimum score.
+
+        Raises:
+            FrameRejectedError: labels or detections missing, undecodable, or of another shape than the image.
+        """
+        if frame.labels_png is None:
+            raise FrameRejectedError(FrameReason.NO_LABELS)
+        labels = _decode(frame.labels_png, cv2.IMREAD_UNCHANGED)
+        if labels is None or labels.ndim != 2 or labels.dtype != np.uint8:
+            raise FrameRejectedError(FrameReason.UNDECODABLE_LABELS)
+        size = label_size(frame.image_width_px, frame.image_height_px, self._config.label_scale)
+        if not _same_aspect(labels.shape, size):
+            raise FrameRejectedError(FrameReason.LABELS_SHAPE)
+        detections = _logged_detections(frame).at_least(self._config.detection_min_score)
+        return CameraSemantics(resize_labels(self._table[labels], size), detections)
+
+
+def label_size(width_px: int, height_px: int, scale: float) -> tuple[int, int]:
+    """(rows, columns) of label images of an image; the same rounding as `Camera.scaled`."""
+    return max(1, round(height_px * scale)), max(1, round(width_px * scale))
+
+
+def resize_labels(labels: UInt8[np.ndarray, "H W"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
+    """Label image at another size (rows, columns); pixel centres stay aligned, so that no boundary shifts.
+
+    Reducing by two takes the majority of each 2x2 block, with ties to the smaller id: the nearest pixel would be a
+    choice among four equally near ones, and taking always the same of them shifts every boundary by half a pixel.
+    """
+    rows, columns = size
+    if labels.shape == (rows, columns):
+        return labels
+    if labels.shape == (2 * rows, 2 * columns):
+        return _majority_of_blocks(labels)
+    # INTER_NEAREST rounds down (a shift of up to half a pixel); NEAREST_EXACT samples at the pixel centre.
+    return cv2.resize(labels, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT).astype(
+        np.uint8, copy=False
+    )
+
+
+def decode_colour(frame: Frame) -> UInt8[np.ndarray, "H W 3"]:
+    """The frame's image as BGR.
+
+    Raises:
+        FrameRejectedError: undecodable, or not of the size that the intrinsics refer to.
+    """
+    return _sized(_decode(frame.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), frame, 1.0)
+
+
+def decode_grey(frame: Frame, scale: float) -> UInt8[np.ndarray, "h w"]:
+    """The frame's image as grey at label size; JPEG is decoded at half size where that is enough.
+
+    Raises:
+        FrameRejectedError: undecodable, or not of the size that the intrinsics refer to.
+    """
+    half = scale <= 0.5 and frame.image_format == "jpeg"  # only JPEG saves time by it
+    flag = cv2.IMREAD_REDUCED_GRAYSCALE_2 if half else cv2.IMREAD_GRAYSCALE
+    grey = _sized(_decode(frame.image, flag | cv2.IMREAD_IGNORE_ORIENTATION), frame, 0.5 if half else 1.0)
+    rows, columns = label_size(frame.image_width_px, frame.image_height_px, scale)
+    if grey.shape == (rows, columns):
+        return grey
+    return cv2.resize(grey, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+
+
+def encode_png(image: UInt8[np.ndarray, "H W"]) -> bytes:
+    """PNG mono8; lossless, fast compression (label images are mostly flat)."""
+    ok, blob = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    assert ok, "OpenCV cannot encode a grey PNG"
+    return bytes(blob)
+
+
+def _decode(blob: bytes, flag: int) -> np.ndarray | None:
+    if not blob:
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(blob, np.uint8), flag)
+    except cv2.error:
+        return None
+
+
+def _sized(image: np.ndarray | None, frame: Frame, scale: float) -> np.ndarray:
+    if image is None:
+        raise FrameRejectedError(FrameReason.UNDECODABLE_IMAGE)
+    # JPEG's reduced decoding rounds odd sizes up.
+    wanted = (np.ceil(frame.image_height_px * scale), np.ceil(frame.image_width_px * scale))
+    if image.shape[:2] != wanted:
+        raise FrameRejectedError(FrameReason.IMAGE_SIZE)
+    return image
+
+
+def _same_aspect(shape: tuple[int, ...], size: tuple[int, int]) -> bool:
+    """Whole-pixel rounding of either side may differ; a crop or another camera may not."""
+    scale_rows, scale_columns = shape[0] / size[0], shape[1] / size[1]
+    return abs(scale_rows - scale_columns) <= max(1 / size[0], 1 / size[1]) * max(scale_rows, scale_columns)
+
+
+def _logged_detections(frame: Frame) -> Detections:
+    boxes, classes, scores = frame.detection_boxes_px, frame.detection_classes, frame.detection_scores
+    if boxes is None or classes is None or scores is None:
+        raise FrameRejectedError(FrameReason.NO_DETECTIONS)
+    if not len(boxes) == len(classes) == len(scores):
+        raise FrameRejectedError(FrameReason.BAD_DETECTIONS)
+    names = [road_user_name(c) for c in classes]
+    finite = np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
+    whole = finite & (boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])
+    keep = [i for i, name in enumerate(names) if name is not None and whole[i]]
+    return Detections(
+        boxes[keep].astype(np.float32),
+        [n for n in (names[i] for i in keep) if n],
+        scores[keep].astype(np.float32),
+    )
+
+
+def _majority_of_blocks(labels: np.ndarray) -> np.ndarray:
+    block = np.stack([labels[0::2, 0::2], labels[0::2, 1::2], labels[1::2, 0::2], labels[1::2, 1::2]])
+    # Sorted a <= b <= c <= d: a label held twice or more is a (a = b), else b (b = c), else c (c = d), else all differ.
+    a, b, c, d = np.sort(block, axis=0)
+    return np.where(a == b, a, np.where(b == c, b, np.where(c == d, c, a)))

@@ -1,0 +1,169 @@
+"""The ground under the vehicle in one lidar sweep: a plane, the points on it, and how far it is free.
+
+RANSAC sees only the lowest point of each cell of a grid over the ground, so that neither the dense rings around the
+vehicle nor walls outvote the road; then each sector follows the surface outwards, because roads bend and crown.
+
+Source: paper, section 4.2 (RANSAC drivable area; its RangeNet++ stage is replaced by geometry here).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+__all__ = ["Ground", "find_ground", "height_over"]
+
+_NEAR_M = 2.5  # nearer returns are the vehicle itself
+_FAR_M = 60.0  # a 0.2 deg grazing angle and less: no ground returns worth a plane
+_CELL_M = 1.0
+_PLANE_REACH_M = 35.0  # further out a plane is a poor model of a road
+_MAX_TILT_RAD = 0.26  # 15 deg: mounting plus road; a steeper "ground" is a bank or a wall
+_HEIGHT_RANGE_M = (0.3, 4.0)  # lidar above the road: bumper to truck roof
+_HYPOTHESES = 400
+_MIN_SUPPORT = 40  # cells of 1 m^2
+_SECTORS = 120
+_BIN_M = 1.5
+_SLOPE = 0.06  # change of gradient along a sector that is still the same surface
+_OBSTACLE_M = (0.35, 2.5)  # above the local ground: over kerbs, under signs and branches
+_FREE_BINS = 360
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """`plane` (n, d) with n.p + d = 0, n up, lidar frame; None where none was found: then nothing is ground."""
+
+    plane: Float[np.ndarray, "4"] | None
+    is_ground: Bool[np.ndarray, " N"]
+    drivable_xyz_m: Float32[np.ndarray, "M 3"]
+
+
+def find_ground(xyz_m: Float32[np.ndarray, "N 3"], inlier_m: float, rng: np.random.Generator) -> Ground:
+    """Plane, ground points and the reachable ground on a 1 m grid of one sweep (lidar frame, z roughly up)."""
+    plane = _fit_plane(_lowest_of_cells(xyz_m), inlier_m, rng)
+    if plane is None:
+        return Ground(None, np.zeros(len(xyz_m), bool), np.zeros((0, 3), np.float32))
+    above_local = _follow_surface(xyz_m, height_over(plane, xyz_m), inlier_m)
+    range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
+    # Range noise on a grazing beam and ring tilt show as height: 0.3 % of the range.
+    is_ground = (np.abs(above_local) < inlier_m + 0.003 * range_m) & (range_m > _NEAR_M) & (range_m < _FAR_M)
+    free = _reachable(xyz_m, range_m, above_local)
+    return Ground(plane, is_ground, _on_grid(xyz_m[is_ground & free]))
+
+
+def height_over(
+    plane: Float[np.ndarray, "4"], xyz_m: Float32[np.ndarray, "N 3"]
+) -> Float32[np.ndarray, " N"]:
+    """Signed distance to the plane [m], positive upwards."""
+    return (xyz_m @ plane[:3].astype(np.float32) + np.float32(plane[3])).astype(np.float32)
+
+
+def _lowest_of_cells(xyz_m: np.ndarray) -> np.ndarray:
+    range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
+    near = xyz_m[(range_m > _NEAR_M) & (range_m < _PLANE_REACH_M)]
+    cell = np.floor(near[:, :2] / _CELL_M).astype(np.int64)
+    order = np.lexsort((near[:, 2], cell[:, 1], cell[:, 0]))
+    first = np.ones(len(near), bool)
+    first[1:] = np.any(np.diff(cell[order], axis=0) != 0, axis=1)
+    return near[order[first]].astype(np.float64)
+
+
+def _fit_plane(low: np.ndarray, inlier_m: float, rng: np.random.Generator) -> np.ndarray | None:
+    """Best of many 3-point planes that could be a road, refined by least squares."""
+    if len(low) < _MIN_SUPPORT:
+        return None
+    picks = rng.integers(len(low), size=(_HYPOTHESES, 3))
+    a, b, c = low[picks[:, 0]], low[picks[:, 1]], low[picks[:, 2]]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    # Slivers turn noise into tilt: the triangle's area must be that of a car's footprint at least.
+    wide = length > 16.0
+    normal = np.where(normal[:, 2:] < 0, -normal, normal)[wide] / length[wide, None]
+    offset = -np.sum(normal * a[wide], axis=1)
+    possible = (
+        (normal[:, 2] > np.cos(_MAX_TILT_RAD)) & (offset > _HEIGHT_RANGE_M[0]) & (offset < _HEIGHT_RANGE_M[1])
+    )
+    if not possible.any():
+        return None
+    normal, offset = normal[possible], offset[possible]
+    height = normal @ low.T + offset[:, None]
+    # The ground is the floor: what lies under a plane speaks against it (a plane through bonnets and hedges).
+    score = np.sum(np.abs(height) < inlier_m, axis=1) - np.sum(height < -2 * inlier_m, axis=1)
+    best = int(np.argmax(score))
+    return _refine(low, np.append(normal[best], offset[best]), inlier_m)
+
+
+def _refine(low: np.ndarray, plane: np.ndarray, inlier_m: float) -> np.ndarray | None:
+    for _ in range(5):
+        inside = low[np.abs(low @ plane[:3] + plane[3]) < inlier_m]
+        if len(inside) < _MIN_SUPPORT:
+            return None
+        centre = inside.mean(axis=0)
+        normal = np.linalg.svd(inside - centre, full_matrices=False)[2][2]
+        normal = normal if normal[2] > 0 else -normal
+        plane = np.append(normal, -normal @ centre)
+    return plane if normal[2] > np.cos(_MAX_TILT_RAD) else None
+
+
+def _follow_surface(xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float) -> np.ndarray:
+    """Height over the local ground: each sector carries the ground's height over the plane outwards."""
+    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
+    sector = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _SECTORS).astype(np.int32), _SECTORS - 1)
+    ring = (np.hypot(xyz_m[:, 0], xyz_m[:, 1]) / _BIN_M).astype(np.int32)
+    bins = int(np.ceil(_FAR_M / _BIN_M)) + 1
+    ring = np.minimum(ring, bins - 1)
+    cell = sector * bins + ring
+    order = np.argsort(cell, kind="stable")
+    start = np.searchsorted(cell[order], np.arange(_SECTORS * bins + 1))
+    surface = _walk(height_m[order].astype(np.float64), start, _SECTORS, bins, inlier_m)
+    # Neighbouring sectors see the same road: their median drops the sector that climbed onto a car.
+    surface = np.median(np.stack([np.roll(surface, s, axis=0) for s in (-2, -1, 0, 1, 2)]), axis=0)
+    return (height_m - surface[sector, ring]).astype(np.float32)
+
+
+@numba.njit(cache=True)
+def _walk(height: np.ndarray, start: np.ndarray, sectors: int, bins: int, inlier_m: float) -> np.ndarray:
+    surface = np.zeros((sectors, bins))
+    for s in range(sectors):
+        level, gap = 0.0, 1
+        for b in range(bins):
+            cell = height[start[s * bins + b] : start[s * bins + b + 1]]
+            reach = inlier_m + _SLOPE * _BIN_M * min(gap, 4)
+            fits = np.sort(cell[np.abs(cell - level) < reach])
+            if fits.size >= 2:
+                # The lower part: the upper one may be the foot of an object.
+                level, gap = fits[int(0.3 * (fits.size - 1))], 1
+            else:
+                gap += 1
+            surface[s, b] = level
+    return surface
+
+
+def _reachable(xyz_m: np.ndarray, range_m: np.ndarray, above_local_m: np.ndarray) -> np.ndarray:
+    """True where no obstacle stands nearer in the same direction."""
+    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
+    direction = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _FREE_BINS).astype(np.int32), _FREE_BINS - 1)
+    blocks = (above_local_m > _OBSTACLE_M[0]) & (above_local_m < _OBSTACLE_M[1]) & (range_m > _NEAR_M)
+    limit = _second_nearest(direction[blocks], range_m[blocks])
+    return range_m < limit[direction]
+
+
+def _second_nearest(direction: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+    """Per direction the second shortest range (a single return may be noise or snow), infinity where there is none."""
+    order = np.lexsort((range_m, direction))
+    direction, range_m = direction[order], range_m[order]
+    limit = np.full(_FREE_BINS, np.inf)
+    second = np.flatnonzero(direction[1:] == direction[:-1]) + 1
+    directions, first = np.unique(direction[second], return_index=True)
+    limit[directions] = range_m[second[first]]
+    return limit
+
+
+def _on_grid(ground_m: np.ndarray) -> np.ndarray:
+    """Mean ground point of each occupied cell."""
+    cell = np.floor(ground_m[:, :2] / _CELL_M).astype(np.int64)
+    _, index, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(index.ravel(), ground_m[:, k], len(count)) for k in range(3)], axis=1)
+    return (sums / count[:, None]).astype(np.float32)
