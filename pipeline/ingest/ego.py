@@ -1,0 +1,77 @@
+"""Ego motion at a stamp, interpolated from logged odometry; nothing is said outside of what was logged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation, log_so3
+
+__all__ = ["EgoState", "EgoTrack"]
+
+_LONGEST_GAP_S = (
+    0.5  # odometry comes at 10 Hz or more; across a longer gap a car's yaw rate is anyone's guess
+)
+
+
+@dataclass(frozen=True, eq=False)
+class EgoState:
+    """Motion at one stamp: forward speed, yaw rate (positive to the left), pose of the vehicle in the odometry frame."""
+
+    speed_mps: float
+    yaw_rate_radps: float
+    T_odom_vehicle: Float[np.ndarray, "4 4"]
+
+
+class EgoTrack:
+    """Odometry of one vehicle-day."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, ...]] = []
+        self._sorted: tuple[np.ndarray, np.ndarray] | None = None
+        self.vehicle_frame = ""
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, stamp_ns: int, message: Any) -> bool:
+        """Take a nav_msgs/Odometry; False where its numbers are no motion (not finite, zero quaternion)."""
+        p, q = message.pose.pose.position, message.pose.pose.orientation
+        twist = message.twist.twist
+        numbers = (p.x, p.y, p.z, q.w, q.x, q.y, q.z, twist.linear.x, twist.angular.z)
+        if not np.all(np.isfinite(numbers)) or not 0.5 < q.w**2 + q.x**2 + q.y**2 + q.z**2 < 2:
+            return False
+        self._rows.append((stamp_ns, *numbers))
+        self._sorted = None
+        self.vehicle_frame = str(message.child_frame_id).lstrip("/") or self.vehicle_frame
+        return True
+
+    def at(self, stamp_ns: int) -> EgoState | None:
+        """State at a stamp between two odometry messages at most half a second apart, else None."""
+        if not self._rows:
+            return None
+        stamps, values = self._arrays()
+        i = int(np.searchsorted(stamps, stamp_ns, "right"))
+        if i and stamps[i - 1] == stamp_ns:
+            return _state(values[i - 1], values[i - 1], 0.0)
+        if i == 0 or i == len(stamps) or stamps[i] - stamps[i - 1] > _LONGEST_GAP_S * 1e9:
+            return None
+        share = (stamp_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
+        return _state(values[i - 1], values[i], float(share))
+
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        if self._sorted is None:
+            stamps = np.array([r[0] for r in self._rows], np.int64)
+            order = np.unique(stamps, return_index=True)[1]
+            self._sorted = stamps[order], np.array([r[1:] for r in self._rows], np.float64)[order]
+        return self._sorted
+
+
+def _state(a: Float[np.ndarray, " 9"], b: Float[np.ndarray, " 9"], share: float) -> EgoState:
+    T_a, T_b = from_quaternion(a[3:7], a[:3]), from_quaternion(b[3:7], b[:3])
+    R = T_a[:3, :3] @ exp_so3(share * log_so3(T_a[:3, :3].T @ T_b[:3, :3]))
+    mixed = a + share * (b - a)
+    return EgoState(float(mixed[7]), float(mixed[8]), from_rotation_translation(R, mixed[:3]))

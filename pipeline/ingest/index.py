@@ -1,0 +1,212 @@
+"""First pass over a day's logs: when and where each message lies, and the small messages that every frame needs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64
+
+from pipeline.config import Rig, TopicSemantics
+from pipeline.errors import LogError
+from pipeline.geometry.cameras import Camera
+from pipeline.ingest.decoding import DECODE_ERRORS, decode, header_stamp_ns
+from pipeline.ingest.ego import EgoTrack
+from pipeline.ingest.images import read_camera_info
+from pipeline.ingest.readers import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
+from pipeline.ingest.transforms import TransformTree
+
+__all__ = ["ACCEPTED_TYPES", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]
+
+_IMAGE_TYPES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
+    "image": _IMAGE_TYPES,
+    "info": ("sensor_msgs/msg/CameraInfo",),
+    "labels": _IMAGE_TYPES,
+    "detections": ("vision_msgs/msg/Detection2DArray",),
+    "lidar": ("sensor_msgs/msg/PointCloud2",),
+    "radar": ("sensor_msgs/msg/PointCloud2", "radar_msgs/msg/RadarScan", "radar_msgs/msg/RadarTracks"),
+    "odometry": ("nav_msgs/msg/Odometry",),
+    "tf_static": ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """Where one message lies."""
+
+    log: int
+    channel: Channel
+    position: Position
+
+
+@dataclass(eq=False)
+class Stream:
+    """All messages of one role, in order of logging."""
+
+    stamps: list[int] = field(default_factory=list)
+    located: list[Located] = field(default_factory=list)
+
+    @property
+    def stamps_ns(self) -> Int64[np.ndarray, " N"]:
+        """Header stamps [ns]."""
+        return np.array(self.stamps, np.int64)
+
+
+@dataclass(eq=False)
+class DayIndex:
+    """What the logs of a vehicle-day hold. `problems` says in words, and `damage` counts, what could not be read."""
+
+    logs: list[LogReader] = field(default_factory=list)
+    log_names: list[str] = field(default_factory=list)
+    streams: dict[str, Stream] = field(default_factory=dict)
+    cameras: list[tuple[int, int, Camera]] = field(default_factory=list)  # log, stamp, intrinsics
+    trees: list[TransformTree] = field(default_factory=list)
+    ego: EgoTrack = field(default_factory=EgoTrack)
+    problems: list[str] = field(default_factory=list)
+    damage: Counter[str] = field(default_factory=Counter)
+    _camera_of_bytes: dict[bytes, Camera | str] = field(default_factory=dict)
+
+    def stream(self, role: str) -> Stream:
+        """Messages of a role; empty where there are none."""
+        return self.streams.setdefault(role, Stream())
+
+    def read(self, located: Located) -> memoryview:
+        """Payload of a message."""
+        return self.logs[located.log].read(located.position)
+
+    def camera_at(self, log: int, stamp_ns: int) -> Camera | None:
+        """Intrinsics nearest in time within the same log, else of the nearest log; None where no log has any."""
+        own = [c for c in self.cameras if c[0] == log] or self.cameras
+        return min(own, key=lambda c: abs(c[1] - stamp_ns))[2] if own else None
+
+    def complain(self, problem: str) -> None:
+        """Remember a problem once."""
+        if problem not in self.problems:
+            self.problems.append(problem)
+
+    def close(self) -> None:
+        """Let go of all logs."""
+        for log in self.logs:
+            log.close()
+
+
+def topics_of(rig: Rig) -> dict[str, str]:
+    """Role of each topic that the rig names."""
+    topics = {
+        rig.camera.image: "image",
+        rig.camera.info: "info",
+        rig.lidar.points: "lidar",
+        rig.radar.points: "radar",
+    }
+    topics["/tf_static"] = "tf_static"
+    if isinstance(rig.camera.semantics, TopicSemantics):
+        topics |= {rig.camera.semantics.labels: "labels", rig.camera.semantics.detections: "detections"}
+    if rig.ego is not None:
+        topics[rig.ego.odometry] = "odometry"
+    return topics
+
+
+def index_logs(
+    paths: Sequence[Path], rig: Rig, on_log: Callable[[int], None] = lambda done: None
+) -> DayIndex:
+    """Scan the logs once. Of images, clouds and scans only the stamp is read; logs that cannot be opened become problems."""
+    index, topics, cache = DayIndex(), topics_of(rig), ChunkCache()
+    for path in paths:
+        try:
+            index.logs.append(open_log(path, cache))
+        except LogError as err:
+            index.complain(str(err))
+            index.damage["unreadable_logs"] += 1
+            continue
+        index.log_names.append(path.name)
+        index.trees.append(TransformTree())
+        _index_log(index, len(index.logs) - 1, topics)
+        on_log(len(index.logs))
+    for role in ("image", "lidar", "radar", "info"):
+        if role not in index.streams and not any(
+            f"topic {t}" in p for t, r in topics.items() if r == role for p in index.problems
+        ):
+            topic = next(t for t, r in topics.items() if r == role)
+            index.complain(f"topic {topic} ({role}) has no message in any log")
+    for tree in index.trees:
+        for other in index.trees:
+            tree.fill_from(other)
+    index.cameras.sort(key=lambda c: c[1])
+    return index
+
+
+def _index_log(index: DayIndex, number: int, topics: dict[str, str]) -> None:
+    log = index.logs[number]
+    for message in log.scan(topics):
+        role = topics[message.channel.topic]
+        if message.channel.msgtype not in ACCEPTED_TYPES[role]:
+            index.damage["wrong_type"] += 1
+            index.complain(
+                f"{log.path.name}, topic {message.channel.topic}: type {message.channel.msgtype or 'unknown'}, "
+                f"not {' or '.join(ACCEPTED_TYPES[role])}"
+            )
+            continue
+        if role == "tf_static":
+            _take_transforms(index, number, message)
+            continue
+        stamp = header_stamp_ns(message.channel, message.data)
+        if stamp is None:
+            index.damage[f"{role}_without_stamp"] += 1
+        elif role == "info":
+            _take_camera(index, number, stamp, message)
+        elif role == "odometry":
+            _take_odometry(index, stamp, message)
+        else:
+            index.stream(role).stamps.append(stamp)
+            index.stream(role).located.append(Located(number, message.channel, message.position))
+    for name, count in log.damage.items():
+        index.damage[name] += count
+        index.complain(
+            f"{log.path.name}: {count} {name.replace('_', ' ')}"
+            if name != "truncated"
+            else f"{log.path.name}: is cut off"
+        )
+
+
+def _take_transforms(index: DayIndex, number: int, message: RawMessage) -> None:
+    try:
+        index.damage["bad_transforms"] += index.trees[number].add_message(
+            decode(message.channel, message.data)
+        )
+    except (LogError, *DECODE_ERRORS) as err:
+        index.damage["tf_static_undecodable"] += 1
+        index.complain(f"{index.log_names[number]}: {err}")
+
+
+def _take_odometry(index: DayIndex, stamp: int, message: RawMessage) -> None:
+    try:
+        if not index.ego.add(stamp, decode(message.channel, message.data)):
+            index.damage["bad_odometry"] += 1
+    except (LogError, *DECODE_ERRORS):
+        index.damage["odometry_undecodable"] += 1
+
+
+def _take_camera(index: DayIndex, number: int, stamp: int, message: RawMessage) -> None:
+    index.stream("info").stamps.append(stamp)
+    content = bytes(message.data[12:])  # all but sequence number and stamp: the same for hours
+    camera = index._camera_of_bytes.get(content)  # noqa: SLF001
+    if camera is None:
+        try:
+            camera = read_camera_info(decode(message.channel, message.data))
+        except (LogError, *DECODE_ERRORS) as err:
+            camera = str(err)
+        if len(index._camera_of_bytes) < 1000:  # noqa: SLF001
+            index._camera_of_bytes[content] = camera  # noqa: SLF001
+    if isinstance(camera, str):
+        index.damage["camera_info_unusable"] += 1
+        index.complain(f"{index.log_names[number]}, topic {message.channel.topic}: {camera}")
+        return
+    # One entry per change and log is enough for "nearest": keep the first and the last of each run.
+    runs = [c for c in index.cameras[-2:] if c[0] == number and c[2] is camera]
+    if len(runs) == 2:
+        index.cameras.pop()
+    index.cameras.append((number, stamp, camera))

@@ -1,0 +1,119 @@
+"""Radar scans as PointCloud2, radar_msgs/RadarScan or radar_msgs/RadarTracks; Doppler becomes range rate, positive = receding."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from pipeline.config import RadarTopics
+from pipeline.ingest.clouds import cloud_columns, first_field
+
+__all__ = ["RadarCloud", "read_radar"]
+
+_POWER = ("power", "rcs", "amplitude", "intensity", "snr", "snr_db", "power_db")
+_MAX_RANGE_M = 1000.0  # no automotive radar sees farther; more is a damaged number
+_FLAT_RAD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RadarCloud:
+    """Detections of one scan in the radar frame; `range_rate_mps` positive = receding, not ego-compensated."""
+
+    xyz_m: Float32[np.ndarray, "N 3"]
+    range_rate_mps: Float32[np.ndarray, " N"]
+    power_db: Float32[np.ndarray, " N"] | None
+    has_elevation: bool
+    dropped: Counter[str] = field(default_factory=Counter)
+
+
+def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
+    """Detections of one radar message, those that are not finite or at no range dropped and counted.
+
+    Args:
+        message: decoded by the log's own definition.
+        msgtype: PointCloud2, RadarScan or RadarTracks decide what is read.
+        config: name and sign of the Doppler field, sign of RadarScan's azimuth. The velocity vector of a RadarTrack needs no
+            sign: it is taken relative to the sensor, and its component along the line of sight is the range rate.
+
+    Raises:
+        ValueError: a field is missing (the message names those that there are), or the layout contradicts itself.
+    """
+    kind = msgtype.rsplit("/", 1)[-1]
+    xyz, range_rate, power = {"RadarScan": _scan, "RadarTracks": _tracks}.get(kind, _cloud)(message, config)
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = np.linalg.norm(xyz, axis=1)
+        finite = np.isfinite(distance) & np.isfinite(range_rate)
+        near, far = finite & (distance < 0.05), finite & (distance > _MAX_RANGE_M)
+    keep = finite & ~near & ~far
+    dropped = Counter({
+        "radar_points_not_finite": int(np.sum(~finite)),
+        "radar_points_at_no_range": int(np.sum(near)),
+        "radar_points_beyond_range": int(np.sum(far)),
+    })  # fmt: skip
+    has_elevation = bool(np.any(np.abs(xyz[keep, 2]) > _FLAT_RAD * distance[keep]))
+    return RadarCloud(
+        xyz[keep].astype(np.float32),
+        range_rate[keep].astype(np.float32),
+        None if power is None else power[keep].astype(np.float32),
+        has_elevation,
+        +dropped,
+    )
+
+
+_Columns = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"], Float[np.ndarray, " N"] | None]
+
+
+def _cloud(message: Any, config: RadarTopics) -> _Columns:
+    points = cloud_columns(message)
+    names = points.dtype.names or ()
+    if config.doppler_field not in names:
+        raise ValueError(
+            f"no field {config.doppler_field!r} for the Doppler; there are {', '.join(names) or 'none'}"
+        )
+    missing = [n for n in ("x", "y") if n not in names]
+    if missing:
+        raise ValueError(f"no field {' and '.join(missing)}; there are {', '.join(names)}")
+    used = ["x", "y", *(["z"] if "z" in names else []), config.doppler_field]
+    if any(points[n].ndim > 1 for n in used):
+        raise ValueError(f"a field of {', '.join(used)} holds more than one value a point")
+    # A planar radar has no z: 0 and has_elevation = False say so.
+    z = points["z"].astype(np.float64) if "z" in names else np.zeros(len(points))
+    xyz = np.stack([points["x"].astype(np.float64), points["y"].astype(np.float64), z], axis=1)
+    doppler = points[config.doppler_field].astype(np.float64)
+    power = first_field(points, _POWER)
+    return xyz, _receding(doppler, config), None if power is None else power.astype(np.float64)
+
+
+def _scan(message: Any, config: RadarTopics) -> _Columns:
+    raw = np.array(
+        [(r.range, r.azimuth, r.elevation, r.doppler_velocity, r.amplitude) for r in message.returns],
+        np.float64,
+    ).reshape(-1, 5)
+    distance, azimuth, elevation, doppler, amplitude = raw.T
+    azimuth = azimuth if config.azimuth_positive == "left" else -azimuth
+    with np.errstate(over="ignore", invalid="ignore"):
+        xyz = distance[:, None] * np.stack(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
+            axis=1,
+        )
+    return xyz, _receding(doppler, config), amplitude
+
+
+def _tracks(message: Any, _config: RadarTopics) -> _Columns:
+    xyz = np.array([(t.position.x, t.position.y, t.position.z) for t in message.tracks], np.float64).reshape(
+        -1, 3
+    )
+    velocity = np.array(
+        [(t.velocity.x, t.velocity.y, t.velocity.z) for t in message.tracks], np.float64
+    ).reshape(-1, 3)
+    with np.errstate(all="ignore"):
+        range_rate = np.einsum("ij,ij->i", xyz, velocity) / np.linalg.norm(xyz, axis=1)
+    return xyz, range_rate, None
+
+
+def _receding(doppler: Float[np.ndarray, " N"], config: RadarTopics) -> Float[np.ndarray, " N"]:
+    return doppler if config.doppler_positive == "receding" else -doppler

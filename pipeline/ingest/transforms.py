@@ -1,0 +1,83 @@
+"""Static transforms as logged: a tree of frames, walked in both directions."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import from_quaternion, inverse
+
+__all__ = ["TransformTree"]
+
+_UNIT_TOLERANCE = 0.01  # a quaternion farther from unit length is damaged or no rotation at all
+
+
+class TransformTree:
+    """Edges `T_parent_child` by frame ids; the last one logged for a child counts."""
+
+    def __init__(self) -> None:
+        self._parent_of: dict[str, tuple[str, np.ndarray]] = {}
+
+    @property
+    def edges(self) -> dict[str, str]:
+        """Parent of each child frame."""
+        return {child: parent for child, (parent, _) in self._parent_of.items()}
+
+    def add_message(self, message: Any) -> int:
+        """Take the transforms of a tf2_msgs/TFMessage; returns how many were no transforms (zero quaternion, not finite)."""
+        bad = 0
+        for entry in message.transforms:
+            q, t = entry.transform.rotation, entry.transform.translation
+            try:
+                added = self.add(
+                    entry.header.frame_id, entry.child_frame_id, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z)
+                )
+            except ValueError:
+                added = False
+            bad += not added
+        return bad
+
+    def add(
+        self,
+        parent: str,
+        child: str,
+        q_wxyz: tuple[float, float, float, float],
+        t: tuple[float, float, float],
+    ) -> bool:
+        """One edge; False (and nothing added) where it is no rigid transform between two frames."""
+        parent, child = parent.lstrip("/"), child.lstrip("/")
+        numbers = np.array([*q_wxyz, *t], np.float64)
+        is_rigid = np.all(np.isfinite(numbers)) and abs(np.linalg.norm(numbers[:4]) - 1) < _UNIT_TOLERANCE
+        if not is_rigid or not parent or not child or parent == child:
+            return False
+        self._parent_of[child] = (parent, from_quaternion(numbers[:4], numbers[4:]))
+        return True
+
+    def fill_from(self, other: TransformTree) -> None:
+        """Take the edges of frames that this tree does not know (a split recording logs them in its first file only)."""
+        for child, edge in other._parent_of.items():  # noqa: SLF001
+            self._parent_of.setdefault(child, edge)
+
+    def lookup(self, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
+        """T_a_b along the shortest chain of edges, None where no chain joins the two frames."""
+        a, b = a.lstrip("/"), b.lstrip("/")
+        neighbours: dict[str, list[tuple[str, np.ndarray]]] = {}
+        for child, (parent, T_parent_child) in self._parent_of.items():
+            neighbours.setdefault(parent, []).append((child, T_parent_child))
+            neighbours.setdefault(child, []).append((parent, inverse(T_parent_child)))
+        if not a or a not in neighbours:
+            return None
+        reached = {a: np.eye(4)}
+        queue = deque([a])
+        while queue:
+            frame = queue.popleft()
+            if frame == b:
+                return reached[b]
+            for following, T_frame_following in neighbours[frame]:
+                if following not in reached:
+                    reached[following] = reached[frame] @ T_frame_following
+                    queue.append(following)
+        return None
