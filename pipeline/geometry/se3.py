@@ -54,7 +54,7 @@ def _series(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def exp_so3(phi: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrix of a rotation vector [rad]."""
-    theta = np.linalg.norm(phi, axis=-1)
+    theta = np.asarray(np.linalg.norm(phi, axis=-1))
     a, b, _ = _series(theta)
     W = hat(phi)
     return np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W)
@@ -74,7 +74,7 @@ def log_so3(R: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]
 def exp_se3(xi: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 4 4"]:
     """Transform of a twist (rotation vector [rad], translation [m])."""
     phi, rho = xi[..., :3], xi[..., 3:]
-    _, b, c = _series(np.linalg.norm(phi, axis=-1))
+    _, b, c = _series(np.asarray(np.linalg.norm(phi, axis=-1)))
     W = hat(phi)
     V = np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W)
     return from_rotation_translation(exp_so3(phi), (V @ rho[..., None])[..., 0])
@@ -83,7 +83,7 @@ def exp_se3(xi: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 4 4"
 def log_se3(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 6"]:
     """Twist of a transform, inverse of `exp_se3` for rotations below pi."""
     phi = log_so3(T[..., :3, :3])
-    theta = np.linalg.norm(phi, axis=-1)
+    theta = np.asarray(np.linalg.norm(phi, axis=-1))
     a, b, _ = _series(theta)
     small = theta < _SMALL_RAD
     t2 = np.where(small, 1.0, theta * theta)
@@ -141,7 +141,7 @@ def inverse_covariance(T_a_b: Float[np.ndarray, "4 4"], cov_a_b: Float[np.ndarra
 
 def rotation_angle_rad(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch"]:
     """Angle of the rotation part [rad], in [0, pi]."""
-    return np.linalg.norm(log_so3(T[..., :3, :3]), axis=-1)
+    return np.asarray(np.linalg.norm(log_so3(T[..., :3, :3]), axis=-1))
 
 
 def to_quaternion(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4"]:

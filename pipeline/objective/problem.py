@@ -28,7 +28,11 @@ class Prior:
 
     def of(self, pair: str) -> Float[np.ndarray, "4 4"]:
         """Prior transform of camera_lidar, camera_radar or lidar_radar."""
-        return {"camera_lidar": self.T_camera_lidar, "camera_radar": self.T_camera_radar, "lidar_radar": self.T_lidar_radar}[pair]
+        return {
+            "camera_lidar": self.T_camera_lidar,
+            "camera_radar": self.T_camera_radar,
+            "lidar_radar": self.T_lidar_radar,
+        }[pair]
 
     def covariance(self, pair: str) -> Float[np.ndarray, "6 6"]:
         """Prior covariance (rotation vector, translation; left perturbation); camera_radar composes the other two."""
