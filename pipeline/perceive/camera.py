@@ -100,8 +100,9 @@ def label_size(width_px: int, height_px: int, scale: float) -> tuple[int, int]:
 def resize_labels(labels: UInt8[np.ndarray, "H W"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
     """Label image at another size (rows, columns); pixel centres stay aligned, so that no boundary shifts.
 
-    Reducing by two takes the majority of each 2x2 block, with ties to the smaller id: the nearest pixel would be a
-    choice among four equally near ones, and taking always the same of them shifts every boundary by half a pixel.
+    Reducing by two takes the majority of each 2x2 block, with ties to the smaller id: the nearest pixel would
+    be a choice among four equally near ones, and taking always the same of them shifts every boundary by half
+    a pixel.
     """
     rows, columns = size
     if labels.shape == (rows, columns):
@@ -189,6 +190,7 @@ def _logged_detections(frame: Frame) -> Detections:
 
 def _majority_of_blocks(labels: np.ndarray) -> np.ndarray:
     block = np.stack([labels[0::2, 0::2], labels[0::2, 1::2], labels[1::2, 0::2], labels[1::2, 1::2]])
-    # Sorted a <= b <= c <= d: a label held twice or more is a (a = b), else b (b = c), else c (c = d), else all differ.
+    # Sorted a <= b <= c <= d: a label held twice or more is a (a = b), else b (b = c), else c (c = d), else
+    # all differ.
     a, b, c, d = np.sort(block, axis=0)
     return np.where(a == b, a, np.where(b == c, b, np.where(c == d, c, a)))

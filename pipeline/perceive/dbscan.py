@@ -15,8 +15,9 @@ __all__ = ["dbscan"]
 def dbscan(points: Float[np.ndarray, "N D"], eps: float, min_points: int) -> Int32[np.ndarray, " N"]:
     """Cluster of each point (2-D or 3-D), 0..K-1 in order of first appearance, -1 = noise.
 
-    A core point has at least `min_points` points, itself included, at distance <= eps. A border point that several
-    clusters reach joins that of its nearest core point, so that the result does not depend on the order of points.
+    A core point has at least `min_points` points, itself included, at distance <= eps. A border point that
+    several clusters reach joins that of its nearest core point, so that the result does not depend on the
+    order of points.
     """
     if not len(points):
         return np.zeros(0, np.int32)
@@ -56,28 +57,40 @@ def _dbscan(
     parent = np.arange(n)
     for i in range(n):
         if core[i]:
-            c = cell_of[i]
-            for r in range(9):
-                # Each pair once: j < i.
-                for j in range(first[c, r], min(last[c, r], i)):
-                    if core[j] and _distance2(p, i, j) <= eps2:
-                        a, b = _root(parent, i), _root(parent, j)
-                        if a != b:
-                            parent[max(a, b)] = min(a, b)
+            _join_earlier(p, i, cell_of[i], first, last, eps2, core, parent)
     label = np.full(n, -1, np.int32)
     for i in range(n):
-        if core[i]:
-            label[i] = _root(parent, i)
-        else:
-            best = eps2
-            c = cell_of[i]
-            for r in range(9):
-                for j in range(first[c, r], last[c, r]):
-                    d = _distance2(p, i, j)
-                    if core[j] and (d < best or (d == best and label[i] < 0)):
-                        best = d
-                        label[i] = _root(parent, j)
+        nearest = i if core[i] else _nearest_core(p, i, cell_of[i], first, last, eps2, core)
+        if nearest >= 0:
+            label[i] = _root(parent, nearest)
     return label
+
+
+@numba.njit(cache=True)
+def _join_earlier(
+    p: np.ndarray, i: int, c: int, first: np.ndarray, last: np.ndarray, eps2: float, core: np.ndarray,
+    parent: np.ndarray,
+) -> None:  # fmt: skip
+    """Unite a core point with the core points in reach that come before it: each pair once."""
+    for r in range(9):
+        for j in range(first[c, r], min(last[c, r], i)):
+            if core[j] and _distance2(p, i, j) <= eps2:
+                a, b = _root(parent, i), _root(parent, j)
+                if a != b:
+                    parent[max(a, b)] = min(a, b)
+
+
+@numba.njit(cache=True)
+def _nearest_core(
+    p: np.ndarray, i: int, c: int, first: np.ndarray, last: np.ndarray, eps2: float, core: np.ndarray
+) -> int:
+    nearest, best = -1, eps2
+    for r in range(9):
+        for j in range(first[c, r], last[c, r]):
+            d = _distance2(p, i, j)
+            if core[j] and (d < best or (d == best and nearest < 0)):
+                nearest, best = j, d
+    return nearest
 
 
 @numba.njit(cache=True)

@@ -1,7 +1,8 @@
-"""How far the road is free in each direction, seen by the radar: geometry instead of the paper's weakly supervised network.
+"""How far the road is free in each direction, seen by the radar.
 
-The static returns of a road scene lie on kerbs, rails, walls and parked cars; the asphalt itself scatters away. The free
-sector of a direction ends at its nearest static return that is no loner.
+The static returns of a road scene lie on kerbs, rails, walls and parked cars; the asphalt itself scatters
+away. The free sector of a direction ends at its nearest static return that is no loner. Geometry, instead of
+the paper's weakly supervised network.
 
 Source: paper, section 4.2 (radar drivable area), as the geometric fallback of the design.
 """
@@ -29,7 +30,10 @@ _STATIC = 0
 
 @dataclass(frozen=True, eq=False)
 class FreeSector:
-    """Drivable until `range_m` at each `azimuth_rad` (bin centres, radar frame, increasing); directions without evidence are absent."""
+    """Drivable until `range_m` at each `azimuth_rad` (bin centres, radar frame, increasing).
+
+    Directions without evidence are absent.
+    """
 
     azimuth_rad: Float32[np.ndarray, " B"]
     range_m: Float32[np.ndarray, " B"]
@@ -38,7 +42,10 @@ class FreeSector:
 def free_sector(
     xyz_m: Float32[np.ndarray, "M 3"], motion: UInt8[np.ndarray, " M"], has_elevation: bool
 ) -> FreeSector:
-    """Range to the nearest supported static return per azimuth bin; moving road users stand on the road and don't end it."""
+    """Range to the nearest supported static return per azimuth bin.
+
+    Moving road users stand on the road and don't end it.
+    """
     points = _supported(xyz_m[_could_bound(xyz_m, motion, has_elevation)])
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     bins = round(2 * _HALF_SECTOR_RAD / _BIN_RAD)
@@ -70,7 +77,7 @@ def _supported(points_m: np.ndarray) -> np.ndarray:
 
 
 def _bridge_gaps(centres_rad: np.ndarray, nearest_m: np.ndarray) -> FreeSector:
-    """Bins without a return take the line between their neighbours where the gap is short; else they say nothing."""
+    """Bins without a return lie on the line between their neighbours; in a wide gap they say nothing."""
     seen = np.flatnonzero(np.isfinite(nearest_m))
     if not seen.size:
         return FreeSector(np.zeros(0, np.float32), np.zeros(0, np.float32))

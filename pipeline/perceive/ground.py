@@ -1,7 +1,8 @@
 """The ground under the vehicle in one lidar sweep: a plane, the points on it, and how far it is free.
 
-RANSAC sees only the lowest point of each cell of a grid over the ground, so that neither the dense rings around the
-vehicle nor walls outvote the road; then each sector follows the surface outwards, because roads bend and crown.
+RANSAC sees only the lowest point of each cell of a grid over the ground, so that neither the dense rings
+around the vehicle nor walls outvote the road; then each sector follows the surface outwards, because roads
+bend and crown.
 
 Source: paper, section 4.2 (RANSAC drivable area; its RangeNet++ stage is replaced by geometry here).
 """
@@ -33,15 +34,15 @@ _FREE_BINS = 360
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """`plane` (n, d) with n.p + d = 0, n up, lidar frame; None where none was found: then nothing is ground."""
+    """`plane` (n, d) with n.p + d = 0, n up, lidar frame; None where none was found."""
 
-    plane: Float[np.ndarray, "4"] | None
+    plane: Float[np.ndarray, " 4"] | None
     is_ground: Bool[np.ndarray, " N"]
     drivable_xyz_m: Float32[np.ndarray, "M 3"]
 
 
 def find_ground(xyz_m: Float32[np.ndarray, "N 3"], inlier_m: float, rng: np.random.Generator) -> Ground:
-    """Plane, ground points and the reachable ground on a 1 m grid of one sweep (lidar frame, z roughly up)."""
+    """Plane, ground points and reachable ground on a 1 m grid of one sweep (lidar frame, z roughly up)."""
     plane = _fit_plane(_lowest_of_cells(xyz_m), inlier_m, rng)
     if plane is None:
         return Ground(None, np.zeros(len(xyz_m), bool), np.zeros((0, 3), np.float32))
@@ -54,7 +55,7 @@ def find_ground(xyz_m: Float32[np.ndarray, "N 3"], inlier_m: float, rng: np.rand
 
 
 def height_over(
-    plane: Float[np.ndarray, "4"], xyz_m: Float32[np.ndarray, "N 3"]
+    plane: Float[np.ndarray, " 4"], xyz_m: Float32[np.ndarray, "N 3"]
 ) -> Float32[np.ndarray, " N"]:
     """Signed distance to the plane [m], positive upwards."""
     return (xyz_m @ plane[:3].astype(np.float32) + np.float32(plane[3])).astype(np.float32)
@@ -151,7 +152,7 @@ def _reachable(xyz_m: np.ndarray, range_m: np.ndarray, above_local_m: np.ndarray
 
 
 def _second_nearest(direction: np.ndarray, range_m: np.ndarray) -> np.ndarray:
-    """Per direction the second shortest range (a single return may be noise or snow), infinity where there is none."""
+    """Per direction the second shortest range (one return may be snow), infinity where there is none."""
     order = np.lexsort((range_m, direction))
     direction, range_m = direction[order], range_m[order]
     limit = np.full(_FREE_BINS, np.inf)

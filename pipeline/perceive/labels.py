@@ -1,7 +1,7 @@
-"""Semantic classes: every label set is brought to Cityscapes train ids, every detector's names to eight road users.
+"""Semantic classes: label sets become Cityscapes train ids, detectors' names become eight road users.
 
-Sources: Cityscapes `labels.py` (train ids); ADE20K `objectInfo150` (ids from 0, as SegFormer puts them out); COCO-Stuff
-`labels.md` (182 ids, here from 0, 255 = void); COCO detection's 80 consecutive ids.
+Sources: Cityscapes `labels.py` (train ids); ADE20K `objectInfo150` (ids from 0, as SegFormer puts them out);
+COCO-Stuff `labels.md` (182 ids, here from 0, 255 = void); COCO detection's 80 consecutive ids.
 """
 
 from __future__ import annotations
@@ -25,32 +25,31 @@ __all__ = [
 ]
 
 CITYSCAPES = (
-    "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation", "terrain",
-    "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle",
+    "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation",
+    "terrain", "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle",
 )  # fmt: skip
 ROAD_USERS = ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle")
 ROAD_ID, SKY_ID, VOID_ID = 0, 10, 255
 # Paper, section 4.3: vehicles, pedestrians, signs, poles, buildings, fences and vegetation reflect lidar.
 REFLECTING_IDS = (2, 3, 4, 5, 6, 7, 8, 11, 12, 13, 14, 15, 16, 17, 18)
 
-# Foreign id -> Cityscapes name, outdoor classes only; everything else is void.
+# Cityscapes name -> ids of the foreign set, outdoor classes only; every other id is void.
 _ADE20K = {
-    0: "wall", 1: "building", 2: "sky", 4: "vegetation", 6: "road", 9: "terrain", 11: "sidewalk", 12: "person",
-    13: "terrain", 17: "vegetation", 20: "car", 25: "building", 29: "terrain", 32: "fence", 38: "fence", 42: "pole",
-    43: "traffic sign", 48: "building", 52: "sidewalk", 54: "road", 72: "vegetation", 79: "building", 80: "bus",
-    83: "truck", 84: "building", 87: "pole", 91: "terrain", 93: "pole", 94: "terrain", 102: "car", 116: "motorcycle",
-    127: "bicycle", 136: "traffic light",
+    "road": (6, 54), "sidewalk": (11, 52), "building": (1, 25, 48, 79, 84), "wall": (0,), "fence": (32, 38),
+    "pole": (42, 87, 93), "traffic light": (136,), "traffic sign": (43,), "vegetation": (4, 17, 72),
+    "terrain": (9, 13, 29, 91, 94), "sky": (2,), "person": (12,), "car": (20, 102), "truck": (83,),
+    "bus": (80,), "motorcycle": (116,), "bicycle": (127,),
 }  # fmt: skip
 _COCO_STUFF = {
-    0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 6: "train", 7: "truck", 9: "traffic light",
-    11: "traffic sign", 12: "traffic sign", 93: "vegetation", 95: "building", 96: "vegetation", 105: "sky", 110: "terrain",
-    112: "fence", 118: "vegetation", 119: "sky", 123: "terrain", 124: "terrain", 125: "terrain", 127: "building",
-    128: "vegetation", 133: "vegetation", 135: "terrain", 137: "fence", 139: "sidewalk", 141: "vegetation", 145: "fence",
-    148: "road", 150: "building", 153: "terrain", 156: "sky", 157: "building", 168: "vegetation", 170: "wall", 171: "wall",
-    172: "wall", 173: "wall", 174: "wall", 175: "wall", 176: "wall",
+    "road": (148,), "sidewalk": (139,), "building": (95, 127, 150, 157),
+    "wall": (170, 171, 172, 173, 174, 175, 176), "fence": (112, 137, 145), "traffic light": (9,),
+    "traffic sign": (11, 12),
+    "vegetation": (93, 96, 118, 128, 133, 141, 168), "terrain": (110, 123, 124, 125, 135, 153),
+    "sky": (105, 119, 156), "person": (0,), "car": (2,), "truck": (7,), "bus": (5,), "train": (6,),
+    "motorcycle": (3,), "bicycle": (1,),
 }  # fmt: skip
-LABEL_SETS: dict[str, dict[int, str]] = {
-    "cityscapes": dict(enumerate(CITYSCAPES)),
+LABEL_SETS: dict[str, dict[str, tuple[int, ...]]] = {
+    "cityscapes": {name: (train_id,) for train_id, name in enumerate(CITYSCAPES)},
     "ade20k": _ADE20K,
     "coco": _COCO_STUFF,
 }
@@ -68,11 +67,11 @@ _ALIASES = {
 }  # fmt: skip
 
 
-def to_cityscapes(label_set: str) -> UInt8[np.ndarray, "256"]:
+def to_cityscapes(label_set: str) -> UInt8[np.ndarray, " 256"]:
     """Lookup table from labels of a set to Cityscapes train ids; what has no counterpart becomes VOID_ID."""
     table = np.full(256, VOID_ID, np.uint8)
-    for foreign, name in LABEL_SETS[label_set].items():
-        table[foreign] = CITYSCAPES.index(name)
+    for name, foreign in LABEL_SETS[label_set].items():
+        table[list(foreign)] = CITYSCAPES.index(name)
     return table
 
 

@@ -39,8 +39,9 @@ _PRIOR_FIELDS = [
     for part in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 ]
 _COPIED_FIELDS = [
-    "frame_index", "log", "drive", "stamp_ns", "camera_stamp_ns", "radar_stamp_ns", "image_width_px", "image_height_px",
-    "camera_model", "camera_K", "camera_D", "radar_power_db", "radar_has_elevation", *_PRIOR_FIELDS,
+    "frame_index", "log", "drive", "stamp_ns", "camera_stamp_ns", "radar_stamp_ns",
+    "image_width_px", "image_height_px", "camera_model", "camera_K", "camera_D",
+    "radar_power_db", "radar_has_elevation", *_PRIOR_FIELDS,
 ]  # fmt: skip
 
 
@@ -53,8 +54,8 @@ def perceive_day(
 ) -> StageResult:
     """Perceive all frames of a vehicle-day and replace its partition of observations.
 
-    A frame that cannot be used is left out and counted by reason. Where none is left, the partition is empty and the
-    result "refused".
+    A frame that cannot be used is left out and counted by reason. Where none is left, the partition is empty
+    and the result "refused".
 
     Raises:
         ConfigError: the vehicle or a model manifest is not as fleet.toml says.
@@ -142,7 +143,8 @@ def _semantics(vehicle: str, fleet: FleetConfig, fleet_file: Path) -> tuple[Sema
     wanted = fleet.rig_of(vehicle, file=str(fleet_file)).camera.semantics
     if isinstance(wanted, TopicSemantics):
         return TopicSource(wanted, fleet.perceive), {"source": "topics", "label_set": wanted.label_set}
-    from pipeline.perceive.models.source import ModelSource  # noqa: PLC0415  onnxruntime loads only where it is used
+    # onnxruntime loads only where it is used.
+    from pipeline.perceive.models.source import ModelSource  # noqa: PLC0415
 
     models = ModelSource.load(wanted, fleet.perceive, fleet_file)
     return models, {"source": "onnx", **models.provenance}
@@ -257,6 +259,14 @@ def _result(lake: Lake, partition: Partition, manifest: Manifest, status: str) -
         counts = ", ".join(f"{n} {why}" for why, n in sorted(manifest.rejected.items()))
         reason = f"no usable frame: {counts}" if counts else "the day has no frames"
     return StageResult(
-        "perceive", partition.vehicle, partition.day, status, manifest.work_key, manifest.rows,
-        dict(manifest.kept), dict(manifest.rejected), reason, [str(lake.folder(OBSERVATIONS.name, partition))],
-    )  # fmt: skip
+        stage="perceive",
+        vehicle=partition.vehicle,
+        day=partition.day,
+        status=status,
+        work_key=manifest.work_key,
+        rows=manifest.rows,
+        kept=dict(manifest.kept),
+        rejected=dict(manifest.rejected),
+        reason=reason,
+        outputs=[str(lake.folder(OBSERVATIONS.name, partition))],
+    )

@@ -1,10 +1,11 @@
-"""Moving radar clusters followed from frame to frame: constant velocity over ground, in the moving radar's frame.
+"""Moving radar clusters followed from frame to frame, each at constant velocity over ground.
 
-Where Doppler is ambiguous, a new track is several hypotheses, one per wrap of its range rate; the next frames tell which
-one is right. Association: Hungarian assignment on gated likelihoods of position and (wrapped) range rate.
+Where Doppler is ambiguous, a new track is several hypotheses, one per wrap of its range rate; the next frames
+tell which one is right. Association: Hungarian assignment on gated likelihoods of position and (wrapped)
+range rate.
 
-Source: paper, section 4.2 (tracking to distinguish moving objects); Blackman, Popoli, "Design and Analysis of Modern
-Tracking Systems", 1999, sections 6.2 and 4.2 (gating, Kalman filter).
+Source: paper, section 4.2 (tracking to distinguish moving objects); Blackman, Popoli, "Design and Analysis of
+Modern Tracking Systems", 1999, sections 6.2 and 4.2 (gating, Kalman filter).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _MAX_MISSED_S = 1.0
 
 @dataclass(frozen=True, eq=False)
 class ClusterReturns:
-    """Clusters of one scan: mean point [m], mean range rate over ground [m/s] (modulo the period), number of detections."""
+    """Clusters of one scan: mean points, mean range rates over ground (modulo the period), detections."""
 
     centre_m: Float32[np.ndarray, "K 3"]
     rate_mps: Float32[np.ndarray, " K"]
@@ -67,14 +68,14 @@ class TrackState:
         """Nothing tracked yet."""
         none = np.zeros(0, np.int32)
         return cls(
-            None, -1, EgoMotion(None, None), 0, np.zeros((0, 4)), np.zeros((0, 4, 4)), np.zeros(0), none, none,
-            np.zeros(0, np.int64),
+            None, -1, EgoMotion(None, None), 0, np.zeros((0, 4)), np.zeros((0, 4, 4)), np.zeros(0), none,
+            none, np.zeros(0, np.int64),
         )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Tracks seen in one scan: measured centres (no filter lag) and filtered velocities over ground, radar frame axes."""
+    """Tracks of one scan: measured centres (no filter lag), filtered velocities over ground, radar axes."""
 
     xyz_m: Float32[np.ndarray, "K 3"]
     velocity_mps: Float32[np.ndarray, "K 3"]
@@ -116,8 +117,8 @@ def advance_tracks(
 ) -> tuple[TrackState, Tracks]:
     """Carry all tracks to `stamp_ns`, match the scan's clusters to them, start tracks for the others.
 
-    A new drive, a gap above 2.5 s or an unknown ego velocity forgets all tracks: nothing links the scans then.
-    Identities are never used twice.
+    A new drive, a gap above 2.5 s or an unknown ego velocity forgets all tracks: nothing links the scans
+    then. Identities are never used twice.
     """
     state = _predict(state, stamp_ns, drive, ego)
     row_of_cluster = _assign(state, returns, period_mps)
@@ -184,7 +185,7 @@ def _assign(state: TrackState, returns: ClusterReturns, period_mps: float | None
 
 
 def _costs(state: TrackState, returns: ClusterReturns, period_mps: float | None) -> np.ndarray:
-    """Negative log likelihood (times two) of clusters (rows) under hypotheses (columns); infinite outside the gate."""
+    """Twice the negative log likelihood of clusters (rows) under hypotheses (columns), inf outside gates."""
     z, R = returns.centre_m[:, :2].astype(np.float64), _noise(returns.centre_m)
     H = _measurement(z)
     innovation = _innovation(z, returns.rate_mps, H, state.state, period_mps)
@@ -195,7 +196,7 @@ def _costs(state: TrackState, returns: ClusterReturns, period_mps: float | None)
 
 
 def _measurement(centre_m: np.ndarray) -> np.ndarray:
-    """d(x, y, range rate)/d(x, y, vx, vy) of each cluster; the turn of the line of sight within a scan is left out."""
+    """d(x, y, range rate)/d(x, y, vx, vy) of each cluster, its line of sight taken as known."""
     H = np.zeros((len(centre_m), 3, 4))
     H[:, 0, 0] = H[:, 1, 1] = 1.0
     H[:, 2, 2:] = centre_m / np.maximum(np.linalg.norm(centre_m, axis=1, keepdims=True), 1e-6)
@@ -243,8 +244,8 @@ def _update(
     cov = A @ state.cov[h] @ A.T + G @ R @ G.T
     one = _take(state, np.arange(len(state.state)) == h)
     return replace(
-        one, state=(state.state[h] + G @ innovation)[None], cov=cov[None], log_weight=np.zeros(1), age=one.age + 1,
-        seen_ns=np.array([stamp_ns]),
+        one, state=(state.state[h] + G @ innovation)[None], cov=cov[None], log_weight=np.zeros(1),
+        age=one.age + 1, seen_ns=np.array([stamp_ns]),
     )  # fmt: skip
 
 

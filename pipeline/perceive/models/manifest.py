@@ -1,0 +1,139 @@
+"""Model manifests: a small TOML file beside each ONNX file says what goes in and what comes out.
+
+It also holds the hash of the one file that it describes.
+
+```toml
+path = "yolox_nano.onnx"          # relative to the manifest
+sha256 = "..."
+task = "detect"                   # or "segment"
+[input]
+size = [416, 416]                 # rows, columns
+mean = [0.0, 0.0, 0.0]            # in the order of `colour`, on the scale of `scale`
+std = [1.0, 1.0, 1.0]
+scale = 1.0                       # pixel values are multiplied by it first (0.00392156862745098 for 0..1)
+colour = "bgr"                    # or "rgb"
+fit = "letterbox_top_left"        # or "letterbox_centre", "stretch"
+pad = 114.0
+tile_scales = [0.625, 0.25]       # optional, detect only: run on overlapping tiles of the image at these
+sizes [output] layout = "yolox"                  # "yolov5" (objectness x class), "yolov8" (classes only,
+transposed), "logits", "labels" label_set = "coco" ```
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from pipeline.errors import ModelError
+from pipeline.perceive.labels import DETECTOR_SETS, LABEL_SETS
+
+__all__ = ["InputSpec", "Manifest", "OutputSpec", "load_manifest"]
+
+_Unit = Annotated[float, Field(ge=0, le=1)]
+_Size = Annotated[int, Field(gt=0)]
+_Triple = tuple[float, float, float]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class InputSpec(_Section):
+    """How an image becomes the model's input, float32 1x3xHxW."""
+
+    size: tuple[_Size, _Size]
+    mean: _Triple = (0.0, 0.0, 0.0)
+    std: _Triple = (1.0, 1.0, 1.0)
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    colour: Literal["rgb", "bgr"] = "rgb"
+    fit: Literal["letterbox_top_left", "letterbox_centre", "stretch"] = "letterbox_centre"
+    pad: float = 114.0
+    tile_scales: tuple[Annotated[float, Field(gt=0, le=1)], ...] = ()
+    tile_overlap: Annotated[float, Field(ge=0, lt=1)] = 0.35
+
+    @model_validator(mode="after")
+    def _std_divides(self) -> InputSpec:
+        if min(self.std) <= 0:
+            raise ValueError("std must be positive")
+        return self
+
+
+class OutputSpec(_Section):
+    """What the model puts out."""
+
+    layout: Literal["yolox", "yolov5", "yolov8", "logits", "labels"]
+    label_set: str
+    strides: tuple[_Size, ...] = (8, 16, 32)
+    nms_iou: _Unit = 0.5
+    min_score: _Unit = 0.05  # candidates for non-maximum suppression; the config's threshold comes after
+
+
+class Manifest(_Section):
+    """One model, checked: the file exists and is the one that the manifest means."""
+
+    path: str
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    task: Literal["detect", "segment"]
+    input: InputSpec
+    output: OutputSpec
+    file: Path = Path()  # of the manifest itself, set on loading
+
+    @model_validator(mode="after")
+    def _output_goes_with_task(self) -> Manifest:
+        segments = self.output.layout in ("logits", "labels")
+        if segments != (self.task == "segment"):
+            raise ValueError(f'output.layout = "{self.output.layout}" does not go with task = "{self.task}"')
+        known = LABEL_SETS if segments else DETECTOR_SETS
+        if self.output.label_set not in known:
+            raise ValueError(f'output.label_set = "{self.output.label_set}" is not one of {", ".join(known)}')
+        if segments and self.input.tile_scales:
+            raise ValueError("input.tile_scales is for detectors only")
+        return self
+
+    @property
+    def model_file(self) -> Path:
+        """The ONNX file."""
+        return self.file.parent / self.path
+
+
+def load_manifest(file: Path, task: Literal["detect", "segment"]) -> Manifest:
+    """Read and check a manifest and the hash of its model.
+
+    Raises:
+        ModelError: missing file, unknown key, impossible value, wrong task, or another model than the
+        manifest means;
+            the message names the manifest and the key.
+    """
+    try:
+        raw = tomllib.loads(file.read_text())
+        manifest = Manifest.model_validate({k: v for k, v in raw.items() if k != "file"} | {"file": file})
+    except FileNotFoundError as err:
+        raise ModelError(str(file), "no such manifest") from err
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as err:
+        raise ModelError(str(file), f"not a TOML file: {err}") from err
+    except ValidationError as err:
+        problems = err.errors(include_url=False)
+        text = "; ".join(f"{'.'.join(map(str, p['loc'])) or 'manifest'}: {p['msg']}" for p in problems)
+        raise ModelError(str(file), text) from err
+    if manifest.task != task:
+        raise ModelError(str(file), f'task: is "{manifest.task}", but fleet.toml uses it to {task}')
+    _check_hash(manifest)
+    return manifest
+
+
+def _check_hash(manifest: Manifest) -> None:
+    try:
+        with manifest.model_file.open("rb") as stream:
+            found = hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as err:
+        raise ModelError(
+            str(manifest.file), f"path: cannot read {manifest.model_file}: {err.strerror}"
+        ) from err
+    if found != manifest.sha256:
+        raise ModelError(
+            str(manifest.file), f"sha256: {manifest.model_file} has {found}, not {manifest.sha256}"
+        )

@@ -1,0 +1,95 @@
+"""Semantic segmentation by ONNX: SegFormer-style logits at reduced resolution, or labels."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.errors import ModelError
+from pipeline.perceive.labels import to_cityscapes
+from pipeline.perceive.models.manifest import Manifest
+from pipeline.perceive.models.session import Fit, Session, fit_image
+
+__all__ = ["Segmenter", "labels_of_logits"]
+
+
+class Segmenter:
+    """A segmentation model behind its manifest."""
+
+    def __init__(self, manifest: Manifest) -> None:
+        self._manifest = manifest
+        self._session = Session(manifest)
+        self._table = to_cityscapes(manifest.output.label_set)
+
+    def segment(
+        self, image_bgr: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]
+    ) -> UInt8[np.ndarray, "h w"]:
+        """Cityscapes train ids at `size` (rows, columns).
+
+        Raises:
+            ModelError: the output has another shape than its layout says, or more classes than labels fit in
+            a byte.
+        """
+        tensor, fit = fit_image(image_bgr, self._manifest.input)
+        output = self._session.run(tensor)
+        if self._manifest.output.layout == "labels":
+            return self._table[self._plain_labels(output, fit, size)]
+        if output.ndim != 4 or output.shape[0] != 1 or not 2 <= output.shape[1] <= 255:
+            raise ModelError(
+                str(self._manifest.file),
+                f"output.layout: logits must be 1 x classes x h x w, the model gives {list(output.shape)}",
+            )
+        return self._table[labels_of_logits(output[0], fit, self._manifest.input.size, size)]
+
+    def _plain_labels(self, output: np.ndarray, fit: Fit, size: tuple[int, int]) -> np.ndarray:
+        is_plane = output.ndim >= 2 and output.size == output.shape[-2] * output.shape[-1]
+        if not is_plane or output.min() < 0 or output.max() > 255:
+            raise ModelError(
+                str(self._manifest.file),
+                f"output.layout: labels must be one image of 0..255, the model gives {list(output.shape)}",
+            )
+        plane = output.reshape(output.shape[-2:]).astype(np.float32)
+        labels = _resample(plane, fit, self._manifest.input.size, size, cv2.INTER_NEAREST)
+        return labels.astype(np.uint8)
+
+
+def labels_of_logits(
+    logits: Float[np.ndarray, "C h w"], fit: Fit, input_size: tuple[int, int], size: tuple[int, int]
+) -> UInt8[np.ndarray, "H W"]:
+    """Most likely class at each label pixel.
+
+    Logits are interpolated bilinearly before the choice, so that boundaries are not steps of the output's
+    stride; pixel centres stay aligned, and the padding of a letterbox is left out.
+    """
+    best = np.full(size, -np.inf, np.float32)
+    label = np.zeros(size, np.uint8)
+    for c, plane in enumerate(logits):
+        value = _resample(np.asarray(plane, np.float32), fit, input_size, size, cv2.INTER_LINEAR)
+        better = value > best
+        best[better] = value[better]
+        label[better] = c
+    return label
+
+
+def _resample(
+    plane: np.ndarray, fit: Fit, input_size: tuple[int, int], size: tuple[int, int], interpolation: int
+) -> np.ndarray:
+    """A plane over the model's whole input, sampled at the centres of label pixels."""
+    stride_y, stride_x = input_size[0] / plane.shape[0], input_size[1] / plane.shape[1]
+    # Centre of label pixel i: (i + 0.5) label pixels from the edge of the image -> input pixels -> output
+    # pixels.
+    step_x, step_y = fit.width / size[1] / stride_x, fit.height / size[0] / stride_y
+    M = np.array(
+        [
+            [step_x, 0.0, 0.5 * step_x + fit.offset_x / stride_x - 0.5],
+            [0.0, step_y, 0.5 * step_y + fit.offset_y / stride_y - 0.5],
+        ]
+    )
+    return cv2.warpAffine(
+        plane,
+        M,
+        (size[1], size[0]),
+        flags=interpolation | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )

@@ -1,0 +1,105 @@
+"""ONNX Runtime sessions and how images get into them and pixels back out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import onnxruntime as ort
+from jaxtyping import Float32, UInt8
+
+from pipeline.errors import ModelError
+from pipeline.perceive.models.manifest import InputSpec, Manifest
+
+__all__ = ["Fit", "Session", "fit_image"]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where an image lies inside a model's input: `input = pixel * scale + offset` for pixel edges (x, y)."""
+
+    scale_x: float
+    scale_y: float
+    offset_x: float
+    offset_y: float
+    width: int
+    height: int
+
+
+class Session:
+    """One model, one thread: workers run side by side, and a spinning pool would steal their cores."""
+
+    def __init__(self, manifest: Manifest) -> None:
+        self._manifest = manifest
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.add_session_config_entry("session.inter_op.allow_spinning", "0")
+        options.log_severity_level = 3  # its warnings are about graph optimisation, not about results
+        try:
+            self._session = ort.InferenceSession(
+                str(manifest.model_file), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as err:  # onnxruntime's own exceptions share no base but this
+            raise ModelError(str(manifest.file), f"path: onnxruntime cannot load the model: {err}") from err
+        self._input = self._checked_input()
+
+    def run(self, tensor: Float32[np.ndarray, "1 3 H W"]) -> np.ndarray:
+        """First output of the model.
+
+        Raises:
+            ModelError: the model does not run on this input.
+        """
+        try:
+            return self._session.run(None, {self._input: tensor})[0]
+        except Exception as err:
+            raise ModelError(str(self._manifest.file), f"the model failed to run: {err}") from err
+
+    def _checked_input(self) -> str:
+        file, size = str(self._manifest.file), self._manifest.input.size
+        inputs = self._session.get_inputs()
+        if len(inputs) != 1 or inputs[0].type != "tensor(float)":
+            found = ", ".join(f"{i.name} {i.type}" for i in inputs)
+            raise ModelError(file, f"path: the model must take one float32 image, it takes {found}")
+        wanted = (1, 3, *size)
+        shape = inputs[0].shape
+        fits = len(shape) == len(wanted) and all(
+            not isinstance(s, int) or s == w for s, w in zip(shape, wanted, strict=True)
+        )
+        if not fits:
+            raise ModelError(
+                file,
+                f"input.size: {list(size)} does not go with the model's input {shape} (1, 3, rows, columns)",
+            )
+        return str(inputs[0].name)
+
+
+def fit_image(
+    image_bgr: UInt8[np.ndarray, "H W 3"], spec: InputSpec
+) -> tuple[Float32[np.ndarray, "1 3 h w"], Fit]:
+    """The model's input for an image, and where the image lies in it."""
+    rows, columns = spec.size
+    height, width = image_bgr.shape[:2]
+    scale_x, scale_y = columns / width, rows / height
+    if spec.fit != "stretch":
+        scale_x = scale_y = min(scale_x, scale_y)
+    inner = (max(1, round(width * scale_x)), max(1, round(height * scale_y)))
+    resized = (
+        image_bgr
+        if inner == (width, height)
+        else cv2.resize(image_bgr, inner, interpolation=cv2.INTER_LINEAR)
+    )
+    left, top = (columns - inner[0]) // 2, (rows - inner[1]) // 2
+    if spec.fit == "letterbox_top_left":
+        left, top = 0, 0
+    canvas = np.full((rows, columns, 3), spec.pad, np.float32)
+    canvas[top : top + inner[1], left : left + inner[0]] = resized
+    if spec.colour == "rgb":
+        canvas = canvas[..., ::-1]
+    normal = (canvas * np.float32(spec.scale) - np.array(spec.mean, np.float32)) / np.array(
+        spec.std, np.float32
+    )
+    tensor = np.ascontiguousarray(normal.transpose(2, 0, 1)[None], np.float32)
+    # The true ratio after rounding to whole pixels, not the wanted one.
+    return tensor, Fit(inner[0] / width, inner[1] / height, left, top, inner[0], inner[1])

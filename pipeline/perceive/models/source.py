@@ -1,0 +1,49 @@
+"""Semantics that are computed here: one segmenter and one detector."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import OnnxSemantics, PerceiveConfig
+from pipeline.perceive.camera import CameraSemantics, decode_colour, label_size
+from pipeline.perceive.models.detector import Detector
+from pipeline.perceive.models.manifest import Manifest, load_manifest
+from pipeline.perceive.models.segmenter import Segmenter
+from schemas.frames import Frame
+
+__all__ = ["ModelSource"]
+
+
+class ModelSource:
+    """Semantics of images from ONNX models."""
+
+    def __init__(self, segmenter: Manifest, detector: Manifest, config: PerceiveConfig) -> None:
+        self._segmenter, self._detector, self._config = Segmenter(segmenter), Detector(detector), config
+        self.provenance: dict[str, Any] = {
+            "segmenter": segmenter.model_dump(mode="json", exclude={"file", "path"}),
+            "detector": detector.model_dump(mode="json", exclude={"file", "path"}),
+        }
+
+    @classmethod
+    def load(cls, wanted: OnnxSemantics, config: PerceiveConfig, fleet_file: Path) -> ModelSource:
+        """Load the models that fleet.toml names; their paths are relative to it.
+
+        Raises:
+            ModelError: a manifest or model is missing, wrong, or not the one that its hash says.
+        """
+        folder = fleet_file.parent
+        segmenter = load_manifest(folder / wanted.segmenter, "segment")
+        return cls(segmenter, load_manifest(folder / wanted.detector, "detect"), config)
+
+    def read(self, frame: Frame) -> CameraSemantics:
+        """Run both models on the frame's image.
+
+        Raises:
+            FrameRejectedError: the image is undecodable or of the wrong size.
+            ModelError: a model does not do what its manifest says.
+        """
+        image = decode_colour(frame)
+        size = label_size(frame.image_width_px, frame.image_height_px, self._config.label_scale)
+        found = self._detector.detect(image).at_least(self._config.detection_min_score)
+        return CameraSemantics(self._segmenter.segment(image, size), found)
