@@ -1,0 +1,241 @@
+"""Rays against the world: Embree (through open3d) on a sliding window of the standing world and on each road user apart.
+
+Road users are hit in their own frame with the ray moved to the ray's own time, so a sweep that takes 100 ms sees each of
+them where it was when the beam came by, and no mesh is ever rebuilt for a frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numba
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.simulate.actors import VARIANTS, actor_mesh
+from pipeline.simulate.meshes import Mesh, join
+from pipeline.simulate.scenes import CHUNK_M, chunk_mesh
+from pipeline.simulate.traffic import Actor, actors_at
+
+if TYPE_CHECKING:
+    from pipeline.simulate.drives import Drive
+
+__all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World"]
+
+_AHEAD_M: Final = 170.0
+_BEHIND_M: Final = 60.0
+_MISS: Final = np.uint32(0xFFFFFFFF)
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What N rays met: range along the ray, row of the moment's triangles (-1 = nothing), barycentric coordinates."""
+
+    range_m: np.ndarray
+    triangle: np.ndarray
+    barycentric: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowMap:
+    """Sunlight (0 = shadow) on the ground by arc length and offset."""
+
+    light: np.ndarray
+    s0: float
+    d0: float
+    cell_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """The standing world around us; map coordinates less `origin` (single precision is exact to 0.1 mm near 0)."""
+
+    origin: np.ndarray
+    mesh: Mesh
+    scene: Any
+    shadows: ShadowMap
+
+
+class World:
+    """The world of one drive; holds one window of it at a time."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.drive = drive
+        self._chunks: dict[int, Mesh] = {}
+        self._window: tuple[int, int] | None = None
+        self._standing: Standing | None = None
+
+    def around(self, s_m: float) -> Standing:
+        """The standing world from 60 m behind to 170 m ahead of an arc length."""
+        window = int((s_m - _BEHIND_M) // CHUNK_M), int((s_m + _AHEAD_M) // CHUNK_M)
+        if self._standing is None or window != self._window:
+            self._chunks = {
+                i: self._chunks.get(i) or chunk_mesh(self.drive, i) for i in range(window[0], window[1] + 1)
+            }
+            origin = np.round(self.drive.road.to_map(np.array([s_m, 0.0, 0.0])))
+            mesh = join(list(self._chunks.values()))
+            mesh = Mesh(
+                (mesh.corners - origin.astype(np.float32)).astype(np.float32),
+                mesh.material,
+                mesh.tint,
+                mesh.uv,
+                mesh.instance,
+            )
+            scene = _scene(mesh)
+            self._window, self._standing = (
+                window,
+                Standing(origin, mesh, scene, _shadows(self.drive, scene, origin, s_m)),
+            )
+        return self._standing
+
+    def moment(self, t_s: float) -> Moment:
+        """The world at a time of the drive."""
+        standing = self.around(float(self.drive.ego.arc(np.array(t_s))))
+        return Moment(standing, actors_at(self.drive, t_s), t_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """The world at one time; for rays at other times, road users move on with constant velocity."""
+
+    standing: Standing
+    actors: list[Actor]
+    t_s: float
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """All triangles, in map coordinates less the window's origin: the standing ones, then actor by actor."""
+        parts = [self.standing.mesh]
+        for actor in self.actors:
+            proto = actor_mesh(actor.kind, actor.variant)
+            R, t = (
+                actor.T_map_actor[:3, :3].astype(np.float32),
+                (actor.T_map_actor[:3, 3] - self.standing.origin).astype(np.float32),
+            )
+            corners = proto.corners @ R.T + t
+            parts.append(
+                Mesh(corners, proto.material, proto.tint, proto.uv, np.full(len(proto), actor.key, np.int32))
+            )
+        return join(parts)
+
+    @cached_property
+    def normals(self) -> Float[np.ndarray, "T 3"]:
+        """Unit normals of the triangles, of either side."""
+        c = self.mesh.corners
+        n = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+        return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+    @cached_property
+    def velocity_of_triangle(self) -> Float[np.ndarray, "T 3"]:
+        """Velocity in the map [m/s]."""
+        v = np.zeros((len(self.mesh), 3), np.float32)
+        for actor, start in zip(self.actors, self._starts, strict=True):
+            v[start : start + len(actor_mesh(actor.kind, actor.variant))] = actor.velocity_map
+        return v
+
+    @cached_property
+    def _starts(self) -> list[int]:
+        sizes = [len(self.standing.mesh)] + [len(actor_mesh(a.kind, a.variant)) for a in self.actors]
+        return [int(n) for n in np.cumsum(sizes)[:-1]] if self.actors else []
+
+    def cast(
+        self,
+        origins: Float[np.ndarray, "N 3"],
+        directions: Float[np.ndarray, "N 3"],
+        delay_s: Float[np.ndarray, " N"],
+    ) -> Hits:
+        """First hits of rays given in map coordinates less the window's origin, `delay_s` after this moment."""
+        origins, directions = (
+            np.ascontiguousarray(origins, np.float32),
+            np.ascontiguousarray(directions, np.float32),
+        )
+        range_m, triangle, barycentric = _cast(self.standing.scene, origins, directions)
+        for actor, start in zip(self.actors, self._starts, strict=True):
+            proto, scene, reach, centre = _prototype(actor.kind, actor.variant)
+            R = actor.T_map_actor[:3, :3].astype(np.float32)
+            v = actor.velocity_map.astype(np.float32)
+            p = (actor.T_map_actor[:3, 3] - self.standing.origin).astype(np.float32)
+            near = _near(
+                origins, directions, delay_s.astype(np.float32), p + R @ centre, v, np.float32(reach), range_m
+            )
+            if not near.size:
+                continue
+            o = (origins[near] - p - v * delay_s[near, None].astype(np.float32)) @ R
+            r, k, b = _cast(scene, o, directions[near] @ R)
+            closer = r < range_m[near]
+            hit = near[closer]
+            range_m[hit], triangle[hit], barycentric[hit] = r[closer], k[closer] + start, b[closer]
+            assert len(proto)
+        return Hits(range_m, triangle, barycentric)
+
+
+@lru_cache(maxsize=128)
+def _prototype(kind: str, variant: int) -> tuple[Mesh, Any, float, np.ndarray]:
+    """An actor's mesh, its scene, and the sphere around it."""
+    mesh = actor_mesh(kind, variant % VARIANTS[kind])
+    points = mesh.corners.reshape(-1, 3)
+    centre = (points.min(0) + points.max(0)) / 2
+    return mesh, _scene(mesh), float(np.linalg.norm(points - centre, axis=1).max()), centre.astype(np.float32)
+
+
+def _scene(mesh: Mesh) -> Any:
+    import open3d as o3d  # noqa: PLC0415  heavy: seconds to import
+
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), np.float32)
+    index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+    scene.add_triangles(o3d.core.Tensor.from_numpy(corners), o3d.core.Tensor.from_numpy(index))
+    return scene
+
+
+def _cast(
+    scene: Any, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    import open3d as o3d  # noqa: PLC0415
+
+    rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
+    found = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
+    primitive = found["primitive_ids"].numpy()
+    triangle = np.where(primitive == _MISS, -1, primitive.astype(np.int64)).astype(np.int32)
+    return found["t_hit"].numpy(), triangle, found["primitive_uvs"].numpy()
+
+
+@numba.njit(cache=True)
+def _near(
+    origins: np.ndarray,
+    directions: np.ndarray,
+    delay: np.ndarray,
+    centre: np.ndarray,
+    velocity: np.ndarray,
+    radius: float,
+    limit: np.ndarray,
+) -> np.ndarray:
+    """Rays that pass within `radius` of a moving point, before what they have hit already."""
+    out = np.empty(len(directions), np.int64)
+    n = 0
+    for i in range(len(directions)):
+        x = centre[0] + velocity[0] * delay[i] - origins[i, 0]
+        y = centre[1] + velocity[1] * delay[i] - origins[i, 1]
+        z = centre[2] + velocity[2] * delay[i] - origins[i, 2]
+        along = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
+        if (
+            along > -radius
+            and x * x + y * y + z * z - along * along < radius * radius
+            and along - radius < limit[i]
+        ):
+            out[n] = i
+            n += 1
+    return out[:n]
+
+
+def _shadows(drive: Drive, scene: Any, origin: np.ndarray, s_m: float) -> ShadowMap:
+    """Cast the ground towards the sun once per window."""
+    cell, half = 0.3, 24.0
+    s0 = s_m - 15.0
+    s, d = np.meshgrid(np.arange(s0, s_m + 110.0, cell), np.arange(-half, half, cell), indexing="ij")
+    ground = drive.road.to_map(np.stack([s.ravel(), d.ravel(), np.full(s.size, 0.2)], 1)) - origin
+    sun = np.broadcast_to(drive.sun, ground.shape)
+    hit = _cast(scene, ground.astype(np.float32), sun.astype(np.float32))[1] >= 0
+    return ShadowMap(np.where(hit, 0.0, 1.0).astype(np.float32).reshape(s.shape), s0, -half, cell)

@@ -1,0 +1,260 @@
+"""One drive: the road it follows, how the vehicle moves along it, and who else is on the road.
+
+Everything is a function of time and of the drive's seed, so a drive of any length needs no memory, and frames that follow
+one another look at the same world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import from_rotation_translation
+
+__all__ = ["Drive", "EgoMotion", "Road", "RoadLayout", "layout_of"]
+
+_STEP_M: Final = 1.0
+_STEP_S: Final = 0.02
+
+
+@dataclass(frozen=True)
+class RoadLayout:
+    """Cross-section of a road; d is the lateral offset from its centre line, positive to the left [m]."""
+
+    environment: str
+    lane_m: float
+    lanes_own: tuple[float, ...]  # lane centres in our direction, ours first
+    lanes_oncoming: tuple[float, ...]
+    right_edge: float  # where the asphalt ends
+    left_edge: float
+    parking_m: float  # width of the parking strip inside each edge, 0 = none
+
+
+def layout_of(environment: str, seed: int) -> RoadLayout:
+    """Layout of an `urban` or `highway` road; right-hand traffic."""
+    rng = np.random.default_rng([seed, 11])
+    if environment == "highway":
+        lanes = 3 if rng.random() < 0.6 else 2
+        own = tuple(-2.4 - 3.7 * (lanes - 1 - i) for i in range(lanes))
+        order = own[1:] + own[:1] if lanes == 3 else own
+        edge = 2.4 + 3.7 * (lanes - 0.5) + 2.6
+        return RoadLayout(environment, 3.7, order, tuple(-d for d in own), -edge, edge, 0.0)
+    parking = 2.3 if rng.random() < 0.75 else 0.0
+    lanes = 2 if rng.random() < 0.35 else 1
+    own = tuple(-1.7 - 3.3 * (lanes - 1 - i) for i in range(lanes))
+    edge = 1.7 + 3.3 * (lanes - 0.5) + 0.15 + parking
+    return RoadLayout("urban", 3.3, own, tuple(-d for d in own), -edge, edge, parking)
+
+
+@dataclass(frozen=True)
+class Road:
+    """Centre line in the map: x, y, z and heading over arc length, smooth and without end."""
+
+    seed: int
+    environment: str
+    length_m: float
+
+    @cached_property
+    def _table(self) -> tuple[np.ndarray, ...]:
+        rng = np.random.default_rng([self.seed, 12])
+        s = np.arange(-200.0, self.length_m + 400.0, _STEP_M)
+        waves = (
+            ((170, 0.0045), (90, 0.0030)) if self.environment == "urban" else ((600, 0.0009), (350, 0.0006))
+        )
+        curvature = np.zeros_like(s)
+        for period, amplitude in waves:
+            curvature += amplitude * np.sin(
+                2 * np.pi * s / (period * rng.uniform(0.8, 1.3)) + rng.uniform(0, 2 * np.pi)
+            )
+        heading = np.cumsum(curvature) * _STEP_M
+        heading -= heading[200]
+        x, y = np.cumsum(np.cos(heading)) * _STEP_M, np.cumsum(np.sin(heading)) * _STEP_M
+        z = np.zeros_like(s)
+        for period, amplitude in (
+            ((420, 1.6), (150, 0.35)) if self.environment == "urban" else ((900, 5.0), (400, 1.2))
+        ):
+            z += amplitude * np.sin(
+                2 * np.pi * s / (period * rng.uniform(0.8, 1.3)) + rng.uniform(0, 2 * np.pi)
+            )
+        return s, x, y, z, heading
+
+    def centre(self, s_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(x, y, z [m], heading [rad]) at arc lengths."""
+        s, x, y, z, heading = self._table
+        return np.interp(s_m, s, x), np.interp(s_m, s, y), np.interp(s_m, s, z), np.interp(s_m, s, heading)
+
+    def to_map(self, s_d_h: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Map coordinates of points given along the road (arc length, offset to the left, height above the centre line)."""
+        x, y, z, heading = self.centre(s_d_h[..., 0])
+        d = s_d_h[..., 1]
+        return np.stack([x - d * np.sin(heading), y + d * np.cos(heading), z + s_d_h[..., 2]], -1)
+
+    def pose(
+        self, s_m: float, d_m: float, h_m: float = 0.0, yaw_rad: float = 0.0
+    ) -> Float[np.ndarray, "4 4"]:
+        """T_map_thing of something that stands on the road, turned by yaw against its direction."""
+        p = self.to_map(np.array([[s_m - 1.0, d_m, h_m], [s_m, d_m, h_m], [s_m + 1.0, d_m, h_m]]))
+        grade = np.arctan2(p[2, 2] - p[0, 2], 2.0) * np.cos(yaw_rad)
+        heading = float(self.centre(np.array(s_m))[3]) + yaw_rad
+        return from_rotation_translation(_rotation(np.array(heading), np.array(-grade), np.array(0.0)), p[1])
+
+
+def _rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """R = Rz(yaw) Ry(pitch) Rx(roll); positive pitch points down (x forward, z up)."""
+    cy, sy, cp, sp, cr, sr = (
+        np.cos(yaw),
+        np.sin(yaw),
+        np.cos(pitch),
+        np.sin(pitch),
+        np.cos(roll),
+        np.sin(roll),
+    )
+    rows = [
+        np.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], -1),
+        np.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], -1),
+        np.stack([-sp, cp * sr, cp * cr], -1),
+    ]
+    return np.stack(rows, -2)
+
+
+@dataclass(frozen=True)
+class EgoMotion:
+    """How our vehicle moves along its road, from time 0 to `duration_s`."""
+
+    road: Road
+    layout: RoadLayout
+    seed: int
+    duration_s: float
+
+    @cached_property
+    def _profile(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        rng = np.random.default_rng([self.seed, 13])
+        t = np.arange(-10.0, self.duration_s + 10.0, _STEP_S)
+        urban = self.layout.environment == "urban"
+        mean, swing = (10.0, 2.6) if urban else (27.0, 3.0)
+        speed = np.full_like(t, mean * rng.uniform(0.85, 1.15))
+        for period in (23.0, 11.0):
+            speed += (
+                swing
+                * rng.uniform(0.4, 0.9)
+                * np.sin(2 * np.pi * t / (period * rng.uniform(0.8, 1.3)) + rng.uniform(0, 6.28))
+            )
+        if urban:  # a red light now and then: brake, stand, start
+            period = rng.uniform(45, 70)
+            phase = (t + rng.uniform(0, period)) % period / period
+            speed *= np.clip(np.abs(phase - 0.5) * 12 - 0.75, 0.0, 1.0) ** 0.8
+        speed = np.maximum(speed, 0.0)
+        kernel = np.hanning(101) / np.hanning(101).sum()
+        speed = np.convolve(np.pad(speed, 50, mode="edge"), kernel, mode="valid")
+        s = np.cumsum(speed) * _STEP_S
+        s += 30.0 - np.interp(0.0, t, s)
+        d = np.full_like(t, self.layout.lanes_own[0])
+        for period in (17.0, 7.0):
+            d += 0.16 * rng.uniform(0.3, 1) * np.sin(2 * np.pi * s / (period * 12) + rng.uniform(0, 6.28))
+        if len(self.layout.lanes_own) > 1:  # one lane change and back per cycle
+            shift = self.layout.lanes_own[1] - self.layout.lanes_own[0]
+            cycle = (s / rng.uniform(500, 900) + rng.uniform()) % 1.0
+            d += (
+                shift
+                * (np.clip((cycle - 0.45) / 0.08, 0, 1) - np.clip((cycle - 0.85) / 0.08, 0, 1))
+                * (rng.random() < 0.5)
+            )
+        d = np.convolve(np.pad(d, 100, mode="edge"), np.hanning(201) / np.hanning(201).sum(), mode="valid")
+        return t, s, d, speed
+
+    @property
+    def travelled_m(self) -> float:
+        """Arc length at the end."""
+        return float(self._profile[1][-1])
+
+    def arc(self, t_s: np.ndarray) -> np.ndarray:
+        """Arc length [m]."""
+        return np.interp(t_s, self._profile[0], self._profile[1])
+
+    def offset(self, t_s: np.ndarray) -> np.ndarray:
+        """Offset from the centre line [m]."""
+        return np.interp(t_s, self._profile[0], self._profile[2])
+
+    def poses(self, t_s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4 4"]:
+        """T_map_vehicle at times; the body pitches and rolls on its springs."""
+        h = 0.01
+        before, after = self._ground(t_s - h), self._ground(t_s + h)
+        here, step = self._ground(t_s), after - before
+        # Standing still there is no direction of travel: fall back to the road's.
+        road_heading = self.road.centre(self.arc(t_s))[3]
+        moving = np.hypot(step[:, 0], step[:, 1]) > 0.2 * h
+        heading = np.where(moving, np.arctan2(step[:, 1], step[:, 0]), road_heading)
+        s = self.arc(t_s)
+        z = self.road.centre(np.stack([s - 1.3, s + 1.3]))[2]
+        grade = np.arctan2(z[1] - z[0], 2.6)
+        rough = 0.0035 if self.layout.environment == "urban" else 0.0018
+        pitch = -grade + rough * (
+            np.sin(0.9 * s / 2.1) * np.sin(0.11 * s) + 0.4 * np.sin(1.7 * s / 2.1 + 1.0)
+        )
+        roll = rough * (np.sin(0.7 * s / 2.3 + 2.0) * np.cos(0.07 * s))
+        return from_rotation_translation(_rotation(heading, pitch, roll), here)
+
+    def _ground(self, t_s: np.ndarray) -> np.ndarray:
+        s = self.arc(t_s)
+        return self.road.to_map(np.stack([s, self.offset(t_s), np.zeros_like(s)], -1))
+
+    def velocities(
+        self, t_s: Float[np.ndarray, " N"]
+    ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+        """(linear velocity of the vehicle's origin, angular velocity), both in the map [m/s, rad/s]."""
+        h = 0.01
+        before, after = self.poses(t_s - h), self.poses(t_s + h)
+        spin = (
+            (after[:, :3, :3] - before[:, :3, :3]) / (2 * h) @ np.swapaxes(self.poses(t_s)[:, :3, :3], 1, 2)
+        )
+        omega = (
+            np.stack(
+                [spin[:, 2, 1] - spin[:, 1, 2], spin[:, 0, 2] - spin[:, 2, 0], spin[:, 1, 0] - spin[:, 0, 1]],
+                -1,
+            )
+            / 2
+        )
+        return (after[:, :3, 3] - before[:, :3, 3]) / (2 * h), omega
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A stretch of driving: where, when, and in what light."""
+
+    seed: int
+    environment: str
+    duration_s: float
+    start_ns: int
+    night: bool = False
+
+    @cached_property
+    def layout(self) -> RoadLayout:
+        """Cross-section of the road."""
+        return layout_of(self.environment, self.seed)
+
+    @cached_property
+    def road(self) -> Road:
+        """The road."""
+        return Road(
+            self.seed,
+            self.environment,
+            self.duration_s * (18.0 if self.environment == "urban" else 42.0) + 100.0,
+        )
+
+    @cached_property
+    def ego(self) -> EgoMotion:
+        """Our motion on it."""
+        return EgoMotion(self.road, self.layout, self.seed, self.duration_s)
+
+    @cached_property
+    def sun(self) -> Float[np.ndarray, " 3"]:
+        """Direction to the sun in the map."""
+        rng = np.random.default_rng([self.seed, 14])
+        azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(22, 58))
+        return np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )

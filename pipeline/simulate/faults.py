@@ -1,0 +1,130 @@
+"""What goes wrong with a vehicle, and bad days: written `vehicle:day:sensor:kind:amount`, several separated by commas.
+
+Kinds: yaw, pitch, roll [deg] and x, y, z [m] are knocks from that day on, about the vehicle's axes at the sensor; the same
+with `drift-` before it grow by the amount per day, starting that day; `time` [s] delays a clock from that day on. Only on that
+day: `missing` (no data), `swap` (the sensor's topic carries the other point cloud), `intrinsics` (logged focal length wrong by
+the fraction), `labels` (classes permuted), `night` (dark images, bad semantics), `few` (that many frames in all).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import exp_so3
+
+if TYPE_CHECKING:
+    from pipeline.simulate.rigs import Mounting
+
+__all__ = ["KINDS", "DayFaults", "Fault", "faults_on", "parse_faults", "shaken"]
+
+_AXES: Final = {"roll": 0, "pitch": 1, "yaw": 2, "x": 0, "y": 1, "z": 2}
+_DAY_ONLY: Final = ("missing", "swap", "intrinsics", "labels", "night", "few")
+KINDS: Final = (*_AXES, *(f"drift-{a}" for a in _AXES), "time", *_DAY_ONLY)
+_SENSORS: Final = {
+    "time": ("camera", "radar"),
+    "missing": ("camera", "lidar", "radar"),
+    "swap": ("lidar", "radar"),
+    **dict.fromkeys(("intrinsics", "labels", "night", "few"), ("camera",)),
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that goes wrong; `day` counts from 0, amounts in deg, m, s, a fraction or a count, by kind."""
+
+    vehicle: str
+    day: int
+    sensor: str
+    kind: str
+    amount: float
+
+
+@dataclass(frozen=True)
+class DayFaults:
+    """What is wrong on one vehicle-day, besides where the sensors are."""
+
+    missing: tuple[str, ...] = ()
+    swapped: bool = False
+    focal_factor: float = 1.0
+    labels_permuted: bool = False
+    night: bool = False
+    frames: int | None = None
+
+
+def parse_faults(text: str, days: list[str]) -> tuple[Fault, ...]:
+    """Faults of a list; a day is one of `days` or its number.
+
+    Raises:
+        ConfigError: wrong number of parts, unknown day, sensor or kind, amount that is no number.
+    """
+    faults = []
+    for item in filter(None, re.split(r"[,\s]+", text)):
+        parts = item.split(":")
+        if len(parts) != 5:
+            raise ConfigError("--faults", item, "expected vehicle:day:sensor:kind:amount")
+        vehicle, day, sensor, kind, amount = parts
+        if kind not in KINDS:
+            raise ConfigError("--faults", item, f"kind {kind!r} is not one of {', '.join(KINDS)}")
+        allowed = _SENSORS.get(kind, ("camera", "lidar", "radar"))
+        if sensor not in allowed:
+            raise ConfigError(
+                "--faults", item, f"{kind} happens to {' or '.join(allowed)}, not to {sensor!r}"
+            )
+        number = days.index(day) if day in days else int(day) if day.isdigit() else -1
+        if not 0 <= number < len(days):
+            raise ConfigError("--faults", item, f"day {day!r} is not one of {', '.join(days)} nor its number")
+        try:
+            faults.append(Fault(vehicle, number, sensor, kind, float(amount)))
+        except ValueError as err:
+            raise ConfigError("--faults", item, f"amount {amount!r} is no number") from err
+    return tuple(faults)
+
+
+def shaken(mounting: Mounting, faults: tuple[Fault, ...], vehicle: str, day: int) -> Mounting:
+    """The mounting after every knock and drift up to a day, and clocks after every shift."""
+    changes: dict[str, object] = {}
+    for fault in faults:
+        if fault.vehicle != vehicle or fault.day > day or fault.kind in _DAY_ONLY:
+            continue
+        if fault.kind == "time":
+            name = f"{fault.sensor}_delay_s"
+            changes[name] = float(changes.get(name, getattr(mounting, name))) + fault.amount  # type: ignore[arg-type]
+            continue
+        kind = fault.kind.removeprefix("drift-")
+        amount = fault.amount * (day - fault.day + 1 if kind != fault.kind else 1)
+        name = f"T_vehicle_{fault.sensor}"
+        T = np.array(changes.get(name, getattr(mounting, name)), np.float64)
+        axis = np.eye(3)[_AXES[kind]]
+        if kind in ("x", "y", "z"):
+            T[:3, 3] += amount * axis
+        else:
+            T[:3, :3] = exp_so3(np.radians(amount) * axis) @ T[:3, :3]
+        changes[name] = T
+    return replace(mounting, **changes)  # type: ignore[arg-type]
+
+
+def faults_on(faults: tuple[Fault, ...], vehicle: str, day: int) -> DayFaults:
+    """What is wrong on that day only."""
+    today = [f for f in faults if f.vehicle == vehicle and f.day == day]
+    kinds = {f.kind: f for f in today}
+    return DayFaults(
+        missing=tuple(f.sensor for f in today if f.kind == "missing"),
+        swapped="swap" in kinds,
+        focal_factor=1 + kinds["intrinsics"].amount if "intrinsics" in kinds else 1.0,
+        labels_permuted="labels" in kinds,
+        night="night" in kinds,
+        frames=int(kinds["few"].amount) if "few" in kinds else None,
+    )
+
+
+def misread(camera: Camera, factor: float) -> Camera:
+    """The camera as its log describes it where the logged focal length is wrong by a factor."""
+    K = camera.K.copy()
+    K[[0, 1], [0, 1]] *= factor
+    return Camera(camera.model, K, camera.D, camera.width_px, camera.height_px)

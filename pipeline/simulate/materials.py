@@ -1,0 +1,182 @@
+"""What surfaces are made of: label, colour, texture, lidar reflectivity, radar strength.
+
+Labels are Cityscapes train ids. Reflectivity is the fraction of lidar light (905 nm) that comes back from a frontal hit;
+retro-reflectors exceed 1. Orders of magnitude after Kidd 2017 (asphalt .1-.2, concrete .3, grass .4-.6 in the near infrared).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numba
+import numpy as np
+
+__all__ = [
+    "LABELS",
+    "MATERIALS",
+    "TABLE",
+    "VOID",
+    "Material",
+    "MaterialTable",
+    "material",
+    "texture",
+    "value_noise",
+]
+
+LABELS: Final = (
+    "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation", "terrain",
+    "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle",
+)  # fmt: skip
+VOID: Final = 255
+_PLAIN, _ASPHALT, _GRASS, _FOLIAGE, _FACADE, _PAVING, _SLATS, _CONCRETE, _WORN = range(9)
+
+
+@dataclass(frozen=True)
+class Material:
+    """One surface; `radar_gain` multiplies the radar echo per solid angle, `glass` is the share of light it mirrors or lets through."""
+
+    name: str
+    label: str
+    albedo: tuple[float, float, float]
+    reflectivity: float
+    radar_gain: float
+    texture: int = _PLAIN
+    glass: float = 0.0
+    glow: float = 0.0
+
+
+MATERIALS: Final = (
+    Material("asphalt", "road", (0.115, 0.115, 0.12), 0.10, 0.02, _ASPHALT),
+    Material("asphalt_patch", "road", (0.075, 0.075, 0.08), 0.085, 0.02, _ASPHALT),
+    Material("paint", "road", (0.62, 0.62, 0.6), 0.62, 0.02, _WORN),
+    Material("paint_yellow", "road", (0.6, 0.45, 0.1), 0.5, 0.02, _WORN),
+    Material("manhole", "road", (0.07, 0.065, 0.06), 0.16, 0.5, _CONCRETE),
+    Material("paving", "sidewalk", (0.30, 0.29, 0.27), 0.27, 0.04, _PAVING),
+    Material("kerb", "sidewalk", (0.38, 0.37, 0.35), 0.33, 0.5, _CONCRETE),
+    Material("facade", "building", (0.42, 0.36, 0.30), 0.32, 0.7, _FACADE),
+    Material("roof", "building", (0.28, 0.13, 0.09), 0.25, 0.3, _PAVING),
+    Material("stone", "wall", (0.36, 0.34, 0.31), 0.32, 0.5, _CONCRETE),
+    Material("noise_wall", "wall", (0.30, 0.33, 0.28), 0.33, 0.5, _SLATS),
+    Material("slats", "fence", (0.27, 0.18, 0.11), 0.38, 0.3, _SLATS),
+    Material("rail", "fence", (0.45, 0.46, 0.47), 0.40, 6.0, _CONCRETE),
+    Material("metal_pole", "pole", (0.30, 0.31, 0.32), 0.32, 25.0, _CONCRETE),
+    Material("delineator", "pole", (0.72, 0.72, 0.70), 0.75, 1.0),
+    Material("signal_box", "traffic light", (0.05, 0.055, 0.05), 0.10, 8.0),
+    Material("signal_lamp", "traffic light", (0.7, 0.1, 0.05), 0.3, 1.0, glow=0.9),
+    Material("sign_face", "traffic sign", (0.7, 0.7, 0.7), 2.5, 8.0),
+    Material("sign_back", "traffic sign", (0.33, 0.34, 0.35), 0.35, 8.0),
+    Material("foliage", "vegetation", (0.10, 0.19, 0.05), 0.48, 0.12, _FOLIAGE),
+    Material("bark", "vegetation", (0.17, 0.13, 0.09), 0.30, 0.6, _CONCRETE),
+    Material("grass", "terrain", (0.15, 0.23, 0.07), 0.45, 0.05, _GRASS),
+    Material("soil", "terrain", (0.24, 0.20, 0.13), 0.28, 0.05, _GRASS),
+    Material("skin", "person", (0.45, 0.30, 0.22), 0.5, 1.0),
+    Material("cloth", "person", (1.0, 1.0, 1.0), 0.40, 1.5),
+    Material("rider_cloth", "rider", (1.0, 1.0, 1.0), 0.40, 1.5),
+    Material("car_paint", "car", (1.0, 1.0, 1.0), 0.35, 12.0),
+    Material("car_glass", "car", (0.03, 0.035, 0.04), 0.05, 2.0, glass=0.75),
+    Material("car_tyre", "car", (0.025, 0.025, 0.027), 0.05, 2.0),
+    Material("car_rim", "car", (0.42, 0.42, 0.43), 0.35, 8.0),
+    Material("car_lamp", "car", (0.75, 0.75, 0.72), 0.8, 3.0, glow=0.25),
+    Material("car_tail", "car", (0.55, 0.03, 0.03), 1.4, 3.0, glow=0.3),
+    Material("car_plate", "car", (0.75, 0.75, 0.72), 3.0, 3.0),
+    Material("truck_paint", "truck", (1.0, 1.0, 1.0), 0.40, 14.0),
+    Material("truck_glass", "truck", (0.03, 0.035, 0.04), 0.05, 2.0, glass=0.75),
+    Material("truck_tyre", "truck", (0.025, 0.025, 0.027), 0.05, 4.0),
+    Material("truck_tail", "truck", (0.55, 0.04, 0.03), 1.6, 6.0, glow=0.3),
+    Material("bus_paint", "bus", (1.0, 1.0, 1.0), 0.38, 14.0),
+    Material("bus_glass", "bus", (0.03, 0.035, 0.04), 0.05, 2.0, glass=0.75),
+    Material("bus_tyre", "bus", (0.025, 0.025, 0.027), 0.05, 4.0),
+    Material("bike_metal", "bicycle", (0.12, 0.12, 0.14), 0.25, 8.0),
+    Material("bike_tyre", "bicycle", (0.03, 0.03, 0.03), 0.08, 1.0),
+    Material("corner_reflector", "pole", (0.65, 0.65, 0.66), 0.85, 4000.0),
+    Material("tripod", "pole", (0.05, 0.05, 0.05), 0.12, 0.3),
+)  # fmt: skip
+_INDEX = {m.name: i for i, m in enumerate(MATERIALS)}
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialTable:
+    """MATERIALS as arrays, row = material index."""
+
+    label: np.ndarray
+    albedo: np.ndarray
+    reflectivity: np.ndarray
+    radar_gain: np.ndarray
+    texture: np.ndarray
+    glass: np.ndarray
+    glow: np.ndarray
+
+
+TABLE: Final = MaterialTable(
+    label=np.array([LABELS.index(m.label) for m in MATERIALS], np.uint8),
+    albedo=np.array([m.albedo for m in MATERIALS], np.float32),
+    reflectivity=np.array([m.reflectivity for m in MATERIALS], np.float32),
+    radar_gain=np.array([m.radar_gain for m in MATERIALS], np.float32),
+    texture=np.array([m.texture for m in MATERIALS], np.uint8),
+    glass=np.array([m.glass for m in MATERIALS], np.float32),
+    glow=np.array([m.glow for m in MATERIALS], np.float32),
+)
+
+
+def material(name: str) -> int:
+    """Index of a material; KeyError where there is none of that name."""
+    return _INDEX[name]
+
+
+@numba.njit(cache=True, inline="always")
+def _lattice(ix: int, iy: int) -> float:
+    """Reproducible number in [0, 1) of an integer lattice point (integer hash after Wang 2007)."""
+    h = (ix * 374761393 + iy * 668265263) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
+    return ((h ^ (h >> 16)) & 0xFFFF) / 65536.0
+
+
+@numba.njit(cache=True, inline="always")
+def value_noise(x: float, y: float) -> float:
+    """Smooth noise in [0, 1) with features of size 1."""
+    fx, fy = np.floor(x), np.floor(y)
+    ix, iy = int(fx), int(fy)
+    a, b = x - fx, y - fy
+    a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
+    top = _lattice(ix, iy) * (1 - a) + _lattice(ix + 1, iy) * a
+    low = _lattice(ix, iy + 1) * (1 - a) + _lattice(ix + 1, iy + 1) * a
+    return top * (1 - b) + low * b
+
+
+@numba.njit(cache=True)
+def texture(kind: int, u: float, v: float) -> tuple[float, float]:
+    """(gain of the albedo, share of glass) of a texture at surface coordinates u, v [m]."""
+    if kind == 1:  # asphalt: aggregate, wear, stains
+        wear = value_noise(u * 0.13 + 7.0, v * 0.9)
+        return 0.72 + 0.22 * wear + 0.22 * value_noise(u * 0.6, v * 0.6) + 0.16 * value_noise(
+            u * 9.0, v * 9.0
+        ), 0.0
+    if kind == 2:  # grass
+        return 0.55 + 0.5 * value_noise(u * 0.5, v * 0.5) + 0.5 * value_noise(u * 5.0, v * 5.0), 0.0
+    if kind == 3:  # foliage: dark gaps between leaves
+        n = 0.6 * value_noise(u * 3.0, v * 3.0) + 0.4 * value_noise(u * 9.0, v * 9.0)
+        return 0.25 + 1.5 * n, 0.0
+    if kind == 4:  # facade: bays of 2.7 m, storeys of 3 m
+        bay, storey = u / 2.7 - np.floor(u / 2.7), v / 3.0 - np.floor(v / 3.0)
+        if 0.27 < bay < 0.73 and 0.30 < storey < 0.80:
+            frame = bay < 0.31 or bay > 0.69 or storey < 0.33 or storey > 0.77 or 0.49 < bay < 0.51
+            return (1.5, 0.0) if frame else (0.16, 0.55)
+        ledge = 0.82 if storey > 0.96 else 1.0
+        return ledge * (
+            0.86 + 0.2 * value_noise(u * 0.7, v * 0.7) + 0.08 * value_noise(u * 8.0, v * 8.0)
+        ), 0.0
+    if kind == 5:  # paving stones of 40 cm
+        a, b = u / 0.4 - np.floor(u / 0.4), v / 0.4 - np.floor(v / 0.4)
+        stone = 0.86 + 0.24 * _lattice(int(np.floor(u / 0.4)), int(np.floor(v / 0.4)))
+        return (0.65 if a < 0.05 or b < 0.05 else stone), 0.0
+    if kind == 6:  # boards of 16 cm
+        a = u / 0.16 - np.floor(u / 0.16)
+        return (0.45 if a < 0.12 else 0.8 + 0.3 * _lattice(int(np.floor(u / 0.16)), 3)), 0.0
+    if kind == 7:
+        return 0.85 + 0.2 * value_noise(u * 1.3, v * 1.3) + 0.1 * value_noise(u * 7.0, v * 7.0), 0.0
+    if kind == 8:  # road paint: worn, tyre marks
+        return 0.62 + 0.45 * value_noise(u * 1.1, v * 2.3) - 0.25 * (
+            value_noise(u * 6.0, v * 6.0) > 0.78
+        ), 0.0
+    return 1.0, 0.0
