@@ -86,4 +86,7 @@ def _bridge_gaps(centres_rad: np.ndarray, nearest_m: np.ndarray) -> FreeSector:
     gap = seen[after] - seen[np.maximum(after - 1, 0)]
     known = np.isfinite(nearest_m[rows]) | (gap <= _MAX_GAP_BINS + 1)
     filled = np.interp(rows, seen, nearest_m[seen])
+    # A look through a gap between two posts, one bin wide, is no way to drive.
+    padded = np.pad(filled, 1, mode="edge")
+    filled = np.minimum(filled, np.maximum(padded[:-2], padded[2:]))
     return FreeSector(centres_rad[rows][known].astype(np.float32), filled[known].astype(np.float32))

@@ -24,6 +24,8 @@ _PLANE_REACH_M = 35.0  # further out a plane is a poor model of a road
 _MAX_TILT_RAD = 0.26  # 15 deg: mounting plus road; a steeper "ground" is a bank or a wall
 _HEIGHT_RANGE_M = (0.3, 4.0)  # lidar above the road: bumper to truck roof
 _HYPOTHESES = 400
+_TRUSTED_M = 10.0
+_FLAT_M = 0.25
 _MIN_SUPPORT = 40  # cells of 1 m^2
 _SECTORS = 120
 _BIN_M = 1.5
@@ -43,7 +45,7 @@ class Ground:
 
 def find_ground(xyz_m: Float32[np.ndarray, "N 3"], inlier_m: float, rng: np.random.Generator) -> Ground:
     """Plane, ground points and reachable ground on a 1 m grid of one sweep (lidar frame, z roughly up)."""
-    plane = _fit_plane(_lowest_of_cells(xyz_m), inlier_m, rng)
+    plane = _fit_plane(*_lowest_of_cells(xyz_m), inlier_m, rng)
     if plane is None:
         return Ground(None, np.zeros(len(xyz_m), bool), np.zeros((0, 3), np.float32))
     above_local = _follow_surface(xyz_m, height_over(plane, xyz_m), inlier_m)
@@ -61,17 +63,24 @@ def height_over(
     return (xyz_m @ plane[:3].astype(np.float32) + np.float32(plane[3])).astype(np.float32)
 
 
-def _lowest_of_cells(xyz_m: np.ndarray) -> np.ndarray:
+def _lowest_of_cells(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest point of each cell, and how much it counts as a witness of the ground under the vehicle."""
     range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
-    near = xyz_m[(range_m > _NEAR_M) & (range_m < _PLANE_REACH_M)]
+    near = xyz_m[(range_m > _NEAR_M) & (range_m < _PLANE_REACH_M)].astype(np.float64)
+    if not len(near):
+        return near, np.zeros(0)
     cell = np.floor(near[:, :2] / _CELL_M).astype(np.int64)
     order = np.lexsort((near[:, 2], cell[:, 1], cell[:, 0]))
-    first = np.ones(len(near), bool)
-    first[1:] = np.any(np.diff(cell[order], axis=0) != 0, axis=1)
-    return near[order[first]].astype(np.float64)
+    first = np.flatnonzero(np.append(True, np.any(np.diff(cell[order], axis=0) != 0, axis=1)))
+    low = near[order[first]]
+    top_m = near[order[np.append(first[1:], len(order)) - 1], 2]
+    # The vehicle stands on the ground that is wanted: near cells count more than ditches and banks beside the road,
+    # and cells with something standing in them, whose lowest point may be a bumper, count less.
+    weight = 1 / (1 + (np.hypot(low[:, 0], low[:, 1]) / _TRUSTED_M) ** 2)
+    return low, np.where(top_m - low[:, 2] < _FLAT_M, weight, 0.2 * weight)
 
 
-def _fit_plane(low: np.ndarray, inlier_m: float, rng: np.random.Generator) -> np.ndarray | None:
+def _fit_plane(low: np.ndarray, weight: np.ndarray, inlier_m: float, rng: np.random.Generator) -> np.ndarray | None:
     """Best of many 3-point planes that could be a road, refined by least squares."""
     if len(low) < _MIN_SUPPORT:
         return None
@@ -91,7 +100,7 @@ def _fit_plane(low: np.ndarray, inlier_m: float, rng: np.random.Generator) -> np
     normal, offset = normal[possible], offset[possible]
     height = normal @ low.T + offset[:, None]
     # The ground is the floor: what lies under a plane speaks against it (a plane through bonnets and hedges).
-    score = np.sum(np.abs(height) < inlier_m, axis=1) - np.sum(height < -2 * inlier_m, axis=1)
+    score = (np.abs(height) < inlier_m) @ weight - 0.5 * ((height < -2 * inlier_m) @ weight)
     best = int(np.argmax(score))
     return _refine(low, np.append(normal[best], offset[best]), inlier_m)
 
