@@ -23,7 +23,7 @@ _CELL_M = 1.0
 _PLANE_REACH_M = 35.0  # further out a plane is a poor model of a road
 _MAX_TILT_RAD = 0.26  # 15 deg: mounting plus road; a steeper "ground" is a bank or a wall
 _HEIGHT_RANGE_M = (0.3, 4.0)  # lidar above the road: bumper to truck roof
-_HYPOTHESES = 400
+_HYPOTHESES = 800
 _TRUSTED_M = 10.0
 _FLAT_M = 0.25
 _MIN_SUPPORT = 40  # cells of 1 m^2
@@ -80,11 +80,13 @@ def _lowest_of_cells(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return low, np.where(top_m - low[:, 2] < _FLAT_M, weight, 0.2 * weight)
 
 
-def _fit_plane(low: np.ndarray, weight: np.ndarray, inlier_m: float, rng: np.random.Generator) -> np.ndarray | None:
+def _fit_plane(
+    low: np.ndarray, weight: np.ndarray, inlier_m: float, rng: np.random.Generator
+) -> np.ndarray | None:
     """Best of many 3-point planes that could be a road, refined by least squares."""
     if len(low) < _MIN_SUPPORT:
         return None
-    picks = rng.integers(len(low), size=(_HYPOTHESES, 3))
+    picks = rng.choice(len(low), size=(_HYPOTHESES, 3), p=weight / weight.sum())
     a, b, c = low[picks[:, 0]], low[picks[:, 1]], low[picks[:, 2]]
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
@@ -102,19 +104,21 @@ def _fit_plane(low: np.ndarray, weight: np.ndarray, inlier_m: float, rng: np.ran
     # The ground is the floor: what lies under a plane speaks against it (a plane through bonnets and hedges).
     score = (np.abs(height) < inlier_m) @ weight - 0.5 * ((height < -2 * inlier_m) @ weight)
     best = int(np.argmax(score))
-    return _refine(low, np.append(normal[best], offset[best]), inlier_m)
+    return _refine(low, weight, np.append(normal[best], offset[best]), inlier_m)
 
 
-def _refine(low: np.ndarray, plane: np.ndarray, inlier_m: float) -> np.ndarray | None:
-    for _ in range(5):
-        inside = low[np.abs(low @ plane[:3] + plane[3]) < inlier_m]
-        if len(inside) < _MIN_SUPPORT:
+def _refine(low: np.ndarray, weight: np.ndarray, plane: np.ndarray, inlier_m: float) -> np.ndarray | None:
+    """Weighted least squares on the plane's inliers, repeated with the inliers that it then has."""
+    for _ in range(8):
+        inside = np.abs(low @ plane[:3] + plane[3]) < inlier_m
+        if np.sum(inside) < _MIN_SUPPORT:
             return None
-        centre = inside.mean(axis=0)
-        normal = np.linalg.svd(inside - centre, full_matrices=False)[2][2]
+        points, share = low[inside], weight[inside, None] / weight[inside].sum()
+        centre = np.sum(share * points, axis=0)
+        normal = np.linalg.svd(np.sqrt(share) * (points - centre), full_matrices=False)[2][2]
         normal = normal if normal[2] > 0 else -normal
         plane = np.append(normal, -normal @ centre)
-    return plane if normal[2] > np.cos(_MAX_TILT_RAD) else None
+    return plane if plane[2] > np.cos(_MAX_TILT_RAD) else None
 
 
 def _follow_surface(xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float) -> np.ndarray:
