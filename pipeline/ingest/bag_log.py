@@ -1,4 +1,4 @@
-"""ROS 1 bags (format 2.0), read chunk by chunk in file order: a bag without its index (a recording cut off) reads as far as it goes.
+"""ROS 1 bags (format 2.0), read chunk by chunk: one cut off, without its index, reads as far as it goes.
 
 Source: http://wiki.ros.org/Bags/Format/2.0
 """
@@ -45,6 +45,7 @@ class BagLog:
             if header["op"] == bytes([_CHUNK]):
                 chunk = self._open_chunk(header, start, length)
                 if chunk is not None:
+                    self._cache.offer((str(self.path), position), chunk)
                     yield from self._scan_records(chunk, position, topics)
             elif header["op"] == bytes([_MESSAGE]):  # bags of an unchunked writer
                 channel, stamp = self._message(header, topics)
@@ -73,14 +74,14 @@ class BagLog:
         """See LogReader."""
         self._file.close()
 
-    # -- records -----------------------------------------------------------------------------------------------------
+    # -- records ------------------------------------------------------------
 
     def _content(self, start: int, length: int) -> bytes:
         self._file.seek(start)
         return self._file.read(length)
 
     def _record(self, position: int) -> tuple[dict[str, bytes], int, int] | None:
-        """(header, start of data, its length) of the record at a position, None where there is no whole one."""
+        """(header, start of data, its length) of a record, None where there is no whole one."""
         head = self._content(position, 4)
         if len(head) < 4:
             return None
@@ -149,7 +150,7 @@ class BagLog:
         except _DAMAGED:
             self.damage["damaged_records"] += 1
 
-    # -- chunks ------------------------------------------------------------------------------------------------------
+    # -- chunks ------------------------------------------------------------
 
     def _open_chunk(self, header: dict[str, bytes], start: int, length: int) -> bytes | None:
         try:
@@ -203,7 +204,7 @@ class BagLog:
 
 
 def _fields(data: bytes) -> dict[str, bytes] | None:
-    """`name=value` fields of a header; None where they do not add up or a record header lacks its known op."""
+    """`name=value` fields of a header; None where they do not add up or a record has no known op."""
     fields: dict[str, bytes] = {}
     position = 0
     while position + 4 <= len(data):

@@ -1,4 +1,4 @@
-"""PointCloud2 of any layout to columns: offsets and padding, either byte order, any datatype, organised rows, missing points."""
+"""PointCloud2 of any layout to columns: padding, byte order, datatypes, organised rows, missing points."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt16
+from jaxtyping import Bool, Float32, UInt16
 
 __all__ = ["LidarCloud", "cloud_columns", "first_field", "read_lidar"]
 
@@ -29,13 +29,19 @@ _MIN_RANGE_M = (
     0.05  # drivers write (0, 0, 0) for a beam without return; no sensor sees its own housing this near
 )
 _LONGEST_SWEEP_S = 1.0
+_DATE_S, _DATE_NS = (
+    1e6,
+    10**15,
+)  # 12 days after 1970, in seconds and nanoseconds: no sweep is that long, no date that early
 
 
 @dataclass(frozen=True, eq=False)
 class LidarCloud:
-    """Points of one sweep in its own frame; `dropped` counts by reason the points that the message had and this has not."""
+    """Points of one sweep in its own frame; `dropped` counts by reason those that were left out."""
 
-    xyz_m: Float32[np.ndarray, "N 3"]
+    x_m: Float32[np.ndarray, " N"]
+    y_m: Float32[np.ndarray, " N"]
+    z_m: Float32[np.ndarray, " N"]
     intensity: Float32[np.ndarray, " N"] | None
     ring: UInt16[np.ndarray, " N"] | None
     time_s: Float32[np.ndarray, " N"] | None
@@ -80,7 +86,7 @@ def cloud_columns(message: Any) -> np.ndarray:
 
 
 def first_field(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray | None:
-    """The first of these fields that the cloud has (compared without case) as a scalar column, None where it has none."""
+    """The first of these fields (compared without case) that the cloud has as a scalar column, else None."""
     found = {str(n).lower(): n for n in reversed(points.dtype.names or ())}
     for name in names:
         if name.lower() in found:
@@ -102,70 +108,82 @@ def read_lidar(message: Any, stamp_ns: int, max_range_m: float) -> LidarCloud:
         ValueError: no x, y, z, or a layout that contradicts itself.
     """
     points = cloud_columns(message)
-    xyz = _xyz(points)
-    range2 = np.einsum("ij,ij->i", xyz, xyz)
-    finite = np.isfinite(range2)
-    near, far = finite & (range2 < _MIN_RANGE_M**2), finite & (range2 > max_range_m**2)
-    keep = finite & ~near & ~far
-    dropped = Counter({
-        "lidar_points_not_finite": int(np.sum(~finite)),
-        "lidar_points_without_return": int(np.sum(near)),
-        "lidar_points_beyond_range": int(np.sum(far)),
-    })  # fmt: skip
+    x, y, z = _coordinates(points)
+    with np.errstate(over="ignore", invalid="ignore"):
+        range2 = x * x + y * y + z * z
+    keep, dropped = _within(range2, max_range_m)
     intensity, ring = first_field(points, _INTENSITY), first_field(points, _RING)
     return LidarCloud(
-        xyz[keep],
+        x[keep],
+        y[keep],
+        z[keep],
         None if intensity is None else intensity[keep].astype(np.float32),
         _ring(ring, keep),
         _relative_time_s(first_field(points, _TIME), keep, stamp_ns),
-        +dropped,
+        dropped,
     )
 
 
-def _xyz(points: np.ndarray) -> Float32[np.ndarray, "N 3"]:
+def _coordinates(points: np.ndarray) -> list[Float32[np.ndarray, " N"]]:
     names = points.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"no fields x, y, z; there are {', '.join(names) or 'none'}")
     if any(points[n].ndim > 1 for n in "xyz"):
         raise ValueError("a field of x, y, z holds more than one value a point")
-    xyz = np.empty((len(points), 3), np.float32)
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # float64 garbage becomes inf and is dropped as not finite
-        for i, name in enumerate("xyz"):
-            xyz[:, i] = points[name]
-        xyz[~(np.abs(xyz) < 1e9).all(axis=1)] = np.nan  # squares stay finite below
-    return xyz
+    with np.errstate(over="ignore", invalid="ignore"):  # a float64 beyond float32 becomes inf and is dropped
+        return [points[n].astype(np.float32) for n in "xyz"]
 
 
-def _ring(ring: np.ndarray | None, keep: Bool[np.ndarray, " N"]) -> UInt16[np.ndarray, " M"] | None:
+def _within(
+    range2: Float32[np.ndarray, " N"], max_range_m: float
+) -> tuple[slice | Bool[np.ndarray, " N"], Counter[str]]:
+    """What to index with to keep the points with a return within range, and how many are dropped for what."""
+    keep = (range2 >= _MIN_RANGE_M**2) & (range2 <= max_range_m**2)  # False for NaN
+    if keep.all():
+        return slice(None), Counter()
+    finite, near = np.isfinite(range2), range2 < _MIN_RANGE_M**2
+    dropped = {
+        "lidar_points_not_finite": int(np.sum(~finite)),
+        "lidar_points_without_return": int(np.sum(near)),
+        "lidar_points_beyond_range": int(np.sum(finite & ~near & ~keep)),
+    }
+    return keep, +Counter(dropped)
+
+
+def _ring(ring: np.ndarray | None, keep: slice | Bool[np.ndarray, " N"]) -> UInt16[np.ndarray, " M"] | None:
     if ring is None:
         return None
     kept = ring[keep]
+    if kept.dtype.kind == "u" and kept.dtype.itemsize <= 2:
+        return kept.astype(np.uint16)
     if kept.dtype.kind == "f" and not np.all(np.isfinite(kept) & (kept == np.round(kept))):
         return None
     return kept.astype(np.uint16) if np.all((kept >= 0) & (kept < 65536)) else None
 
 
 def _relative_time_s(
-    time: np.ndarray | None, keep: Bool[np.ndarray, " N"], stamp_ns: int
+    time: np.ndarray | None, keep: slice | Bool[np.ndarray, " N"], stamp_ns: int
 ) -> Float32[np.ndarray, " M"] | None:
-    """Seconds after the stamp. Floats count seconds, integers nanoseconds; absolute where they are of the size of the stamp.
+    """Seconds after the stamp: floats count seconds, integers nanoseconds; absolute where they are dates.
 
     None where the result is no time within a sweep: better no de-skew than a wrong one.
     """
-    if time is None:
+    if time is None or not len(time):
         return None
     kept = time[keep]
     if kept.dtype.kind == "f":
-        seconds = kept.astype(np.float64)
-        if len(seconds) and not np.all(np.isfinite(seconds)):
-            return None
-        if len(seconds) and abs(float(np.median(seconds))) > 1e6:
-            # float32 cannot hold an absolute time: its steps are minutes long
-            seconds = seconds - stamp_ns * 1e-9 if kept.dtype.itemsize == 8 else np.full_like(seconds, np.inf)
+        if len(kept) and abs(float(kept[0])) > _DATE_S:
+            if kept.dtype.itemsize < 8:
+                return None  # float32 cannot hold a date: its steps are minutes long
+            # Whole seconds first, so that the difference keeps its nanoseconds.
+            kept = (kept - stamp_ns // 10**9) - (stamp_ns % 10**9) * 1e-9
+        seconds = kept.astype(np.float32)
     else:
         ticks = kept.astype(np.int64)
-        absolute = len(ticks) and abs(int(np.median(ticks))) > 10**15
-        seconds = (ticks - (stamp_ns if absolute else 0)) * 1e-9
-    return seconds.astype(np.float32) if np.all(np.abs(seconds) < _LONGEST_SWEEP_S) else None
+        seconds = ((ticks - stamp_ns if len(ticks) and ticks[0] > _DATE_NS else ticks) * 1e-9).astype(
+            np.float32
+        )
+    is_within_sweep = not len(seconds) or (
+        seconds.min() > -_LONGEST_SWEEP_S and seconds.max() < _LONGEST_SWEEP_S
+    )
+    return seconds if is_within_sweep else None  # False for NaN too

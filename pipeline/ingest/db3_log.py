@@ -18,7 +18,8 @@ from pipeline.ingest.readers import Channel, ChunkCache, Position, RawMessage
 
 __all__ = ["Db3Log"]
 
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # rosbag2 compresses single messages; CDR starts with a zero byte, so this is unambiguous
+# rosbag2 can compress single messages; CDR starts with a zero byte, so this is unambiguous.
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _MAX_MESSAGE_BYTES = 1 << 30
 
 
@@ -62,7 +63,10 @@ class Db3Log:
 
     def _rows(self, wanted: list[int]) -> Iterator[tuple[int, int, int, object]]:
         marks = ",".join("?" * len(wanted))
-        query = f"SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? AND topic_id IN ({marks}) ORDER BY id"  # noqa: S608
+        query = (
+            "SELECT id, topic_id, timestamp, data FROM messages "  # noqa: S608  # marks are question marks
+            f"WHERE id > ? AND topic_id IN ({marks}) ORDER BY id"
+        )
         last, skip = 0, 1
         limit = self._last_row()
         while last <= limit:
@@ -71,7 +75,7 @@ class Db3Log:
                     last, skip = row[0], 1
                     yield row
             except (sqlite3.Error, OverflowError, UnicodeDecodeError):
-                # Step over the damaged row; twice as far each time it fails again, so that a lost tail ends the scan soon.
+                # Step over the damaged row, twice as far each time it fails again: a lost tail ends soon.
                 self.damage["damaged_rows"] += 1
                 last, skip = last + skip, skip * 2
             else:
@@ -108,7 +112,8 @@ class Db3Log:
 def _open(path: Path) -> sqlite3.Connection:
     try:
         db = sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
-        # Without it SQLite refuses a file shorter than its header says, which is what a cut-off recording is. Nothing is written.
+        # Without it SQLite refuses a file shorter than its header says, as a cut-off recording is.
+        # Nothing is written.
         db.execute("PRAGMA writable_schema=ON")
         db.execute("SELECT count(*) FROM sqlite_master").fetchone()
     except sqlite3.Error as err:

@@ -1,4 +1,4 @@
-"""Messages from bytes: header stamps straight from the wire, whole messages by the schema that the log itself carries."""
+"""Messages from bytes: header stamps from the wire, whole messages by the schema that the log carries."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SEPARATOR = "=" * 80 + "\n"
 
 
 def header_stamp_ns(channel: Channel, data: memoryview) -> int | None:
-    """Stamp of a message whose first field is a std_msgs/Header; None where it is cut off, zero or no time at all."""
+    """Stamp of a message that starts with a std_msgs/Header; None where that is cut off, zero or no time."""
     if len(data) < _STAMP_END:
         return None
     seconds, nanoseconds = struct.unpack_from(_order(channel, data) + "iI", data, 4)
@@ -46,10 +46,10 @@ def header_frame_id(channel: Channel, data: memoryview) -> str:
 
 
 def decode(channel: Channel, data: memoryview) -> Any:
-    """The message as rosbags' dataclass of the embedded definition (arrays are views: copy what outlives the bytes).
+    """The message by its embedded definition (arrays are views: copy what outlives the bytes).
 
     Raises:
-        LogError: no definition, an encoding that is neither CDR nor ROS 1, or bytes that do not fit the definition.
+        LogError: no definition, neither CDR nor ROS 1, or bytes that do not fit the definition.
     """
     try:
         store = _typestore(channel)

@@ -1,6 +1,6 @@
 """Message definitions for bags that carry none (ROS 2 Humble and older) and that rosbags does not bundle.
 
-Used only where the log itself has no definition; a message that does not fit byte for byte is refused, never guessed.
+Used only where the log itself has no definition; a message that does not fit byte for byte is refused.
 Source: vision_msgs 4.1 (Humble); radar_msgs 0.2 (Humble).
 """
 
@@ -20,7 +20,10 @@ DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
     ),
     "vision_msgs/msg/Detection2D": (
         (),
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox2D bbox\nstring id\n",
+        (
+            "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+            "vision_msgs/BoundingBox2D bbox\nstring id\n"
+        ),
     ),
     "vision_msgs/msg/Detection2DArray": (
         (
@@ -43,10 +46,13 @@ DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
     ),
     "radar_msgs/msg/RadarTrack": (
         (),
-        "unique_identifier_msgs/UUID uuid\ngeometry_msgs/Point position\ngeometry_msgs/Vector3 velocity\n"
-        "geometry_msgs/Vector3 acceleration\ngeometry_msgs/Vector3 size\nuint16 classification\n"
-        "float32[6] position_covariance\nfloat32[6] velocity_covariance\nfloat32[6] acceleration_covariance\n"
-        "float32[6] size_covariance\n",
+        (
+            "unique_identifier_msgs/UUID uuid\n"
+            "geometry_msgs/Point position\ngeometry_msgs/Vector3 velocity\n"
+            "geometry_msgs/Vector3 acceleration\ngeometry_msgs/Vector3 size\nuint16 classification\n"
+            "float32[6] position_covariance\nfloat32[6] velocity_covariance\nfloat32[6] acceleration_covariance\n"
+            "float32[6] size_covariance\n"
+        ),
     ),
     "radar_msgs/msg/RadarTracks": (
         ("radar_msgs/msg/RadarTrack",),

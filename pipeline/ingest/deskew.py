@@ -17,7 +17,7 @@ def deskew(
     yaw_rate_radps: float,
     T_vehicle_lidar: Float[np.ndarray, "4 4"],
 ) -> Float32[np.ndarray, "N 3"]:
-    """Points in the lidar frame at the stamp, for a vehicle that keeps its speed and yaw rate during the sweep.
+    """Points in the lidar frame at the stamp, for a vehicle of constant speed and yaw rate during the sweep.
 
     Args:
         points_lidar: each in the lidar frame at its own time [m].
@@ -43,7 +43,7 @@ def deskew(
 def planar_motion(
     time_s: Float[np.ndarray, " N"], speed_mps: float, yaw_rate_radps: float
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
-    """Yaw [rad] and position [m] of the vehicle at each time on a circular arc, seen from where it is at time 0."""
+    """Yaw [rad] and position [m] of the vehicle on a circular arc, seen from where it is at time 0."""
     yaw = yaw_rate_radps * time_s
     # sin(a)/a and (1-cos(a))/a through sinc: exact on a straight line too
     half = np.sinc(yaw / (2 * np.pi))

@@ -19,7 +19,7 @@ _LONGEST_GAP_S = (
 
 @dataclass(frozen=True, eq=False)
 class EgoState:
-    """Motion at one stamp: forward speed, yaw rate (positive to the left), pose of the vehicle in the odometry frame."""
+    """Motion at one stamp: forward speed, yaw rate (positive to the left), pose in the odometry frame."""
 
     speed_mps: float
     yaw_rate_radps: float

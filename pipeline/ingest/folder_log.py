@@ -1,4 +1,4 @@
-"""ROS 2 bag folders: their .db3 or .mcap files together, with or without metadata.yaml, compressed by file or not."""
+"""ROS 2 bag folders: their .db3 or .mcap files together, with or without metadata.yaml, compressed or not."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class FolderLog:
 
 
 class CompressedLog:
-    """LogReader of a log file that rosbag2 compressed as a whole (.zstd): unpacked into a temporary file while open."""
+    """LogReader of a file that rosbag2 compressed as a whole (.zstd), unpacked aside while it is open."""
 
     def __init__(self, path: Path, cache: ChunkCache) -> None:
         self.path = path

@@ -97,7 +97,7 @@ def label_image(message: Any) -> bytes:
     """PNG mono8 of a label image: a PNG CompressedImage as it is, or a mono8/8UC1/16-bit Image encoded here.
 
     Raises:
-        ValueError: a lossy or coloured image (labels would be invented), or a damaged one, or labels above 255.
+        ValueError: a lossy or coloured image (labels would be invented), a damaged one, or labels above 255.
     """
     if hasattr(message, "format"):
         data = bytes(message.data)
@@ -207,7 +207,7 @@ def _raw_pixels(message: Any, encoding: str) -> np.ndarray:
     return np.ascontiguousarray(rows.reshape(height, width, channels) if channels > 1 else rows)
 
 
-def _to_png(pixels: UInt8[np.ndarray, "..."] | np.ndarray) -> bytes:
+def _to_png(pixels: UInt8[np.ndarray, ...] | np.ndarray) -> bytes:
     # Level 1: raw images compress to much the same size at a fifth of the time of the default.
     ok, encoded = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not ok:

@@ -1,9 +1,9 @@
-"""First pass over a day's logs: when and where each message lies, and the small messages that every frame needs."""
+"""First pass over a day's logs: when and where each message lies, and the small messages that frames need."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,6 +32,8 @@ ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
     "odometry": ("nav_msgs/msg/Odometry",),
     "tf_static": ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
 }
+_MOST_CAMERAS = 1000  # distinct camera_info contents remembered: a bound where a driver writes noise into it
+_NEEDED = ("image", "info", "lidar", "radar")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,7 @@ class Stream:
 
 @dataclass(eq=False)
 class DayIndex:
-    """What the logs of a vehicle-day hold. `problems` says in words, and `damage` counts, what could not be read."""
+    """What the logs of a day hold. `problems` says in words, `damage` counts, what could not be read."""
 
     logs: list[LogReader] = field(default_factory=list)
     log_names: list[str] = field(default_factory=list)
@@ -66,9 +68,10 @@ class DayIndex:
     cameras: list[tuple[int, int, Camera]] = field(default_factory=list)  # log, stamp, intrinsics
     trees: list[TransformTree] = field(default_factory=list)
     ego: EgoTrack = field(default_factory=EgoTrack)
+    topics_seen: set[str] = field(default_factory=set)
     problems: list[str] = field(default_factory=list)
     damage: Counter[str] = field(default_factory=Counter)
-    _camera_of_bytes: dict[bytes, Camera | str] = field(default_factory=dict)
+    camera_of_bytes: dict[bytes, Camera | str] = field(default_factory=dict)
 
     def stream(self, role: str) -> Stream:
         """Messages of a role; empty where there are none."""
@@ -79,7 +82,7 @@ class DayIndex:
         return self.logs[located.log].read(located.position)
 
     def camera_at(self, log: int, stamp_ns: int) -> Camera | None:
-        """Intrinsics nearest in time within the same log, else of the nearest log; None where no log has any."""
+        """Intrinsics nearest in time within the same log, else within any; None where no log has any."""
         own = [c for c in self.cameras if c[0] == log] or self.cameras
         return min(own, key=lambda c: abs(c[1] - stamp_ns))[2] if own else None
 
@@ -110,10 +113,8 @@ def topics_of(rig: Rig) -> dict[str, str]:
     return topics
 
 
-def index_logs(
-    paths: Sequence[Path], rig: Rig, on_log: Callable[[int], None] = lambda done: None
-) -> DayIndex:
-    """Scan the logs once. Of images, clouds and scans only the stamp is read; logs that cannot be opened become problems."""
+def index_logs(paths: Sequence[Path], rig: Rig) -> DayIndex:
+    """Scan the logs once; of images and clouds only the stamp is read. Unreadable logs become problems."""
     index, topics, cache = DayIndex(), topics_of(rig), ChunkCache()
     for path in paths:
         try:
@@ -125,12 +126,8 @@ def index_logs(
         index.log_names.append(path.name)
         index.trees.append(TransformTree())
         _index_log(index, len(index.logs) - 1, topics)
-        on_log(len(index.logs))
-    for role in ("image", "lidar", "radar", "info"):
-        if role not in index.streams and not any(
-            f"topic {t}" in p for t, r in topics.items() if r == role for p in index.problems
-        ):
-            topic = next(t for t, r in topics.items() if r == role)
+    for topic, role in topics.items():
+        if role in _NEEDED and topic not in index.topics_seen:
             index.complain(f"topic {topic} ({role}) has no message in any log")
     for tree in index.trees:
         for other in index.trees:
@@ -143,12 +140,11 @@ def _index_log(index: DayIndex, number: int, topics: dict[str, str]) -> None:
     log = index.logs[number]
     for message in log.scan(topics):
         role = topics[message.channel.topic]
+        index.topics_seen.add(message.channel.topic)
         if message.channel.msgtype not in ACCEPTED_TYPES[role]:
             index.damage["wrong_type"] += 1
-            index.complain(
-                f"{log.path.name}, topic {message.channel.topic}: type {message.channel.msgtype or 'unknown'}, "
-                f"not {' or '.join(ACCEPTED_TYPES[role])}"
-            )
+            found, wanted = message.channel.msgtype or "no type", " or ".join(ACCEPTED_TYPES[role])
+            index.complain(f"{index.log_names[number]}, topic {message.channel.topic}: {found}, not {wanted}")
             continue
         if role == "tf_static":
             _take_transforms(index, number, message)
@@ -165,11 +161,8 @@ def _index_log(index: DayIndex, number: int, topics: dict[str, str]) -> None:
             index.stream(role).located.append(Located(number, message.channel, message.position))
     for name, count in log.damage.items():
         index.damage[name] += count
-        index.complain(
-            f"{log.path.name}: {count} {name.replace('_', ' ')}"
-            if name != "truncated"
-            else f"{log.path.name}: is cut off"
-        )
+        what = "is cut off" if name == "truncated" else f"{count} {name.replace('_', ' ')}"
+        index.complain(f"{log.path.name}: {what}")
 
 
 def _take_transforms(index: DayIndex, number: int, message: RawMessage) -> None:
@@ -193,14 +186,14 @@ def _take_odometry(index: DayIndex, stamp: int, message: RawMessage) -> None:
 def _take_camera(index: DayIndex, number: int, stamp: int, message: RawMessage) -> None:
     index.stream("info").stamps.append(stamp)
     content = bytes(message.data[12:])  # all but sequence number and stamp: the same for hours
-    camera = index._camera_of_bytes.get(content)  # noqa: SLF001
+    camera = index.camera_of_bytes.get(content)
     if camera is None:
         try:
             camera = read_camera_info(decode(message.channel, message.data))
         except (LogError, *DECODE_ERRORS) as err:
             camera = str(err)
-        if len(index._camera_of_bytes) < 1000:  # noqa: SLF001
-            index._camera_of_bytes[content] = camera  # noqa: SLF001
+        if len(index.camera_of_bytes) < _MOST_CAMERAS:
+            index.camera_of_bytes[content] = camera
     if isinstance(camera, str):
         index.damage["camera_info_unusable"] += 1
         index.complain(f"{index.log_names[number]}, topic {message.channel.topic}: {camera}")

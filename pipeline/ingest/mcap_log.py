@@ -1,4 +1,4 @@
-"""MCAP logs, read chunk by chunk: a chunk with a wrong checksum, a lost tail or a broken record costs only itself.
+"""MCAP logs, read chunk by chunk: a wrong checksum, a lost tail or a broken record costs only itself.
 
 Source: MCAP specification, https://mcap.dev/spec (records, chunks, summary section, footer).
 """
@@ -57,6 +57,7 @@ class McapLog:
             if opcode == Opcode.CHUNK:
                 chunk = self._open_chunk(content, check=True)
                 if chunk is not None:
+                    self._cache.offer((str(self.path), start), chunk)
                     yield from self._scan_chunk(chunk, start, topics)
             elif opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
                 channel_id, _, log_time, _ = _MESSAGE.unpack_from(content)
@@ -89,14 +90,14 @@ class McapLog:
         """See LogReader."""
         self._file.close()
 
-    # -- records -----------------------------------------------------------------------------------------------------
+    # -- records ------------------------------------------------------------
 
     def _content(self, start: int, length: int) -> bytes:
         self._file.seek(start)
         return self._file.read(length)
 
     def _records(self) -> Iterator[tuple[int, int, int]]:
-        """(opcode, start of content, length) of the data section's records; lost footing is regained at the next known chunk."""
+        """(opcode, start of content, length) of records; lost footing is regained at the next known chunk."""
         position = _MAGIC_SIZE
         while True:
             head = self._content(position, _RECORD.size)
@@ -129,7 +130,7 @@ class McapLog:
         return self._chunk_starts[i] if i < len(self._chunk_starts) else None
 
     def _read_summary(self) -> list[int]:
-        """Chunk positions from the summary section, empty where it is lost or damaged; learns its schemas and channels."""
+        """Chunk positions from the summary, none where it is lost or damaged; learns schemas and channels."""
         try:
             tail = self._content(max(self._size - _FOOTER_SIZE - _MAGIC_SIZE, 0), _FOOTER_SIZE)
             footer = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :])))
@@ -164,7 +165,7 @@ class McapLog:
         except _DAMAGED:
             self.damage["damaged_records"] += 1
 
-    # -- chunks ------------------------------------------------------------------------------------------------------
+    # -- chunks ------------------------------------------------------------
 
     def _open_chunk(self, content: bytes, *, check: bool) -> bytes | None:
         """The chunk's records, None (and counted) where it is damaged."""

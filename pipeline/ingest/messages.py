@@ -1,15 +1,15 @@
-"""One synchronised trio to one row of `frames`: only here are payloads decoded, and only those of trios that are kept."""
+"""One synchronised trio to one row of `frames`: only here are payloads decoded, only those of kept trios."""
 
 from __future__ import annotations
 
 from collections import Counter
-from enum import StrEnum
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.config import FleetConfig, Rig
+from pipeline.config import IngestConfig, Rig
 from pipeline.errors import LogError
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import to_quaternion
@@ -21,26 +21,10 @@ from pipeline.ingest.ego import EgoState
 from pipeline.ingest.images import EncodedImage, encode_raw_image, inspect_image, label_image
 from pipeline.ingest.index import DayIndex, Located
 from pipeline.ingest.radar import RadarCloud, read_radar
+from pipeline.ingest.sync import Rejection
 from schemas.frames import Frame
 
-__all__ = ["FrameBuilder", "Rejected", "Rejection", "Trio"]
-
-
-class Rejection(StrEnum):
-    """Why a lidar sweep became no frame; every sweep that was indexed is kept or counted under exactly one of these."""
-
-    DUPLICATE_STAMP = "duplicate_stamp"
-    NO_CAMERA = "no_camera_in_gate"
-    NO_RADAR = "no_radar_in_gate"
-    SPREAD = "camera_radar_outside_gate"
-    NOT_PICKED = "beyond_max_frames"
-    IMAGE_DAMAGED = "image_damaged"
-    IMAGE_SIZE = "image_size_differs_from_camera_info"
-    CAMERA_INFO = "no_usable_camera_info"
-    LIDAR_DAMAGED = "lidar_undecodable"
-    LIDAR_SPARSE = "too_few_lidar_points"
-    RADAR_DAMAGED = "radar_undecodable"
-    RADAR_SPARSE = "too_few_radar_points"
+__all__ = ["FrameBuilder", "Rejected", "Trio"]
 
 
 class Rejected(Exception):  # noqa: N818  # an outcome that is counted, not an error that anyone sees
@@ -51,16 +35,16 @@ class Rejected(Exception):  # noqa: N818  # an outcome that is counted, not an e
         super().__init__(f"{reason}: {detail}" if detail else str(reason))
 
 
+@dataclass(frozen=True, slots=True)
 class Trio:
-    """Indices of one trio, and of the labels and detections of its image (None where not logged)."""
+    """Places in the streams of a trio and of its image's labels and detections (None where not logged)."""
 
-    __slots__ = ("camera", "detections", "drive", "labels", "lidar", "radar")
-
-    def __init__(
-        self, camera: int, lidar: int, radar: int, labels: int | None, detections: int | None, drive: int
-    ) -> None:
-        self.camera, self.lidar, self.radar = camera, lidar, radar
-        self.labels, self.detections, self.drive = labels, detections, drive
+    camera: int
+    lidar: int
+    radar: int
+    labels: int | None
+    detections: int | None
+    drive: int
 
 
 _Prior = tuple[Float[np.ndarray, "4 4"] | None, Float[np.ndarray, "4 4"] | None]
@@ -70,10 +54,10 @@ class FrameBuilder:
     """Builds rows from an index. `counts` gathers, by name, dropped points and what frames go without."""
 
     def __init__(
-        self, index: DayIndex, rig: Rig, config: FleetConfig, file_prior: _Prior | None = None
+        self, index: DayIndex, rig: Rig, ingest: IngestConfig, file_prior: _Prior | None = None
     ) -> None:
-        self._index, self._rig, self._ingest, self._file_prior = index, rig, config.ingest, file_prior
-        self._priors: dict[tuple[int, str, str, str], _Prior] = {}
+        self._index, self._rig, self._ingest, self._file_prior = index, rig, ingest, file_prior
+        self._priors: dict[tuple[int, str, str, str], dict[str, float | None]] = {}
         self.counts: Counter[str] = Counter()
 
     def build(self, trio: Trio, frame_index: int) -> Frame:
@@ -94,31 +78,33 @@ class FrameBuilder:
         lidar, lidar_frame = self._lidar(lidar_at, stamp)
         radar, radar_frame = self._radar(radar_at)
         ego = self._index.ego.at(stamp)
-        lidar_xyz, is_deskewed = self._deskewed(lidar, lidar_frame, lidar_at.log, ego)
+        (lidar_x, lidar_y, lidar_z), is_deskewed = self._deskewed(lidar, lidar_frame, lidar_at.log, ego)
         boxes, classes, scores = self._detections(trio)
-        T_camera_lidar, T_lidar_radar = self._prior(lidar_at.log, camera_frame, lidar_frame, radar_frame)
+        prior = self._prior(lidar_at.log, camera_frame, lidar_frame, radar_frame)
         self.counts.update(lidar.dropped + radar.dropped)
-        self.counts.update({"frames_without_prior": T_camera_lidar is None or T_lidar_radar is None})
+        self.counts["frames_without_prior"] += None in prior.values()
         return Frame(
             frame_index=frame_index, log=self._index.log_names[lidar_at.log], drive=trio.drive,
             stamp_ns=stamp, camera_stamp_ns=camera_stamp, lidar_stamp_ns=stamp,
             radar_stamp_ns=self._index.stream("radar").stamps[trio.radar],
-            image=image.data, image_format=image.format, image_width_px=camera.width_px, image_height_px=camera.height_px,
+            image=image.data, image_format=image.format,
+            image_width_px=camera.width_px, image_height_px=camera.height_px,
             camera_model=camera.model, camera_K=camera.K, camera_D=camera.D, labels_png=self._labels(trio),
             detection_boxes_px=boxes, detection_classes=classes, detection_scores=scores,
-            lidar_x_m=lidar_xyz[:, 0], lidar_y_m=lidar_xyz[:, 1], lidar_z_m=lidar_xyz[:, 2],
-            lidar_intensity=lidar.intensity, lidar_ring=lidar.ring, lidar_time_s=lidar.time_s, lidar_deskewed=is_deskewed,
+            lidar_x_m=lidar_x, lidar_y_m=lidar_y, lidar_z_m=lidar_z,
+            lidar_intensity=lidar.intensity, lidar_ring=lidar.ring, lidar_time_s=lidar.time_s,
+            lidar_deskewed=is_deskewed,
             radar_x_m=radar.xyz_m[:, 0], radar_y_m=radar.xyz_m[:, 1], radar_z_m=radar.xyz_m[:, 2],
-            radar_range_rate_mps=radar.range_rate_mps, radar_power_db=radar.power_db, radar_has_elevation=radar.has_elevation,
+            radar_range_rate_mps=radar.range_rate_mps, radar_power_db=radar.power_db,
+            radar_has_elevation=radar.has_elevation,
             doppler_period_mps=self._rig.radar.doppler_period_mps,
             ego_speed_mps=None if ego is None else ego.speed_mps,
             ego_yaw_rate_radps=None if ego is None else ego.yaw_rate_radps,
             **_transform_fields("ego_", None if ego is None else ego.T_odom_vehicle),
-            **_transform_fields("prior_camera_lidar_", T_camera_lidar),
-            **_transform_fields("prior_lidar_radar_", T_lidar_radar),
+            **prior,
         )  # fmt: skip
 
-    # -- parts -------------------------------------------------------------------------------------------------------
+    # -- parts ------------------------------------------------------------
 
     def _located(self, role: str, i: int) -> Located:
         return self._index.stream(role).located[i]
@@ -154,8 +140,8 @@ class FrameBuilder:
             cloud = read_lidar(message, stamp_ns, self._ingest.max_lidar_range_m)
         except (LogError, *DECODE_ERRORS) as err:
             raise Rejected(Rejection.LIDAR_DAMAGED, str(err)) from err
-        if len(cloud.xyz_m) < self._ingest.min_lidar_points:
-            raise Rejected(Rejection.LIDAR_SPARSE, f"{len(cloud.xyz_m)} points")
+        if len(cloud.x_m) < self._ingest.min_lidar_points:
+            raise Rejected(Rejection.LIDAR_SPARSE, f"{len(cloud.x_m)} points")
         return cloud, frame_id
 
     def _radar(self, located: Located) -> tuple[RadarCloud, str]:
@@ -196,34 +182,40 @@ class FrameBuilder:
 
     def _deskewed(
         self, lidar: LidarCloud, frame_id: str, log: int, ego: EgoState | None
-    ) -> tuple[Float[np.ndarray, "N 3"], bool]:
+    ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], bool]:
+        as_logged = lidar.x_m, lidar.y_m, lidar.z_m
         if not self._ingest.deskew or lidar.time_s is None or ego is None:
-            return lidar.xyz_m, False
+            return as_logged, False
         T_vehicle_lidar = self._index.trees[log].lookup(self._index.ego.vehicle_frame, frame_id)
         if T_vehicle_lidar is None:
-            # Without the lever arm the axes' convention (x forward, y left, z up) still tells the direction of travel;
-            # the error left is yaw rate x lever arm x sweep, some 2 cm in a city turn.
+            # Without the lever arm the axes' convention (x forward, y left, z up) still tells the direction
+            # of travel; the error left is yaw rate x lever arm x sweep, some 2 cm in a city turn.
             self.counts["sweeps_deskewed_without_lever_arm"] += 1
             T_vehicle_lidar = np.eye(4)
-        return deskew(lidar.xyz_m, lidar.time_s, ego.speed_mps, ego.yaw_rate_radps, T_vehicle_lidar), True
+        points = np.stack(as_logged, axis=-1)
+        x, y, z = deskew(points, lidar.time_s, ego.speed_mps, ego.yaw_rate_radps, T_vehicle_lidar).T
+        return (x, y, z), True
 
-    def _prior(self, log: int, camera: str, lidar: str, radar: str) -> _Prior:
-        if self._file_prior is not None:
-            return self._file_prior
+    def _prior(self, log: int, camera: str, lidar: str, radar: str) -> dict[str, float | None]:
         key = (log, camera, lidar, radar)
         if key not in self._priors:
-            tree = self._index.trees[log]
-            T_camera_lidar, T_lidar_radar = tree.lookup(camera, lidar), tree.lookup(lidar, radar)
-            self._priors[key] = T_camera_lidar, T_lidar_radar
-            for T, a, b in ((T_camera_lidar, camera, lidar), (T_lidar_radar, lidar, radar)):
-                if T is None:
-                    self._index.complain(
-                        f"/tf_static joins {a or '(no frame id)'} and {b or '(no frame id)'} by no chain: no prior"
-                    )
+            T_camera_lidar, T_lidar_radar = self._file_prior or self._logged_prior(*key)
+            self._priors[key] = _transform_fields("prior_camera_lidar_", T_camera_lidar) | _transform_fields(
+                "prior_lidar_radar_", T_lidar_radar
+            )
         return self._priors[key]
 
+    def _logged_prior(self, log: int, camera: str, lidar: str, radar: str) -> _Prior:
+        tree = self._index.trees[log]
+        T_camera_lidar, T_lidar_radar = tree.lookup(camera, lidar), tree.lookup(lidar, radar)
+        for T, a, b in ((T_camera_lidar, camera, lidar), (T_lidar_radar, lidar, radar)):
+            if T is None:
+                names = f"{a or '(no frame id)'} to {b or '(no frame id)'}"
+                self._index.complain(f"/tf_static has no chain from {names}: no prior")
+        return T_camera_lidar, T_lidar_radar
 
-def _transform_fields(prefix: str, T: Float[np.ndarray, "4 4"] | None) -> dict[str, Any]:
+
+def _transform_fields(prefix: str, T: Float[np.ndarray, "4 4"] | None) -> dict[str, float | None]:
     names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     values = [None] * 7 if T is None else [float(v) for v in (*to_quaternion(T), *T[:3, 3])]
     return {f"{prefix}{n}": v for n, v in zip(names, values, strict=True)}

@@ -1,4 +1,4 @@
-"""Radar scans as PointCloud2, radar_msgs/RadarScan or radar_msgs/RadarTracks; Doppler becomes range rate, positive = receding."""
+"""Radar scans as PointCloud2, RadarScan or RadarTracks; Doppler becomes range rate, positive = receding."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FLAT_RAD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class RadarCloud:
-    """Detections of one scan in the radar frame; `range_rate_mps` positive = receding, not ego-compensated."""
+    """Detections of one scan, radar frame; `range_rate_mps` positive = receding, not ego-compensated."""
 
     xyz_m: Float32[np.ndarray, "N 3"]
     range_rate_mps: Float32[np.ndarray, " N"]
@@ -36,11 +36,11 @@ def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
     Args:
         message: decoded by the log's own definition.
         msgtype: PointCloud2, RadarScan or RadarTracks decide what is read.
-        config: name and sign of the Doppler field, sign of RadarScan's azimuth. The velocity vector of a RadarTrack needs no
-            sign: it is taken relative to the sensor, and its component along the line of sight is the range rate.
+        config: name and sign of the Doppler field, sign of RadarScan's azimuth. The velocity of a RadarTrack
+            needs no sign: taken relative to the sensor, its part along the line of sight is the range rate.
 
     Raises:
-        ValueError: a field is missing (the message names those that there are), or the layout contradicts itself.
+        ValueError: a field is missing (the message names those there are), or the layout is contradictory.
     """
     kind = msgtype.rsplit("/", 1)[-1]
     xyz, range_rate, power = {"RadarScan": _scan, "RadarTracks": _tracks}.get(kind, _cloud)(message, config)

@@ -1,7 +1,8 @@
-"""One interface over MCAP, ROS 1 bags and ROS 2 bags: scan once for an index, then read single messages by position.
+"""One interface over MCAP, ROS 1 and ROS 2 bags: scan once for an index, then read messages by position.
 
-Every backend reads the containers' own records in file order and never a whole file, so damage costs the damaged part
-and memory stays bounded by the chunk cache, whatever the log's length. What is not whole is counted in `damage`.
+Every backend reads the containers' own records in file order and never a whole file, so damage costs the
+damaged part and memory stays bounded by the chunk cache, whatever the log's length. What is not whole is
+counted in `damage`.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ Position = tuple[int, ...]
 class Channel:
     """A stream of messages in a log.
 
-    `encoding` is "cdr" or "ros1" (others cannot be decoded); `definition` is the embedded schema, "" where there is none;
-    `definition_format` is "msg" or "idl".
+    `encoding` is "cdr" or "ros1" (others cannot be decoded); `definition` is the embedded schema, "" where
+    there is none; `definition_format` is "msg" or "idl".
     """
 
     topic: str
@@ -58,7 +59,7 @@ class RawMessage:
 
 
 class LogReader(Protocol):
-    """What a backend can do. `damage` counts, by name, what could not be read; it is complete after a scan."""
+    """What a backend can do. `damage` counts by name what could not be read, complete after a scan."""
 
     path: Path
     damage: Counter[str]
@@ -119,9 +120,10 @@ def open_log(path: Path, cache: ChunkCache | None = None) -> LogReader:
 def content_identity(path: Path) -> str:
     """Name, size and a hash of samples of a log, for work keys.
 
-    Hashed are the first and last MiB of each file and 64 samples of 4 KiB evenly between. A full hash would read a fleet's
-    terabytes only to find that nothing is to be done; logs are written once, and what changes in them (an appended,
-    recovered, re-indexed or re-recorded log) changes size, head or tail. Modification times are left out: copies differ.
+    Hashed are the first and last MiB of each file and 64 samples of 4 KiB evenly between. A full hash would
+    read a fleet's terabytes only to find that nothing is to be done; logs are written once, and what changes
+    in them (an appended, recovered, re-indexed or re-recorded log) changes size, head or tail. Modification
+    times are left out: copies differ in them.
     """
     digest = hashlib.sha256(path.name.encode())
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
@@ -151,6 +153,11 @@ class ChunkCache:
         if chunk is not None:
             self._chunks.move_to_end(key)
         return chunk
+
+    def offer(self, key: tuple[str, int], chunk: bytes) -> None:
+        """Keep a chunk where there is room: a scan of a short day saves the second pass its decompression."""
+        if self._bytes + len(chunk) <= self._max_bytes and key not in self._chunks:
+            self.put(key, chunk)
 
     def put(self, key: tuple[str, int], chunk: bytes) -> None:
         """Keep a chunk; at least the last one stays, however large."""

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int64
 
-from pipeline.config import FleetConfig, Rig, config_hash
-from pipeline.errors import ConfigError
+from pipeline.config import FleetConfig, IngestConfig, Rig, config_hash
+from pipeline.errors import ConfigError, ContractError
 from pipeline.geometry.se3 import from_rotation_translation
 from pipeline.ingest.index import DayIndex, index_logs, topics_of
-from pipeline.ingest.messages import FrameBuilder, Rejected, Rejection, Trio
+from pipeline.ingest.messages import FrameBuilder, Rejected, Trio
 from pipeline.ingest.readers import content_identity
-from pipeline.ingest.sync import Trios, match_nearest, match_trios, number_drives
+from pipeline.ingest.sync import Rejection, match_nearest, match_trios, number_drives
 from pipeline.results import Progress, StageResult, silent
 from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.tables import read_manifest, write_partition
+from pipeline.store.tables import Manifest, read_manifest, write_partition
 from schemas.frames import FRAMES, Frame
 from schemas.versions import CODE_VERSION
 
@@ -30,10 +30,19 @@ _CHUNK_BYTES = (
 )  # a row group: large enough to compress, small enough that a worker stays far below 2 GB
 _CHUNK_FRAMES = 16
 _PROBLEMS_SHOWN = 3
+_UNUSABLE = (
+    Rejection.IMAGE_DAMAGED,
+    Rejection.IMAGE_SIZE,
+    Rejection.CAMERA_INFO,
+    Rejection.LIDAR_DAMAGED,
+    Rejection.LIDAR_SPARSE,
+    Rejection.RADAR_DAMAGED,
+    Rejection.RADAR_SPARSE,
+)
 
 
-class _NothingUsable(Exception):  # noqa: N818  # leaves the writer's block so that nothing is written
-    pass
+class _NothingUsableError(Exception):
+    """Leaves the writer's block, so that nothing is written."""
 
 
 def ingest_day(
@@ -44,12 +53,12 @@ def ingest_day(
     progress: Progress = silent,
     fleet_file: str = "fleet.toml",
 ) -> StageResult:
-    """Write the partition of `frames` that the logs give; nothing is done where it was made from the same inputs before.
+    """Write the partition of `frames` that the logs give; "cached" where the same inputs gave it before.
 
-    A day without a single usable trio is "refused": nothing is written (an empty table would look like a day that was
-    calibrated and found nothing), a partition of earlier inputs stays, and the reason names topics and what to do.
-    `rejected` counts each sweep that became no frame under one Rejection, and damage, dropped points and missing parts
-    under names of their own.
+    A day without a single usable trio is "refused": nothing is written (an empty table would look like a day
+    that was looked at and gave nothing), a partition of earlier inputs stays, and the reason names topics and
+    what to do. `rejected` counts each sweep that became no frame under one Rejection, and damage, dropped
+    points and missing parts under names of their own.
 
     Args:
         logs: files or ROS 2 bag folders, in any order; recordings split by time or by sensor belong together.
@@ -68,52 +77,54 @@ def ingest_day(
         raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
     file_prior = read_file_prior(rig, fleet_file)
     inputs = sorted(content_identity(p) for p in logs)
-    key = work_key("ingest", CODE_VERSION, _config_key(fleet, rig, fleet_file), inputs)
-    manifest = read_manifest(lake, FRAMES, partition)
-    output = str(lake.folder(FRAMES.name, partition))
+    prior_key = {} if file_prior is None else {"prior": [T.tolist() for T in file_prior]}
+    key = work_key("ingest", CODE_VERSION, config_hash(fleet.ingest, rig, prior_key), inputs)
+    manifest = _manifest(lake, partition)
     if manifest is not None and manifest.work_key == key:
-        outcome = StageResult("ingest", partition.vehicle, partition.day, "cached", key, manifest.rows)
-        return _with_counts(outcome, manifest.kept, manifest.rejected, outputs=[output])
+        return _result("cached", lake, partition, key, manifest.rows, manifest.rejected)
     progress(0, 0, "reading the index")
     index = index_logs(logs, rig)
+    builder = FrameBuilder(index, rig, fleet.ingest, file_prior)
+    trios, rejected = pick_trios(index, fleet.ingest)
     try:
-        trios = pick_trios(index, fleet)
-        rejected = Counter(trios[1])
-        builder = FrameBuilder(index, rig, fleet, file_prior)
         with write_partition(lake, FRAMES, partition, key, CODE_VERSION, inputs) as writer:
-            for chunk in _chunks(_frames(trios[0], builder, index, rejected, progress)):
+            for chunk in _chunks(_frames(trios, builder, index, rejected, progress)):
                 writer.append(chunk)
-            if not writer.rows:
-                raise _NothingUsable
-            rows, kept = writer.rows, {"frames": writer.rows}
-            counted = _all_counts(rejected, index, builder)
-            writer.describe(kept=kept, rejected=counted, problems=index.problems, logs=index.log_names)
-    except _NothingUsable:
+            _require_rows(writer.rows)
+            counts = _all_counts(rejected, index, builder)
+            writer.describe(
+                kept={"frames": writer.rows}, rejected=counts, problems=index.problems, logs=index.log_names
+            )
+    except _NothingUsableError:
         reason = refusal(index, rig, rejected, fleet.ingest.sync_gate_s)
-        refused = StageResult("ingest", partition.vehicle, partition.day, "refused", key, reason=reason)
-        return _with_counts(refused, {"frames": 0}, _all_counts(rejected, index, builder))
+        return _result("refused", lake, partition, key, 0, _all_counts(rejected, index, builder), reason)
     finally:
         index.close()
-    done = StageResult(
-        "ingest", partition.vehicle, partition.day, "done", key, rows, reason=_shorten(index.problems)
-    )
-    return _with_counts(done, kept, counted, outputs=[output])
+    return _result("done", lake, partition, key, writer.rows, counts, _shorten(index.problems))
 
 
-def pick_trios(index: DayIndex, fleet: FleetConfig) -> tuple[list[Trio], Counter[str]]:
+def pick_trios(index: DayIndex, config: IngestConfig) -> tuple[list[Trio], Counter[str]]:
     """Trios in order of time, thinned evenly to `max_frames`, and why the other sweeps are left out."""
-    gate_ns = round(fleet.ingest.sync_gate_s * 1e9)
-    lidar = index.stream("lidar")
+    gate_ns = round(config.sync_gate_s * 1e9)
     camera_ns = index.stream("image").stamps_ns
-    found = match_trios(lidar.stamps_ns, camera_ns, index.stream("radar").stamps_ns, gate_ns)
-    rejected = Counter(found.rejected)
+    found = match_trios(index.stream("lidar").stamps_ns, camera_ns, index.stream("radar").stamps_ns, gate_ns)
     drives = _drives(index)
+    # Labels and detections carry the stamp of the image that they were computed on.
     labels = match_nearest(camera_ns[found.camera], index.stream("labels").stamps_ns, gate_ns)
     detections = match_nearest(camera_ns[found.camera], index.stream("detections").stamps_ns, gate_ns)
-    picked = _spread(len(found.lidar), fleet.ingest.max_frames)
-    if len(picked) < len(found.lidar):
-        rejected[Rejection.NOT_PICKED] += len(found.lidar) - len(picked)
-    return [_trio(found, int(i), labels, detections, drives) for i in picked], rejected
+    picked = _spread(len(found.lidar), config.max_frames)
+    trios = [
+        Trio(
+            camera=int(found.camera[i]),
+            lidar=int(found.lidar[i]),
+            radar=int(found.radar[i]),
+            labels=int(labels[i]) if labels[i] >= 0 else None,
+            detections=int(detections[i]) if detections[i] >= 0 else None,
+            drive=int(drives[found.lidar[i]]),
+        )
+        for i in picked
+    ]
+    return trios, +(found.rejected + Counter({Rejection.NOT_PICKED: len(found.lidar) - len(picked)}))
 
 
 def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], gate_s: float) -> str:
@@ -121,22 +132,20 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], gate_s: float) ->
     topics = {role: topic for topic, role in topics_of(rig).items()}
     absent = [f"{topics[r]} ({r})" for r in ("image", "lidar", "radar") if not index.stream(r).stamps]
     if absent:
-        what = f"no usable message on {', '.join(absent)}: check the topic names in fleet.toml against `boresight check`"
+        what = (
+            f"no usable message on {', '.join(absent)}: mend the topics in fleet.toml (see `boresight check`)"
+        )
     elif rejected.get(Rejection.CAMERA_INFO):
         what = f"no usable intrinsics on {topics['info']}: log a sensor_msgs/CameraInfo with a calibrated K"
-    elif (
-        sum(rejected[r] for r in (Rejection.NO_CAMERA, Rejection.NO_RADAR, Rejection.SPREAD))
-        >= len(index.stream("lidar").stamps) - rejected[Rejection.DUPLICATE_STAMP]
-    ):
+    elif not set(rejected) & set(_UNUSABLE):
         what = (
-            f"no sweep of {topics['lidar']} has an image of {topics['image']} and a scan of {topics['radar']} within "
-            f"{gate_s * 1e3:g} ms: trigger the sensors together, check their clocks, or raise ingest.sync_gate_s"
+            f"no sweep of {topics['lidar']} has an image of {topics['image']} and a scan of "
+            f"{topics['radar']} within {gate_s * 1e3:g} ms: trigger the sensors together, check their clocks, or raise "
+            "ingest.sync_gate_s"
         )
     else:
-        reason, count = max(
-            ((r, c) for r, c in rejected.items() if r in set(Rejection)), key=lambda rc: rc[1]
-        )
-        what = f"every synchronised trio was unusable, most often {reason} ({count})"
+        reason = max(_UNUSABLE, key=lambda r: rejected[r])
+        what = f"every synchronised trio was unusable, most often {reason} ({rejected[reason]})"
     return _shorten([what, *index.problems])
 
 
@@ -167,36 +176,31 @@ def read_file_prior(rig: Rig, fleet_file: str) -> tuple[np.ndarray, np.ndarray] 
     )
 
 
-def _config_key(fleet: FleetConfig, rig: Rig, fleet_file: str) -> str:
-    prior = (
-        ""
-        if rig.prior.file is None
-        else hashlib.sha256((Path(fleet_file).parent / rig.prior.file).read_bytes()).hexdigest()
-    )
-    return config_hash(fleet.ingest, rig, {"prior": prior})
+def _manifest(lake: Lake, partition: Partition) -> Manifest | None:
+    try:
+        return read_manifest(lake, FRAMES, partition)
+    except (ContractError, ValueError, OSError):
+        return None  # another version or a damaged file: made anew
 
 
-def _drives(index: DayIndex) -> dict[int, int]:
+def _drives(index: DayIndex) -> Int64[np.ndarray, " N"]:
     """Drive of each sweep, by its place in the stream."""
     lidar = index.stream("lidar")
     order = np.argsort(lidar.stamps_ns, kind="stable")
-    numbers = number_drives([lidar.stamps[i] for i in order], [lidar.located[i].log for i in order])
-    return {int(i): int(n) for i, n in zip(order, numbers, strict=True)}
+    drives = np.zeros(len(order), np.int64)
+    drives[order] = number_drives([lidar.stamps[i] for i in order], [lidar.located[i].log for i in order])
+    return drives
 
 
-def _spread(count: int, limit: int | None) -> np.ndarray:
-    return (
-        np.arange(count)
-        if limit is None or count <= limit
-        else np.unique(np.linspace(0, count - 1, limit).round().astype(int))
-    )
+def _require_rows(rows: int) -> None:
+    if not rows:
+        raise _NothingUsableError
 
 
-def _trio(found: Trios, i: int, labels: np.ndarray, detections: np.ndarray, drives: dict[int, int]) -> Trio:
-    partner = [None if m[i] < 0 else int(m[i]) for m in (labels, detections)]
-    return Trio(
-        int(found.camera[i]), int(found.lidar[i]), int(found.radar[i]), *partner, drives[int(found.lidar[i])]
-    )
+def _spread(count: int, limit: int | None) -> Int64[np.ndarray, " N"]:
+    if limit is None or count <= limit:
+        return np.arange(count, dtype=np.int64)
+    return np.unique(np.linspace(0, count - 1, limit).round().astype(np.int64))
 
 
 def _frames(
@@ -230,10 +234,28 @@ def _all_counts(rejected: Counter[str], index: DayIndex, builder: FrameBuilder) 
     return {str(k): int(v) for k, v in (rejected + index.damage + builder.counts).items() if v}
 
 
-def _with_counts(
-    outcome: StageResult, kept: dict[str, int], rejected: dict[str, int], outputs: list[str] | None = None
+def _result(
+    status: str,
+    lake: Lake,
+    partition: Partition,
+    key: str,
+    rows: int,
+    rejected: dict[str, int],
+    reason: str = "",
 ) -> StageResult:
-    return StageResult(**{**outcome.__dict__, "kept": kept, "rejected": rejected, "outputs": outputs or []})
+    outputs = [str(lake.folder(FRAMES.name, partition))] if rows else []
+    return StageResult(
+        "ingest",
+        partition.vehicle,
+        partition.day,
+        status,
+        key,
+        rows,
+        {"frames": rows},
+        rejected,
+        reason,
+        outputs,
+    )
 
 
 def _shorten(problems: list[str]) -> str:

@@ -5,18 +5,36 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 from jaxtyping import Int, Int64
 
-__all__ = ["Trios", "first_occurrences", "match_nearest", "match_trios", "number_drives"]
+__all__ = ["Rejection", "Trios", "first_occurrences", "match_nearest", "match_trios", "number_drives"]
 
 _DRIVE_GAP_NS = 10 * 10**9
 
 
+class Rejection(StrEnum):
+    """Why a lidar sweep became no frame; each sweep is kept or counted under exactly one of these."""
+
+    DUPLICATE_STAMP = "duplicate_stamp"
+    NO_CAMERA = "no_camera_in_gate"
+    NO_RADAR = "no_radar_in_gate"
+    SPREAD = "camera_radar_outside_gate"
+    NOT_PICKED = "beyond_max_frames"
+    IMAGE_DAMAGED = "image_damaged"
+    IMAGE_SIZE = "image_size_differs_from_camera_info"
+    CAMERA_INFO = "no_usable_camera_info"
+    LIDAR_DAMAGED = "lidar_undecodable"
+    LIDAR_SPARSE = "too_few_lidar_points"
+    RADAR_DAMAGED = "radar_undecodable"
+    RADAR_SPARSE = "too_few_radar_points"
+
+
 @dataclass(frozen=True, eq=False)
 class Trios:
-    """Indices into the three stamp lists, one row per trio in order of the lidar's stamp, and why sweeps found no partner.
+    """Indices into the three stamp lists, in order of the lidar's stamp, and why sweeps found no partner.
 
     `len(lidar) + sum(rejected.values())` is the number of sweeps.
     """
@@ -35,10 +53,10 @@ def first_occurrences(stamps_ns: Int[np.ndarray, " N"]) -> Int64[np.ndarray, " M
 def match_nearest(
     a_ns: Int[np.ndarray, " N"], b_ns: Int[np.ndarray, " M"], gate_ns: int
 ) -> Int64[np.ndarray, " N"]:
-    """For each stamp of a the index of its partner in b within the gate, -1 where it has none; every b is used once.
+    """For each stamp of a the index of its partner in b within the gate, else -1; each b is used once.
 
-    Of two that want the same b the nearer one gets it (the earlier, where they are as near); the other gets its next
-    nearest that is free.
+    Of two that want the same b the nearer one gets it (the earlier, where they are as near); the other gets
+    its next nearest that is free.
     """
     partner = np.full(len(a_ns), -1, np.int64)
     if not len(a_ns) or not len(b_ns):
@@ -67,12 +85,12 @@ def match_trios(
     radar_ns: Int[np.ndarray, " R"],
     gate_ns: int,
 ) -> Trios:
-    """Synchronised trios: every two stamps of a trio lie within the gate (paper, section 4.5.1: under 5 ms between pairs).
+    """Synchronised trios: every two stamps of one lie within the gate (paper, section 4.5.1: under 5 ms).
 
     Stamps may come in any order and more than once: the first of equal stamps counts.
     """
     lidar, camera, radar = (first_occurrences(s) for s in (lidar_ns, camera_ns, radar_ns))
-    rejected = Counter[str]({"duplicate_stamp": len(lidar_ns) - len(lidar)})
+    rejected = Counter[str]({Rejection.DUPLICATE_STAMP: len(lidar_ns) - len(lidar)})
     to_camera = match_nearest(lidar_ns[lidar], camera_ns[camera], gate_ns)
     to_radar = match_nearest(lidar_ns[lidar], radar_ns[radar], gate_ns)
     both = (to_camera >= 0) & (to_radar >= 0)
@@ -80,9 +98,9 @@ def match_trios(
     if both.any():
         spread[both] = np.abs(camera_ns[camera[to_camera[both]]] - radar_ns[radar[to_radar[both]]])
     kept = both & (spread <= gate_ns)
-    rejected["no_camera_in_gate"] = int(np.sum(to_camera < 0))
-    rejected["no_radar_in_gate"] = int(np.sum((to_camera >= 0) & (to_radar < 0)))
-    rejected["camera_radar_outside_gate"] = int(np.sum(both & ~kept))
+    rejected[Rejection.NO_CAMERA] = int(np.sum(to_camera < 0))
+    rejected[Rejection.NO_RADAR] = int(np.sum((to_camera >= 0) & (to_radar < 0)))
+    rejected[Rejection.SPREAD] = int(np.sum(both & ~kept))
     return Trios(lidar[kept], camera[to_camera[kept]], radar[to_radar[kept]], +rejected)
 
 

@@ -27,7 +27,7 @@ class TransformTree:
         return {child: parent for child, (parent, _) in self._parent_of.items()}
 
     def add_message(self, message: Any) -> int:
-        """Take the transforms of a tf2_msgs/TFMessage; returns how many were no transforms (zero quaternion, not finite)."""
+        """Take a tf2_msgs/TFMessage; returns how many of its entries were no rigid transforms."""
         bad = 0
         for entry in message.transforms:
             q, t = entry.transform.rotation, entry.transform.translation
@@ -57,8 +57,8 @@ class TransformTree:
         return True
 
     def fill_from(self, other: TransformTree) -> None:
-        """Take the edges of frames that this tree does not know (a split recording logs them in its first file only)."""
-        for child, edge in other._parent_of.items():  # noqa: SLF001
+        """Take edges of frames that this tree lacks: a split recording logs them in its first file only."""
+        for child, edge in other._parent_of.items():
             self._parent_of.setdefault(child, edge)
 
     def lookup(self, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
