@@ -1,0 +1,82 @@
+"""What the paper's losses and triggers share: classes, robust distance, points in view, stacks of poses."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import transform_points
+from schemas.observations import Observation
+
+__all__ = [
+    "REFLECTING",
+    "ROAD",
+    "SKY",
+    "camera_at_label_size",
+    "distance_cost",
+    "full_camera",
+    "in_camera",
+    "labels_of",
+    "safely_in_view",
+    "thin",
+]
+
+ROAD, SKY = 0, 10  # Cityscapes train ids
+# Paper, section 4.3: "vehicles, pedestrians, signs, poles, buildings, fences, and vegetation"; walls and traffic
+# lights go with fences and signs.
+REFLECTING = np.array([2, 3, 4, 5, 6, 7, 8, 11, 12, 13, 14, 15, 16, 17, 18], np.uint8)
+
+
+def labels_of(observation: Observation) -> UInt8[np.ndarray, "H W"]:
+    """The label image, Cityscapes train ids."""
+    return cv2.imdecode(np.frombuffer(observation.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+
+
+def full_camera(observation: Observation) -> Camera:
+    """The frame's camera at full image size."""
+    return Camera(
+        observation.camera_model,
+        observation.camera_K,
+        observation.camera_D,
+        observation.image_width_px,
+        observation.image_height_px,
+    )
+
+
+def camera_at_label_size(observation: Observation, labels: UInt8[np.ndarray, "H W"]) -> Camera:
+    """The frame's camera scaled to its label image, whose size wins over rounding."""
+    scaled = full_camera(observation).scaled(observation.label_scale)
+    return Camera(scaled.model, scaled.K, scaled.D, labels.shape[1], labels.shape[0])
+
+
+def distance_cost(distance: Float[np.ndarray, "*shape"], scale: float) -> Float[np.ndarray, "*shape"]:
+    """Smooth robust distance d^2 / (d^2 + s^2), 0..1: the paper asks for smooth losses and names no function."""
+    d2 = distance * distance
+    return d2 / (d2 + scale * scale)
+
+
+def safely_in_view(
+    camera: Camera, points_camera: Float[np.ndarray, "N 3"], margin_rad: float
+) -> Bool[np.ndarray, " N"]:
+    """True for points inside the image by a margin: an angle, but at most a quarter of the image's half extent.
+
+    The paper's lidar and radar see less than its camera, so all of their points must fall into the image. Where a
+    sensor sees more (a 360 deg lidar), only points that stay in view when the prior is off by the margin may be
+    asked to; else the out-of-view penalty pulls the pose.
+    """
+    uv, valid = camera.project(points_camera)
+    size = np.array([camera.width_px, camera.height_px])
+    margin = np.minimum(margin_rad * np.array(camera.focal_px), size / 8)
+    return valid & np.all((uv >= margin) & (uv <= size - 1 - margin), axis=1)
+
+
+def thin(points: Float[np.ndarray, "N 3"], limit: int) -> Float[np.ndarray, "M 3"]:
+    """At most `limit` points, evenly spread over their order."""
+    return points if len(points) <= limit else points[np.linspace(0, len(points) - 1, limit).astype(int)]
+
+
+def in_camera(T_camera_points: Float[np.ndarray, "4 4"], points: np.ndarray) -> Float[np.ndarray, "N 3"]:
+    """Points in the optical frame, as float64."""
+    return transform_points(T_camera_points, points.astype(np.float64))

@@ -1,0 +1,113 @@
+"""Differential evolution, then Nelder-Mead: the paper's optimiser (section 4.5.3) over poses about a start.
+
+A pose is six numbers about its start: a rotation vector in the parent's axes [rad] on the rotation part alone, and a
+shift of the origin [m]. The box that is searched means the same whatever the lever arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import differential_evolution, minimize
+
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+
+__all__ = ["Minimum", "Search", "minimise", "poses_about"]
+
+# Costs of a batch of parameter vectors: (S, D) -> (S,)
+Objective = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Search:
+    """Box and effort of one search."""
+
+    rotation_rad: float
+    translation_m: float
+    population: int
+    generations: int
+
+    def half_widths(self, poses: int) -> Float[np.ndarray, " D"]:
+        """Half the box along each parameter of `poses` poses."""
+        return np.tile([self.rotation_rad] * 3 + [self.translation_m] * 3, poses)
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where the search ended."""
+
+    x: np.ndarray
+    value: float
+    evaluations: int
+    at_border: bool  # within 2 % of the box: the true minimum may lie outside
+
+
+def poses_about(T_start: Float[np.ndarray, "4 4"], x: Float[np.ndarray, "S 6"]) -> Float[np.ndarray, "S 4 4"]:
+    """Poses of parameter vectors."""
+    return from_rotation_translation(exp_so3(x[:, :3]) @ T_start[:3, :3], T_start[:3, 3] + x[:, 3:])
+
+
+def minimise(
+    objective: Objective,
+    search: Search,
+    start: Float[np.ndarray, " D"],
+    rng: np.random.Generator,
+    *,
+    spread: float = 1.0,
+) -> Minimum:
+    """Minimise over the box: differential evolution (best1bin) on whole generations, then Nelder-Mead from its best.
+
+    Args:
+        objective: costs of a batch of parameter vectors.
+        search: box and effort.
+        start: member of the first population, and its centre.
+        rng: decides everything random.
+        spread: size of the first population as a share of the box, 1 = all of it.
+    """
+    half = search.half_widths(len(start) // 6)
+    members = start + spread * half * (2 * _latin_hypercube(search.population, len(start), rng) - 1)
+    members = np.clip(members, -half, half)
+    members[0] = np.clip(start, -half, half)
+    evaluations = 0
+
+    def counted(x: np.ndarray) -> np.ndarray:
+        nonlocal evaluations
+        evaluations += len(x)
+        return objective(np.clip(x, -half, half))
+
+    found = differential_evolution(
+        lambda x: counted(x.T),
+        list(zip(-half, half, strict=True)),
+        init=members,
+        maxiter=search.generations,
+        mutation=(0.5, 0.9),
+        recombination=0.8,
+        tol=1e-4,
+        polish=False,
+        vectorized=True,
+        updating="deferred",
+        rng=rng,
+    )
+    simplex = np.vstack([found.x, found.x + np.diag(0.05 * half)])
+    finished = minimize(
+        lambda x: float(counted(x[None])[0]),
+        found.x,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": simplex,
+            "xatol": 1e-5,  # 0.0006 deg, 0.01 mm
+            "fatol": 1e-7,
+            "maxfev": 150 * len(start),
+            "adaptive": len(start) > 6,
+        },
+    )
+    x = np.clip(finished.x, -half, half)
+    return Minimum(x, float(finished.fun), evaluations, bool(np.any(np.abs(x) > 0.98 * half)))
+
+
+def _latin_hypercube(members: int, dimensions: int, rng: np.random.Generator) -> np.ndarray:
+    strata = np.argsort(rng.random((dimensions, members)), axis=1).T
+    return (strata + rng.random((members, dimensions))) / members

@@ -1,0 +1,125 @@
+"""The paper's signs of misalignment (section 4.5.2), measured at any calibration, and the decision to calibrate.
+
+Counts are means per frame where the paper speaks of counts: it does not say over how many frames it sums, and a sum over
+a day exceeds 1 for every calibration. A radar track stands for one dynamic detection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.config import TriggerConfig
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.objective.camera_lidar import cluster_points
+from pipeline.objective.lidar_radar import CELL_M, FAR_M, drivable_map
+from pipeline.objective.semantics import REFLECTING, camera_at_label_size, full_camera, in_camera, labels_of
+from schemas.observations import Observation
+
+__all__ = ["THRESHOLDS", "exceeded", "trigger_metrics"]
+
+# Metric of each pair -> the threshold of the same name in TriggerConfig.
+THRESHOLDS: dict[str, tuple[str, ...]] = {
+    "camera_lidar": ("lidar_outside_fraction",),
+    "camera_radar": ("radar_outside_image",),
+    "lidar_radar": ("radar_outside_lidar", "drivable_outside_fraction"),
+}
+_BOX_MARGIN_M = 0.5  # an axis-aligned box of the visible surface is smaller than the object
+
+
+def trigger_metrics(
+    observations: Sequence[Observation], transforms: Mapping[str, Float[np.ndarray, "4 4"]]
+) -> dict[str, dict[str, float]]:
+    """The metrics of each pair at its transform; a metric that no frame can show is left out.
+
+    Args:
+        observations: frames to look at.
+        transforms: T of each pair.
+    """
+    found: dict[str, dict[str, list[float]]] = {
+        pair: {m: [] for m in metrics} for pair, metrics in THRESHOLDS.items()
+    }
+    for observation in observations:
+        labels = labels_of(observation)
+        _append(
+            found["camera_lidar"],
+            lidar_outside_fraction=_lidar_outside(observation, labels, transforms["camera_lidar"]),
+        )
+        _append(
+            found["camera_radar"],
+            radar_outside_image=_radar_outside_image(observation, transforms["camera_radar"]),
+        )
+        _append(
+            found["lidar_radar"],
+            radar_outside_lidar=_radar_outside_lidar(observation, transforms["lidar_radar"]),
+            drivable_outside_fraction=_drivable_outside(observation, transforms["lidar_radar"]),
+        )
+    return {p: {name: float(np.mean(v)) for name, v in metrics.items() if v} for p, metrics in found.items()}
+
+
+def exceeded(metrics: Mapping[str, float], config: TriggerConfig) -> list[str]:
+    """Names of the metrics above their thresholds."""
+    return [name for name, value in metrics.items() if value > getattr(config, name)]
+
+
+def _append(found: dict[str, list[float]], **values: float | None) -> None:
+    for name, value in values.items():
+        if value is not None:
+            found[name].append(value)
+
+
+def _lidar_outside(observation: Observation, labels: np.ndarray, T_camera_lidar: np.ndarray) -> float | None:
+    """Share of the cluster points in view that fall on no reflecting class."""
+    camera = camera_at_label_size(observation, labels)
+    uv, valid = camera.project(in_camera(T_camera_lidar, cluster_points(observation)))
+    seen = valid & camera.contains(uv)
+    if not seen.any():
+        return None
+    pixel = np.round(uv[seen]).astype(int)
+    return float(np.mean(~np.isin(labels[pixel[:, 1], pixel[:, 0]], REFLECTING)))
+
+
+def _radar_outside_image(observation: Observation, T_camera_radar: np.ndarray) -> float | None:
+    """Tracks in view outside every road user's box."""
+    camera = full_camera(observation)
+    if not len(observation.radar_track_xyz_m):
+        return None
+    uv, valid = camera.project(in_camera(T_camera_radar, observation.radar_track_xyz_m))
+    seen = uv[valid & camera.contains(uv)]
+    boxes = observation.road_user_boxes_px.reshape(-1, 4)
+    inside = np.all((seen[:, None] >= boxes[None, :, :2]) & (seen[:, None] <= boxes[None, :, 2:]), axis=2)
+    return float(np.sum(~inside.any(axis=1)))
+
+
+def _radar_outside_lidar(observation: Observation, T_lidar_radar: np.ndarray) -> float | None:
+    """Tracks outside every lidar cluster's box (horizontally only where the radar measures no elevation)."""
+    if not len(observation.radar_track_xyz_m) or not len(observation.lidar_cluster_min_m):
+        return None
+    axes = 3 if observation.radar_has_elevation else 2
+    points = transform_points(T_lidar_radar, observation.radar_track_xyz_m.astype(np.float64))[:, None, :axes]
+    low = observation.lidar_cluster_min_m[None, :, :axes] - _BOX_MARGIN_M
+    high = observation.lidar_cluster_max_m[None, :, :axes] + _BOX_MARGIN_M
+    return float(np.sum(~np.all((points >= low) & (points <= high), axis=2).any(axis=1)))
+
+
+def _drivable_outside(observation: Observation, T_lidar_radar: np.ndarray) -> float | None:
+    """Share of the lidar's drivable cells in the radar's sector that lie outside the radar's drivable area."""
+    azimuth = observation.radar_drivable_azimuth_rad
+    if len(azimuth) < 2 or not len(observation.lidar_drivable_xyz_m):
+        return None
+    cells = transform_points(inverse(T_lidar_radar), observation.lidar_drivable_xyz_m.astype(np.float64))
+    bearing = np.arctan2(cells[:, 1], cells[:, 0])
+    reach = observation.radar_drivable_range_m.max()
+    seen = (
+        (bearing > azimuth.min())
+        & (bearing < azimuth.max())
+        & (np.hypot(cells[:, 0], cells[:, 1]) < min(reach, FAR_M))
+    )
+    if not seen.any():
+        return None
+    soft = drivable_map(azimuth, observation.radar_drivable_range_m)
+    row = np.clip((cells[seen, 0] / CELL_M).astype(int), 0, soft.shape[0] - 1)
+    column = np.clip(((cells[seen, 1] + FAR_M) / CELL_M).astype(int), 0, soft.shape[1] - 1)
+    return float(np.mean(soft[row, column] < 0.5))
