@@ -189,7 +189,8 @@ class AuditConfig(_Section):
 
     method: str = "joint"
     false_alarms_per_1000_vehicle_days: Positive = 1.0
-    baseline_days: Annotated[int, Field(gt=0)] = 2
+    baseline_days: Annotated[int, Field(gt=0)] = 2  # a chart says nothing until it has one day more than this
+    window_days: Annotated[int, Field(gt=2)] = 28  # audited days where the command names no first day
     camera_lidar_limit_deg: Positive = 0.1
     radar_limit_deg: Positive = 0.25
     translation_limit_m: Positive = 0.05

@@ -32,6 +32,9 @@ DRIFT = TableSchema(
         scalar("magnitude_sigma", "float64", "its sigma", nullable=True),
         scalar("limit", "float64", "size that matters for this pair and DoF [rad or m]"),
         scalar("moved_sensor", "string", "camera, lidar or radar: the sensor that two shifted pairs share", nullable=True),
+        scalar("moved_probability", "float64", "of moved_sensor against the other two, 0..1; null where nothing moved", nullable=True),
+        scalar("moved_motion", "list<float64>", "rotation vector [rad] and shift [m] of the moved sensor in its own axes", nullable=True),
+        scalar("moved_motion_sigma", "list<float64>", "their sigmas", nullable=True),
         scalar("work_key", "string", "hash of code version, config, inputs"),
         scalar("inputs", "list<string>", "work keys of the records on the chart"),
     ),
@@ -61,4 +64,7 @@ class DriftFinding:
     magnitude: float | None = None
     magnitude_sigma: float | None = None
     moved_sensor: str | None = None
+    moved_probability: float | None = None
+    moved_motion: list[float] | None = None
+    moved_motion_sigma: list[float] | None = None
     inputs: list[str] = field(default_factory=list)

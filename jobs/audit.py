@@ -1,0 +1,59 @@
+"""`boresight audit`: control charts over the days of a fleet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+__all__ = ["audit"]
+
+
+def audit(
+    *,
+    fleet: Path,
+    lake: str,
+    from_day: Annotated[str | None, Parameter(name="--from")] = None,
+    to_day: Annotated[str | None, Parameter(name="--to")] = None,
+    method: str | None = None,
+    report: Path | None = None,
+) -> int:
+    """Find out which sensor of which vehicle moved, since when and by how much.
+
+    Args:
+        fleet: fleet.toml; its section [audit] holds limits and false-alarm budget.
+        lake: folder of the tables.
+        from_day: first day of the window, YYYY-MM-DD; default: audit.window_days before its end.
+        to_day: last day of the window; default: the last day with a record.
+        method: method of the audited records; default: audit.method.
+        report: also write the fleet page, and a page per vehicle-day beside it.
+    """
+    from jobs.summary import print_summary, progress_reporter
+    from pipeline.audit.run import audit_fleet
+    from pipeline.config import load_fleet
+    from pipeline.store.partitions import Lake
+
+    config = load_fleet(fleet)
+    tables = Lake.at(lake)
+    with progress_reporter("audit") as progress:
+        findings = audit_fleet(tables, config, from_day, to_day, method, progress)
+    statuses = [f.status for f in findings]
+    counts = {s: statuses.count(s) for s in ("RED", "YELLOW", "GREEN", "UNKNOWN")}
+    moved = sorted({(f.vehicle, f.moved_sensor, f.start_day) for f in findings if f.moved_sensor})
+    outputs = []
+    if report is not None:
+        from pipeline.report.run import write_fleet_report
+
+        outputs = write_fleet_report(tables, config, report, method=method)
+    print_summary(
+        "audit",
+        "done" if findings else "refused",
+        reason="" if findings else "no calibration record in the window",
+        vehicles=len({f.vehicle for f in findings}),
+        charts=counts,
+        moved=[{"vehicle": v, "sensor": s, "since": d} for v, s, d in moved],
+        report=report,
+        outputs=outputs,
+    )
+    return 0 if findings else 3

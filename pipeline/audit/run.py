@@ -1,0 +1,173 @@
+"""Stage audit: table calibrations to table drift, all vehicles of a fleet over a window of days."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.audit.attribution import Attribution
+from pipeline.audit.charts import Chart, ChartVerdict, pooled_scatter
+from pipeline.audit.vehicle import PairDays, VehicleVerdict, charts_of, judge_vehicle, limit_of
+from pipeline.config import FleetConfig, config_hash
+from pipeline.errors import ConfigError
+from pipeline.results import Progress, silent
+from pipeline.store.current import current_records, transform_of
+from pipeline.store.partitions import Lake, Partition, work_key
+from pipeline.store.tables import read_records, write_records
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.drift import DRIFT, DriftFinding
+from schemas.versions import CODE_VERSION
+
+__all__ = ["audit_fleet"]
+
+
+def audit_fleet(
+    lake: Lake,
+    fleet: FleetConfig,
+    from_day: str | None = None,
+    to_day: str | None = None,
+    method: str | None = None,
+    progress: Progress = silent,
+) -> list[DriftFinding]:
+    """Judge every vehicle's charts, append the findings to table drift and return them.
+
+    Args:
+        lake: holds table calibrations.
+        fleet: limits and false-alarm budget in `fleet.audit`; its vehicles are audited even where they have
+            no record.
+        from_day: first day of the window; None = `fleet.audit.window_days` before its end.
+        to_day: last day; None = the last day that any vehicle has a record for.
+        method: method of the records; None = `fleet.audit.method`.
+        progress: called once per vehicle.
+
+    Returns:
+        One finding per vehicle, pair and DoF, in that order; empty where the lake has no record in the
+        window.
+
+    Raises:
+        ConfigError: a day is no day, or the window is empty.
+        ContractError: a record was written with another schema version.
+    """
+    method = method or fleet.audit.method
+    records = current_records(
+        [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
+    )
+    first, last = _window(records, from_day, to_day, fleet.audit.window_days)
+    by_vehicle: dict[str, list[CalibrationRecord]] = {v: [] for v in fleet.vehicles}
+    for record in records:
+        if first <= record.day <= last:
+            by_vehicle.setdefault(record.vehicle, []).append(record)
+    if not any(by_vehicle.values()):
+        return []
+    days = {vehicle: _pairs(rows) for vehicle, rows in by_vehicle.items()}
+    scatter = _scatter(list(days.values()))
+    findings: list[DriftFinding] = []
+    for done, vehicle in enumerate(sorted(by_vehicle)):
+        progress(done, len(by_vehicle), vehicle)
+        verdict = judge_vehicle(days[vehicle], scatter, fleet.audit)
+        findings += _write(lake, fleet, vehicle, by_vehicle[vehicle], verdict, (first, last, method))
+    progress(len(by_vehicle), len(by_vehicle), "")
+    return findings
+
+
+def _window(
+    records: Sequence[CalibrationRecord], from_day: str | None, to_day: str | None, days: int
+) -> tuple[str, str]:
+    for name, day in (("from", from_day), ("to", to_day)):
+        if day is not None:
+            try:
+                dt.date.fromisoformat(day)
+            except ValueError as err:
+                raise ConfigError("command line", name, f"{day!r} is no day of the form YYYY-MM-DD") from err
+    last = to_day or max((r.day for r in records), default="9999-12-31")
+    first = from_day or (dt.date.fromisoformat(last) - dt.timedelta(days=days - 1)).isoformat()
+    if first > last:
+        raise ConfigError("command line", "from", f"{first} lies after the window's last day {last}")
+    return first, last
+
+
+def _pairs(records: Sequence[CalibrationRecord]) -> dict[str, PairDays]:
+    """Accepted estimates by pair; held and refused days are gaps: nothing vouches for their numbers."""
+    pairs = {}
+    for pair in PAIRS:
+        rows = [r for r in records if r.pair == pair and r.status == "accepted" and r.covariance is not None]
+        transforms = [transform_of(r) for r in rows]
+        if rows:
+            pairs[pair] = PairDays(
+                np.array([dt.date.fromisoformat(r.day).toordinal() for r in rows]),
+                np.stack([T for T in transforms if T is not None]),
+                np.stack([r.covariance for r in rows if r.covariance is not None]),
+                np.array([r.observable or [True] * 6 for r in rows], dtype=bool),
+            )
+    return pairs
+
+
+def _scatter(fleet_days: Sequence[dict[str, PairDays]]) -> dict[tuple[str, str], float]:
+    charts: dict[tuple[str, str], list[Chart]] = {}
+    for pairs in fleet_days:
+        for pair, pair_days in pairs.items():
+            for dof, chart in charts_of(pair_days).items():
+                charts.setdefault((pair, dof), []).append(chart)
+    return {key: pooled_scatter(found) for key, found in charts.items()}
+
+
+def _write(
+    lake: Lake,
+    fleet: FleetConfig,
+    vehicle: str,
+    records: Sequence[CalibrationRecord],
+    verdict: VehicleVerdict,
+    window: tuple[str, str, str],
+) -> list[DriftFinding]:
+    first, last, method = window
+    inputs = sorted({r.work_key for r in records})
+    config = config_hash(fleet.audit, {"from": first, "to": last, "method": method})
+    key = work_key("audit", CODE_VERSION, config, inputs)
+    findings = []
+    for pair in PAIRS:
+        for dof in DOF_NAMES:
+            chart = verdict.charts.get((pair, dof)) or _no_data(records, pair)
+            base = DriftFinding(
+                vehicle, last, method, pair, dof, chart.status, chart.reason, chart.days_used,
+                limit_of(pair, dof, fleet.audit), key, inputs=inputs,
+            )  # fmt: skip
+            findings.append(_finding(base, chart, verdict.attribution))
+    write_records(lake, DRIFT, Partition(vehicle, last), findings, key, CODE_VERSION, inputs)
+    return findings
+
+
+def _finding(base: DriftFinding, chart: ChartVerdict, moved: Attribution | None) -> DriftFinding:
+    fields = dict(base.__dict__) | {"statistic": chart.statistic, "threshold": chart.threshold}
+    change = chart.change
+    if change is not None:
+        fields |= {
+            "start_day": _iso(change.day),
+            "start_day_earliest": _iso(change.earliest),
+            "start_day_latest": _iso(change.latest),
+            "kind": change.kind,
+            "magnitude": change.size,
+            "magnitude_sigma": change.size_sigma,
+        }
+        if moved is not None:
+            fields["reason"] = f"{chart.reason}; {moved.explanation}"
+            if moved.sensor is not None:
+                fields |= {
+                    "moved_sensor": moved.sensor,
+                    "moved_probability": moved.probability[moved.sensor],
+                    "moved_motion": moved.motion.tolist(),
+                    "moved_motion_sigma": np.sqrt(np.diag(moved.covariance)).tolist(),
+                }
+    return DriftFinding(**fields)
+
+
+def _no_data(records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:
+    found = [r.status for r in records if r.pair == pair]
+    counts = ", ".join(f"{found.count(s)} {s}" for s in ("held", "refused") if s in found)
+    reason = f"no accepted day in the window ({counts})" if counts else "no record in the window"
+    return ChartVerdict("UNKNOWN", reason, 0, None, None, None, None)
+
+
+def _iso(ordinal: int) -> str:
+    return dt.date.fromordinal(ordinal).isoformat()

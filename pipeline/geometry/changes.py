@@ -1,0 +1,38 @@
+"""How far two estimates of one transform differ, in numbers that a mechanic can check.
+
+A change is (rotation vector, shift of the child's origin), both along the axes of the parent frame. Unlike
+the twist of the left perturbation, its translation is the plain difference of the columns tx_m, ty_m, tz_m:
+a sensor that only turned in its bracket shows no shift, whatever its lever arm.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import hat, log_so3
+
+__all__ = ["change_between", "change_covariance", "change_jacobian"]
+
+
+def change_between(
+    T_before: Float[np.ndarray, "4 4"], T_after: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, " 6"]:
+    """Change (rx ry rz [rad], tx ty tz [m]) that leads from one estimate of T_parent_child to another."""
+    rotation = log_so3(T_after[:3, :3] @ T_before[:3, :3].T)
+    return np.concatenate([rotation, T_after[:3, 3] - T_before[:3, 3]])
+
+
+def change_jacobian(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+    """d(change)/d(xi) for a left perturbation exp(xi) T: t moves by rho + omega x t (first order)."""
+    J = np.eye(6)
+    J[3:, :3] = -hat(T[:3, 3])
+    return J
+
+
+def change_covariance(
+    T: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
+) -> Float[np.ndarray, "6 6"]:
+    """Covariance of (rotation vector, origin) of an estimate, given that of its left perturbation."""
+    J = change_jacobian(T)
+    return J @ covariance @ J.T

@@ -1,0 +1,60 @@
+"""The current record of each vehicle, day, method and pair, and the transforms that records carry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import from_quaternion
+from schemas.calibrations import CalibrationRecord
+from schemas.drift import DriftFinding
+
+__all__ = ["current_drift", "current_records", "prior_of", "transform_of"]
+
+
+def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRecord]:
+    """The last record of each (vehicle, day, method, pair), in order of vehicle, day, method and pair.
+
+    Args:
+        records: as `read_records` returns them, oldest file first within a day.
+    """
+    last = {(r.vehicle, r.day, r.method, r.pair): r for r in records}
+    return [last[key] for key in sorted(last)]
+
+
+def current_drift(findings: Sequence[DriftFinding]) -> list[DriftFinding]:
+    """The findings of each vehicle and method's latest audited day, the last file of that day, in order.
+
+    Args:
+        findings: as `read_records` returns them, oldest file first within a day.
+    """
+    newest: dict[tuple[str, str], str] = {}
+    for finding in findings:
+        key = (finding.vehicle, finding.method)
+        newest[key] = max(newest.get(key, ""), finding.day)
+    last = {
+        (f.vehicle, f.method, f.pair, f.dof): f for f in findings if f.day == newest[(f.vehicle, f.method)]
+    }
+    return [last[key] for key in sorted(last)]
+
+
+def transform_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
+    """T_parent_child of a record; None where the day was refused."""
+    return _transform(record.qw, record.qx, record.qy, record.qz, record.tx_m, record.ty_m, record.tz_m)
+
+
+def prior_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
+    """Prior T_parent_child of a record; None where none was given."""
+    return _transform(
+        record.prior_qw, record.prior_qx, record.prior_qy, record.prior_qz,
+        record.prior_tx_m, record.prior_ty_m, record.prior_tz_m,
+    )  # fmt: skip
+
+
+def _transform(*columns: float | None) -> np.ndarray | None:
+    values = [v for v in columns if v is not None]
+    if len(values) != len(columns):
+        return None
+    return from_quaternion(np.array(values[:4]), np.array(values[4:]))

@@ -1,0 +1,103 @@
+"""Calibration records of a small fleet, made by SE(3) algebra with noise of known covariance."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Callable
+
+import numpy as np
+
+from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse, to_quaternion
+from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+
+FIRST_DAY = dt.date(2026, 3, 1)
+# Lidar axes (x forward, y left, z up) seen in the optical frame, sensors where a car has them.
+T_CAMERA_LIDAR = from_rotation_translation(
+    np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.05, -0.4, -0.6])
+)
+T_LIDAR_RADAR = from_rotation_translation(np.eye(3), np.array([2.1, 0.1, -1.3]))
+# One day's sigmas (rx ry rz [deg], tx ty tz [m]) in the axes of lidar_radar and of camera_lidar.
+SIGMA = {
+    "camera_lidar": np.array([0.02, 0.02, 0.02, 0.015, 0.015, 0.02]),
+    "lidar_radar": np.array([0.5, 0.12, 0.05, 0.02, 0.02, 0.2]),
+}
+NO_MOTION = np.zeros(6)
+
+
+def covariance_of(pair: str) -> np.ndarray:
+    """One day's covariance with correlated roll and height."""
+    sigma = SIGMA[pair].copy()
+    sigma[:3] = np.radians(sigma[:3])
+    correlation = np.eye(6)
+    correlation[1, 5] = correlation[5, 1] = 0.5
+    return correlation * np.outer(sigma, sigma)
+
+
+def vehicle_records(
+    vehicle: str,
+    days: int,
+    rng: np.random.Generator,
+    *,
+    motion: Callable[[int], dict[str, np.ndarray]] = lambda _day: {},
+    status: Callable[[int], str] = lambda _day: "accepted",
+    unobservable: tuple[int, ...] = (),
+    noise: float = 1.0,
+) -> list[CalibrationRecord]:
+    """Records of one vehicle, camera_radar composed; `motion(day)`: each sensor's motion so far, own axes."""
+    records = []
+    for day in range(days):
+        moved = motion(day)
+        M = {s: exp_se3(moved.get(s, NO_MOTION)) for s in ("camera", "lidar", "radar")}
+        T = {
+            "camera_lidar": inverse(M["camera"]) @ T_CAMERA_LIDAR @ M["lidar"],
+            "lidar_radar": inverse(M["lidar"]) @ T_LIDAR_RADAR @ M["radar"],
+        }
+        cov = {pair: covariance_of(pair) for pair in T}
+        for pair, clean in T.items():
+            T[pair] = exp_se3(noise * rng.multivariate_normal(np.zeros(6), cov[pair])) @ clean
+        T["camera_radar"] = T["camera_lidar"] @ T["lidar_radar"]
+        A = adjoint(T["camera_lidar"])
+        cov["camera_radar"] = cov["camera_lidar"] + A @ cov["lidar_radar"] @ A.T
+        records += [
+            _record(vehicle, day, pair, T[pair], cov[pair], status(day), unobservable) for pair in PAIRS
+        ]
+    return records
+
+
+def _record(
+    vehicle: str,
+    day: int,
+    pair: str,
+    T: np.ndarray,
+    cov: np.ndarray,
+    status: str,
+    unobservable: tuple[int, ...],
+) -> CalibrationRecord:
+    parent, child = FRAMES_OF_PAIR[pair]
+    prior = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_LIDAR_RADAR}.get(pair)
+    prior = T_CAMERA_LIDAR @ T_LIDAR_RADAR if prior is None else prior
+    prior_q = to_quaternion(prior).tolist()
+    common = {
+        "vehicle": vehicle, "day": (FIRST_DAY + dt.timedelta(days=day)).isoformat(), "method": "joint",
+        "pair": pair,
+        "parent_frame": parent, "child_frame": child, "status": status, "seed": 0, "frames_total": 120,
+        "reason": "" if status == "accepted" else "held-out frames are no better than at the prior",
+        "work_key": f"{vehicle}-{day}", "code_version": "0.1.0", "environment": "urban", "triggered": day > 1,
+        "frames_used": 0 if status == "refused" else 80, "frames_rejected": {"no road users": 25, "sync": 15},
+        "prior_qw": prior_q[0], "prior_qx": prior_q[1], "prior_qy": prior_q[2], "prior_qz": prior_q[3],
+        "prior_tx_m": prior[0, 3], "prior_ty_m": prior[1, 3], "prior_tz_m": prior[2, 3],
+        "prior_covariance": np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3),
+        "trigger_before": {"lidar_outside_fraction": 0.04}, "trigger_after": {"lidar_outside_fraction":
+        0.004},
+        "inputs": ["observations"],
+    }  # fmt: skip
+    if status == "refused":
+        return CalibrationRecord(**common)
+    q = to_quaternion(T).tolist()
+    seen = [k not in unobservable for k in range(6)]
+    return CalibrationRecord(
+        **common, qw=q[0], qx=q[1], qy=q[2], qz=q[3], tx_m=T[0, 3], ty_m=T[1, 3], tz_m=T[2, 3],
+        covariance=cov, observability=[0.97 if s else 0.05 for s in seen], observable=seen,
+        alignment_before=0.62, alignment_after=0.41, time_offset_s=0.021, time_offset_sigma_s=0.004,
+        notes=["no highway: radar roll is weak"], diagnostics={"halves_rotation_deg": 0.04},
+    )  # fmt: skip

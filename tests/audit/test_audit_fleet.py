@@ -1,0 +1,165 @@
+"""The audit from table calibrations to table drift."""
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from pipeline.audit.run import audit_fleet
+from pipeline.audit.vehicle import PairDays, judge_vehicle
+from pipeline.config import AuditConfig, FleetConfig
+from pipeline.errors import ConfigError
+from pipeline.store.current import current_drift
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_records, write_records
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.drift import DRIFT, DriftFinding
+
+KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])
+
+
+def _fleet(*vehicles: str) -> FleetConfig:
+    semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
+    rig = {
+        "camera": {"image": "/i", "info": "/c", "semantics": semantics},
+        "lidar": {"points": "/p"},
+        "radar": {"points": "/r"},
+    }
+    return FleetConfig.model_validate(
+        {"fleet": {"name": "test"}, "rigs": {"default": rig}, "vehicles": {v: {} for v in vehicles}}
+    )
+
+
+def _write(lake: Lake, records: list[CalibrationRecord], suffix: str = "") -> None:
+    for vehicle, day in sorted({(r.vehicle, r.day) for r in records}):
+        rows = [r for r in records if (r.vehicle, r.day) == (vehicle, day)]
+        key = rows[0].work_key + suffix
+        write_records(lake, CALIBRATIONS, Partition(vehicle, day), rows, key, "0.1.0")
+
+
+def _alarms(findings: list[DriftFinding]) -> list[DriftFinding]:
+    return [f for f in findings if f.status in ("RED", "YELLOW")]
+
+
+def test_a_knocked_radar_is_found_on_its_vehicle_sensor_and_day(tmp_path: Path, maker: ModuleType) -> None:
+    rng = np.random.default_rng(11)
+    lake = Lake.at(tmp_path)
+    for vehicle, motion in (("a", {}), ("b", {"radar": KNOCK}), ("c", {})):
+        _write(lake, maker.vehicle_records(vehicle, 4, rng, motion=lambda d, m=motion: m if d > 1 else {}))
+    findings = audit_fleet(lake, _fleet("a", "b", "c"), None, None, "joint")
+    assert len(findings) == 3 * 18
+    assert {f.vehicle for f in _alarms(findings)} == {"b"}
+    red = [f for f in findings if f.status == "RED"]
+    assert {(f.pair, f.dof) for f in red} >= {("lidar_radar", "rz"), ("camera_radar", "ry")}
+    assert {f.moved_sensor for f in red} == {"radar"}
+    assert {f.start_day for f in red} == {"2026-03-03"}
+    yaw = next(f for f in red if (f.pair, f.dof) == ("lidar_radar", "rz"))
+    assert yaw.magnitude == pytest.approx(np.radians(1.0), abs=4 * (yaw.magnitude_sigma or 0))
+    assert yaw.moved_motion is not None
+    assert yaw.moved_motion[2] == pytest.approx(np.radians(1.0), abs=4 * yaw.moved_motion_sigma[2])
+    assert all(f.status != "RED" for f in findings if f.pair == "camera_lidar")
+
+
+def test_a_vehicle_raises_no_more_false_alarms_than_its_budget(maker: ModuleType) -> None:
+    rng = np.random.default_rng(2)
+    config = AuditConfig(false_alarms_per_1000_vehicle_days=100.0)  # 0.1 per audit: 300 audits can tell
+    from pipeline.store.current import transform_of
+
+    trials, alarms = 300, 0
+    for _ in range(trials):
+        records = maker.vehicle_records("v", 4, rng)
+        pairs = {}
+        for pair in PAIRS:
+            rows = [r for r in records if r.pair == pair]
+            pairs[pair] = PairDays(
+                np.arange(4),
+                np.stack([transform_of(r) for r in rows]),
+                np.stack([r.covariance for r in rows]),
+                np.ones((4, 6), bool),
+            )
+        verdict = judge_vehicle(pairs, {}, config)
+        alarms += any(v.change for v in verdict.charts.values())
+    assert 0 < alarms <= trials * 0.1 + 3 * np.sqrt(trials * 0.1 * 0.9)
+
+
+def test_a_slow_drift_of_the_camera_is_told_from_a_knock(tmp_path: Path, maker: ModuleType) -> None:
+    rng = np.random.default_rng(4)
+    lake = Lake.at(tmp_path)
+    rate = np.array([0, np.radians(0.03), 0, 0, 0, 0])
+    _write(lake, maker.vehicle_records("v", 20, rng, motion=lambda d: {"camera": rate * max(0, d - 4)}))
+    red = [f for f in audit_fleet(lake, _fleet("v")) if f.status == "RED"]
+    assert ("camera_lidar", "ry") in {(f.pair, f.dof) for f in red}
+    yaw = next(f for f in red if (f.pair, f.dof) == ("camera_lidar", "ry"))
+    assert (yaw.kind, yaw.moved_sensor) == ("slow drift", "camera")
+
+
+def test_held_and_refused_days_are_gaps(tmp_path: Path, maker: ModuleType) -> None:
+    rng = np.random.default_rng(5)
+    lake = Lake.at(tmp_path)
+    status = {3: "held", 4: "refused", 8: "refused"}
+    _write(
+        lake,
+        maker.vehicle_records(
+            "v",
+            10,
+            rng,
+            motion=lambda d: {"radar": KNOCK} if d > 4 else {},
+            status=lambda d: status.get(d, "accepted"),
+        ),
+    )
+    findings = audit_fleet(lake, _fleet("v"))
+    yaw = next(f for f in findings if (f.pair, f.dof) == ("lidar_radar", "rz"))
+    assert (yaw.status, yaw.days_used) == ("RED", 7)
+    assert (yaw.start_day_earliest, yaw.start_day_latest) == ("2026-03-04", "2026-03-06")
+    assert yaw.start_day == "2026-03-06"
+
+
+def test_what_no_day_determined_is_unknown_and_so_is_a_vehicle_without_records(
+    tmp_path: Path, maker: ModuleType
+) -> None:
+    lake = Lake.at(tmp_path)
+    _write(lake, maker.vehicle_records("v", 6, np.random.default_rng(6), unobservable=(0, 5)))
+    findings = audit_fleet(lake, _fleet("v", "parked"))
+    unseen = [f for f in findings if f.vehicle == "v" and f.dof in ("rx", "tz")]
+    assert {(f.status, f.days_used) for f in unseen} == {("UNKNOWN", 0)}
+    parked = [f for f in findings if f.vehicle == "parked"]
+    assert {f.status for f in parked} == {"UNKNOWN"}
+    assert {f.reason for f in parked} == {"no record in the window"}
+
+
+def test_the_last_record_of_a_day_counts_and_drift_is_append_only(tmp_path: Path, maker: ModuleType) -> None:
+    lake = Lake.at(tmp_path)
+    records = maker.vehicle_records("v", 4, np.random.default_rng(7))
+    rng = np.random.default_rng(8)
+    _write(lake, maker.vehicle_records("v", 4, rng, motion=lambda d: {"radar": KNOCK * d}))
+    assert _alarms(audit_fleet(lake, _fleet("v")))
+    _write(lake, records, suffix="-again")
+    findings = audit_fleet(lake, _fleet("v"))
+    assert not _alarms(findings)
+    table = read_records(lake, DRIFT, DriftFinding, vehicle="v")
+    assert len(table) in (18, 36)  # the same work key writes the same file, another one adds a file
+    assert [f.status for f in current_drift(table)] == [f.status for f in sorted(findings, key=_key)]
+
+
+def _key(f: DriftFinding) -> tuple[str, str, str, str]:
+    return f.vehicle, f.method, f.pair, f.dof
+
+
+def test_the_same_audit_writes_the_same_file(tmp_path: Path, maker: ModuleType) -> None:
+    lake = Lake.at(tmp_path)
+    _write(lake, maker.vehicle_records("v", 4, np.random.default_rng(9)))
+    first = audit_fleet(lake, _fleet("v"))
+    second = audit_fleet(lake, _fleet("v"))
+    assert first == second
+    assert len(list(tmp_path.glob("drift/vehicle=v/day=*/*.parquet"))) == 1
+
+
+def test_an_impossible_window_names_its_key(tmp_path: Path, maker: ModuleType) -> None:
+    lake = Lake.at(tmp_path)
+    assert audit_fleet(lake, _fleet("v")) == []
+    _write(lake, maker.vehicle_records("v", 3, np.random.default_rng(1)))
+    with pytest.raises(ConfigError, match="from"):
+        audit_fleet(lake, _fleet("v"), "2026-03-09", "2026-03-01")
+    with pytest.raises(ConfigError, match="yesterday"):
+        audit_fleet(lake, _fleet("v"), None, "yesterday")
