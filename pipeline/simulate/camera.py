@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numba
@@ -12,10 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from pipeline.geometry.cameras import Camera
+from pipeline.simulate.casting import Moment
 from pipeline.simulate.materials import TABLE, texture, value_noise
-
-if TYPE_CHECKING:
-    from pipeline.simulate.casting import Moment
 
 __all__ = ["View", "encode_jpeg", "render", "view_of"]
 
@@ -50,7 +48,7 @@ def view_of(moment: Moment, camera: Camera, T_map_camera: Float[np.ndarray, "4 4
     half = _rays_of(camera.scaled(0.5)) @ R.T
     full = _rays_of(camera) @ R.T
     coarse = _seen(moment, origin, half.reshape(-1, 3)).reshape(half.shape[:2])
-    guess, unsure = _upsampled(coarse, camera.height_px, camera.width_px)
+    guess, unsure = _upsampled(coarse, _surfaces(moment), camera.height_px, camera.width_px)
     guess.reshape(-1)[unsure] = _seen(moment, origin, full.reshape(-1, 3)[unsure])
     return View(coarse, guess, full, origin)
 
@@ -59,9 +57,18 @@ def _seen(moment: Moment, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     return moment.cast(np.broadcast_to(origin, rays.shape), rays, np.zeros(len(rays), np.float32)).triangle
 
 
+def _surfaces(moment: Moment) -> np.ndarray:
+    """A number per triangle that neighbours on one smooth surface share (material, body, tint); last row: the sky."""
+    mesh = moment.mesh
+    tint = (mesh.tint[:, 0] * 977 + mesh.tint[:, 2] * 131).astype(np.int64)
+    return np.append((mesh.instance.astype(np.int64) * 64 + mesh.material) * 4096 + tint, -1)
+
+
 @numba.njit(cache=True)
-def _upsampled(coarse: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles at full size, and flat indices of pixels where the half-size neighbourhood is not of one triangle."""
+def _upsampled(
+    coarse: np.ndarray, surface: np.ndarray, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles at full size, and flat indices of pixels where the half-size neighbourhood is not of one surface."""
     h, w = coarse.shape
     out = np.empty((height, width), np.int32)
     unsure = np.empty(height * width, np.int64)
@@ -72,9 +79,9 @@ def _upsampled(coarse: np.ndarray, height: int, width: int) -> tuple[np.ndarray,
         for u in range(width):
             j = min(u // 2, w - 1)
             j2 = min(max(j + (1 if u % 2 else -1), 0), w - 1)
-            a = coarse[i, j]
-            out[v, u] = a
-            if a != coarse[i2, j] or a != coarse[i, j2] or a != coarse[i2, j2]:
+            out[v, u] = coarse[i, j]
+            a = surface[coarse[i, j]]
+            if a != surface[coarse[i2, j]] or a != surface[coarse[i, j2]] or a != surface[coarse[i2, j2]]:
                 unsure[n] = v * width + u
                 n += 1
     return out, unsure[:n]
@@ -236,25 +243,39 @@ def _grain() -> np.ndarray:
     return np.random.default_rng(5).standard_normal((1400, 2400, 3), dtype=np.float32)
 
 
+@lru_cache(maxsize=1)
+def _gamma() -> np.ndarray:
+    """8-bit value of a linear one in 4096 steps."""
+    return (255.0 * np.linspace(0, 1, 4097) ** (1 / 2.2)).astype(np.float32)
+
+
 def _exposed(linear: np.ndarray, exposure: float, noise_8bit: float, rng: np.random.Generator) -> np.ndarray:
     """Optics (point spread, vignetting), sensor noise, gamma, 8 bits; RGB in, BGR out."""
     h, w = linear.shape[:2]
     blurred = cv2.GaussianBlur(linear, (3, 3), 0.55)
-    curve = cv2.pow(
-        np.minimum(blurred * np.float32(exposure) * _vignette(h, w), 1.0, dtype=np.float32), 1 / 2.2
-    )
     a, b = int(rng.integers(0, 1400 - h + 1)), int(rng.integers(0, 2400 - w + 1))
-    # Shot noise is largest in the shadows after the gamma.
-    noisy = curve * np.float32(255) + _grain()[a : a + h, b : b + w] * (
-        np.float32(noise_8bit) * (np.float32(1.35) - curve)
+    return _developed(
+        blurred, np.float32(exposure), _grain()[a : a + h, b : b + w], np.float32(noise_8bit), _gamma()
     )
-    return cv2.cvtColor(np.clip(noisy, 0, 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
 
 
-@lru_cache(maxsize=4)
-def _vignette(h: int, w: int) -> np.ndarray:
-    y, x = np.mgrid[-1 : 1 : h * 1j, -1 : 1 : w * 1j]
-    return (1 - 0.22 * (x * x + 0.35 * y * y))[..., None].astype(np.float32)
+@numba.njit(cache=True, fastmath=True)
+def _developed(
+    linear: np.ndarray, exposure: float, grain: np.ndarray, noise: float, curve: np.ndarray
+) -> np.ndarray:
+    h, w, _ = linear.shape
+    out = np.empty((h, w, 3), np.uint8)
+    for i in range(h):
+        y = 2.0 * i / (h - 1) - 1.0
+        for j in range(w):
+            x = 2.0 * j / (w - 1) - 1.0
+            gain = exposure * (1.0 - 0.22 * (x * x + 0.35 * y * y)) * 4096.0
+            for c in range(3):
+                value = curve[int(min(linear[i, j, c] * gain, 4096.0))]
+                # Shot noise is largest in the shadows after the gamma.
+                value += grain[i, j, c] * noise * (1.35 - value / 255.0)
+                out[i, j, 2 - c] = min(max(value, 0.0), 255.0)
+    return out
 
 
 def encode_jpeg(image_bgr: np.ndarray, quality: int) -> bytes:

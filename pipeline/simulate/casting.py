@@ -8,19 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numba
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.simulate.actors import VARIANTS, actor_mesh
+from pipeline.simulate.drives import Drive
 from pipeline.simulate.meshes import Mesh, join
 from pipeline.simulate.scenes import CHUNK_M, chunk_mesh
 from pipeline.simulate.traffic import Actor, actors_at
-
-if TYPE_CHECKING:
-    from pipeline.simulate.drives import Drive
 
 __all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World"]
 
@@ -56,6 +54,7 @@ class Standing:
     mesh: Mesh
     scene: Any
     shadows: ShadowMap
+    normals: np.ndarray
 
 
 class World:
@@ -86,7 +85,9 @@ class World:
             scene = _scene(mesh)
             self._window, self._standing = (
                 window,
-                Standing(origin, mesh, scene, _shadows(self.drive, scene, origin, s_m)),
+                Standing(
+                    origin, mesh, scene, _shadows(self.drive, scene, origin, s_m), _normals(mesh.corners)
+                ),
             )
         return self._standing
 
@@ -104,28 +105,30 @@ class Moment:
     actors: list[Actor]
     t_s: float
 
+    def advanced(self, t_s: float) -> Moment:
+        """The same world some milliseconds later or earlier."""
+        return Moment(self.standing, [a.advanced(t_s - self.t_s) for a in self.actors], t_s)
+
     @cached_property
     def mesh(self) -> Mesh:
         """All triangles, in map coordinates less the window's origin: the standing ones, then actor by actor."""
         parts = [self.standing.mesh]
         for actor in self.actors:
-            proto = actor_mesh(actor.kind, actor.variant)
-            R, t = (
-                actor.T_map_actor[:3, :3].astype(np.float32),
-                (actor.T_map_actor[:3, 3] - self.standing.origin).astype(np.float32),
-            )
-            corners = proto.corners @ R.T + t
-            parts.append(
-                Mesh(corners, proto.material, proto.tint, proto.uv, np.full(len(proto), actor.key, np.int32))
-            )
+            proto, R = actor_mesh(actor.kind, actor.variant), actor.T_map_actor[:3, :3].astype(np.float32)
+            corners = proto.corners @ R.T + self._place(actor)
+            ids = np.full(len(proto), actor.key, np.int32)
+            parts.append(Mesh(corners, proto.material, proto.tint, proto.uv, ids))
         return join(parts)
 
     @cached_property
     def normals(self) -> Float[np.ndarray, "T 3"]:
         """Unit normals of the triangles, of either side."""
-        c = self.mesh.corners
-        n = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
-        return n / np.linalg.norm(n, axis=1, keepdims=True)
+        parts = [self.standing.normals]
+        for actor in self.actors:
+            parts.append(
+                _prototype(actor.kind, actor.variant).normals @ actor.T_map_actor[:3, :3].T.astype(np.float32)
+            )
+        return np.concatenate(parts)
 
     @cached_property
     def velocity_of_triangle(self) -> Float[np.ndarray, "T 3"]:
@@ -138,7 +141,10 @@ class Moment:
     @cached_property
     def _starts(self) -> list[int]:
         sizes = [len(self.standing.mesh)] + [len(actor_mesh(a.kind, a.variant)) for a in self.actors]
-        return [int(n) for n in np.cumsum(sizes)[:-1]] if self.actors else []
+        return [int(n) for n in np.cumsum(sizes)[:-1]]
+
+    def _place(self, actor: Actor) -> np.ndarray:
+        return (actor.T_map_actor[:3, 3] - self.standing.origin).astype(np.float32)
 
     def cast(
         self,
@@ -147,37 +153,67 @@ class Moment:
         delay_s: Float[np.ndarray, " N"],
     ) -> Hits:
         """First hits of rays given in map coordinates less the window's origin, `delay_s` after this moment."""
-        origins, directions = (
-            np.ascontiguousarray(origins, np.float32),
-            np.ascontiguousarray(directions, np.float32),
-        )
+        origins = np.ascontiguousarray(origins, np.float32)
+        directions = np.ascontiguousarray(directions, np.float32)
+        delay = delay_s.astype(np.float32)
         range_m, triangle, barycentric = _cast(self.standing.scene, origins, directions)
+        axis, cosine = _cone(directions)
         for actor, start in zip(self.actors, self._starts, strict=True):
-            proto, scene, reach, centre = _prototype(actor.kind, actor.variant)
-            R = actor.T_map_actor[:3, :3].astype(np.float32)
-            v = actor.velocity_map.astype(np.float32)
-            p = (actor.T_map_actor[:3, 3] - self.standing.origin).astype(np.float32)
-            near = _near(
-                origins, directions, delay_s.astype(np.float32), p + R @ centre, v, np.float32(reach), range_m
-            )
+            proto = _prototype(actor.kind, actor.variant)
+            R, v = actor.T_map_actor[:3, :3].astype(np.float32), actor.velocity_map.astype(np.float32)
+            p = self._place(actor)
+            centre = p + R @ proto.centre
+            if not _may_be_seen(centre - origins[0], proto.reach_m + 3.0, axis, cosine):
+                continue
+            near = _near(origins, directions, delay, centre, v, np.float32(proto.reach_m), range_m)
             if not near.size:
                 continue
-            o = (origins[near] - p - v * delay_s[near, None].astype(np.float32)) @ R
-            r, k, b = _cast(scene, o, directions[near] @ R)
+            o = (origins[near] - p - v * delay[near, None]) @ R
+            r, k, b = _cast(proto.scene, o, directions[near] @ R)
             closer = r < range_m[near]
             hit = near[closer]
             range_m[hit], triangle[hit], barycentric[hit] = r[closer], k[closer] + start, b[closer]
-            assert len(proto)
         return Hits(range_m, triangle, barycentric)
 
 
+@dataclass(frozen=True, eq=False)
+class _Prototype:
+    """An actor's scene and normals in its own frame, and the sphere around it."""
+
+    scene: Any
+    normals: np.ndarray
+    reach_m: float
+    centre: np.ndarray
+
+
 @lru_cache(maxsize=128)
-def _prototype(kind: str, variant: int) -> tuple[Mesh, Any, float, np.ndarray]:
-    """An actor's mesh, its scene, and the sphere around it."""
+def _prototype(kind: str, variant: int) -> _Prototype:
     mesh = actor_mesh(kind, variant % VARIANTS[kind])
     points = mesh.corners.reshape(-1, 3)
     centre = (points.min(0) + points.max(0)) / 2
-    return mesh, _scene(mesh), float(np.linalg.norm(points - centre, axis=1).max()), centre.astype(np.float32)
+    reach = float(np.linalg.norm(points - centre, axis=1).max())
+    return _Prototype(_scene(mesh), _normals(mesh.corners), reach, centre.astype(np.float32))
+
+
+def _normals(corners: np.ndarray) -> np.ndarray:
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+
+def _cone(directions: np.ndarray) -> tuple[np.ndarray, float]:
+    """Middle of some unit vectors, and the cosine of the widest angle from it."""
+    axis = directions[:: max(len(directions) // 512, 1)].mean(0)
+    axis /= max(float(np.linalg.norm(axis)), 1e-6)
+    return axis, float((directions @ axis).min())
+
+
+def _may_be_seen(centre: np.ndarray, reach_m: float, axis: np.ndarray, cosine: float) -> bool:
+    """Whether a sphere can meet a cone of rays from the origin."""
+    distance = float(np.linalg.norm(centre))
+    if distance <= reach_m or cosine < 0:
+        return True
+    widest = np.arccos(np.clip(cosine, -1, 1)) + np.arcsin(reach_m / distance)
+    return bool(np.arccos(np.clip(centre @ axis / distance, -1, 1)) < widest)
 
 
 def _scene(mesh: Mesh) -> Any:
@@ -232,9 +268,9 @@ def _near(
 
 def _shadows(drive: Drive, scene: Any, origin: np.ndarray, s_m: float) -> ShadowMap:
     """Cast the ground towards the sun once per window."""
-    cell, half = 0.3, 24.0
-    s0 = s_m - 15.0
-    s, d = np.meshgrid(np.arange(s0, s_m + 110.0, cell), np.arange(-half, half, cell), indexing="ij")
+    cell, half = 0.4, 22.0
+    s0 = s_m - 8.0
+    s, d = np.meshgrid(np.arange(s0, s_m + 95.0, cell), np.arange(-half, half, cell), indexing="ij")
     ground = drive.road.to_map(np.stack([s.ravel(), d.ravel(), np.full(s.size, 0.2)], 1)) - origin
     sun = np.broadcast_to(drive.sun, ground.shape)
     hit = _cast(scene, ground.astype(np.float32), sun.astype(np.float32))[1] >= 0

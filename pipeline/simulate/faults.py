@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3
-
-if TYPE_CHECKING:
-    from pipeline.simulate.rigs import Mounting
+from pipeline.simulate.rigs import Mounting
 
 __all__ = ["KINDS", "DayFaults", "Fault", "faults_on", "parse_faults", "shaken"]
 

@@ -7,7 +7,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, date, datetime, timedelta
 from multiprocessing import get_context
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,16 +19,11 @@ from pipeline.simulate.casting import World
 from pipeline.simulate.drives import Drive
 from pipeline.simulate.faults import DayFaults, Fault, faults_on, misread, shaken
 from pipeline.simulate.frames import SimulatedFrame, frame_at
-from pipeline.simulate.logs import CONTAINERS, TOPICS, log_name, open_log
+from pipeline.simulate.logs import CONTAINERS, TOPICS, Put, log_name, open_log
+from pipeline.simulate.messages import Messages
 from pipeline.simulate.rigs import Mounting, RigSpec, mounting_of, rig_named
 from pipeline.simulate.semantics import SemanticsSpec
 from pipeline.simulate.toml import fleet_toml
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.simulate.logs import Put
-    from pipeline.simulate.messages import Messages
 
 __all__ = ["FleetSpec", "day_names", "simulate_fleet", "simulate_vehicle_day", "vehicle_names"]
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.simulate.camera import encode_jpeg, render, view_of
+from pipeline.simulate.casting import World
 from pipeline.simulate.lidar import Sweep, sweep_lidar
 from pipeline.simulate.radar import RadarErrors, Scan, scan_radar
+from pipeline.simulate.rigs import Mounting, RigSpec
 from pipeline.simulate.semantics import (
     Box,
     SemanticsSpec,
@@ -19,10 +20,6 @@ from pipeline.simulate.semantics import (
     noisy_boxes,
     noisy_labels,
 )
-
-if TYPE_CHECKING:
-    from pipeline.simulate.casting import World
-    from pipeline.simulate.rigs import Mounting, RigSpec
 
 __all__ = ["SimulatedFrame", "frame_at"]
 
@@ -55,7 +52,7 @@ def frame_at(
     camera_stamp, radar_stamp = stamp_s + np.clip(rng.normal(0, rig.sync_jitter_s, 2), -0.0045, 0.0045)
     sweep_moment = world.moment(stamp_s - rig.lidar.sweep_s / 2)
     sweep = sweep_lidar(sweep_moment, drive.ego, mounting.T_vehicle_lidar, rig.lidar, stamp_s, rng)
-    exposure = world.moment(float(camera_stamp - mounting.camera_delay_s))
+    exposure = sweep_moment.advanced(float(camera_stamp - mounting.camera_delay_s))
     T_map_camera = drive.ego.poses(np.array([exposure.t_s]))[0] @ mounting.T_vehicle_camera
     view = view_of(exposure, mounting.camera, T_map_camera)
     image = render(exposure, view, drive.sun, rng, night=drive.night)
@@ -63,7 +60,7 @@ def frame_at(
     boxes = noisy_boxes(
         boxes_of(exposure, view.coarse), (mounting.camera.width_px, mounting.camera.height_px), semantics, rng
     )
-    scan_moment = world.moment(float(radar_stamp - mounting.radar_delay_s))
+    scan_moment = sweep_moment.advanced(float(radar_stamp - mounting.radar_delay_s))
     errors = RadarErrors(mounting.radar_range_bias_m, mounting.radar_elevation_bias_rad)
     scan = scan_radar(scan_moment, drive, mounting.T_vehicle_radar, rig.radar, errors, rng)
     return SimulatedFrame(

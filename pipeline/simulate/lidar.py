@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.spherical import from_spherical
-from pipeline.simulate.materials import LABELS, TABLE
-
-if TYPE_CHECKING:
-    from pipeline.simulate.casting import Hits, Moment
-    from pipeline.simulate.drives import EgoMotion
-    from pipeline.simulate.rigs import LidarSpec
+from pipeline.simulate.casting import Hits, Moment
+from pipeline.simulate.drives import EgoMotion
+from pipeline.simulate.materials import LABELS, TABLE, textures
+from pipeline.simulate.rigs import LidarSpec
 
 __all__ = ["Sweep", "sweep_lidar"]
 
@@ -95,7 +93,9 @@ def _echo(
     cosine = np.abs(np.einsum("ij,ij->i", moment.normals[k], rays[found].astype(np.float32)))
     # Dark paint and cloth are dark to the lidar too, though less so.
     reflectivity = TABLE.reflectivity[m] * (0.25 + 0.75 * np.minimum(moment.mesh.tint[k].mean(1), 1.0))
-    pane = rng.random(len(k)) < TABLE.glass[m]
+    gain, glass = textures(TABLE.texture[m], _surface_coordinates(moment, k, hits.barycentric[found]))
+    reflectivity = reflectivity * (0.4 + 0.6 * gain)  # what is worn for the eye is partly so in the infrared
+    pane = rng.random(len(k)) < np.maximum(TABLE.glass[m], glass)
     r = np.where(
         label == _VEGETATION, r + rng.exponential(0.15, len(k)), r
     ) + spec.range_sigma_m * rng.standard_normal(len(k))
@@ -111,6 +111,11 @@ def _echo(
     range_m[back], labels[back] = r[~lost], label[~lost]
     strength[back] = (reflectivity * cosine**0.35)[~lost]
     return range_m, strength, labels
+
+
+def _surface_coordinates(moment: Moment, triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+    uv, (b, c) = moment.mesh.uv[triangle], barycentric.T[..., None]
+    return uv[:, 0] * (1 - b - c) + uv[:, 1] * b + uv[:, 2] * c
 
 
 def _mixed(

@@ -47,29 +47,29 @@ class Material:
 
 
 MATERIALS: Final = (
-    Material("asphalt", "road", (0.115, 0.115, 0.12), 0.10, 0.02, _ASPHALT),
-    Material("asphalt_patch", "road", (0.075, 0.075, 0.08), 0.085, 0.02, _ASPHALT),
-    Material("paint", "road", (0.62, 0.62, 0.6), 0.62, 0.02, _WORN),
+    Material("asphalt", "road", (0.115, 0.115, 0.12), 0.10, 0.05, _ASPHALT),
+    Material("asphalt_patch", "road", (0.075, 0.075, 0.08), 0.085, 0.05, _ASPHALT),
+    Material("paint", "road", (0.62, 0.62, 0.6), 0.62, 0.05, _WORN),
     Material("paint_yellow", "road", (0.6, 0.45, 0.1), 0.5, 0.02, _WORN),
     Material("manhole", "road", (0.07, 0.065, 0.06), 0.16, 0.5, _CONCRETE),
-    Material("paving", "sidewalk", (0.30, 0.29, 0.27), 0.27, 0.04, _PAVING),
-    Material("kerb", "sidewalk", (0.38, 0.37, 0.35), 0.33, 0.5, _CONCRETE),
-    Material("facade", "building", (0.42, 0.36, 0.30), 0.32, 0.7, _FACADE),
+    Material("paving", "sidewalk", (0.30, 0.29, 0.27), 0.27, 0.1, _PAVING),
+    Material("kerb", "sidewalk", (0.38, 0.37, 0.35), 0.33, 1.5, _CONCRETE),
+    Material("facade", "building", (0.42, 0.36, 0.30), 0.32, 1.2, _FACADE),
     Material("roof", "building", (0.28, 0.13, 0.09), 0.25, 0.3, _PAVING),
-    Material("stone", "wall", (0.36, 0.34, 0.31), 0.32, 0.5, _CONCRETE),
-    Material("noise_wall", "wall", (0.30, 0.33, 0.28), 0.33, 0.5, _SLATS),
-    Material("slats", "fence", (0.27, 0.18, 0.11), 0.38, 0.3, _SLATS),
-    Material("rail", "fence", (0.45, 0.46, 0.47), 0.40, 6.0, _CONCRETE),
+    Material("stone", "wall", (0.36, 0.34, 0.31), 0.32, 0.9, _CONCRETE),
+    Material("noise_wall", "wall", (0.30, 0.33, 0.28), 0.33, 0.9, _SLATS),
+    Material("slats", "fence", (0.27, 0.18, 0.11), 0.38, 0.6, _SLATS),
+    Material("rail", "fence", (0.45, 0.46, 0.47), 0.40, 14.0, _CONCRETE),
     Material("metal_pole", "pole", (0.30, 0.31, 0.32), 0.32, 25.0, _CONCRETE),
-    Material("delineator", "pole", (0.72, 0.72, 0.70), 0.75, 1.0),
+    Material("delineator", "pole", (0.72, 0.72, 0.70), 0.75, 2.0),
     Material("signal_box", "traffic light", (0.05, 0.055, 0.05), 0.10, 8.0),
     Material("signal_lamp", "traffic light", (0.7, 0.1, 0.05), 0.3, 1.0, glow=0.9),
     Material("sign_face", "traffic sign", (0.7, 0.7, 0.7), 2.5, 8.0),
     Material("sign_back", "traffic sign", (0.33, 0.34, 0.35), 0.35, 8.0),
-    Material("foliage", "vegetation", (0.10, 0.19, 0.05), 0.48, 0.12, _FOLIAGE),
-    Material("bark", "vegetation", (0.17, 0.13, 0.09), 0.30, 0.6, _CONCRETE),
-    Material("grass", "terrain", (0.15, 0.23, 0.07), 0.45, 0.05, _GRASS),
-    Material("soil", "terrain", (0.24, 0.20, 0.13), 0.28, 0.05, _GRASS),
+    Material("foliage", "vegetation", (0.10, 0.19, 0.05), 0.48, 0.35, _FOLIAGE),
+    Material("bark", "vegetation", (0.17, 0.13, 0.09), 0.30, 1.0, _CONCRETE),
+    Material("grass", "terrain", (0.15, 0.23, 0.07), 0.45, 0.18, _GRASS),
+    Material("soil", "terrain", (0.24, 0.20, 0.13), 0.28, 0.15, _GRASS),
     Material("skin", "person", (0.45, 0.30, 0.22), 0.5, 1.0),
     Material("cloth", "person", (1.0, 1.0, 1.0), 0.40, 1.5),
     Material("rider_cloth", "rider", (1.0, 1.0, 1.0), 0.40, 1.5),
@@ -180,3 +180,12 @@ def texture(kind: int, u: float, v: float) -> tuple[float, float]:
             value_noise(u * 6.0, v * 6.0) > 0.78
         ), 0.0
     return 1.0, 0.0
+
+
+@numba.njit(cache=True)
+def textures(kinds: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`texture` of many surface points."""
+    gain, glass = np.empty(len(kinds)), np.empty(len(kinds))
+    for i in range(len(kinds)):
+        gain[i], glass[i] = texture(kinds[i], uv[i, 0], uv[i, 1])
+    return gain, glass

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
-
-    from pipeline.geometry.cameras import Camera
-    from pipeline.simulate.semantics import Box
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import to_quaternion
+from pipeline.simulate.semantics import Box
 
 __all__ = ["FRAMES", "Messages"]
 
@@ -35,15 +35,22 @@ _TFMESSAGE: Final = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[]
 _FLOAT32, _UINT16 = 7, 4
 
 
+@lru_cache(maxsize=2)
+def _typestore(ros_version: int) -> Any:
+    """All types that the logs need; compiled once per process."""
+    store = get_typestore(Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_HUMBLE)
+    for name, text in (_VISION | _TFMESSAGE).items():
+        if name not in store.types:
+            store.register(get_types_from_msg(text, name))
+    return store
+
+
 class Messages:
     """Makes messages of ROS version 1 or 2."""
 
     def __init__(self, ros_version: int) -> None:
         self.ros_version = ros_version
-        self.typestore = get_typestore(Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_HUMBLE)
-        for name, text in (_VISION | _TFMESSAGE).items():
-            if name not in self.typestore.types:
-                self.typestore.register(get_types_from_msg(text, name))
+        self.typestore = _typestore(ros_version)
 
     def make(self, name: str, /, **fields: Any) -> Any:
         """A message of a type; name as "sensor_msgs/PointCloud2"."""
@@ -164,8 +171,6 @@ class Messages:
         )  # fmt: skip
 
     def _pose(self, T: np.ndarray) -> Any:
-        from pipeline.geometry.se3 import to_quaternion  # noqa: PLC0415
-
         w, x, y, z = (float(q) for q in to_quaternion(T))
         position = self.make("geometry_msgs/Point", x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3]))
         return self.make(

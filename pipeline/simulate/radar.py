@@ -6,19 +6,17 @@ Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Lo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.simulate.casting import Moment
+from pipeline.simulate.drives import Drive
 from pipeline.simulate.materials import LABELS, TABLE, material
-
-if TYPE_CHECKING:
-    from pipeline.simulate.casting import Moment
-    from pipeline.simulate.drives import Drive
-    from pipeline.simulate.rigs import RadarSpec
+from pipeline.simulate.rigs import RadarSpec
 
 __all__ = ["RadarErrors", "Scan", "scan_radar"]
 
@@ -127,13 +125,13 @@ def _scatterers(
     inside += np.where(label == _PLANTS, rng.exponential(0.7, len(k)), 0.0)
     v = moment.velocity_of_triangle[k].astype(np.float64)
     v = v * np.where(np.isin(m, _WHEELS), rng.uniform(0.3, 1.7, len(k)), 1.0)[:, None]
-    v += np.where(np.isin(label, _SOFT), 0.35, 0.0)[:, None] * rng.standard_normal((len(k), 3))
+    v += np.where(np.isin(label, _SOFT), 0.2, 0.0)[:, None] * rng.standard_normal((len(k), 3))
     rate = np.einsum("ij,ij->i", v - velocity_radar, rays[near])
-    # Power per ray: gain x solid angle / r^2; 9,000 rays of gain 1 at 30 m make a signal-to-noise ratio of 1 each.
+    # Power per ray: gain x solid angle / r^2; 9,000 rays of gain 1 at 80 m make a signal-to-noise ratio of 1 each.
     snr = (
         TABLE.radar_gain[m]
         * shape
-        * (30.0 / r) ** 2
+        * (80.0 / r) ** 2
         * (9000 / len(rays))
         * rng.exponential(1.0, len(k))
         * np.exp(-inside / 2.0)

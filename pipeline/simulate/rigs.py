@@ -62,7 +62,7 @@ class RadarSpec:
     max_range_m: float = 80.0
     azimuth_resolution_deg: float = 1.6
     elevation_resolution_deg: float = 6.0
-    range_resolution_m: float = 0.4
+    range_resolution_m: float = 0.3
     doppler_resolution_mps: float = 0.15
     doppler_step_mps: float = 0.08
     doppler_period_mps: float | None = 40.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -21,6 +22,7 @@ _SIGN_COLOURS: Final = (
     (1.0, 0.85, 0.1),
     (0.1, 0.5, 0.25),
 )
+_PANEL: Final = {f: "sign_back" for f in ("front", "left", "right", "top", "bottom")} | {"rear": "sign_face"}
 
 
 @dataclass
@@ -178,6 +180,7 @@ def _arrow(c: _Chunk, s: float, d: float) -> None:
     c.along.quads(head, "paint", uv=head[..., :2])
 
 
+@lru_cache(maxsize=1)
 def _signal() -> Mesh:
     b = MeshBuilder()
     b.tube(np.array([0, 0, 0.0]), np.array([0, 0, 3.4]), 0.06, "metal_pole")
@@ -187,23 +190,18 @@ def _signal() -> Mesh:
     return b.mesh()
 
 
-def _sign(rng: np.random.Generator) -> Mesh:
+@lru_cache(maxsize=32)
+def _sign(variant: int) -> Mesh:
+    rng = np.random.default_rng([63, variant])
     b = MeshBuilder()
     height, tint = rng.uniform(2.2, 2.6), _SIGN_COLOURS[int(rng.integers(len(_SIGN_COLOURS)))]
     b.tube(np.array([0, 0, 0.0]), np.array([0, 0, height + 0.6]), 0.04, "metal_pole", 5)
     w, h = (0.32, 0.32) if rng.random() < 0.7 else (0.5, 0.25)
-    faces = {
-        "rear": "sign_face",
-        "front": "sign_back",
-        "left": "sign_back",
-        "right": "sign_back",
-        "top": "sign_back",
-        "bottom": "sign_back",
-    }
-    b.frustum((-0.06, -0.03, -w, w, height), (-0.06, -0.03, -w, w, height + 2 * h), faces, tint)
+    b.frustum((-0.06, -0.03, -w, w, height), (-0.06, -0.03, -w, w, height + 2 * h), _PANEL, tint)
     return b.mesh()
 
 
+@lru_cache(maxsize=2)
 def _lamp(reach_m: float) -> Mesh:
     b = MeshBuilder()
     b.tube(np.array([0, 0, 0.0]), np.array([0, 0, 7.0]), 0.08, "metal_pole", 7)
@@ -212,31 +210,56 @@ def _lamp(reach_m: float) -> Mesh:
     return b.mesh()
 
 
-def _tree(rng: np.random.Generator, scale: float = 1.0) -> Mesh:
+@lru_cache(maxsize=1)
+def _bollards() -> Mesh:
     b = MeshBuilder()
-    trunk, tall = rng.uniform(1.8, 2.8) * scale, rng.uniform(4.5, 8.0) * scale
-    green = (float(rng.uniform(0.7, 1.3)), float(rng.uniform(0.75, 1.2)), float(rng.uniform(0.6, 1.2)))
-    b.tube(np.array([0, 0, 0.0]), np.array([0, 0, trunk + 0.6]), 0.13 * scale + 0.03, "bark", 7)
-    for _ in range(4):
-        p = np.array([rng.uniform(-0.7, 0.7), rng.uniform(-0.7, 0.7), rng.uniform(trunk + 0.9, tall)]) * [
-            scale,
-            scale,
-            1,
-        ]
-        b.blob(p, rng.uniform(0.9, 1.7, 3) * scale, "foliage", rng, green)
+    for k in range(4):
+        b.tube(np.array([1.5 * k, 0, 0.0]), np.array([1.5 * k, 0, 0.9]), 0.055, "metal_pole", 6)
     return b.mesh()
 
 
-def _bush(rng: np.random.Generator) -> Mesh:
+@lru_cache(maxsize=1)
+def _bin() -> Mesh:
     b = MeshBuilder()
-    for _ in range(2):
-        b.blob(
-            np.array([*rng.uniform(-0.6, 0.6, 2), 0.5]),
-            rng.uniform([0.6, 0.6, 0.5], [1.1, 1.1, 1.0]),
-            "foliage",
-            rng,
-            (0.9, 1, 0.8),
-        )
+    b.frustum((-0.3, 0.3, -0.3, 0.3, 0.0), (-0.35, 0.35, -0.35, 0.35, 1.1), "slats", (0.25, 0.35, 0.25))
+    return b.mesh()
+
+
+@lru_cache(maxsize=1)
+def _delineator() -> Mesh:
+    b = MeshBuilder()
+    b.frustum((-0.06, 0.06, -0.06, 0.06, 0), (-0.05, 0.05, -0.05, 0.05, 1.0), "delineator")
+    return b.mesh()
+
+
+@lru_cache(maxsize=1)
+def _rail_post() -> Mesh:
+    b = MeshBuilder()
+    b.box((0, 0, 0.36), (0.12, 0.08, 0.74), "rail")
+    return b.mesh()
+
+
+@lru_cache(maxsize=64)
+def _tree(variant: int) -> Mesh:
+    rng = np.random.default_rng([61, variant])
+    b = MeshBuilder()
+    scale = rng.uniform(0.8, 1.6)
+    trunk, tall = rng.uniform(1.8, 2.6) * scale, rng.uniform(4.0, 6.5) * scale
+    green = (float(rng.uniform(0.7, 1.3)), float(rng.uniform(0.75, 1.2)), float(rng.uniform(0.6, 1.2)))
+    b.tube(np.array([0, 0, 0.0]), np.array([0, 0, trunk + 0.6]), 0.13 * scale + 0.03, "bark", 7)
+    for _ in range(7):
+        p = np.array([*rng.uniform(-1.0, 1.0, 2) * scale, rng.uniform(trunk + 0.7, tall)])
+        b.blob(p, rng.uniform(0.7, 1.25, 3) * scale, "foliage", rng, green)
+    return b.mesh()
+
+
+@lru_cache(maxsize=32)
+def _bush(variant: int) -> Mesh:
+    rng = np.random.default_rng([62, variant])
+    b = MeshBuilder()
+    for _ in range(3):
+        centre = np.array([*rng.uniform(-0.7, 0.7, 2), 0.45])
+        b.blob(centre, rng.uniform([0.5, 0.5, 0.4], [0.9, 0.9, 0.9]), "foliage", rng, (0.9, 1, 0.8))
     return b.mesh()
 
 
@@ -262,25 +285,20 @@ def _furniture(c: _Chunk, side: int, edge: float, walk: float) -> None:
     for s in c.every(32.0):
         c.put(_lamp(-side * 1.4), s + 8.0 * side, side * (edge + 0.45), 0.12)
     for s in c.every(21.0, 6.0, 0.6):
-        c.put(_sign(rng), s, side * (edge + 0.5), 0.12, 0.0 if side < 0 else np.pi)
+        c.put(_sign(int(rng.integers(24))), s, side * (edge + 0.5), 0.12, 0.0 if side < 0 else np.pi)
     avenue = np.random.default_rng([c.drive.seed, 33, side + 1]).random() < 0.55
     for s in c.every(9.0, 1.5, 0.75 if avenue else 0.12):
         c.put(
-            _tree(rng, rng.uniform(0.75, 1.0)),
+            _tree(int(rng.integers(40))),
             s,
             side * (edge + min(1.3, walk - 0.8)),
             0.12,
             rng.uniform(0, 6.28),
         )
     for s in c.every(14.0, 4.0, 0.35):
-        b = MeshBuilder()
-        for k in range(4):
-            b.tube(np.array([1.5 * k, 0, 0.0]), np.array([1.5 * k, 0, 0.9]), 0.055, "metal_pole", 6)
-        c.put(b.mesh(), s, side * (edge + 0.35), 0.12)
+        c.put(_bollards(), s, side * (edge + 0.35), 0.12)
     for s in c.every(26.0, 8.0, 0.4):
-        b = MeshBuilder()
-        b.frustum((-0.3, 0.3, -0.3, 0.3, 0.0), (-0.35, 0.35, -0.35, 0.35, 1.1), "slats", (0.25, 0.35, 0.25))
-        c.put(b.mesh(), s, side * (edge + walk - 0.5), 0.12)
+        c.put(_bin(), s, side * (edge + walk - 0.5), 0.12)
 
 
 def _frontage(c: _Chunk, side: int, d: float) -> None:
@@ -289,11 +307,11 @@ def _frontage(c: _Chunk, side: int, d: float) -> None:
     while s < c.s0 + CHUNK_M - 4.0:
         width = min(float(rng.uniform(9, 18)), c.s0 + CHUNK_M - s)
         kind = rng.random()
-        if kind < 0.58:
-            _house(c, side, s, width, d + float(rng.choice([0.2, 0.2, 3.0, 6.0])))
-        elif kind < 0.70:
+        if kind < 0.50:
+            _house(c, side, s, width, d + float(rng.choice([0.2, 3.0, 5.0, 8.0])))
+        elif kind < 0.62:
             c.wall(s, s + width, side * (d + 0.1), 0.0, float(rng.uniform(1.2, 2.2)), "stone")
-        elif kind < 0.82:
+        elif kind < 0.76:
             c.wall(
                 s,
                 s + width,
@@ -303,17 +321,17 @@ def _frontage(c: _Chunk, side: int, d: float) -> None:
                 "slats",
                 (0.8, 0.8, float(rng.uniform(0.6, 1.2))),
             )
-        if kind > 0.52:
+        if kind > 0.45:
             for _ in range(int(rng.integers(1, 4))):
                 c.put(
-                    _tree(rng, rng.uniform(0.9, 1.4)),
+                    _tree(int(rng.integers(40))),
                     s + rng.uniform(1, width),
                     side * (d + rng.uniform(3, 14)),
                     0.1,
                     rng.uniform(0, 6),
                 )
                 c.put(
-                    _bush(rng),
+                    _bush(int(rng.integers(20))),
                     s + rng.uniform(1, width),
                     side * (d + rng.uniform(1.2, 3)),
                     0.1,
@@ -324,7 +342,7 @@ def _frontage(c: _Chunk, side: int, d: float) -> None:
 
 def _house(c: _Chunk, side: int, s: float, width: float, d: float) -> None:
     rng = c.rng
-    storeys = int(rng.integers(2, 5))
+    storeys = int(rng.choice([1, 2, 2, 3, 4]))
     top, depth, gap = 3.0 * storeys + 0.6, float(rng.uniform(8, 12)), float(rng.choice([0.0, 0.0, 1.5]))
     tone = rng.uniform(0.55, 1.35)
     tint = (
@@ -389,16 +407,20 @@ def _highway(c: _Chunk) -> None:
                 c.s0, c.s0 + CHUNK_M, edge + side * 4.5, -0.2, float(3.5 + 0.5 * (c.index % 2)), "noise_wall"
             )
         for s in c.every(25.0):
-            b = MeshBuilder()
-            b.frustum((-0.06, 0.06, -0.06, 0.06, 0), (-0.05, 0.05, -0.05, 0.05, 1.0), "delineator")
-            c.put(b.mesh(), s, edge + side * 1.4)
+            c.put(_delineator(), s, edge + side * 1.4)
         for s in c.every(6.0, 3.0, 0.55):
             d = edge + side * rng.uniform(8, 26)
-            c.put(_tree(rng, rng.uniform(0.9, 1.7)), s, d, slope * 0.7 - 0.2, rng.uniform(0, 6.28))
+            c.put(_tree(int(rng.integers(40))), s, d, slope * 0.7 - 0.2, rng.uniform(0, 6.28))
         for s in c.every(5.0, 2.0, 0.5):
-            c.put(_bush(rng), s, edge + side * rng.uniform(5, 10), 0.2 * slope, rng.uniform(0, 6.28))
+            c.put(
+                _bush(int(rng.integers(20))),
+                s,
+                edge + side * rng.uniform(5, 10),
+                0.2 * slope,
+                rng.uniform(0, 6.28),
+            )
         for s in c.every(55.0, 15.0, 0.7):
-            c.put(_sign(rng), s, edge + side * 1.7, 0.0, 0.0 if side < 0 else np.pi)
+            c.put(_sign(int(rng.integers(24))), s, edge + side * 1.7, 0.0, 0.0 if side < 0 else np.pi)
     if c.index % 7 == 3:
         _gantry(c, c.s0 + 20.0)
     if c.index % 5 == 2:
@@ -421,10 +443,8 @@ def _guard_rail(c: _Chunk, d: float, *, both: bool) -> None:
     for offset in (-0.18, 0.18) if both else (0.0,):
         for low, high, out in ((0.48, 0.58, 0.0), (0.58, 0.68, 0.05), (0.68, 0.78, 0.0)):
             c.band(c.s0, c.s0 + CHUNK_M, d + offset + out, d + offset + out + 1e-3, low, high, "rail", 4.0)
-    b = MeshBuilder()
-    b.box((0, 0, 0.36), (0.12, 0.08, 0.74), "rail")
     for s in c.every(4.0):
-        c.put(b.mesh(), s, d)
+        c.put(_rail_post(), s, d)
 
 
 def _gantry(c: _Chunk, s: float) -> None:
@@ -435,19 +455,11 @@ def _gantry(c: _Chunk, s: float) -> None:
         b.tube(np.array([0, d, 0.0]), np.array([0, d, 7.6]), 0.16, "metal_pole", 8)
     for z in (6.6, 7.5):
         b.tube(np.array([0, left, z]), np.array([0, right, z]), 0.10, "metal_pole", 6)
-    faces = {
-        "rear": "sign_face",
-        "front": "sign_back",
-        "left": "sign_back",
-        "right": "sign_back",
-        "top": "sign_back",
-        "bottom": "sign_back",
-    }
     for d in layout.lanes_own:
         b.frustum(
             (-0.25, -0.20, d - 1.6, d + 1.6, 5.6),
             (-0.25, -0.20, d - 1.6, d + 1.6, 8.0),
-            faces,
+            _PANEL,
             _SIGN_COLOURS[2],
         )
     c.put(b.mesh(), s, 0.0)

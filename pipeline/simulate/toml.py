@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from pipeline.simulate.logs import TOPICS
-
-if TYPE_CHECKING:
-    from pipeline.simulate.rigs import RigSpec
+from pipeline.simulate.rigs import RigSpec
 
 __all__ = ["fleet_toml"]
 

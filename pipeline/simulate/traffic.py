@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -26,6 +26,12 @@ class Actor:
     variant: int
     T_map_actor: np.ndarray
     velocity_map: np.ndarray
+
+    def advanced(self, dt_s: float) -> Actor:
+        """Where it is a moment later, at constant velocity."""
+        T = self.T_map_actor.copy()
+        T[:3, 3] += dt_s * self.velocity_map
+        return replace(self, T_map_actor=T)
 
 
 @dataclass(frozen=True)
