@@ -1,0 +1,100 @@
+"""The command `boresight`: which job lies behind which word, and how every job ends.
+
+A job is a function of its own file that returns an exit code; it is imported when its command is called.
+Exit codes: 0 done or up to date; 1 failed, a retry may help; 2 usage or configuration; 3 done, but something
+was held or refused; 130 and 143 after SIGINT and SIGTERM.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from cyclopts import App, CycloptsError
+
+from jobs.logging import configure, logger
+from jobs.summary import print_summary
+from pipeline.errors import BoresightError
+
+__all__ = ["COMMANDS", "app", "main"]
+
+FAILED, USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+
+# Command -> where its function is, and what `boresight --help` says of it.
+COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": ("jobs.demo:demo", "Synthetic fleet to HTML report, in minutes: what all of this does."),
+    "check": ("jobs.check:check", "Can these logs be calibrated, and which degrees of freedom?"),
+    "nightly": (
+        "jobs.nightly:nightly",
+        "Ingest, perceive, calibrate and audit all vehicle-days of a pattern.",
+    ),
+    "ingest": ("jobs.ingest:ingest", "Logs of one vehicle-day to the table frames."),
+    "perceive": ("jobs.perceive:perceive", "Frames of one vehicle-day to the table observations."),
+    "calibrate": ("jobs.calibrate:calibrate", "Observations of one vehicle-day to calibration records."),
+    "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
+    "report": ("jobs.report:report", "HTML pages of vehicle-days and of the fleet."),
+    "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),
+    "export": ("jobs.export:export", "Write the tables' contracts as JSON Schema."),
+    "simulate": ("jobs.simulate:simulate", "Logs of a synthetic fleet, its truth in a file of its own."),
+    "evaluate": ("jobs.evaluate:evaluate", "Compare calibration records with a known truth."),
+}
+
+
+def _version() -> str:
+    from schemas.versions import CODE_VERSION  # brings pyarrow
+
+    return CODE_VERSION
+
+
+app = App(
+    name="boresight",
+    help="Recalibrates a fleet's camera, lidar and radar overnight from ordinary driving logs.",
+    version=_version,
+    help_format="plaintext",
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+for _name, (_path, _help) in COMMANDS.items():
+    app.command(_path, name=_name, help=_help)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    tokens = list(sys.argv[1:] if argv is None else argv)
+    command = next((t for t in tokens if t in COMMANDS), "boresight")
+    signal.signal(signal.SIGTERM, _stop)
+    configure()
+    try:
+        result: Any = app(tokens, exit_on_error=False, print_error=False)
+    except CycloptsError as err:
+        code, reason = USAGE, str(err)
+    except BoresightError as err:
+        code, reason = err.exit_code, str(err)
+    except KeyboardInterrupt:
+        code, reason = INTERRUPTED, "interrupted"
+    except SystemExit as err:
+        if err.code != TERMINATED:
+            raise
+        code, reason = TERMINATED, "terminated"
+    except Exception as err:  # noqa: BLE001 - the last resort: one line for people, the traceback in the log
+        logger().error("unexpected error", command=command, exc_info=True)
+        code, reason = FAILED, f"{type(err).__name__}: {err}"
+    else:
+        return result if isinstance(result, int) else 0
+    return _end(command, reason, code)
+
+
+def _stop(signum: int, _frame: Any) -> None:
+    """Unwind through every `finally`: nothing stays half-written. A second signal cannot cut that short."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.exit(128 + signum)
+
+
+def _end(command: str, reason: str, code: int) -> int:
+    logger().error(reason, command=command, exit_code=code)
+    if command != "show":  # its stdout holds records and nothing else
+        status = {3: "refused", INTERRUPTED: "stopped", TERMINATED: "stopped"}.get(code, "failed")
+        print_summary(command, status, reason=reason, exit_code=code)
+    return code
