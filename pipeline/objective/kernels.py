@@ -116,7 +116,9 @@ def fold_frames(
         else np.zeros((0, 3), _f4)
     )
     return FoldedFrames(
-        *(np.ascontiguousarray(stacked[:, k]) for k in range(3)),
+        x_m=np.ascontiguousarray(stacked[:, 0]),
+        y_m=np.ascontiguousarray(stacked[:, 1]),
+        z_m=np.ascontiguousarray(stacked[:, 2]),
         first=np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64),
         quads=np.concatenate(maps) if maps else np.zeros(0, np.uint32),
         map_first=np.concatenate([[0], np.cumsum([m.size for m in maps])])[: len(maps)].astype(np.int64),

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.errors import ContractError
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import transform_points
 from schemas.observations import Observation
@@ -31,7 +32,10 @@ REFLECTING = np.array([2, 3, 4, 5, 6, 7, 8, 11, 12, 13, 14, 15, 16, 17, 18], np.
 
 def labels_of(observation: Observation) -> UInt8[np.ndarray, "H W"]:
     """The label image, Cityscapes train ids."""
-    return cv2.imdecode(np.frombuffer(observation.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    labels = cv2.imdecode(np.frombuffer(observation.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if labels is None:
+        raise ContractError("observations", f"labels_png of frame {observation.frame_index} is no image")
+    return labels.astype(np.uint8, copy=False)
 
 
 def full_camera(observation: Observation) -> Camera:

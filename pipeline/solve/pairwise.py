@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from pipeline.config import SolveConfig
 from pipeline.geometry.se3 import rotation_angle_rad
-from pipeline.objective.camera_lidar import camera_lidar_loss
-from pipeline.objective.camera_radar import camera_radar_loss
-from pipeline.objective.lidar_radar import lidar_radar_loss
+from pipeline.objective.camera_lidar import CameraLidarLoss, camera_lidar_loss
+from pipeline.objective.camera_radar import CameraRadarLoss, camera_radar_loss
+from pipeline.objective.lidar_radar import LidarRadarLoss, lidar_radar_loss
 from pipeline.objective.loop import loop_transform
 from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.results import Progress, silent
@@ -63,12 +63,13 @@ def pair_problem(
 ) -> PairProblem:
     """Prepare the paper's loss of one pair."""
     T, margin = prior.of(pair), np.radians(config.search_rotation_deg)
-    if pair == "lidar_radar":
-        loss = lidar_radar_loss(observations)
+    loss: CameraLidarLoss | CameraRadarLoss | LidarRadarLoss
+    if pair == "camera_lidar":
+        loss = camera_lidar_loss(observations, T, margin)
+    elif pair == "camera_radar":
+        loss = camera_radar_loss(observations, T, margin)
     else:
-        loss = {"camera_lidar": camera_lidar_loss, "camera_radar": camera_radar_loss}[pair](
-            observations, T, margin
-        )
+        loss = lidar_radar_loss(observations)
     return PairProblem(pair, T, loss.frame_losses, loss.informative, blocks_of(observations))
 
 

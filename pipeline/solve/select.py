@@ -26,6 +26,12 @@ __all__ = ["MIN_FRAMES", "MIN_HOLDOUT", "Selection", "hold_out", "select_frames"
 MIN_FRAMES = 8  # fewer carry no calibration: 10 frames already scatter by 0.1 deg (evidence on the real logs)
 MIN_HOLDOUT = 3
 _BLOCK_S = 10.0
+# What makes a frame worth having, by pair.
+_CONTENT = {
+    "camera_lidar": ("lidar_edge_xyz_m", "marking_xyz_m", "lidar_cluster_centre_m"),
+    "camera_radar": ("radar_track_xyz_m", "road_user_boxes_px", "radar_xyz_m"),
+    "lidar_radar": ("radar_xyz_m", "lidar_cluster_centre_m", "radar_track_xyz_m"),
+}
 _GUARD_S = 1.0  # frames nearer in time than this show the same scene
 
 
@@ -130,20 +136,9 @@ def hold_out(observations: Sequence[Observation], fraction: float) -> list[bool 
 
 def _scores(observations: Sequence[Observation], pair: str) -> np.ndarray:
     """How much a frame offers a pair: logarithms, for the hundredth edge says less than the first."""
-    counts = {
-        "camera_lidar": lambda o: (
-            len(o.lidar_edge_xyz_m),
-            len(o.marking_xyz_m),
-            len(o.lidar_cluster_centre_m),
-        ),
-        "camera_radar": lambda o: (len(o.radar_track_xyz_m), len(o.road_user_boxes_px), len(o.radar_xyz_m)),
-        "lidar_radar": lambda o: (
-            len(o.radar_xyz_m),
-            len(o.lidar_cluster_centre_m),
-            len(o.radar_track_xyz_m),
-        ),
-    }[pair]
-    return np.array([np.log1p(counts(o)).sum() for o in observations])
+    return np.array(
+        [np.log1p([len(getattr(o, name)) for name in _CONTENT[pair]]).sum() for o in observations]
+    )
 
 
 def _choose(candidates: list[int], scores: np.ndarray, count: int) -> list[int]:

@@ -1,0 +1,80 @@
+"""`boresight calibrate`: observations of one vehicle-day to calibration records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["calibrate", "parse_perturb"]
+
+
+def calibrate(
+    *,
+    fleet: Path,
+    lake: str,
+    vehicle: str,
+    day: str,
+    method: str = "joint",
+    perturb: str | None = None,
+    seed: int | None = None,
+) -> int:
+    """Find out how the vehicle's sensors sat relative to each other on that day, and how sure that is.
+
+    Args:
+        fleet: fleet.toml.
+        lake: folder of the tables.
+        vehicle: vehicle id, as in fleet.toml.
+        day: YYYY-MM-DD.
+        method: joint, pairwise-optimisation or joint-optimisation.
+        perturb: ROT_DEG,TRANS_M: move the prior on purpose by exactly this much, for tests.
+        seed: of everything random; the configuration's where left out.
+    """
+    from jobs.summary import exit_code, print_summary, progress_reporter
+    from pipeline.calibrate import calibrate_day
+    from pipeline.config import load_fleet
+    from pipeline.store.partitions import Lake, Partition
+
+    config = load_fleet(fleet)
+    with progress_reporter(f"calibrate {vehicle} {day}") as progress:
+        result = calibrate_day(
+            Partition(vehicle, day),
+            config,
+            Lake.at(lake),
+            method=method,
+            perturb=parse_perturb(perturb),
+            seed=seed,
+            progress=progress,
+            fleet_file=fleet,
+        )
+    print_summary(
+        "calibrate",
+        result.status,
+        vehicle=vehicle,
+        day=day,
+        method=method,
+        pairs=result.kept,
+        reason=result.reason,
+        work_key=result.work_key,
+        outputs=result.outputs,
+    )
+    return exit_code([result.status, *(status for status, pairs in result.kept.items() if pairs)])
+
+
+def parse_perturb(text: str | None) -> tuple[float, float] | None:
+    """(degrees, metres) of "ROT_DEG,TRANS_M".
+
+    Raises:
+        ConfigError: not two numbers >= 0.
+    """
+    from pipeline.errors import ConfigError
+
+    if text is None:
+        return None
+    try:
+        rotation_deg, translation_m = (float(part) for part in text.split(","))
+    except ValueError as err:
+        raise ConfigError("command line", "perturb", f"{text!r} is not ROT_DEG,TRANS_M, as in 2,0.1") from err
+    if not (0 <= rotation_deg < 180 and 0 <= translation_m < 1e3):
+        raise ConfigError(
+            "command line", "perturb", f"{text!r}: degrees must be in 0..180, metres must be >= 0"
+        )
+    return rotation_deg, translation_m

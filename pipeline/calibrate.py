@@ -1,0 +1,201 @@
+"""Stage calibrate: observations of one vehicle-day to one calibration record per pair.
+
+The only module that brings solve and verify together: select, trigger, solve, judge on held-out frames, record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.calibration_records import Inputs, record_of, refused_records
+from pipeline.config import FleetConfig, config_hash
+from pipeline.errors import SolveError
+from pipeline.objective.problem import Prior, Solution
+from pipeline.prior import perturbed, prior_key, read_prior
+from pipeline.results import Progress, StageResult, silent
+from pipeline.solve.alignment import alignment_of
+from pipeline.solve.curvature import blocks_of
+from pipeline.solve.methods import PAPER_METHODS, solver_of
+from pipeline.solve.select import Selection, select_frames
+from pipeline.solve.trigger import exceeded, trigger_metrics
+from pipeline.store.partitions import Lake, Partition, work_key
+from pipeline.store.tables import read_manifest, read_records, read_rows, write_records
+from pipeline.verify.holdout import HeldOutTest, paired_test
+from pipeline.verify.verdict import Limits, judge, loop_doubts
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.observations import OBSERVATIONS, Observation
+from schemas.versions import CODE_VERSION
+
+__all__ = ["calibrate_day", "calibrate_observations"]
+
+_TRIGGER_FRAMES = 40  # metrics are means over frames: more of them only cost time
+
+
+def calibrate_day(
+    partition: Partition,
+    fleet: FleetConfig,
+    lake: Lake,
+    *,
+    method: str = "joint",
+    perturb: tuple[float, float] | None = None,
+    seed: int | None = None,
+    progress: Progress = silent,
+    fleet_file: Path = Path("fleet.toml"),
+) -> StageResult:
+    """Calibrate a vehicle-day and add its records, unless the same work is recorded already.
+
+    Args:
+        partition: vehicle and day.
+        fleet: configuration.
+        lake: where observations lie and records go.
+        method: one of `pipeline.solve.methods.METHOD`.
+        perturb: exact angle [deg] and shift [m] by which the prior is moved on purpose, for tests: T_camera_lidar and
+            T_lidar_radar independently, about a random axis and in a random direction. The prior's sigmas are then no
+            smaller than these two numbers.
+        seed: of everything random; None = `solve.seed`.
+        progress: told how far it is.
+        fleet_file: file that a prior's path is relative to.
+
+    Returns:
+        Counts of accepted, held and refused pairs in `kept`; status "refused" where all pairs are.
+
+    Raises:
+        ConfigError: no such vehicle or method, or an impossible prior file.
+    """
+    solver_of(method)
+    seed = fleet.solve.seed if seed is None else seed
+    rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
+    settings = {
+        "method": method,
+        "perturb": perturb,
+        "seed": seed,
+        "prior_file": prior_key(rig.prior, fleet_file),
+    }
+    observations = read_manifest(lake, OBSERVATIONS, partition)
+    inputs = [observations.work_key] if observations else []
+    resolved = config_hash(fleet.select, fleet.trigger, fleet.solve, rig.prior, settings)
+    key = work_key("calibrate", CODE_VERSION, resolved, inputs)
+    about = Inputs(partition, method, key, seed, tuple(inputs))
+    recorded = [
+        r
+        for r in read_records(
+            lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle, day=partition.day
+        )
+        if r.work_key == key
+    ]
+    if recorded:
+        return _result(about, recorded, "cached", lake)
+    prior: Prior | None = None
+    rows: list[Observation] = []
+    try:
+        if observations is None:
+            raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
+        rows = read_rows(lake, OBSERVATIONS, partition, Observation)
+        prior = perturbed(read_prior(rows, rig.prior, fleet_file), perturb, seed)
+        records = calibrate_observations(rows, prior, fleet, about, progress)
+    except SolveError as err:
+        records = refused_records(about, err.reason, len(rows), prior)
+    write_records(lake, CALIBRATIONS, partition, records, key, CODE_VERSION, inputs)
+    return _result(about, records, "done", lake)
+
+
+def calibrate_observations(
+    observations: Sequence[Observation],
+    prior: Prior,
+    fleet: FleetConfig,
+    about: Inputs,
+    progress: Progress = silent,
+) -> list[CalibrationRecord]:
+    """Select, trigger, solve, judge: the records of one day, without reading or writing anything.
+
+    Raises:
+        SolveError: the day cannot be calibrated.
+    """
+    progress(0, 4, "select frames")
+    is_paper = about.method in PAPER_METHODS
+    selection = select_frames(observations, fleet.select, paper=is_paper)
+    frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in PAIRS}
+    sample = _spread(observations, selection)
+    before = trigger_metrics(sample, {pair: prior.of(pair) for pair in PAIRS})
+    fired = {pair: exceeded(before[pair], fleet.trigger) for pair in PAIRS}
+    active = [p for p in PAIRS if fired[p] or fleet.trigger.when == "always"]
+    progress(1, 4, f"solve by {about.method}")
+    solution = solver_of(about.method)(
+        frames,
+        prior,
+        fleet.solve,
+        seed=about.seed,
+        triggered=active,
+        progress=lambda done, total, what: progress(1, 4, f"{what} ({done}/{total})"),
+    )
+    progress(2, 4, "judge on held-out frames")
+    after = trigger_metrics(sample, {pair: solution.pairs[pair].T for pair in PAIRS})
+    doubts = loop_doubts(solution)
+    limits = Limits(np.radians(fleet.solve.search_rotation_deg), fleet.solve.search_translation_m)
+    records = []
+    for pair in PAIRS:
+        held = [observations[i] for i in selection.holdout[pair]]
+        test = _held_out_test(pair, held, prior, solution, is_paper=is_paper, fleet=fleet)
+        verdict = judge(
+            solution.pairs[pair],
+            prior.of(pair),
+            prior.covariance(pair),
+            test,
+            [*solution.doubts.get(pair, []), *doubts],
+            limits,
+            calibrated=pair in active,
+        )
+        records.append(
+            record_of(
+                about, pair, solution, prior, verdict, test, selection, observations,
+                before=before[pair], after=after[pair], triggered=bool(fired[pair]),
+            )
+        )  # fmt: skip
+    progress(4, 4, "done")
+    return records
+
+
+def _held_out_test(
+    pair: str,
+    held: Sequence[Observation],
+    prior: Prior,
+    solution: Solution,
+    *,
+    is_paper: bool,
+    fleet: FleetConfig,
+) -> HeldOutTest | None:
+    """Alignment of held-out frames at prior and result, with the result's time offset at both: the poses are compared."""
+    if not held:
+        return None
+    estimate = solution.pairs[pair]
+    cost = alignment_of(pair, held, prior, fleet.solve, paper=is_paper)
+    dt_s = estimate.time_offset_s or 0.0
+    return paired_test(cost(prior.of(pair), dt_s), cost(estimate.T, dt_s), blocks_of(held, at_least=2))
+
+
+def _spread(observations: Sequence[Observation], selection: Selection) -> list[Observation]:
+    """Frames that the triggers look at: those of the fit of all pairs, thinned."""
+    rows = sorted(set().union(*selection.fit.values()))
+    picked = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _TRIGGER_FRAMES)).astype(int))
+    return [observations[rows[i]] for i in picked]
+
+
+def _result(about: Inputs, records: Sequence[CalibrationRecord], status: str, lake: Lake) -> StageResult:
+    counts = {s: sum(r.status == s for r in records) for s in ("accepted", "held", "refused")}
+    all_refused = counts["refused"] == len(records)
+    path = lake.folder(CALIBRATIONS.name, about.partition) / f"{about.work_key}.parquet"
+    return StageResult(
+        "calibrate",
+        about.partition.vehicle,
+        about.partition.day,
+        "refused" if all_refused and status == "done" else status,
+        about.work_key,
+        rows=len(records),
+        kept=counts,
+        rejected=dict(records[0].frames_rejected) if records else {},
+        reason="; ".join(f"{r.pair}: {r.reason}" for r in records if r.reason),
+        outputs=[str(path)],
+    )

@@ -1,0 +1,150 @@
+"""Calibration records from what select, solve and verify returned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.geometry.se3 import to_quaternion
+from pipeline.objective.problem import Prior, Solution
+from pipeline.solve.select import Selection
+from pipeline.store.partitions import Partition
+from pipeline.verify.holdout import HeldOutTest
+from pipeline.verify.verdict import Verdict
+from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.observations import Observation
+from schemas.versions import CODE_VERSION
+
+__all__ = ["Inputs", "environment_of", "record_of", "refused_records"]
+
+# Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
+_FAST_MPS = 20.0
+_MOVING_MPS = 1.0
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What identifies a calibration: the same inputs give the same record."""
+
+    partition: Partition
+    method: str
+    work_key: str
+    seed: int
+    inputs: tuple[str, ...]
+
+
+def record_of(
+    about: Inputs,
+    pair: str,
+    solution: Solution,
+    prior: Prior,
+    verdict: Verdict,
+    test: HeldOutTest | None,
+    selection: Selection,
+    observations: Sequence[Observation],
+    *,
+    before: Mapping[str, float],
+    after: Mapping[str, float],
+    triggered: bool,
+) -> CalibrationRecord:
+    """The record of one pair that was computed."""
+    estimate = solution.pairs[pair]
+    refused = verdict.status == "refused"
+    computed: dict[str, Any] = {
+        "covariance": estimate.covariance,
+        "observability": [float(v) for v in estimate.observability],
+        "observable": [bool(v) for v in estimate.observable],
+        **_transform_fields("", estimate.T),
+    }
+    return CalibrationRecord(
+        **_identity(about, pair, len(observations), prior),
+        **({} if refused else computed),
+        status=verdict.status,
+        reason=verdict.reason,
+        frames_used=estimate.frames_used,
+        frames_rejected=_add(selection.rejected[pair], estimate.frames_rejected),
+        environment=environment_of(observations),
+        triggered=triggered,
+        trigger_before=dict(before),
+        trigger_after=dict(after),
+        alignment_before=test.before if test else None,
+        alignment_after=test.after if test else None,
+        loop_rotation_rad=solution.loop_rotation_rad,
+        loop_translation_m=solution.loop_translation_m,
+        time_offset_s=estimate.time_offset_s,
+        time_offset_sigma_s=estimate.time_offset_sigma_s,
+        notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable), *estimate.notes],
+        diagnostics=dict(estimate.diagnostics)
+        | _test_numbers(test)
+        | {"paper_frames": float(selection.passed[pair])},
+    )
+
+
+def refused_records(about: Inputs, reason: str, frames: int, prior: Prior | None) -> list[CalibrationRecord]:
+    """Records of a day that could not be calibrated at all."""
+    return [
+        CalibrationRecord(**_identity(about, pair, frames, prior), status="refused", reason=reason)
+        for pair in PAIRS
+    ]
+
+
+def environment_of(observations: Sequence[Observation]) -> str:
+    """Highway, urban, mixed or unknown, from the speeds of the moving frames.
+
+    More than 70 % of them at 20 m/s or more is a highway, less than 30 % a town; a traffic jam on a highway passes for
+    a town. Unknown where less than half of the frames have a speed or none moves.
+    """
+    speeds = np.array([abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None])
+    moving = speeds[speeds > _MOVING_MPS]
+    if 2 * len(speeds) < len(observations) or not len(moving):
+        return "unknown"
+    fast = float(np.mean(moving >= _FAST_MPS))
+    return "highway" if fast > 0.7 else "urban" if fast < 0.3 else "mixed"
+
+
+def _identity(about: Inputs, pair: str, frames: int, prior: Prior | None) -> dict[str, Any]:
+    parent, child = FRAMES_OF_PAIR[pair]
+    fields: dict[str, Any] = {
+        "vehicle": about.partition.vehicle,
+        "day": about.partition.day,
+        "method": about.method,
+        "pair": pair,
+        "parent_frame": parent,
+        "child_frame": child,
+        "work_key": about.work_key,
+        "code_version": CODE_VERSION,
+        "seed": about.seed,
+        "inputs": list(about.inputs),
+        "frames_total": frames,
+    }
+    if prior is not None:
+        fields |= _transform_fields("prior_", prior.of(pair)) | {"prior_covariance": prior.covariance(pair)}
+    return fields
+
+
+def _transform_fields(prefix: str, T: np.ndarray) -> dict[str, float]:
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    values = (*to_quaternion(T), *T[:3, 3])
+    return {f"{prefix}{name}": float(value) for name, value in zip(names, values, strict=True)}
+
+
+def _unobservable(observable: np.ndarray) -> list[str]:
+    names = [name for name, seen in zip(DOF_NAMES, observable, strict=True) if not seen]
+    return [f"not determined by the day: {', '.join(names)}"] if names else []
+
+
+def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
+    if test is None:
+        return {}
+    return {
+        "holdout_frames": float(test.frames),
+        "holdout_blocks": float(test.blocks),
+        "holdout_z": float(np.clip(test.z, -1e3, 1e3)),
+    }
+
+
+def _add(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
+    return {name: a.get(name, 0) + b.get(name, 0) for name in {*a, *b}}

@@ -1,0 +1,53 @@
+"""Calibration methods by name: import paths, resolved when a method is used, so that torch loads only where it is needed."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+from pipeline.config import SolveConfig
+from pipeline.errors import ConfigError
+from pipeline.objective.problem import Prior, Solution
+from pipeline.results import Progress
+from schemas.calibrations import METHODS
+from schemas.observations import Observation
+
+__all__ = ["METHOD", "PAPER_METHODS", "Solver", "solver_of"]
+
+METHOD: dict[str, str] = {
+    "joint": "pipeline.solve.joint:solve_joint",
+    "pairwise-optimisation": "pipeline.solve.pairwise:solve_pairwise",
+    "joint-optimisation": "pipeline.solve.joint_optimisation:solve_joint_optimisation",
+}
+# Methods that take the paper's frame conditions and judge by the paper's losses.
+PAPER_METHODS = ("pairwise-optimisation", "joint-optimisation")
+
+
+class Solver(Protocol):
+    """What a method is: selected frames per pair and a prior in, a solution out."""
+
+    def __call__(  # noqa: D102
+        self,
+        observations: Mapping[str, Sequence[Observation]],
+        prior: Prior,
+        config: SolveConfig,
+        *,
+        seed: int,
+        triggered: Sequence[str],
+        progress: Progress,
+    ) -> Solution: ...
+
+
+def solver_of(method: str) -> Solver:
+    """The function of a method.
+
+    Raises:
+        ConfigError: no such method, or one that this version does not have yet.
+    """
+    if method not in METHOD:
+        known = "does not exist" if method not in METHODS else "is not in this version"
+        raise ConfigError("command line", "method", f"{method!r} {known}; choose from {', '.join(METHOD)}")
+    module, _, name = METHOD[method].partition(":")
+    solver: Solver = getattr(importlib.import_module(module), name)
+    return solver

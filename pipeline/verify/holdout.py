@@ -1,0 +1,62 @@
+"""Alignment on held-out frames at the prior and at the result: a paired test over blocks of frames that share a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+__all__ = ["HeldOutTest", "paired_test"]
+
+
+@dataclass(frozen=True)
+class HeldOutTest:
+    """Mean cost before and after over the frames that can tell, and how sure the difference is."""
+
+    before: float
+    after: float
+    standard_error: float  # of after - before, from the scatter of blocks
+    frames: int
+    blocks: int
+
+    @property
+    def z(self) -> float:
+        """Difference after - before in standard errors: negative = better aligned; 0 where nothing changed."""
+        difference = self.after - self.before
+        if difference == 0:
+            return 0.0
+        return (
+            difference / self.standard_error if self.standard_error > 0 else float(np.sign(difference)) * 1e3
+        )
+
+
+def paired_test(
+    before: Float[np.ndarray, " F"], after: Float[np.ndarray, " F"], blocks: Int[np.ndarray, " F"]
+) -> HeldOutTest | None:
+    """Compare the costs of the same frames at two calibrations.
+
+    Frames with a cost that is not finite at either calibration are left out. The standard error treats blocks, not frames,
+    as independent; with a single block, frames have to do.
+
+    Args:
+        before: cost of each frame at the prior (lower is better).
+        after: the same at the result.
+        blocks: frames of equal number share a scene.
+
+    Returns:
+        The test, or None where no frame has both costs.
+    """
+    both = np.isfinite(before) & np.isfinite(after)
+    if not both.any():
+        return None
+    before, after, blocks = before[both], after[both], blocks[both]
+    difference = after - before
+    names, index = np.unique(blocks, return_inverse=True)
+    if len(names) == 1:
+        names, index = np.arange(len(difference)), np.arange(len(difference))
+    # Deviations summed over blocks: Var(mean) = sum_b (sum_{f in b} (d_f - mean))^2 / F^2, small-sample factor B/(B-1).
+    sums = np.bincount(index, difference - difference.mean(), minlength=len(names))
+    scale = len(names) / (len(names) - 1) if len(names) > 1 else 1.0
+    error = float(np.sqrt(scale * np.sum(sums**2)) / len(difference))
+    return HeldOutTest(float(before.mean()), float(after.mean()), error, len(difference), len(names))
