@@ -50,7 +50,8 @@ DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
             "unique_identifier_msgs/UUID uuid\n"
             "geometry_msgs/Point position\ngeometry_msgs/Vector3 velocity\n"
             "geometry_msgs/Vector3 acceleration\ngeometry_msgs/Vector3 size\nuint16 classification\n"
-            "float32[6] position_covariance\nfloat32[6] velocity_covariance\nfloat32[6] acceleration_covariance\n"
+            "float32[6] position_covariance\nfloat32[6] velocity_covariance\n"
+            "float32[6] acceleration_covariance\n"
             "float32[6] size_covariance\n"
         ),
     ),

@@ -69,6 +69,7 @@ class DayIndex:
     trees: list[TransformTree] = field(default_factory=list)
     ego: EgoTrack = field(default_factory=EgoTrack)
     topics_seen: set[str] = field(default_factory=set)
+    surveyed: Counter[tuple[str, str]] = field(default_factory=Counter)  # (topic, type) -> messages
     problems: list[str] = field(default_factory=list)
     damage: Counter[str] = field(default_factory=Counter)
     camera_of_bytes: dict[bytes, Camera | str] = field(default_factory=dict)
@@ -113,8 +114,11 @@ def topics_of(rig: Rig) -> dict[str, str]:
     return topics
 
 
-def index_logs(paths: Sequence[Path], rig: Rig) -> DayIndex:
-    """Scan the logs once; of images and clouds only the stamp is read. Unreadable logs become problems."""
+def index_logs(paths: Sequence[Path], rig: Rig, *, survey: bool = False) -> DayIndex:
+    """Scan the logs once; of images and clouds only the stamp is read. Unreadable logs become problems.
+
+    With `survey` every topic is counted in `surveyed`, for those who ask what a log holds at all.
+    """
     index, topics, cache = DayIndex(), topics_of(rig), ChunkCache()
     for path in paths:
         try:
@@ -125,7 +129,7 @@ def index_logs(paths: Sequence[Path], rig: Rig) -> DayIndex:
             continue
         index.log_names.append(path.name)
         index.trees.append(TransformTree())
-        _index_log(index, len(index.logs) - 1, topics)
+        _index_log(index, len(index.logs) - 1, topics, survey=survey)
     for topic, role in topics.items():
         if role in _NEEDED and topic not in index.topics_seen:
             index.complain(f"topic {topic} ({role}) has no message in any log")
@@ -136,10 +140,14 @@ def index_logs(paths: Sequence[Path], rig: Rig) -> DayIndex:
     return index
 
 
-def _index_log(index: DayIndex, number: int, topics: dict[str, str]) -> None:
+def _index_log(index: DayIndex, number: int, topics: dict[str, str], *, survey: bool) -> None:
     log = index.logs[number]
-    for message in log.scan(topics):
-        role = topics[message.channel.topic]
+    for message in log.scan(None if survey else topics):
+        if survey:
+            index.surveyed[message.channel.topic, message.channel.msgtype] += 1
+        role = topics.get(message.channel.topic)
+        if role is None:
+            continue
         index.topics_seen.add(message.channel.topic)
         if message.channel.msgtype not in ACCEPTED_TYPES[role]:
             index.damage["wrong_type"] += 1

@@ -59,6 +59,7 @@ class FrameBuilder:
         self._index, self._rig, self._ingest, self._file_prior = index, rig, ingest, file_prior
         self._priors: dict[tuple[int, str, str, str], dict[str, float | None]] = {}
         self.counts: Counter[str] = Counter()
+        self.frame_ids: dict[str, list[str]] = {}
 
     def build(self, trio: Trio, frame_index: int) -> Frame:
         """The row of a trio.
@@ -199,6 +200,9 @@ class FrameBuilder:
     def _prior(self, log: int, camera: str, lidar: str, radar: str) -> dict[str, float | None]:
         key = (log, camera, lidar, radar)
         if key not in self._priors:
+            for role, frame_id in (("camera", camera), ("lidar", lidar), ("radar", radar)):
+                known = self.frame_ids.setdefault(role, [])
+                known += [] if frame_id in known else [frame_id]
             T_camera_lidar, T_lidar_radar = self._file_prior or self._logged_prior(*key)
             self._priors[key] = _transform_fields("prior_camera_lidar_", T_camera_lidar) | _transform_fields(
                 "prior_lidar_radar_", T_lidar_radar

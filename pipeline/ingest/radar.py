@@ -116,4 +116,4 @@ def _tracks(message: Any, _config: RadarTopics) -> _Columns:
 
 
 def _receding(doppler: Float[np.ndarray, " N"], config: RadarTopics) -> Float[np.ndarray, " N"]:
-    return doppler if config.doppler_positive == "receding" else -doppler
+    return doppler if config.doppler_positive == "receding" else 0.0 - doppler  # no negative zeros

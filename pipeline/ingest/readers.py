@@ -13,7 +13,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from pipeline.errors import LogError
 
@@ -58,6 +58,7 @@ class RawMessage:
     data: memoryview
 
 
+@runtime_checkable
 class LogReader(Protocol):
     """What a backend can do. `damage` counts by name what could not be read, complete after a scan."""
 

@@ -140,8 +140,8 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], gate_s: float) ->
     elif not set(rejected) & set(_UNUSABLE):
         what = (
             f"no sweep of {topics['lidar']} has an image of {topics['image']} and a scan of "
-            f"{topics['radar']} within {gate_s * 1e3:g} ms: trigger the sensors together, check their clocks, or raise "
-            "ingest.sync_gate_s"
+            f"{topics['radar']} within {gate_s * 1e3:g} ms: trigger the sensors together, check their "
+            "clocks, or raise ingest.sync_gate_s"
         )
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])

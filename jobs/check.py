@@ -1,0 +1,120 @@
+"""`boresight check`: can these logs be calibrated, and which DoF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.ingest.check import CheckReport
+
+__all__ = ["check"]
+
+_EXIT = {"yes": 0, "partly": 1, "no": 2}
+_COLOUR = {"yes": "green", "weak": "yellow", "partly": "yellow", "no": "red"}
+
+
+def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = False) -> int:
+    """Say whether these logs can be calibrated, which DoF, and what is missing. Exit 0 yes, 1 partly, 2 no.
+
+    Args:
+        fleet: fleet.toml.
+        logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files, of one vehicle-day.
+        rig: which rig of fleet.toml; default: the only one, or "default".
+        json: print the whole report as one JSON object on stdout.
+    """
+    from dataclasses import asdict
+
+    from jobs.summary import print_json, print_summary, progress_reporter
+    from pipeline.config import load_fleet
+    from pipeline.errors import ConfigError
+    from pipeline.ingest.check import check_logs
+
+    config = load_fleet(fleet)
+    name = rig or (next(iter(config.rigs)) if len(config.rigs) == 1 else "default")
+    if name not in config.rigs:
+        raise ConfigError(
+            str(fleet), "rigs", f"no rig {name!r}; name one of {sorted(config.rigs)} with --rig"
+        )
+    if not logs:
+        raise ConfigError("command line", "LOG", "name at least one log")
+    with progress_reporter("check") as progress:
+        report = check_logs(logs, config.rigs[name], config.ingest, str(fleet), progress)
+    if json:
+        print_json(asdict(report))
+    else:
+        _print_report(report, name)
+        verdicts = {p: _worst(report, p) for p in ("camera_lidar", "lidar_radar", "camera_radar")}
+        print_summary(
+            "check",
+            report.answer,
+            rig=name,
+            frames=report.evidence.frames,
+            pairs=verdicts,
+            problems=report.problems,
+        )
+    return _EXIT[report.answer]
+
+
+def _worst(report: CheckReport, pair: str) -> str:
+    verdicts = [v.verdict for v in report.verdicts if v.pair == pair]
+    return "yes" if "no" not in verdicts else "no" if set(verdicts) == {"no"} else "partly"
+
+
+def _print_report(report: CheckReport, rig: str) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(stderr=True)
+    topics = Table(title=f"Topics of rig {rig}", title_justify="left")
+    for heading in ("role", "topic", "type", "messages", "rate", ""):
+        is_number = heading in {"messages", "rate"}
+        topics.add_column(heading, justify="right" if is_number else "left", overflow="fold")
+    for t in report.topics:
+        rate = "" if t.rate_hz is None else f"{t.rate_hz:.2f} Hz"
+        mark = f"[red]{t.problem}[/]" if t.problem else "[green]ok[/]"
+        topics.add_row(
+            t.role,
+            t.topic,
+            ", ".join(kind.rsplit("/", 1)[-1] for kind in t.types),
+            str(t.messages),
+            rate,
+            mark,
+        )
+    console.print(topics)
+    for line in _measured(report):
+        console.print(line, markup=False, highlight=False)
+    verdicts = Table(title="What can be calibrated", title_justify="left")
+    for heading in ("pair", "DoF", "", "why"):
+        verdicts.add_column(heading)
+    for v in report.verdicts:
+        verdicts.add_row(v.pair, v.dof, f"[{_COLOUR[v.verdict]}]{v.verdict}[/]", "; ".join(v.reasons))
+    console.print(verdicts)
+    for line in [*report.problems, *report.advice]:
+        console.print(f"  - {line}", markup=False)
+    console.print(f"Can these logs be calibrated: [{_COLOUR[report.answer]} bold]{report.answer}[/]")
+
+
+def _measured(report: CheckReport) -> list[str]:
+    e, s = report.evidence, report.sync
+    frame_ids = [f"{sensor} {' '.join(names)}" for sensor, names in report.frame_ids.items()]
+    facts = {
+        "prior": "yes" if e.has_prior else "none",
+        "moving": "unknown" if e.moving_share is None else f"{e.moving_share:.0%} of the frames",
+        "radar elevation": "yes" if e.elevation_share > 0.5 else "no",
+        "lidar rings": e.rings or "unknown",
+        "lidar intensity": "yes" if e.has_intensity else "no",
+        "time per point": "yes" if report.has_point_time else "no",
+        "odometry": "yes" if report.has_odometry else "no",
+    }
+    sync = f"{s.trios} of {s.sweeps} sweeps have image and scan within {s.gate_ms:g} ms"
+    nearest = f"median to image {_number(s.camera_median_ms)}, to scan {_number(s.radar_median_ms)}"
+    return [
+        f"sync: {sync} ({nearest})",
+        f"frame ids: {', '.join(frame_ids) or 'none'}",
+        "; ".join(f"{name}: {value}" for name, value in facts.items()),
+    ]
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.2f} ms"

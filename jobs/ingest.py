@@ -1,0 +1,35 @@
+"""`boresight ingest`: logs of one vehicle-day to frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["ingest"]
+
+
+def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
+    """Synchronise camera, lidar and radar of one vehicle-day and keep the trios.
+
+    Args:
+        logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of that day, in any order.
+        fleet: fleet.toml.
+        lake: folder of the tables.
+        vehicle: vehicle id, as in fleet.toml.
+        day: YYYY-MM-DD.
+    """
+    from dataclasses import asdict
+
+    from jobs.summary import exit_code, print_summary, progress_reporter
+    from pipeline.config import load_fleet
+    from pipeline.errors import ConfigError
+    from pipeline.ingest.run import ingest_day
+    from pipeline.store.partitions import Lake, Partition
+
+    if not logs:
+        raise ConfigError("command line", "LOG", "name at least one log of the day")
+    config = load_fleet(fleet)
+    with progress_reporter(f"ingest {vehicle} {day}") as progress:
+        result = ingest_day(logs, Partition(vehicle, day), config, Lake.at(lake), progress, str(fleet))
+    fields = asdict(result)
+    print_summary("ingest", fields.pop("status"), **fields)
+    return exit_code([result.status])

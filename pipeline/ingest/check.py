@@ -1,0 +1,256 @@
+"""Can these logs be calibrated, and which DoF? Looks at topics, stamps, frame ids and a sample of frames."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.config import IngestConfig, OnnxSemantics, Rig
+from pipeline.errors import ConfigError
+from pipeline.geometry.se3 import from_quaternion
+from pipeline.ingest.index import ACCEPTED_TYPES, DayIndex, index_logs, topics_of
+from pipeline.ingest.messages import FrameBuilder, Rejected
+from pipeline.ingest.run import pick_trios, read_file_prior
+from pipeline.ingest.verdict import DofVerdict, Evidence, judge, overall
+from pipeline.results import Progress, silent
+from schemas.frames import Frame
+
+__all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs", "doppler_speed"]
+
+_SAMPLE = 40  # frames looked into; the rest only by their stamps
+_MOVING_MPS = 1.0
+_FIT_MPS = 0.35  # static points fit the ego speed this well in Doppler, quantisation included
+
+
+@dataclass(frozen=True)
+class TopicFinding:
+    """One topic that the rig names. `problem` is empty where it is as it must be."""
+
+    role: str
+    topic: str
+    types: list[str]
+    messages: int
+    rate_hz: float | None
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class SyncQuality:
+    """How sweeps meet images and scans: median distance to the nearest, and trios within the gate."""
+
+    sweeps: int
+    trios: int
+    camera_median_ms: float | None
+    radar_median_ms: float | None
+    gate_ms: float
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What `boresight check` found. `answer` is "yes", "partly" or "no"."""
+
+    answer: str
+    verdicts: list[DofVerdict]
+    evidence: Evidence
+    topics: list[TopicFinding]
+    sync: SyncQuality
+    frame_ids: dict[str, list[str]]
+    has_point_time: bool
+    has_odometry: bool
+    rejected: dict[str, int]
+    problems: list[str]
+    advice: list[str]
+
+
+def check_logs(
+    logs: Sequence[Path],
+    rig: Rig,
+    config: IngestConfig,
+    fleet_file: str = "fleet.toml",
+    progress: Progress = silent,
+) -> CheckReport:
+    """Look at logs without writing anything.
+
+    Raises:
+        ConfigError: a log does not exist, or the prior file is unusable.
+    """
+    missing = [str(p) for p in logs if not p.exists()]
+    if missing:
+        raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
+    progress(0, 0, "reading the index")
+    index = index_logs(logs, rig, survey=True)
+    try:
+        trios, rejected = pick_trios(index, config)
+        builder = FrameBuilder(index, rig, config, read_file_prior(rig, fleet_file))
+        frames: list[Frame] = []
+        picked = np.unique(np.linspace(0, max(len(trios) - 1, 0), _SAMPLE).round().astype(int))
+        for done, i in enumerate(picked if trios else [], 1):
+            try:
+                frames.append(builder.build(trios[i], int(i)))
+            except Rejected as outcome:
+                rejected[outcome.reason] += 1
+                index.complain(str(outcome))
+            progress(done, len(picked), "frames looked at")
+        frame_ids = builder.frame_ids
+    finally:
+        index.close()
+    usable = round(len(trios) * len(frames) / len(picked)) if trios else 0
+    evidence = _evidence(frames, usable, rig)
+    verdicts = judge(evidence)
+    topics = _topics(index, rig)
+    return CheckReport(
+        answer=overall(verdicts),
+        verdicts=verdicts,
+        evidence=evidence,
+        topics=topics,
+        sync=_sync(index, len(trios), config),
+        frame_ids=frame_ids,
+        has_point_time=any(f.lidar_time_s is not None for f in frames),
+        has_odometry=any(f.ego_speed_mps is not None for f in frames),
+        rejected={str(k): int(v) for k, v in (rejected + index.damage).items() if v},
+        problems=index.problems,
+        advice=_advice(frames, rig, topics, usable),
+    )
+
+
+def doppler_speed(
+    directions: Float[np.ndarray, "N 3"], range_rate_mps: Float[np.ndarray, " N"], period_mps: float | None
+) -> tuple[float, float]:
+    """Forward speed [m/s] whose static world fits most detections of a scan, and the share that it fits.
+
+    The radar is taken to look along the driving direction; a share below a third says that this is not so, or
+    that the Doppler is not what the configuration says. Negative = its sign is wrong, or the car reverses.
+    """
+    speeds = np.arange(-45.0, 45.01, 0.15)
+    misfit = range_rate_mps + speeds[:, None] * directions[:, 0]
+    if period_mps is not None:
+        misfit = (misfit + period_mps / 2) % period_mps - period_mps / 2
+    share = np.mean(np.abs(misfit) < _FIT_MPS, axis=1)
+    # Equal fits (aliases, or no detection off the axis) go to the slowest speed.
+    best = int(np.lexsort((np.abs(speeds), -np.round(share, 2)))[0])
+    return float(speeds[best]), float(share[best])
+
+
+def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:
+    def share(flags: list[bool]) -> float:
+        return float(np.mean(flags)) if flags else 0.0
+
+    uses_models = isinstance(rig.camera.semantics, OnnxSemantics)
+    moving, doubt = _motion(frames, rig)
+    rings = max((len(np.unique(f.lidar_ring)) for f in frames if f.lidar_ring is not None), default=0)
+    return Evidence(
+        frames=usable,
+        has_prior=share(
+            [f.prior_camera_lidar_qw is not None and f.prior_lidar_radar_qw is not None for f in frames]
+        )
+        > 0.5,
+        labels_share=1.0 if uses_models else share([f.labels_png is not None for f in frames]),
+        detections_share=1.0 if uses_models else share([f.detection_boxes_px is not None for f in frames]),
+        has_intensity=share([f.lidar_intensity is not None for f in frames]) > 0.5,
+        rings=rings,
+        elevation_share=share([f.radar_has_elevation for f in frames]),
+        moving_share=moving,
+        doppler_doubt=doubt,
+    )
+
+
+def _motion(frames: list[Frame], rig: Rig) -> tuple[float | None, str]:
+    """Share of frames in which the car moves, by odometry or else Doppler, and doubts about the Doppler."""
+    period = rig.radar.doppler_period_mps
+    fits = []
+    for f in frames:
+        xyz = f.radar_xyz_m.astype(np.float64)
+        directions = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+        fits.append(doppler_speed(directions, f.radar_range_rate_mps.astype(np.float64), period))
+    speeds = np.array([s for s, share in fits if share > 1 / 3])
+    odometry = np.array([f.ego_speed_mps for f in frames if f.ego_speed_mps is not None])
+    fitted = speeds if len(speeds) >= len(frames) / 2 else np.zeros(0)
+    known = odometry if len(odometry) else fitted
+    moving = float(np.mean(np.abs(known) > _MOVING_MPS)) if len(known) else None
+    return moving, _doppler_doubt(frames, speeds, rig)
+
+
+def _doppler_doubt(frames: list[Frame], speeds: Float[np.ndarray, " N"], rig: Rig) -> str:
+    period = rig.radar.doppler_period_mps
+    spans = [float(np.ptp(f.radar_range_rate_mps)) for f in frames]
+    if period is not None and spans and max(spans) > 1.05 * period:
+        return f"Doppler spans {max(spans):.1f} m/s, more than doppler_period_mps = {period:g} allows"
+    if frames and len(speeds) < len(frames) / 2:
+        return (
+            "most scans fit no static world: check doppler_field, doppler_period_mps and the radar's heading"
+        )
+    moving = speeds[np.abs(speeds) > _MOVING_MPS]
+    if len(moving) >= 3 and np.mean(moving < 0) > 2 / 3:
+        other = "receding" if rig.radar.doppler_positive == "approaching" else "approaching"
+        return f'the car would drive backwards: doppler_positive is probably "{other}"'
+    return ""
+
+
+def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
+    findings = []
+    for topic, role in topics_of(rig).items():
+        types = Counter({kind: n for (name, kind), n in index.surveyed.items() if name == topic})
+        wanted = ACCEPTED_TYPES[role]
+        problem = ""
+        if not types:
+            others = sorted(
+                {name for (name, kind) in index.surveyed if kind in wanted and name not in topics_of(rig)}
+            )
+            problem = "no message" + (f"; the same type comes on {', '.join(others[:4])}" if others else "")
+        elif not set(types) & set(wanted):
+            problem = f"type {', '.join(types)}, not {' or '.join(wanted)}"
+        stamps = np.unique(index.stream(role).stamps_ns)
+        rate = float(1e9 / np.median(np.diff(stamps))) if len(stamps) > 2 else None
+        findings.append(TopicFinding(role, topic, sorted(types), sum(types.values()), rate, problem))
+    return findings
+
+
+def _sync(index: DayIndex, trios: int, config: IngestConfig) -> SyncQuality:
+    lidar = np.unique(index.stream("lidar").stamps_ns)
+    image, radar = (np.unique(index.stream(role).stamps_ns) for role in ("image", "radar"))
+    return SyncQuality(
+        sweeps=len(index.stream("lidar").stamps),
+        trios=trios,
+        camera_median_ms=_median_distance_ms(lidar, image),
+        radar_median_ms=_median_distance_ms(lidar, radar),
+        gate_ms=config.sync_gate_s * 1e3,
+    )
+
+
+def _median_distance_ms(a_ns: Int64[np.ndarray, " N"], b_ns: Int64[np.ndarray, " M"]) -> float | None:
+    if not len(a_ns) or not len(b_ns):
+        return None
+    right = np.clip(np.searchsorted(b_ns, a_ns), 1, max(len(b_ns) - 1, 1))
+    nearest = np.minimum(
+        np.abs(a_ns - b_ns[np.minimum(right, len(b_ns) - 1)]), np.abs(a_ns - b_ns[right - 1])
+    )
+    return float(np.median(nearest) * 1e-6)
+
+
+def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: int) -> list[str]:
+    advice = [
+        f"{t.topic}: {t.problem}" for t in topics if t.problem and t.role not in {"tf_static", "odometry"}
+    ]
+    if frames and frames[0].prior_camera_lidar_qw is not None:
+        f = frames[0]
+        q = [getattr(f, f"prior_camera_lidar_{name}") for name in ("qw", "qx", "qy", "qz")]
+        R = from_quaternion(np.array(q, np.float64), np.zeros(3))[:3, :3]
+        # Up of the lidar is -y of an optical frame; more than 45 deg off, the frame is no optical one.
+        if -R[1, 2] < np.cos(np.pi / 4):
+            advice.append(
+                "the image's frame id is no optical frame (x right, y down, z forward): check /tf_static"
+            )
+    if rig.ego is None:
+        advice.append("no odometry configured: ego speed comes from Doppler, the lidar is not de-skewed")
+    elif frames and all(f.ego_speed_mps is None for f in frames):
+        advice.append(f"{rig.ego.odometry} never brackets a sweep: the lidar is not de-skewed")
+    if frames and all(f.lidar_time_s is None for f in frames):
+        advice.append("the lidar logs no time per point: sweeps cannot be de-skewed")
+    if 0 < usable < 100:
+        advice.append(f"{usable} frames: a calibration takes 100 where it can, so log a longer drive")
+    return advice

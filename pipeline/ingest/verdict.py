@@ -1,0 +1,120 @@
+"""From what logs hold to what they can calibrate, per pair and class of DoF, and what is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+__all__ = ["DofVerdict", "Evidence", "judge", "overall"]
+
+# 30 frames give camera-lidar within .1 deg and lidar-radar yaw within .15 deg on real logs, 10 twice that.
+_ENOUGH_FRAMES, _FEW_FRAMES = 30, 10
+_MOVING_SHARE = 0.2  # time offsets show only where the car moves
+_DENSE_RINGS = 32  # below, reflectivity on the road has to carry pitch
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a verdict rests on; shares are of the frames looked at."""
+
+    frames: int
+    has_prior: bool
+    labels_share: float
+    detections_share: float
+    has_intensity: bool
+    rings: int
+    elevation_share: float
+    moving_share: float | None
+    doppler_doubt: str = ""
+
+
+@dataclass(frozen=True)
+class DofVerdict:
+    """Whether a class of DoF can be calibrated: "yes", "weak" (the prior carries part of it) or "no"."""
+
+    pair: str
+    dof: str
+    verdict: str
+    reasons: list[str] = field(default_factory=list)
+
+
+def judge(evidence: Evidence) -> list[DofVerdict]:
+    """One verdict per pair and class of DoF, the weakest of what it needs."""
+    camera, radar, ground = _camera_needs(evidence), _radar_needs(evidence), _common_needs(evidence)
+    pitch = ground + camera + _pitch_needs(evidence)
+    tilt = ground + radar + _elevation_needs(evidence)
+    moving = ground + _moving_needs(evidence)
+    shift = [("weak", "far objects say little about shifts: the prior carries part of it")]
+    rows = [
+        ("camera_lidar", "yaw and roll", ground + camera),
+        ("camera_lidar", "pitch", pitch),
+        ("camera_lidar", "translation", ground + camera + shift),
+        ("camera_lidar", "time offset", moving + camera),
+        ("lidar_radar", "yaw, x and y", ground + radar),
+        ("lidar_radar", "roll, pitch and z", tilt + camera),
+        ("lidar_radar", "time offset", moving + radar),
+        ("camera_radar", "yaw", ground + camera + radar),
+        ("camera_radar", "roll and pitch", tilt + camera),
+        ("camera_radar", "translation", ground + camera + radar + shift),
+    ]
+    return [_verdict(pair, dof, needs) for pair, dof, needs in rows]
+
+
+def overall(verdicts: list[DofVerdict]) -> str:
+    """The answer for all: "no" where every DoF is, "yes" where none is, else "partly"."""
+    refused = [v.verdict == "no" for v in verdicts]
+    return "yes" if not any(refused) else "no" if all(refused) else "partly"
+
+
+_Needs = list[tuple[str, str]]
+
+
+def _common_needs(e: Evidence) -> _Needs:
+    needs: _Needs = []
+    if e.frames < _FEW_FRAMES:
+        needs.append(("no", f"{e.frames} usable synchronised frames; at least {_FEW_FRAMES} are needed"))
+    elif e.frames < _ENOUGH_FRAMES:
+        needs.append(("weak", f"{e.frames} usable frames; {_ENOUGH_FRAMES} or more make it sharp"))
+    if not e.has_prior:
+        needs.append(
+            ("no", "no prior: log /tf_static with a chain between the three sensors, or give prior.file")
+        )
+    return needs
+
+
+def _camera_needs(e: Evidence) -> _Needs:
+    if e.labels_share == 0:
+        return [("no", "no semantic labels: log them, or set semantics.source = 'onnx'")]
+    return [("weak", f"labels on {e.labels_share:.0%} of the frames only")] if e.labels_share < 0.5 else []
+
+
+def _pitch_needs(e: Evidence) -> _Needs:
+    if e.has_intensity or e.rings >= _DENSE_RINGS:
+        return []
+    return [("weak", "the lidar has few rings and logs no intensity: pitch rests on vertical edges alone")]
+
+
+def _radar_needs(e: Evidence) -> _Needs:
+    return [("weak", e.doppler_doubt)] if e.doppler_doubt else []
+
+
+def _elevation_needs(e: Evidence) -> _Needs:
+    if e.elevation_share < 0.5:
+        return [("no", "the radar measures no elevation: roll, pitch and z keep their prior")]
+    if e.detections_share < 0.5:
+        return [("weak", "no camera detections to hold against the radar's elevation")]
+    return [("weak", "radar elevation is coarse: expect half a degree, and z from the prior")]
+
+
+def _moving_needs(e: Evidence) -> _Needs:
+    if e.moving_share is None:
+        return [("weak", "whether the car moves could not be told from Doppler or odometry")]
+    if e.moving_share < _MOVING_SHARE:
+        return [("no", f"the car moves in {e.moving_share:.0%} of the frames: time offsets do not show")]
+    return []
+
+
+def _verdict(pair: str, dof: str, needs: _Needs) -> DofVerdict:
+    worst = "no" if any(n[0] == "no" for n in needs) else "weak" if needs else "yes"
+    return DofVerdict(
+        pair, dof, worst, list(dict.fromkeys(reason for level, reason in needs if level == worst))
+    )
