@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import lru_cache
 from typing import Final
 
@@ -227,7 +228,7 @@ def _cyclist(b: MeshBuilder, rng: np.random.Generator) -> None:
     for x in (-0.53, 0.53):
         phi = np.linspace(0, 2 * np.pi, 13)
         ring = np.stack([x + 0.34 * np.cos(phi), np.zeros(13), 0.35 + 0.34 * np.sin(phi)], 1)
-        for a, c in zip(ring[:-1], ring[1:], strict=True):
+        for a, c in itertools.pairwise(ring):
             b.tube(a, c, 0.025, "bike_tyre", 4)
     rear, front, seat, bottom, bar = (
         [-0.53, 0, 0.35],

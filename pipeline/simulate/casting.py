@@ -6,6 +6,7 @@ them where it was when the beam came by, and no mesh is ever rebuilt for a frame
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Final
@@ -20,7 +21,7 @@ from pipeline.simulate.meshes import Mesh, join
 from pipeline.simulate.scenes import CHUNK_M, chunk_mesh
 from pipeline.simulate.traffic import Actor, actors_at
 
-__all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World"]
+__all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "shadow_map", "standing_of"]
 
 _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 60.0
@@ -74,21 +75,8 @@ class World:
                 i: self._chunks.get(i) or chunk_mesh(self.drive, i) for i in range(window[0], window[1] + 1)
             }
             origin = np.round(self.drive.road.to_map(np.array([s_m, 0.0, 0.0])))
-            mesh = join(list(self._chunks.values()))
-            mesh = Mesh(
-                (mesh.corners - origin.astype(np.float32)).astype(np.float32),
-                mesh.material,
-                mesh.tint,
-                mesh.uv,
-                mesh.instance,
-            )
-            scene = _scene(mesh)
-            self._window, self._standing = (
-                window,
-                Standing(
-                    origin, mesh, scene, _shadows(self.drive, scene, origin, s_m), _normals(mesh.corners)
-                ),
-            )
+            mesh, road = join(list(self._chunks.values())), self.drive.road
+            self._window, self._standing = window, standing_of(mesh, origin, self.drive.sun, road.to_map, s_m)
         return self._standing
 
     def moment(self, t_s: float) -> Moment:
@@ -217,7 +205,7 @@ def _may_be_seen(centre: np.ndarray, reach_m: float, axis: np.ndarray, cosine: f
 
 
 def _scene(mesh: Mesh) -> Any:
-    import open3d as o3d  # noqa: PLC0415  heavy: seconds to import
+    import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), np.float32)
@@ -229,7 +217,7 @@ def _scene(mesh: Mesh) -> Any:
 def _cast(
     scene: Any, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    import open3d as o3d  # noqa: PLC0415
+    import open3d as o3d
 
     rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
     found = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
@@ -266,12 +254,25 @@ def _near(
     return out[:n]
 
 
-def _shadows(drive: Drive, scene: Any, origin: np.ndarray, s_m: float) -> ShadowMap:
-    """Cast the ground towards the sun once per window."""
+def shadow_map(
+    scene: Any, origin: np.ndarray, sun: np.ndarray, to_map: Callable[[np.ndarray], np.ndarray], s_m: float
+) -> ShadowMap:
+    """Cast the ground around an arc length towards the sun; once per window, not per image."""
     cell, half = 0.4, 22.0
     s0 = s_m - 8.0
     s, d = np.meshgrid(np.arange(s0, s_m + 95.0, cell), np.arange(-half, half, cell), indexing="ij")
-    ground = drive.road.to_map(np.stack([s.ravel(), d.ravel(), np.full(s.size, 0.2)], 1)) - origin
-    sun = np.broadcast_to(drive.sun, ground.shape)
-    hit = _cast(scene, ground.astype(np.float32), sun.astype(np.float32))[1] >= 0
+    ground = to_map(np.stack([s.ravel(), d.ravel(), np.full(s.size, 0.2)], 1)) - origin
+    hit = (
+        _cast(scene, ground.astype(np.float32), np.broadcast_to(sun, ground.shape).astype(np.float32))[1] >= 0
+    )
     return ShadowMap(np.where(hit, 0.0, 1.0).astype(np.float32).reshape(s.shape), s0, -half, cell)
+
+
+def standing_of(
+    mesh: Mesh, origin: np.ndarray, sun: np.ndarray, to_map: Callable[[np.ndarray], np.ndarray], s_m: float
+) -> Standing:
+    """A standing world of a mesh given in the map."""
+    corners = (mesh.corners - origin.astype(np.float32)).astype(np.float32)
+    local = Mesh(corners, mesh.material, mesh.tint, mesh.uv, mesh.instance)
+    scene = _scene(local)
+    return Standing(origin, local, scene, shadow_map(scene, origin, sun, to_map, s_m), _normals(corners))

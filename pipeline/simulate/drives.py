@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.se3 import from_rotation_translation
 
-__all__ = ["Drive", "EgoMotion", "Road", "RoadLayout", "layout_of"]
+__all__ = ["Drive", "EgoMotion", "Motion", "Parked", "Road", "RoadLayout", "layout_of"]
 
 _STEP_M: Final = 1.0
 _STEP_S: Final = 0.02
@@ -119,6 +119,36 @@ def _rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarra
         np.stack([-sp, cp * sr, cp * cr], -1),
     ]
     return np.stack(rows, -2)
+
+
+@runtime_checkable
+class Motion(Protocol):
+    """How a vehicle moves."""
+
+    def poses(self, t_s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4 4"]:
+        """T_map_vehicle at times."""
+        ...
+
+    def velocities(
+        self, t_s: Float[np.ndarray, " N"]
+    ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+        """Linear velocity of the vehicle's origin, angular velocity, both in the map [m/s, rad/s]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Parked:
+    """A vehicle that stands at the map's origin."""
+
+    def poses(self, t_s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4 4"]:
+        """T_map_vehicle: always the identity."""
+        return np.tile(np.eye(4), (len(t_s), 1, 1))
+
+    def velocities(
+        self, t_s: Float[np.ndarray, " N"]
+    ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+        """Always zero."""
+        return np.zeros((len(t_s), 3)), np.zeros((len(t_s), 3))
 
 
 @dataclass(frozen=True)

@@ -8,27 +8,30 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, date, datetime, timedelta
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import from_rotation_translation
 from pipeline.results import Progress, silent
 from pipeline.simulate.casting import World
 from pipeline.simulate.drives import Drive
-from pipeline.simulate.faults import DayFaults, Fault, faults_on, misread, shaken
-from pipeline.simulate.frames import SimulatedFrame, frame_at
-from pipeline.simulate.logs import CONTAINERS, TOPICS, Put, log_name, open_log
-from pipeline.simulate.messages import Messages
-from pipeline.simulate.rigs import Mounting, RigSpec, mounting_of, rig_named
+from pipeline.simulate.faults import DayFaults, Fault, faults_on, shaken
+from pipeline.simulate.logs import CONTAINERS, log_name, open_log
+from pipeline.simulate.recording import FIRST_FRAME_S, record_drive
+from pipeline.simulate.rigs import Mounting, mounting_of, rig_named
 from pipeline.simulate.semantics import SemanticsSpec
 from pipeline.simulate.toml import fleet_toml
 
-__all__ = ["FleetSpec", "day_names", "simulate_fleet", "simulate_vehicle_day", "vehicle_names"]
-
-_ODOMETRY_HZ: Final = 20.0
-_SETTLE_S: Final = 1.0  # a drive's log begins this long before its first frame
+__all__ = [
+    "FleetSpec",
+    "day_names",
+    "drive_of",
+    "mounting_on",
+    "simulate_fleet",
+    "simulate_vehicle_day",
+    "vehicle_names",
+]
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,23 @@ class FleetSpec:
     seed: int = 1
     semantics: SemanticsSpec = field(default_factory=SemanticsSpec)
 
+    def __post_init__(self) -> None:
+        counts = {
+            "vehicles": self.vehicles,
+            "days": self.days,
+            "frames": self.frames,
+            "drives": self.drives,
+            "rate_hz": self.rate_hz,
+        }
+        for name, value in counts.items():
+            if value <= 0:
+                raise ConfigError("simulate", name, f"{value} is not positive")
+        for fault in self.faults:
+            if fault.vehicle not in vehicle_names(self):
+                raise ConfigError(
+                    "--faults", fault.vehicle, f"no such vehicle among {', '.join(vehicle_names(self))}"
+                )
+
 
 def vehicle_names(spec: FleetSpec) -> list[str]:
     """vehicle-1, vehicle-2, ..."""
@@ -55,7 +75,11 @@ def vehicle_names(spec: FleetSpec) -> list[str]:
 
 
 def day_names(first_day: str, days: int) -> list[str]:
-    """Consecutive days as YYYY-MM-DD."""
+    """Consecutive days as YYYY-MM-DD.
+
+    Raises:
+        ConfigError: `first_day` is no such day.
+    """
     try:
         first = date.fromisoformat(first_day)
     except ValueError as err:
@@ -72,21 +96,17 @@ def simulate_fleet(
         Counts and paths, for a summary.
     """
     vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
-    for fault in spec.faults:
-        if fault.vehicle not in vehicles:
-            raise ConfigError(
-                "--faults", fault.vehicle, f"unknown vehicle; the fleet has {', '.join(vehicles)}"
-            )
     out.mkdir(parents=True, exist_ok=True)
     (out / "fleet.toml").write_text(fleet_toml("synthetic", spec.rig, rig_named(spec.rig), vehicles))
     work = [(v, d) for d in range(len(days)) for v in range(len(vehicles))]
     total, done, logs = len(work) * spec.frames, 0, 0
     if workers <= 1:
         for v, d in work:
-            base = done
-            logs += simulate_vehicle_day(
-                spec, v, d, out, lambda n, _t, what, base=base: progress(base + n, total, what)
-            )
+
+            def report(n: int, _total: int, what: str, base: int = done) -> None:
+                progress(base + n, total, what)
+
+            logs += simulate_vehicle_day(spec, v, d, out, report)
             done += spec.frames
     else:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
@@ -101,6 +121,7 @@ def simulate_fleet(
         "frames": total,
         "logs": logs,
         "fleet": str(out / "fleet.toml"),
+        "truth": str(out / "truth"),
     }
 
 
@@ -109,199 +130,67 @@ def simulate_vehicle_day(
 ) -> int:
     """Write one vehicle-day, a log per drive; returns the number of logs."""
     name, day_name = vehicle_names(spec)[vehicle], day_names(spec.first_day, spec.days)[day]
-    rig, today = rig_named(spec.rig), faults_on(spec.faults, name, day)
-    mounting = shaken(mounting_of(rig, spec.seed, vehicle, day), spec.faults, name, day)
+    today, mounting = faults_on(spec.faults, name, day), mounting_on(spec, vehicle, day)
     folder, drives, done = out / "logs" / name / day_name, [], 0
-    counts = _shares(today.frames or spec.frames, spec.drives)
-    for i, count in enumerate(counts):
-        drive = _drive(spec, vehicle, day, i, count, day_name, today)
+    shares = _shares(today.frames or spec.frames, spec.drives)
+    for i, frames in enumerate(shares):
+        drive = drive_of(spec, vehicle, day, i, frames)
         container = CONTAINERS[(i + day) % 3] if spec.container == "mixed" else spec.container
         path = folder / log_name(f"{name}_{day_name}_{i:02d}", container)
         rng = np.random.default_rng([spec.seed, vehicle, day, i, 51])
+
+        def tick(n: int, base: int = done) -> None:
+            progress(base + n, spec.frames, f"{name} {day_name}")
+
         with open_log(path, container) as (messages, put):
-            _write_drive(
-                messages,
-                put,
-                World(drive),
-                rig,
-                mounting,
-                spec,
-                today,
-                count,
-                rng,
-                lambda n, base=done: progress(base + n, spec.frames, f"{name} {day_name}"),
-            )
-        done += count
+            record_drive(
+                messages, put, World(drive), rig_named(spec.rig), mounting, spec.semantics, today, frames, spec.rate_hz, rng, tick
+            )  # fmt: skip
+        done += frames
         drives.append(
-            {
-                "log": path.name,
-                "environment": drive.environment,
-                "start_ns": drive.start_ns,
-                "frames": count,
-                "seed": drive.seed,
-            }
+            {"log": path.name, "frames": frames}
+            | {k: getattr(drive, k) for k in ("environment", "start_ns", "seed", "night")}
         )
     truth = out / "truth" / name / f"{day_name}.json"
     truth.parent.mkdir(parents=True, exist_ok=True)
-    truth.write_text(json.dumps(_truth(spec, name, day_name, rig, mounting, day, drives), indent=1))
-    return len(counts)
+    truth.write_text(json.dumps(_truth(spec, vehicle, day, mounting) | {"drives": drives}, indent=1))
+    return len(shares)
+
+
+def mounting_on(spec: FleetSpec, vehicle: int, day: int) -> Mounting:
+    """Where the sensors of a vehicle are on a day, faults included."""
+    mounting = mounting_of(rig_named(spec.rig), spec.seed, vehicle, day)
+    return shaken(mounting, spec.faults, vehicle_names(spec)[vehicle], day)
 
 
 def _shares(frames: int, drives: int) -> list[int]:
     return [n for n in (frames // drives + (i < frames % drives) for i in range(drives)) if n]
 
 
-def _drive(
-    spec: FleetSpec, vehicle: int, day: int, number: int, frames: int, day_name: str, today: DayFaults
-) -> Drive:
-    environment = (
-        spec.environments
-        if spec.environments != "mixed"
-        else ("urban", "highway")[(vehicle + day + number) % 2]
-    )
+def drive_of(spec: FleetSpec, vehicle: int, day: int, number: int, frames: int) -> Drive:
+    """One of a vehicle's drives of a day."""
+    environment = spec.environments
+    if environment == "mixed":
+        environment = ("urban", "highway")[(vehicle + day + number) % 2]
+    day_name = day_names(spec.first_day, spec.days)[day]
     start = datetime.fromisoformat(day_name).replace(tzinfo=UTC) + timedelta(
         hours=8 + 3 * number, minutes=7 * vehicle
     )
     seed = int(np.random.default_rng([spec.seed, vehicle, day, number, 52]).integers(1 << 31))
-    return Drive(
-        seed,
-        environment,
-        _SETTLE_S + frames / spec.rate_hz + 1.0,
-        int(start.timestamp()) * 10**9,
-        today.night,
-    )
+    today: DayFaults = faults_on(spec.faults, vehicle_names(spec)[vehicle], day)
+    duration = FIRST_FRAME_S + frames / spec.rate_hz + 1.0
+    return Drive(seed, environment, duration, int(start.timestamp()) * 10**9, today.night)
 
 
-def _write_drive(
-    messages: Messages, put: Put, world: World, rig: RigSpec, mounting: Mounting, spec: FleetSpec, today: DayFaults, frames: int,
-    rng: np.random.Generator, tick: Any,
-) -> None:  # fmt: skip
-    drive = world.drive
-
-    def at(t_s: float) -> int:
-        return drive.start_ns + round(t_s * 1e9)
-
-    odometry = _odometry(drive, rng)
-    put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), _nominal(mounting)))
-    semantics = _night(spec.semantics) if today.night else spec.semantics
-    written = 0
-    for k in range(frames):
-        stamp = _SETTLE_S + k / spec.rate_hz + rng.uniform(0, 0.02)
-        frame = frame_at(world, rig, mounting, stamp, rng, semantics)
-        pending = _trio(messages, frame, rig, mounting, today, at, rng)
-        while written < len(odometry) and odometry[written][0] <= stamp + 0.1:
-            t, T, speed, yaw_rate = odometry[written]
-            pending.append((at(t), TOPICS["odometry"], messages.odometry(at(t), T, speed, yaw_rate)))
-            written += 1
-        for time_ns, topic, message in sorted(pending, key=lambda p: p[0]):
-            put(topic, time_ns, message)
-        tick(k + 1)
-
-
-def _trio(
-    messages: Messages,
-    frame: SimulatedFrame,
-    rig: RigSpec,
-    mounting: Mounting,
-    today: DayFaults,
-    at: Any,
-    rng: np.random.Generator,
-) -> list[tuple[int, str, Any]]:
-    """The messages of one frame: (log time, topic, message)."""
-    camera, lidar, radar = at(frame.camera_stamp_s), at(frame.lidar_stamp_s), at(frame.radar_stamp_s)
-    sweep, scan = frame.sweep, frame.scan
-    sign = -1.0 if rig.radar.doppler_positive == "approaching" else 1.0
-    points = dict(zip("xyz", sweep.xyz_m.T, strict=True)) | {
-        "intensity": sweep.intensity,
-        "ring": sweep.ring,
-        "time": sweep.time_s,
-    }
-    detections = dict(zip("xyz", scan.xyz_m.T, strict=True)) | {
-        "doppler": np.float32(sign) * scan.range_rate_mps,
-        "power": scan.power_db,
-    }
-    lidar_topic, radar_topic = (
-        (TOPICS["radar"], TOPICS["lidar"]) if today.swapped else (TOPICS["lidar"], TOPICS["radar"])
-    )
-    info = misread(mounting.nominal_camera, today.focal_factor)
-    labels = _permuted(frame.labels_png, rng) if today.labels_permuted else frame.labels_png
-    sent = {
-        "camera": [
-            (camera, TOPICS["info"], messages.camera_info(camera, info)),
-            (camera, TOPICS["image"], messages.image(camera, frame.jpeg, "jpeg")),
-            (camera, TOPICS["labels"], messages.image(camera, labels, "mono8; png compressed")),
-            (camera, TOPICS["detections"], messages.detections(camera, frame.boxes)),
-        ],
-        "lidar": [(lidar, lidar_topic, messages.cloud(lidar, "lidar", points))],
-        "radar": [(radar, radar_topic, messages.cloud(radar, "radar", detections))],
-    }
-    return [item for sensor, items in sent.items() if sensor not in today.missing for item in items]
-
-
-def _permuted(png: bytes, rng: np.random.Generator) -> bytes:
-    """Labels with their classes exchanged (a model with another label set)."""
-    import cv2  # noqa: PLC0415
-
-    from pipeline.simulate.semantics import encode_png  # noqa: PLC0415
-
-    labels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
-    return encode_png(np.concatenate([rng.permutation(19), np.full(237, 255)]).astype(np.uint8)[labels])
-
-
-def _night(spec: SemanticsSpec) -> SemanticsSpec:
-    """Networks trained by day, at night."""
-    return SemanticsSpec(
-        3 * spec.boundary_px, spec.swell, 0.35, 0.5, 3 * spec.box_jitter, 3 * spec.false_boxes
-    )
-
-
-def _nominal(m: Mounting) -> dict[str, np.ndarray]:
-    return {
-        "camera": m.nominal_T_vehicle_camera,
-        "lidar": m.nominal_T_vehicle_lidar,
-        "radar": m.nominal_T_vehicle_radar,
-    }
-
-
-def _odometry(drive: Drive, rng: np.random.Generator) -> list[tuple[float, np.ndarray, float, float]]:
-    """Dead reckoning from wheels and a gyro: (time, T_odom_vehicle, speed, yaw rate)."""
-    t = np.arange(0.0, drive.duration_s, 1 / _ODOMETRY_HZ)
-    T = drive.ego.poses(t)
-    velocity, omega = drive.ego.velocities(t)
-    speed = np.einsum("ij,ij->i", velocity, T[:, :3, 0]) * (1 + rng.normal(0, 0.004)) + rng.normal(
-        0, 0.03, len(t)
-    )
-    yaw_rate = np.einsum("ij,ij->i", omega, T[:, :3, 2]) + rng.normal(0, 5e-4) + rng.normal(0, 0.002, len(t))
-    yaw = np.cumsum(yaw_rate) / _ODOMETRY_HZ
-    x, y = np.cumsum(speed * np.cos(yaw)) / _ODOMETRY_HZ, np.cumsum(speed * np.sin(yaw)) / _ODOMETRY_HZ
-    R = np.zeros((len(t), 3, 3))
-    R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = (
-        np.cos(yaw),
-        -np.sin(yaw),
-        np.sin(yaw),
-        np.cos(yaw),
-        1.0,
-    )
-    poses = from_rotation_translation(R, np.stack([x, y, np.zeros_like(x)], 1))
-    return [(float(a), b, float(c), float(d)) for a, b, c, d in zip(t, poses, speed, yaw_rate, strict=True)]
-
-
-def _truth(
-    spec: FleetSpec,
-    vehicle: str,
-    day: str,
-    rig: RigSpec,
-    m: Mounting,
-    number: int,
-    drives: list[dict[str, Any]],
-) -> dict[str, Any]:
+def _truth(spec: FleetSpec, vehicle: int, day: int, m: Mounting) -> dict[str, Any]:
     """What a judge needs to know; stamp_a = stamp_b + dt_a_b_s, as in the calibration records."""
+    name = vehicle_names(spec)[vehicle]
     return {
-        "vehicle": vehicle,
-        "day": day,
-        "rig": rig.name,
+        "vehicle": name,
+        "day": day_names(spec.first_day, spec.days)[day],
+        "rig": spec.rig,
         "seed": spec.seed,
-        **{name: T.tolist() for name, T in m.truth().items()},
+        **{key: T.tolist() for key, T in m.truth().items()},
         "T_vehicle_camera": m.T_vehicle_camera.tolist(),
         "T_vehicle_lidar": m.T_vehicle_lidar.tolist(),
         "T_vehicle_radar": m.T_vehicle_radar.tolist(),
@@ -312,6 +201,5 @@ def _truth(
         "radar_elevation_bias_rad": m.radar_elevation_bias_rad,
         "camera_K": m.camera.K.tolist(),
         "camera_K_logged": m.nominal_camera.K.tolist(),
-        "faults": [asdict(f) | {"active": f.day <= number} for f in spec.faults if f.vehicle == vehicle],
-        "drives": drives,
+        "faults": [asdict(f) | {"active": f.day <= day} for f in spec.faults if f.vehicle == name],
     }

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from pipeline.geometry.spherical import from_spherical
 from pipeline.simulate.casting import Hits, Moment
-from pipeline.simulate.drives import EgoMotion
+from pipeline.simulate.drives import Motion
 from pipeline.simulate.materials import LABELS, TABLE, textures
 from pipeline.simulate.rigs import LidarSpec
 
@@ -45,7 +45,7 @@ def _beams(spec: LidarSpec) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def sweep_lidar(
     moment: Moment,
-    ego: EgoMotion,
+    ego: Motion,
     T_vehicle_lidar: Float[np.ndarray, "4 4"],
     spec: LidarSpec,
     end_s: float,
@@ -100,7 +100,9 @@ def _echo(
         label == _VEGETATION, r + rng.exponential(0.15, len(k)), r
     ) + spec.range_sigma_m * rng.standard_normal(len(k))
     echo = reflectivity * cosine * (100.0 / np.maximum(r, 1.0)) ** 2
-    lost = (echo < _FAINTEST * rng.uniform(0.6, 1.6, len(k))) | (r > spec.max_range_m) | (r < 0.8)
+    lost = (
+        (echo < _FAINTEST * rng.uniform(0.6, 1.6, len(k))) | (r > spec.max_range_m) | (r < spec.min_range_m)
+    )
     lost |= pane | ((label == _VEGETATION) & (rng.random(len(k)) < 0.08))
     range_m, strength, labels = (
         np.full(len(rays), np.inf),

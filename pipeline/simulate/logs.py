@@ -47,7 +47,7 @@ def open_log(path: Path, container: str) -> Iterator[tuple[Messages, Put]]:
 
 @contextmanager
 def _mcap(path: Path) -> Iterator[tuple[Messages, Put]]:
-    from mcap.writer import CompressionType, Writer  # noqa: PLC0415
+    from mcap.writer import CompressionType, Writer
 
     messages = Messages(2)
     channels: dict[str, int] = {}
@@ -73,7 +73,7 @@ def _mcap(path: Path) -> Iterator[tuple[Messages, Put]]:
 
 @contextmanager
 def _ros1(path: Path) -> Iterator[tuple[Messages, Put]]:
-    from rosbags.rosbag1 import Writer  # noqa: PLC0415
+    from rosbags.rosbag1 import Writer
 
     messages = Messages(1)
     connections: dict[str, Any] = {}
@@ -94,7 +94,7 @@ def _ros1(path: Path) -> Iterator[tuple[Messages, Put]]:
 
 @contextmanager
 def _db3(path: Path) -> Iterator[tuple[Messages, Put]]:
-    from rosbags.rosbag2 import Writer  # noqa: PLC0415
+    from rosbags.rosbag2 import Writer
 
     messages = Messages(2)
     connections: dict[str, Any] = {}

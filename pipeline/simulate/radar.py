@@ -8,13 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+import numba
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import from_spherical, to_spherical
 from pipeline.simulate.casting import Moment
-from pipeline.simulate.drives import Drive
+from pipeline.simulate.drives import Motion
 from pipeline.simulate.materials import LABELS, TABLE, material
 from pipeline.simulate.rigs import RadarSpec
 
@@ -59,30 +60,44 @@ class _Cells:
 
 def scan_radar(
     moment: Moment,
-    drive: Drive,
+    ego: Motion,
     T_vehicle_radar: Float[np.ndarray, "4 4"],
     spec: RadarSpec,
     errors: RadarErrors,
     rng: np.random.Generator,
+    mirrors_m: tuple[float, ...] = (),
+    beacons_map: Float[np.ndarray, "N 3"] | None = None,
 ) -> Scan:
-    """One scan at the moment's time."""
-    T_map_vehicle = drive.ego.poses(np.array([moment.t_s]))[0]
+    """One scan at the moment's time.
+
+    Args:
+        moment: the world.
+        ego: how the vehicle moves.
+        T_vehicle_radar: mounting.
+        spec: data sheet.
+        errors: constant errors.
+        rng: noise.
+        mirrors_m: offsets to the left of the vehicle of long walls and rails that mirror targets.
+        beacons_map: corner reflectors, so strong that every scan sees them.
+    """
+    T_map_vehicle = ego.poses(np.array([moment.t_s]))[0]
     T_map_radar = T_map_vehicle @ T_vehicle_radar
-    velocity, omega = (v[0] for v in drive.ego.velocities(np.array([moment.t_s])))
+    velocity, omega = (v[0] for v in ego.velocities(np.array([moment.t_s])))
     velocity_radar = velocity + np.cross(omega, T_map_radar[:3, 3] - T_map_vehicle[:3, 3])
-    cells = _merged(_scatterers(moment, T_map_radar, velocity_radar, spec, rng), spec, rng)
-    cells = _bounced(cells, T_vehicle_radar, spec, rng)
-    origin = cells.moving.astype(np.uint8)
-    ghosts = _ghosts(cells, drive, T_vehicle_radar, rng)
-    clutter = _clutter(spec, rng)
-    parts = [
-        (cells, origin),
-        (ghosts, np.full(len(ghosts.snr), 2, np.uint8)),
-        (clutter, np.full(len(clutter.snr), 3, np.uint8)),
+    echoes = _scatterers(moment, T_map_radar, velocity_radar, spec, rng)
+    if beacons_map is not None:
+        echoes = _with_beacons(echoes, transform_points(inverse(T_map_radar), beacons_map))
+    cells = _bounced(_merged(echoes, spec, rng), T_vehicle_radar, spec, rng)
+    ghosts, clutter = _ghosts(cells, mirrors_m, T_vehicle_radar, rng), _clutter(spec, rng)
+    origin = [
+        cells.moving.astype(np.uint8),
+        np.full(len(ghosts.snr), 2, np.uint8),
+        np.full(len(clutter.snr), 3, np.uint8),
     ]
-    aer = np.concatenate([c.aer for c, _ in parts])
-    rate, snr = np.concatenate([c.rate for c, _ in parts]), np.concatenate([c.snr for c, _ in parts])
-    aer, rate = _measured(aer, rate, snr, spec, errors, rng)
+    parts = (cells, ghosts, clutter)
+    snr = np.concatenate([c.snr for c in parts])
+    rates = np.concatenate([c.rate for c in parts])
+    aer, rate = _measured(np.concatenate([c.aer for c in parts]), rates, snr, spec, errors, rng)
     a, e, r = aer.T
     inside = (np.abs(a) < np.radians(spec.azimuth_deg)) & (np.abs(e) < np.radians(spec.elevation_deg) * 1.1)
     inside &= (r > spec.min_range_m) & (r < spec.max_range_m)
@@ -93,7 +108,7 @@ def scan_radar(
         xyz,
         rate[inside].astype(np.float32),
         (30 + 10 * np.log10(snr[inside])).astype(np.float32),
-        np.concatenate([o for _, o in parts])[inside],
+        np.concatenate(origin)[inside],
     )
 
 
@@ -127,11 +142,11 @@ def _scatterers(
     v = v * np.where(np.isin(m, _WHEELS), rng.uniform(0.3, 1.7, len(k)), 1.0)[:, None]
     v += np.where(np.isin(label, _SOFT), 0.2, 0.0)[:, None] * rng.standard_normal((len(k), 3))
     rate = np.einsum("ij,ij->i", v - velocity_radar, rays[near])
-    # Power per ray: gain x solid angle / r^2; 9,000 rays of gain 1 at 80 m make a signal-to-noise ratio of 1 each.
+    # Power per ray: gain x solid angle / r^2; 9,000 rays of gain 1 at 120 m make a signal-to-noise ratio of 1 each.
     snr = (
         TABLE.radar_gain[m]
         * shape
-        * (80.0 / r) ** 2
+        * (120.0 / r) ** 2
         * (9000 / len(rays))
         * rng.exponential(1.0, len(k))
         * np.exp(-inside / 2.0)
@@ -169,9 +184,29 @@ def _merged(echoes: _Cells, spec: RadarSpec, rng: np.random.Generator) -> _Cells
     # Swerling I: the whole cell fades from scan to scan.
     snr = total * rng.exponential(1.0, n) + 1.0
     keep = snr > _THRESHOLD
-    return _Cells(
+    found = _Cells(
         np.stack(mean[:3], 1)[keep], mean[3][keep], snr[keep], mean[4][keep] > 0.5, mean[5][keep] > 0.5
     )
+    return _peaks(found, np.append(size, spec.doppler_resolution_mps))
+
+
+def _peaks(cells: _Cells, size: np.ndarray) -> _Cells:
+    """Local maxima: of two detections closer than the resolution in all four dimensions, the weaker one is not seen."""
+    strongest = np.argsort(-cells.snr)
+    x = (np.concatenate([cells.aer, cells.rate[:, None]], 1) / size)[strongest]
+    keep = strongest[_unsuppressed(x)]
+    return _Cells(cells.aer[keep], cells.rate[keep], cells.snr[keep], cells.ground[keep], cells.moving[keep])
+
+
+@numba.njit(cache=True)
+def _unsuppressed(x: np.ndarray) -> np.ndarray:
+    keep = np.ones(len(x), np.bool_)
+    for i in range(len(x)):
+        if keep[i]:
+            for j in range(i + 1, len(x)):
+                if np.all(np.abs(x[i] - x[j]) < 1.0):
+                    keep[j] = False
+    return keep
 
 
 def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
@@ -203,13 +238,23 @@ def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: n
     )  # fmt: skip
 
 
-def _ghosts(cells: _Cells, drive: Drive, T_vehicle_radar: np.ndarray, rng: np.random.Generator) -> _Cells:
+def _with_beacons(echoes: _Cells, xyz_radar: np.ndarray) -> _Cells:
+    n, no = len(xyz_radar), np.zeros(len(xyz_radar), bool)
+    return _Cells(
+        np.concatenate([echoes.aer, to_spherical(xyz_radar)]), np.concatenate([echoes.rate, np.zeros(n)]),
+        np.concatenate([echoes.snr, np.full(n, 3e4)]), np.concatenate([echoes.ground, no]),
+        np.concatenate([echoes.moving, no]),
+    )  # fmt: skip
+
+
+def _ghosts(
+    cells: _Cells, mirrors_m: tuple[float, ...], T_vehicle_radar: np.ndarray, rng: np.random.Generator
+) -> _Cells:
     """Mirror images behind rails and walls, and second trips between a target and ourselves."""
     strong = cells.moving & (cells.snr > 60)
-    mirrored, doubled = strong & (rng.random(len(strong)) < 0.12), strong & (rng.random(len(strong)) < 0.03)
-    side = drive.layout.right_edge - 0.8 - drive.layout.lanes_own[0]
-    if drive.environment == "highway" and rng.random() < 0.5:
-        side = -drive.layout.lanes_own[0]
+    mirrored = strong & (rng.random(len(strong)) < (0.12 if mirrors_m else 0.0))
+    doubled = strong & (rng.random(len(strong)) < 0.03)
+    side = mirrors_m[int(rng.integers(len(mirrors_m)))] if mirrors_m else 0.0
     image = transform_points(T_vehicle_radar, from_spherical(cells.aer[mirrored]))
     image[:, 1] = 2 * side - image[:, 1]
     first = to_spherical(transform_points(inverse(T_vehicle_radar), image))

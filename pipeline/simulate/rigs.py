@@ -47,7 +47,8 @@ class LidarSpec:
     columns: int = 240
     rows: int = 96
     sweep_s: float = 0.08
-    max_range_m: float = 120.0
+    min_range_m: float = 5.0
+    max_range_m: float = 80.0
     range_sigma_m: float = 0.02
     divergence_deg: float = 0.10  # half angle of the footprint
 
@@ -102,7 +103,7 @@ RIGS: Final = {
     "ring16": RigSpec(
         "ring16",
         camera=CameraSpec(912, 470),
-        lidar=LidarSpec((-180.0, 180.0), (-15.0, 15.0), 1800, 16, 0.1, 100.0),
+        lidar=LidarSpec((-180.0, 180.0), (-15.0, 15.0), 1800, 16, 0.1, 0.8, 100.0),
         radar=RadarSpec(rays=6000, doppler_period_mps=10.394, doppler_positive="approaching"),
     ),
 }

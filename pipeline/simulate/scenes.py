@@ -22,7 +22,9 @@ _SIGN_COLOURS: Final = (
     (1.0, 0.85, 0.1),
     (0.1, 0.5, 0.25),
 )
-_PANEL: Final = {f: "sign_back" for f in ("front", "left", "right", "top", "bottom")} | {"rear": "sign_face"}
+_PANEL: Final = dict.fromkeys(("front", "left", "right", "top", "bottom"), "sign_back") | {
+    "rear": "sign_face"
+}
 
 
 @dataclass

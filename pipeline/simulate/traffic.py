@@ -69,7 +69,7 @@ def _streams(drive: Drive) -> list[_Stream]:
                         i,
                         d,
                         rng.uniform(21, 25) if slow else rng.uniform(27, 36),
-                        rng.uniform(32, 48),
+                        rng.uniform(24, 36),
                         0.75,
                         kinds,
                     )
@@ -77,7 +77,7 @@ def _streams(drive: Drive) -> list[_Stream]:
         for i, d in enumerate(layout.lanes_oncoming):
             streams.append(
                 _Stream(
-                    10 + i, d, -rng.uniform(24, 35), rng.uniform(36, 60), 0.65, ("car", "car", "van", "truck")
+                    10 + i, d, -rng.uniform(24, 35), rng.uniform(26, 42), 0.65, ("car", "car", "van", "truck")
                 )
             )
         return streams

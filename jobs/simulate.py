@@ -1,0 +1,68 @@
+"""`boresight simulate`: logs of a synthetic fleet, with its truth beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+__all__ = ["simulate"]
+
+
+def simulate(
+    *,
+    out: Path,
+    vehicles: int = 3,
+    days: int = 4,
+    first_day: str = "2026-03-02",
+    frames: int = 40,
+    rate_hz: float = 2.0,
+    rig: Literal["demo", "paper", "ring16", "demo-flat", "paper-flat", "ring16-flat"] = "demo",
+    environments: Literal["mixed", "urban", "highway"] = "mixed",
+    container: Literal["mcap", "ros1", "db3", "mixed"] = "mcap",
+    faults: str = "",
+    reflectors: bool = False,
+    seed: int = 1,
+    workers: int = 1,
+) -> int:
+    """Write OUT/logs/VEHICLE/DAY/*, OUT/truth/VEHICLE/DAY.json and OUT/fleet.toml.
+
+    Args:
+        out: folder to write into; logs of the same name are replaced.
+        vehicles: number of vehicles, vehicle-1 and so on.
+        days: number of consecutive days.
+        first_day: first of them, YYYY-MM-DD.
+        frames: camera-lidar-radar trios per vehicle-day, in three drives.
+        rate_hz: trios per second within a drive.
+        rig: sensors; `-flat` means a radar without elevation.
+        environments: what the drives lead through.
+        container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
+        faults: vehicle:day:sensor:kind:amount, several with commas; kinds: yaw pitch roll [deg], x y z [m],
+            drift-... per day, time [s], missing, swap, intrinsics, labels, night, few.
+        reflectors: also record three corner reflectors on every vehicle's last day, under OUT/reflectors.
+        seed: same seed, same logs.
+        workers: processes.
+    """
+    from jobs.summary import print_summary, progress_reporter
+    from pipeline.simulate.faults import parse_faults
+    from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
+    from pipeline.simulate.reflectors import simulate_reflectors
+
+    named = parse_faults(faults, day_names(first_day, days))
+    spec = FleetSpec(
+        vehicles=vehicles,
+        days=days,
+        first_day=first_day,
+        frames=frames,
+        rate_hz=rate_hz,
+        rig=rig,
+        environments=environments,
+        container=container,
+        faults=named,
+        seed=seed,
+    )
+    with progress_reporter(f"simulate {vehicles} x {days}") as progress:
+        result = simulate_fleet(spec, out, progress, workers)
+        if reflectors:
+            result["reflectors"] = [str(simulate_reflectors(spec, v, days - 1, out)) for v in range(vehicles)]
+    print_summary("simulate", "done", **result)
+    return 0

@@ -1,0 +1,164 @@
+"""The paper's controlled recording: three trihedral corner reflectors on a level empty lot, seen standing still.
+
+Source: paper, section 2.1 (150 frames, positions picked by hand in each sensor's data) and figure 2.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.results import Progress, silent
+from pipeline.simulate.casting import Moment, standing_of
+from pipeline.simulate.drives import Parked
+from pipeline.simulate.faults import DayFaults
+from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, vehicle_names
+from pipeline.simulate.frames import Scene, SimulatedFrame, frame_of
+from pipeline.simulate.logs import TOPICS, open_log
+from pipeline.simulate.meshes import Mesh, MeshBuilder
+from pipeline.simulate.recording import nominal_poses, trio
+from pipeline.simulate.rigs import Mounting, rig_named
+
+__all__ = ["REFLECTORS_VEHICLE", "simulate_reflectors"]
+
+# Apexes in the vehicle frame [m]: three ranges, three bearings, at about the height of the sensors.
+REFLECTORS_VEHICLE: Final = np.array([[16.3, -2.6, 1.45], [26.0, 3.5, 1.30], [41.2, 0.6, 1.60]])
+_EDGE_M: Final = 0.35
+_RATE_HZ: Final = 10.0
+_SUN: Final = np.array([0.35, 0.55, 0.76]) / np.linalg.norm([0.35, 0.55, 0.76])
+
+
+def simulate_reflectors(
+    spec: FleetSpec, vehicle: int, day: int, out: Path, frames: int = 150, progress: Progress = silent
+) -> Path:
+    """Write `reflectors/<vehicle>/<day>.mcap` and `<day>.json` (picked positions, and the truth apart from them).
+
+    Returns:
+        Path of the JSON file.
+    """
+    name, day_name = vehicle_names(spec)[vehicle], day_names(spec.first_day, spec.days)[day]
+    rig, mounting = rig_named(spec.rig), mounting_on(spec, vehicle, day)
+    rng = np.random.default_rng([spec.seed, vehicle, day, 71])
+    scene = Scene(Parked(), _SUN, beacons_map=REFLECTORS_VEHICLE)
+    moment = Moment(standing_of(_lot(), np.zeros(3), _SUN, lambda p: p, 8.0), [], 0.0)
+    start_ns = (
+        int((datetime.fromisoformat(day_name).replace(tzinfo=UTC) + timedelta(hours=18)).timestamp()) * 10**9
+    )
+    folder, seen = out / "reflectors" / name, []
+
+    def at(t_s: float) -> int:
+        return start_ns + round(t_s * 1e9)
+
+    with open_log(folder / f"{day_name}.mcap", "mcap") as (messages, put):
+        put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), nominal_poses(mounting)))
+        for k in range(frames):
+            frame = frame_of(moment, scene, rig, mounting, 1.0 + k / _RATE_HZ, rng, spec.semantics)
+            items = trio(messages, frame, rig, mounting, DayFaults(), at, rng)
+            for time_ns, topic, message in sorted(items, key=lambda p: p[0]):
+                put(topic, time_ns, message)
+            seen.append(replace(frame, jpeg=b"", labels_png=b"", true_labels=np.zeros((0, 0), np.uint8)))
+            progress(k + 1, frames, f"{name} {day_name} reflectors")
+    path = folder / f"{day_name}.json"
+    path.write_text(json.dumps(_picks(name, day_name, mounting, seen, rng), indent=1))
+    return path
+
+
+def _lot() -> Mesh:
+    """Level asphalt with bays, a fence at its far end, and the reflectors on tripods."""
+    b = MeshBuilder()
+    b.quads(_level(-40, 90, -60, 60, 0.0), "asphalt", uv=_level(-40, 90, -60, 60, 0.0)[..., :2])
+    for side in (-1, 1):
+        for x in np.arange(6.0, 60.0, 2.6):
+            y0, y1 = sorted((side * 8.0, side * 13.0))
+            b.quads(
+                _level(x - 0.06, x + 0.06, y0, y1, 0.004),
+                "paint",
+                uv=_level(x - 0.06, x + 0.06, y0, y1, 0)[..., :2],
+            )
+    b.box((75.0, 0.0, 0.9), (0.1, 110.0, 1.8), "slats")
+    rng = np.random.default_rng(72)
+    for y in np.arange(-50.0, 51.0, 8.0):
+        b.blob(np.array([82.0, y + rng.uniform(-2, 2), 3.2]), rng.uniform(1.6, 3.0, 3), "foliage", rng)
+    for apex in REFLECTORS_VEHICLE:
+        _trihedral(b, apex)
+    return b.mesh()
+
+
+def _level(x0: float, x1: float, y0: float, y1: float, z: float) -> np.ndarray:
+    return np.array([[[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]]])
+
+
+def _trihedral(b: MeshBuilder, apex: np.ndarray) -> None:
+    """Three right-angled plates that open towards the vehicle, symmetric about the line of sight."""
+    u = -apex * [1, 1, 0] / np.linalg.norm(apex[:2])
+    side = np.array([-u[1], u[0], 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    # Orthonormal triad whose sum points along u: columns of a rotation that takes (1, 1, 1)/sqrt(3) to u.
+    edges = [
+        u / np.sqrt(3) + (np.cos(a) * side + np.sin(a) * up) * np.sqrt(2 / 3)
+        for a in np.radians([90, 210, 330])
+    ]
+    tips = [apex + _EDGE_M * e for e in edges]
+    for i in range(3):
+        b.quads(np.array([[apex, tips[i], tips[(i + 1) % 3], apex]]), "corner_reflector")
+    foot = apex - u * 0.05
+    for a in np.radians([20, 140, 260]):
+        ground = np.array([foot[0] + 0.45 * np.cos(a), foot[1] + 0.45 * np.sin(a), 0.0])
+        b.tube(ground, foot - [0, 0, 0.22], 0.02, "tripod", 5)
+
+
+def _picks(
+    vehicle: str, day: str, m: Mounting, frames: list[SimulatedFrame], rng: np.random.Generator
+) -> dict[str, Any]:
+    """What a patient person marks in each sensor's data, and what is true."""
+    T_camera_vehicle, T_lidar_vehicle = inverse(m.T_vehicle_camera), inverse(m.T_vehicle_lidar)
+    pixels, _ = m.camera.project(transform_points(T_camera_vehicle, REFLECTORS_VEHICLE))
+    lidar = transform_points(T_lidar_vehicle, REFLECTORS_VEHICLE)
+    radar = transform_points(inverse(m.T_vehicle_radar), REFLECTORS_VEHICLE)
+    step = m.camera.width_px / 1824  # half a pixel of the full camera
+    targets = [
+        {
+            "pixel": (pixels[i] + rng.normal(0, 0.5 * max(step, 0.5), 2)).tolist(),
+            "lidar_m": (lidar[i] + rng.normal(0, 0.015, 3)).tolist(),
+            "radar_m": _radar_pick(frames, radar[i]).tolist(),
+        }
+        for i in range(len(REFLECTORS_VEHICLE))
+    ]
+    return {
+        "vehicle": vehicle,
+        "day": day,
+        "frames": len(frames),
+        "targets": targets,
+        "camera": {
+            "model": m.nominal_camera.model,
+            "K": m.nominal_camera.K.tolist(),
+            "D": m.nominal_camera.D.tolist(),
+            "width_px": m.nominal_camera.width_px,
+            "height_px": m.nominal_camera.height_px,
+        },
+        "truth": {
+            "pixels": pixels.tolist(),
+            "lidar_m": lidar.tolist(),
+            "radar_m": radar.tolist(),
+            "camera_K": m.camera.K.tolist(),
+            **{key: T.tolist() for key, T in m.truth().items()},
+        },
+    }
+
+
+def _radar_pick(frames: list[SimulatedFrame], near_m: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """Mean of the strongest detection around a reflector over all frames."""
+    found = []
+    for frame in frames:
+        offset = np.linalg.norm(frame.scan.xyz_m[:, :2] - near_m[:2], axis=1)
+        close = np.flatnonzero(offset < 1.5)
+        if close.size:
+            found.append(frame.scan.xyz_m[close[np.argmax(frame.scan.power_db[close])]])
+    return np.mean(found, axis=0).astype(np.float64) if found else np.full(3, np.nan)
