@@ -1,0 +1,127 @@
+"""`boresight nightly`: a fleet's logs to records, drift findings and pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from pipeline.fleet.nightly import DayOutcome, Night
+    from pipeline.fleet.pattern import VehicleDay
+    from schemas.drift import DriftFinding
+
+__all__ = ["nightly", "watch_night"]
+
+
+def nightly(
+    *,
+    fleet: Path,
+    lake: str,
+    logs: str,
+    from_day: Annotated[str | None, Parameter(name="--from")] = None,
+    to_day: Annotated[str | None, Parameter(name="--to")] = None,
+    executor: Literal["process", "inline"] = "process",
+    workers: int | None = None,
+    method: str | None = None,
+    seed: int | None = None,
+    report: Path | None = None,
+) -> int:
+    """Take every vehicle-day of a pattern through all stages; one bad day never stops the fleet.
+
+    Args:
+        fleet: fleet.toml.
+        lake: folder of the tables; made where it is missing.
+        logs: pattern such as "logs/{vehicle}/{day}/*.mcap" or "data/{vehicle}_{day}_*"; quoted.
+        from_day: first day, YYYY-MM-DD.
+        to_day: last day.
+        executor: process (a pool) or inline (one after the other in this process).
+        workers: processes at a time; default: one per CPU that this process may use.
+        method: calibration method; default: audit.method, so that calibration and charts agree.
+        seed: of everything random; the configuration's where left out.
+        report: HTML page of the fleet; default: report/fleet.html inside the lake.
+    """
+    from jobs.summary import exit_code, print_summary
+    from pipeline.config import load_fleet
+    from pipeline.fleet.nightly import Night
+    from pipeline.fleet.pattern import find_vehicle_days
+    from pipeline.store.partitions import Lake
+
+    config = load_fleet(fleet)
+    tables = Lake.at(lake)
+    night = Night(config, fleet, tables, method or config.audit.method, seed)
+    days = find_vehicle_days(logs, from_day, to_day)
+    outcomes = watch_night(night, days, executor, workers)
+    findings, pages = close_night(night, from_day, to_day, report or tables.root / "report" / "fleet.html")
+    code = exit_code([o.status for o in outcomes])
+    print_summary(
+        "nightly",
+        {0: "done", 1: "failed", 3: "held"}[code],
+        vehicle_days=len(outcomes),
+        **{s: sum(o.status == s for o in outcomes) for s in ("done", "cached", "held", "refused", "failed")},
+        problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
+        moved=moved_sensors(findings),
+        report=pages[0] if pages else None,
+    )
+    return code
+
+
+def watch_night(
+    night: Night, days: Sequence[VehicleDay], executor: str, workers: int | None
+) -> list[DayOutcome]:
+    """Run the night in view of whoever watches; outcomes in order of their end."""
+    from jobs.night_view import night_view
+    from pipeline.errors import ConfigError
+    from pipeline.fleet.nightly import run_night
+
+    if workers is not None and workers < 1:
+        raise ConfigError("command line", "--workers", f"{workers} is less than one")
+    known = [d.partition for d in days if d.partition.vehicle in night.fleet.vehicles]
+    outcomes = []
+    with night_view([f"{p.vehicle} {p.day}" for p in known], len(days)) as view:
+        for outcome in run_night(night, days, executor, workers or usable_cpus(), view.watch):
+            view.finished(outcome)
+            outcomes.append(outcome)
+    return outcomes
+
+
+def close_night(
+    night: Night, from_day: str | None, to_day: str | None, report: Path, truth: Any = None
+) -> tuple[list[DriftFinding], list[str]]:
+    """Audit the fleet and write its pages; returns the findings and the pages, the fleet's first."""
+    from jobs.summary import progress_reporter
+    from pipeline.stages import AUDIT, REPORT
+
+    with progress_reporter("audit") as progress:
+        findings = AUDIT.load()(night.lake, night.fleet, from_day, to_day, night.method, progress)
+    if not findings:
+        return [], []
+    with progress_reporter("report") as progress:
+        progress(0, 0, "pages")
+        pages = REPORT.load()(night.lake, night.fleet, report, method=night.method, truth=truth)
+    return findings, [str(p) for p in pages]
+
+
+def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
+    """Which sensor of which vehicle moved, and since when, without repetition."""
+    moved = sorted({(f.vehicle, f.moved_sensor, f.start_day or "") for f in findings if f.moved_sensor})
+    return [{"vehicle": v, "sensor": s, "since": d or None} for v, s, d in moved]
+
+
+def usable_cpus() -> int:
+    """CPUs that this process may use; containers often give fewer than the machine has."""
+    import os
+
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _problem(outcome: DayOutcome) -> dict[str, Any]:
+    return {
+        "vehicle": outcome.vehicle,
+        "day": outcome.day,
+        "status": outcome.status,
+        "reason": outcome.reason,
+        "pairs": outcome.pairs,
+    }
