@@ -49,15 +49,17 @@ def solve_joint_optimisation(
     active = [pair for pair in PAIRS if pair in triggered]
     problems = {pair: pair_problem(pair, observations[pair], prior, config) for pair in PAIRS}
     starts = []
+    scales = {}
     for k, pair in enumerate(active):
         progress(k, len(active) + 1, f"{pair}: differential evolution")
         alone = solve_pair(problems[pair], config, np.random.default_rng([seed, PAIRS.index(pair)]))
         starts.append(alone.x)
+        scales[pair] = max(alone.value, 1e-6)
     progress(len(active), len(active) + 1, "all pairs with the loop")
     pairs = {pair: estimate_of(problems[pair], prior.of(pair), prior, None) for pair in PAIRS}
     if active:
         found = minimise(
-            lambda x: joint_costs(problems, prior, active, x),
+            lambda x: joint_costs(problems, prior, scales, x),
             search_of(config),
             np.concatenate(starts),
             np.random.default_rng([seed, len(PAIRS)]),
@@ -71,12 +73,21 @@ def solve_joint_optimisation(
 
 
 def joint_costs(
-    problems: Mapping[str, PairProblem], prior: Prior, active: Sequence[str], x: Float[np.ndarray, "S D"]
+    problems: Mapping[str, PairProblem],
+    prior: Prior,
+    scales: Mapping[str, float],
+    x: Float[np.ndarray, "S D"],
 ) -> Float[np.ndarray, " S"]:
-    """Equation 2 for a batch of parameter vectors, six numbers per active pair about its prior."""
+    """Equation 2 for a batch of parameter vectors, six numbers per pair of `scales` about its prior.
+
+    Each pair's loss is divided by its scale, the value of its pairwise minimum: the paper names no weights, and unweighted
+    the pair with the largest unexplained rest, not the best determined one, would decide.
+    """
     poses = {pair: np.broadcast_to(prior.of(pair), (len(x), 4, 4)) for pair in PAIRS}
-    for k, pair in enumerate(active):
+    for k, pair in enumerate(scales):
         poses[pair] = poses_about(prior.of(pair), x[:, 6 * k : 6 * k + 6])
-    pairwise = sum((problems[pair].loss(poses[pair]) for pair in active), np.zeros(len(x)))
+    pairwise = sum(
+        (problems[pair].loss(poses[pair]) / scale for pair, scale in scales.items()), np.zeros(len(x))
+    )
     loop = loop_transform(poses["camera_lidar"], poses["lidar_radar"], poses["camera_radar"])
     return joint_objective(pairwise, loop_loss(loop))
