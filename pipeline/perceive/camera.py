@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -59,6 +59,7 @@ class CameraSemantics:
         return float(np.mean(self.labels == ROAD_ID))
 
 
+@runtime_checkable
 class SemanticsSource(Protocol):
     """Where semantics come from."""
 

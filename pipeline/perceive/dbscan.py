@@ -5,6 +5,8 @@ Source: Ester, Kriegel, Sander, Xu, "A density-based algorithm for discovering c
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numba
 import numpy as np
 from jaxtyping import Float, Int32
@@ -46,6 +48,7 @@ def _neighbour_runs(cells: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, n
     return start[low], start[high]
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True)
 def _dbscan(
     p: np.ndarray, cell_of: np.ndarray, first: np.ndarray, last: np.ndarray, eps2: float, min_points: int
@@ -66,6 +69,7 @@ def _dbscan(
     return label
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True)
 def _join_earlier(
     p: np.ndarray, i: int, c: int, first: np.ndarray, last: np.ndarray, eps2: float, core: np.ndarray,
@@ -80,6 +84,7 @@ def _join_earlier(
                     parent[max(a, b)] = min(a, b)
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True)
 def _nearest_core(
     p: np.ndarray, i: int, c: int, first: np.ndarray, last: np.ndarray, eps2: float, core: np.ndarray
@@ -93,6 +98,7 @@ def _nearest_core(
     return nearest
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True)
 def _neighbours_reach(
     p: np.ndarray, i: int, c: int, first: np.ndarray, last: np.ndarray, eps2: float, wanted: int
@@ -107,12 +113,14 @@ def _neighbours_reach(
     return False
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, inline="always")
 def _distance2(p: np.ndarray, i: int, j: int) -> float:
     x, y, z = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
     return x * x + y * y + z * z
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True)
 def _root(parent: np.ndarray, i: int) -> int:
     while parent[i] != i:

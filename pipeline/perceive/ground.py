@@ -10,6 +10,7 @@ Source: paper, section 4.2 (RANSAC drivable area; its RangeNet++ stage is replac
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numba
 import numpy as np
@@ -74,8 +75,8 @@ def _lowest_of_cells(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first = np.flatnonzero(np.append(True, np.any(np.diff(cell[order], axis=0) != 0, axis=1)))
     low = near[order[first]]
     top_m = near[order[np.append(first[1:], len(order)) - 1], 2]
-    # The vehicle stands on the ground that is wanted: near cells count more than ditches and banks beside the road,
-    # and cells with something standing in them, whose lowest point may be a bumper, count less.
+    # The vehicle stands on the ground that is wanted: near cells count more than ditches and banks beside the
+    # road, and cells with something standing in them, whose lowest point may be a bumper, count less.
     weight = 1 / (1 + (np.hypot(low[:, 0], low[:, 1]) / _TRUSTED_M) ** 2)
     return low, np.where(top_m - low[:, 2] < _FLAT_M, weight, 0.2 * weight)
 
@@ -137,6 +138,7 @@ def _follow_surface(xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float) ->
     return (height_m - surface[sector, ring]).astype(np.float32)
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True)
 def _walk(height: np.ndarray, start: np.ndarray, sectors: int, bins: int, inlier_m: float) -> np.ndarray:
     surface = np.zeros((sectors, bins))

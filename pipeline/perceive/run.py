@@ -202,26 +202,32 @@ def _perceive_radar(
         frame.radar_has_elevation, config, rng,
     )  # fmt: skip
     returns = measure_clusters(xyz, motion.residual_mps, motion.cluster, frame.doppler_period_mps)
-    velocity = motion.velocity_mps
-    ego = EgoMotion(
-        None if velocity is None else (float(velocity[0]), float(velocity[1])), frame.ego_yaw_rate_radps
-    )
     state, found = advance_tracks(
-        tracks, frame.radar_stamp_ns, frame.drive, ego, returns, frame.doppler_period_mps
-    )
+        tracks, frame.radar_stamp_ns, frame.drive, _ego_motion(frame, motion), returns,
+        frame.doppler_period_mps,
+    )  # fmt: skip
     sector = free_sector(xyz, motion.motion, frame.radar_has_elevation)
     columns = {
         "radar_xyz_m": xyz,
         "radar_residual_mps": motion.residual_mps,
         "radar_motion": motion.motion,
         "radar_cluster": motion.cluster,
-        "radar_velocity_mps": velocity,
+        "radar_velocity_mps": motion.velocity_mps,
         "radar_velocity_cov": motion.velocity_cov,
         **_track_columns(found),
         "radar_drivable_azimuth_rad": sector.azimuth_rad,
         "radar_drivable_range_m": sector.range_m,
     }
     return columns, motion, state
+
+
+def _ego_motion(frame: Frame, motion: RadarMotion) -> EgoMotion:
+    """The radar's velocity, or the odometry's speed where the scan shows no static world."""
+    velocity = motion.velocity_mps
+    if velocity is not None:
+        return EgoMotion((float(velocity[0]), float(velocity[1])), frame.ego_yaw_rate_radps)
+    speed = frame.ego_speed_mps
+    return EgoMotion(None if speed is None else (speed, 0.0), frame.ego_yaw_rate_radps)
 
 
 def _track_columns(tracks: Tracks) -> dict[str, np.ndarray]:

@@ -27,6 +27,8 @@ _SPEED_SIGMA_MPS = 15.0  # prior speed of road users; weighs the Doppler wraps
 _WRAPS = 3
 _YAW_RATE_SIGMA_RADPS = 0.08  # where nobody measured it: gentle bends
 _GATE = 11.3  # chi^2 with 3 degrees of freedom, 99 %
+_FORBIDDEN = 1e6  # cost of a pair outside the gate
+_PRUNE = -8.0  # log weight against the best hypothesis of the track
 _MAX_GAP_S = 2.5
 _MAX_MISSED_S = 1.0
 
@@ -121,17 +123,19 @@ def advance_tracks(
     then. Identities are never used twice.
     """
     state = _predict(state, stamp_ns, drive, ego)
-    row_of_cluster = _assign(state, returns, period_mps)
+    identity = _assign(state, returns, period_mps)
+    fresh = np.flatnonzero(identity < 0)
     updated = [
-        _update(state, h, returns, k, period_mps, stamp_ns) for k, h in enumerate(row_of_cluster) if h >= 0
+        _update(_take(state, state.identity == i), returns, k, period_mps, stamp_ns)
+        for k, i in enumerate(identity)
+        if i >= 0
     ]
-    fresh = [k for k, h in enumerate(row_of_cluster) if h < 0]
     born = _born(returns, fresh, period_mps, state.next_identity, stamp_ns)
-    matched = {int(state.identity[h]) for h in row_of_cluster if h >= 0}
-    missed = ~np.isin(state.identity, list(matched)) & (stamp_ns - state.seen_ns < _MAX_MISSED_S * 1e9)
+    missed = ~np.isin(state.identity, identity) & (stamp_ns - state.seen_ns < _MAX_MISSED_S * 1e9)
     following = _concatenate(state, [_take(state, missed), *updated, born])
-    tracks = _report(following, row_of_cluster, state, returns, fresh)
-    return replace(following, next_identity=state.next_identity + len(fresh)), tracks
+    identity[fresh] = state.next_identity + np.arange(len(fresh))
+    following = replace(following, next_identity=state.next_identity + len(fresh))
+    return following, _report(following, identity, returns)
 
 
 def _predict(state: TrackState, stamp_ns: int, drive: int, ego: EgoMotion) -> TrackState:
@@ -162,25 +166,18 @@ def _mean_yaw_rate(a: EgoMotion, b: EgoMotion) -> tuple[float, float]:
     return (float(np.mean(known)), 0.01) if known else (0.0, _YAW_RATE_SIGMA_RADPS)
 
 
-def _assign(state: TrackState, returns: ClusterReturns, period_mps: float | None) -> list[int]:
-    """Row of the hypothesis that each cluster continues, -1 where it starts a track."""
-    clusters, rows = len(returns.points), len(state.state)
-    if not clusters or not rows:
-        return [-1] * clusters
+def _assign(state: TrackState, returns: ClusterReturns, period_mps: float | None) -> np.ndarray:
+    """Identity of the track that each cluster continues, -1 where it starts one."""
+    result = np.full(len(returns.points), -1, np.int32)
+    if not len(result) or not len(state.state):
+        return result
     cost = _costs(state, returns, period_mps)
     tracks, column = np.unique(state.identity, return_inverse=True)
-    best = np.full((clusters, len(tracks)), np.inf)
-    hypothesis = np.zeros((clusters, len(tracks)), int)
-    for t in range(len(tracks)):
-        of_track = np.flatnonzero(column == t)
-        pick = np.argmin(cost[:, of_track], axis=1)
-        hypothesis[:, t] = of_track[pick]
-        best[:, t] = cost[np.arange(clusters), hypothesis[:, t]]
-    gated = np.where(np.isfinite(best), best, 1e6)
-    result = [-1] * clusters
+    best = np.stack([cost[:, column == t].min(axis=1) for t in range(len(tracks))], axis=1)
+    gated = np.where(np.isfinite(best), best, _FORBIDDEN)
     for k, t in zip(*linear_sum_assignment(gated), strict=True):
-        if gated[k, t] < 1e6:
-            result[k] = int(hypothesis[k, t])
+        if gated[k, t] < _FORBIDDEN:
+            result[k] = tracks[t]
     return result
 
 
@@ -232,68 +229,54 @@ def _outer(v: np.ndarray) -> np.ndarray:
 
 
 def _update(
-    state: TrackState, h: int, returns: ClusterReturns, k: int, period_mps: float | None, stamp_ns: int
+    track: TrackState, returns: ClusterReturns, k: int, period_mps: float | None, stamp_ns: int
 ) -> TrackState:
-    """The one hypothesis that stays of its track, after the measurement (Joseph form)."""
+    """The hypotheses of one track after the measurement (Joseph form), without those grown unlikely."""
     z = returns.centre_m[k : k + 1, :2].astype(np.float64)
-    H, R = _measurement(z), _noise(z)[0]
-    innovation = _innovation(z, returns.rate_mps[k : k + 1], H, state.state[h : h + 1], period_mps)[0, 0]
-    H = H[0]
-    G = np.linalg.solve(H @ state.cov[h] @ H.T + R, H @ state.cov[h]).T
+    H, R = _measurement(z)[0], _noise(z)[0]
+    innovation = _innovation(z, returns.rate_mps[k : k + 1], H[None], track.state, period_mps)[0]
+    S = H @ track.cov @ H.T + R
+    G = np.swapaxes(np.linalg.solve(S, H @ track.cov), 1, 2)
     A = np.eye(4) - G @ H
-    cov = A @ state.cov[h] @ A.T + G @ R @ G.T
-    one = _take(state, np.arange(len(state.state)) == h)
-    return replace(
-        one, state=(state.state[h] + G @ innovation)[None], cov=cov[None], log_weight=np.zeros(1),
-        age=one.age + 1, seen_ns=np.array([stamp_ns]),
+    cov = A @ track.cov @ np.swapaxes(A, 1, 2) + G @ R @ np.swapaxes(G, 1, 2)
+    d2 = np.einsum("hi,hi->h", innovation, np.linalg.solve(S, innovation[..., None])[..., 0])
+    log_weight = track.log_weight - 0.5 * (d2 + np.linalg.slogdet(S)[1])
+    log_weight = log_weight - log_weight.max()
+    after = replace(
+        track, state=track.state + np.einsum("hij,hj->hi", G, innovation), cov=cov, log_weight=log_weight,
+        age=track.age + 1, seen_ns=np.full(len(d2), stamp_ns, np.int64),
     )  # fmt: skip
+    return _take(after, log_weight > _PRUNE)
 
 
 def _born(
-    returns: ClusterReturns, fresh: list[int], period_mps: float | None, first_identity: int, stamp_ns: int
+    returns: ClusterReturns, fresh: np.ndarray, period_mps: float | None, first_identity: int, stamp_ns: int
 ) -> TrackState:
     """Hypotheses of new tracks, one per Doppler wrap."""
     wraps = np.zeros(1) if period_mps is None else period_mps * np.arange(-_WRAPS, _WRAPS + 1)
-    states, covs, weights, identities = [], [], [], []
-    noise = _noise(returns.centre_m)
-    for number, k in enumerate(fresh):
-        z = returns.centre_m[k, :2].astype(np.float64)
-        u = z / max(float(np.linalg.norm(z)), 1e-6)
-        across = np.array([-u[1], u[0]])
-        rates = float(returns.rate_mps[k]) + wraps
-        cov = np.zeros((4, 4))
-        cov[:2, :2] = noise[k, :2, :2]
-        cov[2:, 2:] = _RATE_SIGMA_MPS**2 * np.outer(u, u) + _TANGENTIAL_SIGMA_MPS**2 * np.outer(
-            across, across
-        )
-        for rate in rates:
-            states.append([*z, *(rate * u)])
-            covs.append(cov)
-            weights.append(-0.5 * (rate / _SPEED_SIGMA_MPS) ** 2)
-            identities.append(first_identity + number)
-    count = len(states)
+    row = np.repeat(fresh, len(wraps))
+    z = returns.centre_m[row, :2].astype(np.float64)
+    u = z / np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-6)
+    rate = returns.rate_mps[row] + np.tile(wraps, len(fresh))
+    cov = np.zeros((len(row), 4, 4))
+    cov[:, :2, :2] = _noise(z)[:, :2, :2]
+    across = np.stack([-u[:, 1], u[:, 0]], axis=1)
+    cov[:, 2:, 2:] = _RATE_SIGMA_MPS**2 * _outer(u) + _TANGENTIAL_SIGMA_MPS**2 * _outer(across)
     return replace(
-        TrackState.empty(), state=np.array(states).reshape(count, 4), cov=np.array(covs).reshape(count, 4, 4),
-        log_weight=np.array(weights), identity=np.array(identities, np.int32), age=np.ones(count, np.int32),
-        seen_ns=np.full(count, stamp_ns, np.int64),
+        TrackState.empty(), state=np.concatenate([z, rate[:, None] * u], axis=1), cov=cov,
+        log_weight=-0.5 * (rate / _SPEED_SIGMA_MPS) ** 2,
+        identity=(first_identity + np.repeat(np.arange(len(fresh)), len(wraps))).astype(np.int32),
+        age=np.ones(len(row), np.int32), seen_ns=np.full(len(row), stamp_ns, np.int64),
     )  # fmt: skip
 
 
-def _report(
-    following: TrackState,
-    row_of_cluster: list[int],
-    before: TrackState,
-    returns: ClusterReturns,
-    fresh: list[int],
-) -> Tracks:
-    identity = np.array([before.identity[h] if h >= 0 else -1 for h in row_of_cluster], np.int32)
-    identity[fresh] = before.next_identity + np.arange(len(fresh))
-    # Of a new track the most probable hypothesis: the slowest.
-    order = np.lexsort((-following.log_weight, following.identity))
-    rows = order[np.searchsorted(following.identity[order], identity)] if len(order) else np.zeros(0, int)
+def _report(state: TrackState, identity: np.ndarray, returns: ClusterReturns) -> Tracks:
+    """The tracks seen now, in the order of the clusters, each by its most probable hypothesis."""
+    order = np.lexsort((-state.log_weight, state.identity))
+    rows = order[np.searchsorted(state.identity[order], identity)]
     velocity = np.zeros((len(identity), 3), np.float32)
-    velocity[:, :2] = following.state[rows, 2:]
-    return Tracks(returns.centre_m, velocity, identity, following.age[rows].astype(np.int32), returns.points)
+    velocity[:, :2] = state.state[rows, 2:]
+    return Tracks(returns.centre_m, velocity, identity, state.age[rows], returns.points)
 
 
 def _take(state: TrackState, rows: np.ndarray) -> TrackState:

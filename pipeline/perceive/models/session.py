@@ -21,8 +21,8 @@ class Fit:
 
     scale_x: float
     scale_y: float
-    offset_x: float
-    offset_y: float
+    offset_x: int
+    offset_y: int
     width: int
     height: int
 

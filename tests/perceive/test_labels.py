@@ -1,0 +1,60 @@
+"""Label sets and road users."""
+
+import numpy as np
+import pytest
+
+from pipeline.perceive.labels import (
+    CITYSCAPES,
+    DETECTOR_SETS,
+    LABEL_SETS,
+    ROAD_USERS,
+    SKY_ID,
+    VOID_ID,
+    is_reflecting,
+    road_user_name,
+    to_cityscapes,
+)
+
+
+def test_cityscapes_labels_stay_as_they_are():
+    table = to_cityscapes("cityscapes")
+    assert np.array_equal(table[:19], np.arange(19))
+    assert np.all(table[19:] == VOID_ID)
+
+
+@pytest.mark.parametrize("label_set", LABEL_SETS)
+def test_no_foreign_label_means_two_classes_and_all_names_are_known(label_set):
+    ids = [i for group in LABEL_SETS[label_set].values() for i in group]
+    assert len(ids) == len(set(ids))
+    assert set(LABEL_SETS[label_set]) <= set(CITYSCAPES)
+    assert to_cityscapes(label_set)[255] == VOID_ID
+
+
+@pytest.mark.parametrize(
+    ("label_set", "foreign", "name"),
+    [
+        ("ade20k", 6, "road"), ("ade20k", 2, "sky"), ("ade20k", 20, "car"), ("ade20k", 93, "pole"),
+        ("ade20k", 7, None), ("coco", 148, "road"), ("coco", 156, "sky"), ("coco", 2, "car"),
+        ("coco", 63, None),
+    ],
+)  # fmt: skip
+def test_foreign_labels_mean_what_their_sets_say(label_set, foreign, name):
+    assert to_cityscapes(label_set)[foreign] == (VOID_ID if name is None else CITYSCAPES.index(name))
+
+
+@pytest.mark.parametrize(
+    ("logged", "name"),
+    [("car", "car"), ("Pedestrian", "person"), ("motor_bike", None), ("van", "car"), ("dog", None)],
+)
+def test_logged_class_names_become_road_users(logged, name):
+    assert road_user_name(logged) == name
+
+
+def test_detectors_know_only_road_users():
+    for names in DETECTOR_SETS.values():
+        assert set(names.values()) <= set(ROAD_USERS)
+
+
+def test_sky_road_and_void_reflect_no_lidar():
+    labels = np.array([[0, SKY_ID, VOID_ID, CITYSCAPES.index("car"), CITYSCAPES.index("pole")]], np.uint8)
+    assert is_reflecting(labels).tolist() == [[False, False, False, True, True]]
