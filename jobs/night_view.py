@@ -33,12 +33,15 @@ class NightView(Protocol):
     def finished(self, outcome: DayOutcome) -> None:
         """A vehicle-day ended."""
 
+    def ended(self, name: str) -> None:
+        """The work of that name ended well, and there is nothing to say about it."""
+
 
 @contextmanager
-def night_view(names: list[str], total: int) -> Iterator[NightView]:
+def night_view(names: list[str], total: int, title: str = "night") -> Iterator[NightView]:
     """A view of `total` vehicle-days, of which those in work have `names` in order of their index."""
     if not is_terminal():
-        yield _Lines(total)
+        yield _Lines(total, title)
         return
     from rich.console import Console
     from rich.progress import (
@@ -59,12 +62,12 @@ def night_view(names: list[str], total: int) -> Iterator[NightView]:
         TextColumn("[dim]{task.fields[what]}"),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        yield _Bars(bars, names, total)
+        yield _Bars(bars, names, total, title)
 
 
 class _Lines:
-    def __init__(self, total: int) -> None:
-        self._total, self._ended = total, 0
+    def __init__(self, total: int, title: str) -> None:
+        self._total, self._title, self._ended = total, title, 0
 
     def watch(self, index: int, done: int, total: int, what: str) -> None:
         pass  # only ends are worth a log line
@@ -86,11 +89,15 @@ class _Lines:
             **trace,
         )
 
+    def ended(self, name: str) -> None:
+        self._ended += 1
+        logger().info(self._title, what=name, ended=self._ended, total=self._total)
+
 
 class _Bars:
-    def __init__(self, bars: Any, names: list[str], total: int) -> None:
+    def __init__(self, bars: Any, names: list[str], total: int, title: str) -> None:
         self._bars, self._names = bars, names
-        self._all = bars.add_task("night", total=total, what="")
+        self._all = bars.add_task(title, total=total, what="")
         self._tasks: dict[int, Any] = {}
         self._began: dict[str, float] = {}
 
@@ -102,11 +109,14 @@ class _Bars:
 
     def finished(self, outcome: DayOutcome) -> None:
         name = f"{outcome.vehicle} {outcome.day}"
-        for index in [i for i in self._tasks if self._names[i] == name]:
-            self._bars.remove_task(self._tasks.pop(index))
-        self._bars.advance(self._all)
+        self.ended(name)
         seconds = f"{time.monotonic() - self._began[name]:5.1f} s" if name in self._began else "      -"
         accepted = sum(s == "accepted" for s in outcome.pairs.values())
         pairs = f"{accepted}/{len(outcome.pairs)} pairs accepted" if outcome.pairs else ""
         why = f"[dim]{outcome.reason[:90]}[/]" if outcome.status not in ("done", "cached") else ""
         self._bars.print(f"{name}  {seconds}  {_MARKS[outcome.status]}  {pairs}  {why}", highlight=False)
+
+    def ended(self, name: str) -> None:
+        for index in [i for i in self._tasks if self._names[i] == name]:
+            self._bars.remove_task(self._tasks.pop(index))
+        self._bars.advance(self._all)

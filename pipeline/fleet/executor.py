@@ -60,14 +60,14 @@ class Executor(Protocol):
         items: Sequence[Any],
         workers: int,
         watch: Watch,
-    ) -> Iterator[Finished[Any, Any]]:
+    ) -> Generator[Finished[Any, Any], None, None]:
         """Yield each item's end as it comes."""
         ...
 
 
 def run_inline(
     function: Callable[[Item, Progress], Outcome], items: Sequence[Item], workers: int, watch: Watch
-) -> Iterator[Finished[Item, Outcome]]:
+) -> Generator[Finished[Item, Outcome], None, None]:
     """One item after the other in this process; `workers` has no meaning here."""
     del workers
     for index, item in enumerate(items):
@@ -76,7 +76,7 @@ def run_inline(
 
 def run_processes(
     function: Callable[[Item, Progress], Outcome], items: Sequence[Item], workers: int, watch: Watch
-) -> Iterator[Finished[Item, Outcome]]:
+) -> Generator[Finished[Item, Outcome], None, None]:
     """A pool of spawned processes (fork would copy the threads that numeric libraries hold).
 
     Where a worker is killed, the pool is built anew: items that had not begun go on as before, items that

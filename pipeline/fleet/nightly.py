@@ -72,7 +72,7 @@ def run_night(
         reason = f"{night.fleet_file} has no vehicle {unknown.vehicle!r}"
         yield DayOutcome(unknown.vehicle, unknown.day, "refused", reason)
     jobs = [(night, day) for day in known]
-    with closing(EXECUTORS[executor](_run_job, jobs, workers, watch)) as results:  # type: ignore[type-var]
+    with closing(EXECUTORS[executor](_run_job, jobs, workers, watch)) as results:
         for finished in results:
             yield _outcome(finished)
 

@@ -1,0 +1,121 @@
+"""`boresight demo`: a synthetic fleet with one knocked radar, from logs to a report."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.results import Progress
+    from pipeline.simulate.fleet import FleetSpec
+
+__all__ = ["demo"]
+
+# The radar of the second vehicle is knocked before the third day: 1.2 deg is what a kerb or a car wash does.
+_FAULTS = "vehicle-2:2:radar:yaw:1.2"
+_VEHICLES, _DAYS = 3, 4
+
+
+def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = None, seed: int = 1) -> int:
+    """Simulate three vehicles for four days, knock a radar, find it again, and write the report.
+
+    Args:
+        out: folder for logs, truth, lake and report; what is up to date there is not made again.
+        frames: camera-lidar-radar trios per vehicle and day.
+        workers: processes at a time; default: one per CPU that this process may use.
+        seed: another seed is another fleet.
+    """
+    from jobs.demo_table import print_comparison
+    from jobs.nightly import close_night, moved_sensors, usable_cpus, watch_night
+    from jobs.summary import exit_code, print_summary
+    from pipeline.config import load_fleet
+    from pipeline.fleet.nightly import Night
+    from pipeline.fleet.pattern import find_vehicle_days
+    from pipeline.report.truth import read_truth
+    from pipeline.simulate.faults import parse_faults
+    from pipeline.simulate.fleet import FleetSpec, day_names
+    from pipeline.store.partitions import Lake
+
+    began = time.monotonic()
+    base = FleetSpec(vehicles=_VEHICLES, days=_DAYS, frames=frames, seed=seed, container="mixed")
+    days = day_names(base.first_day, base.days)
+    spec = FleetSpec(**(vars(base) | {"faults": parse_faults(_FAULTS, days)}))
+    workers = workers or usable_cpus()
+    _say(f"[bold]1/3[/]  {_VEHICLES} vehicles drive for {_DAYS} days; before day 3 someone bumps a radar")
+    _simulate(spec, out, workers)
+    fleet_file = out / "fleet.toml"
+    night = Night(load_fleet(fleet_file), fleet_file, Lake.at(out / "lake"))
+    _say("[bold]2/3[/]  the night: ingest, perceive, calibrate every vehicle-day")
+    work = find_vehicle_days(str(out / "logs" / "{vehicle}" / "{day}" / "*"), days[0], days[-1])
+    outcomes = watch_night(night, work, "process", workers)
+    _say("[bold]3/3[/]  the audit: which sensor moved, and since when")
+    truth = read_truth(out / "truth")
+    findings, pages = close_night(night, None, None, out / "report" / "fleet.html", truth)
+    errors = print_comparison(night.lake, night.method, truth, days[-1], findings)
+    code = exit_code([o.status for o in outcomes])
+    seconds = time.monotonic() - began
+    _say(f"\n[bold]{pages[0] if pages else 'no report'}[/]  open it in a browser ({seconds:.0f} s in all)")
+    print_summary(
+        "demo",
+        {0: "done", 1: "failed", 3: "held"}[code],
+        report=pages[0] if pages else None,
+        seconds=round(seconds, 1),
+        vehicle_days=len(outcomes),
+        moved=moved_sensors(findings),
+        knocked=[{"vehicle": f.vehicle, "sensor": f.sensor, "since": days[f.day]} for f in spec.faults],
+        errors=errors,
+    )
+    return code
+
+
+def _simulate(spec: FleetSpec, out: Path, workers: int) -> None:
+    """Write the fleet's logs, unless the same fleet lies there already."""
+    import shutil
+    from contextlib import closing
+
+    from jobs.night_view import night_view
+    from pipeline.config import config_hash
+    from pipeline.errors import LogError
+    from pipeline.fleet.executor import EXECUTORS
+    from pipeline.simulate.fleet import day_names, vehicle_names
+    from pipeline.simulate.rigs import rig_named
+    from pipeline.simulate.toml import fleet_toml
+    from schemas.versions import CODE_VERSION
+
+    stamp, key = out / ".simulated", config_hash({"spec": repr(spec), "code": CODE_VERSION})
+    if stamp.is_file() and stamp.read_text() == key:
+        return
+    stamp.unlink(missing_ok=True)
+    for folder in ("logs", "truth"):
+        shutil.rmtree(out / folder, ignore_errors=True)
+    out.mkdir(parents=True, exist_ok=True)
+    vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
+    (out / "fleet.toml").write_text(fleet_toml("demo", spec.rig, rig_named(spec.rig), vehicles))
+    work = [(spec, v, d, out) for d in range(len(days)) for v in range(len(vehicles))]
+    names = [f"{vehicles[v]} {days[d]}" for _, v, d, _ in work]
+    with (
+        night_view(names, len(work), title="simulate") as view,
+        closing(EXECUTORS["process"](_simulate_one, work, workers, view.watch)) as results,
+    ):
+        for finished in results:
+            if finished.error:
+                raise LogError(str(out), f"simulating failed: {finished.error}\n{finished.trace}")
+            view.ended(names[work.index(finished.item)])
+    stamp.write_text(key)
+
+
+def _simulate_one(work: tuple[FleetSpec, int, int, Path], progress: Progress) -> int:
+    from pipeline.simulate.fleet import simulate_vehicle_day
+
+    return simulate_vehicle_day(*work, progress)
+
+
+def _say(text: str) -> None:
+    """A line for whoever watches; without a terminal the log lines say it."""
+    from jobs.summary import is_terminal
+
+    if is_terminal():
+        from rich.console import Console
+
+        Console(stderr=True, highlight=False).print(text)

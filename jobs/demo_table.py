@@ -1,0 +1,138 @@
+"""True against estimated extrinsics, as a table for people and as numbers for the summary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from pipeline.store.partitions import Lake
+    from schemas.calibrations import CalibrationRecord
+    from schemas.drift import DriftFinding
+
+__all__ = ["print_comparison"]
+
+_STATUS = {"accepted": "[green]accepted[/]", "held": "[yellow]held[/]", "refused": "[yellow]refused[/]"}
+
+
+def print_comparison(
+    lake: Lake,
+    method: str,
+    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    day: str,
+    findings: Sequence[DriftFinding],
+) -> list[dict[str, Any]]:
+    """Print the records of one day beside the truth, and what the audit found.
+
+    Both are shown as what differs from the prior, i.e. what the drawing did not know: rotation vector [deg] and shift
+    [cm] in the axes of the pair's parent sensor (`T = exp(xi) T_prior`). A DoF in brackets is one that the day did
+    not determine: it stays at the prior.
+
+    Returns:
+        For each record: errors of rotation [deg] and translation [m] against the truth, before and after.
+    """
+    from rich.console import Console
+
+    from pipeline.store.current import current_records
+    from pipeline.store.tables import read_records
+    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+
+    found = current_records(
+        [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, day=day) if r.method == method]
+    )
+    console = Console(highlight=False, width=None if Console().is_terminal else 150)
+    table, errors = _table(day), []
+    for record in found:
+        T_true = truth[record.vehicle, record.day][record.pair]
+        errors.append(_errors(record, T_true))
+        for row in _rows(record, T_true):
+            table.add_row(*row)
+        table.add_section()
+    console.print(table)
+    for line in _drift_lines(findings):
+        console.print(line)
+    return errors
+
+
+def _table(day: str) -> Table:
+    from rich.table import Table
+
+    table = Table(
+        title=f"What the drawing did not know, {day}: true and estimated", title_style="bold", pad_edge=False
+    )
+    for name, justify in (("vehicle", "left"), ("pair", "left"), ("verdict", "left"), ("", "left")):
+        table.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    for axis in "xyz":
+        table.add_column(f"{axis}: true", justify="right", no_wrap=True)
+        table.add_column("estimate", justify="right", no_wrap=True)
+        table.add_column("± sigma", justify="right", no_wrap=True, style="dim")
+    return table
+
+
+def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
+    from pipeline.geometry.se3 import inverse, log_se3
+    from pipeline.store.current import prior_of, transform_of
+
+    T, T_prior = transform_of(record), prior_of(record)
+    if T is None or T_prior is None or record.covariance is None:
+        return [[record.vehicle, record.pair, _STATUS[record.status], record.reason[:40]]]
+    true, estimate = log_se3(T_true @ inverse(T_prior)), log_se3(T @ inverse(T_prior))
+    sigma = np.sqrt(np.diag(record.covariance))
+    seen = record.observable or [True] * 6
+    scale = np.array([np.degrees(1)] * 3 + [100.0] * 3)
+    rows = []
+    for first, unit in ((0, "deg"), (3, "cm")):
+        head = [record.vehicle, record.pair, _STATUS[record.status]] if first == 0 else ["", "", ""]
+        cells = [f"rotation {unit}" if first == 0 else f"shift {unit}"]
+        digits = 2 if first == 0 else 1
+        for i in range(first, first + 3):
+            values = (true[i] * scale[i], estimate[i] * scale[i])
+            shown = f"{values[1]:+.{digits}f}"
+            cells += [f"{values[0]:+.{digits}f}", shown if seen[i] else f"[dim]({shown})[/]"]
+            cells.append(f"{sigma[i] * scale[i]:.{digits}f}")
+        rows.append(head + cells)
+    return rows
+
+
+def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
+    from pipeline.geometry.se3 import inverse, rotation_angle_rad
+    from pipeline.store.current import prior_of, transform_of
+
+    def error(T: np.ndarray | None) -> tuple[float | None, float | None]:
+        if T is None:
+            return None, None
+        angle = float(np.degrees(rotation_angle_rad(T_true @ inverse(T))))
+        return round(angle, 4), round(float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), 4)
+
+    before, after = error(prior_of(record)), error(transform_of(record))
+    return {
+        "vehicle": record.vehicle,
+        "day": record.day,
+        "pair": record.pair,
+        "status": record.status,
+        "rotation_error_prior_deg": before[0],
+        "rotation_error_deg": after[0],
+        "translation_error_prior_m": before[1],
+        "translation_error_m": after[1],
+    }
+
+
+def _drift_lines(findings: Sequence[DriftFinding]) -> list[str]:
+    """One line per vehicle: what moved, or that nothing did."""
+    lines = []
+    colours = {"RED": "bold red", "YELLOW": "yellow", "GREEN": "green", "UNKNOWN": "dim"}
+    for vehicle in sorted({f.vehicle for f in findings}):
+        own = [f for f in findings if f.vehicle == vehicle]
+        worst = min(own, key=lambda f: list(colours).index(f.status))
+        moved = next((f for f in own if f.moved_sensor), None)
+        text = (
+            f"the {moved.moved_sensor} moved, first seen on {moved.start_day}: {moved.reason}"
+            if moved
+            else {"GREEN": "nothing moved", "UNKNOWN": worst.reason}.get(worst.status, worst.reason)
+        )
+        lines.append(f"[{colours[worst.status]}]{worst.status:8}[/] {vehicle}  {text}")
+    return lines
