@@ -1,0 +1,213 @@
+"""Study: from known perturbations of a given calibration, what does each method find on a real vehicle-day?
+
+A resumable command: every finished run is one line of the JSON Lines file, and is not run again by the same code.
+
+    boresight ingest --fleet astyx.toml --lake LAKE --vehicle astyx-1 --day 2019-01-14 LOG...
+    boresight perceive --fleet astyx.toml --lake LAKE --vehicle astyx-1 --day 2019-01-14
+    python tests/benchmarks/recovery.py --fleet astyx.toml --lake LAKE --vehicle astyx-1 --day 2019-01-14 \
+        --methods joint,joint-optimisation --starts 2,0.1 5,0.2 --seeds 10 --out recovery.jsonl
+
+The given calibration is the logs' own tf_static. It is no truth: the distance to it says how well methods agree with
+whoever calibrated the car, the halves of the day say how well a method agrees with itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.calibrate import calibrate_observations
+from pipeline.calibration_records import Inputs
+from pipeline.config import load_fleet
+from pipeline.errors import SolveError
+from pipeline.geometry.se3 import from_quaternion, inverse, log_se3
+from pipeline.prior import perturbed, read_prior
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_rows
+from pipeline.verify.targets import errors_at_targets
+from schemas.calibrations import CalibrationRecord
+from schemas.observations import OBSERVATIONS, Observation
+
+PARTS = ("day", "first_half", "second_half")
+
+
+def main() -> None:
+    """Run what is missing, then print the table."""
+    args = _arguments()
+    done = _read(args.out)
+    wanted = [
+        (method, start, seed, part)
+        for method in args.methods.split(",")
+        for start in args.starts
+        for part in PARTS
+        for seed in range(args.seeds if part == "day" else min(args.seeds, args.half_seeds))
+    ]
+    todo = [run for run in wanted if run not in {_key(r) for r in done}]
+    commit = _commit()
+    with (
+        ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool,
+        args.out.open("a") as out,
+    ):
+        jobs = [pool.submit(run_once, args.fleet, args.lake, args.vehicle, args.day, *run) for run in todo]
+        for job in jobs:
+            result = job.result() | {"commit": commit, "date": time.strftime("%Y-%m-%d")}
+            out.write(json.dumps(result) + "\n")
+            out.flush()
+            print(_line(result), flush=True)  # noqa: T201
+    print(table(_read(args.out)))  # noqa: T201
+
+
+def run_once(
+    fleet_file: Path, lake: str, vehicle: str, day: str, method: str, start: str, seed: int, part: str
+) -> dict[str, Any]:
+    """One calibration from one perturbed start on one part of the day."""
+    fleet = load_fleet(fleet_file)
+    partition = Partition(vehicle, day)
+    rows = read_rows(Lake.at(lake), OBSERVATIONS, partition, Observation)
+    given = read_prior(rows, fleet.rig_of(vehicle).prior, fleet_file)
+    rotation_deg, translation_m = (float(v) for v in start.split(","))
+    prior = perturbed(given, (rotation_deg, translation_m), seed)
+    half = len(rows) // 2
+    chosen = {"day": rows, "first_half": rows[:half], "second_half": rows[half:]}[part]
+    began = time.process_time()
+    result: dict[str, Any] = {"method": method, "start": start, "seed": seed, "part": part, "pairs": {}}
+    try:
+        records = calibrate_observations(chosen, prior, fleet, Inputs(partition, method, "study", seed, ()))
+    except SolveError as err:
+        return result | {"refused": err.reason}
+    result["cpu_s"] = round(time.process_time() - began, 1)
+    for record in records:
+        result["pairs"][record.pair] = _measure(record, given.of(record.pair))
+    return result
+
+
+def _measure(record: CalibrationRecord, T_given: np.ndarray) -> dict[str, Any]:
+    T = from_quaternion(
+        np.array([record.qw, record.qx, record.qy, record.qz], np.float64),
+        np.array([record.tx_m, record.ty_m, record.tz_m], np.float64),
+    )
+    azimuth, elevation, range_m = errors_at_targets(record.pair, T, T_given)
+    assert record.covariance is not None
+    return {
+        "az_deg": float(np.degrees(azimuth)),
+        "el_deg": float(np.degrees(elevation)),
+        "range_m": float(range_m),
+        "xi": log_se3(T @ inverse(T_given)).tolist(),
+        "sigma": np.sqrt(np.diag(record.covariance)).tolist(),
+        "observable": record.observable,
+        "status": record.status,
+        "reason": record.reason,
+        "time_offset_ms": None if record.time_offset_s is None else record.time_offset_s * 1e3,
+        "time_offset_sigma_ms": None
+        if record.time_offset_sigma_s is None
+        else record.time_offset_sigma_s * 1e3,
+        "frames_used": record.frames_used,
+    }
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """Markdown: distance to the given calibration (mean, 95th percentile), agreement of halves, time offsets."""
+    lines = [
+        (
+            "| method | start | runs | pair | az mean / p95 [deg] | el mean / p95 [deg] | range mean / p95 [m] "
+            "| accepted | halves az / el [deg] | dt day, halves [ms] |"
+        ),
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+    for result in results:
+        groups[result["method"], result["start"]].append(result)
+    for (method, start), members in groups.items():
+        lines += [f"| {method} | {start} | {row} |" for row in _rows(members)]
+    return "\n".join(lines)
+
+
+def _rows(members: list[dict[str, Any]]) -> Iterator[str]:
+    parts = {p: [m for m in members if m["part"] == p and m["pairs"]] for p in PARTS}
+    for pair in ("camera_lidar", "camera_radar", "lidar_radar"):
+        day = [m["pairs"][pair] for m in parts["day"]]
+        if not day:
+            continue
+        cells = []
+        for name in ("az_deg", "el_deg", "range_m"):
+            values = np.array([d[name] for d in day])
+            cells.append(f"{values.mean():.3f} / {np.percentile(values, 95):.3f}")
+        accepted = f"{sum(d['status'] == 'accepted' for d in day)}/{len(day)}"
+        offsets = [_median([m["pairs"][pair]["time_offset_ms"] for m in parts[p]]) for p in PARTS]
+        yield " | ".join([str(len(day)), pair, *cells, accepted, _halves(parts, pair), ", ".join(offsets)])
+
+
+def _halves(parts: dict[str, list[dict[str, Any]]], pair: str) -> str:
+    """Mean distance between the halves' results of the same seed: parent-axis rotations as azimuth and elevation."""
+    second = {m["seed"]: m["pairs"][pair]["xi"] for m in parts["second_half"]}
+    gaps = [
+        np.degrees(np.abs(np.array(m["pairs"][pair]["xi"][:3]) - np.array(second[m["seed"]][:3])))
+        for m in parts["first_half"]
+        if m["seed"] in second
+    ]
+    if not gaps:
+        return "-"
+    mean = np.mean(gaps, axis=0)
+    # Camera axes: azimuth turns about y, elevation about x; lidar axes: about z and y.
+    azimuth, elevation = (mean[1], mean[0]) if pair != "lidar_radar" else (mean[2], mean[1])
+    return f"{azimuth:.3f} / {elevation:.3f}"
+
+
+def _median(values: list[float | None]) -> str:
+    known = [v for v in values if v is not None]
+    return f"{np.median(known):.1f}" if known else "-"
+
+
+def _line(result: dict[str, Any]) -> str:
+    head = f"{result['method']} {result['start']} seed {result['seed']} {result['part']}"
+    if not result["pairs"]:
+        return f"{head}: refused: {result['refused']}"
+    cells = [
+        f"{pair} {p['az_deg']:.3f}/{p['el_deg']:.3f}/{p['range_m']:.3f} {p['status']}"
+        for pair, p in result["pairs"].items()
+    ]
+    return f"{head}: {'; '.join(cells)} ({result['cpu_s']} CPU s)"
+
+
+def _key(result: dict[str, Any]) -> tuple[str, str, int, str]:
+    return result["method"], result["start"], result["seed"], result["part"]
+
+
+def _read(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def _commit() -> str:
+    run = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    return run.stdout.strip() or "unknown"
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--fleet", type=Path, required=True)
+    parser.add_argument("--lake", required=True)
+    parser.add_argument("--vehicle", required=True)
+    parser.add_argument("--day", required=True)
+    parser.add_argument("--methods", default="joint,joint-optimisation")
+    parser.add_argument("--starts", nargs="+", default=["2,0.1", "5,0.2"])
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--half-seeds", type=int, default=3)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
