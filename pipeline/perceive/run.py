@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config import FleetConfig, PerceiveConfig, TopicSemantics, config_hash
+from pipeline.config import FleetConfig, OnnxSemantics, PerceiveConfig, TopicSemantics, config_hash
 from pipeline.errors import ContractError
 from pipeline.geometry.cameras import Camera
 from pipeline.perceive.camera import SemanticsSource, TopicSource, decode_grey, encode_png
@@ -62,11 +62,12 @@ def perceive_day(
         ContractError: the day has no frames yet.
         ModelError: a model does not do what its manifest says.
     """
+    semantics = fleet.rig_of(partition.vehicle, file=str(fleet_file)).camera.semantics
     frames = read_manifest(lake, FRAMES, partition)
     if frames is None:
         folder = lake.folder(FRAMES.name, partition)
         raise ContractError(str(folder), "no frames of this vehicle and day: run `boresight ingest` first")
-    source, semantics_key = _semantics(partition.vehicle, fleet, fleet_file)
+    source, semantics_key = _source(semantics, fleet.perceive, fleet_file)
     key = work_key("perceive", CODE_VERSION, config_hash(fleet.perceive, semantics_key), [frames.work_key])
     done = read_manifest(lake, OBSERVATIONS, partition)
     if done is not None and done.work_key == key:
@@ -138,15 +139,16 @@ class _Sweep:
     ring: np.ndarray | None
 
 
-def _semantics(vehicle: str, fleet: FleetConfig, fleet_file: Path) -> tuple[SemanticsSource, dict[str, Any]]:
-    """Where this vehicle's semantics come from, and what of it belongs into the work key."""
-    wanted = fleet.rig_of(vehicle, file=str(fleet_file)).camera.semantics
+def _source(
+    wanted: TopicSemantics | OnnxSemantics, config: PerceiveConfig, fleet_file: Path
+) -> tuple[SemanticsSource, dict[str, Any]]:
+    """Where semantics come from, and what of it belongs into the work key."""
     if isinstance(wanted, TopicSemantics):
-        return TopicSource(wanted, fleet.perceive), {"source": "topics", "label_set": wanted.label_set}
+        return TopicSource(wanted, config), {"source": "topics", "label_set": wanted.label_set}
     # onnxruntime loads only where it is used.
     from pipeline.perceive.models.source import ModelSource  # noqa: PLC0415
 
-    models = ModelSource.load(wanted, fleet.perceive, fleet_file)
+    models = ModelSource.load(wanted, config, fleet_file)
     return models, {"source": "onnx", **models.provenance}
 
 
