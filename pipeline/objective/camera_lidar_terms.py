@@ -1,0 +1,364 @@
+"""The camera-lidar terms of method `joint`, prepared from observations and evaluated for many poses at once.
+
+Source: evidence of this project on simulated and real logs: directed edges, reflectivity on the road, camera time offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.cameras import Camera
+from pipeline.objective.class_information import class_information
+from pipeline.objective.edges import (
+    CHANCE_BINS,
+    chance_of,
+    edge_gradients,
+    edge_residuals,
+    edge_scores,
+    fit_match_share,
+)
+from pipeline.objective.image_maps import CONTRAST_STEP, CameraMaps, prepare_maps
+from pipeline.objective.projection_loops import camera_parameters
+from pipeline.objective.reflectivity import marking_gradients, marking_scores
+from schemas.observations import Observation
+
+__all__ = ["CONTRAST_BLURS_PX", "Level", "Points", "Terms", "lidar_velocities", "prepare_terms"]
+
+CONTRAST_BLURS_PX = (6.0, 3.0, 1.5)
+# Markings brighter than this stand out of their ring (lane paint, patches).
+_MARKING_Z = 2.5
+# Edges that match alike: direction, height above the road [m], and size of the object (thirds of the day's edges). Low and
+# compact things (poles, cars) have boundaries in the labels, tall and large ones (plants, walls) mostly not.
+_HEIGHTS_M = (1.0, 2.0)
+_SIZE_QUANTILES = (1 / 3, 2 / 3)
+_KINDS = 4 * (len(_HEIGHTS_M) + 1) * (len(_SIZE_QUANTILES) + 1)
+# Classes of the mutual information: height above the road and range [m].
+_CLASS_HEIGHTS_M = (0.25, 1.0, 2.5, 5.0)
+_CLASS_RANGES_M = (12.0, 25.0)
+_CLASSES = (len(_CLASS_HEIGHTS_M) + 1) * (len(_CLASS_RANGES_M) + 1)
+_CLASS_STRIDE = 8  # of the sampled cloud: neighbours say the same
+# Chance density of an edge's distance before the data has been asked: boundaries every hundred pixels.
+_EVEN_CHANCE = np.full((_KINDS, CHANCE_BINS), 1 / 100, np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """How sharply the terms look: kernel scale, contrast level, mixture shares, weights."""
+
+    sigma_px: float
+    contrast_level: int
+    match: np.ndarray  # share of matching edges by kind
+    chance: np.ndarray
+    delta: float = 0.4  # contrast that marked points see more than the road, in standard deviations
+    edge_weight: float = 1.0
+    marking_weight: float = 1.0
+
+    @staticmethod
+    def wide(sigma_px: float, contrast_level: int, match: float = 0.25) -> Level:
+        """A level that presumes nothing of the data."""
+        return Level(sigma_px, contrast_level, np.full(_KINDS, match, np.float32), _EVEN_CHANCE)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points of F frames, one after the other: frame f has rows start[f]:start[f+1]; lidar frame."""
+
+    xyz_m: np.ndarray
+    start: np.ndarray
+    side: np.ndarray
+    kind: np.ndarray
+    gap_rad: np.ndarray
+
+    def chosen(self, keep: np.ndarray) -> Points:
+        """The points of a mask."""
+        counts = np.concatenate([[0], np.cumsum(keep)])
+        return Points(
+            np.ascontiguousarray(self.xyz_m[keep]),
+            counts[self.start],
+            self.side[keep],
+            self.kind[keep],
+            self.gap_rad[keep],
+        )
+
+    def of_frames(self, frames: np.ndarray) -> Points:
+        """The points of some frames, in the order given."""
+        rows = [np.arange(self.start[f], self.start[f + 1]) for f in frames]
+        start = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(np.int64)
+        index = np.concatenate(rows) if rows else np.empty(0, np.int64)
+        return Points(
+            np.ascontiguousarray(self.xyz_m[index]),
+            start,
+            self.side[index],
+            self.kind[index],
+            self.gap_rad[index],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """Everything that the camera-lidar score of F frames needs."""
+
+    maps: CameraMaps
+    camera: np.ndarray
+    edges: Points
+    markings: Points
+    classes: Points  # sampled cloud by height and range, for the basin
+    velocity_lidar: np.ndarray  # F 3, own velocity in lidar axes [m/s]
+    yaw_rate: np.ndarray  # F [rad/s]
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.velocity_lidar)
+
+    def thinned(self, fraction: float, rng: np.random.Generator) -> Terms:
+        """The same frames with a random share of the points."""
+        edges, markings, classes = (p.chosen(rng.random(len(p.xyz_m)) < fraction) for p in self._points)
+        return replace(self, edges=edges, markings=markings, classes=classes)
+
+    @property
+    def _points(self) -> tuple[Points, Points, Points]:
+        return self.edges, self.markings, self.classes
+
+    def sharp(self, max_gap_px: float) -> Terms:
+        """Without the edges whose interval is wider than `max_gap_px`: those make the basin, not the accuracy."""
+        narrow = self.edges.gap_rad * self.camera[1] <= max_gap_px
+        return replace(self, edges=self.edges.chosen(narrow))
+
+    def of_frames(self, frames: np.ndarray) -> Terms:
+        """Some of the frames."""
+        maps = replace(
+            self.maps,
+            offsets=self.maps.offsets[frames],
+            contrast=self.maps.contrast[:, frames],
+            labels=self.maps.labels[frames],
+        )
+        return Terms(
+            maps,
+            self.camera,
+            *(p.of_frames(frames) for p in self._points),
+            self.velocity_lidar[frames],
+            self.yaw_rate[frames],
+        )
+
+    def poses(self, T_camera_lidar: Float[np.ndarray, "P 4 4"], dt_s: Float[np.ndarray, " P"]) -> np.ndarray:
+        """Rows of the transform from each frame's lidar points to its image [P, F, 12].
+
+        The image shows the lidar clock's time `-dt` (stamp_camera = stamp_lidar + dt). The car was then dt earlier on its way,
+        so what stands still lay dt times the own velocity further ahead: p' = Rz(yaw_rate dt) (p + v dt).
+        """
+        angle = dt_s[:, None] * self.yaw_rate  # P F
+        c, s, o = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+        turn = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1], -1)], -2)
+        shift = (turn @ (dt_s[:, None, None] * self.velocity_lidar)[..., None])[..., 0]
+        out = np.empty((*angle.shape, 3, 4), np.float32)
+        R = T_camera_lidar[:, None, :3, :3]
+        out[..., :3] = R @ turn
+        out[..., 3] = (R @ shift[..., None])[..., 0] + T_camera_lidar[:, None, :3, 3]
+        return out.reshape(*angle.shape, 12)
+
+    def edge_score(self, poses: np.ndarray, level: Level) -> Float[np.ndarray, "P F"]:
+        """Unweighted log likelihood ratio of the edges."""
+        e = self.edges
+        return edge_scores(
+            self.camera,
+            self.maps.offsets,
+            e.xyz_m,
+            e.side,
+            e.kind,
+            e.gap_rad,
+            e.start,
+            poses,
+            level.match,
+            level.chance,
+            level.sigma_px,
+        )
+
+    def marking_score(self, poses: np.ndarray, level: Level) -> Float[np.ndarray, "P F"]:
+        """Unweighted log likelihood ratio of the markings."""
+        m, contrast = self.markings, self.maps.contrast[level.contrast_level]
+        return marking_scores(self.camera, contrast, m.xyz_m, _weights(m, level), m.start, poses)
+
+    def class_information(self, poses: np.ndarray) -> Float[np.ndarray, " P"]:
+        """Mutual information of lidar class and label, nats per point; for the basin only."""
+        c = self.classes
+        return class_information(self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, poses, _CLASSES)
+
+    def score(
+        self, T_camera_lidar: Float[np.ndarray, "P 4 4"], dt_s: Float[np.ndarray, " P"], level: Level
+    ) -> Float[np.ndarray, "P F"]:
+        """Score of each frame at each pose; higher is better."""
+        poses = self.poses(T_camera_lidar, dt_s)
+        score = level.edge_weight * self.edge_score(poses, level).astype(np.float64)
+        return score + level.marking_weight * self.marking_score(poses, level)
+
+    def gradient(
+        self, T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float, level: Level
+    ) -> tuple[Float[np.ndarray, "F 7"], Float[np.ndarray, "F 7 7"]]:
+        """Per frame: gradient of the score by (left perturbation, dt) and its information (positive semidefinite)."""
+        poses = self.poses(T_camera_lidar[None], np.array([dt_s]))[0].astype(np.float64)
+        velocity = self.velocity_lidar @ T_camera_lidar[:3, :3].T
+        e, m = self.edges, self.markings
+        g_edges, I_edges = edge_gradients(
+            self.camera,
+            self.maps.offsets,
+            e.xyz_m,
+            e.side,
+            e.kind,
+            e.gap_rad,
+            e.start,
+            poses,
+            velocity,
+            level.match,
+            level.chance,
+            level.sigma_px,
+        )
+        contrast = self.maps.contrast[level.contrast_level]
+        g_marks, I_marks = marking_gradients(
+            self.camera, contrast, m.xyz_m, _weights(m, level), m.start, poses, velocity
+        )
+        a, b = level.edge_weight, level.marking_weight
+        return a * g_edges + b * g_marks, a * I_edges + b * I_marks
+
+    def mean_match(self, level: Level) -> Float[np.ndarray, "4"]:
+        """Share of matching edges by direction, over the edges that there are."""
+        share = level.match[self.edges.kind]
+        counts = np.bincount(self.edges.side, minlength=4)
+        return np.bincount(self.edges.side, share, minlength=4) / np.maximum(counts, 1)
+
+    def fitted(
+        self, T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float, level: Level, rng: np.random.Generator
+    ) -> Level:
+        """The level with the mixture shares, chance densities and contrast difference that the data shows at a pose."""
+        poses = self.poses(T_camera_lidar[None], np.array([dt_s]))
+        e, m = self.edges, self.markings
+        offsets, still = self.maps.offsets, np.zeros((len(e.xyz_m), 2), np.float32)
+        elsewhere = rng.uniform(-60, 60, still.shape).astype(np.float32)
+        at_chance = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses[0], elsewhere)
+        here = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses[0], still)
+        chance = chance_of(at_chance, e.kind, _KINDS)
+        sigma = np.hypot(level.sigma_px, e.gap_rad * self.camera[1] / np.sqrt(12))
+        match = fit_match_share(here, e.kind, sigma, chance)
+        ones = np.full(len(m.xyz_m), CONTRAST_STEP, np.float32)
+        contrast = self.maps.contrast[level.contrast_level]
+        total = marking_scores(self.camera, contrast, m.xyz_m, ones, m.start, poses).sum()
+        delta = float(np.clip(total / max(len(m.xyz_m), 1), 0.0, 1.0))
+        return replace(level, match=match, chance=chance, delta=delta)
+
+
+def _weights(markings: Points, level: Level) -> np.ndarray:
+    return np.full(len(markings.xyz_m), level.delta * CONTRAST_STEP, np.float32)
+
+
+def lidar_velocities(
+    observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "F 3"]:
+    """Own velocity in lidar axes [m/s]: the speed along the heading that the radar's Doppler shows (0 where unknown).
+
+    One heading for the day, in the horizontal plane: the mount's yaw. A single frame's heading is noisier than it varies, and
+    the radar's vertical velocity is no measurement.
+    """
+    speed = np.array([o.ego_speed_mps if o.ego_speed_mps is not None else 0.0 for o in observations])
+    moving = [
+        o.radar_velocity_mps
+        for o in observations
+        if o.radar_velocity_mps is not None and (o.ego_speed_mps or 0.0) > 3.0
+    ]
+    heading = 0.0
+    if len(moving) >= 5:
+        v = np.stack(moving) @ T_lidar_radar[:3, :3].T
+        heading = float(np.median(np.arctan2(v[:, 1], v[:, 0])))
+    return speed[:, None] * np.array([np.cos(heading), np.sin(heading), 0.0])
+
+
+def prepare_terms(
+    observations: Sequence[Observation],
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    velocity_lidar: Float[np.ndarray, "F 3"],
+    *,
+    reach_rad: float,
+) -> Terms:
+    """Decode maps and gather the points that can come into view within `reach_rad` of a pose."""
+    maps = prepare_maps(observations, CONTRAST_BLURS_PX)
+    edges = _gather(
+        [
+            (o.lidar_edge_xyz_m, o.lidar_edge_side, k, o.lidar_edge_gap_rad)
+            for o, k in zip(observations, _kinds(observations), strict=True)
+        ],
+        T_camera_lidar,
+        maps.camera,
+        reach_rad,
+    )
+    bright = [o.marking_xyz_m[o.marking_z > _MARKING_Z] for o in observations]
+    plain = [np.zeros(len(b), np.uint8) for b in bright]
+    columns = list(zip(bright, plain, plain, plain, strict=True))
+    markings = _gather(columns, T_camera_lidar, maps.camera, reach_rad)
+    classes = _gather([_height_classes(o) for o in observations], T_camera_lidar, maps.camera, reach_rad)
+    yaw_rate = np.array([o.ego_yaw_rate_radps or 0.0 for o in observations])
+    return Terms(maps, camera_parameters(maps.camera), edges, markings, classes, velocity_lidar, yaw_rate)
+
+
+def _kinds(observations: Sequence[Observation]) -> list[np.ndarray]:
+    """Kind of each edge: direction, height and size class."""
+    sizes = np.concatenate([o.lidar_edge_points for o in observations])
+    limits = np.quantile(sizes, _SIZE_QUANTILES) if len(sizes) else np.zeros(len(_SIZE_QUANTILES))
+    out = []
+    for o in observations:
+        if o.ground_plane is None:  # the middle class says least
+            height = np.full(len(o.lidar_edge_side), np.mean(_HEIGHTS_M))
+        else:
+            height = o.lidar_edge_xyz_m @ o.ground_plane[:3] + o.ground_plane[3]
+        class_ = np.digitize(height, _HEIGHTS_M) * 3 + np.digitize(o.lidar_edge_points, limits, right=True)
+        out.append((o.lidar_edge_side * 9 + class_).astype(np.uint8))
+    return out
+
+
+def _height_classes(o: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Every eighth point of the sampled cloud with its class; none where the road was not found."""
+    xyz = o.lidar_map_xyz_m[::_CLASS_STRIDE] if o.ground_plane is not None else o.lidar_map_xyz_m[:0]
+    plane = o.ground_plane if o.ground_plane is not None else np.zeros(4)
+    height = np.digitize(xyz @ plane[:3] + plane[3], _CLASS_HEIGHTS_M)
+    class_ = (height * 3 + np.digitize(np.linalg.norm(xyz, axis=1), _CLASS_RANGES_M)).astype(np.uint8)
+    return xyz, class_, class_, np.zeros(len(xyz), np.float32)
+
+
+def _gather(
+    frames: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
+    T_camera_lidar: np.ndarray,
+    camera: Camera,
+    reach_rad: float,
+) -> Points:
+    """Points of all frames in or near the camera's field of view."""
+    border = np.array(
+        [
+            [u, v]
+            for u in (0.0, camera.width_px / 2, camera.width_px)
+            for v in (0.0, camera.height_px / 2, camera.height_px)
+        ]
+    )
+    rays = camera.unproject(border)
+    rays = rays[np.isfinite(rays).all(1)]
+    azimuth, elevation = (
+        np.arctan2(rays[:, 0], rays[:, 2]),
+        np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2])),
+    )
+    kept, counts = [], [0]
+    for xyz, side, kind, gap in frames:
+        q = xyz @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+        a, e = np.arctan2(q[:, 0], q[:, 2]), np.arctan2(q[:, 1], np.hypot(q[:, 0], q[:, 2]))
+        near = (a > azimuth.min() - reach_rad) & (a < azimuth.max() + reach_rad)
+        near &= (e > elevation.min() - reach_rad) & (e < elevation.max() + reach_rad)
+        kept.append((xyz[near], side[near], kind[near], gap[near]))
+        counts.append(counts[-1] + int(near.sum()))
+    columns = [np.concatenate(c) for c in zip(*kept, strict=True)]
+    return Points(
+        np.ascontiguousarray(columns[0], np.float32),
+        np.array(counts, np.int64),
+        columns[1].astype(np.uint8),
+        columns[2].astype(np.uint8),
+        columns[3].astype(np.float32),
+    )

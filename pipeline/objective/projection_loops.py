@@ -1,0 +1,123 @@
+"""Projection inside compiled loops: one camera model as a flat parameter vector."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    from pipeline.geometry.cameras import Camera
+
+__all__ = ["camera_parameters", "project_point", "project_with_jacobian"]
+
+_PINHOLE, _DISTORTED, _EQUIDISTANT = 0.0, 1.0, 2.0
+_POLYNOMIAL_DEGREE = 9
+_MIN_DEPTH_M = 0.3
+
+
+def camera_parameters(camera: Camera) -> np.ndarray:
+    """The camera as float32[18]: model, fx, fy, cx, cy, largest tangent squared (or smallest cosine), 10 coefficients.
+
+    Coefficients: k1 k2 p1 p2 k3 k4 k5 k6 of the pinhole models, or the polynomial k(c) of `Camera.fast_polynomial`.
+    """
+    out = np.zeros(18, np.float32)
+    out[1:3], out[3:5] = camera.focal_px, camera.centre_px
+    if camera.model == "equidistant":
+        coefficients, _ = camera.fast_polynomial(_POLYNOMIAL_DEGREE)
+        corners = np.array(
+            [[0.0, 0.0], [camera.width_px, 0], [0, camera.height_px], [camera.width_px, camera.height_px]]
+        )
+        rays = camera.unproject(corners)
+        # The polynomial is fitted 10 % beyond the image's corners; cosines below that are outside.
+        reach = np.arccos(np.nanmin(rays[:, 2])) if np.isfinite(rays).any() else camera.max_angle_rad
+        out[0], out[5] = _EQUIDISTANT, np.cos(min(1.08 * reach, camera.max_angle_rad))
+        out[6 : 6 + len(coefficients)] = coefficients
+        return out
+    distorted = len(camera.D) > 0 and bool(np.any(camera.D))
+    out[0] = _DISTORTED if distorted else _PINHOLE
+    out[5] = np.tan(camera.max_angle_rad) ** 2
+    if distorted:
+        out[6 : 6 + len(camera.D)] = camera.D
+    return out
+
+
+@numba.njit(inline="always", fastmath=True, nogil=True)
+def project_point(c: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """(u, v, valid) of a point in the optical frame."""
+    one = np.float32(1.0)
+    if c[0] == np.float32(2.0):
+        norm = np.sqrt(x * x + y * y + z * z) + np.float32(1e-6)
+        cosine = z / norm
+        k = c[15]
+        for i in range(14, 5, -1):
+            k = k * cosine + c[i]
+        s = k / norm
+        return c[3] + c[1] * s * x, c[4] + c[2] * s * y, cosine > c[5]
+    if z < np.float32(0.3):
+        return np.float32(0.0), np.float32(0.0), False
+    iz = one / z
+    a, b = x * iz, y * iz
+    r2 = a * a + b * b
+    if r2 > c[5]:
+        return np.float32(0.0), np.float32(0.0), False
+    if c[0] == np.float32(1.0):
+        radial = (one + r2 * (c[6] + r2 * (c[7] + r2 * c[10]))) / (
+            one + r2 * (c[11] + r2 * (c[12] + r2 * c[13]))
+        )
+        two = np.float32(2.0)
+        ad = a * radial + two * c[8] * a * b + c[9] * (r2 + two * a * a)
+        bd = b * radial + c[8] * (r2 + two * b * b) + two * c[9] * a * b
+        a, b = ad, bd
+    return c[3] + c[1] * a, c[4] + c[2] * b, True
+
+
+@numba.njit(nogil=True, cache=True)
+def project_with_jacobian(
+    c: np.ndarray, x: float, y: float, z: float
+) -> tuple[float, float, bool, float, float, float, float, float, float]:
+    """(u, v, valid, du/dx, du/dy, du/dz, dv/dx, dv/dy, dv/dz) in double precision."""
+    u, v, valid = project_point(c, x, y, z)
+    if not valid:
+        return 0.0, 0.0, False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if c[0] == 2.0:
+        norm = np.sqrt(x * x + y * y + z * z)
+        cosine = z / norm
+        k, slope = np.float64(c[15]), 0.0
+        for i in range(14, 5, -1):
+            slope = slope * cosine + k
+            k = k * cosine + c[i]
+        # s = k(cosine)/norm; d cosine/d(x, y, z) = (-x z, -y z, x^2 + y^2)/norm^3
+        s = k / norm
+        n3 = norm * norm * norm
+        sx = (-slope * x * z / norm - k * x) / n3
+        sy = (-slope * y * z / norm - k * y) / n3
+        sz = (slope * (x * x + y * y) / norm - k * z) / n3
+        fx, fy = c[1], c[2]
+        return (
+            u,
+            v,
+            True,
+            fx * (s + x * sx),
+            fx * x * sy,
+            fx * x * sz,
+            fy * y * sx,
+            fy * (s + y * sy),
+            fy * y * sz,
+        )
+    iz = 1.0 / z
+    a, b = x * iz, y * iz
+    aa, ab, ba, bb = 1.0, 0.0, 0.0, 1.0
+    if c[0] == 1.0:
+        r2 = a * a + b * b
+        n, dn = 1 + r2 * (c[6] + r2 * (c[7] + r2 * c[10])), c[6] + r2 * (2 * c[7] + 3 * c[10] * r2)
+        d, dd = 1 + r2 * (c[11] + r2 * (c[12] + r2 * c[13])), c[11] + r2 * (2 * c[12] + 3 * c[13] * r2)
+        radial, slope = n / d, (dn * d - n * dd) / (d * d)
+        p1, p2 = c[8], c[9]
+        aa = radial + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a
+        ab = 2 * a * b * slope + 2 * p1 * a + 2 * p2 * b
+        ba = ab
+        bb = radial + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a
+    aa, ab, ba, bb = c[1] * aa, c[1] * ab, c[2] * ba, c[2] * bb
+    return u, v, True, aa * iz, ab * iz, -(aa * a + ab * b) * iz, ba * iz, bb * iz, -(ba * a + bb * b) * iz
