@@ -28,9 +28,9 @@ def print_comparison(
 ) -> list[dict[str, Any]]:
     """Print the records of one day beside the truth, and what the audit found.
 
-    Both are shown as what differs from the prior, i.e. what the drawing did not know: rotation vector [deg] and shift
-    [cm] in the axes of the pair's parent sensor (`T = exp(xi) T_prior`). A DoF in brackets is one that the day did
-    not determine: it stays at the prior.
+    Both are shown as what differs from the prior, i.e. what the drawing did not know: rotation vector [deg] and
+    shift of the child's origin [cm], in the axes of the pair's parent sensor. An estimate in brackets is a DoF
+    that the day did not determine: it stays at the prior.
 
     Returns:
         For each record: errors of rotation [deg] and translation [m] against the truth, before and after.
@@ -74,14 +74,14 @@ def _table(day: str) -> Table:
 
 
 def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
-    from pipeline.geometry.se3 import inverse, log_se3
+    from pipeline.geometry.changes import change_between, change_covariance
     from pipeline.store.current import prior_of, transform_of
 
     T, T_prior = transform_of(record), prior_of(record)
     if T is None or T_prior is None or record.covariance is None:
         return [[record.vehicle, record.pair, _STATUS[record.status], record.reason[:40]]]
-    true, estimate = log_se3(T_true @ inverse(T_prior)), log_se3(T @ inverse(T_prior))
-    sigma = np.sqrt(np.diag(record.covariance))
+    true, estimate = change_between(T_prior, T_true), change_between(T_prior, T)
+    sigma = np.sqrt(np.diag(change_covariance(T, record.covariance)))
     seen = record.observable or [True] * 6
     scale = np.array([np.degrees(1)] * 3 + [100.0] * 3)
     rows = []

@@ -76,15 +76,18 @@ class Camera:
         self, points_camera: Float[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
         """Pixels of points, and a mask that is False behind the camera or outside the model's valid angle (pixels there mean nothing)."""
-        x, y, z = np.moveaxis(points_camera.astype(np.float64), -1, 0)
+        x, y, z = points_camera.astype(np.float64).reshape(-1, 3).T
         if self.model == "equidistant":
             valid, xd, yd = self._equidistant(x, y, z)
         else:
             valid, xd, yd = self._pinhole(x, y, z)
         fx, fy, cx, cy = self.K[0, 0], self.K[1, 1], self.K[0, 2], self.K[1, 2]
-        return np.stack([fx * xd + cx, fy * yd + cy], -1), valid
+        batch = points_camera.shape[:-1]
+        return np.stack([fx * xd + cx, fy * yd + cy], -1).reshape(*batch, 2), valid.reshape(batch)
 
-    def contains(self, uv: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
+    def contains(
+        self, uv: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0
+    ) -> Bool[np.ndarray, "*batch"]:
         """True for pixels inside the image, `margin_px` from its border."""
         u, v = uv[..., 0], uv[..., 1]
         m = margin_px - 0.5
@@ -92,15 +95,21 @@ class Camera:
 
     def unproject(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
         """Unit rays in the optical frame through pixels; NaN where no ray of the model meets the pixel."""
-        xd = (uv[..., 0] - self.K[0, 2]) / self.K[0, 0]
-        yd = (uv[..., 1] - self.K[1, 2]) / self.K[1, 1]
-        return self._unproject_equidistant(xd, yd) if self.model == "equidistant" else self._unproject_pinhole(xd, yd)
+        flat = uv.astype(np.float64).reshape(-1, 2)
+        xd = (flat[:, 0] - self.K[0, 2]) / self.K[0, 0]
+        yd = (flat[:, 1] - self.K[1, 2]) / self.K[1, 1]
+        equidistant = self.model == "equidistant"
+        rays = self._unproject_equidistant(xd, yd) if equidistant else self._unproject_pinhole(xd, yd)
+        return rays.reshape(*uv.shape[:-1], 3)
 
-    def projection_jacobian(self, points_camera: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
+    def projection_jacobian(
+        self, points_camera: Float[np.ndarray, "*batch 3"]
+    ) -> Float[np.ndarray, "*batch 2 3"]:
         """d(u, v)/d(x, y, z) [px/m]; meaningful where `project` is valid."""
-        x, y, z = np.moveaxis(points_camera.astype(np.float64), -1, 0)
-        J = self._jacobian_equidistant(x, y, z) if self.model == "equidistant" else self._jacobian_pinhole(x, y, z)
-        return J * np.array([[self.K[0, 0]], [self.K[1, 1]]])
+        x, y, z = points_camera.astype(np.float64).reshape(-1, 3).T
+        equidistant = self.model == "equidistant"
+        J = self._jacobian_equidistant(x, y, z) if equidistant else self._jacobian_pinhole(x, y, z)
+        return (J * np.array([[self.K[0, 0]], [self.K[1, 1]]])).reshape(*points_camera.shape[:-1], 2, 3)
 
     def fast_polynomial(self, degree: int = 9) -> tuple[Float[np.ndarray, " P"], float]:
         """k(c) with `u = cx + fx k x/|p|`, `v = cy + fy k y/|p|`, c = z/|p|: coefficients, lowest power first, and the fit's largest error [px].
@@ -109,7 +118,9 @@ class Camera:
         """
         if self.model != "equidistant":
             raise ValueError("the polynomial path is for equidistant cameras")
-        corners = np.array([[0.0, 0.0], [self.width_px, 0], [0, self.height_px], [self.width_px, self.height_px]])
+        corners = np.array(
+            [[0.0, 0.0], [self.width_px, 0], [0, self.height_px], [self.width_px, self.height_px]]
+        )
         rays = self.unproject(corners)
         reach = np.arccos(np.nanmin(rays[..., 2])) if np.isfinite(rays).any() else self.max_angle_rad
         theta = np.linspace(1e-6, min(1.1 * reach, self.max_angle_rad), 2000)
@@ -142,7 +153,9 @@ class Camera:
         m, dm = 1 + r2 * (k4 + r2 * (k5 + r2 * k6)), k4 + r2 * (2 * k5 + 3 * k6 * r2)
         return n / m, (dn * m - n * dm) / (m * m)
 
-    def _pinhole(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _pinhole(
+        self, x: np.ndarray, y: np.ndarray, z: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         safe = np.maximum(z, _MIN_DEPTH_M)
         a, b = x / safe, y / safe
         valid = (z > _MIN_DEPTH_M) & (np.hypot(a, b) <= np.tan(self.max_angle_rad))
@@ -155,7 +168,9 @@ class Camera:
         p1, p2 = self._coefficients[2:4]
         r2 = a * a + b * b
         radial, _ = self._radial(r2)
-        return a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a), b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+        return a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a), b * radial + p1 * (
+            r2 + 2 * b * b
+        ) + 2 * p2 * a * b
 
     def _distort_jacobian(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         p1, p2 = self._coefficients[2:4]
@@ -189,11 +204,15 @@ class Camera:
         ray = np.stack([a, b, np.ones_like(a)], -1)
         return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
 
-    def _equidistant(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _equidistant(
+        self, x: np.ndarray, y: np.ndarray, z: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         h = np.hypot(x, y)
         theta = np.arctan2(h, z)
         norm = np.sqrt(h * h + z * z)
-        k = np.where(h > 1e-9 * norm, self._radius(theta) / np.where(h > 0, h, 1.0), 1 / np.where(norm > 0, norm, 1.0))
+        k = np.where(
+            h > 1e-9 * norm, self._radius(theta) / np.where(h > 0, h, 1.0), 1 / np.where(norm > 0, norm, 1.0)
+        )
         return (theta <= self.max_angle_rad) & (norm > _MIN_DEPTH_M), k * x, k * y
 
     def _jacobian_equidistant(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:

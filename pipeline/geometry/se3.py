@@ -110,7 +110,9 @@ def inverse(T_a_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch
     return from_rotation_translation(R, -(R @ T_a_b[..., :3, 3:])[..., 0])
 
 
-def transform_points(T_a_b: Float[np.ndarray, "4 4"], points_b: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+def transform_points(
+    T_a_b: Float[np.ndarray, "4 4"], points_b: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 3"]:
     """Coordinates in a of points given in b [m]."""
     return points_b @ T_a_b[:3, :3].T.astype(points_b.dtype) + T_a_b[:3, 3].astype(points_b.dtype)
 
@@ -133,7 +135,9 @@ def compose_covariance(
     return cov_a_b + A @ cov_b_c @ A.T
 
 
-def inverse_covariance(T_a_b: Float[np.ndarray, "4 4"], cov_a_b: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+def inverse_covariance(
+    T_a_b: Float[np.ndarray, "4 4"], cov_a_b: Float[np.ndarray, "6 6"]
+) -> Float[np.ndarray, "6 6"]:
     """Covariance of T_b_a, given that of T_a_b (first order)."""
     A = adjoint(inverse(T_a_b))
     return A @ cov_a_b @ A.T
@@ -150,7 +154,9 @@ def to_quaternion(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*bat
     return np.where(q[..., :1] < 0, -q, q)
 
 
-def from_quaternion(q_wxyz: Float[np.ndarray, "*batch 4"], t: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 4 4"]:
+def from_quaternion(
+    q_wxyz: Float[np.ndarray, "*batch 4"], t: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 4 4"]:
     """Transform of a quaternion (w, x, y, z), normalised here, and a translation [m].
 
     Raises:

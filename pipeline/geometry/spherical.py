@@ -45,4 +45,4 @@ def camera_direction_angles(points_camera: Float[np.ndarray, "*batch 3"]) -> Flo
 
 def wrap_angle(angle: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
     """The same angle in [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
