@@ -19,7 +19,7 @@ from pipeline.errors import SolveError
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, log_so3
 from pipeline.objective.camera_lidar_terms import Level, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.problem import PairEstimate, Prior
-from pipeline.solve.covariance import blocks_of, bootstrap_covariance, posterior
+from pipeline.solve.covariance import blocks_of, bootstrap_covariance, posterior, spread_to_covariance
 from pipeline.solve.globalise import evolve
 from schemas.observations import Observation
 
@@ -91,7 +91,7 @@ def estimate_camera_lidar(
     thin = sharp.thinned(0.35, rng)
     first = Level.wide(*_LADDER[0])
     ends = [_climb(thin, s, first, prior, config, steps=5) for s in starts]
-    scores = [float(_total(sharp, e, np.zeros((1, 7)), first, prior, config)[0]) for e in ends]
+    scores = [float(sharp.score(e.T_camera_lidar[None], np.array([e.dt_s]), first).sum()) for e in ends]
     best = int(np.argmax(scores))
     state, level = ends[best], first
     for sigma_px, contrast in _LADDER[1:]:
@@ -177,20 +177,13 @@ def _basin(terms: Terms, prior: Prior, config: SolveConfig, rng: np.random.Gener
     return AlignmentState(poses(x[None])[0], 0.0)
 
 
-def _total(
-    terms: Terms,
-    state: AlignmentState,
-    xi: Float[np.ndarray, "P 7"],
-    level: Level,
-    prior: Prior,
-    config: SolveConfig,
+def _prior_value(
+    T_camera_lidar: Float[np.ndarray, "P 4 4"], dt_s: Float[np.ndarray, " P"], prior: Prior, config: SolveConfig
 ) -> Float[np.ndarray, " P"]:
-    """Log posterior (up to a constant) at steps from a state."""
-    T, dt = state.moved(xi)
-    score = terms.score(T, dt, level).sum(1)
-    turn = log_so3(T[:, :3, :3] @ prior.T_camera_lidar[:3, :3].T) / prior.rotation_sigma_rad
-    shift = (T[:, :3, 3] - prior.T_camera_lidar[:3, 3]) / prior.translation_sigma_m
-    return score - 0.5 * ((turn**2).sum(1) + (shift**2).sum(1) + (dt / config.time_offset_sigma_s) ** 2)
+    """Log density of the prior, up to a constant."""
+    turn = log_so3(T_camera_lidar[:, :3, :3] @ prior.T_camera_lidar[:3, :3].T) / prior.rotation_sigma_rad
+    shift = (T_camera_lidar[:, :3, 3] - prior.T_camera_lidar[:3, 3]) / prior.translation_sigma_m
+    return -0.5 * ((turn**2).sum(1) + (shift**2).sum(1) + (dt_s / config.time_offset_sigma_s) ** 2)
 
 
 def _scales(terms: Terms, level: Level) -> Float[np.ndarray, " 7"]:
@@ -230,22 +223,30 @@ def _quadratic(
 def _climb(
     terms: Terms, state: AlignmentState, level: Level, prior: Prior, config: SolveConfig, *, steps: int
 ) -> AlignmentState:
-    """Maximise by response surfaces: the score is rough at the scale of a pixel, and a quadratic over a ball is not."""
+    """Maximise by response surfaces: the score is rough at the scale of a pixel, and a quadratic over a ball is not.
+
+    Newton steps, with at least half the curvature that the frames' gradients promise by their scatter (Fisher scoring): a
+    direction that the roughness makes flat or convex would send the step anywhere.
+    """
     scale = 1.8 * _scales(terms, level)
     for _ in range(steps):
-        value = _total(terms, state, _DESIGN * scale, level, prior, config)
-        gradient, H = (x[0] for x in _quadratic(value[:, None]))
-        curvature, axes = np.linalg.eigh(H)
-        curvature = np.minimum(curvature, -max(1e-3 * np.abs(curvature).max(), 1e-9))
-        step = -(axes / curvature) @ axes.T @ gradient
+        T, dt = state.moved(_DESIGN * scale)
+        gradient, H = _quadratic(terms.score(T, dt, level))
+        (before,), (H_prior,) = _quadratic(_prior_value(T, dt, prior, config)[:, None])
+        promised = gradient.T @ gradient - H_prior
+        curvature = _at_least(-H.sum(0) - H_prior, 0.5 * promised + 1e-9 * np.trace(promised) * np.eye(7))
+        step = np.linalg.solve(curvature, gradient.sum(0) + before)
         length = float(np.linalg.norm(step))
-        if length > 1.0:
-            step /= length
-        else:
-            scale = scale * 0.75
-        T, dt = state.moved((step * scale / (0.75 if length <= 1.0 else 1.0))[None])
+        T, dt = state.moved((step / max(length, 1.0) * scale)[None])
         state = AlignmentState(T[0], float(dt[0]))
+        if length < 1.0:
+            scale = scale * 0.75
     return state
+
+
+def _at_least(curvature: Float[np.ndarray, "7 7"], least: Float[np.ndarray, "7 7"]) -> Float[np.ndarray, "7 7"]:
+    """The larger of two symmetric matrices in every direction; `least` must be positive definite."""
+    return spread_to_covariance(0.5 * (curvature + curvature.T), least)
 
 
 def _derivatives(
@@ -324,19 +325,16 @@ def _conclude(
 ) -> PairEstimate:
     """Covariance from curvature and blocks, observability, notes."""
     scale = _scales(terms, level)
-    gradient, H = _derivatives(terms, state, level, scale)
-    gradient, H = gradient / scale, H / np.outer(scale, scale)
+    gradient = _derivatives(terms, state, level, scale)[0] / scale
     prior_information = np.diag(
         [prior.rotation_sigma_rad**-2] * 3
         + [prior.translation_sigma_m**-2] * 3
         + [config.time_offset_sigma_s**-2]
     )
-    # Differences of a rough score can come out with the wrong sign in a weak direction; the day's sum decides which are real.
-    total = -H.sum(0)
-    values, axes = np.linalg.eigh(total * np.outer(scale, scale))
-    repair = (axes * (np.maximum(values, 0.0) - values)) @ axes.T / np.outer(scale, scale) / len(frames)
+    # After `_weighted`, the scatter of the frames' gradients is the curvature, without its roughness (Bartlett's identity).
+    information = gradient[:, :, None] * gradient[:, None, :]
     block = blocks_of(np.array([o.drive for o in frames]), config.bootstrap_blocks)
-    covariance = bootstrap_covariance(-H + repair, -gradient, prior_information, block, rng)
+    covariance = bootstrap_covariance(information, -gradient, prior_information, block, rng)
     after = posterior(covariance[:6, :6], prior.covariance("camera_lidar"), _BIAS_FLOOR)
     dt_sigma = float(np.sqrt(covariance[6, 6] + 0.001**2))
     notes = []
