@@ -1,0 +1,49 @@
+"""`boresight report`: HTML pages of one vehicle-day, or of the whole fleet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["report"]
+
+
+def report(
+    *,
+    fleet: Path,
+    lake: str,
+    out: Path,
+    vehicle: str | None = None,
+    day: str | None = None,
+    method: str | None = None,
+    truth: Path | None = None,
+) -> int:
+    """Write self-contained HTML: one day with --vehicle and --day, else the fleet with all its days.
+
+    Args:
+        fleet: fleet.toml.
+        lake: folder of the tables.
+        out: the HTML file to write; pages of days go into a folder beside it.
+        vehicle: vehicle id.
+        day: YYYY-MM-DD.
+        method: method of the records; default: audit.method.
+        truth: JSON with the true extrinsics of a simulated fleet, shown beside the estimates.
+    """
+    from pipeline.report.run import write_day_page, write_fleet_report
+    from pipeline.report.truth import read_truth
+
+    from jobs.summary import print_summary
+    from pipeline.config import load_fleet
+    from pipeline.errors import ConfigError
+    from pipeline.store.partitions import Lake, Partition
+
+    if (vehicle is None) != (day is None):
+        raise ConfigError("command line", "vehicle, day", "a day's page needs both --vehicle and --day")
+    config = load_fleet(fleet)
+    tables = Lake.at(lake)
+    if vehicle is not None and day is not None:
+        outputs = [write_day_page(tables, Partition(vehicle, day), config, out, method)]
+    else:
+        known = read_truth(truth) if truth is not None else None
+        outputs = write_fleet_report(tables, config, out, method=method, truth=known)
+    print_summary("report", "done", report=out, outputs=outputs)
+    return 0

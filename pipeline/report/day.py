@@ -1,0 +1,239 @@
+"""What the page of one vehicle-day says, from its records: plain values for the template, no HTML."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.report.words import PAIR_TITLES, dof_title, motion_in_words, scaled, unit_of
+from pipeline.store.current import prior_of, transform_of
+from schemas.calibrations import DOF_NAMES, CalibrationRecord
+from schemas.drift import DriftFinding
+
+__all__ = ["DofRow", "PairView", "answer_for", "drift_sentence", "pair_view", "sigmas_of"]
+
+_ADVICE = {
+    "accepted": "use it",
+    "held": "keep the prior",
+    "refused": "keep the prior",
+}
+
+
+@dataclass(frozen=True)
+class DofRow:
+    """One line of a pair's table: numbers in words."""
+
+    name: str
+    unit: str
+    prior: str
+    change: str
+    sigma: str
+    prior_sigma: str
+    observability: str
+    observable: bool
+
+
+@dataclass(frozen=True)
+class PairView:
+    """One pair on the page."""
+
+    pair: str
+    title: str
+    status: str
+    advice: str
+    reason: str
+    known_to: str
+    undetermined: str
+    moved_by: str
+    rows: list[DofRow]
+    matrix: list[list[str]]
+    quaternion: str
+    translation: str
+    json_text: str
+    triggers: list[tuple[str, str, str]]
+    alignment: str
+    frames: str
+    rejected: list[tuple[str, int]]
+    time_offset: str
+    loop: str
+    notes: list[str]
+    diagnostics: list[tuple[str, str]]
+
+
+def sigmas_of(record: CalibrationRecord) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Sigmas (rotation [rad], origin [m]) of the prior and of the estimate; None where there is none."""
+    T_prior, T = prior_of(record), transform_of(record)
+    prior = None
+    if T_prior is not None and record.prior_covariance is not None:
+        # The prior's covariance is stated about the sensor itself, without a lever arm.
+        prior = np.sqrt(np.diag(record.prior_covariance))
+    if T is None or record.covariance is None:
+        return prior, None
+    return prior, np.sqrt(np.diag(change_covariance(T, record.covariance)))
+
+
+def pair_view(record: CalibrationRecord) -> PairView:
+    """Everything that the page says of one pair."""
+    T, T_prior = transform_of(record), prior_of(record)
+    prior_sigma, sigma = sigmas_of(record)
+    observable = record.observable or [sigma is not None] * 6
+    rows = _dof_rows(record, T, T_prior, prior_sigma, sigma, observable)
+    unseen = [dof_title(record.pair, d) for d, o in zip(DOF_NAMES, observable, strict=True) if not o]
+    quaternion = [record.qw, record.qx, record.qy, record.qz]
+    translation = [record.tx_m, record.ty_m, record.tz_m]
+    return PairView(
+        pair=record.pair,
+        title=PAIR_TITLES[record.pair],
+        status=record.status,
+        advice=_ADVICE[record.status],
+        reason=record.reason,
+        known_to=_known_to(sigma, observable),
+        undetermined=", ".join(unseen) if sigma is not None else "",
+        moved_by=_moved_by(T, T_prior),
+        rows=rows,
+        matrix=[] if T is None else [[f"{v:.6f}" for v in row] for row in T],
+        quaternion=_numbers(quaternion, 7),
+        translation=_numbers(translation, 4),
+        json_text=_json_text(record, T),
+        triggers=_triggers(record),
+        alignment=_before_after(record.alignment_before, record.alignment_after),
+        frames=f"{record.frames_used} of {record.frames_total}",
+        rejected=sorted(record.frames_rejected.items(), key=lambda kv: -kv[1]),
+        time_offset=_time_offset(record),
+        loop=_loop(record),
+        notes=list(record.notes),
+        diagnostics=[(name, f"{value:.4g}") for name, value in sorted(record.diagnostics.items())],
+    )
+
+
+def answer_for(views: Sequence[PairView]) -> tuple[str, str]:
+    """The first thing on the page: (good, partly or bad; a sentence) on whether these numbers may go on the car."""
+    accepted = [v.title for v in views if v.status == "accepted"]
+    other = [v.title for v in views if v.status != "accepted"]
+    if not views:
+        return "bad", "No. There is no calibration record for this day."
+    if not other:
+        return "good", "Yes. All pairs are accepted: they may go on the car, with the sigmas below."
+    if not accepted:
+        return "bad", "No. Nothing was accepted: keep the transforms that the car has."
+    return "partly", f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."
+
+
+def drift_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
+    """Status and sentence on the vehicle's drift, from the current findings."""
+    alarms = [f for f in findings if f.status in ("RED", "YELLOW")]
+    if not findings:
+        return "UNKNOWN", "No audit yet."
+    if not alarms:
+        seen = sum(f.status == "GREEN" for f in findings)
+        if not seen:
+            return "UNKNOWN", "Too little data to say whether a sensor moved."
+        return (
+            "GREEN",
+            f"No sensor moved ({seen} of {len(findings)} charts would show a change that matters).",
+        )
+    status = "RED" if any(f.status == "RED" for f in alarms) else "YELLOW"
+    best = max(alarms, key=lambda f: (f.status == "RED", f.moved_sensor is not None, f.statistic or 0.0))
+    if best.moved_sensor is None:
+        charts = ", ".join(f"{PAIR_TITLES[f.pair]} {f.dof}" for f in alarms[:4])
+        return status, f"Something changed on {best.start_day} ({charts}): {best.reason}."
+    motion = motion_in_words(best.moved_sensor, best.moved_motion or [], best.moved_motion_sigma or [])
+    kind = "moved on" if best.kind == "step" else "has been drifting since"
+    return status, f"The {best.moved_sensor} {kind} {best.start_day}: {motion}."
+
+
+def _dof_rows(
+    record: CalibrationRecord,
+    T: np.ndarray | None,
+    T_prior: np.ndarray | None,
+    prior_sigma: np.ndarray | None,
+    sigma: np.ndarray | None,
+    observable: Sequence[bool],
+) -> list[DofRow]:
+    change = change_between(T_prior, T) if T is not None and T_prior is not None else None
+    rows = []
+    for k, dof in enumerate(DOF_NAMES):
+        value = "" if T_prior is None or dof.startswith("r") else f"{T_prior[k - 3, 3]:+.3f}"
+        rows.append(
+            DofRow(
+                dof_title(record.pair, dof),
+                unit_of(dof),
+                value,
+                "" if change is None else f"{scaled(change[k], dof):+.3f}",
+                "" if sigma is None else f"{scaled(sigma[k], dof):.3f}",
+                "" if prior_sigma is None else f"{scaled(prior_sigma[k], dof):.3f}",
+                "" if record.observability is None else f"{100 * record.observability[k]:.0f} %",
+                bool(observable[k]),
+            )
+        )
+    return rows
+
+
+def _known_to(sigma: np.ndarray | None, observable: Sequence[bool]) -> str:
+    if sigma is None:
+        return "nothing was computed"
+    parts = []
+    for name, index in (("rotation", range(3)), ("position", range(3, 6))):
+        seen = [k for k in index if observable[k]]
+        if seen:
+            worst = max(seen, key=lambda k: sigma[k])
+            text = f"{scaled(sigma[worst], DOF_NAMES[worst]):.2g} {unit_of(DOF_NAMES[worst])}"
+            parts.append(f"{name} ± {text} ({DOF_NAMES[worst]})")
+    return ", ".join(parts) or "no degree of freedom"
+
+
+def _moved_by(T: np.ndarray | None, T_prior: np.ndarray | None) -> str:
+    if T is None or T_prior is None:
+        return ""
+    change = change_between(T_prior, T)
+    angle, shift = np.degrees(np.linalg.norm(change[:3])), np.linalg.norm(change[3:])
+    return f"{angle:.2f} deg and {100 * shift:.1f} cm from the prior"
+
+
+def _triggers(record: CalibrationRecord) -> list[tuple[str, str, str]]:
+    names = sorted({*record.trigger_before, *record.trigger_after})
+    return [(n, _number(record.trigger_before.get(n)), _number(record.trigger_after.get(n))) for n in names]
+
+
+def _before_after(before: float | None, after: float | None) -> str:
+    return f"{_number(before)} → {_number(after)}" if before is not None or after is not None else ""
+
+
+def _time_offset(record: CalibrationRecord) -> str:
+    if record.time_offset_s is None:
+        return ""
+    sigma = "" if record.time_offset_sigma_s is None else f" ± {1e3 * record.time_offset_sigma_s:.1f}"
+    parent, child = record.parent_frame, record.child_frame
+    return f"{1e3 * record.time_offset_s:+.1f}{sigma} ms ({parent} stamp = {child} stamp + this)"
+
+
+def _loop(record: CalibrationRecord) -> str:
+    if record.loop_rotation_rad is None or record.loop_translation_m is None:
+        return ""
+    return f"{np.degrees(record.loop_rotation_rad):.2f} deg, {100 * record.loop_translation_m:.1f} cm"
+
+
+def _json_text(record: CalibrationRecord, T: np.ndarray | None) -> str:
+    if T is None:
+        return ""
+    fields = {
+        "vehicle": record.vehicle, "day": record.day, "method": record.method, "pair": record.pair,
+        "status": record.status, "parent_frame": record.parent_frame, "child_frame": record.child_frame,
+        "qw": record.qw, "qx": record.qx, "qy": record.qy, "qz": record.qz,
+        "tx_m": record.tx_m, "ty_m": record.ty_m, "tz_m": record.tz_m,
+        "T": T.tolist(), "covariance": None if record.covariance is None else record.covariance.tolist(),
+        "observable": record.observable, "work_key": record.work_key,
+    }  # fmt: skip
+    return json.dumps(fields)
+
+
+def _numbers(values: Sequence[float | None], digits: int) -> str:
+    return ", ".join(f"{v:.{digits}f}" for v in values if v is not None)
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"

@@ -1,0 +1,224 @@
+"""What the fleet page says, from table calibrations and table drift: plain values for the template, no HTML."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.report.day import drift_sentence
+from pipeline.report.figures import DriftPanel
+from pipeline.report.words import PAIR_TITLES, motion_in_words, with_sigma
+from pipeline.store.current import transform_of
+from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.drift import DriftFinding
+
+__all__ = [
+    "DayCell",
+    "FindingView",
+    "VehicleRow",
+    "drift_panels",
+    "finding_views",
+    "headline_for",
+    "vehicle_rows",
+]
+
+_WORST = ("refused", "held", "accepted")
+
+
+@dataclass(frozen=True)
+class DayCell:
+    """One vehicle-day of the table; `link` is relative to the fleet page, empty where there is no page."""
+
+    day: str
+    status: str
+    text: str
+    link: str
+
+
+@dataclass(frozen=True)
+class VehicleRow:
+    """One vehicle of the table."""
+
+    vehicle: str
+    status: str
+    sentence: str
+    cells: list[DayCell]
+
+
+@dataclass(frozen=True)
+class FindingView:
+    """One vehicle in which something changed."""
+
+    vehicle: str
+    status: str
+    sensor: str
+    since: str
+    kind: str
+    motion: str
+    sure: str
+    charts: list[str]
+
+
+def vehicle_rows(
+    records: Sequence[CalibrationRecord],
+    findings: Sequence[DriftFinding],
+    days: Sequence[str],
+    links: Mapping[tuple[str, str], str],
+) -> list[VehicleRow]:
+    """The table vehicles x days, alarmed vehicles first."""
+    order = {"RED": 0, "YELLOW": 1, "UNKNOWN": 2, "GREEN": 3}
+    rows = []
+    for vehicle in sorted({r.vehicle for r in records} | {f.vehicle for f in findings}):
+        status, sentence = drift_sentence([f for f in findings if f.vehicle == vehicle])
+        cells = [_cell(records, vehicle, day, links.get((vehicle, day), "")) for day in days]
+        rows.append(VehicleRow(vehicle, status, sentence, cells))
+    return sorted(rows, key=lambda r: (order[r.status], r.vehicle))
+
+
+def finding_views(findings: Sequence[DriftFinding]) -> list[FindingView]:
+    """What changed, vehicle by vehicle: RED before YELLOW."""
+    views = []
+    for vehicle in sorted({f.vehicle for f in findings}):
+        alarms = [f for f in findings if f.vehicle == vehicle and f.status in ("RED", "YELLOW")]
+        if alarms:
+            views.append(_finding_view(vehicle, alarms))
+    return sorted(views, key=lambda v: (v.status != "RED", v.vehicle))
+
+
+def headline_for(findings: Sequence[DriftFinding], views: Sequence[FindingView]) -> tuple[str, str]:
+    """(RED, YELLOW, GREEN or UNKNOWN; the page's first sentence)."""
+    vehicles = len({f.vehicle for f in findings})
+    if not vehicles:
+        return "UNKNOWN", "No audit yet: run boresight audit."
+    if not views:
+        if not any(f.status == "GREEN" for f in findings):
+            return (
+                "UNKNOWN",
+                f"Too little data to say whether a sensor moved on {_count(vehicles, 'vehicle')}.",
+            )
+        return "GREEN", f"No sensor moved on {_count(vehicles, 'vehicle')}."
+    red = [v for v in views if v.status == "RED"]
+    named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in (red or views)[:3]]
+    more = "" if len(views) <= 3 else f" and {len(views) - 3} more"
+    verb = "A sensor moved" if red else "Something may have moved"
+    status = "RED" if red else "YELLOW"
+    return status, f"{verb} on {len(views)} of {_count(vehicles, 'vehicle')}: {'; '.join(named)}{more}."
+
+
+def drift_panels(
+    vehicle: str, records: Sequence[CalibrationRecord], findings: Sequence[DriftFinding]
+) -> list[DriftPanel]:
+    """The vehicle's charts with the day estimates they rest on, each relative to its level before the change."""
+    panels = []
+    for pair in PAIRS:
+        rows = [r for r in records if (r.vehicle, r.pair) == (vehicle, pair)]
+        used = [r for r in rows if r.status == "accepted" and r.covariance is not None]
+        for k, dof in enumerate(DOF_NAMES):
+            finding = next((f for f in findings if (f.vehicle, f.pair, f.dof) == (vehicle, pair, dof)), None)
+            if finding is not None:
+                panels.append(_panel(finding, rows, used, k))
+    return panels
+
+
+def _panel(
+    finding: DriftFinding, rows: Sequence[CalibrationRecord], used: Sequence[CalibrationRecord], k: int
+) -> DriftPanel:
+    seen = [r for r in used if r.observable is None or r.observable[k]]
+    start = None
+    if finding.start_day and finding.start_day_earliest and finding.start_day_latest:
+        start = (
+            _ordinal(finding.start_day),
+            _ordinal(finding.start_day_earliest),
+            _ordinal(finding.start_day_latest),
+        )
+    day = [_ordinal(r.day) for r in seen]
+    T = [t for t in map(transform_of, seen) if t is not None]
+    value = np.array([change_between(T[0], t)[k] for t in T])
+    sigma = np.array(
+        [
+            np.sqrt(change_covariance(t, r.covariance)[k, k])
+            for t, r in zip(T, seen, strict=True)
+            if r.covariance is not None
+        ]
+    )
+    before = np.array([start is None or d < start[0] for d in day], dtype=bool)
+    if before.any():
+        value = value - np.average(value[before], weights=sigma[before] ** -2)
+    missing = sorted({_ordinal(r.day) for r in rows} - set(day))
+    return DriftPanel(
+        finding.pair,
+        finding.dof,
+        finding.status,
+        day,
+        value.tolist(),
+        sigma.tolist(),
+        finding.limit,
+        start,
+        missing,
+    )
+
+
+def _cell(records: Sequence[CalibrationRecord], vehicle: str, day: str, link: str) -> DayCell:
+    found = [r for r in records if (r.vehicle, r.day) == (vehicle, day)]
+    if not found:
+        return DayCell(day, "none", "-", link)
+    statuses = [r.status for r in found]
+    accepted = statuses.count("accepted")
+    if accepted == len(found):
+        return DayCell(day, "accepted", "accepted", link)
+    if accepted:
+        return DayCell(day, "partly", f"{accepted} of {len(found)} accepted", link)
+    worst = next(s for s in _WORST if s in statuses)
+    return DayCell(day, worst, worst, link)
+
+
+def _finding_view(vehicle: str, alarms: Sequence[DriftFinding]) -> FindingView:
+    status = "RED" if any(f.status == "RED" for f in alarms) else "YELLOW"
+    best = max(alarms, key=lambda f: (f.moved_sensor is not None, f.status == "RED", f.statistic or 0.0))
+    interval = (
+        ""
+        if best.start_day_earliest == best.start_day_latest
+        else f" ({best.start_day_earliest} to {best.start_day_latest})"
+    )
+    motion = best.reason
+    if best.moved_sensor is not None:
+        motion = motion_in_words(best.moved_sensor, best.moved_motion or [], best.moved_motion_sigma or [])
+    return FindingView(
+        vehicle,
+        status,
+        best.moved_sensor or "not clear which",
+        f"{best.start_day}{interval}",
+        best.kind or "",
+        motion,
+        _sure(best),
+        [_chart_words(f) for f in sorted(alarms, key=lambda f: -(f.statistic or 0.0))],
+    )
+
+
+def _sure(finding: DriftFinding) -> str:
+    parts = []
+    if finding.statistic is not None and finding.threshold is not None:
+        parts.append(f"change {finding.statistic:.1f} sigma, alarm from {finding.threshold:.1f}")
+    if finding.moved_probability is not None:
+        share = 100 * finding.moved_probability
+        parts.append(f"sensor {'> 99.9' if share > 99.9 else f'{share:.1f}'} %")
+    return "; ".join(parts)
+
+
+def _chart_words(finding: DriftFinding) -> str:
+    if finding.magnitude is None or finding.magnitude_sigma is None:
+        return f"{PAIR_TITLES[finding.pair]} {finding.dof}"
+    size = with_sigma(finding.magnitude, finding.magnitude_sigma, finding.dof)
+    return f"{PAIR_TITLES[finding.pair]} {finding.dof} {size}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def _ordinal(day: str) -> int:
+    return dt.date.fromisoformat(day).toordinal()

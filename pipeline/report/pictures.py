@@ -1,0 +1,59 @@
+"""The pictures of one vehicle-day: chosen frames, drawn and encoded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.report.encode import jpeg_uri, png_uri
+from pipeline.report.overlays import Extrinsics, Scene, camera_of, close_up, front_view, top_view
+from pipeline.report.scenes import choose_windows
+
+__all__ = ["ScenePictures", "scene_pictures"]
+
+_CLOSE_UPS = 3
+_CLOSE_UP_WIDTH_PX = 420
+
+
+@dataclass(frozen=True)
+class ScenePictures:
+    """One frame on the page; pictures as data URIs."""
+
+    frame_index: int
+    log: str
+    drive: int
+    front: str
+    top: str
+    close_ups: list[tuple[str, str]]
+    zoom: int
+    window_deg: str
+
+
+def scene_pictures(
+    scenes: Sequence[Scene], before: Extrinsics, after: Extrinsics, labels: tuple[str, str]
+) -> list[ScenePictures]:
+    """Draw and encode all pictures of the chosen frames."""
+    return [_pictures(scene, before, after, labels) for scene in scenes]
+
+
+def _pictures(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> ScenePictures:
+    windows = choose_windows(scene.observation, after.T_camera_lidar, _CLOSE_UPS)
+    width = windows[0].size_px[0] if windows else 1
+    zoom = max(2, round(_CLOSE_UP_WIDTH_PX / width))
+    close_ups = []
+    for window in windows:
+        pair = [jpeg_uri(close_up(scene, s, window, zoom)) for s in (before, after)]
+        close_ups.append((pair[0], pair[1]))
+    angle = np.degrees(width / camera_of(scene.frame).focal_px[0])
+    return ScenePictures(
+        scene.frame.frame_index,
+        scene.frame.log,
+        scene.frame.drive,
+        jpeg_uri(front_view(scene, before, after, labels)),
+        png_uri(top_view(scene, before, after, labels)),
+        close_ups,
+        zoom,
+        f"{angle:.1f}",
+    )

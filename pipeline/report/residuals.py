@@ -1,0 +1,103 @@
+"""How well the sensors agree in each frame, before and after: for the eye, never for the verdict.
+
+A low residual is not accuracy: a calibration can be repeatable, fit best and still be wrong. The verdict
+rests on held-out frames, restarts and sigmas (pipeline.verify); these numbers show what a person can check
+in the pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from pipeline.geometry.se3 import transform_points
+from pipeline.report.overlays import Extrinsics, camera_of
+from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
+
+__all__ = ["MEASURES", "boundary_distance_px", "frame_residuals"]
+
+# pair -> what is measured, whether more is better
+MEASURES = {
+    "camera_lidar": ("lidar edges on a silhouette [%]", True),
+    "camera_radar": ("moving radar inside a road user's box [%]", True),
+    "lidar_radar": ("static radar to the lidar cloud, median [m]", False),
+}
+_ON_SILHOUETTE_RAD = 0.003  # 0.17 deg, as wide as a mask's boundary is uncertain
+_STATIC, _MOVING = 0, 1
+_MIN_POINTS = 5  # shares of fewer say nothing
+
+
+def frame_residuals(
+    observations: Sequence[Observation], state: Extrinsics
+) -> dict[str, Float[np.ndarray, " F"]]:
+    """Measure per pair and frame, as MEASURES says; NaN where a frame has too little to tell."""
+    rows = [
+        (
+            _on_silhouette(o, state.T_camera_lidar),
+            _in_boxes(o, state.T_camera_radar),
+            _radar_gap_m(o, state.T_lidar_radar),
+        )
+        for o in observations
+    ]
+    values = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return {pair: values[:, k] for k, pair in enumerate(MEASURES)}
+
+
+def boundary_distance_px(observation: Observation, uv: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " N"]:
+    """Distance of pixels to the nearest sideways change of label, in full-image pixels; inf where there is none."""
+    labels = _decode_labels(observation)
+    change = np.zeros(labels.shape, bool)
+    change[:, 1:] = labels[:, 1:] != labels[:, :-1]
+    if not change.any() or not len(uv):
+        return np.full(len(uv), np.inf)
+    distance = cv2.distanceTransform((~change).astype(np.uint8), cv2.DIST_L2, 3) / observation.label_scale
+    at = np.round((uv + 0.5) * observation.label_scale - 0.5).astype(int)
+    column, row = (np.clip(at[:, k], 0, labels.shape[1 - k] - 1) for k in (0, 1))
+    return distance[row, column].astype(np.float64)
+
+
+def _decode_labels(observation: Observation) -> np.ndarray:
+    labels = cv2.imdecode(np.frombuffer(observation.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return np.zeros((1, 1), np.uint8) if labels is None else labels
+
+
+def _on_silhouette(observation: Observation, T_camera_lidar: np.ndarray) -> float:
+    sideways = np.isin(observation.lidar_edge_side, (EDGE_LEFT, EDGE_RIGHT))
+    camera = camera_of(observation)
+    uv, valid = camera.project(_seen_from(T_camera_lidar, observation.lidar_edge_xyz_m[sideways]))
+    uv = uv[valid & camera.contains(uv, margin_px=2)]
+    if len(uv) < _MIN_POINTS:
+        return float("nan")
+    return float(
+        100 * np.mean(boundary_distance_px(observation, uv) < _ON_SILHOUETTE_RAD * camera.focal_px[0])
+    )
+
+
+def _in_boxes(observation: Observation, T_camera_radar: np.ndarray) -> float:
+    moving = observation.radar_xyz_m[(observation.radar_motion == _MOVING) & (observation.radar_cluster >= 0)]
+    camera, boxes = camera_of(observation), observation.road_user_boxes_px.astype(np.float64)
+    uv, valid = camera.project(_seen_from(T_camera_radar, moving))
+    uv = uv[valid & camera.contains(uv)]
+    if len(uv) < _MIN_POINTS or not len(boxes):
+        return float("nan")
+    inside = (uv[:, None, :] >= boxes[None, :, :2]) & (uv[:, None, :] <= boxes[None, :, 2:])
+    return float(100 * inside.all(axis=-1).any(axis=1).mean())
+
+
+def _radar_gap_m(observation: Observation, T_lidar_radar: np.ndarray) -> float:
+    static = observation.radar_xyz_m[observation.radar_motion == _STATIC]
+    standing = observation.lidar_map_xyz_m[observation.lidar_map_is_ground == 0]
+    if min(len(static), len(standing)) < _MIN_POINTS:
+        return float("nan")
+    seen = _seen_from(T_lidar_radar, static)
+    # From above: most radars measure elevation ten times worse than azimuth.
+    distance, _ = cKDTree(standing[:, :2]).query(seen[:, :2])
+    return float(np.median(distance))
+
+
+def _seen_from(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return transform_points(T, points.astype(np.float64))

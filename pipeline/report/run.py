@@ -1,0 +1,278 @@
+"""Stage report: tables to HTML pages, one per vehicle-day and one for the fleet."""
+
+from __future__ import annotations
+
+import datetime as dt
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from pipeline.config import FleetConfig
+from pipeline.errors import ConfigError
+from pipeline.report.day import PairView, answer_for, drift_sentence, pair_view, sigmas_of
+from pipeline.report.encode import svg_inline
+from pipeline.report.figures import drift_figure, residual_figure, sigma_figure
+from pipeline.report.fleet import drift_panels, finding_views, headline_for, vehicle_rows
+from pipeline.report.overlays import Extrinsics, Scene
+from pipeline.report.page import render, write_page
+from pipeline.report.pictures import scene_pictures
+from pipeline.report.residuals import frame_residuals
+from pipeline.report.scenes import choose_frames
+from pipeline.report.truth import truth_rows
+from pipeline.results import Progress, silent
+from pipeline.store.current import current_drift, current_records, prior_of, transform_of
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import iterate_rows, read_manifest, read_records
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.drift import DRIFT, DriftFinding
+from schemas.frames import FRAMES, Frame
+from schemas.observations import OBSERVATIONS, Observation
+
+__all__ = ["write_day_page", "write_fleet_page", "write_fleet_report"]
+
+_SCENES = 3
+_RESIDUAL_FRAMES = 60  # evenly spread; more dots say nothing more
+_CHARTS = 24  # vehicles without an alarm whose charts still go on the fleet page
+
+
+def write_day_page(
+    lake: Lake,
+    partition: Partition,
+    fleet: FleetConfig,
+    out: Path,
+    method: str | None = None,
+    *,
+    fleet_link: str = "",
+) -> Path:
+    """Write the page of one vehicle-day.
+
+    Args:
+        lake: holds calibrations; observations and frames where there shall be pictures.
+        partition: the vehicle-day.
+        fleet: names the fleet and the default method.
+        out: the HTML file.
+        method: None = `fleet.audit.method`.
+        fleet_link: relative link to the fleet page; empty = none.
+
+    Raises:
+        ConfigError: the day has no record of the method.
+    """
+    method = method or fleet.audit.method
+    records = _day_records(lake, partition, method)
+    findings = _drift(lake, method, partition.vehicle)
+    views = [pair_view(records[p]) for p in PAIRS if p in records]
+    before, after = _states(records)
+    labels = ("prior", _after_label(views))
+    pictures, residual_svg, no_pictures = _pictures(lake, partition, before, after, labels)
+    html = render(
+        "day.html",
+        vehicle=partition.vehicle,
+        day=partition.day,
+        fleet=fleet.fleet.name,
+        fleet_link=fleet_link,
+        method=method,
+        environment=next(iter(records.values())).environment,
+        answer=answer_for(views),
+        drift=drift_sentence(findings),
+        pairs=views,
+        labels=labels,
+        scenes=pictures,
+        no_pictures=no_pictures,
+        sigma_svg=_sigma_svg(records),
+        residual_svg=residual_svg,
+        provenance=_provenance(list(records.values())),
+    )
+    return write_page(out, html)
+
+
+def write_fleet_page(
+    lake: Lake,
+    fleet: FleetConfig,
+    out: Path,
+    method: str | None = None,
+    *,
+    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]] | None = None,
+    links: Mapping[tuple[str, str], str] | None = None,
+) -> Path:
+    """Write the page of the whole fleet: findings first, then vehicles x days, then charts.
+
+    Args:
+        lake: holds calibrations and drift.
+        fleet: names the fleet and the default method.
+        out: the HTML file.
+        method: None = `fleet.audit.method`.
+        truth: true extrinsics by (vehicle, day) and pair, where a simulated fleet has them.
+        links: day pages by (vehicle, day), relative to `out`.
+    """
+    method = method or fleet.audit.method
+    records = _fleet_records(lake, method)
+    findings = _drift(lake, method)
+    days = sorted({r.day for r in records})
+    views = finding_views(findings)
+    rows = vehicle_rows(records, findings, days, links or {})
+    alarmed = {v.vehicle for v in views}
+    quiet = [r for r in rows if r.vehicle not in alarmed]
+    shown = [r for r in rows if r.vehicle in alarmed] + quiet[:_CHARTS]
+    html = render(
+        "fleet.html",
+        fleet=fleet.fleet.name,
+        method=method,
+        span=f"{days[0]} to {days[-1]}" if days else "no calibration record yet",
+        headline=headline_for(findings, views),
+        budget=_budget(fleet),
+        findings=views,
+        days=days,
+        rows=rows,
+        dofs=[f"{d} [{'deg' if d.startswith('r') else 'm'}]" for d in DOF_NAMES],
+        truth=truth_rows(records, truth) if truth else [],
+        charts=[_chart(row.vehicle, row.status, records, findings, row.vehicle in alarmed) for row in shown],
+        left_out=max(0, len(quiet) - _CHARTS),
+        provenance=_fleet_provenance(records, findings),
+    )
+    return write_page(out, html)
+
+
+def write_fleet_report(
+    lake: Lake,
+    fleet: FleetConfig,
+    out: Path,
+    method: str | None = None,
+    *,
+    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]] | None = None,
+    progress: Progress = silent,
+) -> list[Path]:
+    """Write the fleet page and, in a folder beside it, the page of every vehicle-day; the fleet page comes first."""
+    method = method or fleet.audit.method
+    partitions = sorted({Partition(r.vehicle, r.day) for r in _fleet_records(lake, method)})
+    folder = out.parent / f"{out.stem}_days"
+    links, pages = {}, []
+    for done, partition in enumerate(partitions):
+        progress(done, len(partitions), f"{partition.vehicle} {partition.day}")
+        name = f"{re.sub(r'[^A-Za-z0-9._-]', '_', partition.vehicle)}_{partition.day}.html"
+        path = folder / name
+        pages.append(write_day_page(lake, partition, fleet, path, method, fleet_link=f"../{quote(out.name)}"))
+        links[(partition.vehicle, partition.day)] = f"{quote(folder.name)}/{quote(name)}"
+    return [write_fleet_page(lake, fleet, out, method, truth=truth, links=links), *pages]
+
+
+def _day_records(lake: Lake, partition: Partition, method: str) -> dict[str, CalibrationRecord]:
+    found = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle, day=partition.day)
+    records = {r.pair: r for r in current_records([r for r in found if r.method == method])}
+    if not records:
+        known = sorted({r.method for r in found})
+        problem = (
+            f"{partition.vehicle} has no {method} record on {partition.day}; the lake has {known or 'none'}"
+        )
+        raise ConfigError("command line", "day", problem)
+    return records
+
+
+def _fleet_records(lake: Lake, method: str) -> list[CalibrationRecord]:
+    records = read_records(lake, CALIBRATIONS, CalibrationRecord)
+    return current_records([r for r in records if r.method == method])
+
+
+def _drift(lake: Lake, method: str, vehicle: str | None = None) -> list[DriftFinding]:
+    findings = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle)
+    return current_drift([f for f in findings if f.method == method])
+
+
+def _states(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics | None, Extrinsics | None]:
+    """Extrinsics at the prior and at the result; a pair without a result stays at its prior."""
+    prior = {p: prior_of(r) for p, r in records.items()}
+    result = {p: transform_of(r) for p, r in records.items()}
+    before = {p: T for p, T in prior.items() if T is not None}
+    after = before | {p: T for p, T in result.items() if T is not None}
+    if any(set(PAIRS) - set(state) for state in (before, after)):
+        return None, None
+    return tuple(Extrinsics(s["camera_lidar"], s["camera_radar"], s["lidar_radar"]) for s in (before, after))  # type: ignore[return-value]
+
+
+def _after_label(views: Sequence[PairView]) -> str:
+    statuses = {v.status for v in views}
+    if statuses == {"accepted"}:
+        return "calibrated"
+    return "result, partly held" if "accepted" in statuses else "result, held"
+
+
+def _pictures(
+    lake: Lake,
+    partition: Partition,
+    before: Extrinsics | None,
+    after: Extrinsics | None,
+    labels: tuple[str, str],
+) -> tuple[list[Any], Any, str]:
+    if before is None or after is None:
+        return [], "", "the records carry no prior"
+    if any(read_manifest(lake, t, partition) is None for t in (FRAMES, OBSERVATIONS)):
+        return [], "", "the lake no longer has the day's frames and observations"
+    observations = [o for chunk in iterate_rows(lake, OBSERVATIONS, partition, Observation) for o in chunk]
+    if not observations:
+        return [], "", "no frame of the day could be used"
+    some = np.unique(np.linspace(0, len(observations) - 1, _RESIDUAL_FRAMES).astype(int))
+    spread = [observations[i] for i in some]
+    residuals = residual_figure(frame_residuals(spread, before), frame_residuals(spread, after))
+    chosen = [observations[i] for i in choose_frames(observations, after.T_camera_lidar, _SCENES)]
+    rows = [o.frame_index for o in chosen]
+    frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
+    scenes = [Scene(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
+    svg = svg_inline(residuals, "residuals", "Agreement of the sensors in each frame, prior and calibrated")
+    return scene_pictures(scenes, before, after, labels), svg, "no frame of the day could be drawn"
+
+
+def _sigma_svg(records: Mapping[str, CalibrationRecord]) -> str:
+    prior, sigma, observable = {}, {}, {}
+    for pair, record in records.items():
+        before, after = sigmas_of(record)
+        if before is not None:
+            prior[pair] = before
+        if after is not None:
+            sigma[pair] = after
+            observable[pair] = record.observable or [True] * 6
+    return svg_inline(sigma_figure(prior, sigma, observable), "sigmas", "Sigma of each degree of freedom")
+
+
+def _chart(
+    vehicle: str,
+    status: str,
+    records: Sequence[CalibrationRecord],
+    findings: Sequence[DriftFinding],
+    alarmed: bool,
+) -> dict[str, Any]:
+    panels = drift_panels(vehicle, records, findings)
+    ordinals = {dt.date.fromisoformat(r.day).toordinal(): r.day[5:] for r in records if r.vehicle == vehicle}
+    if not panels or not ordinals:
+        svg: Any = "No record in the window."
+    else:
+        name = "drift-" + re.sub(r"[^A-Za-z0-9]", "-", vehicle)
+        svg = svg_inline(drift_figure(panels, ordinals), name, f"Control charts of {vehicle}")
+    return {"vehicle": vehicle, "status": status, "svg": svg, "open": alarmed}
+
+
+def _budget(fleet: FleetConfig) -> str:
+    rate = fleet.audit.false_alarms_per_1000_vehicle_days
+    return f"False alarms expected: at most {rate:g} in 1000 vehicle-days, over all charts together."
+
+
+def _provenance(records: Sequence[CalibrationRecord]) -> list[tuple[str, str]]:
+    return [
+        ("work keys", ", ".join(sorted({r.work_key for r in records}))),
+        ("code version", ", ".join(sorted({r.code_version for r in records}))),
+        ("seed", ", ".join(sorted({str(r.seed) for r in records}))),
+        ("inputs", ", ".join(sorted({i for r in records for i in r.inputs}))),
+    ]
+
+
+def _fleet_provenance(
+    records: Sequence[CalibrationRecord], findings: Sequence[DriftFinding]
+) -> list[tuple[str, str]]:
+    return [
+        ("calibration records", str(len(records))),
+        ("audited until", ", ".join(sorted({f.day for f in findings})) or "not audited"),
+        ("audit work keys", ", ".join(sorted({f.work_key for f in findings}))),
+        ("code version", ", ".join(sorted({r.code_version for r in records}))),
+    ]

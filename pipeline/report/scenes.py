@@ -1,0 +1,70 @@
+"""Which frames and which windows of them are worth looking at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import transform_points
+from pipeline.report.overlays import Window, camera_of
+from pipeline.report.residuals import boundary_distance_px
+from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
+
+__all__ = ["choose_frames", "choose_windows"]
+
+_MIN_EDGES = 5  # fewer do not show a silhouette
+_REACH_RAD = 0.003  # 0.17 deg, as wide as a mask's boundary is uncertain
+
+
+def choose_frames(observations: Sequence[Observation], T_camera_lidar: np.ndarray, count: int) -> list[int]:
+    """Indices of frames with much to see (depth jumps, road users, moving radar clusters), spread over the day."""
+    if not observations:
+        return []
+    score = np.array([_richness(o, T_camera_lidar) for o in observations])
+    parts = np.array_split(np.arange(len(observations)), min(count, len(observations)))
+    return [int(part[np.argmax(score[part])]) for part in parts]
+
+
+def choose_windows(observation: Observation, T_camera_lidar: np.ndarray, count: int) -> list[Window]:
+    """Windows in which many sideways depth jumps of near objects have a silhouette to lie on: vehicles, poles, signs.
+
+    Chosen on the calibrated state, so that before and after show the same window; a window says how well the two states
+    agree with the picture only because a person looks at it.
+    """
+    uv, distance = _side_edges(observation, T_camera_lidar)
+    near = (distance > 5) & (distance < 40)
+    uv = uv[near]
+    reach = _REACH_RAD * camera_of(observation).focal_px[0]
+    weight = np.where(boundary_distance_px(observation, uv) < reach, 1.0, -0.3)
+    width = round(observation.image_width_px / 8)
+    size = np.array([width, round(width * 0.62)])
+    windows: list[Window] = []
+    while len(windows) < count and len(uv) >= _MIN_EDGES:
+        inside = (np.abs(uv[:, None, :] - uv[None, :, :]) < size / 2 * 0.8).all(axis=-1) @ weight
+        best = int(np.argmax(inside))
+        if inside[best] < _MIN_EDGES:
+            break
+        centre = uv[best]
+        windows.append(Window((float(centre[0]), float(centre[1])), (int(size[0]), int(size[1]))))
+        free = (np.abs(uv - centre) >= size).any(axis=1)
+        uv, weight = uv[free], weight[free]
+    return windows
+
+
+def _richness(observation: Observation, T_camera_lidar: np.ndarray) -> float:
+    edges = len(_side_edges(observation, T_camera_lidar)[0])
+    users, tracks = len(observation.road_user_boxes_px), len(observation.radar_track_xyz_m)
+    return float(np.sqrt(edges) + 4 * min(users, 6) + 4 * min(tracks, 6))
+
+
+def _side_edges(
+    observation: Observation, T_camera_lidar: np.ndarray
+) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, " N"]]:
+    sideways = np.isin(observation.lidar_edge_side, (EDGE_LEFT, EDGE_RIGHT))
+    points = transform_points(T_camera_lidar, observation.lidar_edge_xyz_m[sideways].astype(np.float64))
+    camera = camera_of(observation)
+    uv, valid = camera.project(points)
+    valid &= camera.contains(uv, margin_px=8)
+    return uv[valid], np.linalg.norm(points[valid], axis=1)

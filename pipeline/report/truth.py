@@ -1,0 +1,84 @@
+"""True extrinsics of a simulated fleet, for the table beside the estimates. Only pages read them, no estimator."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.report.words import PAIR_TITLES, scaled
+from pipeline.store.current import prior_of, transform_of
+from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
+
+__all__ = ["TruthRow", "read_truth", "truth_rows"]
+
+# (vehicle, day) -> pair -> T_parent_child
+Truth = Mapping[tuple[str, str], Mapping[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class TruthRow:
+    """Estimate minus truth of one pair on one day, per DoF with its sigma; in degrees and metres."""
+
+    vehicle: str
+    day: str
+    title: str
+    status: str
+    prior_error: str
+    errors: list[str]
+    within: list[bool]  # of three sigmas
+    determined: list[bool]
+
+
+def read_truth(folder: Path) -> dict[tuple[str, str], dict[str, np.ndarray]]:
+    """Read `<folder>/<vehicle>/<day>.json`, each with T_camera_lidar, T_camera_radar and T_lidar_radar as 4x4 lists.
+
+    Raises:
+        ConfigError: the folder holds no such file, or one lacks a transform.
+    """
+    truth = {}
+    for path in sorted(folder.glob("*/*.json")):
+        try:
+            content = json.loads(path.read_text())
+            truth[(path.parent.name, path.stem)] = {
+                p: np.array(content[f"T_{p}"], dtype=float) for p in PAIRS
+            }
+        except (KeyError, ValueError, TypeError) as err:
+            raise ConfigError(str(path), "", f"holds no true extrinsics: {err}") from err
+    if not truth:
+        raise ConfigError(str(folder), "truth", "holds no <vehicle>/<day>.json")
+    return truth
+
+
+def truth_rows(records: Sequence[CalibrationRecord], truth: Truth) -> list[TruthRow]:
+    """Rows for all records whose truth is known."""
+    rows = []
+    for record in records:
+        T_true = truth.get((record.vehicle, record.day), {}).get(record.pair)
+        if T_true is not None:
+            rows.append(_row(record, T_true))
+    return rows
+
+
+def _row(record: CalibrationRecord, T_true: np.ndarray) -> TruthRow:
+    T, T_prior = transform_of(record), prior_of(record)
+    prior_error = ""
+    if T_prior is not None:
+        off = change_between(T_true, T_prior)
+        prior_error = f"{np.degrees(np.linalg.norm(off[:3])):.2f} deg, {100 * np.linalg.norm(off[3:]):.1f} cm"
+    head = (record.vehicle, record.day, PAIR_TITLES[record.pair], record.status, prior_error)
+    if T is None or record.covariance is None:
+        return TruthRow(*head, [""] * 6, [True] * 6, [False] * 6)
+    error = change_between(T_true, T)
+    sigma = np.sqrt(np.diag(change_covariance(T, record.covariance)))
+    words = [
+        f"{scaled(e, d):+.3f} ± {scaled(s, d):.3f}" for e, s, d in zip(error, sigma, DOF_NAMES, strict=True)
+    ]
+    return TruthRow(
+        *head, words, (np.abs(error) <= 3 * sigma).tolist(), list(record.observable or [True] * 6)
+    )

@@ -1,0 +1,61 @@
+"""Numbers and statuses in words: degrees and metres, axes by their names, sentences that answer a question."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR
+
+__all__ = [
+    "AXIS_NAMES",
+    "PAIR_TITLES",
+    "dof_title",
+    "motion_in_words",
+    "scaled",
+    "significant_motion",
+    "unit_of",
+    "with_sigma",
+]
+
+_BODY = ("roll", "pitch", "yaw", "forward", "left", "up")
+_OPTICAL = ("pitch", "yaw", "roll", "right", "down", "forward")
+# What the DoFs of a twist mean along the axes of a sensor.
+AXIS_NAMES = {"camera": _OPTICAL, "lidar": _BODY, "radar": _BODY}
+PAIR_TITLES = {pair: "-".join(frames) for pair, frames in FRAMES_OF_PAIR.items()}
+_CLEAR_SIGMAS = 3.0
+
+
+def unit_of(dof: str) -> str:
+    """Unit on pages: degrees for rotations."""
+    return "deg" if dof.startswith("r") else "m"
+
+
+def scaled(value: float, dof: str) -> float:
+    """A value in its unit on pages."""
+    return float(np.degrees(value)) if dof.startswith("r") else float(value)
+
+
+def with_sigma(value: float, sigma: float, dof: str, *, sign: bool = True) -> str:
+    """As `+1.02 ± 0.05 deg`, with as many digits as the sigma deserves."""
+    v, s = scaled(value, dof), scaled(sigma, dof)
+    digits = int(np.clip(1 - np.floor(np.log10(max(s, 1e-9))), 1, 4))
+    return f"{v:{'+' if sign else ''}.{digits}f} ± {s:.{digits}f} {unit_of(dof)}"
+
+
+def dof_title(pair: str, dof: str) -> str:
+    """As `rz (yaw)`, along the axes of the pair's parent."""
+    return f"{dof} ({AXIS_NAMES[FRAMES_OF_PAIR[pair][0]][DOF_NAMES.index(dof)]})"
+
+
+def significant_motion(motion: list[float], sigma: list[float]) -> list[int]:
+    """Components of a motion that stand out of their sigma, largest ratio first."""
+    ratio = np.abs(motion) / np.maximum(sigma, 1e-12)
+    return [int(k) for k in np.argsort(-ratio) if ratio[k] >= _CLEAR_SIGMAS]
+
+
+def motion_in_words(sensor: str, motion: list[float], sigma: list[float]) -> str:
+    """As `yaw +1.02 ± 0.05 deg, left +0.031 ± 0.010 m`: what stands out, in the sensor's own axes."""
+    names = AXIS_NAMES[sensor]
+    shown = significant_motion(motion, sigma)
+    parts = [f"{names[k]} {with_sigma(motion[k], sigma[k], DOF_NAMES[k])}" for k in shown]
+    return ", ".join(parts) or "no single axis stands out"
