@@ -31,13 +31,8 @@ class TransformTree:
         bad = 0
         for entry in message.transforms:
             q, t = entry.transform.rotation, entry.transform.translation
-            try:
-                added = self.add(
-                    entry.header.frame_id, entry.child_frame_id, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z)
-                )
-            except ValueError:
-                added = False
-            bad += not added
+            rotation, translation = (q.w, q.x, q.y, q.z), (t.x, t.y, t.z)
+            bad += not self.add(entry.header.frame_id, entry.child_frame_id, rotation, translation)
         return bad
 
     def add(

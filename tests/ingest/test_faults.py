@@ -1,0 +1,261 @@
+"""Faulty logs: what is whole is kept, what is not is counted and named, nothing is made up."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.ingest.sync import Rejection
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_manifest
+from schemas.frames import FRAMES
+
+
+def test_a_missing_file_or_unknown_vehicle_is_a_mistake_of_the_caller(kit, tmp_path, run_ingest):
+    with pytest.raises(ConfigError, match="no such file"):
+        run_ingest(tmp_path / "none.mcap")
+    with pytest.raises(ConfigError, match="unknown vehicle"):
+        run_ingest(tmp_path, fleet=kit.fleet(vehicles={"other": {}}))
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a.db3", "a.txt", "folder"])
+@pytest.mark.parametrize("content", [b"", b"this is no log at all, only text" * 30])
+def test_what_is_no_log_is_refused_by_name(tmp_path, run_ingest, name, content):
+    path = tmp_path / name
+    if name == "folder":
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    result, _ = run_ingest(path)
+    assert result.status == "refused"
+    assert name in result.reason
+
+
+def test_one_bad_log_does_not_cost_the_others(kit, tmp_path, run_ingest):
+    (tmp_path / "bad.bag").write_bytes(b"rubbish")
+    result, frames = run_ingest(tmp_path / "bad.bag", kit.Kit().drive().mcap(tmp_path / "good.mcap"))
+    assert (result.status, len(frames)) == ("done", 4)
+    assert result.rejected["unreadable_logs"] == 1
+    assert "bad.bag" in result.reason
+
+
+@pytest.mark.parametrize("container", ["mcap", "bag", "db3"])
+def test_a_recording_cut_off_keeps_the_frames_before_the_cut(kit, tmp_path, run_ingest, container):
+    if container == "mcap":
+        log = kit.Kit(frames=20).drive().mcap(tmp_path / "a.mcap")
+    elif container == "bag":
+        log = kit.Kit(ros=1, frames=20).drive().bag(tmp_path / "a.bag")
+    else:
+        log = next(kit.Kit(frames=20).drive().folder(tmp_path / "bag").glob("*.db3"))
+    log.write_bytes(log.read_bytes()[: int(log.stat().st_size * 0.6)])
+    result, frames = run_ingest(log)
+    assert result.status == "done"
+    assert 6 <= len(frames) <= 12
+    assert [f.image for f in frames] == [kit.jpeg(i) for i in range(len(frames))]
+    assert result.reason
+    assert set(result.rejected) & {"truncated", "damaged_rows", "damaged_chunks"}
+
+
+def test_a_flipped_bit_costs_one_chunk_of_an_mcap(kit, tmp_path, run_ingest):
+    log = kit.Kit(frames=20).drive().mcap(tmp_path / "a.mcap", compression="NONE")
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 4
+    log.write_bytes(data)
+    result, frames = run_ingest(log)
+    assert 14 <= len(frames) < 20
+    assert result.rejected["damaged_chunks"] == 1
+    assert "damaged chunks" in result.reason
+    for f in frames:
+        assert f.image == kit.jpeg((f.stamp_ns - kit.START_NS) // kit.PERIOD_NS)
+
+
+def test_the_first_chunk_of_an_mcap_lost_does_not_lose_the_channels(kit, tmp_path, run_ingest):
+    log = kit.Kit(frames=20).drive().mcap(tmp_path / "a.mcap")
+    data = bytearray(log.read_bytes())
+    data[600] ^= 255
+    log.write_bytes(data)
+    assert 14 <= run_ingest(log)[0].rows < 20
+
+
+def test_reordered_and_repeated_messages_give_each_frame_once_in_order(kit, tmp_path, run_ingest):
+    drive = kit.Kit(frames=6).drive()
+    order = np.random.default_rng(0).permutation(len(drive.messages))
+    repeated = [i for i, m in enumerate(drive.messages) if m[0] in (kit.LIDAR, kit.IMAGE)][:4]
+    drive.messages = [drive.messages[i] for i in (*order, *repeated)]
+    result, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    assert [f.stamp_ns for f in frames] == [kit.START_NS + i * kit.PERIOD_NS for i in range(6)]
+    assert [f.image for f in frames] == [kit.jpeg(i) for i in range(6)]
+    assert result.rejected["duplicate_stamp"] == 2
+
+
+@pytest.mark.parametrize("topic", ["IMAGE", "LIDAR", "RADAR", "INFO"])
+def test_a_sensor_that_is_missing_is_refused_by_its_topic(kit, tmp_path, run_ingest, topic):
+    name = getattr(kit, topic)
+    result, _ = run_ingest(kit.Kit().drive().without(name).mcap(tmp_path / "a.mcap"))
+    assert (result.status, result.rows) == ("refused", 0)
+    assert name in result.reason
+
+
+def test_a_wrong_type_on_a_topic_is_named(kit, tmp_path, run_ingest):
+    drive = kit.Kit().drive()
+    for i in range(4):
+        drive.replaced(kit.RADAR, i, drive.info(kit.START_NS))
+    result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    assert result.status == "refused"
+    assert result.rejected["wrong_type"] == 4
+    assert kit.RADAR in result.reason
+    assert "sensor_msgs/msg/CameraInfo, not sensor_msgs/msg/PointCloud2" in result.reason
+
+
+def test_a_definition_that_does_not_fit_its_bytes_is_refused_not_guessed(kit, tmp_path, run_ingest):
+    log = kit.Kit().drive().mcap(tmp_path / "a.mcap", compression="NONE", enable_crcs=False)
+    data = log.read_bytes()
+    assert b"uint32 point_step" in data
+    log.write_bytes(data.replace(b"uint32 point_step", b"uint16 point_step"))
+    result, _ = run_ingest(log)
+    assert result.status == "refused"
+    assert result.rejected[Rejection.LIDAR_DAMAGED] == 4
+
+
+def test_each_fault_of_one_frame_costs_that_frame_under_its_own_name(kit, tmp_path, run_ingest):
+    drive = kit.Kit(frames=12).drive()
+    start, period = kit.START_NS, kit.PERIOD_NS
+    jpeg = kit.jpeg(1)
+    drive.replaced(kit.IMAGE, 1, drive.compressed(start + period, jpeg[:-200]))
+    drive.replaced(kit.IMAGE, 2, drive.compressed(start + 2 * period, b"no image"))
+    empty = {n: np.zeros(0, "f4") for n in "xyz"}
+    drive.replaced(kit.LIDAR, 3, drive.cloud(start + 3 * period, empty))
+    drive.replaced(kit.LIDAR, 4, drive.cloud(start + 4 * period, {"range": np.ones(900, "f4")}))
+    drive.replaced(kit.RADAR, 5, drive.cloud(start + 5 * period, empty | {"doppler": np.zeros(0, "f4")}))
+    drive.replaced(kit.RADAR, 6, drive.cloud(start + 6 * period, kit.lidar(0)))
+    drive.replaced(kit.IMAGE, 7, drive.compressed(start + 7 * period + 20_000_000, kit.jpeg(7)))
+    drive.replaced(kit.RADAR, 8, drive.cloud(start + 8 * period + 9_000_000, kit.radar(8)))
+    small = drive.image(start + 9 * period, np.zeros((5, 6, 3), np.uint8), "rgb8")
+    drive.replaced(kit.IMAGE, 9, small)
+    drive.replaced(kit.LIDAR, 10, drive.cloud(0, kit.lidar(10)))
+    result, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    assert [(f.stamp_ns - start) // period for f in frames] == [0, 11]
+    assert [f.frame_index for f in frames] == [0, 1]
+    counted = {k: v for k, v in result.rejected.items() if k in set(Rejection)}
+    assert counted == {
+        "image_damaged": 2,
+        "too_few_lidar_points": 1,
+        "lidar_undecodable": 1,
+        "too_few_radar_points": 1,
+        "radar_undecodable": 1,
+        "no_camera_in_gate": 1,
+        "no_radar_in_gate": 1,
+        "image_size_differs_from_camera_info": 1,
+    }
+    assert result.rejected["lidar_without_stamp"] == 1
+    assert result.rows + sum(counted.values()) == 11  # every sweep that has a stamp is accounted for
+
+
+def test_intrinsics_that_are_not_calibrated_are_refused_with_what_to_do(kit, tmp_path, run_ingest):
+    drive = kit.Kit().drive()
+    for i in range(4):
+        drive.replaced(kit.INFO, i, drive.info(kit.START_NS + i * kit.PERIOD_NS, focal_px=0.0))
+    result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    assert result.status == "refused"
+    assert "zero K" in result.reason
+    assert result.rejected["camera_info_unusable"] == 4
+
+
+def test_without_a_chain_of_transforms_there_is_no_prior_rather_than_an_identity(kit, tmp_path, run_ingest):
+    result, frames = run_ingest(kit.Kit().drive().without("/tf_static").mcap(tmp_path / "a.mcap"))
+    assert all(f.prior_camera_lidar_qw is None and f.prior_lidar_radar_tx_m is None for f in frames)
+    assert result.rejected["frames_without_prior"] == 4
+    assert "/tf_static has no chain from camera_optical to lidar" in result.reason
+
+
+def test_damaged_labels_and_detections_are_absent_not_empty(kit, tmp_path, run_ingest):
+    drive = kit.Kit().drive()
+    drive.replaced(kit.LABELS, 1, drive.compressed(kit.START_NS + kit.PERIOD_NS, kit.jpeg(0)))
+    drive.messages.pop([i for i, m in enumerate(drive.messages) if m[0] == kit.DETECTIONS][2])
+    result, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    assert [f.labels_png is None for f in frames] == [False, True, False, False]
+    assert [f.detection_boxes_px is None for f in frames] == [False, False, True, False]
+    assert result.rejected["labels_damaged"] == 1
+    assert result.rejected["frames_without_detections"] == 1
+
+
+@pytest.mark.parametrize("old_types", [False, True])
+def test_detections_of_both_versions_give_boxes_and_those_without_a_size_are_counted(
+    kit, tmp_path, run_ingest, old_types
+):
+    drive = kit.Kit(old_types=old_types).drive()
+    boxes = [
+        (50.0, 20.0, 20.0, 10.0, "bus", 0.5),
+        (9.0, 9.0, 0.0, 4.0, "car", 0.9),
+        (np.nan, 9.0, 3.0, 4.0, "car", 0.9),
+    ]
+    drive.replaced(kit.DETECTIONS, 0, drive.detections(kit.START_NS + 1_000_000, boxes))
+    result, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    np.testing.assert_array_equal(frames[0].detection_boxes_px, [[40, 15, 60, 25]])
+    assert frames[0].detection_classes == ["bus"]
+    np.testing.assert_array_equal(frames[0].detection_scores, [0.5])
+    assert result.rejected["detections_without_box_or_class"] == 2
+
+
+def test_an_unchanged_day_is_cached_and_a_changed_one_is_made_anew(kit, tmp_path, run_ingest):
+    log = kit.Kit().drive().mcap(tmp_path / "a.mcap")
+    first, _ = run_ingest(log)
+    second, frames = run_ingest(log)
+    assert (second.status, second.work_key, second.rows) == ("cached", first.work_key, 4)
+    assert len(frames) == 4
+    other = run_ingest(log, fleet=kit.fleet(ingest={"sync_gate_s": 0.0004}))[0]
+    assert (other.status, other.rows) == ("refused", 0)
+    assert "within 0.4 ms" in other.reason
+    again = run_ingest(kit.Kit(frames=5).drive().mcap(tmp_path / "a.mcap"))[0]
+    assert (again.status, again.rows) == ("done", 5)
+    assert again.work_key != first.work_key
+
+
+def test_a_refused_day_leaves_the_lake_as_it_was(kit, tmp_path, run_ingest):
+    log = kit.Kit().drive().mcap(tmp_path / "a.mcap")
+    lake, day = Lake.at(tmp_path / "lake"), Partition("car", "2023-11-14")
+    refused = kit.Kit().drive().without(kit.RADAR).mcap(tmp_path / "b.mcap")
+    assert run_ingest(refused)[0].status == "refused"
+    assert lake.partitions("frames") == []
+    key = run_ingest(log)[0].work_key
+    assert run_ingest(refused)[0].status == "refused"
+    assert read_manifest(lake, FRAMES, day).work_key == key
+
+
+def test_the_manifest_tells_inputs_counts_and_problems(kit, tmp_path, run_ingest):
+    result, _ = run_ingest(kit.Kit().drive().without("/tf_static").mcap(tmp_path / "a.mcap"))
+    manifest = read_manifest(Lake.at(tmp_path / "lake"), FRAMES, Partition("car", "2023-11-14"))
+    assert manifest.rejected == result.rejected
+    assert manifest.kept == {"frames": 4}
+    assert manifest.inputs[0].startswith("a.mcap:")
+    assert any("no prior" in p for p in manifest.extra["problems"])
+
+
+def test_max_frames_keeps_an_even_spread_and_counts_the_rest(kit, tmp_path, run_ingest):
+    log = kit.Kit(frames=21).drive().mcap(tmp_path / "a.mcap")
+    result, frames = run_ingest(log, fleet=kit.fleet(ingest={"max_frames": 5}))
+    assert [(f.stamp_ns - kit.START_NS) // kit.PERIOD_NS for f in frames] == [0, 5, 10, 15, 20]
+    assert result.rejected == {"beyond_max_frames": 16}
+
+
+def test_a_prior_file_stands_in_for_tf_static_and_enters_the_work_key(kit, tmp_path, run_ingest):
+    log = kit.Kit().drive().mcap(tmp_path / "a.mcap")
+    T = np.eye(4)
+    T[0, 3] = 0.25
+    file = tmp_path / "prior.json"
+    fleet = kit.fleet(prior={"source": "file", "file": "prior.json"})
+    toml = str(tmp_path / "fleet.toml")
+    with pytest.raises(ConfigError, match="no prior file"):
+        run_ingest(log, fleet=fleet, file=toml)
+    file.write_text(json.dumps({"T_camera_lidar": T.tolist(), "T_lidar_radar": np.eye(4).tolist()}))
+    first, frames = run_ingest(log, fleet=fleet, file=toml)
+    assert frames[0].prior_camera_lidar_tx_m == 0.25
+    assert frames[0].prior_camera_lidar_qw == 1.0
+    T[0, 3] = 0.5
+    file.write_text(json.dumps({"T_camera_lidar": T.tolist(), "T_lidar_radar": np.eye(4).tolist()}))
+    assert run_ingest(log, fleet=fleet, file=toml)[0].work_key != first.work_key
+    T[0, 0] = 2.0
+    file.write_text(json.dumps({"T_camera_lidar": T.tolist(), "T_lidar_radar": np.eye(4).tolist()}))
+    with pytest.raises(ConfigError, match="no rigid"):
+        run_ingest(log, fleet=fleet, file=toml)
