@@ -1,8 +1,8 @@
 """Covariance of a minimum of the paper's losses: block sandwich from curvature and the scatter of the drives' gradients.
 
-The paper gives no uncertainty. The sandwich `H^-1 S H^-1` (H: curvature of the mean loss, S: scatter of the gradients over
-blocks of frames that share a scene) is what resampling whole blocks converges to, at the price of a few evaluations.
-It knows nothing of bias, and these losses are biased (their minimum lies below the truth's value): a floor measured in
+The paper gives no uncertainty. The sandwich `H^-1 S H^-1` (H: curvature of the mean loss, S: scatter of the gradients
+over blocks of frames that share a scene) is what resampling whole blocks converges to, at the price of a few
+evaluations; its inverse is added to the prior's information. It knows nothing of bias, and these losses are biased (their minimum lies below the truth's value): a floor measured in
 simulation is added.
 """
 
@@ -56,8 +56,7 @@ def sandwich_covariance(
     sums -= sums.mean(axis=0)
     S = sums.T @ sums * len(names) / max(len(names) - 1, 1)
     H = _curvature(frame_losses, T, plus.mean(axis=1), minus.mean(axis=1))
-    bread = np.linalg.inv(_scaled_positive(H))
-    information = np.linalg.inv(bread @ S @ bread + 1e-12 * np.eye(6)) + np.linalg.inv(prior_covariance)
+    information = _godambe(H, S) + np.linalg.inv(prior_covariance)
     covariance = np.linalg.inv(information) + np.diag([floor[0] ** 2] * 3 + [floor[1] ** 2] * 3)
     covariance = (covariance + covariance.T) / 2
     observability = np.clip(1 - np.diag(covariance) / np.diag(prior_covariance), 0, 1)
@@ -87,9 +86,11 @@ def _curvature(
     return H
 
 
-def _scaled_positive(H: np.ndarray) -> np.ndarray:
-    """H with its eigenvalues, in units of the steps, raised to a thousandth of the largest: a minimum has none below 0."""
-    scaled = H * _STEP[:, None] * _STEP[None]
-    values, vectors = np.linalg.eigh(scaled)
-    values = np.maximum(values, 1e-3 * max(values.max(), 1e-12))
-    return (vectors * values) @ vectors.T / _STEP[:, None] / _STEP[None]
+def _godambe(H: np.ndarray, S: np.ndarray) -> np.ndarray:
+    """H S^-1 H, the inverse of the sandwich: 0 along what the losses do not see, for there both H and S vanish."""
+    scale = _STEP[:, None] * _STEP[None]
+    values, vectors = np.linalg.eigh(H * scale)
+    positive = (vectors * np.maximum(values, 0)) @ vectors.T
+    scatter = S * scale
+    floor = 1e-3 * max(float(np.linalg.eigvalsh(scatter).max()), 1e-15)
+    return positive @ np.linalg.solve(scatter + floor * np.eye(6), positive) / scale

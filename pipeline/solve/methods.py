@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from pipeline.config import SolveConfig
 from pipeline.errors import ConfigError
@@ -24,6 +24,7 @@ METHOD: dict[str, str] = {
 PAPER_METHODS = ("pairwise-optimisation", "joint-optimisation")
 
 
+@runtime_checkable
 class Solver(Protocol):
     """What a method is: selected frames per pair and a prior in, a solution out."""
 

@@ -1,0 +1,243 @@
+"""The stage: observations in a lake to records, refused days included, the same work never twice."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate import calibrate_day
+from pipeline.calibration_records import environment_of
+from pipeline.config import FleetConfig
+from pipeline.errors import ConfigError
+from pipeline.geometry.se3 import from_quaternion, rotation_angle_rad
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_records, write_partition
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.observations import OBSERVATIONS
+from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day, prior_columns
+
+DAY = Partition("car 1", "2024-05-06")
+TOPICS = {
+    "camera": {
+        "image": "/i",
+        "info": "/c",
+        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
+    },
+    "lidar": {"points": "/p"},
+    "radar": {"points": "/r"},
+}
+
+
+def fleet_of(prior=None, **sections):
+    rig = TOPICS | ({"prior": prior} if prior else {})
+    small = {"paper_population": 20, "paper_generations": 10, "search_rotation_deg": 4.0}
+    solve = small | sections.pop("solve", {})
+    return FleetConfig.model_validate(
+        {
+            "fleet": {"name": "f"},
+            "rigs": {"default": rig},
+            "vehicles": {"car 1": {}},
+            "select": {"frames": 16},
+            "solve": solve,
+            **sections,
+        }
+    )
+
+
+def lake_with(tmp_path, observations, key="k1"):
+    lake = Lake.at(tmp_path)
+    with write_partition(lake, OBSERVATIONS, DAY, key, "0") as writer:
+        writer.append(observations)
+        writer.describe(kept={}, rejected={})
+    return lake
+
+
+def records_of(lake):
+    return read_records(lake, CALIBRATIONS, CalibrationRecord)
+
+
+@pytest.fixture(scope="module")
+def day():
+    return make_day(40)
+
+
+@pytest.fixture(scope="module")
+def solved(day, tmp_path_factory):
+    lake = lake_with(tmp_path_factory.mktemp("lake"), day)
+    result = calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation", perturb=(2.0, 0.1), seed=5)
+    return lake, result
+
+
+def test_one_record_per_pair_with_every_column_filled(solved):
+    lake, result = solved
+    records = {r.pair: r for r in records_of(lake)}
+    assert set(records) == set(PAIRS)
+    assert result.status == "done"
+    assert result.kept["accepted"] + result.kept["held"] == 3
+    for record in records.values():
+        assert record.status in ("accepted", "held")
+        assert record.frames_total == 40
+        assert record.frames_used == 16
+        assert sum(record.frames_rejected.values()) == 24
+        assert record.environment == "urban"
+        assert record.seed == 5
+        assert record.inputs == ["k1"]
+        assert record.covariance.shape == (6, 6)
+        assert np.all(np.linalg.eigvalsh(record.covariance) > 0)
+        assert record.alignment_before > 0
+        assert record.trigger_before
+        assert set(record.trigger_before) == set(record.trigger_after)
+        assert record.diagnostics["holdout_frames"] >= 3
+
+
+def test_the_perturbed_prior_is_off_by_exactly_what_was_asked(solved):
+    lake, _ = solved
+    for record in records_of(lake):
+        truth = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_LIDAR_RADAR}.get(record.pair)
+        if truth is None:
+            continue
+        q = np.array([record.prior_qw, record.prior_qx, record.prior_qy, record.prior_qz])
+        T = from_quaternion(q, np.array([record.prior_tx_m, record.prior_ty_m, record.prior_tz_m]))
+        angle = rotation_angle_rad(from_quaternion(q, np.zeros(3)) @ np.linalg.inv(only_rotation(truth)))
+        assert np.degrees(angle) == pytest.approx(2.0, abs=1e-6)
+        assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) == pytest.approx(0.1, abs=1e-9)
+        assert np.sqrt(record.prior_covariance[3, 3]) == pytest.approx(
+            0.1
+        )  # max(configured 0.05, perturbation)
+
+
+def only_rotation(T):
+    R = np.eye(4)
+    R[:3, :3] = T[:3, :3]
+    return R
+
+
+def test_the_same_work_is_done_once(solved):
+    lake, first = solved
+    before = len(records_of(lake))
+    again = calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation", perturb=(2.0, 0.1), seed=5)
+    assert again.status == "cached"
+    assert again.work_key == first.work_key
+    assert again.kept == first.kept
+    assert len(records_of(lake)) == before
+
+
+def test_other_seed_method_or_config_is_other_work(solved):
+    lake, first = solved
+    keys = {first.work_key}
+    keys.add(
+        calibrate_day(
+            DAY, fleet_of(), lake, method="joint-optimisation", perturb=(2.0, 0.1), seed=5
+        ).work_key
+    )
+    keys.add(
+        calibrate_day(
+            DAY, fleet_of(), lake, method="pairwise-optimisation", perturb=(2.0, 0.1), seed=6
+        ).work_key
+    )
+    tight = fleet_of(solve={"paper_generations": 11})
+    keys.add(
+        calibrate_day(DAY, tight, lake, method="pairwise-optimisation", perturb=(2.0, 0.1), seed=5).work_key
+    )
+    assert len(keys) == 4
+    assert len(records_of(lake)) == 12
+
+
+def test_a_day_without_observations_is_refused_with_the_reason(tmp_path):
+    lake = Lake.at(tmp_path)
+    result = calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation")
+    assert result.status == "refused"
+    assert result.kept == {"accepted": 0, "held": 0, "refused": 3}
+    for record in records_of(lake):
+        assert record.status == "refused"
+        assert "no observations" in record.reason
+        assert record.qw is None
+        assert record.prior_qw is None
+
+
+def refusal(tmp_path, observations, **fleet):
+    lake = lake_with(tmp_path, observations)
+    result = calibrate_day(DAY, fleet_of(**fleet), lake, method="pairwise-optimisation")
+    assert result.status == "refused"
+    return records_of(lake)[0].reason
+
+
+def test_too_few_frames_are_refused(tmp_path, day):
+    assert "too few frames" in refusal(tmp_path, day[:5])
+
+
+def test_no_frames_at_all_are_refused(tmp_path):
+    assert "no prior" in refusal(tmp_path, [])
+
+
+def test_a_prior_that_changes_over_the_day_is_refused(tmp_path, day):
+    other = T_CAMERA_LIDAR.copy()
+    other[0, 3] += 0.01
+    changed = [replace(o, **prior_columns("camera_lidar", other)) if i > 20 else o for i, o in enumerate(day)]
+    assert "changes over the day" in refusal(tmp_path, changed)
+
+
+def test_a_missing_prior_is_refused_and_some_frames_without_one_are_not(tmp_path, day):
+    bare = [replace(o, **prior_columns("lidar_radar", None)) for o in day]
+    assert "no tf_static chain for lidar_radar" in refusal(tmp_path / "a", bare)
+    lake = lake_with(tmp_path / "b", [*bare[:3], *day[3:]])
+    assert calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation").status == "done"
+
+
+def test_a_prior_file_is_read_beside_fleet_toml_and_its_content_is_part_of_the_work(tmp_path, day):
+    fleet = fleet_of(prior={"source": "file", "file": "prior.json"})
+    lake = lake_with(tmp_path, [replace(o, **prior_columns("camera_lidar", None)) for o in day])
+    content = '{"T_camera_lidar": %s, "T_lidar_radar": %s}'
+    path = tmp_path / "prior.json"
+    path.write_text(content % (T_CAMERA_LIDAR.tolist(), T_LIDAR_RADAR.tolist()))
+    toml = tmp_path / "fleet.toml"
+    first = calibrate_day(DAY, fleet, lake, method="pairwise-optimisation", fleet_file=toml)
+    assert first.status == "done"
+    path.write_text(content % (T_CAMERA_LIDAR.tolist(), np.eye(4).tolist()))
+    assert (
+        calibrate_day(DAY, fleet, lake, method="pairwise-optimisation", fleet_file=toml).work_key
+        != first.work_key
+    )
+    path.write_text('{"T_camera_lidar": [[1, 0], [0, 1]]}')
+    with pytest.raises(ConfigError, match="T_camera_lidar: is no 4x4"):
+        calibrate_day(DAY, fleet, lake, method="pairwise-optimisation", fleet_file=toml)
+
+
+def test_without_a_trigger_the_prior_stays(tmp_path, day):
+    quiet = {
+        "when": "triggered",
+        "lidar_outside_fraction": 1.0,
+        "radar_outside_image": 99,
+        "radar_outside_lidar": 99,
+        "drivable_outside_fraction": 1.0,
+    }
+    lake = lake_with(tmp_path, day)
+    result = calibrate_day(DAY, fleet_of(trigger=quiet), lake, method="joint-optimisation")
+    assert result.kept == {"accepted": 0, "held": 3, "refused": 0}
+    for record in records_of(lake):
+        assert record.reason == "not triggered: the prior stays"
+        assert record.triggered is False
+        assert record.tx_m == record.prior_tx_m
+
+
+def test_unknown_vehicle_or_method_is_a_usage_error(tmp_path):
+    with pytest.raises(ConfigError, match="magic"):
+        calibrate_day(DAY, fleet_of(), Lake.at(tmp_path), method="magic")
+    with pytest.raises(ConfigError, match="unknown vehicle"):
+        calibrate_day(
+            Partition("other", "2024-05-06"), fleet_of(), Lake.at(tmp_path), method="joint-optimisation"
+        )
+
+
+@pytest.mark.parametrize(
+    ("speeds", "environment"),
+    [
+        ([30.0] * 10, "highway"),
+        ([8.0] * 10, "urban"),
+        ([8.0] * 5 + [30.0] * 5, "mixed"),
+        ([None] * 10, "unknown"),
+        ([0.0] * 10, "unknown"),
+    ],
+)
+def test_environment_follows_from_speed(day, speeds, environment):
+    assert environment_of([replace(day[0], ego_speed_mps=s) for s in speeds]) == environment

@@ -1,0 +1,167 @@
+"""The paper's losses: lowest near the truth, penalties where the paper wants them, the loop term."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.geometry.se3 import exp_so3, inverse
+from pipeline.objective.camera_lidar import camera_lidar_loss, object_cost_map
+from pipeline.objective.camera_radar import camera_radar_loss
+from pipeline.objective.lidar_radar import CELL_M, drivable_map, lidar_radar_loss
+from pipeline.objective.loop import euler_angles, joint_objective, loop_loss, loop_transform
+from tests.solve_scenes import CAMERA, CAR, SKY, T_CAMERA_LIDAR, T_LIDAR_RADAR, VEGETATION, make_day
+
+TRUTH = {
+    "camera_lidar": T_CAMERA_LIDAR,
+    "camera_radar": T_CAMERA_LIDAR @ T_LIDAR_RADAR,
+    "lidar_radar": T_LIDAR_RADAR,
+}
+MARGIN_RAD = np.radians(3.0)
+
+
+@pytest.fixture(scope="module")
+def day():
+    return make_day(16)
+
+
+def loss_of(pair, observations):
+    if pair == "camera_lidar":
+        return camera_lidar_loss(observations, TRUTH[pair], MARGIN_RAD)
+    if pair == "camera_radar":
+        return camera_radar_loss(observations, TRUTH[pair], MARGIN_RAD)
+    return lidar_radar_loss(observations)
+
+
+def turned(T, axis, angle_deg):
+    T = T.copy()
+    T[:3, :3] = exp_so3(np.radians(angle_deg) * np.eye(3)[axis]) @ T[:3, :3]
+    return T
+
+
+@pytest.mark.parametrize("pair", TRUTH)
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_every_loss_grows_when_the_pose_turns_by_two_degrees(day, pair, axis):
+    loss = loss_of(pair, day)
+    values = loss.frame_losses(np.stack([turned(TRUTH[pair], axis, a) for a in (-2, 0, 2)])).mean(axis=1)
+    if (pair, axis) in {
+        ("camera_lidar", 2),
+        ("camera_radar", 2),
+        ("lidar_radar", 0),
+    }:  # roll: far objects hardly move
+        assert values[1] <= min(values[0], values[2]) + 1e-3
+    else:
+        assert values[1] < 0.97 * min(values[0], values[2])
+
+
+def test_camera_lidar_cost_is_nothing_on_objects_and_two_deep_in_the_sky():
+    labels = np.full((160, 320), VEGETATION, np.uint8)
+    labels[:100] = SKY
+    cost = object_cost_map(labels, CAMERA.scaled(0.5))
+    assert cost[120, 50] == 0
+    assert cost[99, 50] > 1.0  # the penalty, even at the edge
+    assert 1.9 < cost[0, 50] < 2.0
+
+
+def test_an_image_without_reflecting_objects_costs_the_same_everywhere_but_in_the_sky():
+    labels = np.zeros((160, 320), np.uint8)
+    labels[:50] = SKY
+    cost = object_cost_map(labels, CAMERA.scaled(0.5))
+    assert np.unique(cost[50:]) == [1.0]
+    assert np.unique(cost[:50]) == [2.0]
+
+
+def test_lidar_points_out_of_view_are_penalised():
+    day = make_day(2)
+    loss = loss_of("camera_lidar", day)
+    away = turned(T_CAMERA_LIDAR, 1, 90)
+    np.testing.assert_allclose(loss.frame_losses(away[None]), 1.0)
+
+
+def test_radar_detections_in_the_sky_are_penalised():
+    day = make_day(2)
+    loss = loss_of("camera_radar", day)
+    up = turned(TRUTH["camera_radar"], 0, 8)
+    at_truth, raised = loss.frame_losses(np.stack([TRUTH["camera_radar"], up]))
+    assert np.all(at_truth < 0.02)
+    assert np.all(raised > at_truth + 1.0)  # both terms: sky, and far from every box centre
+
+
+def test_a_track_on_a_box_centre_costs_nothing():
+    loss = loss_of("camera_radar", make_day(1))
+    assert loss.frame_losses(TRUTH["camera_radar"][None])[0, 0] < 1e-3
+
+
+def test_a_radar_without_elevation_is_compared_in_the_plane_only():
+    day = make_day(4)
+    lifted = T_LIDAR_RADAR.copy()
+    lifted[2, 3] += 3.0
+    with_elevation = lidar_radar_loss(day).frame_losses(np.stack([T_LIDAR_RADAR, lifted])).mean(axis=1)
+    flat = [replace(o, radar_has_elevation=False) for o in day]
+    without = lidar_radar_loss(flat).frame_losses(np.stack([T_LIDAR_RADAR, lifted])).mean(axis=1)
+    assert with_elevation[1] > with_elevation[0] + 0.3
+    assert abs(without[1] - without[0]) < 1e-3
+
+
+def test_drivable_iou_lies_between_0_and_1_and_falls_with_yaw(day):
+    loss = lidar_radar_loss(day)
+    iou = loss.drivable_iou(np.stack([turned(T_LIDAR_RADAR, 2, a) for a in (-8, -4, 0, 4, 8)])).mean(axis=1)
+    assert np.all((iou > 0) & (iou < 1))
+    assert iou[2] > 0.65  # the ragged rim of 1 m cells costs the rest
+    assert iou[0] < iou[1] < iou[2] > iou[3] > iou[4]
+
+
+def test_drivable_map_holds_the_sector_area():
+    azimuth = np.linspace(-0.5, 0.5, 51)
+    area = drivable_map(azimuth, np.full(51, 30.0)).sum() * CELL_M**2
+    sector = 0.5 * 30**2 * (azimuth[-1] - azimuth[0] + azimuth[1] - azimuth[0])
+    assert area == pytest.approx(sector, rel=0.02)
+
+
+def test_frames_without_anything_to_compare_say_so():
+    empty = make_day(
+        2,
+        radar_track_xyz_m=np.zeros((0, 3), np.float32),
+        radar_drivable_azimuth_rad=np.zeros(0, np.float32),
+        radar_drivable_range_m=np.zeros(0, np.float32),
+        lidar_map_cluster=np.full(780, -1, np.int32),
+    )
+    for pair in TRUTH:
+        loss = loss_of(pair, empty)
+        assert not loss.informative.any()
+        assert loss.frame_losses(TRUTH[pair][None]).tolist() == [[0, 0]]
+
+
+def test_loop_of_consistent_transforms_costs_nothing_and_grows_with_each_angle():
+    cl, lr = TRUTH["camera_lidar"], TRUTH["lidar_radar"]
+    closed = loop_transform(cl, lr, cl @ lr)
+    assert loop_loss(closed) == pytest.approx(0, abs=1e-12)
+    angles = np.array([0.01, -0.02, 0.03])
+    open_by = np.eye(4)
+    open_by[:3, :3] = euler_matrix(angles)
+    open_by[:3, 3] = [0.1, -0.2, 0.0]
+    T_camera_radar = inverse(open_by) @ cl @ lr
+    assert loop_loss(loop_transform(cl, lr, T_camera_radar)) == pytest.approx(0.06 + 0.3)
+
+
+def euler_matrix(angles):
+    roll, pitch, yaw = (exp_so3(a * e) for a, e in zip(angles, np.eye(3), strict=True))
+    return yaw @ pitch @ roll
+
+
+def test_euler_angles_invert_the_matrix_of_roll_pitch_and_yaw():
+    rng = np.random.default_rng(0)
+    for angles in rng.uniform(-1.4, 1.4, (20, 3)):
+        T = np.eye(4)
+        T[:3, :3] = euler_matrix(angles)
+        np.testing.assert_allclose(euler_angles(T), angles, atol=1e-12)
+
+
+def test_objective_is_equation_two():
+    np.testing.assert_allclose(joint_objective(np.array([0.0, 0.5]), np.array([0.2, 0.1])), [1.2, 1.65])
+
+
+def test_labels_survive_the_png(day):
+    labels = cv2.imdecode(np.frombuffer(day[0].labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert {SKY, CAR} <= set(np.unique(labels))
