@@ -1,0 +1,180 @@
+"""Radar detections inside the camera's vehicle boxes: the term that gives a radar's roll and pitch.
+
+A box and the detections in its azimuths, at the range that its height suggests, are one vehicle. The elevation of these
+detections, turned into the camera, is the box's elevation up to a constant per class (returns lie under the box's
+centre). Roll shows as a slope of the difference over azimuth, so it owes nothing to that constant; pitch owes it all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import hat, transform_points
+from pipeline.geometry.spherical import camera_direction_angles, from_spherical, to_spherical
+from schemas.observations import Observation
+
+__all__ = ["BOX_CLASSES", "BoxPairs", "box_equations", "box_pairs", "elevation_residuals"]
+
+BOX_CLASSES = (("car",), ("truck", "bus"))
+BIAS_SIGMA_RAD = np.radians(1.0)  # returns lie up to half a box below its centre; real logs showed 0.5-1 deg
+_HEIGHT_M = (1.5, 2.9)
+_RANGE_FACTOR = 1.8  # box height to range: vans to low cars, poor boxes
+_RANGE_M = (3.0, 60.0)
+_DEPTH_M = 3.5  # detections of one vehicle lie within this range interval
+_LEAST_HEIGHT_PX = 12.0
+_LEAST_SIGMA_RAD = np.radians(0.3)  # box edges are no better
+
+
+@dataclass(frozen=True, eq=False)
+class BoxPairs:
+    """Vehicles seen by camera and radar: one radar point per box."""
+
+    point_radar_m: Float[np.ndarray, "B 3"]  # median azimuth, elevation and range of the detections
+    azimuth_rad: Float[np.ndarray, " B"]  # box centre as the camera sees it, left positive
+    elevation_rad: Float[np.ndarray, " B"]  # up positive
+    detections: Int64[np.ndarray, " B"]
+    kind: Int64[np.ndarray, " B"]  # index into BOX_CLASSES
+    frame: Int64[np.ndarray, " B"]  # index into the observations given
+
+    @property
+    def count(self) -> int:
+        """Number of boxes."""
+        return len(self.kind)
+
+
+def box_pairs(
+    observations: Sequence[Observation],
+    T_camera_radar: Float[np.ndarray, "4 4"],
+    elevation_gate_rad: float,
+    least_detections: int = 2,
+) -> BoxPairs:
+    """Find the detections of each unoccluded vehicle box.
+
+    Args:
+        observations: frames; those whose radar measures no elevation give nothing.
+        T_camera_radar: a pose whose azimuth is right to about a box's width.
+        elevation_gate_rad: detections farther from the box's centre belong to something else.
+        least_detections: fewer tell nothing.
+    """
+    rows: list[tuple[np.ndarray, float, float, int, int, int]] = []
+    for index, o in enumerate(observations):
+        if not o.radar_has_elevation or not len(o.road_user_boxes_px) or not len(o.radar_xyz_m):
+            continue
+        radar = o.radar_xyz_m.astype(np.float64)
+        in_camera = transform_points(T_camera_radar, radar)
+        angles = camera_direction_angles(in_camera)
+        distance = np.linalg.norm(in_camera, axis=1)
+        measured = to_spherical(radar)
+        for kind, centre, sides, expected_m in _vehicle_boxes(o):
+            chosen = _detections_of(angles, distance, centre, sides, expected_m, elevation_gate_rad)
+            if len(chosen) >= least_detections:
+                middle = from_spherical(np.median(measured[chosen], axis=0))
+                rows.append((middle, centre[0], centre[1], len(chosen), kind, index))
+    if not rows:
+        none = np.zeros(0)
+        return BoxPairs(np.zeros((0, 3)), none, none, *(np.zeros(0, np.int64) for _ in range(3)))
+    points, azimuth, elevation, number, kinds, frames = zip(*rows, strict=True)
+    integers = (np.array(v, np.int64) for v in (number, kinds, frames))
+    return BoxPairs(np.array(points), np.array(azimuth), np.array(elevation), *integers)
+
+
+def elevation_residuals(
+    pairs: BoxPairs,
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    bias_rad: Float[np.ndarray, " C"],
+) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B P"]]:
+    """Radar elevation minus box elevation minus the class's bias, and its Jacobian.
+
+    Unknowns: left twist of T_lidar_radar (6), then the biases, one per entry of BOX_CLASSES.
+    """
+    lidar = transform_points(T_lidar_radar, pairs.point_radar_m)
+    camera = transform_points(T_camera_lidar, lidar)
+    elevation = camera_direction_angles(camera)[:, 1]
+    x, y, z = camera.T
+    h = np.hypot(x, z)
+    r2 = h * h + y * y
+    # elevation = atan2(-y, hypot(x, z))
+    gradient = np.stack([x * y / (h * r2), -h / r2, z * y / (h * r2)], -1) @ T_camera_lidar[:3, :3]
+    J = np.zeros((pairs.count, 6 + len(bias_rad)))
+    J[:, :3] = -(gradient[:, None, :] @ hat(lidar))[:, 0]
+    J[:, 3:6] = gradient
+    J[np.arange(pairs.count), 6 + pairs.kind] = -1.0
+    return elevation - pairs.elevation_rad - bias_rad[pairs.kind], J
+
+
+def box_equations(
+    pairs: BoxPairs,
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    bias_rad: Float[np.ndarray, " C"],
+    frames: int,
+) -> tuple[Float[np.ndarray, "F P P"], Float[np.ndarray, "F P"], float]:
+    """Per frame, information and gradient of the robust (Cauchy) elevation cost, and the residual's own sigma [rad].
+
+    The spread of the residuals themselves says what this radar's elevation is worth.
+    """
+    residual, J = elevation_residuals(pairs, T_camera_lidar, T_lidar_radar, bias_rad)
+    P = J.shape[1]
+    H, g = np.zeros((frames, P, P)), np.zeros((frames, P))
+    if pairs.count < 5:  # no spread to weigh them by
+        return H, g, float("nan")
+    spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
+    sigma = max(float(spread), _LEAST_SIGMA_RAD)
+    weight = 1 / (1 + (residual / (2 * sigma)) ** 2) / sigma**2
+    np.add.at(H, pairs.frame, weight[:, None, None] * J[:, :, None] * J[:, None, :])
+    np.add.at(g, pairs.frame, (weight * residual)[:, None] * J)
+    return H, g, sigma
+
+
+def _vehicle_boxes(o: Observation) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
+    """Whole, unoccluded vehicle boxes: class index, centre (az, el), (az of left and right side), range by height [m]."""
+    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+    boxes = o.road_user_boxes_px.astype(np.float64)
+    x0, y0, x1, y1 = boxes.T
+    inside = (x0 > 3) & (y0 > 3) & (x1 < o.image_width_px - 4) & (y1 < o.image_height_px - 4)
+    out = []
+    for b, name in enumerate(o.road_user_classes):
+        kind = next((k for k, names in enumerate(BOX_CLASSES) if name in names), -1)
+        if kind < 0 or not inside[b] or y1[b] - y0[b] < _LEAST_HEIGHT_PX:
+            continue
+        overlap = np.minimum(x1, x1[b]) - np.maximum(x0, x0[b])
+        if np.any((y1 > y1[b] + 1) & (overlap > 0.3 * (x1[b] - x0[b]))):
+            continue  # something nearer stands before it
+        xm, ym = 0.5 * (x0[b] + x1[b]), 0.5 * (y0[b] + y1[b])
+        rays = camera.unproject(np.array([[xm, ym], [x0[b], ym], [x1[b], ym], [xm, y0[b]], [xm, y1[b]]]))
+        if not np.isfinite(rays).all():
+            continue
+        angle = camera_direction_angles(rays)
+        height_rad = angle[3, 1] - angle[4, 1]
+        out.append((kind, angle[0], angle[1:3, 0], _HEIGHT_M[kind] / max(height_rad, 1e-3)))
+    return out
+
+
+def _detections_of(
+    angles: np.ndarray,
+    distance: np.ndarray,
+    centre: np.ndarray,
+    sides: np.ndarray,
+    expected_m: float,
+    elevation_gate: float,
+) -> np.ndarray:
+    """Indices of the detections between the box's sides in the most populated range interval near the expected range."""
+    near = np.flatnonzero(
+        (angles[:, 0] < sides[0])
+        & (angles[:, 0] > sides[1])
+        & (np.abs(angles[:, 1] - centre[1]) < elevation_gate)
+        & (distance > max(_RANGE_M[0], expected_m / _RANGE_FACTOR))
+        & (distance < min(_RANGE_M[1], expected_m * _RANGE_FACTOR))
+    )
+    if not len(near):
+        return near
+    r = np.sort(distance[near])
+    count = np.searchsorted(r, r + _DEPTH_M, side="right") - np.arange(len(r))
+    start = r[int(np.argmax(count))]
+    return near[(distance[near] >= start) & (distance[near] <= start + _DEPTH_M)]

@@ -1,0 +1,211 @@
+"""Moving radar clusters against lidar object clusters, and against the centres of camera boxes, in azimuth.
+
+A moving cluster of detections is a road user; so is, nearly always, the lidar cluster at its place and the box at its
+azimuth. Only azimuth is compared: ranges differ by what the radar sees through (0.2-0.3 m), elevations by the bounce.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import hat, inverse, transform_points
+from pipeline.geometry.spherical import camera_direction_angles
+from schemas.observations import Observation
+
+__all__ = [
+    "MovingClusters",
+    "azimuth_equations_camera",
+    "azimuth_equations_lidar",
+    "camera_azimuth_residuals",
+    "lidar_azimuth_residuals",
+    "moving_clusters",
+]
+
+_GATE_M = 2.5  # lidar cluster centre to radar cluster centre: half a car, twice
+_LARGEST_M = 12.0  # lidar clusters longer than a lorry are walls
+_RANGE_FACTOR = 1.8
+_HEIGHT_M = {
+    "person": 1.7,
+    "rider": 1.7,
+    "bicycle": 1.6,
+    "motorcycle": 1.6,
+    "truck": 2.9,
+    "bus": 3.0,
+    "train": 3.5,
+}
+_LEAST_SIGMA_RAD = np.radians(0.3)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingClusters:
+    """Centres of moving clusters in radar axes, with what is needed to bring them to the lidar's time."""
+
+    point_radar_m: Float[np.ndarray, "B 3"]
+    relative_mps: Float[np.ndarray, "B 3"]  # velocity relative to the radar along the line of sight
+    stamp_gap_s: Float[np.ndarray, " B"]  # radar stamp minus lidar stamp
+    frame: Int64[np.ndarray, " B"]
+
+    @property
+    def count(self) -> int:
+        """Number of clusters."""
+        return len(self.frame)
+
+    def at_lidar_time(self, dt_s: float) -> Float[np.ndarray, "B 3"]:
+        """Where they were at the lidar's stamp, radar axes, for a radar time offset dt (stamp_lidar = stamp_radar + dt)."""
+        return self.point_radar_m - self.relative_mps * (self.stamp_gap_s + dt_s)[:, None]
+
+
+def moving_clusters(observations: Sequence[Observation], least_detections: int = 2) -> MovingClusters:
+    """Moving clusters between 3 and 60 m; elevation is left out where the radar has none."""
+    points, speeds, gaps, frames = [], [], [], []
+    for index, o in enumerate(observations):
+        for label in range(int(o.radar_cluster.max(initial=-1)) + 1):
+            member = o.radar_cluster == label
+            if member.sum() < least_detections:
+                continue
+            centre = np.median(o.radar_xyz_m[member], axis=0).astype(np.float64)
+            distance = float(np.linalg.norm(centre))
+            if not 3.0 < distance < 60.0:
+                continue
+            u = centre / distance
+            own = np.zeros(3) if o.radar_velocity_mps is None else o.radar_velocity_mps
+            rate = float(np.median(o.radar_residual_mps[member])) - u @ own
+            points.append(centre)
+            speeds.append(rate * u)
+            gaps.append((o.radar_stamp_ns - o.stamp_ns) * 1e-9)
+            frames.append(index)
+    return MovingClusters(
+        np.array(points).reshape(-1, 3),
+        np.array(speeds).reshape(-1, 3),
+        np.array(gaps, np.float64),
+        np.array(frames, np.int64),
+    )
+
+
+def lidar_azimuth_residuals(
+    clusters: MovingClusters,
+    observations: Sequence[Observation],
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    dt_s: float,
+    gate_m: float = _GATE_M,
+) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
+    """Azimuth of the nearest lidar cluster minus the radar cluster's, seen from the radar, and its Jacobian.
+
+    Returns:
+        Residuals [rad] of the clusters that found a partner within `gate_m` in the plane, d/d(left twist of
+        T_lidar_radar), and the frames that they belong to.
+    """
+    points = clusters.at_lidar_time(dt_s)
+    in_lidar = transform_points(T_lidar_radar, points)
+    T_radar_lidar = inverse(T_lidar_radar)
+    residual, J, frame = [], [], []
+    for b in range(clusters.count):
+        o = observations[clusters.frame[b]]
+        centres = o.lidar_cluster_centre_m.astype(np.float64)
+        if not len(centres):
+            continue
+        size = np.max(o.lidar_cluster_max_m[:, :2] - o.lidar_cluster_min_m[:, :2], axis=1)
+        gap = np.linalg.norm(centres[:, :2] - in_lidar[b, :2], axis=1) + np.where(size > _LARGEST_M, 1e3, 0.0)
+        n = int(np.argmin(gap))
+        if gap[n] > gate_m:
+            continue
+        q = transform_points(T_radar_lidar, centres[n])
+        h2 = q[0] ** 2 + q[1] ** 2
+        measured = np.arctan2(points[b, 1], points[b, 0])
+        gradient = np.array([-q[1], q[0], 0.0]) / h2 @ T_lidar_radar[:3, :3].T
+        residual.append(float(np.arctan2(q[1], q[0]) - measured))
+        # The lidar point moves against the sensor: dq = R^T ([p]x dphi - drho).
+        J.append(np.concatenate([gradient @ hat(centres[n]), -gradient]))
+        frame.append(int(clusters.frame[b]))
+    return np.array(residual), np.array(J).reshape(-1, 6), np.array(frame, np.int64)
+
+
+def camera_azimuth_residuals(
+    clusters: MovingClusters,
+    observations: Sequence[Observation],
+    T_camera_radar: Float[np.ndarray, "4 4"],
+    gate_rad: float,
+) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
+    """Azimuth of each moving cluster minus that of the nearest box of fitting size, as the camera sees them.
+
+    Returns:
+        Residuals [rad] of the clusters that found a box within `gate_rad`, d/d(left twist of T_camera_radar), frames.
+    """
+    in_camera = transform_points(T_camera_radar, clusters.point_radar_m)
+    angles = camera_direction_angles(in_camera)
+    boxes = {int(f): _box_angles(observations[f]) for f in np.unique(clusters.frame)}
+    residual, J, frame = [], [], []
+    for b in range(clusters.count):
+        azimuth, expected_m = boxes[int(clusters.frame[b])]
+        x, _, z = in_camera[b]
+        if z < 1.0 or not len(azimuth):
+            continue
+        ratio = np.linalg.norm(in_camera[b]) / expected_m
+        fits = (ratio < _RANGE_FACTOR) & (ratio > 1 / _RANGE_FACTOR)
+        gap = np.where(fits, np.abs(angles[b, 0] - azimuth), np.inf)
+        n = int(np.argmin(gap))
+        if gap[n] > gate_rad:
+            continue
+        gradient = np.array([-z, 0.0, x]) / (x * x + z * z)  # azimuth = atan2(-x, z)
+        residual.append(float(angles[b, 0] - azimuth[n]))
+        J.append(np.concatenate([-gradient @ hat(in_camera[b]), gradient]))
+        frame.append(int(clusters.frame[b]))
+    return np.array(residual), np.array(J).reshape(-1, 6), np.array(frame, np.int64)
+
+
+def azimuth_equations_lidar(
+    clusters: MovingClusters,
+    observations: Sequence[Observation],
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    dt_s: float,
+) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
+    """Per frame, information and gradient of the robust azimuth cost of moving clusters against the lidar."""
+    return _robust(*lidar_azimuth_residuals(clusters, observations, T_lidar_radar, dt_s), len(observations))
+
+
+def azimuth_equations_camera(
+    clusters: MovingClusters,
+    observations: Sequence[Observation],
+    T_camera_radar: Float[np.ndarray, "4 4"],
+    gate_rad: float,
+) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
+    """The same against camera boxes; unknowns are the left twist of T_camera_radar."""
+    return _robust(
+        *camera_azimuth_residuals(clusters, observations, T_camera_radar, gate_rad), len(observations)
+    )
+
+
+def _robust(
+    residual: np.ndarray, J: np.ndarray, frame: np.ndarray, frames: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Cauchy-weighted normal equations by frame with the residuals' own spread."""
+    H, g = np.zeros((frames, 6, 6)), np.zeros((frames, 6))
+    if len(residual) < 5:  # no spread to weigh them by
+        return H, g, float("nan")
+    sigma = max(float(1.4826 * np.median(np.abs(residual - np.median(residual)))), _LEAST_SIGMA_RAD)
+    weight = 1 / (1 + (residual / (2 * sigma)) ** 2) / sigma**2
+    np.add.at(H, frame, weight[:, None, None] * J[:, :, None] * J[:, None, :])
+    np.add.at(g, frame, (weight * residual)[:, None] * J)
+    return H, g, sigma
+
+
+def _box_angles(o: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth of the centre and range by height of each road-user box."""
+    if not len(o.road_user_boxes_px):
+        return np.zeros(0), np.zeros(0)
+    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+    x0, y0, x1, y1 = o.road_user_boxes_px.astype(np.float64).T
+    xm = 0.5 * (x0 + x1)
+    rays = camera.unproject(
+        np.stack([np.stack([xm, 0.5 * (y0 + y1)], -1), np.stack([xm, y0], -1), np.stack([xm, y1], -1)])
+    )
+    angle = camera_direction_angles(rays)
+    height = np.array([_HEIGHT_M.get(name, 1.5) for name in o.road_user_classes])
+    ok = np.isfinite(angle).all(axis=(0, 2))
+    extent = np.maximum(angle[1, :, 1] - angle[2, :, 1], 1e-3)
+    return angle[0, ok, 0], (height / extent)[ok]
