@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import glob
 import re
 from collections import defaultdict
@@ -10,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from pipeline.store.partitions import Partition
+from pipeline.store.partitions import Partition, is_day
 
 __all__ = ["VehicleDay", "check_day", "find_vehicle_days"]
 
@@ -52,7 +51,7 @@ def find_vehicle_days(
     found: dict[tuple[str, str], set[Path]] = defaultdict(set)
     for name in glob.iglob(shell, recursive=True, include_hidden=False):  # noqa: PTH207 - patterns may be absolute
         match = matcher.fullmatch(name.rstrip("/"))
-        if match and _is_day(match["day"]):
+        if match and is_day(match["day"]):
             found[match["day"], match["vehicle"]].update(_logs_at(Path(name)))
     days = [
         VehicleDay(Partition(vehicle, day), tuple(sorted(logs)))
@@ -66,15 +65,8 @@ def find_vehicle_days(
 
 def check_day(name: str, day: str | None) -> None:
     """Raise ConfigError, naming the option, where a day is given that is no YYYY-MM-DD."""
-    if day is not None and not _is_day(day):
+    if day is not None and not is_day(day):
         raise ConfigError("command line", name, f"{day!r} is no day of the form YYYY-MM-DD")
-
-
-def _is_day(text: str) -> bool:
-    try:
-        return dt.date.fromisoformat(text).isoformat() == text
-    except ValueError:
-        return False
 
 
 def _matcher(pattern: str) -> re.Pattern[str]:

@@ -12,9 +12,17 @@ from urllib.parse import quote, unquote
 
 from pipeline.errors import ConfigError
 
-__all__ = ["Lake", "Partition", "work_key"]
+__all__ = ["Lake", "Partition", "is_day", "work_key"]
 
-_VEHICLE = re.compile(r"^[^/\0=]+$")
+_VEHICLE = re.compile(r"[^/\0=]+")
+
+
+def is_day(text: str) -> bool:
+    """True for a day of the calendar as YYYY-MM-DD (ISO 8601 has other spellings, the lake has one)."""
+    try:
+        return dt.date.fromisoformat(text).isoformat() == text
+    except ValueError:
+        return False
 
 
 @dataclass(frozen=True, order=True)
@@ -25,12 +33,10 @@ class Partition:
     day: str
 
     def __post_init__(self) -> None:
-        if not _VEHICLE.match(self.vehicle) or self.vehicle in (".", ".."):
+        if not _VEHICLE.fullmatch(self.vehicle) or self.vehicle in (".", ".."):
             raise ConfigError("command line", "vehicle", f"{self.vehicle!r} cannot be a vehicle's name")
-        try:
-            dt.date.fromisoformat(self.day)
-        except ValueError as err:
-            raise ConfigError("command line", "day", f"{self.day!r} is no day of the form YYYY-MM-DD") from err
+        if not is_day(self.day):
+            raise ConfigError("command line", "day", f"{self.day!r} is no day of the form YYYY-MM-DD")
 
     @property
     def folder(self) -> str:
@@ -55,10 +61,21 @@ class Lake:
         """The folder of one partition of one table."""
         return self.root / table / partition.folder
 
-    def partitions(self, table: str) -> list[Partition]:
-        """Partitions of a table that hold at least one file, in order."""
-        found = {p.parent for p in self.root.glob(f"{table}/vehicle=*/day=*/*.parquet")}
-        return sorted(Partition(unquote(f.parent.name.removeprefix("vehicle=")), f.name.removeprefix("day=")) for f in found)
+    def partitions(self, table: str, vehicle: str | None = None, day: str | None = None) -> list[Partition]:
+        """Partitions of a table that hold at least one file, in order; only those of a vehicle or day if given."""
+        vehicles = "*" if vehicle is None else quote(vehicle, safe="")
+        pattern = f"{table}/vehicle={vehicles}/day={day or '*'}/*.parquet"
+        return sorted({p for f in self.root.glob(pattern) if (p := _partition_of(f.parent)) is not None})
+
+
+def _partition_of(folder: Path) -> Partition | None:
+    """The partition that a folder is; None for one that nobody could have written through here."""
+    try:
+        return Partition(
+            unquote(folder.parent.name.removeprefix("vehicle=")), folder.name.removeprefix("day=")
+        )
+    except ConfigError:
+        return None
 
 
 def work_key(stage: str, code_version: str, config: str, inputs: list[str]) -> str:

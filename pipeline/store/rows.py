@@ -53,7 +53,9 @@ def _encode(value: Any, column: Column, table: str) -> Any:
         return list(value.items()) if isinstance(value, dict) else value
     array = np.ascontiguousarray(value, dtype=np.dtype(column.dtype))
     wanted = column.shape
-    if array.ndim != len(wanted) or any(isinstance(w, int) and w != s for w, s in zip(wanted, array.shape, strict=False)):
+    if array.ndim != len(wanted) or any(
+        isinstance(w, int) and w != s for w, s in zip(wanted, array.shape, strict=False)
+    ):
         raise ContractError(table, f"column {column.name} has shape {array.shape}, not {wanted}")
     return array.tobytes()
 

@@ -1,0 +1,56 @@
+"""Rows of any table, filled by what its schema promises."""
+
+import numpy as np
+
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.drift import DRIFT, DriftFinding
+from schemas.frames import FRAMES, Frame
+from schemas.observations import OBSERVATIONS, Observation
+
+ROW_TYPES = {
+    FRAMES.name: (FRAMES, Frame),
+    OBSERVATIONS.name: (OBSERVATIONS, Observation),
+    CALIBRATIONS.name: (CALIBRATIONS, CalibrationRecord),
+    DRIFT.name: (DRIFT, DriftFinding),
+}
+
+
+def make_row(table, rng, *, nulls=False, free=5, **values):
+    """A row of `table` whose fields are random values of the right kind, or null where that is allowed."""
+    schema, row_type = ROW_TYPES[table]
+    filled = {c.name: None if nulls and c.nullable else make_value(c, rng, free) for c in schema.columns}
+    return row_type(**filled | values)
+
+
+def make_value(column, rng, free):
+    if column.is_array:
+        shape = tuple(free if s == "N" else s for s in column.shape)
+        return (rng.normal(size=shape) * 50).astype(column.dtype)
+    number = int(rng.integers(0, 1000))
+    return {
+        "int64": 1_700_000_000_000_000_000 + number,
+        "int32": number,
+        "float64": number / 7,
+        "string": f"text {number} äß",
+        "bool": bool(number % 2),
+        "binary": rng.bytes(64),
+        "list<string>": ["a", "", f"b{number}"],
+        "list<float64>": [0.5, number / 3],
+        "list<bool>": [True, False],
+        "map<string,float64>": {"x": number / 3, "y": 0.0},
+        "map<string,int64>": {"reason": number},
+    }[column.kind]
+
+
+def same(a, b):
+    """Two rows are the same, field by field."""
+    for name, value in vars(a).items():
+        other = getattr(b, name)
+        if isinstance(value, np.ndarray):
+            if not (
+                isinstance(other, np.ndarray) and value.dtype == other.dtype and np.array_equal(value, other)
+            ):
+                return False
+        elif value != other:
+            return False
+    return True

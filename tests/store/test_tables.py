@@ -1,0 +1,295 @@
+import importlib.util
+import json
+import multiprocessing
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import polars as pl
+import psutil
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline.errors import ContractError
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import (
+    iterate_rows,
+    read_manifest,
+    read_records,
+    read_rows,
+    write_partition,
+    write_records,
+)
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.columns import TableSchema
+from schemas.frames import FRAMES, Frame
+
+HERE = Path(__file__).resolve().parent
+DAY = Partition("car", "2026-03-02")
+
+spec = importlib.util.spec_from_file_location("rows_for_tests", HERE / "rows_for_tests.py")
+rows_for_tests = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(rows_for_tests)
+make_row, same, ROW_TYPES = rows_for_tests.make_row, rows_for_tests.same, rows_for_tests.ROW_TYPES
+
+
+@pytest.fixture
+def lake(tmp_path):
+    return Lake.at(tmp_path / "lake")
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def write(lake, rows, key="k1", schema=FRAMES, partition=DAY, group=2):
+    with write_partition(lake, schema, partition, key, "0.1", ["in"]) as writer:
+        for first in range(0, len(rows), group):
+            writer.append(rows[first : first + group])
+        writer.describe(kept={"frames": len(rows)}, rejected={"dark": 2}, note="x")
+
+
+@pytest.mark.parametrize("table", ROW_TYPES)
+@pytest.mark.parametrize("case", ["full", "nulls", "empty arrays"])
+def test_rows_of_every_table_come_back_as_they_were(table, case, lake, rng):
+    schema, row_type = ROW_TYPES[table]
+    options = {"nulls": case == "nulls", "free": 0 if case == "empty arrays" else 5}
+    rows = [make_row(table, rng, **options) for _ in range(5)]
+    write(lake, rows, schema=schema)
+    found = read_rows(lake, schema, DAY, row_type)
+    assert len(found) == 5
+    assert all(same(a, b) for a, b in zip(rows, found, strict=True))
+
+
+def test_the_manifest_says_where_a_partition_comes_from(lake, rng):
+    assert read_manifest(lake, FRAMES, DAY) is None
+    write(lake, [make_row("frames", rng) for _ in range(3)])
+    manifest = read_manifest(lake, FRAMES, DAY)
+    assert (manifest.table, manifest.version, manifest.work_key) == ("frames", FRAMES.version, "k1")
+    assert (manifest.rows, manifest.kept, manifest.rejected) == (3, {"frames": 3}, {"dark": 2})
+    assert (manifest.inputs, manifest.extra) == (["in"], {"note": "x"})
+
+
+def test_picked_rows_come_from_their_row_groups_alone(lake, rng):
+    rows = [make_row("frames", rng, frame_index=i) for i in range(7)]
+    write(lake, rows)
+    chunks = list(iterate_rows(lake, FRAMES, DAY, Frame, rows=[6, 0, 3]))
+    assert [[r.frame_index for r in chunk] for chunk in chunks] == [[0], [3], [6]]
+
+
+def test_an_error_while_writing_leaves_the_old_partition_and_nothing_else(lake, rng):
+    write(lake, [make_row("frames", rng, frame_index=7)])
+    with (
+        pytest.raises(RuntimeError, match="sensor"),
+        write_partition(lake, FRAMES, DAY, "k2", "0.1") as writer,
+    ):
+        writer.append([make_row("frames", rng)])
+        raise RuntimeError("sensor")
+    assert [r.frame_index for r in read_rows(lake, FRAMES, DAY, Frame)] == [7]
+    assert read_manifest(lake, FRAMES, DAY).work_key == "k1"
+    assert [p.name for p in lake.folder("frames", DAY).iterdir()] == ["part-0.parquet"]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "match"),
+    [("camera_K", np.eye(4), "shape"), ("lidar_x_m", np.zeros((2, 2)), "shape"), ("log", None, "null")],
+)
+def test_a_row_that_breaks_its_contract_is_not_written(field, value, match, lake, rng):
+    with (
+        pytest.raises(ContractError, match=match),
+        write_partition(lake, FRAMES, DAY, "k", "0.1") as writer,
+    ):
+        row = make_row("frames", rng)
+        object.__setattr__(row, field, value)  # as code without a type check would
+        writer.append([row])
+    assert read_manifest(lake, FRAMES, DAY) is None
+
+
+def test_another_version_a_foreign_file_and_a_damaged_one_are_named(lake, rng):
+    write(lake, [make_row("frames", rng)])
+    path = lake.folder("frames", DAY) / "part-0.parquet"
+    newer = TableSchema("frames", FRAMES.version + 1, FRAMES.columns)
+    with pytest.raises(ContractError, match=rf"part-0\.parquet.*frames/{FRAMES.version}.*anew"):
+        read_rows(lake, newer, DAY, Frame)
+    whole = path.read_bytes()
+    pq.write_table(pa.table({"a": [1]}), path)
+    with pytest.raises(ContractError, match="not written by Boresight"):
+        read_rows(lake, FRAMES, DAY, Frame)
+    for damaged in (whole[: len(whole) // 2], b"", whole[:-8] + b"\xff" * 8):
+        path.write_bytes(damaged)
+        with pytest.raises(ContractError, match="damaged"):
+            read_manifest(lake, FRAMES, DAY)
+    with pytest.raises(ContractError, match="no partition for car on 2026-03-03"):
+        read_rows(lake, FRAMES, Partition("car", "2026-03-03"), Frame)
+
+
+def test_records_are_appended_and_the_same_work_gives_the_same_file(lake, rng):
+    first = make_row("calibrations", rng, vehicle="car", seed=1)
+    second = make_row("calibrations", rng, vehicle="car", seed=2)
+    paths = [
+        write_records(lake, CALIBRATIONS, DAY, [row], key, "0.1")
+        for row, key in ((first, "k1"), (second, "k2"), (first, "k1"))
+    ]
+    assert paths[0] == paths[2]
+    assert len(list(lake.folder("calibrations", DAY).iterdir())) == 2
+    other = Partition("bus", "2026-03-02")
+    write_records(lake, CALIBRATIONS, other, [make_row("calibrations", rng, seed=3)], "k3", "0.1")
+    seeds = [r.seed for r in read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="car")]
+    assert sorted(seeds) == [1, 2]
+    assert len(read_records(lake, CALIBRATIONS, CalibrationRecord)) == 3
+    assert read_records(lake, CALIBRATIONS, CalibrationRecord, day="2026-03-03") == []
+
+
+def test_the_newest_record_file_comes_last(lake, rng):
+    for age, key in ((100, "a"), (300, "b"), (200, "c")):
+        path = write_records(lake, CALIBRATIONS, DAY, [make_row("calibrations", rng, seed=age)], key, "0.1")
+        os.utime(path, ns=(0, 10**18 - age))
+    assert [r.seed for r in read_records(lake, CALIBRATIONS, CalibrationRecord)] == [300, 200, 100]
+
+
+def test_files_can_be_read_by_whoever_the_umask_lets(lake, rng):
+    write(lake, [make_row("frames", rng)])
+    umask = os.umask(0)
+    os.umask(umask)
+    mode = (lake.folder("frames", DAY) / "part-0.parquet").stat().st_mode & 0o777
+    assert mode == 0o666 & ~umask
+
+
+# -- other engines ---------------------------------------------------------------------------------
+
+
+def decode(blob, field):
+    """What a reader without Boresight does: dtype and shape are in the field's metadata."""
+    shape = [-1 if s == "N" else int(s) for s in field.metadata[b"shape"].decode().split(",")]
+    return np.frombuffer(blob, field.metadata[b"dtype"].decode()).reshape(shape)
+
+
+def test_duckdb_and_polars_read_the_lake_by_plain_glob(lake, rng):
+    rows = {}
+    for vehicle, day in (("car", "2026-03-02"), ("car", "2026-03-03"), ("bus 7", "2026-03-02")):
+        rows[vehicle, day] = [make_row("frames", rng, frame_index=i) for i in range(3)]
+        write(lake, rows[vehicle, day], partition=Partition(vehicle, day))
+        # What a killed writer leaves must not be seen.
+        (lake.folder("frames", Partition(vehicle, day)) / ".writing-x-1-y.tmp").write_bytes(b"half")
+    pattern = f"{lake.root}/frames/*/*/*.parquet"
+    table = f"read_parquet('{pattern}', hive_partitioning=true)"
+    by_duckdb = duckdb.sql(f"select vehicle, day::varchar, frame_index, lidar_x_m from {table}").fetchall()
+    frame = pl.scan_parquet(pattern, hive_partitioning=True)
+    by_polars = (
+        frame.select("vehicle", pl.col("day").cast(pl.String), "frame_index", "lidar_x_m").collect().rows()
+    )
+    field = FRAMES.arrow_schema().field("lidar_x_m")
+    for found in (by_duckdb, by_polars):
+        assert len(found) == 9
+        for vehicle, day, index, blob in found:
+            np.testing.assert_array_equal(decode(blob, field), rows[vehicle, day][index].lidar_x_m)
+
+
+def test_duckdb_and_polars_read_records_whose_columns_repeat_the_folders_names(lake, rng):
+    row = make_row("calibrations", rng, vehicle="car", day="2026-03-02", status="held")
+    write_records(lake, CALIBRATIONS, DAY, [row], "k1", "0.1")
+    pattern = f"{lake.root}/calibrations/*/*/*.parquet"
+    sql = f"select vehicle, status, diagnostics['x'] from read_parquet('{pattern}', hive_partitioning=true)"
+    assert duckdb.sql(sql).fetchall() == [("car", "held", row.diagnostics["x"])]
+    frame = (
+        pl.scan_parquet(pattern, hive_partitioning=True).select("vehicle", "status", "covariance").collect()
+    )
+    assert frame["vehicle"].to_list() == ["car"]
+    blob = frame["covariance"][0]
+    np.testing.assert_array_equal(
+        decode(blob, CALIBRATIONS.arrow_schema().field("covariance")), row.covariance
+    )
+
+
+# -- faults ------------------------------------------------------------------------------------------
+
+
+def assert_whole(lake):
+    """One generation in the partition, and all three rows of every record file."""
+    manifest = read_manifest(lake, FRAMES, DAY)
+    rows = read_rows(lake, FRAMES, DAY, Frame)
+    assert len(rows) == 12
+    assert {f"key-{r.drive}" for r in rows} == {manifest.work_key}
+    for path in lake.folder("calibrations", DAY).glob("*.parquet"):
+        assert pq.read_metadata(path).num_rows == 3
+
+
+def test_a_writer_killed_at_any_moment_never_leaves_a_bad_read(lake, rng):
+    server = subprocess.Popen(
+        [sys.executable, str(HERE / "writer_to_kill.py"), str(lake.root)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with server:
+        assert server.stdout.readline() == "ready\n"
+        kills = [0.5, *rng.uniform(0.0, 0.12, 59)]
+        generations = set()
+        leftovers = 0
+        for delay in kills:
+            server.stdin.write(f"{delay}\n")
+            server.stdin.flush()
+            assert server.stdout.readline() == "killed\n"
+            assert_whole(lake)
+            generations.add(read_manifest(lake, FRAMES, DAY).work_key)
+            leftovers += len(list(lake.folder("frames", DAY).glob("*.tmp")))
+        server.stdin.close()
+    assert len(generations) > 5  # kills came between complete writes,
+    assert leftovers > 5  # and in the middle of some
+    write(lake, [make_row("frames", rng)])
+    assert not list(lake.folder("frames", DAY).glob("*.tmp"))
+
+
+def write_many(root, name, times):
+    lake, rng = Lake.at(root), np.random.default_rng(1)
+    for i in range(times):
+        rows = [make_row("frames", rng, free=500, log=f"{name}{i}", frame_index=j) for j in range(6)]
+        write(lake, rows, key=f"{name}{i}")
+
+
+def test_two_writers_on_one_partition_end_with_one_of_them_whole(lake):
+    context = multiprocessing.get_context("fork")
+    writers = [context.Process(target=write_many, args=(lake.root, name, 25)) for name in "ab"]
+    for process in writers:
+        process.start()
+    while any(p.is_alive() for p in writers):
+        manifest = read_manifest(lake, FRAMES, DAY)
+        if manifest is not None:
+            assert manifest.rows == 6
+    assert [p.exitcode for p in writers] == [0, 0]
+    rows = read_rows(lake, FRAMES, DAY, Frame)
+    assert len(rows) == 6
+    assert {r.log for r in rows} == {read_manifest(lake, FRAMES, DAY).work_key}
+    assert {r.log for r in rows} <= {"a24", "b24"}
+    assert [p.name for p in lake.folder("frames", DAY).iterdir()] == ["part-0.parquet"]
+
+
+def test_leftovers_go_when_their_writer_is_dead_or_a_day_has_passed(lake, rng):
+    folder = lake.folder("frames", DAY)
+    folder.mkdir(parents=True)
+    host = socket.gethostname()
+    dead = next(pid for pid in range(4_000_000, 3_000_000, -1) if not psutil.pid_exists(pid))
+    names = {
+        "dead": f".writing-{host}-{dead}-aa.tmp",
+        "alive": f".writing-{host}-{os.getppid()}-bb.tmp",
+        "elsewhere": ".writing-other-host-1-cc.tmp",
+        "old": ".writing-other-host-1-dd.tmp",
+    }
+    for name in names.values():
+        (folder / name).write_bytes(b"half")
+    os.utime(folder / names["old"], (0, 0))
+    write(lake, [make_row("frames", rng)])
+    left = {key for key, name in names.items() if (folder / name).exists()}
+    assert left == {"alive", "elsewhere"}
+
+
+def test_the_footer_is_plain_json_that_other_tools_can_read(lake, rng):
+    write(lake, [make_row("frames", rng)])
+    raw = pq.read_metadata(lake.folder("frames", DAY) / "part-0.parquet").metadata[b"boresight"]
+    assert json.loads(raw)["work_key"] == "k1"

@@ -1,0 +1,52 @@
+"""A server that forks a writer, kills it after the delay that it reads from stdin, and says so."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from rows_for_tests import make_row
+
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import write_partition, write_records
+from schemas.calibrations import CALIBRATIONS
+from schemas.frames import FRAMES
+
+
+def make_rows():
+    rng = np.random.default_rng(0)
+    frames = [make_row("frames", rng, free=4000, image=rng.bytes(100_000)) for _ in range(12)]
+    return frames, make_row("calibrations", rng)
+
+
+def write_for_ever(lake, generation, rows, record):
+    partition = Partition("car", "2026-03-02")
+    while True:
+        generation += 1
+        with write_partition(lake, FRAMES, partition, f"key-{generation}", "0") as writer:
+            for first in range(0, 12, 3):
+                for row in rows:
+                    object.__setattr__(row, "drive", generation)
+                writer.append(rows[first : first + 3])
+        write_records(lake, CALIBRATIONS, partition, [record] * 3, f"key-{generation}", "0")
+
+
+def main():
+    lake = Lake.at(sys.argv[1])
+    rows, record = make_rows()
+    print("ready", flush=True)
+    for turn, line in enumerate(sys.stdin):
+        child = os.fork()
+        if child == 0:
+            write_for_ever(lake, 100_000 * (turn + 1), rows, record)
+        time.sleep(float(line))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        print("killed", flush=True)
+
+
+main()
