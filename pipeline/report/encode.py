@@ -1,22 +1,17 @@
-"""Pictures as text inside a page: JPEG and PNG as data URIs, charts as inline SVG that follows the page's colours."""
+"""Pictures as text inside a page: JPEG and PNG as data URIs."""
 
 from __future__ import annotations
 
 import base64
 import io
-import re
 
 import cv2
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import UInt8
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
-__all__ = ["INK", "jpeg_uri", "png_uri", "svg_inline"]
+__all__ = ["jpeg_uri", "png_uri"]
 
-# Stands for the text colour of the page while matplotlib draws; becomes currentColor.
-INK = "#010203"
 _JPEG_QUALITY = 82
 
 
@@ -35,24 +30,6 @@ def png_uri(figure: Figure) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return _uri("image/png", buffer.getvalue())
-
-
-def svg_inline(figure: Figure, name: str, description: str) -> Markup:
-    """A chart as an `<svg>` element; `name` keeps its ids apart from other charts of the page."""
-    buffer = io.StringIO()
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{name}-", text)
-    text = re.sub(r"font: ([^;\"]*)'DejaVu Sans'[^;\"]*", r"font: \1system-ui, sans-serif", text)
-    text = text.replace(INK, "currentColor")
-    # The width follows the page; the view box keeps the proportions.
-    text = re.sub(r'<svg ([^>]*?)width="[^"]*"', r"<svg \1", text, count=1)
-    text = re.sub(r'<svg ([^>]*?)height="[^"]*"', r"<svg \1", text, count=1)
-    label = Markup.escape(description)
-    return Markup(text.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1))  # noqa: S704 (our own SVG)
 
 
 def _uri(kind: str, data: bytes) -> str:

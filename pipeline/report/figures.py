@@ -1,29 +1,27 @@
-"""Charts of the pages. Plain Figures without pyplot; the ink is the page's text colour."""
+"""The charts of the pages: sigmas per axis, agreement per frame, control charts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from markupsafe import Markup
 
-from pipeline.report.encode import INK
 from pipeline.report.residuals import MEASURES
+from pipeline.report.svg import MUTED, Plot, document, nice_step
 from pipeline.report.words import PAIR_TITLES, dof_title, scaled, unit_of
 from schemas.calibrations import DOF_NAMES, PAIRS
 
 __all__ = ["DriftPanel", "drift_figure", "residual_figure", "sigma_figure"]
 
-BEFORE, AFTER, MUTED = "#e0813a", "#3b82c4", "#8a8f98"
-STATUS_COLOURS = {"RED": "#d64550", "YELLOW": "#d9a21b", "GREEN": "#2f9e6a", "UNKNOWN": MUTED}
-_SMALL = 8
+BEFORE, AFTER = "#e0813a", "#3b82c4"
+STATUS_COLOURS = {"RED": "#d64550", "YELLOW": "#c8920f", "GREEN": "#2f9e6a", "UNKNOWN": MUTED}
 
 
 @dataclass(frozen=True)
 class DriftPanel:
-    """One chart: day numbers and values in radians or metres, relative to the level before the change."""
+    """One chart: day ordinals and values in radians or metres, relative to the level before the change."""
 
     pair: str
     dof: str
@@ -40,133 +38,154 @@ def sigma_figure(
     prior_sigma: Mapping[str, np.ndarray],
     sigma: Mapping[str, np.ndarray],
     observable: Mapping[str, Sequence[bool]],
-) -> Figure:
-    """Sigma of each DoF beside that of the prior; hollow where the day did not determine it."""
-    figure = Figure(figsize=(11.4, 3.5), layout="constrained")
-    axes = figure.subplots(2, 3, squeeze=False)
+) -> Markup:
+    """Sigma of each DoF beside that of the prior, on a log scale; hollow where the day did not determine it."""
+    parts: list[str] = []
     for column, pair in enumerate(PAIRS):
         for row, dofs in enumerate((DOF_NAMES[:3], DOF_NAMES[3:])):
-            ax = axes[row, column]
-            _plain(ax)
-            if pair not in sigma:
-                ax.text(0.5, 0.5, "no estimate", transform=ax.transAxes, ha="center", color=INK)
-            else:
-                _sigma_bars(ax, pair, dofs, prior_sigma.get(pair), sigma[pair], observable[pair])
+            values = [
+                s
+                for source in (prior_sigma, sigma)
+                if pair in source
+                for s in _page_units(source[pair], dofs)
+            ]
+            low, high = _decades(values)
+            plot = Plot(column * 410 + 80, row * 132 + 24, 310, 84, (low, high), (3.0, 0.0))
             if row == 0:
-                ax.set_title(PAIR_TITLES[pair], fontsize=10, color=INK, loc="left", weight="bold")
-            ax.set_xlabel(f"sigma [{unit_of(dofs[0])}]", fontsize=_SMALL, color=INK)
-    return figure
+                plot.text(column * 410, 12, PAIR_TITLES[pair], bold=True, size=12.5)
+            decades = [(d, f"{10.0**d:g}") for d in np.arange(np.ceil(low), high + 1e-9)]
+            plot.frame(decades, [])
+            plot.text(
+                plot.left + 310,
+                plot.top + 110,
+                f"sigma [{unit_of(dofs[0])}], log",
+                anchor="end",
+                colour=MUTED,
+            )
+            for k, dof in enumerate(dofs):
+                plot.text(plot.left - 6, plot.top + 28 * k + 18, dof_title(pair, dof), anchor="end")
+                _sigma_bars(
+                    plot,
+                    k,
+                    DOF_NAMES.index(dof),
+                    prior_sigma.get(pair),
+                    sigma.get(pair),
+                    observable.get(pair),
+                )
+            parts += plot.parts
+    return document(1210, 272, parts, "Sigma of each degree of freedom, of the prior and of the result")
 
 
 def _sigma_bars(
-    ax: Any,
-    pair: str,
-    dofs: Sequence[str],
+    plot: Plot,
+    row: int,
+    k: int,
     prior: np.ndarray | None,
-    sigma: np.ndarray,
-    observable: Sequence[bool],
+    sigma: np.ndarray | None,
+    observable: Sequence[bool] | None,
 ) -> None:
-    position = np.arange(len(dofs))
-    index = [DOF_NAMES.index(d) for d in dofs]
-    values = np.array([scaled(sigma[k], DOF_NAMES[k]) for k in index])
+    low = plot.x[0]
     if prior is not None:
-        before = [scaled(prior[k], DOF_NAMES[k]) for k in index]
-        ax.barh(position - 0.2, before, 0.36, color=MUTED, alpha=0.45)
-    for p, k, v in zip(position, index, values, strict=True):
-        seen = bool(observable[k])
-        ax.barh(p + 0.2, v, 0.36, color=AFTER if seen else "none", edgecolor=AFTER, linewidth=1)
-        text = f" {v:.2g}" if seen else f" {v:.2g}, not determined"
-        ax.text(v, p + 0.2, text, va="center", fontsize=_SMALL, color=INK)
-    ax.set_xscale("log")
-    low, high = ax.get_xlim()
-    ax.set_xlim(low, high * 6)  # room for the numbers
-    ax.set_yticks(position, [dof_title(pair, d) for d in dofs])
-    ax.invert_yaxis()
+        plot.area((low, row + 0.48), (np.log10(scaled(prior[k], DOF_NAMES[k])), row + 0.14), MUTED, 0.45)
+    if sigma is None or observable is None:
+        return
+    value = scaled(sigma[k], DOF_NAMES[k])
+    end = float(np.log10(value))
+    plot.area((low, row + 0.88), (end, row + 0.54), AFTER, 1.0 if observable[k] else 0.0, AFTER)
+    u, v = plot.at(end, row + 0.71)
+    plot.text(u + 5, v + 3.5, f"{value:.2g}" + ("" if observable[k] else " not determined"), size=10)
 
 
-def residual_figure(before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> Figure:
+def residual_figure(before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> Markup:
     """Measures of `frame_residuals` over the day's frames."""
-    figure = Figure(figsize=(11.4, 2.5), layout="constrained")
-    axes = figure.subplots(1, 3, squeeze=False)[0]
-    for ax, pair in zip(axes, PAIRS, strict=True):
-        _plain(ax)
+    parts: list[str] = []
+    for column, pair in enumerate(PAIRS):
         name, more_is_better = MEASURES[pair]
-        ax.set_title(PAIR_TITLES[pair], fontsize=10, color=INK, loc="left", weight="bold")
-        ax.set_ylabel(name, fontsize=_SMALL, color=INK)
-        ax.set_xlabel("frame, in order of time", fontsize=_SMALL, color=INK)
-        for series, colour, label in ((before, BEFORE, "prior"), (after, AFTER, "calibrated")):
-            values = series[pair]
-            if np.isfinite(values).any():
-                ax.plot(np.arange(len(values)), values, ".", color=colour, markersize=4, alpha=0.7)
-                level = float(np.nanmedian(values))
-                ax.axhline(level, color=colour, linewidth=1.4, label=f"{label}: median {level:.2g}")
-        if ax.get_legend_handles_labels()[0]:
-            hint = "more is better" if more_is_better else "less is better"
-            legend = ax.legend(
-                fontsize=_SMALL, title=hint, title_fontsize=_SMALL, framealpha=0.0, labelcolor=INK
-            )
-            legend.get_title().set_color(INK)
-        else:
-            ax.text(0.5, 0.5, "too little in view", transform=ax.transAxes, ha="center", color=INK)
-    return figure
+        finite = np.concatenate([v[np.isfinite(v)] for v in (before[pair], after[pair])])
+        # A few frames in poor surroundings must not flatten the rest.
+        top = 1.1 * float(np.quantile(finite, 0.97)) if len(finite) else 1.0
+        plot = Plot(column * 410 + 44, 40, 350, 130, (-1.0, float(len(before[pair]))), (0.0, max(top, 1e-6)))
+        plot.text(column * 410, 12, PAIR_TITLES[pair], bold=True, size=12.5)
+        plot.text(column * 410, 28, f"{name}; {'more' if more_is_better else 'less'} is better", colour=MUTED)
+        step = nice_step(plot.y[1])
+        plot.frame([], [(y, f"{y:g}") for y in np.arange(0, plot.y[1], step)])
+        plot.text(plot.left + 350, 186, "frames in order of time", anchor="end", colour=MUTED)
+        if not len(finite):
+            plot.text(plot.left + 175, 110, "too little in view", anchor="middle")
+        for k, (series, colour, label) in enumerate(
+            ((before, BEFORE, "prior"), (after, AFTER, "calibrated"))
+        ):
+            _residual_dots(plot, series[pair], colour, label, plot.left + 130 * k)
+        parts += plot.parts
+    return document(1210, 192, parts, "Agreement of the sensors in each frame, at the prior and calibrated")
 
 
-def drift_figure(panels: Sequence[DriftPanel], day_labels: Mapping[int, str]) -> Figure:
+def _residual_dots(plot: Plot, values: np.ndarray, colour: str, label: str, legend_u: float) -> None:
+    if not np.isfinite(values).any():
+        return
+    level = float(np.nanmedian(values))
+    for i in np.flatnonzero(np.isfinite(values)):
+        y = min(float(values[i]), plot.y[1])
+        plot.dot(float(i), y, colour, f"{label}: {values[i]:.3g}", radius=2.3, opacity=0.65)
+    plot.line((plot.x[0], min(level, plot.y[1])), (plot.x[1], min(level, plot.y[1])), colour, 1.6)
+    plot.text(legend_u, 186, f"{label}: median {level:.2g}", colour=colour, bold=True)
+
+
+def drift_figure(panels: Sequence[DriftPanel], day_labels: Mapping[int, str], vehicle: str) -> Markup:
     """All charts of a vehicle: pairs down, DoFs across; bars are one sigma, the band is what matters."""
-    figure = Figure(figsize=(13.0, 6.0), layout="constrained")
-    axes = figure.subplots(len(PAIRS), len(DOF_NAMES), squeeze=False, sharex=True)
-    for panel in panels:
-        _drift_panel(axes[PAIRS.index(panel.pair), DOF_NAMES.index(panel.dof)], panel)
+    parts: list[str] = []
     days = sorted(day_labels)
-    for ax in axes[-1]:
-        shown = days if len(days) <= 4 else [days[0], days[len(days) // 2], days[-1]]
-        ax.set_xticks(shown, [day_labels[d] for d in shown], fontsize=_SMALL - 1)
-        ax.set_xlim(days[0] - 0.6, days[-1] + 0.6)
+    ticks = days if len(days) <= 4 else [days[0], days[len(days) // 2], days[-1]]
     for row, pair in enumerate(PAIRS):
-        axes[row, 0].set_ylabel(PAIR_TITLES[pair], fontsize=10, color=INK, weight="bold")
-    return figure
+        parts.append(
+            f'<text x="0" y="{row * 150 + 12}" font-weight="600" font-size="12.5">{PAIR_TITLES[pair]}</text>'
+        )
+    for panel in panels:
+        row, column = PAIRS.index(panel.pair), DOF_NAMES.index(panel.dof)
+        plot = Plot(
+            column * 206 + 40, row * 150 + 36, 158, 84, (days[0] - 0.6, days[-1] + 0.6), _reach(panel)
+        )
+        _drift_panel(plot, panel, [(d, day_labels[d]) for d in ticks], day_labels)
+        parts += plot.parts
+    return document(1236, 446, parts, f"Control charts of {vehicle}")
 
 
-def _drift_panel(ax: Any, panel: DriftPanel) -> None:
-    _plain(ax)
+def _drift_panel(
+    plot: Plot, panel: DriftPanel, ticks: Sequence[tuple[float, str]], day_labels: Mapping[int, str]
+) -> None:
     colour = STATUS_COLOURS[panel.status]
-    title = f"{dof_title(panel.pair, panel.dof)} [{unit_of(panel.dof)}]"
     alarmed = panel.status in ("RED", "YELLOW")
-    ax.set_title(
-        title,
-        fontsize=_SMALL + 0.5,
-        color=colour if alarmed else INK,
-        loc="left",
-        weight="bold" if alarmed else None,
-    )
-    for side in ("left", "bottom"):
-        ax.spines[side].set_color(colour)
-        ax.spines[side].set_linewidth(2.0 if alarmed else 1.0)
-    limit = scaled(panel.limit, panel.dof)
-    ax.axhspan(-limit, limit, color=STATUS_COLOURS["GREEN"], alpha=0.13, linewidth=0)
+    unit, limit = unit_of(panel.dof), min(scaled(panel.limit, panel.dof), plot.y[1])
+    title = f"{dof_title(panel.pair, panel.dof)} [{unit}]" + (f" {panel.status}" if alarmed else "")
+    plot.text(plot.left, plot.top - 6, title, colour=colour if alarmed else "currentColor", bold=alarmed)
+    plot.area((plot.x[0], -limit), (plot.x[1], limit), STATUS_COLOURS["GREEN"], 0.14)
+    step = nice_step(plot.y[1] * 1.6)
+    plot.frame(ticks, [(y, f"{y:g}") for y in (-step, 0.0, step)], colour, 2.0 if alarmed else 1.0)
     if panel.start is not None:
         first, earliest, latest = panel.start
-        ax.axvspan(earliest - 0.5, latest - 0.5 + 1e-3, color=colour, alpha=0.25, linewidth=0)
-        ax.axvline(first - 0.5, color=colour, linewidth=1.2, linestyle="--")
-    if len(panel.day):
-        value = [scaled(v, panel.dof) for v in panel.value]
-        sigma = [scaled(s, panel.dof) for s in panel.sigma]
-        ax.errorbar(
-            panel.day, value, sigma, fmt="o", color=colour, ecolor=colour, markersize=3.5, elinewidth=1.1
-        )
-        reach = 1.15 * max(*(abs(v) + s for v, s in zip(value, sigma, strict=True)), limit)
-        ax.set_ylim(-reach, reach)
-    else:
-        ax.text(0.5, 0.6, "not determined", transform=ax.transAxes, ha="center", fontsize=_SMALL, color=MUTED)
-        ax.set_ylim(-2 * limit, 2 * limit)
-    ax.plot(panel.missing, np.zeros(len(panel.missing)), "x", color=MUTED, markersize=4)
+        plot.area((earliest - 0.5, plot.y[0]), (max(latest - 0.5, earliest - 0.45), plot.y[1]), colour, 0.22)
+        plot.line((first - 0.5, plot.y[0]), (first - 0.5, plot.y[1]), colour, 1.2, "4 3")
+    for day, value, sigma in zip(panel.day, panel.value, panel.sigma, strict=True):
+        v, s = scaled(value, panel.dof), scaled(sigma, panel.dof)
+        plot.dot(day, v, colour, f"{day_labels.get(day, '')}: {v:+.3f} ± {s:.3f} {unit}", bar=s)
+    for day in panel.missing:
+        plot.cross(day, 0.0, f"{day_labels.get(day, '')}: held, refused or not determined")
+    if not len(panel.day):
+        plot.text(plot.left + plot.width / 2, plot.top + 26, "not determined", anchor="middle", colour=MUTED)
 
 
-def _plain(ax: Any) -> None:
-    ax.patch.set_alpha(0.0)
-    ax.tick_params(colors=INK, labelsize=_SMALL, length=3)
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        ax.spines[side].set_color(INK)
-    ax.grid(visible=True, color=MUTED, alpha=0.22, linewidth=0.6)
+def _reach(panel: DriftPanel) -> tuple[float, float]:
+    ends = [abs(v) + s for v, s in zip(panel.value, panel.sigma, strict=True)]
+    reach = 1.15 * scaled(max([*ends, panel.limit]), panel.dof)
+    return -reach, reach
+
+
+def _page_units(sigma: np.ndarray, dofs: Sequence[str]) -> list[float]:
+    return [scaled(sigma[DOF_NAMES.index(d)], d) for d in dofs]
+
+
+def _decades(values: Sequence[float]) -> tuple[float, float]:
+    """Range of a log axis with room for bars on the left and numbers on the right."""
+    if not values:
+        return -3.0, 1.0
+    return float(np.log10(min(values))) - 0.5, float(np.log10(max(values))) + 0.9

@@ -193,8 +193,10 @@ def _range_colours(distance_m: np.ndarray) -> list[list[int]]:
 
 
 def _dimmed(image: np.ndarray, brightness: float = 0.7) -> np.ndarray:
+    """Less colour and an even brightness, so that coloured dots stand out on dusk and snow alike."""
     grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
-    return cv2.addWeighted(image, 0.35 * brightness, grey, 0.65 * brightness, 0)
+    gain = float(np.clip(120 * brightness / max(float(grey.mean()), 1.0), 0.6, 1.8))
+    return cv2.addWeighted(image, 0.35 * gain, grey, 0.65 * gain, 0)
 
 
 def _interpolation(scale: float) -> int:

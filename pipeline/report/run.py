@@ -14,7 +14,6 @@ import numpy as np
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.report.day import PairView, answer_for, drift_sentence, pair_view, sigmas_of
-from pipeline.report.encode import svg_inline
 from pipeline.report.figures import drift_figure, residual_figure, sigma_figure
 from pipeline.report.fleet import drift_panels, finding_views, headline_for, vehicle_rows
 from pipeline.report.overlays import Extrinsics, Scene
@@ -22,7 +21,7 @@ from pipeline.report.page import render, write_page
 from pipeline.report.pictures import scene_pictures
 from pipeline.report.residuals import frame_residuals
 from pipeline.report.scenes import choose_frames
-from pipeline.report.truth import truth_rows
+from pipeline.report.truth import truth_rows, truth_summary
 from pipeline.results import Progress, silent
 from pipeline.store.current import current_drift, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
@@ -117,6 +116,7 @@ def write_fleet_page(
     alarmed = {v.vehicle for v in views}
     quiet = [r for r in rows if r.vehicle not in alarmed]
     shown = [r for r in rows if r.vehicle in alarmed] + quiet[:_CHARTS]
+    known = truth_rows(records, truth) if truth else []
     html = render(
         "fleet.html",
         fleet=fleet.fleet.name,
@@ -128,7 +128,8 @@ def write_fleet_page(
         days=days,
         rows=rows,
         dofs=[f"{d} [{'deg' if d.startswith('r') else 'm'}]" for d in DOF_NAMES],
-        truth=truth_rows(records, truth) if truth else [],
+        truth=known,
+        truth_summary=truth_summary(known),
         charts=[_chart(row.vehicle, row.status, records, findings, row.vehicle in alarmed) for row in shown],
         left_out=max(0, len(quiet) - _CHARTS),
         provenance=_fleet_provenance(records, findings),
@@ -220,8 +221,7 @@ def _pictures(
     rows = [o.frame_index for o in chosen]
     frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
     scenes = [Scene(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
-    svg = svg_inline(residuals, "residuals", "Agreement of the sensors in each frame, prior and calibrated")
-    return scene_pictures(scenes, before, after, labels), svg, "no frame of the day could be drawn"
+    return scene_pictures(scenes, before, after, labels), residuals, "no frame of the day could be drawn"
 
 
 def _sigma_svg(records: Mapping[str, CalibrationRecord]) -> str:
@@ -233,7 +233,7 @@ def _sigma_svg(records: Mapping[str, CalibrationRecord]) -> str:
         if after is not None:
             sigma[pair] = after
             observable[pair] = record.observable or [True] * 6
-    return svg_inline(sigma_figure(prior, sigma, observable), "sigmas", "Sigma of each degree of freedom")
+    return sigma_figure(prior, sigma, observable)
 
 
 def _chart(
@@ -246,10 +246,9 @@ def _chart(
     panels = drift_panels(vehicle, records, findings)
     ordinals = {dt.date.fromisoformat(r.day).toordinal(): r.day[5:] for r in records if r.vehicle == vehicle}
     if not panels or not ordinals:
-        svg: Any = "No record in the window."
+        svg: str = "No record in the window."
     else:
-        name = "drift-" + re.sub(r"[^A-Za-z0-9]", "-", vehicle)
-        svg = svg_inline(drift_figure(panels, ordinals), name, f"Control charts of {vehicle}")
+        svg = drift_figure(panels, ordinals, vehicle)
     return {"vehicle": vehicle, "status": status, "svg": svg, "open": alarmed}
 
 

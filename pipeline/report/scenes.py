@@ -14,7 +14,8 @@ from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["choose_frames", "choose_windows"]
 
-_MIN_EDGES = 5  # fewer do not show a silhouette
+_MIN_EDGES = 4  # fewer do not show a silhouette
+_NEAREST_M, _FARTHEST_M = 4.0, 45.0  # nearer fills the window, further is a few pixels
 _REACH_RAD = 0.003  # 0.17 deg, as wide as a mask's boundary is uncertain
 
 
@@ -33,11 +34,7 @@ def choose_windows(observation: Observation, T_camera_lidar: np.ndarray, count: 
     Chosen on the calibrated state, so that before and after show the same window; a window says how well the two states
     agree with the picture only because a person looks at it.
     """
-    uv, distance = _side_edges(observation, T_camera_lidar)
-    near = (distance > 5) & (distance < 40)
-    uv = uv[near]
-    reach = _REACH_RAD * camera_of(observation).focal_px[0]
-    weight = np.where(boundary_distance_px(observation, uv) < reach, 1.0, -0.3)
+    uv, weight = _weighted_edges(observation, T_camera_lidar)
     width = round(observation.image_width_px / 8)
     size = np.array([width, round(width * 0.62)])
     windows: list[Window] = []
@@ -54,17 +51,21 @@ def choose_windows(observation: Observation, T_camera_lidar: np.ndarray, count: 
 
 
 def _richness(observation: Observation, T_camera_lidar: np.ndarray) -> float:
-    edges = len(_side_edges(observation, T_camera_lidar)[0])
+    edges = np.maximum(_weighted_edges(observation, T_camera_lidar)[1], 0).sum()
     users, tracks = len(observation.road_user_boxes_px), len(observation.radar_track_xyz_m)
-    return float(np.sqrt(edges) + 4 * min(users, 6) + 4 * min(tracks, 6))
+    return float(2 * np.sqrt(edges) + 3 * min(users, 6) + 3 * min(tracks, 6))
 
 
-def _side_edges(
+def _weighted_edges(
     observation: Observation, T_camera_lidar: np.ndarray
 ) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, " N"]]:
+    """Near sideways depth jumps in the image: 1 where a silhouette is close, less than 0 where none is."""
     sideways = np.isin(observation.lidar_edge_side, (EDGE_LEFT, EDGE_RIGHT))
     points = transform_points(T_camera_lidar, observation.lidar_edge_xyz_m[sideways].astype(np.float64))
     camera = camera_of(observation)
     uv, valid = camera.project(points)
-    valid &= camera.contains(uv, margin_px=8)
-    return uv[valid], np.linalg.norm(points[valid], axis=1)
+    distance = np.linalg.norm(points, axis=1)
+    valid &= camera.contains(uv, margin_px=8) & (distance > _NEAREST_M) & (distance < _FARTHEST_M)
+    uv = uv[valid]
+    is_near = boundary_distance_px(observation, uv) < _REACH_RAD * camera.focal_px[0]
+    return uv, np.where(is_near, 1.0, -0.15)

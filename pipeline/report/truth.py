@@ -15,7 +15,7 @@ from pipeline.report.words import PAIR_TITLES, scaled
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
 
-__all__ = ["TruthRow", "read_truth", "truth_rows"]
+__all__ = ["TruthRow", "read_truth", "truth_rows", "truth_summary"]
 
 # (vehicle, day) -> pair -> T_parent_child
 Truth = Mapping[tuple[str, str], Mapping[str, np.ndarray]]
@@ -63,6 +63,16 @@ def truth_rows(records: Sequence[CalibrationRecord], truth: Truth) -> list[Truth
         if T_true is not None:
             rows.append(_row(record, T_true))
     return rows
+
+
+def truth_summary(rows: Sequence[TruthRow]) -> str:
+    """How many of the determined axes of accepted days lie within three of their sigmas."""
+    axes = [
+        w for r in rows if r.status == "accepted" for w, d in zip(r.within, r.determined, strict=True) if d
+    ]
+    if not axes:
+        return "no accepted estimate"
+    return f"{sum(axes)} of {len(axes)} determined axes lie within three sigmas"
 
 
 def _row(record: CalibrationRecord, T_true: np.ndarray) -> TruthRow:
