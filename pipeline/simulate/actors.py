@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.simulate.meshes import Mesh, MeshBuilder
+from pipeline.simulate.meshes import Colour, Mesh, MeshBuilder
 
 __all__ = ["ACTOR_KINDS", "CAR_COLOURS", "actor_mesh"]
 
@@ -58,7 +58,7 @@ def _wheels(
             )
 
 
-def _car(b: MeshBuilder, rng: np.random.Generator, colour: tuple[float, float, float]) -> None:
+def _car(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
     length, width, height = rng.uniform(3.8, 4.9), rng.uniform(1.70, 1.90), rng.uniform(1.40, 1.66)
     half, w = length / 2, width / 2
     estate = rng.random() < 0.5
@@ -106,7 +106,7 @@ def _car(b: MeshBuilder, rng: np.random.Generator, colour: tuple[float, float, f
     b.box((half - 0.03, 0, 0.31 * height), (0.08, 0.9, 0.14), "car_tyre")
 
 
-def _van(b: MeshBuilder, rng: np.random.Generator, colour: tuple[float, float, float]) -> None:
+def _van(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
     length, w, height = rng.uniform(5.0, 6.0), 0.98, rng.uniform(2.0, 2.6)
     half = length / 2
     b.frustum((-half, half, -w, w, 0.25), (-half + 0.05, half - 0.15, -w, w, 1.05), "car_paint", colour)
@@ -132,7 +132,7 @@ def _van(b: MeshBuilder, rng: np.random.Generator, colour: tuple[float, float, f
     b.box((-half, 0, 0.65), (0.05, 0.5, 0.11), "car_plate")
 
 
-def _truck(b: MeshBuilder, rng: np.random.Generator, colour: tuple[float, float, float]) -> None:
+def _truck(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
     cargo, w, height = rng.uniform(5.5, 12.0), 1.25, rng.uniform(3.2, 3.9)
     half = (cargo + 2.4) / 2
     cab_start = half - 2.1
@@ -162,7 +162,7 @@ def _truck(b: MeshBuilder, rng: np.random.Generator, colour: tuple[float, float,
     b.box((-half - 0.02, 0, 0.62), (0.10, 2.3, 0.14), "truck_paint", (0.3, 0.3, 0.3))
 
 
-def _bus(b: MeshBuilder, colour: tuple[float, float, float]) -> None:
+def _bus(b: MeshBuilder, colour: Colour) -> None:
     half, w = 5.9, 1.27
     b.frustum((-half, half, -w, w, 0.35), (-half, half, -w, w, 1.25), "bus_paint", colour)
     faces = {"front": "bus_glass", "rear": "bus_glass", "left": "bus_glass", "right": "bus_glass"}

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Final
 
-import numba
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.simulate.actors import VARIANTS, actor_mesh
 from pipeline.simulate.drives import Drive
+from pipeline.simulate.loops import near as rays_near
 from pipeline.simulate.meshes import Mesh, join
 from pipeline.simulate.scenes import CHUNK_M, chunk_mesh
 from pipeline.simulate.traffic import Actor, actors_at
@@ -74,14 +74,14 @@ class World:
             self._chunks = {
                 i: self._chunks.get(i) or chunk_mesh(self.drive, i) for i in range(window[0], window[1] + 1)
             }
-            origin = np.round(self.drive.road.to_map(np.array([s_m, 0.0, 0.0])))
+            origin = np.round(self.drive.road.to_map(np.array([[s_m, 0.0, 0.0]]))[0])
             mesh, road = join(list(self._chunks.values())), self.drive.road
             self._window, self._standing = window, standing_of(mesh, origin, self.drive.sun, road.to_map, s_m)
         return self._standing
 
     def moment(self, t_s: float) -> Moment:
         """The world at a time of the drive."""
-        standing = self.around(float(self.drive.ego.arc(np.array(t_s))))
+        standing = self.around(self.drive.ego.arc(t_s))
         return Moment(standing, actors_at(self.drive, t_s), t_s)
 
 
@@ -153,7 +153,7 @@ class Moment:
             centre = p + R @ proto.centre
             if not _may_be_seen(centre - origins[0], proto.reach_m + 3.0, axis, cosine):
                 continue
-            near = _near(origins, directions, delay, centre, v, np.float32(proto.reach_m), range_m)
+            near = rays_near(origins, directions, delay, centre, v, np.float32(proto.reach_m), range_m)
             if not near.size:
                 continue
             o = (origins[near] - p - v * delay[near, None]) @ R
@@ -224,34 +224,6 @@ def _cast(
     primitive = found["primitive_ids"].numpy()
     triangle = np.where(primitive == _MISS, -1, primitive.astype(np.int64)).astype(np.int32)
     return found["t_hit"].numpy(), triangle, found["primitive_uvs"].numpy()
-
-
-@numba.njit(cache=True)
-def _near(
-    origins: np.ndarray,
-    directions: np.ndarray,
-    delay: np.ndarray,
-    centre: np.ndarray,
-    velocity: np.ndarray,
-    radius: float,
-    limit: np.ndarray,
-) -> np.ndarray:
-    """Rays that pass within `radius` of a moving point, before what they have hit already."""
-    out = np.empty(len(directions), np.int64)
-    n = 0
-    for i in range(len(directions)):
-        x = centre[0] + velocity[0] * delay[i] - origins[i, 0]
-        y = centre[1] + velocity[1] * delay[i] - origins[i, 1]
-        z = centre[2] + velocity[2] * delay[i] - origins[i, 2]
-        along = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
-        if (
-            along > -radius
-            and x * x + y * y + z * z - along * along < radius * radius
-            and along - radius < limit[i]
-        ):
-            out[n] = i
-            n += 1
-    return out[:n]
 
 
 def shadow_map(

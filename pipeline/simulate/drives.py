@@ -82,10 +82,17 @@ class Road:
             )
         return s, x, y, z, heading
 
-    def centre(self, s_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def centre(
+        self, s_m: Float[np.ndarray, "*batch"]
+    ) -> tuple[
+        Float[np.ndarray, "*batch"],
+        Float[np.ndarray, "*batch"],
+        Float[np.ndarray, "*batch"],
+        Float[np.ndarray, "*batch"],
+    ]:
         """(x, y, z [m], heading [rad]) at arc lengths."""
         s, x, y, z, heading = self._table
-        return np.interp(s_m, s, x), np.interp(s_m, s, y), np.interp(s_m, s, z), np.interp(s_m, s, heading)
+        return tuple(np.asarray(np.interp(s_m, s, column)) for column in (x, y, z, heading))
 
     def to_map(self, s_d_h: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Map coordinates of points given along the road (arc length, offset to the left, height above the centre line)."""
@@ -99,7 +106,7 @@ class Road:
         """T_map_thing of something that stands on the road, turned by yaw against its direction."""
         p = self.to_map(np.array([[s_m - 1.0, d_m, h_m], [s_m, d_m, h_m], [s_m + 1.0, d_m, h_m]]))
         grade = np.arctan2(p[2, 2] - p[0, 2], 2.0) * np.cos(yaw_rad)
-        heading = float(self.centre(np.array(s_m))[3]) + yaw_rad
+        heading = float(self.centre(np.array([s_m]))[3][0]) + yaw_rad
         return from_rotation_translation(_rotation(np.array(heading), np.array(-grade), np.array(0.0)), p[1])
 
 
@@ -196,18 +203,12 @@ class EgoMotion:
         d = np.convolve(np.pad(d, 100, mode="edge"), np.hanning(201) / np.hanning(201).sum(), mode="valid")
         return t, s, d, speed
 
-    @property
-    def travelled_m(self) -> float:
-        """Arc length at the end."""
-        return float(self._profile[1][-1])
+    def arc(self, t_s: float) -> float:
+        """Arc length [m] at a time."""
+        return float(np.interp(t_s, self._profile[0], self._profile[1]))
 
-    def arc(self, t_s: np.ndarray) -> np.ndarray:
-        """Arc length [m]."""
+    def _arcs(self, t_s: np.ndarray) -> np.ndarray:
         return np.interp(t_s, self._profile[0], self._profile[1])
-
-    def offset(self, t_s: np.ndarray) -> np.ndarray:
-        """Offset from the centre line [m]."""
-        return np.interp(t_s, self._profile[0], self._profile[2])
 
     def poses(self, t_s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4 4"]:
         """T_map_vehicle at times; the body pitches and rolls on its springs."""
@@ -215,10 +216,10 @@ class EgoMotion:
         before, after = self._ground(t_s - h), self._ground(t_s + h)
         here, step = self._ground(t_s), after - before
         # Standing still there is no direction of travel: fall back to the road's.
-        road_heading = self.road.centre(self.arc(t_s))[3]
+        road_heading = self.road.centre(self._arcs(t_s))[3]
         moving = np.hypot(step[:, 0], step[:, 1]) > 0.2 * h
         heading = np.where(moving, np.arctan2(step[:, 1], step[:, 0]), road_heading)
-        s = self.arc(t_s)
+        s = self._arcs(t_s)
         z = self.road.centre(np.stack([s - 1.3, s + 1.3]))[2]
         grade = np.arctan2(z[1] - z[0], 2.6)
         rough = 0.0035 if self.layout.environment == "urban" else 0.0018
@@ -229,8 +230,10 @@ class EgoMotion:
         return from_rotation_translation(_rotation(heading, pitch, roll), here)
 
     def _ground(self, t_s: np.ndarray) -> np.ndarray:
-        s = self.arc(t_s)
-        return self.road.to_map(np.stack([s, self.offset(t_s), np.zeros_like(s)], -1))
+        s = self._arcs(t_s)
+        return self.road.to_map(
+            np.stack([s, np.interp(t_s, self._profile[0], self._profile[2]), np.zeros_like(s)], -1)
+        )
 
     def velocities(
         self, t_s: Float[np.ndarray, " N"]

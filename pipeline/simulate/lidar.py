@@ -12,7 +12,8 @@ from jaxtyping import Float
 from pipeline.geometry.spherical import from_spherical
 from pipeline.simulate.casting import Hits, Moment
 from pipeline.simulate.drives import Motion
-from pipeline.simulate.materials import LABELS, TABLE, textures
+from pipeline.simulate.loops import textures
+from pipeline.simulate.materials import LABELS, TABLE
 from pipeline.simulate.rigs import LidarSpec
 
 __all__ = ["Sweep", "sweep_lidar"]

@@ -9,7 +9,11 @@ from jaxtyping import Float
 
 from pipeline.simulate.materials import material
 
-__all__ = ["Mesh", "MeshBuilder", "join", "placed"]
+__all__ = ["Colour", "Mesh", "MeshBuilder", "Number", "join", "placed"]
+
+# Integers are numbers too: beartype does not take them for floats.
+Number = float | int
+Colour = tuple[Number, Number, Number]
 
 _WHITE = (1.0, 1.0, 1.0)
 # Corner order of a hexahedron's faces; 0-3 bottom, 4-7 top, each (x0 y0), (x1 y0), (x1 y1), (x0 y1).
@@ -78,7 +82,7 @@ class MeshBuilder:
         self,
         corners: np.ndarray,
         name: str,
-        tint: tuple[float, float, float] = _WHITE,
+        tint: Colour = _WHITE,
         uv: np.ndarray | None = None,
     ) -> None:
         """Add Q quads (Q 4 3); uv (Q 4 2) defaults to lengths along the first and the last edge."""
@@ -103,9 +107,7 @@ class MeshBuilder:
         self._material.append(np.full(n, material(name), np.uint8))
         self._tint.append(np.broadcast_to(np.asarray(tint, np.float32), (n, 3)))
 
-    def hexahedron(
-        self, corners: np.ndarray, faces: dict[str, str], tint: tuple[float, float, float] = _WHITE
-    ) -> None:
+    def hexahedron(self, corners: np.ndarray, faces: dict[str, str], tint: Colour = _WHITE) -> None:
         """Add the named faces (face name -> material) of 8 corners in the order of _FACES."""
         c = np.asarray(corners, np.float32)
         for face, name in faces.items():
@@ -113,10 +115,10 @@ class MeshBuilder:
 
     def frustum(
         self,
-        bottom: tuple[float, float, float, float, float],
-        top: tuple[float, float, float, float, float],
+        bottom: tuple[Number, Number, Number, Number, Number],
+        top: tuple[Number, Number, Number, Number, Number],
         faces: dict[str, str] | str,
-        tint: tuple[float, float, float] = _WHITE,
+        tint: Colour = _WHITE,
     ) -> None:
         """Add a block between two level rectangles (x0, x1, y0, y1, z)."""
         corners = []
@@ -127,10 +129,10 @@ class MeshBuilder:
 
     def box(
         self,
-        centre: tuple[float, float, float],
-        size: tuple[float, float, float],
+        centre: tuple[Number, Number, Number],
+        size: tuple[Number, Number, Number],
         name: str,
-        tint: tuple[float, float, float] = _WHITE,
+        tint: Colour = _WHITE,
     ) -> None:
         """Add an upright box."""
         (x, y, z), (a, b, c) = centre, (size[0] / 2, size[1] / 2, size[2] / 2)
@@ -143,7 +145,7 @@ class MeshBuilder:
         radius_m: float,
         name: str,
         sides: int = 6,
-        tint: tuple[float, float, float] = _WHITE,
+        tint: Colour = _WHITE,
     ) -> None:
         """Add a closed tube from a to b."""
         a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
@@ -165,7 +167,7 @@ class MeshBuilder:
         radii: np.ndarray,
         name: str,
         rng: np.random.Generator,
-        tint: tuple[float, float, float] = _WHITE,
+        tint: Colour = _WHITE,
     ) -> None:
         """Add a lumpy ellipsoid: tree crown, bush, head."""
         lat, lon = np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 10)

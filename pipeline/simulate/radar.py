@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import numba
 import numpy as np
 from jaxtyping import Float
 
@@ -16,6 +15,7 @@ from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import from_spherical, to_spherical
 from pipeline.simulate.casting import Moment
 from pipeline.simulate.drives import Motion
+from pipeline.simulate.loops import unsuppressed
 from pipeline.simulate.materials import LABELS, TABLE, material
 from pipeline.simulate.rigs import RadarSpec
 
@@ -194,19 +194,8 @@ def _peaks(cells: _Cells, size: np.ndarray) -> _Cells:
     """Local maxima: of two detections closer than the resolution in all four dimensions, the weaker one is not seen."""
     strongest = np.argsort(-cells.snr)
     x = (np.concatenate([cells.aer, cells.rate[:, None]], 1) / size)[strongest]
-    keep = strongest[_unsuppressed(x)]
+    keep = strongest[unsuppressed(x)]
     return _Cells(cells.aer[keep], cells.rate[keep], cells.snr[keep], cells.ground[keep], cells.moving[keep])
-
-
-@numba.njit(cache=True)
-def _unsuppressed(x: np.ndarray) -> np.ndarray:
-    keep = np.ones(len(x), np.bool_)
-    for i in range(len(x)):
-        if keep[i]:
-            for j in range(i + 1, len(x)):
-                if np.all(np.abs(x[i] - x[j]) < 1.0):
-                    keep[j] = False
-    return keep
 
 
 def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:

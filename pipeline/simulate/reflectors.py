@@ -22,7 +22,7 @@ from pipeline.simulate.faults import DayFaults
 from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, vehicle_names
 from pipeline.simulate.frames import Scene, SimulatedFrame, frame_of
 from pipeline.simulate.logs import TOPICS, open_log
-from pipeline.simulate.meshes import Mesh, MeshBuilder
+from pipeline.simulate.meshes import Mesh, MeshBuilder, Number
 from pipeline.simulate.recording import nominal_poses, trio
 from pipeline.simulate.rigs import Mounting, rig_named
 
@@ -91,7 +91,7 @@ def _lot() -> Mesh:
     return b.mesh()
 
 
-def _level(x0: float, x1: float, y0: float, y1: float, z: float) -> np.ndarray:
+def _level(x0: Number, x1: Number, y0: Number, y1: Number, z: Number) -> np.ndarray:
     return np.array([[[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]]])
 
 

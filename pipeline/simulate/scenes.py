@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.simulate.actors import VARIANTS, actor_mesh
 from pipeline.simulate.drives import Drive
-from pipeline.simulate.meshes import Mesh, MeshBuilder, join, placed
+from pipeline.simulate.meshes import Colour, Mesh, MeshBuilder, join, placed
 
 __all__ = ["CHUNK_M", "chunk_mesh"]
 
@@ -50,14 +50,14 @@ class _Chunk:
         h1: float,
         name: str,
         step: float = 5.0,
-        tint: tuple[float, float, float] = (1, 1, 1),
+        tint: Colour = (1, 1, 1),
     ) -> None:
         """Add a band along the whole chunk, d0 < d1."""
         self.band(self.s0, self.s0 + CHUNK_M, d0, d1, h0, h1, name, step, tint)
 
     def band(
         self, s0: float, s1: float, d0: float, d1: float, h0: float, h1: float, name: str, step: float = 5.0,
-        tint: tuple[float, float, float] = (1, 1, 1),
+        tint: Colour = (1, 1, 1),
     ) -> None:  # fmt: skip
         """Add a band from s0 to s1."""
         s = np.linspace(s0, s1, max(2, round((s1 - s0) / step) + 1))
@@ -82,7 +82,7 @@ class _Chunk:
         h0: float,
         h1: float,
         name: str,
-        tint: tuple[float, float, float] = (1, 1, 1),
+        tint: Colour = (1, 1, 1),
     ) -> None:
         """Add an upright band."""
         self.band(s0, s1, d, d, h0, h1, name, 10.0, tint)

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import cv2
-import numba
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
 from pipeline.simulate.casting import Moment
+from pipeline.simulate.loops import extents
 from pipeline.simulate.materials import LABELS, TABLE
 
 __all__ = ["Box", "SemanticsSpec", "boxes_of", "encode_png", "label_image", "noisy_boxes", "noisy_labels"]
@@ -40,7 +40,7 @@ _CONFUSED: Final = {
     "rider": "person", "car": "truck", "truck": "car", "bus": "truck", "bicycle": "vegetation", "sky": "building",
 }  # fmt: skip
 _PRONENESS: Final = {
-    "road": 0.12, "sky": 0.02, "sidewalk": 1.6, "building": 0.9, "wall": 6.0, "fence": 5.0, "pole": 2.5, "terrain": 2.5,
+    "road": 0.12, "sky": 0.01, "sidewalk": 1.6, "building": 0.9, "wall": 6.0, "fence": 5.0, "pole": 2.5, "terrain": 2.5,
     "vegetation": 0.8, "car": 0.6, "truck": 4.0, "bus": 3.0, "traffic sign": 2.0, "rider": 3.0, "bicycle": 2.5,
 }  # fmt: skip
 
@@ -126,25 +126,9 @@ def _confused(labels: np.ndarray, share: float, rng: np.random.Generator) -> np.
     for name, factor in _PRONENESS.items():
         proneness[LABELS.index(name)] = factor
     threshold = np.array([np.sqrt(2) * _quantile(min(share * p, 0.45)) for p in proneness], np.float32)
-    field = 0.85 * _field(labels.shape, 30.0, rng) + 0.5 * _field(labels.shape, 10.0, rng)
+    w = labels.shape[1]
+    field = 0.9 * _field(labels.shape, w / 13, rng) + 0.42 * _field(labels.shape, w / 50, rng)
     return np.where(field > threshold[labels], table[labels], labels)
-
-
-@numba.njit(cache=True)
-def _extents(coarse: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """(x0, y0, x1, y1, pixels) of each group of triangles."""
-    out = np.empty((groups, 5), np.int64)
-    out[:, :2], out[:, 2:] = 1 << 30, -1
-    out[:, 4] = 0
-    h, w = coarse.shape
-    for i in range(h):
-        for j in range(w):
-            k = coarse[i, j]
-            if k >= 0 and group[k] >= 0:
-                o = out[group[k]]
-                o[0], o[1], o[2], o[3] = min(o[0], j), min(o[1], i), max(o[2], j), max(o[3], i)
-                o[4] += 1
-    return out
 
 
 def boxes_of(moment: Moment, coarse: Int32[np.ndarray, "h w"]) -> list[tuple[Box, int]]:
@@ -156,7 +140,7 @@ def boxes_of(moment: Moment, coarse: Int32[np.ndarray, "h w"]) -> list[tuple[Box
     group = np.full(len(mesh), -1, np.int64)
     group[bodies] = number
     found = []
-    for key, (x0, y0, x1, y1, pixels) in zip(keys, _extents(coarse, group, len(keys)), strict=True):
+    for key, (x0, y0, x1, y1, pixels) in zip(keys, extents(coarse, group, len(keys)), strict=True):
         if pixels > 0 and LABELS[key % 32] in _COCO:
             # half-size pixel j covers full-size pixels 2j and 2j + 1
             found.append(

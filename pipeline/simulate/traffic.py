@@ -49,7 +49,7 @@ class _Stream:
 
 def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (_BEHIND_M, _AHEAD_M)) -> list[Actor]:
     """Road users from `within_m[0]` behind us to `within_m[1]` ahead."""
-    here = float(drive.ego.arc(np.array(t_s)))
+    here = drive.ego.arc(t_s)
     actors = _leaders(drive, t_s, here, within_m)
     for stream in _streams(drive):
         actors += _members(drive, stream, t_s, here, within_m)
@@ -156,9 +156,9 @@ def _leaders(drive: Drive, t_s: float, here_m: float, within_m: tuple[float, flo
             kind = ("car", "car", "van", "truck", "car")[int(rng.integers(5))]
             variant = int(rng.integers(VARIANTS[kind]))
             t = t_s + sign * headway
-            s = float(drive.ego.arc(np.array(t))) + sign * gap
+            s = drive.ego.arc(t) + sign * gap
             if -within_m[0] <= s - here_m <= within_m[1]:
-                speed = float(drive.ego.arc(np.array(t + 0.05)) - drive.ego.arc(np.array(t - 0.05))) / 0.1
+                speed = (drive.ego.arc(t + 0.05) - drive.ego.arc(t - 0.05)) / 0.1
                 d = drive.layout.lanes_own[0] + float(rng.uniform(-0.2, 0.2))
                 actors.append(
                     _actor(drive, 900_000 + 10 * (sign + 1) + i, kind, variant, s, d, 0.0, speed, 0.0)

@@ -1,0 +1,92 @@
+"""A few simulated frames that the tests of this room share."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag1 import Reader as Bag1
+from rosbags.rosbag2 import Reader as Bag2
+
+from pipeline.simulate.casting import Moment, World
+from pipeline.simulate.drives import Drive
+from pipeline.simulate.frames import Scene, SimulatedFrame, frame_of, scene_of
+from pipeline.simulate.messages import Messages
+from pipeline.simulate.rigs import Mounting, RigSpec, mounting_of, rig_named
+from pipeline.simulate.semantics import SemanticsSpec
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One simulated trio and everything that is known about it."""
+
+    drive: Drive
+    scene: Scene
+    moment: Moment
+    rig: RigSpec
+    mounting: Mounting
+    frame: SimulatedFrame
+
+
+def shots_of(environment, *, rig=None, times=(1.0, 4.0), seed=5, night=False):
+    rig = rig or rig_named("demo")
+    mounting = mounting_of(rig, 3, 0, 0)
+    drive = Drive(seed, environment, 8.0, 0, night)
+    world, scene, shots = World(drive), scene_of(drive), []
+    for t in times:
+        moment = world.moment(t - rig.lidar.sweep_s / 2)
+        frame = frame_of(
+            moment, scene, rig, mounting, t, np.random.default_rng([7, int(10 * t)]), SemanticsSpec()
+        )
+        shots.append(Shot(drive, scene, moment, rig, mounting, frame))
+    return shots
+
+
+@pytest.fixture(scope="session")
+def urban():
+    return shots_of("urban")
+
+
+@pytest.fixture(scope="session")
+def highway():
+    return shots_of("highway")
+
+
+@pytest.fixture(scope="session")
+def shots(urban, highway):
+    return [*urban, *highway]
+
+
+@pytest.fixture(scope="session")
+def flat_shot():
+    rig = rig_named("ring16-flat")
+    small = replace(rig, lidar=replace(rig.lidar, columns=450))
+    return shots_of("urban", rig=small, times=(2.0,))[0]
+
+
+def messages_of(path):
+    one, two = Messages(1).typestore, Messages(2).typestore
+    if path.suffix == ".mcap":
+        with path.open("rb") as file:
+            found = make_reader(file).iter_messages()
+            return [(c.topic, m.log_time, two.deserialize_cdr(m.data, s.name)) for s, c, m in found]
+    with Bag1(path) if path.suffix == ".bag" else Bag2(path) as bag:
+        unpack = one.deserialize_ros1 if path.suffix == ".bag" else two.deserialize_cdr
+        return [(c.topic, t, unpack(raw, c.msgtype)) for c, t, raw in bag.messages()]
+
+
+@pytest.fixture(scope="session")
+def read():
+    """(topic, stamp, message) of a log of any container, by other readers than the pipeline's."""
+    return messages_of
+
+
+@pytest.fixture(scope="session")
+def the_log():
+    """The only log of vehicle-1 in a simulated folder."""
+
+    def find(out: Path):
+        return next((out / "logs" / "vehicle-1").glob("*/*"))
+
+    return find

@@ -1,0 +1,155 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.simulate.faults import Fault, faults_on, parse_faults
+from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day
+from pipeline.simulate.logs import TOPICS
+
+DAYS = ["2026-03-02", "2026-03-03", "2026-03-04"]
+QUIET = {"vehicles": 2, "days": 3, "frames": 1, "drives": 1, "environments": "urban"}
+
+
+def spec_with(*faults):
+    return FleetSpec(**QUIET, faults=faults)
+
+
+def moved_deg(spec, day, pair):
+    """Turn of a pair's true transform against the same day without faults."""
+    T, T0 = (mounting_on(s, 0, day).truth()[pair] for s in (spec, FleetSpec(**QUIET)))
+    return np.degrees(np.linalg.norm(log_so3((T @ inverse(T0))[:3, :3])))
+
+
+def test_a_knocked_radar_moves_its_two_pairs_from_that_day_on_and_no_other():
+    spec = spec_with(Fault("vehicle-1", 1, "radar", "yaw", 1.2))
+    for pair in ("T_lidar_radar", "T_camera_radar"):
+        assert moved_deg(spec, 0, pair) == pytest.approx(0, abs=1e-9)
+        assert moved_deg(spec, 1, pair) == pytest.approx(1.2, abs=1e-6)
+        assert moved_deg(spec, 2, pair) == pytest.approx(1.2, abs=1e-6)
+    assert moved_deg(spec, 2, "T_camera_lidar") == pytest.approx(0, abs=1e-9)
+    other = mounting_on(spec, 1, 2).truth()["T_lidar_radar"]
+    np.testing.assert_array_equal(other, mounting_on(FleetSpec(**QUIET), 1, 2).truth()["T_lidar_radar"])
+
+
+def test_a_slow_drift_grows_day_by_day():
+    spec = spec_with(Fault("vehicle-1", 1, "lidar", "drift-pitch", 0.2))
+    turned = [moved_deg(spec, day, "T_camera_lidar") for day in range(3)]
+    np.testing.assert_allclose(turned, [0.0, 0.2, 0.4], atol=1e-6)
+
+
+def test_a_shift_moves_the_sensor_and_a_late_clock_the_stamps():
+    spec = spec_with(Fault("vehicle-1", 1, "camera", "z", 0.05), Fault("vehicle-1", 1, "radar", "time", 0.03))
+    before, after = (mounting_on(s, 0, 1) for s in (FleetSpec(**QUIET), spec))
+    np.testing.assert_allclose(
+        after.T_vehicle_camera[:3, 3] - before.T_vehicle_camera[:3, 3], [0, 0, 0.05], atol=1e-12
+    )
+    assert after.radar_delay_s - before.radar_delay_s == pytest.approx(0.03)
+
+
+def test_the_daily_remount_is_small_beside_a_knock():
+    spec = FleetSpec(**QUIET | {"days": 20})
+    first = mounting_on(spec, 0, 0).truth()["T_lidar_radar"]
+    turns = [
+        np.degrees(
+            np.linalg.norm(
+                log_so3((mounting_on(spec, 0, d).truth()["T_lidar_radar"] @ inverse(first))[:3, :3])
+            )
+        )
+        for d in range(1, 20)
+    ]
+    assert 0.005 < np.mean(turns) < 0.15
+
+
+@pytest.fixture
+def logged(read, the_log):
+    def run(spec, out):
+        return first_messages(spec, out, read, the_log)
+
+    return run
+
+
+def first_messages(spec, tmp_path, read, the_log):
+    simulate_vehicle_day(spec, 0, 1, tmp_path)
+    found = {}
+    for topic, _, message in read(the_log(tmp_path)):
+        found.setdefault(topic, message)
+    return found, json.loads((tmp_path / "truth" / "vehicle-1" / f"{DAYS[1]}.json").read_text())
+
+
+def decoded(message):
+    return cv2.imdecode(np.asarray(message.data), cv2.IMREAD_UNCHANGED)
+
+
+def test_a_missing_sensor_is_missing_and_the_others_are_not(tmp_path, logged):
+    found, truth = logged(spec_with(Fault("vehicle-1", 1, "lidar", "missing", 1.0)), tmp_path)
+    assert TOPICS["lidar"] not in found
+    assert {TOPICS["image"], TOPICS["radar"]} <= found.keys()
+    assert truth["faults"][0]["kind"] == "missing"
+
+
+def test_swapped_sensors_carry_one_another_s_points(tmp_path, logged):
+    found, _ = logged(spec_with(Fault("vehicle-1", 1, "radar", "swap", 1.0)), tmp_path)
+    assert "doppler" in [f.name for f in found[TOPICS["lidar"]].fields]
+    assert "ring" in [f.name for f in found[TOPICS["radar"]].fields]
+
+
+def test_bad_days_spoil_what_they_say(tmp_path, logged):
+    good, truth = logged(FleetSpec(**QUIET), tmp_path / "good")
+    bad, spoiled = logged(
+        spec_with(
+            Fault("vehicle-1", 1, "camera", "intrinsics", 0.05),
+            Fault("vehicle-1", 1, "camera", "labels", 1.0),
+        ),
+        tmp_path / "bad",
+    )
+    assert bad[TOPICS["info"]].k[0] / good[TOPICS["info"]].k[0] == pytest.approx(1.05)
+    assert spoiled["camera_K"] == truth["camera_K"]
+    np.testing.assert_array_equal(bad[TOPICS["image"]].data, good[TOPICS["image"]].data)
+    assert np.mean(decoded(bad[TOPICS["labels"]]) != decoded(good[TOPICS["labels"]])) > 0.5
+
+
+def test_night_is_dark_and_confuses_the_networks(tmp_path, logged):
+    good, _ = logged(FleetSpec(**QUIET), tmp_path / "day")
+    dark, truth = logged(spec_with(Fault("vehicle-1", 1, "camera", "night", 1.0)), tmp_path / "night")
+    assert decoded(dark[TOPICS["image"]]).mean() < 0.75 * decoded(good[TOPICS["image"]]).mean()
+    assert np.mean(decoded(dark[TOPICS["labels"]]) != decoded(good[TOPICS["labels"]])) > 0.1
+    assert truth["drives"][0]["night"]
+
+
+def test_faults_on_another_day_leave_this_one_alone():
+    faults = (Fault("vehicle-1", 2, "lidar", "missing", 1.0), Fault("vehicle-1", 2, "camera", "few", 3.0))
+    assert faults_on(faults, "vehicle-1", 1).missing == ()
+    assert faults_on(faults, "vehicle-1", 2).missing == ("lidar",)
+    assert faults_on(faults, "vehicle-1", 2).frames == 3
+
+
+def test_faults_are_read_from_text_by_day_or_number():
+    text = "vehicle-2:2026-03-03:radar:yaw:1.2, vehicle-1:0:camera:time:-0.02"
+    first, second = parse_faults(text, DAYS)
+    assert first == Fault("vehicle-2", 1, "radar", "yaw", 1.2)
+    assert second == Fault("vehicle-1", 0, "camera", "time", -0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("vehicle-1:0:radar:yaw", "expected vehicle:day:sensor:kind:amount"),
+        ("vehicle-1:0:radar:wobble:1", "wobble"),
+        ("vehicle-1:0:sonar:yaw:1", "sonar"),
+        ("vehicle-1:7:radar:yaw:1", "day '7'"),
+        ("vehicle-1:0:radar:yaw:much", "much"),
+        ("vehicle-1:0:lidar:time:0.1", "camera or radar"),
+    ],
+)
+def test_a_fault_that_cannot_be_is_refused_with_what_is_wrong(text, names):
+    with pytest.raises(ConfigError, match=names):
+        parse_faults(text, DAYS)
+
+
+def test_a_fault_of_an_unknown_vehicle_is_refused():
+    with pytest.raises(ConfigError, match="vehicle-9"):
+        spec_with(Fault("vehicle-9", 1, "radar", "yaw", 1.2))

@@ -1,0 +1,128 @@
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.config import load_fleet
+from pipeline.errors import ConfigError
+from pipeline.simulate.fleet import FleetSpec, simulate_fleet, simulate_vehicle_day
+from pipeline.simulate.logs import TOPICS
+from pipeline.simulate.reflectors import simulate_reflectors
+
+SMALL = {"vehicles": 1, "days": 1, "frames": 2, "drives": 1, "environments": "urban"}
+
+
+@pytest.fixture(scope="module")
+def mcap_day(tmp_path_factory):
+    out = tmp_path_factory.mktemp("mcap")
+    simulate_fleet(FleetSpec(**SMALL), out)
+    return out
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not(mcap_day, tmp_path, the_log):
+    simulate_vehicle_day(FleetSpec(**SMALL), 0, 0, tmp_path / "again")
+    simulate_vehicle_day(FleetSpec(**SMALL, seed=2), 0, 0, tmp_path / "other")
+    assert the_log(tmp_path / "again").read_bytes() == the_log(mcap_day).read_bytes()
+    assert the_log(tmp_path / "other").read_bytes() != the_log(mcap_day).read_bytes()
+
+
+def test_a_day_comes_out_the_same_whatever_the_size_of_the_fleet(mcap_day, tmp_path, the_log):
+    simulate_vehicle_day(FleetSpec(**SMALL | {"vehicles": 5, "days": 9}), 0, 0, tmp_path)
+    assert the_log(tmp_path).read_bytes() == the_log(mcap_day).read_bytes()
+
+
+@pytest.mark.parametrize("container", ["ros1", "db3"])
+def test_containers_hold_the_same_messages(container, mcap_day, tmp_path, read, the_log):
+    simulate_vehicle_day(FleetSpec(**SMALL, container=container), 0, 0, tmp_path)
+    expected, found = read(the_log(mcap_day)), read(the_log(tmp_path))
+    order = [(topic, stamp) for topic, stamp, _ in expected]
+    assert sorted(order) == sorted((topic, stamp) for topic, stamp, _ in found)
+    by_key = {(topic, stamp): message for topic, stamp, message in found}
+    for topic, stamp, message in expected:
+        other = by_key[topic, stamp]
+        if hasattr(message, "data"):
+            np.testing.assert_array_equal(message.data, other.data)
+        if topic == TOPICS["info"]:
+            np.testing.assert_array_equal(
+                message.k, other.K
+            ) if container == "ros1" else np.testing.assert_array_equal(message.k, other.k)
+        if topic == TOPICS["detections"]:
+            assert [d.bbox.size_x for d in message.detections] == [d.bbox.size_x for d in other.detections]
+
+
+def test_a_log_has_the_topics_of_a_real_one_and_odometry_but_no_truth(mcap_day, read, the_log):
+    messages = read(the_log(mcap_day))
+    assert {topic for topic, _, _ in messages} == set(TOPICS.values())
+    transforms = next(m for topic, _, m in messages if topic == TOPICS["tf"]).transforms
+    truth = json.loads(next((mcap_day / "truth").glob("*/*.json")).read_text())
+    for item in transforms:
+        sensor = {"camera_front_optical": "camera", "lidar_top": "lidar", "radar_front": "radar"}[
+            item.child_frame_id
+        ]
+        logged = np.array(
+            [item.transform.translation.x, item.transform.translation.y, item.transform.translation.z]
+        )
+        assert np.linalg.norm(logged - np.array(truth[f"T_vehicle_{sensor}"])[:3, 3]) > 1e-4
+
+
+def test_stamps_of_a_trio_lie_within_the_gate_of_the_paper(mcap_day, read, the_log):
+    stamps = {
+        key: [t for topic, t, _ in read(the_log(mcap_day)) if topic == TOPICS[key]]
+        for key in ("image", "lidar", "radar")
+    }
+    for key in ("image", "radar"):
+        assert np.abs(np.array(stamps[key]) - np.array(stamps["lidar"])).max() < 5e6
+
+
+def test_the_fleet_file_is_valid_and_names_every_vehicle(tmp_path):
+    spec = FleetSpec(vehicles=2, days=1, frames=1, drives=1, rig="ring16")
+    simulate_fleet(spec, tmp_path)
+    fleet = load_fleet(tmp_path / "fleet.toml")
+    assert set(fleet.vehicles) == {"vehicle-1", "vehicle-2"}
+    assert fleet.rig_of("vehicle-1").radar.doppler_period_mps == 10.394
+    assert fleet.rig_of("vehicle-1").radar.doppler_positive == "approaching"
+
+
+def test_doppler_signs_follow_the_fleet_file(tmp_path, read, the_log):
+    rates = {}
+    for rig in ("demo", "ring16"):
+        out = tmp_path / rig
+        simulate_fleet(FleetSpec(**SMALL | {"frames": 1}, rig=rig), out)
+        clouds = [m for topic, _, m in read(the_log(out)) if topic == TOPICS["radar"]]
+        rows = np.frombuffer(clouds[0].data.tobytes(), [(f.name, "<f4") for f in clouds[0].fields])
+        period = load_fleet(out / "fleet.toml").rig_of("vehicle-1").radar.doppler_period_mps
+        rates[rig] = (rows["doppler"][np.abs(rows["y"]) < 0.3 * rows["x"]], period)
+    # We drive ahead at 5-15 m/s: most of the world comes nearer.
+    assert np.median(rates["demo"][0]) < -2
+    assert np.abs(rates["ring16"][0]).max() <= 10.394 / 2 + 0.1
+
+
+def test_workers_give_what_one_process_gives(mcap_day, tmp_path, the_log):
+    done = []
+    simulate_fleet(
+        FleetSpec(**SMALL), tmp_path, lambda n, total, what: done.append((n, total, what)), workers=2
+    )
+    assert the_log(tmp_path).read_bytes() == the_log(mcap_day).read_bytes()
+    assert done[-1][:2] == (2, 2)
+
+
+@pytest.mark.parametrize(("field", "value"), [("vehicles", 0), ("frames", 0), ("rate_hz", -1.0)])
+def test_an_impossible_fleet_is_refused_by_name(field, value):
+    with pytest.raises(ConfigError, match=field):
+        FleetSpec(**{field: value})
+
+
+def test_reflectors_are_picked_where_all_sensors_agree_under_the_truth(tmp_path, read):
+    spec = FleetSpec(vehicles=1, days=1)
+    path = simulate_reflectors(spec, 0, 0, tmp_path, frames=12)
+    picks = json.loads(path.read_text())
+    lidar, radar, pixels = (
+        np.array([t[k] for t in picks["targets"]]) for k in ("lidar_m", "radar_m", "pixel")
+    )
+    T = np.array(picks["truth"]["T_lidar_radar"])
+    assert len(lidar) == 3
+    offset = np.linalg.norm(radar @ T[:3, :3].T + T[:3, 3] - lidar, axis=1)
+    assert np.all(offset < 0.1 + 0.02 * np.linalg.norm(lidar, axis=1))  # 6 deg of elevation resolution
+    assert np.abs(pixels - np.array(picks["truth"]["pixels"])).max() < 2
+    messages = read(path.with_suffix(".mcap"))
+    assert sum(topic == TOPICS["lidar"] for topic, _, _ in messages) == 12

@@ -1,0 +1,138 @@
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from pipeline.simulate.materials import LABELS
+from pipeline.simulate.radar import RadarErrors, scan_radar
+from pipeline.simulate.rigs import rig_named
+from pipeline.simulate.semantics import Box, SemanticsSpec, noisy_boxes, noisy_labels
+
+
+def test_the_paper_rig_has_the_data_sheet_of_the_paper():
+    rig = rig_named("paper")
+    camera = rig.camera.nominal()
+    assert (camera.width_px, camera.height_px, camera.model) == (1824, 940, "equidistant")
+    edges = camera.unproject(np.array([[-0.5, 469.5], [1823.5, 469.5], [911.5, -0.5], [911.5, 939.5]]))
+    np.testing.assert_allclose(np.degrees(np.arccos(edges[0] @ edges[1])), 116.0, atol=0.1)
+    np.testing.assert_allclose(np.degrees(np.arccos(edges[2] @ edges[3])), 58.5, atol=0.1)
+    assert rig.lidar.columns == 240
+    assert rig.lidar.rows == 96
+    assert (rig.radar.azimuth_resolution_deg, rig.radar.elevation_resolution_deg) == (1.6, 6.0)
+
+
+def test_doppler_is_quantised_and_folded_into_one_period(highway):
+    shot = highway[0]
+    spec = replace(shot.rig.radar, doppler_period_mps=10.394, doppler_step_mps=0.0812)
+    args = (shot.moment, shot.scene.ego, shot.mounting.T_vehicle_radar)
+    folded = scan_radar(*args, spec, RadarErrors(), np.random.default_rng(3))
+    free = scan_radar(*args, replace(spec, doppler_period_mps=None), RadarErrors(), np.random.default_rng(3))
+    assert np.abs(folded.range_rate_mps).max() <= 10.394 / 2 + 0.05
+    assert np.abs(free.range_rate_mps).max() > 12
+    steps = folded.range_rate_mps / 0.0812
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-3)
+
+
+def test_range_and_elevation_errors_are_what_was_asked_for(urban):
+    shot = urban[0]
+    args = (shot.moment, shot.scene.ego, shot.mounting.T_vehicle_radar, shot.rig.radar)
+    plain = scan_radar(*args, RadarErrors(), np.random.default_rng(3))
+    off = scan_radar(*args, RadarErrors(range_bias_m=0.3), np.random.default_rng(3))
+    n = min(len(plain.xyz_m), len(off.xyz_m))
+    shift = np.median(np.linalg.norm(off.xyz_m, axis=1)) - np.median(np.linalg.norm(plain.xyz_m, axis=1))
+    assert n > 50
+    assert abs(shift - 0.3) < 0.15
+
+
+def test_a_radar_without_elevation_reports_none(flat_shot):
+    assert np.all(flat_shot.frame.scan.xyz_m[:, 2] == 0)
+    assert len(flat_shot.frame.scan.xyz_m) > 30
+
+
+def test_sixteen_rings_look_all_around(flat_shot):
+    sweep = flat_shot.frame.sweep
+    azimuth = np.arctan2(sweep.xyz_m[:, 1], sweep.xyz_m[:, 0])
+    assert set(np.unique(sweep.ring)) <= set(range(16))
+    assert np.histogram(azimuth, 8, (-np.pi, np.pi))[0].min() > 50
+    assert sweep.time_s.min() >= -0.1
+    assert sweep.time_s.max() <= 0
+
+
+def test_paint_is_brighter_than_asphalt_to_camera_and_lidar(highway):
+    for shot in highway:
+        road = shot.frame.sweep.label == LABELS.index("road")
+        near = road & (np.linalg.norm(shot.frame.sweep.xyz_m, axis=1) < 18)
+        intensity = shot.frame.sweep.intensity[near]
+        bright = intensity > 25
+        assert 0.01 < bright.mean() < 0.3
+        T_camera_lidar = shot.mounting.truth()["T_camera_lidar"]
+        p = shot.frame.sweep.xyz_m[near] @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+        uv, ok = shot.mounting.camera.project(p)
+        ok &= shot.mounting.camera.contains(uv)
+        image = cv2.imdecode(np.frombuffer(shot.frame.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+        u, v = np.round(uv[ok]).astype(int).T
+        grey = image[v, u].astype(float)
+        assert grey[bright[ok]].mean() > grey[~bright[ok]].mean() + 15
+
+
+def test_edges_of_objects_give_mixed_points(urban):
+    """Some returns lie between two surfaces, so an estimator may not trust each depth jump."""
+    spec = urban[0].rig.lidar
+    sharp = replace(spec, divergence_deg=1e-6)
+    from pipeline.simulate.lidar import sweep_lidar
+
+    args = (urban[0].moment, urban[0].scene.ego, urban[0].mounting.T_vehicle_lidar)
+    end = urban[0].frame.lidar_stamp_s
+    wide = sweep_lidar(*args, spec, end, np.random.default_rng(0))
+    fine = sweep_lidar(*args, sharp, end, np.random.default_rng(0))
+    range_of = [
+        dict(
+            zip(
+                zip(s.ring.tolist(), s.time_s.tolist(), strict=True),
+                np.linalg.norm(s.xyz_m, axis=1),
+                strict=True,
+            )
+        )
+        for s in (wide, fine)
+    ]
+    both = range_of[0].keys() & range_of[1].keys()
+    moved = np.array([abs(range_of[0][k] - range_of[1][k]) for k in both])
+    assert 0.002 < np.mean(moved > 0.25) < 0.2
+
+
+def test_some_beams_never_come_back(urban):
+    spec = urban[0].rig.lidar
+    assert 0.3 < len(urban[0].frame.sweep.ring) / (spec.rows * spec.columns) < 0.99
+
+
+def test_labels_err_as_much_as_was_asked_for(shots):
+    for shot in shots:
+        wrong = []
+        for share in (0.0, 0.05, 0.3):
+            spec = SemanticsSpec(confusion=share)
+            noisy = noisy_labels(shot.frame.true_labels, spec, np.random.default_rng(2))
+            wrong.append(np.mean(noisy != shot.frame.true_labels))
+        assert wrong[0] < 0.08  # boundaries alone
+        assert wrong[0] < wrong[1] < wrong[2]
+        assert wrong[1] < 0.15
+
+
+def test_boxes_are_missed_jittered_and_invented_at_the_stated_rates():
+    rng = np.random.default_rng(4)
+    true = [(Box(100.0, 100.0, 200.0, 180.0, "car", 1.0), 2000)]
+    found = [noisy_boxes(true, (912, 470), SemanticsSpec(false_boxes=0.0), rng) for _ in range(2000)]
+    assert abs(np.mean([not f for f in found]) - 0.04) < 0.015
+    left = np.array([f[0].x0 for f in found if f])
+    assert abs(left.mean() - 100) < 0.3
+    assert 1.5 < left.std() < 3.5
+    invented = [noisy_boxes([], (912, 470), SemanticsSpec(), rng) for _ in range(1000)]
+    assert abs(np.mean([len(f) for f in invented]) - 0.12) < 0.05
+
+
+def test_boxes_hold_the_road_users_of_the_label_image(urban):
+    cars = urban[0].frame.true_labels == LABELS.index("car")
+    covered = np.zeros_like(cars)
+    for box in urban[0].frame.boxes:
+        x0, x1, y0, y1 = (round(v / 2) for v in (box.x0, box.x1, box.y0, box.y1))
+        covered[max(y0, 0) : y1 + 1, max(x0, 0) : x1 + 1] |= box.name in ("car", "truck")
+    assert covered[cars].mean() > 0.7

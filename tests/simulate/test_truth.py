@@ -1,0 +1,144 @@
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.geometry.se3 import exp_so3, inverse, transform_points
+from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.simulate.casting import _cast
+from pipeline.simulate.materials import LABELS
+from pipeline.simulate.radar import RadarErrors, scan_radar
+
+MOVERS = [LABELS.index(n) for n in ("person", "rider", "car", "truck", "bus", "bicycle")]
+
+
+def points_in_map(shot, own_time=True):
+    """Lidar points in the map: from where the vehicle was when each beam fired, or from where it was at the end."""
+    sweep, end = shot.frame.sweep, shot.frame.lidar_stamp_s
+    times, column = np.unique(sweep.time_s, return_inverse=True)
+    T = shot.scene.ego.poses(end + (times if own_time else np.zeros_like(times)).astype(np.float64))
+    T = (T @ shot.mounting.T_vehicle_lidar)[column]
+    return np.einsum("nij,nj->ni", T[:, :3, :3], sweep.xyz_m.astype(np.float64)) + T[:, :3, 3]
+
+
+def share_on_own_class(shot, turn_rad=0.0):
+    """Share of standing lidar points that the true transforms put on their own class of the label image."""
+    exposure_s = shot.frame.camera_stamp_s - shot.mounting.camera_delay_s
+    T_map_camera = shot.scene.ego.poses(np.array([exposure_s]))[0] @ shot.mounting.T_vehicle_camera
+    T_map_camera[:3, :3] = T_map_camera[:3, :3] @ exp_so3(np.array([0.0, turn_rad, 0.0]))
+    keep = ~np.isin(shot.frame.sweep.label, MOVERS)
+    uv, ok = shot.mounting.camera.project(transform_points(inverse(T_map_camera), points_in_map(shot)[keep]))
+    ok &= shot.mounting.camera.contains(uv)
+    u, v = ((uv[ok] + 0.5) / 2).astype(int).T
+    return np.mean(shot.frame.true_labels[v, u] == shot.frame.sweep.label[keep][ok])
+
+
+def test_lidar_points_fall_on_their_own_class_in_the_image_under_the_true_transforms(shots):
+    for shot in shots:
+        assert share_on_own_class(shot) > 0.95
+        assert share_on_own_class(shot, np.radians(1.0)) < share_on_own_class(shot) - 0.01
+
+
+def test_each_beam_is_fired_from_where_the_vehicle_was_at_that_time(shots):
+    """Points put into the map at their own times lie on the meshes; all put there at one time, far more do not."""
+    off, off_at_one_time = [], []
+    for shot in shots:
+        standing = shot.moment.standing
+        hard = ~np.isin(shot.frame.sweep.label, [*MOVERS, LABELS.index("vegetation")])
+        T = (
+            shot.scene.ego.poses(np.array([shot.frame.lidar_stamp_s - 0.04]))[0]
+            @ shot.mounting.T_vehicle_lidar
+        )
+        origin = (T[:3, 3] - standing.origin).astype(np.float32)
+        for own_time, shares in ((True, off), (False, off_at_one_time)):
+            rays = (points_in_map(shot, own_time)[hard] - standing.origin).astype(np.float32) - origin
+            length = np.linalg.norm(rays, axis=1)
+            hit, _, _ = _cast(standing.scene, np.tile(origin, (len(rays), 1)), rays / length[:, None])
+            shares.append(np.mean(np.abs(hit - length) > 0.3))
+    assert np.mean(off) < 0.04
+    assert np.mean(off_at_one_time) > 2 * np.mean(off)
+
+
+def static_radar(shot, spec=None):
+    """A scan without constant errors, its vehicle pose and radar velocity (in the radar frame)."""
+    t = shot.moment.t_s
+    rng = np.random.default_rng(11)
+    spec = spec or shot.rig.radar
+    scan = scan_radar(shot.moment, shot.scene.ego, shot.mounting.T_vehicle_radar, spec, RadarErrors(), rng)
+    T = shot.scene.ego.poses(np.array([t]))[0] @ shot.mounting.T_vehicle_radar
+    velocity, omega = (v[0] for v in shot.scene.ego.velocities(np.array([t])))
+    lever = T[:3, 3] - shot.scene.ego.poses(np.array([t]))[0][:3, 3]
+    return scan, T, T[:3, :3].T @ (velocity + np.cross(omega, lever))
+
+
+def test_standing_detections_approach_as_fast_as_the_radar_moves(shots):
+    for shot in shots:
+        scan, _, velocity = static_radar(shot)
+        standing = scan.origin == 0
+        direction = scan.xyz_m[standing] / np.linalg.norm(scan.xyz_m[standing], axis=1, keepdims=True)
+        residual = scan.range_rate_mps[standing] + direction @ velocity
+        period = shot.rig.radar.doppler_period_mps
+        residual = (residual + period / 2) % period - period / 2
+        assert np.sum(standing) > 40
+        # Doppler noise, and the direction's error times the speed.
+        assert np.median(np.abs(residual)) < 0.12 + 0.01 * np.linalg.norm(velocity)
+
+
+def test_moving_detections_do_not_fit_the_standing_world(highway):
+    scan, _, velocity = static_radar(highway[1])
+    moving = scan.origin == 1
+    direction = scan.xyz_m[moving] / np.linalg.norm(scan.xyz_m[moving], axis=1, keepdims=True)
+    assert np.median(np.abs(scan.range_rate_mps[moving] + direction @ velocity)) > 2.0
+
+
+def test_standing_radar_detections_lie_on_what_the_lidar_sees(shots):
+    for shot in shots:
+        scan, T_map_radar, _ = static_radar(shot)
+        T_map_lidar = shot.scene.ego.poses(np.array([shot.moment.t_s]))[0] @ shot.mounting.T_vehicle_lidar
+        aer = to_spherical(
+            transform_points(inverse(T_map_lidar) @ T_map_radar, scan.xyz_m[scan.origin == 0].astype(float))
+        )
+        aer = aer[(np.abs(aer[:, 0]) < 0.45) & (aer[:, 1] > -0.22) & (aer[:, 1] < 0.12) & (aer[:, 2] < 45)]
+        cloud = transform_points(inverse(T_map_lidar), points_in_map(shot))
+        nearest = np.linalg.norm(from_spherical(aer)[:, None] - cloud[None], axis=2).min(axis=1)
+        assert len(nearest) > 15
+        assert np.median(nearest) < 0.6
+
+
+def test_truth_is_one_consistent_triangle(urban):
+    truth = urban[0].mounting.truth()
+    loop = truth["T_camera_lidar"] @ truth["T_lidar_radar"] @ inverse(truth["T_camera_radar"])
+    np.testing.assert_allclose(loop, np.eye(4), atol=1e-12)
+
+
+def test_the_nominal_mounting_is_off_by_a_degree_or_so_but_not_more():
+    from pipeline.geometry.se3 import rotation_angle_rad
+    from pipeline.simulate.rigs import mounting_of, rig_named
+
+    off = []
+    for vehicle in range(12):
+        m = mounting_of(rig_named("demo"), 1, vehicle, 0)
+        nominal = inverse(m.nominal_T_vehicle_camera) @ m.nominal_T_vehicle_lidar
+        off.append(np.degrees(rotation_angle_rad(inverse(nominal) @ m.truth()["T_camera_lidar"])))
+    assert 0.5 < np.mean(off) < 2.5
+    assert np.max(off) < 5.0
+
+
+def test_an_image_shows_a_street(shots):
+    for shot in shots:
+        image = cv2.imdecode(np.frombuffer(shot.frame.jpeg, np.uint8), cv2.IMREAD_COLOR)
+        assert image.shape == (470, 912, 3)
+        assert 60 < image.mean() < 200
+        assert image.std() > 30
+        sky, road = (shot.frame.true_labels == LABELS.index(n) for n in ("sky", "road"))
+        assert sky.mean() > 0.05
+        assert road.mean() > 0.08
+        half = cv2.resize(image, sky.shape[::-1], interpolation=cv2.INTER_AREA)
+        assert half[sky].mean() > half[road].mean() + 40
+        assert len(np.unique(shot.frame.true_labels)) >= 6
+
+
+@pytest.mark.parametrize("environment", ["urban", "highway"])
+def test_frames_offer_what_the_paper_selects_by(environment, request):
+    shots = request.getfixturevalue(environment)
+    assert np.mean([len(s.frame.boxes) for s in shots]) >= 3
+    assert np.mean([np.sum(s.frame.scan.origin == 1) for s in shots]) >= 3
