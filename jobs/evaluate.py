@@ -27,8 +27,9 @@ def evaluate(
     Args:
         lake: folder of the tables.
         truth: JSON with T_camera_lidar and T_lidar_radar (4x4), or a folder with VEHICLE/DAY.json.
-        reflectors: JSON of reflector positions as picked in each sensor's data, instead of a truth: {"camera": {model,
-            K, D, width_px, height_px}, "targets": [{"pixel": [u, v], "lidar_m": [x, y, z], "radar_m": [x, y, z]}]}.
+        reflectors: JSON of reflector positions as picked in each sensor's data, instead of a truth:
+            {"camera": {model, K, D, width_px, height_px}, "targets": [{"pixel": [u, v], "lidar_m": [x, y, z],
+            "radar_m": [x, y, z]}]}.
         method: only this method's records.
         out: Markdown file to write; the table goes to stderr in any case.
     """

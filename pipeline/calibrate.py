@@ -1,6 +1,7 @@
 """Stage calibrate: observations of one vehicle-day to one calibration record per pair.
 
-The only module that brings solve and verify together: select, trigger, solve, judge on held-out frames, record.
+The only module that brings solve and verify together: select, trigger, solve, judge on held-out frames,
+record.
 """
 
 from __future__ import annotations
@@ -52,9 +53,9 @@ def calibrate_day(
         fleet: configuration.
         lake: where observations lie and records go.
         method: one of `pipeline.solve.methods.METHOD`.
-        perturb: exact angle [deg] and shift [m] by which the prior is moved on purpose, for tests: T_camera_lidar and
-            T_lidar_radar independently, about a random axis and in a random direction. The prior's sigmas are then no
-            smaller than these two numbers.
+        perturb: exact angle [deg] and shift [m] by which the prior is moved on purpose, for tests:
+            T_camera_lidar and T_lidar_radar independently, about a random axis and in a random direction. The
+            prior's sigmas are then no smaller than these two numbers.
         seed: of everything random; None = `solve.seed`.
         progress: told how far it is.
         fleet_file: file that a prior's path is relative to.
@@ -91,9 +92,7 @@ def calibrate_day(
     prior: Prior | None = None
     rows: list[Observation] = []
     try:
-        if observations is None:
-            raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
-        rows = read_rows(lake, OBSERVATIONS, partition, Observation)
+        rows = _observations(lake, partition)
         prior = perturbed(read_prior(rows, rig.prior, fleet_file), perturb, seed)
         records = calibrate_observations(rows, prior, fleet, about, progress)
     except SolveError as err:
@@ -115,8 +114,7 @@ def calibrate_observations(
         SolveError: the day cannot be calibrated.
     """
     progress(0, 4, "select frames")
-    is_paper = about.method in PAPER_METHODS
-    selection = select_frames(observations, fleet.select, paper=is_paper)
+    selection = select_frames(observations, fleet.select, paper=about.method in PAPER_METHODS)
     frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in PAIRS}
     sample = _spread(observations, selection)
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in PAIRS})
@@ -138,7 +136,7 @@ def calibrate_observations(
     records = []
     for pair in PAIRS:
         held = [observations[i] for i in selection.holdout[pair]]
-        test = _held_out_test(pair, held, prior, solution, is_paper=is_paper, fleet=fleet)
+        test = _held_out_test(pair, held, prior, solution)
         verdict = judge(
             solution.pairs[pair],
             prior.of(pair),
@@ -158,20 +156,20 @@ def calibrate_observations(
     return records
 
 
+def _observations(lake: Lake, partition: Partition) -> list[Observation]:
+    if read_manifest(lake, OBSERVATIONS, partition) is None:
+        raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
+    return read_rows(lake, OBSERVATIONS, partition, Observation)
+
+
 def _held_out_test(
-    pair: str,
-    held: Sequence[Observation],
-    prior: Prior,
-    solution: Solution,
-    *,
-    is_paper: bool,
-    fleet: FleetConfig,
+    pair: str, held: Sequence[Observation], prior: Prior, solution: Solution
 ) -> HeldOutTest | None:
-    """Alignment of held-out frames at prior and result, with the result's time offset at both: the poses are compared."""
+    """Alignment of held-out frames at prior and result, the result's time offset at both: poses are compared."""
     if not held:
         return None
     estimate = solution.pairs[pair]
-    cost = alignment_of(pair, held, prior, fleet.solve, paper=is_paper)
+    cost = alignment_of(pair, held, prior)
     dt_s = estimate.time_offset_s or 0.0
     return paired_test(cost(prior.of(pair), dt_s), cost(estimate.T, dt_s), blocks_of(held, at_least=2))
 

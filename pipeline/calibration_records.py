@@ -94,8 +94,8 @@ def refused_records(about: Inputs, reason: str, frames: int, prior: Prior | None
 def environment_of(observations: Sequence[Observation]) -> str:
     """Highway, urban, mixed or unknown, from the speeds of the moving frames.
 
-    More than 70 % of them at 20 m/s or more is a highway, less than 30 % a town; a traffic jam on a highway passes for
-    a town. Unknown where less than half of the frames have a speed or none moves.
+    More than 70 % of them at 20 m/s or more is a highway, less than 30 % a town; a traffic jam on a highway
+    passes for a town. Unknown where less than half of the frames have a speed or none moves.
     """
     speeds = np.array([abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None])
     moving = speeds[speeds > _MOVING_MPS]

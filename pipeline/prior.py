@@ -41,8 +41,8 @@ def read_prior(observations: Sequence[Observation], config: PriorConfig, fleet_f
 def perturbed(prior: Prior, perturb: tuple[float, float] | None, seed: int) -> Prior:
     """The prior moved by an exact angle [deg] and shift [m] on both transforms, with sigmas that allow for it.
 
-    The sigmas become max(configured sigma, size of the perturbation): whoever moves a prior on purpose knows how far, as a
-    workshop knows its tolerance, but not which way.
+    The sigmas become max(configured sigma, size of the perturbation): whoever moves a prior on purpose knows
+    how far, as a workshop knows its tolerance, but not which way.
     """
     if perturb is None:
         return prior

@@ -1,7 +1,7 @@
 """Small days of observations with a known truth, for the tests of objective, solve, verify and calibrate.
 
-Boxes on a road, seen exactly by all three sensors: no noise model, for these tests ask whether losses and optimiser do what
-they should, not how well they do on the road.
+Boxes on a road, seen exactly by all three sensors: no noise model, for these tests ask whether losses and
+optimiser do what they should, not how well they do on the road.
 """
 
 import cv2
@@ -67,7 +67,7 @@ def make_observation(
         "road_user_scores": np.ones(n, np.float32), "road_contrast_png": None,
         "lidar_map_xyz_m": cloud.astype(np.float32),
         "lidar_map_is_ground": np.r_[np.zeros(len(cloud) - 300), np.ones(300)].astype(np.uint8),
-        "lidar_map_cluster": np.r_[np.repeat(np.arange(n), [len(c) for c in clusters]), np.full(300, -1)].astype(np.int32),
+        "lidar_map_cluster": np.r_[np.repeat(np.arange(n), len(clusters[0])), np.full(300, -1)].astype(np.int32),
         "lidar_cluster_centre_m": centres.astype(np.float32),
         "lidar_cluster_min_m": (centres - HALF_SIZE_M).astype(np.float32),
         "lidar_cluster_max_m": (centres + HALF_SIZE_M).astype(np.float32),

@@ -1,11 +1,12 @@
 """Cost of projected points in folded cost maps, for many poses at once: value, gradient, Gauss-Newton matrix.
 
 A frame's cost map already holds robust distance, sky penalty and whatever else a pixel can say ("folded"), as
-one byte per pixel; the four bytes that bilinear interpolation needs lie in one 32-bit word ("quad"), so a point
-costs one gather. Points outside the image, or behind the camera, cost the out-of-view penalty.
+one byte per pixel; the four bytes that bilinear interpolation needs lie in one 32-bit word ("quad"), so a
+point costs one gather. Points outside the image, or behind the camera, cost the out-of-view penalty.
 
-Two projections: pinhole, and `u = cx + fx k(1 - c) x / |p|` with `c = z / |p|` and a polynomial `k`, which covers
-f-theta and Kannala-Brandt as well as radial distortion. Tangential distortion is moved into the map (`fold_map`).
+Two projections: pinhole, and `u = cx + fx k(1 - c) x / |p|` with `c = z / |p|` and a polynomial `k`, which
+covers f-theta and Kannala-Brandt as well as radial distortion. Tangential distortion is moved into the map
+(`fold_map`).
 
 Order of loops: frame, tile of points, pose, point. A tile stays in the L1 cache while all poses pass over it.
 """
@@ -35,7 +36,7 @@ _f4 = np.float32
 
 @dataclass(frozen=True, eq=False)
 class FoldedFrames:
-    """Points and folded maps of several frames, laid out for the kernel (structure of arrays, frames one after another)."""
+    """Points and folded maps of several frames, laid out for the kernel (structure of arrays, frame after frame)."""
 
     x_m: Float32[np.ndarray, " N"]
     y_m: Float32[np.ndarray, " N"]
@@ -62,7 +63,7 @@ class FoldedFrames:
 
 
 def pack_quads(bytes_map: UInt8[np.ndarray, "H W"]) -> UInt32[np.ndarray, "H W"]:
-    """Each pixel's byte with those of its right, lower and lower right neighbour (0 beyond the border, where they weigh 0)."""
+    """Each pixel's byte with those of its right, lower and lower right neighbour (0 beyond the border: no weight)."""
     q = bytes_map.astype(np.uint32)
     q[:, :-1] |= bytes_map[:, 1:].astype(np.uint32) << 8
     q[:-1] |= bytes_map[1:].astype(np.uint32) << 16
@@ -148,9 +149,9 @@ def frame_gradients(
 ) -> tuple[Float[np.ndarray, "P F"], Float[np.ndarray, "P F 6"], Float[np.ndarray, "P F 6 6"]]:
     """Costs as `frame_costs`, gradients for a left perturbation (rotation vector, translation), Gauss-Newton matrices.
 
-    The Gauss-Newton residual of a point is the root of its cost c, so its matrix is `g g^T / (2 c)`, with c no
-    smaller than one byte of the map. The matrix is positive semidefinite and vanishes where all points cost nothing:
-    damp the steps (Levenberg-Marquardt).
+    The Gauss-Newton residual of a point is the root of its cost c, so its matrix is `g g^T / (2 c)`, with c
+    no smaller than one byte of the map. The matrix is positive semidefinite and vanishes where all points
+    cost nothing: damp the steps (Levenberg-Marquardt).
     """
     terms = np.zeros((len(T_camera_points), frames.frames, 28))
     poses = np.ascontiguousarray(T_camera_points[:, :3, :], dtype=np.float32).reshape(-1, 12)

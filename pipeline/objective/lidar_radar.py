@@ -1,8 +1,8 @@
 """The paper's lidar-radar loss: drivable areas overlap, and tracked clusters lie at lidar clusters' centres.
 
-Per frame: `1 - IoU` of the lidar's drivable cells (1 m2 each), seen from the radar, with the radar's drivable area, plus the
-mean over tracked clusters of `d^2 / (d^2 + s^2)`, d = distance to the nearest lidar cluster centre, s = 2 m. The IoU is
-smooth because the radar's area fades out over about 2 m.
+Per frame: `1 - IoU` of the lidar's drivable cells (1 m2 each), seen from the radar, with the radar's drivable
+area, plus the mean over tracked clusters of `d^2 / (d^2 + s^2)`, d = distance to the nearest lidar cluster
+centre, s = 2 m. The IoU is smooth because the radar's area fades out over about 2 m.
 
 Source: section 4.3.
 """

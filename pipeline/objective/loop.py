@@ -1,7 +1,7 @@
 """The paper's global loss and how it joins the pairwise ones: `(1 + L_P)(1 + L_G)`.
 
-Source: sections 4.4 and 4.5.3, equations 1 and 2. The paper writes T_lidar^camera T_radar^lidar T_camera^radar; in the
-house's names that is T_camera_lidar T_lidar_radar T_camera_radar^-1.
+Source: sections 4.4 and 4.5.3, equations 1 and 2. The paper writes T_lidar^camera T_radar^lidar
+T_camera^radar; in the house's names that is T_camera_lidar T_lidar_radar T_camera_radar^-1.
 """
 
 from __future__ import annotations

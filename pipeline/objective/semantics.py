@@ -25,8 +25,8 @@ __all__ = [
 ]
 
 ROAD, SKY = 0, 10  # Cityscapes train ids
-# Paper, section 4.3: "vehicles, pedestrians, signs, poles, buildings, fences, and vegetation"; walls and traffic
-# lights go with fences and signs.
+# Paper, section 4.3: "vehicles, pedestrians, signs, poles, buildings, fences, and vegetation"; walls and
+# traffic lights go with fences and signs.
 REFLECTING = np.array([2, 3, 4, 5, 6, 7, 8, 11, 12, 13, 14, 15, 16, 17, 18], np.uint8)
 
 
@@ -66,9 +66,9 @@ def safely_in_view(
 ) -> Bool[np.ndarray, " N"]:
     """True for points inside the image by a margin: an angle, but at most a quarter of the image's half extent.
 
-    The paper's lidar and radar see less than its camera, so all of their points must fall into the image. Where a
-    sensor sees more (a 360 deg lidar), only points that stay in view when the prior is off by the margin may be
-    asked to; else the out-of-view penalty pulls the pose.
+    The paper's lidar and radar see less than its camera, so all of their points must fall into the image.
+    Where a sensor sees more (a 360 deg lidar), only points that stay in view when the prior is off by the
+    margin may be asked to; else the out-of-view penalty pulls the pose.
     """
     uv, valid = camera.project(points_camera)
     size = np.array([camera.width_px, camera.height_px])

@@ -1,4 +1,9 @@
-"""Alignment costs of frames at a pose: what held-out frames are judged by."""
+"""Alignment costs of frames at a pose: what held-out frames are judged by, whatever the method.
+
+The judge is the same for all methods: the sharp edges and road markings of method `joint` for camera-lidar,
+its registration likelihood for lidar-radar, azimuths of tracked clusters against road users' boxes for
+camera-radar. The paper's losses can't judge: their minimum lies off the truth.
+"""
 
 from __future__ import annotations
 
@@ -6,33 +11,35 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pipeline.config import SolveConfig
+from pipeline.objective.camera_radar import azimuth_cost
 from pipeline.objective.problem import Prior
-from pipeline.solve.pairwise import pair_problem
+from pipeline.solve.camera_lidar import camera_lidar_cost
+from pipeline.solve.lidar_radar import lidar_radar_cost
 from schemas.observations import Observation
 
 __all__ = ["Alignment", "alignment_of"]
 
-# (T of the pair, time offset of the pair [s]) -> cost per frame, NaN where a frame cannot tell; lower is better.
+# (T of the pair, time offset of the pair [s]) -> cost per frame, NaN where a frame cannot tell; lower is
+# better.
 Alignment = Callable[[np.ndarray, float], np.ndarray]
 
 
-def alignment_of(
-    pair: str, observations: Sequence[Observation], prior: Prior, config: SolveConfig, *, paper: bool
-) -> Alignment:
-    """The alignment cost of frames that took no part in the fit, prepared once for several poses.
+def alignment_of(pair: str, observations: Sequence[Observation], prior: Prior) -> Alignment:
+    """The alignment cost of frames that took no part in the fit.
 
     Args:
         pair: camera_lidar, camera_radar or lidar_radar.
         observations: the held-out frames.
-        prior: decides which points are in view.
-        config: search range.
-        paper: judge by the paper's loss; it knows no time offset.
+        prior: turns the radar's own velocity into lidar axes, for time offsets.
     """
-    problem = pair_problem(pair, observations, prior, config)
-    del paper
 
-    def cost(T: np.ndarray, _dt_s: float) -> np.ndarray:
-        return np.where(problem.informative, problem.frame_losses(T[None])[0], np.nan)
+    def camera_lidar(T: np.ndarray, dt_s: float) -> np.ndarray:
+        return camera_lidar_cost(observations, T, dt_s, T_lidar_radar=prior.T_lidar_radar)
 
-    return cost
+    def lidar_radar(T: np.ndarray, dt_s: float) -> np.ndarray:
+        return lidar_radar_cost(observations, T, dt_s)
+
+    def camera_radar(T: np.ndarray, _dt_s: float) -> np.ndarray:
+        return azimuth_cost(observations, T)
+
+    return {"camera_lidar": camera_lidar, "lidar_radar": lidar_radar, "camera_radar": camera_radar}[pair]

@@ -1,9 +1,9 @@
-"""Covariance of a minimum of the paper's losses: block sandwich from curvature and the scatter of the drives' gradients.
+"""Covariance of a minimum of the paper's losses: block sandwich from curvature and the scatter of gradients.
 
-The paper gives no uncertainty. The sandwich `H^-1 S H^-1` (H: curvature of the mean loss, S: scatter of the gradients
-over blocks of frames that share a scene) is what resampling whole blocks converges to, at the price of a few
-evaluations; its inverse is added to the prior's information. It knows nothing of bias, and these losses are biased (their minimum lies below the truth's value): a floor measured in
-simulation is added.
+The paper gives no uncertainty. The sandwich `H^-1 S H^-1` (H: curvature of the mean loss, S: scatter of the
+gradients over blocks of frames that share a scene) is what resampling whole blocks converges to, at the price
+of a few evaluations; its inverse is added to the prior's information. It knows nothing of bias, and these
+losses are biased (their minimum lies below the truth's value): a floor measured in simulation is added.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from schemas.observations import Observation
 
 __all__ = ["BIAS_FLOOR", "blocks_of", "sandwich_covariance"]
 
-# Largest RMS over axes of the paper's losses at their minimum, 100 simulated frames a day, 4 days (method evidence,
-# section 2): rotation [rad], translation [m].
+# Largest RMS over axes of the paper's losses at their minimum, 100 simulated frames a day, 4 days (method
+# evidence, section 2): rotation [rad], translation [m].
 BIAS_FLOOR = {
     "camera_lidar": (np.radians(0.33), 0.06),
     "camera_radar": (np.radians(0.56), 0.11),

@@ -80,8 +80,8 @@ def joint_costs(
 ) -> Float[np.ndarray, " S"]:
     """Equation 2 for a batch of parameter vectors, six numbers per pair of `scales` about its prior.
 
-    Each pair's loss is divided by its scale, the value of its pairwise minimum: the paper names no weights, and unweighted
-    the pair with the largest unexplained rest, not the best determined one, would decide.
+    Each pair's loss is divided by its scale, the value of its pairwise minimum: the paper names no weights,
+    and unweighted the pair with the largest unexplained rest, not the best determined one, would decide.
     """
     poses = {pair: np.broadcast_to(prior.of(pair), (len(x), 4, 4)) for pair in PAIRS}
     for k, pair in enumerate(scales):

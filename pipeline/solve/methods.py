@@ -1,4 +1,4 @@
-"""Calibration methods by name: import paths, resolved when a method is used, so that torch loads only where it is needed."""
+"""Calibration methods by name: import paths, resolved on use, so that torch loads only where it is needed."""
 
 from __future__ import annotations
 

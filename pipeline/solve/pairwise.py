@@ -1,4 +1,4 @@
-"""Method `pairwise-optimisation`: each pair alone minimises the paper's loss, by differential evolution and Nelder-Mead.
+"""Method `pairwise-optimisation`: each pair alone minimises the paper's loss.
 
 Source: sections 4.3 and 4.5.3, the row "pairwise optimization" of Table 1.
 """

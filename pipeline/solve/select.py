@@ -1,11 +1,13 @@
 """Which frames a calibration is made from, which ones judge it, and why the others are not used.
 
-The paper's conditions (section 4.5.1) per pair, read as: camera-lidar needs sky, drivable area and road users; camera-radar
-needs sky, road users and dynamic radar clusters; lidar-radar needs drivable area and dynamic clusters; all need stamps
-within 5 ms. Where they leave fewer frames than a calibration takes, the frames that come nearest to them fill up, and
-the selection says so: a narrow camera may never see 20 % of sky.
+The paper's conditions (section 4.5.1) per pair, read as: camera-lidar needs sky, drivable area and road
+users; camera-radar needs sky, road users and dynamic radar clusters; lidar-radar needs drivable area and
+dynamic clusters; all need stamps within 5 ms. Where they leave fewer frames than a calibration takes, the
+frames that come nearest to them fill up, and the selection says so: a narrow camera may never see 20 % of
+sky.
 
-Method `joint` does not need the paper's conditions; there they are only counted, and frames are chosen by content.
+Method `joint` does not need the paper's conditions; there they are only counted, and frames are chosen by
+content.
 """
 
 from __future__ import annotations
@@ -114,8 +116,8 @@ def unmet_conditions(
 def hold_out(observations: Sequence[Observation], fraction: float) -> list[bool | None]:
     """Split a day into blocks of time: True = judges, False = fits, None = too near in time to a frame of the fit.
 
-    Every k-th block (k = 1/fraction) judges, so that both parts see all of the day; blocks are at most 10 s long and
-    never cross a drive.
+    Every k-th block (k = 1/fraction) judges, so that both parts see all of the day; blocks are at most 10 s
+    long and never cross a drive.
     """
     if not observations:
         return []
@@ -171,9 +173,8 @@ def _count_rejected(
 
 def _notes(pair: str, passed: int, below: Sequence[int], chosen: int, *, paper: bool) -> list[str]:
     if paper and below:
-        return [
-            f"the paper's frame conditions hold for {passed} frames of {pair}; {len(below)} of the {chosen} frames used are below them"
-        ]
+        kept = f"the paper's frame conditions hold for {passed} frames of {pair}"
+        return [f"{kept}; {len(below)} of the {chosen} frames used are below them"]
     return []
 
 

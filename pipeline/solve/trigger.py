@@ -1,7 +1,7 @@
 """The paper's signs of misalignment (section 4.5.2), measured at any calibration, and the decision to calibrate.
 
-Counts are means per frame where the paper speaks of counts: it does not say over how many frames it sums, and a sum over
-a day exceeds 1 for every calibration. A radar track stands for one dynamic detection.
+Counts are means per frame where the paper speaks of counts: it does not say over how many frames it sums, and
+a sum over a day exceeds 1 for every calibration. A radar track stands for one dynamic detection.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ from schemas.calibrations import METHODS, PAIRS, CalibrationRecord
 
 __all__ = ["Comparison", "compare", "current_runs", "table_1"]
 
-# The rows that the paper prints (Table 1; highway and urban: extended data table 1): azimuth, elevation [deg] of
-# camera-lidar and camera-radar, azimuth, elevation, range [m] of lidar-radar and of the loop.
+# The rows that the paper prints (Table 1; highway and urban: extended data table 1): azimuth, elevation [deg]
+# of camera-lidar and camera-radar, azimuth, elevation, range [m] of lidar-radar and of the loop.
 PAPER_ROWS: tuple[tuple[str, str, tuple[float, ...]], ...] = (
     ("object tracking [60]", "all", (0.55, 2.01, 1.92, 3.13, 1.46, 1.87, 0.22, np.nan, np.nan, np.nan)),
     ("pairwise optimization", "all", (0.21, 0.28, 0.20, 0.44, 0.97, 0.21, 0.14, 1.43, 0.83, 0.01)),
@@ -94,8 +94,10 @@ def compare(
 def table_1(comparisons: Sequence[Comparison]) -> str:
     """Markdown: our rows by method and environment, the paper's rows beside them, and the sigmas' honesty."""
     lines = [
-        "| method | environment | runs | camera-lidar az/el [deg] | camera-radar az/el [deg] "
-        "| lidar-radar az/el [deg] / range [m] | loop az/el [deg] / range [m] | accepted |",
+        (
+            "| method | environment | runs | camera-lidar az/el [deg] | camera-radar az/el [deg] "
+            "| lidar-radar az/el [deg] / range [m] | loop az/el [deg] / range [m] | accepted |"
+        ),
         "|---|---|---|---|---|---|---|---|",
     ]
     order = {method: k for k, method in enumerate(METHODS)}

@@ -1,4 +1,4 @@
-"""Alignment on held-out frames at the prior and at the result: a paired test over blocks of frames that share a scene."""
+"""Alignment on held-out frames at the prior and at the result: a paired test over blocks of frames."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def paired_test(
 ) -> HeldOutTest | None:
     """Compare the costs of the same frames at two calibrations.
 
-    Frames with a cost that is not finite at either calibration are left out. The standard error treats blocks, not frames,
-    as independent; with a single block, frames have to do.
+    Frames with a cost that is not finite at either calibration are left out. The standard error treats
+    blocks, not frames, as independent; with a single block, frames have to do.
 
     Args:
         before: cost of each frame at the prior (lower is better).
@@ -55,7 +55,8 @@ def paired_test(
     names, index = np.unique(blocks, return_inverse=True)
     if len(names) == 1:
         names, index = np.arange(len(difference)), np.arange(len(difference))
-    # Deviations summed over blocks: Var(mean) = sum_b (sum_{f in b} (d_f - mean))^2 / F^2, small-sample factor B/(B-1).
+    # Deviations summed over blocks: Var(mean) = sum_b (sum_{f in b} (d_f - mean))^2 / F^2, small-sample
+    # factor B/(B-1).
     sums = np.bincount(index, difference - difference.mean(), minlength=len(names))
     scale = len(names) / (len(names) - 1) if len(names) > 1 else 1.0
     error = float(np.sqrt(scale * np.sum(sums**2)) / len(difference))

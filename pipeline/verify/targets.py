@@ -1,7 +1,8 @@
 """The paper's error: azimuth, elevation (and range) of corner reflectors, carried from one sensor to another.
 
-Camera pairs are compared as directions in the camera, lidar-radar in lidar coordinates; the loop carries a lidar point
-through radar and camera back to the lidar (section 2.2). Known truth takes the place of picked positions where it exists.
+Camera pairs are compared as directions in the camera, lidar-radar in lidar coordinates; the loop carries a
+lidar point through radar and camera back to the lidar (section 2.2). Known truth takes the place of picked
+positions where it exists.
 """
 
 from __future__ import annotations

@@ -89,9 +89,8 @@ def loop_doubts(solution: Solution, sigmas: float = 3.0) -> list[str]:
     translation = float(np.sqrt(np.trace(covariance[3:, 3:])))
     doubts = []
     if solution.loop_rotation_rad > sigmas * rotation:
-        doubts.append(
-            f"the loop is open by {np.degrees(solution.loop_rotation_rad):.2f} deg, its sigma is {np.degrees(rotation):.2f} deg"
-        )
+        open_deg, sigma_deg = np.degrees(solution.loop_rotation_rad), np.degrees(rotation)
+        doubts.append(f"the loop is open by {open_deg:.2f} deg, its sigma is {sigma_deg:.2f} deg")
     if solution.loop_translation_m > sigmas * translation:
         doubts.append(
             f"the loop is open by {solution.loop_translation_m:.3f} m, its sigma is {translation:.3f} m"
@@ -133,9 +132,8 @@ def _holdout_reasons(
             f"too few held-out frames to judge: {0 if test is None else test.frames}, needs {limits.min_holdout}"
         ]
     if test.z > limits.z:
-        return [
-            f"held-out frames align worse than at the prior ({test.after:.4g} after {test.before:.4g}, z = {test.z:.1f})"
-        ]
+        change = f"{test.after:.4g} after {test.before:.4g}, z = {test.z:.1f}"
+        return [f"held-out frames align worse than at the prior ({change})"]
     if test.z < -limits.z:
         return []
     # Neither better nor worse: fine as long as the result says the same as the prior.
@@ -143,7 +141,6 @@ def _holdout_reasons(
     ratio = np.where(estimate.observable, np.abs(moved(estimate.T, T_prior)) / sigma, 0.0)
     worst = int(np.argmax(ratio))
     if ratio[worst] > limits.agree_sigmas:
-        return [
-            f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} of its sigmas, and held-out frames align no better (z = {test.z:.1f})"
-        ]
+        claim = f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} of its sigmas"
+        return [f"{claim}, and held-out frames align no better (z = {test.z:.1f})"]
     return []

@@ -90,7 +90,8 @@ def test_kernel_is_thirty_times_as_fast_as_naive_numpy(workload, capsys):
     with capsys.disabled():
         rate = POSES * FRAMES * POINTS / fast / 1e6
         print(f"\nobjective_vs_numpy {ratio:.1f} x ({rate:.0f} M points/s on one core)")
-    # Target 30; the floor leaves room for neighbours on the machine, whose load hits gathers harder than NumPy.
+    # Target 30; the floor leaves room for neighbours on the machine, whose load hits gathers harder than
+    # NumPy.
     assert ratio >= 20
 
 

@@ -126,9 +126,7 @@ def test_other_seed_method_or_config_is_other_work(solved):
     lake, first = solved
     keys = {first.work_key}
     keys.add(
-        calibrate_day(
-            DAY, fleet_of(), lake, method="joint-optimisation", perturb=(2.0, 0.1), seed=5
-        ).work_key
+        calibrate_day(DAY, fleet_of(), lake, method="joint-optimisation", perturb=(2.0, 0.1), seed=5).work_key
     )
     keys.add(
         calibrate_day(

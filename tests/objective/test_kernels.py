@@ -69,7 +69,8 @@ def test_costs_equal_the_numpy_reference_for_every_camera_model(name):
     want = np.array(
         [[reference_cost(p, c, camera, t) for p, c in zip(clouds, costs, strict=True)] for t in T]
     )
-    # Bytes round by at most 1/510 of the largest cost, at random; up to three points at the rim may change sides.
+    # Bytes round by at most 1/510 of the largest cost, at random; up to three points at the rim may change
+    # sides.
     np.testing.assert_allclose(got, want, atol=3 * PENALTY + 0.3)
     assert np.mean(np.abs(got - want) / frames.counts) < 3e-3
 

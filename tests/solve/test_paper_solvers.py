@@ -1,4 +1,4 @@
-"""Differential evolution and Nelder-Mead, alone and with the loop: recovery, determinism, honesty about what is not solved."""
+"""Differential evolution and Nelder-Mead, alone and with the loop: recovery, determinism, honesty."""
 
 import numpy as np
 import pytest
