@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from pipeline.geometry.cameras import Camera
 from pipeline.objective.class_information import class_information
@@ -26,7 +26,7 @@ from pipeline.objective.projection_loops import camera_parameters
 from pipeline.objective.reflectivity import marking_gradients, marking_scores
 from schemas.observations import Observation
 
-__all__ = ["CONTRAST_BLURS_PX", "Level", "Points", "Terms", "lidar_velocities", "prepare_terms"]
+__all__ = ["Alignments", "CONTRAST_BLURS_PX", "Level", "Points", "Terms", "lidar_velocities", "prepare_terms"]
 
 CONTRAST_BLURS_PX = (6.0, 3.0, 1.5)
 # Markings brighter than this stand out of their ring (lane paint, patches).
@@ -41,6 +41,7 @@ _CLASS_HEIGHTS_M = (0.25, 1.0, 2.5, 5.0)
 _CLASS_RANGES_M = (12.0, 25.0)
 _CLASSES = (len(_CLASS_HEIGHTS_M) + 1) * (len(_CLASS_RANGES_M) + 1)
 _CLASS_STRIDE = 8  # of the sampled cloud: neighbours say the same
+_CHANCE_SHIFT_PX = 60.0  # far enough to be elsewhere, near enough to see the same scene
 # Chance density of an edge's distance before the data has been asked: boundaries every hundred pixels.
 _EVEN_CHANCE = np.full((_KINDS, CHANCE_BINS), 1 / 100, np.float32)
 
@@ -61,6 +62,21 @@ class Level:
     def wide(sigma_px: float, contrast_level: int, match: float = 0.25) -> Level:
         """A level that presumes nothing of the data."""
         return Level(sigma_px, contrast_level, np.full(_KINDS, match, np.float32), _EVEN_CHANCE)
+
+
+@dataclass(frozen=True, eq=False)
+class Alignments:
+    """P candidates: poses, camera time offsets, focal lengths in units of the camera's."""
+
+    T_camera_lidar: np.ndarray
+    dt_s: np.ndarray
+    focal: np.ndarray
+
+    @staticmethod
+    def of_poses(T_camera_lidar: Float[np.ndarray, "P 4 4"]) -> Alignments:
+        """Candidates without time offset and with the camera's own focal length."""
+        count = len(T_camera_lidar)
+        return Alignments(T_camera_lidar, np.zeros(count), np.ones(count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,64 +161,70 @@ class Terms:
             self.yaw_rate[frames],
         )
 
-    def poses(self, T_camera_lidar: Float[np.ndarray, "P 4 4"], dt_s: Float[np.ndarray, " P"]) -> np.ndarray:
+    def poses(self, at: Alignments) -> Float32[np.ndarray, "P F 12"]:
         """Rows of the transform from each frame's lidar points to its image [P, F, 12].
 
         The image shows the lidar clock's time `-dt` (stamp_camera = stamp_lidar + dt). The car was then dt earlier on its way,
         so what stands still lay dt times the own velocity further ahead: p' = Rz(yaw_rate dt) (p + v dt).
         """
-        angle = dt_s[:, None] * self.yaw_rate  # P F
+        angle = at.dt_s[:, None] * self.yaw_rate  # P F
         c, s, o = np.cos(angle), np.sin(angle), np.zeros_like(angle)
         turn = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1], -1)], -2)
-        shift = (turn @ (dt_s[:, None, None] * self.velocity_lidar)[..., None])[..., 0]
+        shift = (turn @ (at.dt_s[:, None, None] * self.velocity_lidar)[..., None])[..., 0]
         out = np.empty((*angle.shape, 3, 4), np.float32)
-        R = T_camera_lidar[:, None, :3, :3]
+        R = at.T_camera_lidar[:, None, :3, :3]
         out[..., :3] = R @ turn
-        out[..., 3] = (R @ shift[..., None])[..., 0] + T_camera_lidar[:, None, :3, 3]
+        out[..., 3] = (R @ shift[..., None])[..., 0] + at.T_camera_lidar[:, None, :3, 3]
         return out.reshape(*angle.shape, 12)
 
-    def edge_score(self, poses: np.ndarray, level: Level) -> Float[np.ndarray, "P F"]:
+    def edge_score(self, at: Alignments, level: Level) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the edges."""
-        e = self.edges
+        e, maps = self.edges, self.maps
         return edge_scores(
             self.camera,
-            self.maps.offsets,
+            maps.offsets,
             e.xyz_m,
             e.side,
             e.kind,
             e.gap_rad,
             e.start,
-            poses,
+            self.poses(at),
+            at.focal.astype(np.float32),
             level.match,
             level.chance,
             level.sigma_px,
         )
 
-    def marking_score(self, poses: np.ndarray, level: Level) -> Float[np.ndarray, "P F"]:
+    def marking_score(self, at: Alignments, level: Level) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the markings."""
         m, contrast = self.markings, self.maps.contrast[level.contrast_level]
-        return marking_scores(self.camera, contrast, m.xyz_m, _weights(m, level), m.start, poses)
+        focal = at.focal.astype(np.float32)
+        return marking_scores(
+            self.camera, contrast, m.xyz_m, _weights(m, level), m.start, self.poses(at), focal
+        )
 
-    def class_information(self, poses: np.ndarray) -> Float[np.ndarray, " P"]:
+    def class_information(self, at: Alignments) -> Float[np.ndarray, " P"]:
         """Mutual information of lidar class and label, nats per point; for the basin only."""
         c = self.classes
-        return class_information(self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, poses, _CLASSES)
+        return class_information(
+            self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, self.poses(at), _CLASSES
+        )
 
-    def score(
-        self, T_camera_lidar: Float[np.ndarray, "P 4 4"], dt_s: Float[np.ndarray, " P"], level: Level
-    ) -> Float[np.ndarray, "P F"]:
-        """Score of each frame at each pose; higher is better."""
-        poses = self.poses(T_camera_lidar, dt_s)
-        score = level.edge_weight * self.edge_score(poses, level).astype(np.float64)
-        return score + level.marking_weight * self.marking_score(poses, level)
+    def score(self, at: Alignments, level: Level) -> Float[np.ndarray, "P F"]:
+        """Score of each frame at each alignment; higher is better."""
+        score = level.edge_weight * self.edge_score(at, level).astype(np.float64)
+        return score + level.marking_weight * self.marking_score(at, level)
 
     def gradient(
-        self, T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float, level: Level
-    ) -> tuple[Float[np.ndarray, "F 7"], Float[np.ndarray, "F 7 7"]]:
-        """Per frame: gradient of the score by (left perturbation, dt) and its information (positive semidefinite)."""
-        poses = self.poses(T_camera_lidar[None], np.array([dt_s]))[0].astype(np.float64)
-        velocity = self.velocity_lidar @ T_camera_lidar[:3, :3].T
-        e, m = self.edges, self.markings
+        self, at: Alignments, level: Level
+    ) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
+        """Gradient of each frame's score at ONE alignment, and its information (positive semidefinite).
+
+        By left perturbation of T_camera_lidar, time offset, focal scale.
+        """
+        poses = self.poses(at)[0].astype(np.float64)
+        velocity = self.velocity_lidar @ at.T_camera_lidar[0, :3, :3].T
+        focal, e, m = float(at.focal[0]), self.edges, self.markings
         g_edges, I_edges = edge_gradients(
             self.camera,
             self.maps.offsets,
@@ -212,6 +234,7 @@ class Terms:
             e.gap_rad,
             e.start,
             poses,
+            focal,
             velocity,
             level.match,
             level.chance,
@@ -219,7 +242,7 @@ class Terms:
         )
         contrast = self.maps.contrast[level.contrast_level]
         g_marks, I_marks = marking_gradients(
-            self.camera, contrast, m.xyz_m, _weights(m, level), m.start, poses, velocity
+            self.camera, contrast, m.xyz_m, _weights(m, level), m.start, poses, focal, velocity
         )
         a, b = level.edge_weight, level.marking_weight
         return a * g_edges + b * g_marks, a * I_edges + b * I_marks
@@ -230,23 +253,19 @@ class Terms:
         counts = np.bincount(self.edges.side, minlength=4)
         return np.bincount(self.edges.side, share, minlength=4) / np.maximum(counts, 1)
 
-    def fitted(
-        self, T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float, level: Level, rng: np.random.Generator
-    ) -> Level:
-        """The level with the mixture shares, chance densities and contrast difference that the data shows at a pose."""
-        poses = self.poses(T_camera_lidar[None], np.array([dt_s]))
-        e, m = self.edges, self.markings
-        offsets, still = self.maps.offsets, np.zeros((len(e.xyz_m), 2), np.float32)
-        elsewhere = rng.uniform(-60, 60, still.shape).astype(np.float32)
-        at_chance = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses[0], elsewhere)
-        here = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses[0], still)
+    def fitted(self, at: Alignments, level: Level, rng: np.random.Generator) -> Level:
+        """The level with the mixture shares, chance densities and contrast that the data shows at ONE alignment."""
+        poses, focal = self.poses(at)[0], np.float32(at.focal[0])
+        e, m, offsets = self.edges, self.markings, self.maps.offsets
+        still = np.zeros((len(e.xyz_m), 2), np.float32)
+        elsewhere = rng.uniform(-_CHANCE_SHIFT_PX, _CHANCE_SHIFT_PX, still.shape).astype(np.float32)
+        at_chance = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses, focal, elsewhere)
+        here = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses, focal, still)
         chance = chance_of(at_chance, e.kind, _KINDS)
         sigma = np.hypot(level.sigma_px, e.gap_rad * self.camera[1] / np.sqrt(12))
         match = fit_match_share(here, e.kind, sigma, chance)
-        ones = np.full(len(m.xyz_m), CONTRAST_STEP, np.float32)
-        contrast = self.maps.contrast[level.contrast_level]
-        total = marking_scores(self.camera, contrast, m.xyz_m, ones, m.start, poses).sum()
-        delta = float(np.clip(total / max(len(m.xyz_m), 1), 0.0, 1.0))
+        unit = replace(level, delta=1.0)
+        delta = float(np.clip(self.marking_score(at, unit).sum() / max(len(m.xyz_m), 1), 0.0, 1.0))
         return replace(level, match=match, chance=chance, delta=delta)
 
 

@@ -30,6 +30,7 @@ def edge_scores(
     gap_rad: Float32[np.ndarray, " N"],
     start: Int64[np.ndarray, " G"],
     poses: Float32[np.ndarray, "P F 12"],
+    focal: Float32[np.ndarray, " P"],
     match: Float32[np.ndarray, " K"],
     chance: Float32[np.ndarray, "K B"],
     sigma_px: float,
@@ -45,6 +46,7 @@ def edge_scores(
         gap_rad: angle between its two beams; widens its kernel by the sd of an even distribution over it.
         start: F + 1 offsets.
         poses: rows of the 3x4 transform into the camera, per pose and frame (frames differ by time offset times speed).
+        focal: focal length in units of the camera's, by pose.
         match: share of jumps that match, by kind.
         chance: density of |r| at random places [1/px], by kind, in bins of one pixel.
         sigma_px: scale of the kernel (1 + (r/s)^2)^-2.
@@ -57,7 +59,7 @@ def edge_scores(
     u_max, v_max = f4(width - 1), f4(height - 1)
     for f in range(frames):
         for p in range(count):
-            m = poses[p, f]
+            m, s = poses[p, f], focal[p]
             total = f4(0.0)
             for i in range(start[f], start[f + 1]):
                 x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
@@ -65,6 +67,7 @@ def edge_scores(
                 y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
                 z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
                 u, v, valid = project_point(camera, x, y, z)
+                u, v = camera[3] + s * (u - camera[3]), camera[4] + s * (v - camera[4])
                 if not valid or u < f4(0) or v < f4(0) or u > u_max or v > v_max:
                     continue
                 c = side[i]
@@ -94,21 +97,22 @@ def edge_gradients(
     gap_rad: np.ndarray,
     start: np.ndarray,
     poses: np.ndarray,
+    focal: float,
     velocity: np.ndarray,
     match: np.ndarray,
     chance: np.ndarray,
     sigma_px: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Per frame: gradient [F, 7] of the score by (rotation, translation, time offset), and its information [F, 7, 7].
+    """Per frame: gradient [F, 8] of the score by (rotation, translation, time offset, focal scale), and its information.
 
     Left perturbation of T_camera_lidar; `poses` [F, 12] and `velocity` [F, 3] (camera axes, m/s) at the pose. The
     information is Gauss-Newton's: residuals weighted by how likely they are matches (iterated re-weighting).
     """
     frames = poses.shape[0]
     height, width = offsets.shape[2], offsets.shape[3]
-    gradient, information = np.zeros((frames, 7)), np.zeros((frames, 7, 7))
+    gradient, information = np.zeros((frames, 8)), np.zeros((frames, 8, 8))
     s2, beam = sigma_px * sigma_px, camera[1] * camera[1] / 12
-    row = np.zeros(7)
+    row = np.zeros(8)
     for f in range(frames):
         m = poses[f]
         for i in range(start[f], start[f + 1]):
@@ -117,6 +121,8 @@ def edge_gradients(
             y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
             z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
             u, v, valid, jux, juy, juz, jvx, jvy, jvz = project_with_jacobian(camera, x, y, z)
+            ou, ov = u - camera[3], v - camera[4]
+            u, v = camera[3] + focal * ou, camera[4] + focal * ov
             if not valid or u < 0 or v < 0 or u > width - 1 or v > height - 1:
                 continue
             c = side[i]
@@ -125,7 +131,9 @@ def edge_gradients(
             if k == -128:
                 continue
             r = k + 0.5 + (iu - u if c < 2 else iv - v)
-            dx, dy, dz = (jux, juy, juz) if c < 2 else (jvx, jvy, jvz)
+            dx, dy, dz = (
+                (focal * jux, focal * juy, focal * juz) if c < 2 else (focal * jvx, focal * jvy, focal * jvz)
+            )
             si2 = s2 + gap_rad[i] * gap_rad[i] * beam
             q = 1 + r * r / si2
             pi = match[kind[i]]
@@ -134,9 +142,10 @@ def edge_gradients(
             row[0], row[1], row[2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
             row[3], row[4], row[5] = dx, dy, dz
             row[6] = dx * velocity[f, 0] + dy * velocity[f, 1] + dz * velocity[f, 2]
-            for a in range(7):
+            row[7] = ou if c < 2 else ov
+            for a in range(8):
                 gradient[f, a] += weight * r * row[a]
-                for b in range(7):
+                for b in range(8):
                     information[f, a, b] += weight * row[a] * row[b]
     return gradient, information
 
@@ -149,6 +158,7 @@ def edge_residuals(
     side: np.ndarray,
     start: np.ndarray,
     poses: np.ndarray,
+    focal: float,
     shift_px: np.ndarray,
 ) -> np.ndarray:
     """Signed distance of each jump, moved by `shift_px` [N, 2], to its boundary: NaN outside the image, 127 without boundary."""
@@ -162,7 +172,8 @@ def edge_residuals(
             y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
             z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
             u, v, valid = project_point(camera, x, y, z)
-            u, v = u + shift_px[i, 0], v + shift_px[i, 1]
+            u = camera[3] + focal * (u - camera[3]) + shift_px[i, 0]
+            v = camera[4] + focal * (v - camera[4]) + shift_px[i, 1]
             if not valid or u < 0 or v < 0 or u > width - 1 or v > height - 1:
                 continue
             iu, iv = int(u + 0.5), int(v + 0.5)

@@ -25,6 +25,7 @@ def marking_scores(
     weight: Float32[np.ndarray, " N"],
     start: Int64[np.ndarray, " G"],
     poses: Float32[np.ndarray, "P F 12"],
+    focal: Float32[np.ndarray, " P"],
 ) -> Float32[np.ndarray, "P F"]:
     """Weighted sum of the contrast under each frame's points at each pose; 0 outside the road."""
     count, frames = poses.shape[0], poses.shape[1]
@@ -34,7 +35,7 @@ def marking_scores(
     u_max, v_max = f4(width - 1.01), f4(height - 1.01)
     for f in range(frames):
         for p in range(count):
-            m = poses[p, f]
+            m, s = poses[p, f], focal[p]
             total = f4(0.0)
             for i in range(start[f], start[f + 1]):
                 x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
@@ -42,6 +43,7 @@ def marking_scores(
                 y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
                 z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
                 u, v, valid = project_point(camera, x, y, z)
+                u, v = camera[3] + s * (u - camera[3]), camera[4] + s * (v - camera[4])
                 if not valid or u < f4(0) or v < f4(0) or u > u_max or v > v_max:
                     continue
                 iu, iv = int(u), int(v)
@@ -62,17 +64,18 @@ def marking_gradients(
     weight: np.ndarray,
     start: np.ndarray,
     poses: np.ndarray,
+    focal: float,
     velocity: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Per frame: gradient [F, 7] of the score by (rotation, translation, time offset), and its information [F, 7, 7].
+    """Per frame: gradient [F, 8] of the score by (rotation, translation, time offset, focal scale), and its information.
 
     As in `edge_gradients`. The score is linear in the contrast, so the information is that of the likelihood: the outer
     product of each point's gradient.
     """
     frames = poses.shape[0]
     height, width = contrast.shape[1], contrast.shape[2]
-    gradient, information = np.zeros((frames, 7)), np.zeros((frames, 7, 7))
-    row = np.zeros(7)
+    gradient, information = np.zeros((frames, 8)), np.zeros((frames, 8, 8))
+    row = np.zeros(8)
     for f in range(frames):
         m = poses[f]
         for i in range(start[f], start[f + 1]):
@@ -81,6 +84,8 @@ def marking_gradients(
             y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
             z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
             u, v, valid, jux, juy, juz, jvx, jvy, jvz = project_with_jacobian(camera, x, y, z)
+            ou, ov = u - camera[3], v - camera[4]
+            u, v = camera[3] + focal * ou, camera[4] + focal * ov
             if not valid or u < 0 or v < 0 or u > width - 1.01 or v > height - 1.01:
                 continue
             iu, iv = int(u), int(v)
@@ -90,12 +95,14 @@ def marking_gradients(
             top, bottom, left = c01 - c00, c11 - c10, c10 - c00
             gu = weight[i] * (top + b * (bottom - top))
             gv = weight[i] * (left + a * (bottom - top))
+            gu, gv = focal * gu, focal * gv
             dx, dy, dz = gu * jux + gv * jvx, gu * juy + gv * jvy, gu * juz + gv * jvz
             row[0], row[1], row[2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
             row[3], row[4], row[5] = dx, dy, dz
             row[6] = dx * velocity[f, 0] + dy * velocity[f, 1] + dz * velocity[f, 2]
-            for j in range(7):
+            row[7] = (gu * ou + gv * ov) / focal
+            for j in range(8):
                 gradient[f, j] += row[j]
-                for k in range(7):
+                for k in range(8):
                     information[f, j, k] += row[j] * row[k]
     return gradient, information

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, log_so3
-from pipeline.objective.camera_lidar_terms import Level, Terms, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar_terms import Alignments, Level, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.problem import PairEstimate, Prior
 from pipeline.solve.covariance import blocks_of, bootstrap_covariance, posterior, spread_to_covariance
 from pipeline.solve.globalise import evolve
@@ -38,20 +38,36 @@ _MAX_GAP_PX = 5.0  # edges whose interval is wider (16 rings: 30 px) are for the
 # Typical distance of what edges and markings lie on: turns a width in pixels into metres.
 _TYPICAL_RANGE_M = 12.0
 _TYPICAL_SPEED_MPS = 8.0
+# Intrinsics are known to about this; free within it, so that the pose along the optical axis is not surer than they are.
+_FOCAL_SIGMA = 0.003
 # What no resampling shows: mask dilation, focal length off by 0.1-0.5 %, rolling shutter (evidence/method.md, section 4).
 _BIAS_FLOOR = np.array([np.radians(0.03)] * 3 + [0.01] * 3)
 
 
 @dataclass(frozen=True, eq=False)
 class AlignmentState:
-    """A pose with its time offset."""
+    """A pose, its time offset and focal scale."""
 
     T_camera_lidar: np.ndarray
-    dt_s: float
+    dt_s: float = 0.0
+    focal: float = 1.0
 
-    def moved(self, xi: Float[np.ndarray, "P 7"]) -> tuple[np.ndarray, np.ndarray]:
-        """Poses and time offsets at steps (left perturbation, dt)."""
-        return exp_se3(xi[:, :6]) @ self.T_camera_lidar, self.dt_s + xi[:, 6]
+    def moved(self, xi: Float[np.ndarray, "P 8"]) -> Alignments:
+        """Candidates at steps (left perturbation, dt, focal scale)."""
+        return Alignments(
+            exp_se3(xi[:, :6]) @ self.T_camera_lidar, self.dt_s + xi[:, 6], self.focal + xi[:, 7]
+        )
+
+    def stepped(self, xi: Float[np.ndarray, " 8"]) -> AlignmentState:
+        """The state one step on."""
+        return AlignmentState(
+            exp_se3(xi[:6]) @ self.T_camera_lidar, self.dt_s + float(xi[6]), self.focal + float(xi[7])
+        )
+
+    @property
+    def alone(self) -> Alignments:
+        """The state as one candidate."""
+        return self.moved(np.zeros((1, 8)))
 
 
 def estimate_camera_lidar(
@@ -91,13 +107,11 @@ def estimate_camera_lidar(
     thin = sharp.thinned(0.35, rng)
     first = Level.wide(*_LADDER[0])
     ends = [_climb(thin, s, first, prior, config, steps=5) for s in starts]
-    scores = [float(sharp.score(e.T_camera_lidar[None], np.array([e.dt_s]), first).sum()) for e in ends]
+    scores = [float(sharp.score(e.alone, first).sum()) for e in ends]
     best = int(np.argmax(scores))
     state, level = ends[best], first
     for sigma_px, contrast in _LADDER[1:]:
-        level = _weighted(
-            sharp, state, sharp.fitted(state.T_camera_lidar, state.dt_s, Level.wide(sigma_px, contrast), rng)
-        )
+        level = _weighted(sharp, state, sharp.fitted(state.alone, Level.wide(sigma_px, contrast), rng))
         state = _climb(sharp, state, level, prior, config, steps=5)
     halves = [
         _climb(sharp.of_frames(np.arange(k, len(used), 2)), state, level, prior, config, steps=4)
@@ -127,14 +141,14 @@ def camera_lidar_cost(
     if velocity_lidar is None:
         velocity_lidar = lidar_velocities(observations, np.eye(4) if T_lidar_radar is None else T_lidar_radar)
     terms = prepare_terms(observations, T_camera_lidar, velocity_lidar, reach_rad=0.0).sharp(_MAX_GAP_PX)
-    return -terms.score(T_camera_lidar[None], np.array([dt_s]), _VERDICT)[0]
+    return -terms.score(AlignmentState(T_camera_lidar, dt_s).alone, _VERDICT)[0]
 
 
 def camera_lidar_information(
     terms: Terms, T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float, level: Level | None = None
-) -> tuple[Float[np.ndarray, " 7"], Float[np.ndarray, "7 7"]]:
+) -> tuple[Float[np.ndarray, " 8"], Float[np.ndarray, "8 8"]]:
     """Gradient of the COST (minus score) and Gauss-Newton information by (left perturbation, dt), for joint assembly."""
-    gradient, information = terms.gradient(T_camera_lidar, dt_s, level or _VERDICT)
+    gradient, information = terms.gradient(AlignmentState(T_camera_lidar, dt_s).alone, level or _VERDICT)
     return -gradient.sum(0), information.sum(0)
 
 
@@ -168,41 +182,39 @@ def _basin(terms: Terms, prior: Prior, config: SolveConfig, rng: np.random.Gener
         return from_rotation_translation(exp_so3(x[:, :3]) @ T_0[:3, :3], T_0[:3, 3] + x[:, 3:])
 
     def cost(x: np.ndarray) -> np.ndarray:
-        still = np.zeros(len(x))
-        score = thin.score(poses(x), still, _COARSE).sum(1)
-        score += weight * thin.class_information(thin.poses(poses(x), still))
+        at = Alignments.of_poses(poses(x))
+        score = thin.score(at, _COARSE).sum(1) + weight * thin.class_information(at)
         return -score + 0.5 * ((x[:, 3:] / sigma) ** 2).sum(1)
 
     x, _ = evolve(cost, -box, box, rng, population=48, generations=36, start=np.zeros((1, 6)))
-    return AlignmentState(poses(x[None])[0], 0.0)
+    return AlignmentState(poses(x[None])[0])
 
 
-def _prior_value(
-    T_camera_lidar: Float[np.ndarray, "P 4 4"], dt_s: Float[np.ndarray, " P"], prior: Prior, config: SolveConfig
-) -> Float[np.ndarray, " P"]:
+def _prior_value(at: Alignments, prior: Prior, config: SolveConfig) -> Float[np.ndarray, " P"]:
     """Log density of the prior, up to a constant."""
-    turn = log_so3(T_camera_lidar[:, :3, :3] @ prior.T_camera_lidar[:3, :3].T) / prior.rotation_sigma_rad
-    shift = (T_camera_lidar[:, :3, 3] - prior.T_camera_lidar[:3, 3]) / prior.translation_sigma_m
-    return -0.5 * ((turn**2).sum(1) + (shift**2).sum(1) + (dt_s / config.time_offset_sigma_s) ** 2)
+    turn = log_so3(at.T_camera_lidar[:, :3, :3] @ prior.T_camera_lidar[:3, :3].T) / prior.rotation_sigma_rad
+    shift = (at.T_camera_lidar[:, :3, 3] - prior.T_camera_lidar[:3, 3]) / prior.translation_sigma_m
+    clock = (at.dt_s / config.time_offset_sigma_s) ** 2 + ((at.focal - 1) / _FOCAL_SIGMA) ** 2
+    return -0.5 * ((turn**2).sum(1) + (shift**2).sum(1) + clock)
 
 
-def _scales(terms: Terms, level: Level) -> Float[np.ndarray, " 7"]:
+def _scales(terms: Terms, level: Level) -> Float[np.ndarray, " 8"]:
     """Step per DoF that moves typical points by about one kernel width."""
     angle = level.sigma_px / float(terms.camera[1])
     shift = angle * _TYPICAL_RANGE_M
-    return np.array([angle] * 3 + [shift] * 3 + [shift / _TYPICAL_SPEED_MPS])
+    return np.array([angle] * 3 + [shift] * 3 + [shift / _TYPICAL_SPEED_MPS, _FOCAL_SIGMA])
 
 
-def _design() -> Float[np.ndarray, "P 7"]:
+def _design() -> Float[np.ndarray, "P 8"]:
     """Points of the response surface: centre and antithetic pairs in a ball, the same for every call."""
     rng = np.random.default_rng(7)
-    x = rng.normal(size=(54, 7))
-    x *= (rng.random((54, 1)) ** (1 / 3)) / np.linalg.norm(x, axis=1, keepdims=True)
-    return np.concatenate([np.zeros((1, 7)), x, -x])
+    x = rng.normal(size=(66, 8))
+    x *= (rng.random((66, 1)) ** (1 / 3)) / np.linalg.norm(x, axis=1, keepdims=True)
+    return np.concatenate([np.zeros((1, 8)), x, -x])
 
 
 _DESIGN = _design()
-_UPPER = np.triu_indices(7)
+_UPPER = np.triu_indices(8)
 
 
 _FIT = np.linalg.pinv(
@@ -212,12 +224,12 @@ _FIT = np.linalg.pinv(
 
 def _quadratic(
     value: Float[np.ndarray, "P F"],
-) -> tuple[Float[np.ndarray, "F 7"], Float[np.ndarray, "F 7 7"]]:
+) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
     """Gradient and Hessian of the least-squares quadratic through each frame's values on the design."""
     c = (_FIT @ value).T
-    H = np.zeros((value.shape[1], 7, 7))
-    H[:, _UPPER[0], _UPPER[1]] = c[:, 8:]
-    return c[:, 1:8], H + H.transpose(0, 2, 1)
+    H = np.zeros((value.shape[1], 8, 8))
+    H[:, _UPPER[0], _UPPER[1]] = c[:, 9:]
+    return c[:, 1:9], H + H.transpose(0, 2, 1)
 
 
 def _climb(
@@ -230,31 +242,31 @@ def _climb(
     """
     scale = 1.8 * _scales(terms, level)
     for _ in range(steps):
-        T, dt = state.moved(_DESIGN * scale)
-        gradient, H = _quadratic(terms.score(T, dt, level))
-        (before,), (H_prior,) = _quadratic(_prior_value(T, dt, prior, config)[:, None])
+        at = state.moved(_DESIGN * scale)
+        gradient, H = _quadratic(terms.score(at, level))
+        (before,), (H_prior,) = _quadratic(_prior_value(at, prior, config)[:, None])
         promised = gradient.T @ gradient - H_prior
-        curvature = _at_least(-H.sum(0) - H_prior, 0.5 * promised + 1e-9 * np.trace(promised) * np.eye(7))
+        curvature = _at_least(-H.sum(0) - H_prior, 0.5 * promised + 1e-9 * np.trace(promised) * np.eye(8))
         step = np.linalg.solve(curvature, gradient.sum(0) + before)
         length = float(np.linalg.norm(step))
-        T, dt = state.moved((step / max(length, 1.0) * scale)[None])
-        state = AlignmentState(T[0], float(dt[0]))
+        state = state.stepped(step / max(length, 1.0) * scale)
         if length < 1.0:
             scale = scale * 0.75
     return state
 
 
-def _at_least(curvature: Float[np.ndarray, "7 7"], least: Float[np.ndarray, "7 7"]) -> Float[np.ndarray, "7 7"]:
+def _at_least(
+    curvature: Float[np.ndarray, "8 8"], least: Float[np.ndarray, "8 8"]
+) -> Float[np.ndarray, "8 8"]:
     """The larger of two symmetric matrices in every direction; `least` must be positive definite."""
     return spread_to_covariance(0.5 * (curvature + curvature.T), least)
 
 
 def _derivatives(
-    terms: Terms, state: AlignmentState, level: Level, scale: Float[np.ndarray, " 7"]
-) -> tuple[Float[np.ndarray, "F 7"], Float[np.ndarray, "F 7 7"]]:
+    terms: Terms, state: AlignmentState, level: Level, scale: Float[np.ndarray, " 8"]
+) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
     """Gradient and Hessian of each frame's score over a ball of `scale`, in units of `scale`."""
-    T, dt = state.moved(_DESIGN * scale)
-    return _quadratic(terms.score(T, dt, level))
+    return _quadratic(terms.score(state.moved(_DESIGN * scale), level))
 
 
 def _weighted(terms: Terms, state: AlignmentState, level: Level) -> Level:
@@ -297,6 +309,7 @@ def _diagnostics(
             f"edge_match_share_{n}": float(terms.mean_match(level)[i])
             for i, n in enumerate(("left", "right", "above", "below"))
         },
+        "focal_scale": state.focal,
         "edge_weight": level.edge_weight,
         "marking_contrast_sd": level.delta,
         "marking_weight": level.marking_weight,
@@ -305,11 +318,11 @@ def _diagnostics(
     }
 
 
-def _difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 7"]:
+def _difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]:
     """Rotation vector, translation and dt from b to a."""
     D = a.T_camera_lidar @ inverse(b.T_camera_lidar)
     shift = a.T_camera_lidar[:3, 3] - b.T_camera_lidar[:3, 3]
-    return np.concatenate([log_so3(D[:3, :3]), shift, [a.dt_s - b.dt_s]])
+    return np.concatenate([log_so3(D[:3, :3]), shift, [a.dt_s - b.dt_s, a.focal - b.focal]])
 
 
 def _conclude(
@@ -329,7 +342,7 @@ def _conclude(
     prior_information = np.diag(
         [prior.rotation_sigma_rad**-2] * 3
         + [prior.translation_sigma_m**-2] * 3
-        + [config.time_offset_sigma_s**-2]
+        + [config.time_offset_sigma_s**-2, _FOCAL_SIGMA**-2]
     )
     # After `_weighted`, the scatter of the frames' gradients is the curvature, without its roughness (Bartlett's identity).
     information = gradient[:, :, None] * gradient[:, None, :]
