@@ -7,7 +7,7 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import pytest
+import pytest  # noqa: E402 - numeric libraries read the environment while they are imported
 
 REPO = Path(__file__).resolve().parent.parent
 SHARED = REPO.parent / "shared"

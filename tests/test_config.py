@@ -1,0 +1,90 @@
+import pytest
+
+from pipeline.config import PriorConfig, config_hash, load_fleet
+from pipeline.errors import ConfigError
+
+GOOD = """
+[fleet]
+name = "test"
+[rigs.default.camera]
+image = "/camera/image"
+info = "/camera/info"
+semantics = { source = "topics", labels = "/labels", detections = "/detections" }
+[rigs.default.lidar]
+points = "/lidar"
+[rigs.default.radar]
+points = "/radar"
+[vehicles."car-1"]
+rig = "default"
+"""
+
+
+def load(tmp_path, text):
+    path = tmp_path / "fleet.toml"
+    path.write_text(text)
+    return load_fleet(path)
+
+
+def test_a_small_file_is_enough_and_defaults_are_physical(tmp_path):
+    fleet = load(tmp_path, GOOD)
+    assert fleet.rig_of("car-1").prior == PriorConfig()
+    assert fleet.ingest.sync_gate_s == 0.005
+    assert fleet.rigs["default"].ego is None
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (("[fleet]", "[fleet]\ncolour = 1"), "fleet.colour"),
+        (('points = "/radar"', 'points = "/radar"\ndoppler_period_mps = -1'), "doppler_period_mps"),
+        (('points = "/radar"', 'points = "radar"'), "radar.points"),
+        (('source = "topics"', 'source = "magic"'), "semantics"),
+        (('rig = "default"', 'rig = "other"'), "vehicles.car-1.rig"),
+        (("[fleet]", "[ingest]\nsync_gate_s = 0\n[fleet]"), "ingest.sync_gate_s"),
+        (("[fleet]", "[ingest]\nsync_gate_s = nan\n[fleet]"), "ingest.sync_gate_s"),
+        (("[fleet]", "[select]\nholdout_fraction = 1.0\n[fleet]"), "select.holdout_fraction"),
+        (("[fleet]", "[rigs.default.prior]\nsource = 'file'\n[fleet]"), "prior"),
+        (('name = "test"', ""), "fleet.name"),
+    ],
+)
+def test_what_cannot_be_right_is_refused_by_the_name_of_its_key(change, key, tmp_path):
+    assert change[0] in GOOD
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, GOOD.replace(*change, 1))
+    assert key in str(caught.value)
+    assert "fleet.toml" in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize("text", ["not toml [", "\x00"])
+def test_a_file_that_is_no_toml_is_named(text, tmp_path):
+    with pytest.raises(ConfigError, match="not a TOML file"):
+        load(tmp_path, text)
+
+
+def test_a_missing_file_and_an_unknown_vehicle_are_named(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        load_fleet(tmp_path / "nowhere.toml")
+    with pytest.raises(ConfigError, match=r"car-2.*car-1"):
+        load(tmp_path, GOOD).rig_of("car-2")
+
+
+def test_all_problems_are_told_at_once(tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, GOOD.replace("[fleet]", "[ingest]\nsync_gate_s = 0\nfoo = 1\n[fleet]"))
+    assert "ingest.sync_gate_s" in str(caught.value)
+    assert "ingest.foo" in str(caught.value)
+
+
+def test_the_hash_changes_with_every_value_and_not_with_how_it_was_written(tmp_path):
+    a = load(tmp_path, GOOD)
+    b = load(tmp_path, GOOD + "[ingest]\nsync_gate_s = 5e-3\n")
+    c = load(tmp_path, GOOD + "[ingest]\nsync_gate_s = 6e-3\n")
+    assert config_hash(a.ingest) == config_hash(b.ingest) != config_hash(c.ingest)
+    assert config_hash(a.ingest, {"x": 1}) != config_hash(a.ingest, {"x": 2})
+
+
+def test_configuration_cannot_be_changed_after_loading(tmp_path):
+    fleet = load(tmp_path, GOOD)
+    with pytest.raises(ValueError, match="frozen"):
+        fleet.ingest.sync_gate_s = 1.0

@@ -1,0 +1,126 @@
+"""Who may import whom: schemas <- pipeline <- jobs, stages apart, the estimator blind to the simulator."""
+
+import ast
+import importlib
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from jobs.cli import COMMANDS
+from pipeline.stages import STAGES
+
+REPO = Path(__file__).resolve().parent.parent
+LAYERS = ("schemas", "pipeline", "jobs")
+FOUNDATIONS = {"config", "errors", "results", "geometry", "store", "objective", "prior"}
+# Stage folders. solve and verify are two halves of one stage that pipeline/calibrate.py joins.
+ROOMS = {"ingest", "perceive", "solve", "verify", "audit", "report", "fleet", "simulate"}
+# Beside the rooms: modules that bring several of them together.
+JOINTS = {"stages", "calibrate", "calibration_records"}
+
+
+def modules():
+    for layer in LAYERS:
+        for path in sorted((REPO / layer).rglob("*.py")):
+            yield ".".join(path.relative_to(REPO).with_suffix("").parts).removesuffix(".__init__"), path
+
+
+def imports_of(path):
+    """Full names of our own modules that a file imports, at its top or inside functions."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found.add(node.module)
+            found |= {f"{node.module}.{a.name}" for a in node.names}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and ":" in node.value:
+            target = node.value.partition(":")[0]  # import paths of backends, resolved on use
+            if target.startswith("pipeline.") and " " not in target:
+                found.add(target)
+    return {name for name in found if name.split(".")[0] in LAYERS}
+
+
+EDGES = [(name, imported) for name, path in modules() for imported in sorted(imports_of(path))]
+
+
+def room(name):
+    parts = name.split(".")
+    return parts[1] if parts[0] == "pipeline" and len(parts) > 1 else None
+
+
+def test_the_walk_sees_the_tree():
+    assert len(EDGES) > 100
+    assert ("jobs.nightly", "pipeline.store.partitions") in EDGES
+    assert ("pipeline.stages", "pipeline.ingest.run") in EDGES  # an import path in a string
+
+
+def test_schemas_know_neither_pipeline_nor_jobs_and_pipeline_knows_no_jobs():
+    rank = {layer: i for i, layer in enumerate(LAYERS)}
+    upward = [(a, b) for a, b in EDGES if rank[a.split(".")[0]] < rank[b.split(".")[0]]]
+    assert upward == []
+
+
+def test_stage_folders_meet_only_in_the_foundations():
+    crossings = [
+        (a, b)
+        for a, b in EDGES
+        if room(a) in ROOMS and room(b) is not None and room(b) not in {room(a), *FOUNDATIONS}
+    ]
+    # The night runs the stages, so it knows their table of contents and writes the records of refused days.
+    allowed = {("fleet", "stages"), ("fleet", "calibration_records")}
+    assert [c for c in crossings if (room(c[0]), room(c[1])) not in allowed] == []
+
+
+def test_foundations_stand_on_foundations_alone():
+    downward = [(a, b) for a, b in EDGES if room(a) in FOUNDATIONS and room(b) in ROOMS | JOINTS]
+    assert downward == []
+
+
+def test_every_folder_of_pipeline_has_a_place_in_these_rules():
+    found = {room(name) for name, _ in modules()} - {None}
+    assert found <= ROOMS | FOUNDATIONS | JOINTS | {"learn", "export"}, found
+
+
+def test_nothing_that_estimates_imports_the_simulator():
+    users = {a for a, b in EDGES if room(b) == "simulate" and room(a) != "simulate"}
+    assert users <= {"jobs.simulate", "jobs.demo"}
+
+
+def test_stages_read_only_what_an_earlier_one_writes():
+    written = set()
+    for stage in STAGES:
+        assert {t.name for t in stage.reads} <= written, stage.name
+        written |= {t.name for t in stage.writes}
+
+
+@pytest.mark.parametrize("stage", STAGES, ids=lambda s: s.name)
+def test_every_stage_can_be_found(stage):
+    assert callable(stage.load())
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_leads_to_a_function_with_a_sentence_of_help(command):
+    module, name = COMMANDS[command][0].split(":")
+    function = getattr(importlib.import_module(module), name)
+    assert function.__doc__
+    assert function.__annotations__["return"] in (int, "int")
+
+
+def test_help_comes_within_a_second_and_loads_nothing_heavy():
+    code = (
+        "import sys; from jobs.cli import main; main(['--help']);"
+        "heavy = {'torch', 'open3d', 'numpy', 'pyarrow', 'scipy', 'numba', 'cv2', 'matplotlib', 'pydantic'};"
+        "print('loaded:', sorted(heavy & set(sys.modules)))"
+    )
+    seconds = []
+    for _ in range(3):  # the best of three: another process may be busy on this machine
+        began = time.monotonic()
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        seconds.append(time.monotonic() - began)
+        assert done.stdout.splitlines()[-1] == "loaded: []"
+    assert min(seconds) < 1.0
+    assert all(command in done.stdout for command in COMMANDS)

@@ -1,0 +1,91 @@
+"""The three folders are the import packages of one distribution; nothing else may own their generic names."""
+
+import importlib.metadata
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parent.parent
+PACKAGES = ("jobs", "pipeline", "schemas")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """A wheel as `pip wheel` makes it, without the network: the build backend is in the environment."""
+    folder = tmp_path_factory.mktemp("wheel")
+    code = f"import hatchling.build, os; os.chdir({str(REPO)!r}); print(hatchling.build.build_wheel({str(folder)!r}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return zipfile.ZipFile(folder / done.stdout.split()[-1])
+
+
+def test_the_three_names_resolve_to_one_parent_folder():
+    import jobs
+    import pipeline
+    import schemas
+
+    assert {Path(p.__file__).resolve().parent.parent for p in (jobs, pipeline, schemas)} == {REPO}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_second_distribution_owns_a_name(package):
+    owners = {o.lower() for o in importlib.metadata.packages_distributions().get(package, [])}
+    assert owners <= {"boresight"}
+
+
+def test_the_command_is_installed():
+    scripts = importlib.metadata.entry_points(group="console_scripts", name="boresight")
+    assert [s.value for s in scripts] == ["jobs.cli:main"]
+
+
+def test_a_wheel_holds_all_modules_and_data_files_and_nothing_else(wheel):
+    names = {n for n in wheel.namelist() if ".dist-info/" not in n}
+    listed = subprocess.run(
+        ["git", "ls-files", *PACKAGES], cwd=REPO, capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert set(listed) <= names
+    assert any(n.startswith("pipeline/report/templates/") for n in names)
+    assert {n.split("/")[0] for n in names} == set(PACKAGES)
+
+
+def test_every_dependency_is_pinned_to_what_was_tested():
+    project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["test"]]
+    names = {w.split("=")[0].split("[")[0].lower() for w in wanted}
+    lines = (REPO / "constraints.txt").read_text().splitlines()
+    pinned = {line.split("==")[0].lower() for line in lines if "==" in line and not line.startswith("#")}
+    assert names <= pinned, names - pinned
+
+
+def test_what_we_import_we_declare():
+    import ast
+
+    project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
+    declared = {d.split("=")[0].lower().replace("-", "_") for d in project["dependencies"]}
+    called = {"cv2": "opencv_python_headless"}  # import name -> distribution
+    imported = set()
+    for package in PACKAGES:
+        for path in (REPO / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+                names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+                imported |= {n.split(".")[0] for n in names}
+    third_party = imported - set(sys.stdlib_module_names) - set(PACKAGES)
+    assert {called.get(n, n) for n in third_party} <= declared
+
+
+def test_nothing_names_this_machine():
+    tracked = subprocess.run(["git", "ls-files"], cwd=REPO, capture_output=True, text=True, check=True).stdout
+    texts = [p for p in tracked.split() if not p.startswith("tests/") and (REPO / p).is_file()]
+    assert [
+        p for p in texts if "/work/" in (REPO / p).read_text() or "../shared" in (REPO / p).read_text()
+    ] == []
+
+
+@pytest.mark.parametrize("target", ["setup", "demo", "test", "lint", "bench", "help"])
+def test_make_has_the_targets_that_the_readme_promises(target):
+    done = subprocess.run(["make", "help"], cwd=REPO, capture_output=True, text=True, check=True)
+    assert target in {line.split()[0] for line in done.stdout.splitlines() if line}
