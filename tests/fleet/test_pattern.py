@@ -1,0 +1,114 @@
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.fleet.pattern import find_vehicle_days
+
+
+def touch(*paths):
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def found(pattern, root, *days):
+    return {
+        (d.partition.vehicle, d.partition.day): [str(p.relative_to(root)) for p in d.logs]
+        for d in find_vehicle_days(str(root / pattern), *days)
+    }
+
+
+def test_placeholders_may_be_folders(tmp_path):
+    touch(
+        tmp_path / "car/2026-03-02/a.mcap",
+        tmp_path / "car/2026-03-03/b.mcap",
+        tmp_path / "bus/2026-03-02/c.mcap",
+    )
+    touch(tmp_path / "car/2026-03-02/notes.txt", tmp_path / "car/latest/a.mcap")
+    assert found("{vehicle}/{day}/*.mcap", tmp_path) == {
+        ("bus", "2026-03-02"): ["bus/2026-03-02/c.mcap"],
+        ("car", "2026-03-02"): ["car/2026-03-02/a.mcap"],
+        ("car", "2026-03-03"): ["car/2026-03-03/b.mcap"],
+    }
+
+
+def test_placeholders_may_be_inside_names_and_containers_may_be_mixed(tmp_path):
+    touch(tmp_path / "my_car-1_2026-03-02_00.mcap", tmp_path / "my_car-1_2026-03-02_01.bag")
+    touch(tmp_path / "my_car-1_2026-03-02_02/metadata.yaml", tmp_path / "my_car-1_2026-03-02_02/x.db3")
+    touch(tmp_path / "my_car-1_2026-03-02_03/lost_metadata.db3")
+    touch(tmp_path / "my_car-1_2026-03-02_calibration.json", tmp_path / "my_car-1_2026-02-30_00.mcap")
+    names = [f"my_car-1_2026-03-02_0{i}" for i in range(4)]
+    assert found("{vehicle}_{day}_*", tmp_path) == {
+        ("my_car-1", "2026-03-02"): [names[0] + ".mcap", names[1] + ".bag", names[2], names[3]]
+    }
+
+
+def test_files_inside_a_recording_stand_for_the_recording_once(tmp_path):
+    touch(*(tmp_path / "car/2026-03-02/rec" / n for n in ("metadata.yaml", "rec_0.db3", "rec_1.db3")))
+    assert found("{vehicle}/{day}/**/*.db3", tmp_path) == {("car", "2026-03-02"): ["car/2026-03-02/rec"]}
+    assert found("{vehicle}/{day}/*", tmp_path) == {("car", "2026-03-02"): ["car/2026-03-02/rec"]}
+
+
+def test_a_folder_of_logs_stands_for_its_logs(tmp_path):
+    touch(
+        tmp_path / "car/2026-03-02/a.mcap",
+        tmp_path / "car/2026-03-02/b.bag",
+        tmp_path / "car/2026-03-02/readme.md",
+    )
+    logs = ["car/2026-03-02/a.mcap", "car/2026-03-02/b.bag"]
+    assert found("{vehicle}/{day}", tmp_path) == {("car", "2026-03-02"): logs}
+    assert found("{vehicle}/{day}/", tmp_path) == {("car", "2026-03-02"): logs}
+
+
+def test_a_placeholder_that_comes_again_must_say_the_same(tmp_path):
+    touch(tmp_path / "car/2026-03-02/car_2026-03-02.mcap", tmp_path / "car/2026-03-02/bus_2026-03-02.mcap")
+    assert found("{vehicle}/{day}/{vehicle}_{day}.mcap", tmp_path) == {
+        ("car", "2026-03-02"): ["car/2026-03-02/car_2026-03-02.mcap"]
+    }
+
+
+def test_shell_wildcards_choose_the_files(tmp_path):
+    touch(*(tmp_path / f"car/2026-03-02/{n}.mcap" for n in ("a0", "a1", "a2", "b0")))
+    assert found("{vehicle}/{day}/a[0-1].mcap", tmp_path)["car", "2026-03-02"] == [
+        "car/2026-03-02/a0.mcap",
+        "car/2026-03-02/a1.mcap",
+    ]
+    assert len(found("{vehicle}/{day}/?0.mcap", tmp_path)["car", "2026-03-02"]) == 2
+
+
+def test_days_are_filtered_and_come_in_order(tmp_path):
+    touch(*(tmp_path / f"{v}/2026-03-0{d}/a.mcap" for v in ("b", "a") for d in (1, 2, 3)))
+    pattern = str(tmp_path / "{vehicle}/{day}/*")
+    days = find_vehicle_days(pattern, "2026-03-02", "2026-03-03")
+    assert [(d.partition.day, d.partition.vehicle) for d in days] == [
+        ("2026-03-02", "a"),
+        ("2026-03-02", "b"),
+        ("2026-03-03", "a"),
+        ("2026-03-03", "b"),
+    ]
+    assert find_vehicle_days(pattern, "2027-01-01") == []
+
+
+def test_relative_patterns_work(tmp_path, monkeypatch):
+    touch(tmp_path / "logs/car/2026-03-02/a.mcap")
+    monkeypatch.chdir(tmp_path)
+    assert find_vehicle_days("logs/{vehicle}/{day}/*")[0].logs == (Path("logs/car/2026-03-02/a.mcap"),)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "days", "match"),
+    [
+        ("{vehicle}/*.mcap", (), r"lacks \{day\}"),
+        ("{day}/*.mcap", (), r"lacks \{vehicle\}"),
+        ("{vehicle}/{date}/{day}", (), r"\{date\}"),
+        ("{vehicle}/{day}/*.nothing", (), "no log matches"),
+        ("{vehicle}/{day}/*", ("yesterday",), "--from"),
+        ("{vehicle}/{day}/*", ("2026-03-03", "2026-03-02"), "after --to"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(pattern, days, match, tmp_path):
+    touch(tmp_path / "car/2026-03-02/a.mcap")
+    with pytest.raises(ConfigError, match=match) as caught:
+        find_vehicle_days(str(tmp_path / pattern), *days)
+    assert caught.value.exit_code == 2

@@ -1,0 +1,149 @@
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from jobs import cli
+from pipeline.errors import ConfigError, LogError, SolveError
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Make `boresight audit` do what a test wants."""
+
+    def behave(error):
+        def audit() -> int:
+            if isinstance(error, BaseException):
+                raise error
+            return error
+
+        import jobs.audit
+
+        monkeypatch.setattr(jobs.audit, "audit", audit)
+        app = cli.App(name="boresight", result_action="return_value", suppress_keyboard_interrupt=False)
+        app.command("jobs.audit:audit", name="audit")
+        monkeypatch.setattr(cli, "app", app)
+
+    handler = signal.getsignal(signal.SIGTERM)
+    yield behave
+    signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.mark.parametrize(
+    ("what", "code", "status", "reason"),
+    [
+        (ConfigError("fleet.toml", "rigs", "unknown key"), 2, "failed", "fleet.toml: rigs: unknown key"),
+        (LogError("a.mcap", "is empty"), 1, "failed", "a.mcap: is empty"),
+        (SolveError("a straight drive"), 3, "refused", "a straight drive"),
+        (KeyboardInterrupt(), 130, "stopped", "interrupted"),
+        (SystemExit(143), 143, "stopped", "terminated"),
+        (ZeroDivisionError("x"), 1, "failed", "ZeroDivisionError: x"),
+    ],
+)
+def test_every_end_has_its_exit_code_a_line_for_people_and_a_summary(
+    what, code, status, reason, command, capsys
+):
+    command(what)
+    assert cli.main(["audit"]) == code
+    captured = capsys.readouterr()
+    assert json.loads(captured.out.splitlines()[-1]) == {
+        "command": "audit",
+        "status": status,
+        "reason": reason,
+        "exit_code": code,
+    }
+    lines = [json.loads(line) for line in captured.err.splitlines()]
+    assert lines[-1]["event"] == reason
+    # The traceback of a surprise is in the log, of an expected error it is not.
+    assert any("Traceback" in line.get("exception", "") for line in lines) == isinstance(
+        what, ZeroDivisionError
+    )
+
+
+@pytest.mark.parametrize("code", [0, 1, 3])
+def test_a_job_decides_its_own_exit_code(code, command):
+    command(code)
+    assert cli.main(["audit"]) == code
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["nonsense"],
+        ["audit"],
+        ["audit", "--fleet", "x.toml", "--lake", "l", "--colour", "red"],
+        ["nightly", "--fleet", "x", "--lake", "l", "--logs", "p", "--executor", "magic"],
+        ["nightly", "--fleet", "x", "--lake", "l", "--logs", "p", "--workers", "many"],
+        ["audit", "--fleet", "nowhere.toml", "--lake", "l"],
+        ["show", "nonsense", "--lake", "l"],
+    ],
+)
+def test_wrong_usage_exits_with_2_and_says_why(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        assert cli.main(arguments) == 2
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    assert json.loads(capsys.readouterr().err.splitlines()[-1])["event"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_installed_command_exports_schemas(tmp_path):
+    script = f"{sys.prefix}/bin/boresight"
+    done = subprocess.run(
+        [script, "export", "schemas", "--out", str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0
+    assert (
+        len(json.loads(done.stdout.splitlines()[-1])["outputs"])
+        == len(list(tmp_path.glob("*.schema.json")))
+        > 3
+    )
+
+
+def test_show_of_an_empty_lake_is_an_empty_list_and_nothing_else(tmp_path, capsys):
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        assert cli.main(["show", "calibrations", "--lake", str(tmp_path), "--json"]) == 0
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    assert json.loads(capsys.readouterr().out) == []
+
+
+SLEEPER = """
+import sys, time
+import jobs.export
+from pathlib import Path
+from jobs import cli
+
+def export(what: str, *, out: Path) -> int:
+    from pipeline.store.aside import new_file_aside
+    with new_file_aside(out / "x.parquet") as stream:
+        stream.write(b"half")
+        stream.flush()
+        (out / "begun").touch()
+        time.sleep(60)
+    return 0
+
+jobs.export.export = export
+sys.exit(cli.main(["export", "schemas", "--out", sys.argv[1]]))
+"""
+
+
+def test_sigterm_ends_a_command_with_143_and_nothing_half_written(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SLEEPER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 30
+    while not (tmp_path / "begun").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    out, _ = process.communicate(timeout=20)
+    assert process.returncode == 143
+    assert json.loads(out.splitlines()[-1])["status"] == "stopped"
+    assert [p.name for p in tmp_path.iterdir()] == ["begun"]
