@@ -75,10 +75,28 @@ def render(
         [_footprint(a.T_map_actor, moment.standing.origin, a.kind) for a in moment.actors], np.float32
     ).reshape(-1, 8)
     image = shade(
-        view.full, view.rays_map, view.origin, mesh.corners, moment.normals, mesh.material, mesh.tint, mesh.uv,
-        TABLE.albedo, TABLE.texture, TABLE.glass, TABLE.glow, TABLE.label,
-        sun.astype(np.float32), sun_light, sky_light, shadows.light, shadows.s0, shadows.d0, shadows.cell_m, blobs,
-    )  # fmt: skip
+        view.full,
+        view.rays_map,
+        view.origin,
+        mesh.corners,
+        moment.normals,
+        mesh.material,
+        mesh.tint,
+        mesh.uv,
+        TABLE.albedo,
+        TABLE.texture,
+        TABLE.glass,
+        TABLE.glow,
+        TABLE.label,
+        sun.astype(np.float32),
+        sun_light,
+        sky_light,
+        shadows.light,
+        shadows.s0,
+        shadows.d0,
+        shadows.cell_m,
+        blobs,
+    )
     exposure = 1.55 * rng.uniform(0.9, 1.12) * (3.2 if night else 1.0)
     return _exposed(image, exposure, 7.0 if night else 2.2, rng)
 

@@ -1,7 +1,7 @@
-"""Rays against the world: Embree (through open3d) on a sliding window of the standing world and on each road user apart.
+"""Rays against the world: Embree (open3d) on a sliding window of the standing world and on each road user apart.
 
-Road users are hit in their own frame with the ray moved to the ray's own time, so a sweep that takes 100 ms sees each of
-them where it was when the beam came by, and no mesh is ever rebuilt for a frame.
+Road users are hit in their own frame with the ray moved to the ray's own time, so a sweep that takes 100 ms sees
+each of them where it was when the beam came by, and no mesh is ever rebuilt for a frame.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from functools import cached_property, lru_cache
 from typing import Any, Final
 
 import numpy as np
+import open3d as o3d
 from jaxtyping import Float
 
 from pipeline.simulate.actors import VARIANTS, actor_mesh
@@ -111,12 +112,11 @@ class Moment:
     @cached_property
     def normals(self) -> Float[np.ndarray, "T 3"]:
         """Unit normals of the triangles, of either side."""
-        parts = [self.standing.normals]
-        for actor in self.actors:
-            parts.append(
-                _prototype(actor.kind, actor.variant).normals @ actor.T_map_actor[:3, :3].T.astype(np.float32)
-            )
-        return np.concatenate(parts)
+        turned = (
+            _prototype(a.kind, a.variant).normals @ a.T_map_actor[:3, :3].T.astype(np.float32)
+            for a in self.actors
+        )
+        return np.concatenate([self.standing.normals, *turned])
 
     @cached_property
     def velocity_of_triangle(self) -> Float[np.ndarray, "T 3"]:
@@ -205,8 +205,6 @@ def _may_be_seen(centre: np.ndarray, reach_m: float, axis: np.ndarray, cosine: f
 
 
 def _scene(mesh: Mesh) -> Any:
-    import open3d as o3d
-
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), np.float32)
     index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
@@ -217,8 +215,6 @@ def _scene(mesh: Mesh) -> Any:
 def _cast(
     scene: Any, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    import open3d as o3d
-
     rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
     found = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
     primitive = found["primitive_ids"].numpy()

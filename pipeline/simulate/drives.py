@@ -1,7 +1,7 @@
 """One drive: the road it follows, how the vehicle moves along it, and who else is on the road.
 
-Everything is a function of time and of the drive's seed, so a drive of any length needs no memory, and frames that follow
-one another look at the same world.
+Everything is a function of time and of the drive's seed, so a drive of any length needs no memory, and frames that
+follow one another look at the same world.
 """
 
 from __future__ import annotations
@@ -92,10 +92,11 @@ class Road:
     ]:
         """(x, y, z [m], heading [rad]) at arc lengths."""
         s, x, y, z, heading = self._table
-        return tuple(np.asarray(np.interp(s_m, s, column)) for column in (x, y, z, heading))
+        at = [np.asarray(np.interp(s_m, s, column)) for column in (x, y, z, heading)]
+        return at[0], at[1], at[2], at[3]
 
     def to_map(self, s_d_h: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Map coordinates of points given along the road (arc length, offset to the left, height above the centre line)."""
+        """Map coordinates of points along the road (arc length, offset to the left, height above the centre line)."""
         x, y, z, heading = self.centre(s_d_h[..., 0])
         d = s_d_h[..., 1]
         return np.stack([x - d * np.sin(heading), y + d * np.cos(heading), z + s_d_h[..., 2]], -1)

@@ -1,9 +1,10 @@
-"""What goes wrong with a vehicle, and bad days: written `vehicle:day:sensor:kind:amount`, several separated by commas.
+"""What goes wrong with a vehicle, and bad days: written `vehicle:day:sensor:kind:amount`, several with commas.
 
-Kinds: yaw, pitch, roll [deg] and x, y, z [m] are knocks from that day on, about the vehicle's axes at the sensor; the same
-with `drift-` before it grow by the amount per day, starting that day; `time` [s] delays a clock from that day on. Only on that
-day: `missing` (no data), `swap` (the sensor's topic carries the other point cloud), `intrinsics` (logged focal length wrong by
-the fraction), `labels` (classes permuted), `night` (dark images, bad semantics), `few` (that many frames in all).
+Kinds: yaw, pitch, roll [deg] and x, y, z [m] are knocks from that day on, about the vehicle's axes at the sensor; the
+same with `drift-` before it grow by the amount per day, starting that day; `time` [s] delays a clock from that day on.
+Only on that day: `missing` (no data), `swap` (the sensor's topic carries the other point cloud), `intrinsics` (logged
+focal length wrong by the fraction), `labels` (classes permuted), `night` (dark images, bad semantics), `few` (that many
+frames in all).
 """
 
 from __future__ import annotations

@@ -144,8 +144,18 @@ def simulate_vehicle_day(
 
         with open_log(path, container) as (messages, put):
             record_drive(
-                messages, put, World(drive), rig_named(spec.rig), mounting, spec.semantics, today, frames, spec.rate_hz, rng, tick
-            )  # fmt: skip
+                messages,
+                put,
+                World(drive),
+                rig_named(spec.rig),
+                mounting,
+                spec.semantics,
+                today,
+                frames,
+                spec.rate_hz,
+                rng,
+                tick,
+            )
         done += frames
         drives.append(
             {"log": path.name, "frames": frames}

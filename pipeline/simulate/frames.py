@@ -42,7 +42,7 @@ class SimulatedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is around a vehicle, beside the meshes: its motion, the light, and what mirrors or outshines for the radar."""
+    """What is around a vehicle, beside meshes: its motion, the light, and what mirrors or outshines for the radar."""
 
     ego: Motion
     sun: np.ndarray
@@ -60,8 +60,14 @@ def scene_of(drive: Drive) -> Scene:
 
 
 def frame_of(
-    moment: Moment, scene: Scene, rig: RigSpec, mounting: Mounting, stamp_s: float, rng: np.random.Generator, semantics: SemanticsSpec
-) -> SimulatedFrame:  # fmt: skip
+    moment: Moment,
+    scene: Scene,
+    rig: RigSpec,
+    mounting: Mounting,
+    stamp_s: float,
+    rng: np.random.Generator,
+    semantics: SemanticsSpec,
+) -> SimulatedFrame:
     """The trio whose lidar sweep ends at `stamp_s`; `moment` should be near the middle of the sweep."""
     camera_stamp, radar_stamp = stamp_s + np.clip(rng.normal(0, rig.sync_jitter_s, 2), -0.0045, 0.0045)
     sweep = sweep_lidar(moment, scene.ego, mounting.T_vehicle_lidar, rig.lidar, stamp_s, rng)
@@ -74,10 +80,23 @@ def frame_of(
     boxes = noisy_boxes(boxes_of(exposure, view.coarse), size_px, semantics, rng)
     errors = RadarErrors(mounting.radar_range_bias_m, mounting.radar_elevation_bias_rad)
     scan = scan_radar(
-        moment.advanced(float(radar_stamp - mounting.radar_delay_s)), scene.ego, mounting.T_vehicle_radar, rig.radar, errors, rng,
-        scene.mirrors_m, scene.beacons_map,
-    )  # fmt: skip
+        moment.advanced(float(radar_stamp - mounting.radar_delay_s)),
+        scene.ego,
+        mounting.T_vehicle_radar,
+        rig.radar,
+        errors,
+        rng,
+        scene.mirrors_m,
+        scene.beacons_map,
+    )
     return SimulatedFrame(
-        stamp_s, float(camera_stamp), float(radar_stamp), encode_jpeg(image, rig.camera.jpeg_quality),
-        encode_png(noisy_labels(true, semantics, rng)), boxes, sweep, scan, true,
-    )  # fmt: skip
+        stamp_s,
+        float(camera_stamp),
+        float(radar_stamp),
+        encode_jpeg(image, rig.camera.jpeg_quality),
+        encode_png(noisy_labels(true, semantics, rng)),
+        boxes,
+        sweep,
+        scan,
+        true,
+    )

@@ -19,7 +19,7 @@ from pipeline.simulate.rigs import LidarSpec
 __all__ = ["Sweep", "sweep_lidar"]
 
 _VEGETATION: Final = LABELS.index("vegetation")
-# Echo of a frontal white wall at 100 m is 1; what is weaker than this is lost (asphalt at about 50 m from 1.8 m height).
+# Echo of a frontal white wall at 100 m is 1; what is weaker is lost (asphalt at about 50 m from 1.8 m height).
 _FAINTEST: Final = 0.018
 
 
@@ -132,7 +132,7 @@ def _mixed(
     other = np.where(np.isfinite(two[0]), two[0], one[0])
     seen = np.isfinite(one[0]) | (np.isfinite(two[0]) & (rng.random(n) < 0.5))
     gap = np.abs(np.where(seen, first, 0.0) - np.where(np.isfinite(other), other, 0.0))
-    # Echoes closer than the pulse is long merge into one in between; farther apart, the stronger or the nearer one is taken.
+    # Echoes closer than the pulse is long merge into one in between; farther apart, one of the two is taken.
     blend = (gap > 0.15) & (gap < 1.3) & (rng.random(n) < 0.6)
     switch = (gap >= 1.3) & (rng.random(n) < 0.35) & np.isfinite(two[0])
     w = rng.random(n)

@@ -8,6 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Bag1Writer
+from rosbags.rosbag2 import Writer as Bag2Writer
+
 from pipeline.simulate.messages import Messages
 
 __all__ = ["CONTAINERS", "TOPICS", "log_name", "open_log"]
@@ -47,12 +52,10 @@ def open_log(path: Path, container: str) -> Iterator[tuple[Messages, Put]]:
 
 @contextmanager
 def _mcap(path: Path) -> Iterator[tuple[Messages, Put]]:
-    from mcap.writer import CompressionType, Writer
-
     messages = Messages(2)
     channels: dict[str, int] = {}
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4 << 20, compression=CompressionType.ZSTD)
+        writer = McapWriter(file, chunk_size=4 << 20, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="boresight-simulate")
 
         def put(topic: str, stamp_ns: int, message: Any) -> None:
@@ -73,12 +76,10 @@ def _mcap(path: Path) -> Iterator[tuple[Messages, Put]]:
 
 @contextmanager
 def _ros1(path: Path) -> Iterator[tuple[Messages, Put]]:
-    from rosbags.rosbag1 import Writer
-
     messages = Messages(1)
     connections: dict[str, Any] = {}
-    writer = Writer(path)
-    writer.set_compression(Writer.CompressionFormat.LZ4)
+    writer = Bag1Writer(path)
+    writer.set_compression(Bag1Writer.CompressionFormat.LZ4)
     with writer:
 
         def put(topic: str, stamp_ns: int, message: Any) -> None:
@@ -94,11 +95,9 @@ def _ros1(path: Path) -> Iterator[tuple[Messages, Put]]:
 
 @contextmanager
 def _db3(path: Path) -> Iterator[tuple[Messages, Put]]:
-    from rosbags.rosbag2 import Writer
-
     messages = Messages(2)
     connections: dict[str, Any] = {}
-    with Writer(path, version=9) as writer:
+    with Bag2Writer(path, version=9) as writer:
 
         def put(topic: str, stamp_ns: int, message: Any) -> None:
             if topic not in connections:

@@ -3,7 +3,7 @@
 Scalar code for numba; arguments are those of the functions that call them.
 """
 # numba infers the types of the arguments; `no_type_check` keeps the tests' shape checks out of compiled code.
-# ruff: noqa: ANN001, ANN201, C901, PLR0911, PLR0912, PLR0914, PLR0915
+# ruff: noqa: ANN001, ANN201, ANN202, C901, D103, PLR0911, PLR0915, PLR1714
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _fast = numba.njit(cache=True, fastmath=True)
 
 @no_type_check
 @_fast
-def lattice(ix, iy):
+def _lattice(ix, iy):
     """Reproducible number in [0, 1) of an integer lattice point (integer hash after Wang 2007)."""
     h = (ix * 374761393 + iy * 668265263) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
@@ -46,8 +46,8 @@ def value_noise(x, y):
     ix, iy = int(fx), int(fy)
     a, b = x - fx, y - fy
     a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
-    top = lattice(ix, iy) * (1 - a) + lattice(ix + 1, iy) * a
-    low = lattice(ix, iy + 1) * (1 - a) + lattice(ix + 1, iy + 1) * a
+    top = _lattice(ix, iy) * (1 - a) + _lattice(ix + 1, iy) * a
+    low = _lattice(ix, iy + 1) * (1 - a) + _lattice(ix + 1, iy + 1) * a
     return top * (1 - b) + low * b
 
 
@@ -76,11 +76,11 @@ def texture(kind, u, v):
         ), 0.0
     if kind == 5:  # paving stones of 40 cm
         a, b = u / 0.4 - np.floor(u / 0.4), v / 0.4 - np.floor(v / 0.4)
-        stone = 0.86 + 0.24 * lattice(int(np.floor(u / 0.4)), int(np.floor(v / 0.4)))
+        stone = 0.86 + 0.24 * _lattice(int(np.floor(u / 0.4)), int(np.floor(v / 0.4)))
         return (0.65 if a < 0.05 or b < 0.05 else stone), 0.0
     if kind == 6:  # boards of 16 cm
         a = u / 0.16 - np.floor(u / 0.16)
-        return (0.45 if a < 0.12 else 0.8 + 0.3 * lattice(int(np.floor(u / 0.16)), 3)), 0.0
+        return (0.45 if a < 0.12 else 0.8 + 0.3 * _lattice(int(np.floor(u / 0.16)), 3)), 0.0
     if kind == 7:
         return 0.85 + 0.2 * value_noise(u * 1.3, v * 1.3) + 0.1 * value_noise(u * 7.0, v * 7.0), 0.0
     if kind == 8:  # road paint: worn, tyre marks
@@ -145,7 +145,7 @@ def upsampled(coarse, surface, height, width):
 
 @no_type_check
 @_fast
-def sky(x, y, z, sx, sy, sz):
+def _sky(x, y, z, sx, sy, sz):
     """Sky radiance (r, g, b) of a direction: gradient, clouds, glow around the sun."""
     up = max(z, 0.0)
     a = np.sqrt(up)
@@ -197,7 +197,7 @@ def shade(
             dx, dy, dz = rays[i, j, 0], rays[i, j, 1], rays[i, j, 2]
             k = seen[i, j]
             if k < 0:
-                r, g, b = sky(dx, dy, dz, sun[0], sun[1], sun[2])
+                r, g, b = _sky(dx, dy, dz, sun[0], sun[1], sun[2])
                 out[i, j, 0], out[i, j, 1], out[i, j, 2] = r * sky_gain, g * sky_gain, b * sky_gain
                 continue
             # Ray and plane of the triangle, barycentric coordinates (Moller and Trumbore 1997).
@@ -258,7 +258,7 @@ def shade(
                 fresnel = 0.06 + 0.94 * (1.0 + facing) ** 5
                 strength = (0.25 + fresnel) * mirror if mirror > 0 else 0.35 * fresnel
                 if rz > 0:
-                    cr, cg, cb = sky(rx, ry, rz, sun[0], sun[1], sun[2])
+                    cr, cg, cb = _sky(rx, ry, rz, sun[0], sun[1], sun[2])
                     r, g, b = (
                         r + strength * 0.55 * cr * sky_gain,
                         g + strength * 0.55 * cg * sky_gain,

@@ -1,7 +1,7 @@
 """What surfaces are made of: label, colour, texture, lidar reflectivity, radar strength.
 
-Labels are Cityscapes train ids. Reflectivity is the fraction of lidar light (905 nm) that comes back from a frontal hit;
-retro-reflectors exceed 1. Orders of magnitude after Kidd 2017 (asphalt .1-.2, concrete .3, grass .4-.6 in the near infrared).
+Labels are Cityscapes train ids. Reflectivity is the fraction of lidar light (905 nm) that comes back from a frontal
+hit; retro-reflectors exceed 1 (asphalt .1-.2, concrete .3, grass .4-.6 in the near infrared).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _PLAIN, _ASPHALT, _GRASS, _FOLIAGE, _FACADE, _PAVING, _SLATS, _CONCRETE, _WORN =
 
 @dataclass(frozen=True)
 class Material:
-    """One surface; `radar_gain` multiplies the radar echo per solid angle, `glass` is the share of light it mirrors or lets through."""
+    """One surface; `radar_gain`: radar echo per solid angle, `glass`: share of light it mirrors or lets through."""
 
     name: str
     label: str

@@ -27,8 +27,13 @@ _VISION: Final = {
     "vision_msgs/msg/Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
     "vision_msgs/msg/BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
-    "vision_msgs/msg/ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
-    "vision_msgs/msg/Detection2D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox2D bbox\nstring id",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"
+    ),
+    "vision_msgs/msg/Detection2D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox2D bbox\nstring id"
+    ),
     "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections",
 }
 _TFMESSAGE: Final = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms"}
@@ -91,28 +96,41 @@ class Messages:
             P.ravel(),
         )
         return self.make(
-            "sensor_msgs/CameraInfo", header=self._header(stamp_ns, "camera"), height=camera.height_px, width=camera.width_px,
-            distortion_model=camera.model, binning_x=0, binning_y=0, roi=roi, **dict(zip(names, values, strict=True)),
-        )  # fmt: skip
+            "sensor_msgs/CameraInfo",
+            header=self._header(stamp_ns, "camera"),
+            height=camera.height_px,
+            width=camera.width_px,
+            distortion_model=camera.model,
+            binning_x=0,
+            binning_y=0,
+            roi=roi,
+            **dict(zip(names, values, strict=True)),
+        )
 
     def cloud(self, stamp_ns: int, frame: str, columns: dict[str, np.ndarray]) -> Any:
         """PointCloud2 of float32 and uint16 columns, packed in their order."""
         dtype = np.dtype([(name, c.dtype.newbyteorder("<")) for name, c in columns.items()])
         rows = np.empty(len(next(iter(columns.values()))), dtype)
-        fields = []
+        fields, offset = [], 0
         for name, c in columns.items():
             rows[name] = c
             kind = {"f": _FLOAT32, "u": _UINT16}[c.dtype.kind]
             fields.append(
-                self.make(
-                    "sensor_msgs/PointField", name=name, offset=dtype.fields[name][1], datatype=kind, count=1
-                )
-            )  # type: ignore[index]
+                self.make("sensor_msgs/PointField", name=name, offset=offset, datatype=kind, count=1)
+            )
+            offset += c.dtype.itemsize
         return self.make(
-            "sensor_msgs/PointCloud2", header=self._header(stamp_ns, frame), height=1, width=len(rows), fields=fields,
-            is_bigendian=False, point_step=dtype.itemsize, row_step=dtype.itemsize * len(rows),
-            data=np.frombuffer(rows.tobytes(), np.uint8), is_dense=True,
-        )  # fmt: skip
+            "sensor_msgs/PointCloud2",
+            header=self._header(stamp_ns, frame),
+            height=1,
+            width=len(rows),
+            fields=fields,
+            is_bigendian=False,
+            point_step=dtype.itemsize,
+            row_step=dtype.itemsize * len(rows),
+            data=np.frombuffer(rows.tobytes(), np.uint8),
+            is_dense=True,
+        )
 
     def detections(self, stamp_ns: int, boxes: list[Box]) -> Any:
         """Detection2DArray; boxes in full-image pixels."""
@@ -165,10 +183,14 @@ class Messages:
         angular = self.make("geometry_msgs/Vector3", **(o | {"z": yaw_rate_radps}))
         twist = self.make("geometry_msgs/Twist", linear=linear, angular=angular)
         return self.make(
-            "nav_msgs/Odometry", header=header, child_frame_id=FRAMES["vehicle"],
-            pose=self.make("geometry_msgs/PoseWithCovariance", pose=self._pose(T_odom_vehicle), covariance=np.zeros(36)),
+            "nav_msgs/Odometry",
+            header=header,
+            child_frame_id=FRAMES["vehicle"],
+            pose=self.make(
+                "geometry_msgs/PoseWithCovariance", pose=self._pose(T_odom_vehicle), covariance=np.zeros(36)
+            ),
             twist=self.make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
-        )  # fmt: skip
+        )
 
     def _pose(self, T: np.ndarray) -> Any:
         w, x, y, z = (float(q) for q in to_quaternion(T))

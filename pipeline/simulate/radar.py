@@ -1,6 +1,6 @@
 """What an FMCW radar reports: scatterers from cast rays, merged by resolution cell, bent by the road's mirror, aliased.
 
-Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Low-angle radar tracking", eq. 4 (two-ray glint).
+Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Low-angle radar tracking" (glint).
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ class RadarErrors:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Detections in the radar frame; range rate positive = receding, quantised and aliased. `origin`: 0 standing, 1 moving, 2 ghost, 3 clutter (truth, in no log)."""
+    """Detections in the radar frame; range rate positive = receding, quantised and aliased.
+
+    `origin` is the truth and goes into no log: 0 standing, 1 moving, 2 ghost, 3 clutter.
+    """
 
     xyz_m: np.ndarray
     range_rate_mps: np.ndarray
@@ -199,7 +202,7 @@ def _peaks(cells: _Cells, size: np.ndarray) -> _Cells:
 
 
 def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
-    """Let the road mirror each target: unresolved, the mirror image bends the elevation; resolved, it is a second detection."""
+    """Let the road mirror targets: unresolved, the image bends the elevation; resolved, it is a second detection."""
     xyz_vehicle = transform_points(T_vehicle_radar, from_spherical(cells.aer))
     height, radar_height = xyz_vehicle[:, 2], T_vehicle_radar[2, 3]
     image = xyz_vehicle * [1.0, 1.0, -1.0]
@@ -221,19 +224,23 @@ def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: n
     copy = aer_image[second]
     copy[:, 2] = aer[second, 2] + 2 * height[second] * radar_height / aer[second, 2]
     return _Cells(
-        np.concatenate([aer, copy]), np.concatenate([cells.rate, cells.rate[second]]),
+        np.concatenate([aer, copy]),
+        np.concatenate([cells.rate, cells.rate[second]]),
         np.concatenate([cells.snr, np.abs(mirror[second]) ** 4 * cells.snr[second]]),
-        np.concatenate([cells.ground, cells.ground[second]]), np.concatenate([cells.moving, cells.moving[second]]),
-    )  # fmt: skip
+        np.concatenate([cells.ground, cells.ground[second]]),
+        np.concatenate([cells.moving, cells.moving[second]]),
+    )
 
 
 def _with_beacons(echoes: _Cells, xyz_radar: np.ndarray) -> _Cells:
     n, no = len(xyz_radar), np.zeros(len(xyz_radar), bool)
     return _Cells(
-        np.concatenate([echoes.aer, to_spherical(xyz_radar)]), np.concatenate([echoes.rate, np.zeros(n)]),
-        np.concatenate([echoes.snr, np.full(n, 3e4)]), np.concatenate([echoes.ground, no]),
+        np.concatenate([echoes.aer, to_spherical(xyz_radar)]),
+        np.concatenate([echoes.rate, np.zeros(n)]),
+        np.concatenate([echoes.snr, np.full(n, 3e4)]),
+        np.concatenate([echoes.ground, no]),
         np.concatenate([echoes.moving, no]),
-    )  # fmt: skip
+    )
 
 
 def _ghosts(
@@ -249,10 +256,12 @@ def _ghosts(
     first = to_spherical(transform_points(inverse(T_vehicle_radar), image))
     second = cells.aer[doubled] * [1.0, 1.0, 2.0]
     return _Cells(
-        np.concatenate([first, second]), np.concatenate([cells.rate[mirrored], 2 * cells.rate[doubled]]),
+        np.concatenate([first, second]),
+        np.concatenate([cells.rate[mirrored], 2 * cells.rate[doubled]]),
         np.concatenate([cells.snr[mirrored] / 4, cells.snr[doubled] / 5]),
-        np.zeros(int(mirrored.sum() + doubled.sum()), bool), np.ones(int(mirrored.sum() + doubled.sum()), bool),
-    )  # fmt: skip
+        np.zeros(int(mirrored.sum() + doubled.sum()), bool),
+        np.ones(int(mirrored.sum() + doubled.sum()), bool),
+    )
 
 
 def _clutter(spec: RadarSpec, rng: np.random.Generator) -> _Cells:
@@ -287,7 +296,8 @@ def _measured(
             spec.range_resolution_m,
         ]
     )
-    # Single-target accuracy: resolution / (1.6 sqrt(2 snr)), never better than a tenth (Skolnik, ch. 9; calibration residue of the array).
+    # Single-target accuracy: resolution / (1.6 sqrt(2 snr)) (Skolnik, ch. 9), never better than a tenth: the array's
+    # own calibration leaves that much.
     sigma = size * np.maximum(1 / (1.6 * np.sqrt(2 * snr)), 0.1)[:, None]
     aer = aer + sigma * rng.standard_normal(aer.shape) + [0.0, errors.elevation_bias_rad, errors.range_bias_m]
     grid = size / [8, 8, 8]

@@ -98,9 +98,9 @@ def trio(
 def nominal_poses(mounting: Mounting) -> dict[str, np.ndarray]:
     """T_vehicle_sensor as /tf_static says."""
     return {
-        "camera": mounting.nominal_T_vehicle_camera,
-        "lidar": mounting.nominal_T_vehicle_lidar,
-        "radar": mounting.nominal_T_vehicle_radar,
+        "camera": mounting.T_vehicle_nominal_camera,
+        "lidar": mounting.T_vehicle_nominal_lidar,
+        "radar": mounting.T_vehicle_nominal_radar,
     }
 
 

@@ -126,9 +126,9 @@ class Mounting:
     T_vehicle_camera: np.ndarray
     T_vehicle_lidar: np.ndarray
     T_vehicle_radar: np.ndarray
-    nominal_T_vehicle_camera: np.ndarray
-    nominal_T_vehicle_lidar: np.ndarray
-    nominal_T_vehicle_radar: np.ndarray
+    T_vehicle_nominal_camera: np.ndarray
+    T_vehicle_nominal_lidar: np.ndarray
+    T_vehicle_nominal_radar: np.ndarray
     camera: Camera
     nominal_camera: Camera
     camera_delay_s: float
@@ -180,8 +180,16 @@ def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int) -> Mounting:
     K[1, 1] *= K[0, 0] / logged.K[0, 0]
     K[:2, 2] += built.normal(0, rig.camera.centre_error_px * rig.camera.width_px / 1824, 2)
     return Mounting(
-        true["camera"], true["lidar"], true["radar"], nominal["camera"], nominal["lidar"], nominal["radar"],
-        Camera(logged.model, K, logged.D, logged.width_px, logged.height_px), logged,
-        rig.camera_delay_s + built.normal(0, 0.004), rig.radar_delay_s + built.normal(0, 0.004),
-        built.normal(0, 0.03), np.radians(built.normal(0, 0.15)),
-    )  # fmt: skip
+        true["camera"],
+        true["lidar"],
+        true["radar"],
+        nominal["camera"],
+        nominal["lidar"],
+        nominal["radar"],
+        Camera(logged.model, K, logged.D, logged.width_px, logged.height_px),
+        logged,
+        rig.camera_delay_s + built.normal(0, 0.004),
+        rig.radar_delay_s + built.normal(0, 0.004),
+        built.normal(0, 0.03),
+        np.radians(built.normal(0, 0.15)),
+    )

@@ -1,9 +1,8 @@
-"""The standing world along a road, made chunk by chunk: asphalt, paint, kerbs, houses, poles, signs, trees, parked cars."""
+"""The standing world along a road, made chunk by chunk: asphalt, paint, kerbs, houses, poles, trees, parked cars."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -11,20 +10,24 @@ import numpy as np
 from pipeline.simulate.actors import VARIANTS, actor_mesh
 from pipeline.simulate.drives import Drive
 from pipeline.simulate.meshes import Colour, Mesh, MeshBuilder, join, placed
+from pipeline.simulate.props import (
+    PANEL,
+    SIGN_COLOURS,
+    bollards,
+    bush,
+    delineator,
+    farm,
+    lamp,
+    litter_bin,
+    rail_post,
+    sign,
+    signal,
+    tree,
+)
 
 __all__ = ["CHUNK_M", "chunk_mesh"]
 
 CHUNK_M: Final = 40.0
-_SIGN_COLOURS: Final = (
-    (1.0, 1.0, 1.0),
-    (1.0, 0.15, 0.12),
-    (0.12, 0.25, 1.0),
-    (1.0, 0.85, 0.1),
-    (0.1, 0.5, 0.25),
-)
-_PANEL: Final = dict.fromkeys(("front", "left", "right", "top", "bottom"), "sign_back") | {
-    "rear": "sign_face"
-}
 
 
 @dataclass
@@ -124,6 +127,11 @@ def _asphalt(c: _Chunk) -> None:
     for _ in range(int(c.rng.integers(0, 3))):
         s, d = c.s0 + c.rng.uniform(0, 39), c.rng.uniform(layout.right_edge + 1, layout.left_edge - 1)
         c.band(s, s + 0.62, d, d + 0.62, lift, lift, "manhole")
+    _lanes(c)
+
+
+def _lanes(c: _Chunk) -> None:
+    layout, lift = c.drive.layout, 0.004
     own, other = sorted(layout.lanes_own), sorted(layout.lanes_oncoming)
     half = layout.lane_m / 2
     inner = [d + half for d in own[:-1]] + [d + half for d in other[:-1]]
@@ -171,7 +179,7 @@ def _crossing(c: _Chunk, s: float) -> None:
     for d in layout.lanes_own:
         _arrow(c, s - 12.0, d)
     for side, yaw in ((-1, np.pi), (1, 0.0)):
-        c.put(_signal(), s - 1.0 if side < 0 else s + 4.5, side * (edge + 0.5), 0.12, yaw)
+        c.put(signal(), s - 1.0 if side < 0 else s + 4.5, side * (edge + 0.5), 0.12, yaw)
 
 
 def _arrow(c: _Chunk, s: float, d: float) -> None:
@@ -180,89 +188,6 @@ def _arrow(c: _Chunk, s: float, d: float) -> None:
         [[[s + 2.4, d - 0.35, 0.005], [s + 4.0, d, 0.005], [s + 4.0, d, 0.005], [s + 2.4, d + 0.35, 0.005]]]
     )
     c.along.quads(head, "paint", uv=head[..., :2])
-
-
-@lru_cache(maxsize=1)
-def _signal() -> Mesh:
-    b = MeshBuilder()
-    b.tube(np.array([0, 0, 0.0]), np.array([0, 0, 3.4]), 0.06, "metal_pole")
-    b.box((0.05, 0, 2.9), (0.22, 0.30, 0.90), "signal_box")
-    for z, tint in ((3.18, (1, 0.2, 0.2)), (2.90, (0.15, 0.3, 0.05)), (2.62, (0.05, 1.0, 0.8))):
-        b.box((0.17, 0, z), (0.04, 0.2, 0.2), "signal_lamp", tint)
-    return b.mesh()
-
-
-@lru_cache(maxsize=32)
-def _sign(variant: int) -> Mesh:
-    rng = np.random.default_rng([63, variant])
-    b = MeshBuilder()
-    height, tint = rng.uniform(2.2, 2.6), _SIGN_COLOURS[int(rng.integers(len(_SIGN_COLOURS)))]
-    b.tube(np.array([0, 0, 0.0]), np.array([0, 0, height + 0.6]), 0.04, "metal_pole", 5)
-    w, h = (0.32, 0.32) if rng.random() < 0.7 else (0.5, 0.25)
-    b.frustum((-0.06, -0.03, -w, w, height), (-0.06, -0.03, -w, w, height + 2 * h), _PANEL, tint)
-    return b.mesh()
-
-
-@lru_cache(maxsize=2)
-def _lamp(reach_m: float) -> Mesh:
-    b = MeshBuilder()
-    b.tube(np.array([0, 0, 0.0]), np.array([0, 0, 7.0]), 0.08, "metal_pole", 7)
-    b.tube(np.array([0, 0, 6.9]), np.array([0, reach_m, 7.3]), 0.045, "metal_pole", 5)
-    b.box((0, reach_m, 7.25), (0.25, 0.6, 0.12), "metal_pole")
-    return b.mesh()
-
-
-@lru_cache(maxsize=1)
-def _bollards() -> Mesh:
-    b = MeshBuilder()
-    for k in range(4):
-        b.tube(np.array([1.5 * k, 0, 0.0]), np.array([1.5 * k, 0, 0.9]), 0.055, "metal_pole", 6)
-    return b.mesh()
-
-
-@lru_cache(maxsize=1)
-def _bin() -> Mesh:
-    b = MeshBuilder()
-    b.frustum((-0.3, 0.3, -0.3, 0.3, 0.0), (-0.35, 0.35, -0.35, 0.35, 1.1), "slats", (0.25, 0.35, 0.25))
-    return b.mesh()
-
-
-@lru_cache(maxsize=1)
-def _delineator() -> Mesh:
-    b = MeshBuilder()
-    b.frustum((-0.06, 0.06, -0.06, 0.06, 0), (-0.05, 0.05, -0.05, 0.05, 1.0), "delineator")
-    return b.mesh()
-
-
-@lru_cache(maxsize=1)
-def _rail_post() -> Mesh:
-    b = MeshBuilder()
-    b.box((0, 0, 0.36), (0.12, 0.08, 0.74), "rail")
-    return b.mesh()
-
-
-@lru_cache(maxsize=64)
-def _tree(variant: int) -> Mesh:
-    rng = np.random.default_rng([61, variant])
-    b = MeshBuilder()
-    scale = rng.uniform(0.8, 1.6)
-    trunk, tall = rng.uniform(1.8, 2.6) * scale, rng.uniform(4.0, 6.5) * scale
-    green = (float(rng.uniform(0.7, 1.3)), float(rng.uniform(0.75, 1.2)), float(rng.uniform(0.6, 1.2)))
-    b.tube(np.array([0, 0, 0.0]), np.array([0, 0, trunk + 0.6]), 0.13 * scale + 0.03, "bark", 7)
-    for _ in range(7):
-        p = np.array([*rng.uniform(-1.0, 1.0, 2) * scale, rng.uniform(trunk + 0.7, tall)])
-        b.blob(p, rng.uniform(0.7, 1.25, 3) * scale, "foliage", rng, green)
-    return b.mesh()
-
-
-@lru_cache(maxsize=32)
-def _bush(variant: int) -> Mesh:
-    rng = np.random.default_rng([62, variant])
-    b = MeshBuilder()
-    for _ in range(3):
-        centre = np.array([*rng.uniform(-0.7, 0.7, 2), 0.45])
-        b.blob(centre, rng.uniform([0.5, 0.5, 0.4], [0.9, 0.9, 0.9]), "foliage", rng, (0.9, 1, 0.8))
-    return b.mesh()
 
 
 def _urban(c: _Chunk) -> None:
@@ -285,22 +210,22 @@ def _urban(c: _Chunk) -> None:
 def _furniture(c: _Chunk, side: int, edge: float, walk: float) -> None:
     rng = c.rng
     for s in c.every(32.0):
-        c.put(_lamp(-side * 1.4), s + 8.0 * side, side * (edge + 0.45), 0.12)
+        c.put(lamp(-side * 1.4), s + 8.0 * side, side * (edge + 0.45), 0.12)
     for s in c.every(21.0, 6.0, 0.6):
-        c.put(_sign(int(rng.integers(24))), s, side * (edge + 0.5), 0.12, 0.0 if side < 0 else np.pi)
+        c.put(sign(int(rng.integers(24))), s, side * (edge + 0.5), 0.12, 0.0 if side < 0 else np.pi)
     avenue = np.random.default_rng([c.drive.seed, 33, side + 1]).random() < 0.55
     for s in c.every(9.0, 1.5, 0.75 if avenue else 0.12):
         c.put(
-            _tree(int(rng.integers(40))),
+            tree(int(rng.integers(40))),
             s,
             side * (edge + min(1.3, walk - 0.8)),
             0.12,
             rng.uniform(0, 6.28),
         )
     for s in c.every(14.0, 4.0, 0.35):
-        c.put(_bollards(), s, side * (edge + 0.35), 0.12)
+        c.put(bollards(), s, side * (edge + 0.35), 0.12)
     for s in c.every(26.0, 8.0, 0.4):
-        c.put(_bin(), s, side * (edge + walk - 0.5), 0.12)
+        c.put(litter_bin(), s, side * (edge + walk - 0.5), 0.12)
 
 
 def _frontage(c: _Chunk, side: int, d: float) -> None:
@@ -326,14 +251,14 @@ def _frontage(c: _Chunk, side: int, d: float) -> None:
         if kind > 0.45:
             for _ in range(int(rng.integers(1, 4))):
                 c.put(
-                    _tree(int(rng.integers(40))),
+                    tree(int(rng.integers(40))),
                     s + rng.uniform(1, width),
                     side * (d + rng.uniform(3, 14)),
                     0.1,
                     rng.uniform(0, 6),
                 )
                 c.put(
-                    _bush(int(rng.integers(20))),
+                    bush(int(rng.integers(20))),
                     s + rng.uniform(1, width),
                     side * (d + rng.uniform(1.2, 3)),
                     0.1,
@@ -409,25 +334,25 @@ def _highway(c: _Chunk) -> None:
                 c.s0, c.s0 + CHUNK_M, edge + side * 4.5, -0.2, float(3.5 + 0.5 * (c.index % 2)), "noise_wall"
             )
         for s in c.every(25.0):
-            c.put(_delineator(), s, edge + side * 1.4)
+            c.put(delineator(), s, edge + side * 1.4)
         for s in c.every(6.0, 3.0, 0.55):
             d = edge + side * rng.uniform(8, 26)
-            c.put(_tree(int(rng.integers(40))), s, d, slope * 0.7 - 0.2, rng.uniform(0, 6.28))
+            c.put(tree(int(rng.integers(40))), s, d, slope * 0.7 - 0.2, rng.uniform(0, 6.28))
         for s in c.every(5.0, 2.0, 0.5):
             c.put(
-                _bush(int(rng.integers(20))),
+                bush(int(rng.integers(20))),
                 s,
                 edge + side * rng.uniform(5, 10),
                 0.2 * slope,
                 rng.uniform(0, 6.28),
             )
         for s in c.every(55.0, 15.0, 0.7):
-            c.put(_sign(int(rng.integers(24))), s, edge + side * 1.7, 0.0, 0.0 if side < 0 else np.pi)
+            c.put(sign(int(rng.integers(24))), s, edge + side * 1.7, 0.0, 0.0 if side < 0 else np.pi)
     if c.index % 7 == 3:
         _gantry(c, c.s0 + 20.0)
     if c.index % 5 == 2:
         c.put(
-            _farm(rng),
+            farm(rng),
             c.s0 + 20.0,
             float(rng.choice([-1, 1])) * rng.uniform(45, 80),
             1.0,
@@ -446,7 +371,7 @@ def _guard_rail(c: _Chunk, d: float, *, both: bool) -> None:
         for low, high, out in ((0.48, 0.58, 0.0), (0.58, 0.68, 0.05), (0.68, 0.78, 0.0)):
             c.band(c.s0, c.s0 + CHUNK_M, d + offset + out, d + offset + out + 1e-3, low, high, "rail", 4.0)
     for s in c.every(4.0):
-        c.put(_rail_post(), s, d)
+        c.put(rail_post(), s, d)
 
 
 def _gantry(c: _Chunk, s: float) -> None:
@@ -461,15 +386,7 @@ def _gantry(c: _Chunk, s: float) -> None:
         b.frustum(
             (-0.25, -0.20, d - 1.6, d + 1.6, 5.6),
             (-0.25, -0.20, d - 1.6, d + 1.6, 8.0),
-            _PANEL,
-            _SIGN_COLOURS[2],
+            PANEL,
+            SIGN_COLOURS[2],
         )
     c.put(b.mesh(), s, 0.0)
-
-
-def _farm(rng: np.random.Generator) -> Mesh:
-    b = MeshBuilder()
-    x, y, z = rng.uniform(6, 12), rng.uniform(4, 7), rng.uniform(4, 7)
-    b.frustum((-x, x, -y, y, -1.0), (-x, x, -y, y, z), "facade")
-    b.frustum((-x, x, -y, y, z), (-x, x, -0.1, 0.1, z + 3.0), "roof")
-    return b.mesh()

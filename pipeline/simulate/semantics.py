@@ -35,14 +35,41 @@ _COCO: Final = {
 }
 # What a class is taken for when a network errs; after the confusion matrices that Cityscapes networks publish.
 _CONFUSED: Final = {
-    "road": "sidewalk", "sidewalk": "road", "building": "wall", "wall": "building", "fence": "vegetation", "pole": "building",
-    "traffic light": "building", "traffic sign": "building", "vegetation": "terrain", "terrain": "vegetation", "person": "rider",
-    "rider": "person", "car": "truck", "truck": "car", "bus": "truck", "bicycle": "vegetation", "sky": "building",
-}  # fmt: skip
+    "road": "sidewalk",
+    "sidewalk": "road",
+    "building": "wall",
+    "wall": "building",
+    "fence": "vegetation",
+    "pole": "building",
+    "traffic light": "building",
+    "traffic sign": "building",
+    "vegetation": "terrain",
+    "terrain": "vegetation",
+    "person": "rider",
+    "rider": "person",
+    "car": "truck",
+    "truck": "car",
+    "bus": "truck",
+    "bicycle": "vegetation",
+    "sky": "building",
+}
 _PRONENESS: Final = {
-    "road": 0.12, "sky": 0.01, "sidewalk": 1.6, "building": 0.9, "wall": 6.0, "fence": 5.0, "pole": 2.5, "terrain": 2.5,
-    "vegetation": 0.8, "car": 0.6, "truck": 4.0, "bus": 3.0, "traffic sign": 2.0, "rider": 3.0, "bicycle": 2.5,
-}  # fmt: skip
+    "road": 0.12,
+    "sky": 0.01,
+    "sidewalk": 1.6,
+    "building": 0.9,
+    "wall": 6.0,
+    "fence": 5.0,
+    "pole": 2.5,
+    "terrain": 2.5,
+    "vegetation": 0.8,
+    "car": 0.6,
+    "truck": 4.0,
+    "bus": 3.0,
+    "traffic sign": 2.0,
+    "rider": 3.0,
+    "bicycle": 2.5,
+}
 
 
 @dataclass(frozen=True)
@@ -109,7 +136,7 @@ def noisy_labels(
 
 
 def _quantile(share: float) -> float:
-    """Threshold (in units of sqrt 2 sigma, by the inverse error function's rational fit) that a share of a normal field exceeds."""
+    """Threshold, in sqrt 2 sigma, that a share of a normal field exceeds (inverse error function, rational fit)."""
     u = np.clip(1 - 2 * share, -0.999, 0.999)
     log = np.log(1 - u * u)
     inner = 2 / (np.pi * 0.147) + log / 2  # Winitzki 2008

@@ -18,7 +18,10 @@ def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> 
         f"[rigs.{rig_name}.camera]",
         f'image = "{TOPICS["image"]}"',
         f'info = "{TOPICS["info"]}"',
-        f'semantics = {{ source = "topics", labels = "{TOPICS["labels"]}", detections = "{TOPICS["detections"]}", label_set = "cityscapes" }}',
+        (
+            f'semantics = {{ source = "topics", labels = "{TOPICS["labels"]}", '
+            f'detections = "{TOPICS["detections"]}", label_set = "cityscapes" }}'
+        ),
         "",
         f"[rigs.{rig_name}.lidar]",
         f'points = "{TOPICS["lidar"]}"',

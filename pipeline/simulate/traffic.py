@@ -1,4 +1,4 @@
-"""Who else is on the road at a moment: endless streams per lane, leaders that drive as we do, people on the pavements."""
+"""Who else is on the road at a moment: endless streams per lane, leaders that drive as we do, people on pavements."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def test_the_nominal_mounting_is_off_by_a_degree_or_so_but_not_more():
     off = []
     for vehicle in range(12):
         m = mounting_of(rig_named("demo"), 1, vehicle, 0)
-        nominal = inverse(m.nominal_T_vehicle_camera) @ m.nominal_T_vehicle_lidar
+        nominal = inverse(m.T_vehicle_nominal_camera) @ m.T_vehicle_nominal_lidar
         off.append(np.degrees(rotation_angle_rad(inverse(nominal) @ m.truth()["T_camera_lidar"])))
     assert 0.5 < np.mean(off) < 2.5
     assert np.max(off) < 5.0
