@@ -50,7 +50,7 @@ class PairView:
     undetermined: str
     moved_by: str
     rows: list[DofRow]
-    matrix: list[list[str]]
+    matrix: str
     quaternion: str
     translation: str
     json_text: str
@@ -95,7 +95,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
         undetermined=", ".join(unseen) if sigma is not None else "",
         moved_by=_moved_by(T, T_prior),
         rows=rows,
-        matrix=[] if T is None else [[f"{v:.6f}" for v in row] for row in T],
+        matrix="" if T is None else "\n".join("".join(f"{v:12.6f}" for v in row) for row in T),
         quaternion=_numbers(quaternion, 7),
         translation=_numbers(translation, 4),
         json_text=_json_text(record, T),

@@ -50,10 +50,10 @@ def sigma_figure(
                 for s in _page_units(source[pair], dofs)
             ]
             low, high = _decades(values)
-            plot = Plot(column * 410 + 80, row * 132 + 24, 310, 84, (low, high), (3.0, 0.0))
+            plot = Plot(column * 410.0 + 80.0, row * 132.0 + 24.0, 310.0, 84.0, (low, high), (3.0, 0.0))
             if row == 0:
-                plot.text(column * 410, 12, PAIR_TITLES[pair], bold=True, size=12.5)
-            decades = [(d, f"{10.0**d:g}") for d in np.arange(np.ceil(low), high + 1e-9)]
+                plot.text(column * 410.0, 12.0, PAIR_TITLES[pair], bold=True, size=12.5)
+            decades = [(float(d), f"{10.0**d:g}") for d in np.arange(np.ceil(low), high + 1e-9)]
             plot.frame(decades, [])
             plot.text(
                 plot.left + 310,
@@ -73,7 +73,7 @@ def sigma_figure(
                     observable.get(pair),
                 )
             parts += plot.parts
-    return document(1210, 272, parts, "Sigma of each degree of freedom, of the prior and of the result")
+    return document(1210.0, 272.0, parts, "Sigma of each degree of freedom, of the prior and of the result")
 
 
 def _sigma_bars(
@@ -86,38 +86,41 @@ def _sigma_bars(
 ) -> None:
     low = plot.x[0]
     if prior is not None:
-        plot.area((low, row + 0.48), (np.log10(scaled(prior[k], DOF_NAMES[k])), row + 0.14), MUTED, 0.45)
+        end = float(np.log10(scaled(prior[k], DOF_NAMES[k])))
+        plot.area((low, row + 0.48), (end, row + 0.14), MUTED, 0.45)
     if sigma is None or observable is None:
         return
     value = scaled(sigma[k], DOF_NAMES[k])
     end = float(np.log10(value))
     plot.area((low, row + 0.88), (end, row + 0.54), AFTER, 1.0 if observable[k] else 0.0, AFTER)
     u, v = plot.at(end, row + 0.71)
-    plot.text(u + 5, v + 3.5, f"{value:.2g}" + ("" if observable[k] else " not determined"), size=10)
+    plot.text(u + 5, v + 3.5, f"{value:.2g}" + ("" if observable[k] else " not determined"), size=10.0)
 
 
 def residual_figure(before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> Markup:
     """Measures of `frame_residuals` over the day's frames."""
     parts: list[str] = []
     for column, pair in enumerate(PAIRS):
-        name, more_is_better = MEASURES[pair]
         finite = np.concatenate([v[np.isfinite(v)] for v in (before[pair], after[pair])])
         # A few frames in poor surroundings must not flatten the rest.
         top = 1.1 * float(np.quantile(finite, 0.97)) if len(finite) else 1.0
-        plot = Plot(column * 410 + 44, 40, 350, 130, (-1.0, float(len(before[pair]))), (0.0, max(top, 1e-6)))
-        plot.text(column * 410, 12, PAIR_TITLES[pair], bold=True, size=12.5)
-        plot.text(column * 410, 28, f"{name}; {'more' if more_is_better else 'less'} is better", colour=MUTED)
+        plot = Plot(
+            column * 410.0 + 44.0, 40.0, 350.0, 130.0, (-1.0, float(len(before[pair]))), (0.0, max(top, 1e-6))
+        )
+        plot.text(column * 410.0, 12.0, PAIR_TITLES[pair], bold=True, size=12.5)
+        plot.text(column * 410.0, 28.0, f"{MEASURES[pair]}; more is better", colour=MUTED)
         step = nice_step(plot.y[1])
-        plot.frame([], [(y, f"{y:g}") for y in np.arange(0, plot.y[1], step)])
-        plot.text(plot.left + 350, 186, "frames in order of time", anchor="end", colour=MUTED)
+        plot.frame([], [(float(y), f"{y:g}") for y in np.arange(0.0, plot.y[1], step)])
         if not len(finite):
-            plot.text(plot.left + 175, 110, "too little in view", anchor="middle")
+            plot.text(plot.left + 175, 110.0, "too little in view", anchor="middle")
         for k, (series, colour, label) in enumerate(
             ((before, BEFORE, "prior"), (after, AFTER, "calibrated"))
         ):
             _residual_dots(plot, series[pair], colour, label, plot.left + 130 * k)
         parts += plot.parts
-    return document(1210, 192, parts, "Agreement of the sensors in each frame, at the prior and calibrated")
+    return document(
+        1210.0, 192.0, parts, "Agreement of the sensors in each frame, at the prior and calibrated"
+    )
 
 
 def _residual_dots(plot: Plot, values: np.ndarray, colour: str, label: str, legend_u: float) -> None:
@@ -128,7 +131,7 @@ def _residual_dots(plot: Plot, values: np.ndarray, colour: str, label: str, lege
         y = min(float(values[i]), plot.y[1])
         plot.dot(float(i), y, colour, f"{label}: {values[i]:.3g}", radius=2.3, opacity=0.65)
     plot.line((plot.x[0], min(level, plot.y[1])), (plot.x[1], min(level, plot.y[1])), colour, 1.6)
-    plot.text(legend_u, 186, f"{label}: median {level:.2g}", colour=colour, bold=True)
+    plot.text(legend_u, 186.0, f"{label}: median {level:.2g}", colour=colour, bold=True)
 
 
 def drift_figure(panels: Sequence[DriftPanel], day_labels: Mapping[int, str], vehicle: str) -> Markup:
@@ -145,9 +148,9 @@ def drift_figure(panels: Sequence[DriftPanel], day_labels: Mapping[int, str], ve
         plot = Plot(
             column * 206 + 40, row * 150 + 36, 158, 84, (days[0] - 0.6, days[-1] + 0.6), _reach(panel)
         )
-        _drift_panel(plot, panel, [(d, day_labels[d]) for d in ticks], day_labels)
+        _drift_panel(plot, panel, [(float(d), day_labels[d]) for d in ticks], day_labels)
         parts += plot.parts
-    return document(1236, 446, parts, f"Control charts of {vehicle}")
+    return document(1236.0, 446.0, parts, f"Control charts of {vehicle}")
 
 
 def _drift_panel(
@@ -167,9 +170,9 @@ def _drift_panel(
         plot.line((first - 0.5, plot.y[0]), (first - 0.5, plot.y[1]), colour, 1.2, "4 3")
     for day, value, sigma in zip(panel.day, panel.value, panel.sigma, strict=True):
         v, s = scaled(value, panel.dof), scaled(sigma, panel.dof)
-        plot.dot(day, v, colour, f"{day_labels.get(day, '')}: {v:+.3f} ± {s:.3f} {unit}", bar=s)
+        plot.dot(float(day), v, colour, f"{day_labels.get(day, '')}: {v:+.3f} ± {s:.3f} {unit}", bar=s)
     for day in panel.missing:
-        plot.cross(day, 0.0, f"{day_labels.get(day, '')}: held, refused or not determined")
+        plot.cross(float(day), 0.0, f"{day_labels.get(day, '')}: held, refused or not determined")
     if not len(panel.day):
         plot.text(plot.left + plot.width / 2, plot.top + 26, "not determined", anchor="middle", colour=MUTED)
 

@@ -20,13 +20,15 @@ from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["MEASURES", "boundary_distance_px", "frame_residuals"]
 
-# pair -> what is measured, whether more is better
+# pair -> what is measured; more is better
 MEASURES = {
-    "camera_lidar": ("lidar edges on a silhouette [%]", True),
-    "camera_radar": ("moving radar inside a road user's box [%]", True),
-    "lidar_radar": ("static radar to the lidar cloud, median [m]", False),
+    "camera_lidar": "lidar edges on a silhouette [%]",
+    "camera_radar": "moving radar inside a road user's box [%]",
+    "lidar_radar": "static radar within 0.3 m of a lidar structure [%]",
 }
 _ON_SILHOUETTE_RAD = 0.003  # 0.17 deg, as wide as a mask's boundary is uncertain
+# Nearer the car's own body is seen, further the lidar has gaps wider than a degree of radar yaw.
+_STRUCTURE_FROM_M, _STRUCTURE_TO_M, _ON_STRUCTURE_M = 5.0, 40.0, 0.3
 _STATIC, _MOVING = 0, 1
 _MIN_POINTS = 5  # shares of fewer say nothing
 
@@ -39,7 +41,7 @@ def frame_residuals(
         (
             _on_silhouette(o, state.T_camera_lidar),
             _in_boxes(o, state.T_camera_radar),
-            _radar_gap_m(o, state.T_lidar_radar),
+            _on_structure(o, state.T_lidar_radar),
         )
         for o in observations
     ]
@@ -88,15 +90,16 @@ def _in_boxes(observation: Observation, T_camera_radar: np.ndarray) -> float:
     return float(100 * inside.all(axis=-1).any(axis=1).mean())
 
 
-def _radar_gap_m(observation: Observation, T_lidar_radar: np.ndarray) -> float:
-    static = observation.radar_xyz_m[observation.radar_motion == _STATIC]
+def _on_structure(observation: Observation, T_lidar_radar: np.ndarray) -> float:
+    static = _seen_from(T_lidar_radar, observation.radar_xyz_m[observation.radar_motion == _STATIC])
+    reach = np.hypot(static[:, 0], static[:, 1])
+    static = static[(reach > _STRUCTURE_FROM_M) & (reach < _STRUCTURE_TO_M)]
     standing = observation.lidar_map_xyz_m[observation.lidar_map_is_ground == 0]
     if min(len(static), len(standing)) < _MIN_POINTS:
         return float("nan")
-    seen = _seen_from(T_lidar_radar, static)
     # From above: most radars measure elevation ten times worse than azimuth.
-    distance, _ = cKDTree(standing[:, :2]).query(seen[:, :2])
-    return float(np.median(distance))
+    distance, _ = cKDTree(standing[:, :2]).query(static[:, :2])
+    return float(100 * np.mean(distance < _ON_STRUCTURE_M))
 
 
 def _seen_from(T: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from markupsafe import Markup, escape
 __all__ = ["MUTED", "Plot", "document", "nice_step"]
 
 MUTED = "#8a8f98"
+Number = float | int  # a position in the drawing
 
 
 def nice_step(span: float) -> float:
@@ -22,7 +23,7 @@ def nice_step(span: float) -> float:
     return float(next(power * m for m in (0.2, 0.5, 1.0, 2.0) if span / (power * m) <= 5))
 
 
-def document(width: float, height: float, parts: Sequence[str], description: str) -> Markup:
+def document(width: Number, height: Number, parts: Sequence[str], description: str) -> Markup:
     """One `<svg>` element that scales with the page."""
     size = f'viewBox="0 0 {width:g} {height:g}" font-size="11" fill="currentColor"'
     head = f'<svg {size} role="img" aria-label="{escape(description)}">'
@@ -33,15 +34,15 @@ def document(width: float, height: float, parts: Sequence[str], description: str
 class Plot:
     """One panel: a rectangle of the drawing and the data range that it shows; drawing calls add to `parts`."""
 
-    left: float
-    top: float
-    width: float
-    height: float
-    x: tuple[float, float]
-    y: tuple[float, float]
+    left: Number
+    top: Number
+    width: Number
+    height: Number
+    x: tuple[Number, Number]
+    y: tuple[Number, Number]
     parts: list[str] = field(default_factory=list)
 
-    def at(self, x: float, y: float) -> tuple[float, float]:
+    def at(self, x: Number, y: Number) -> tuple[Number, Number]:
         """Position of a data point in the drawing."""
         u = (x - self.x[0]) / (self.x[1] - self.x[0])
         v = (y - self.y[0]) / (self.y[1] - self.y[0])
@@ -49,10 +50,10 @@ class Plot:
 
     def line(
         self,
-        start: tuple[float, float],
-        end: tuple[float, float],
+        start: tuple[Number, Number],
+        end: tuple[Number, Number],
         colour: str,
-        width: float = 1.0,
+        width: Number = 1.0,
         dash: str = "",
     ) -> None:
         """A line between two data points."""
@@ -65,10 +66,10 @@ class Plot:
 
     def area(
         self,
-        low: tuple[float, float],
-        high: tuple[float, float],
+        low: tuple[Number, Number],
+        high: tuple[Number, Number],
         colour: str,
-        opacity: float,
+        opacity: Number,
         outline: str = "none",
     ) -> None:
         """A filled rectangle between two data points."""
@@ -80,14 +81,14 @@ class Plot:
 
     def dot(
         self,
-        x: float,
-        y: float,
+        x: Number,
+        y: Number,
         colour: str,
         tooltip: str,
         *,
-        radius: float = 3.0,
-        bar: float = 0.0,
-        opacity: float = 1.0,
+        radius: Number = 3.0,
+        bar: Number = 0.0,
+        opacity: Number = 1.0,
     ) -> None:
         """A dot with an error bar of +-`bar` and a tooltip."""
         u, v = self.at(x, y)
@@ -97,7 +98,7 @@ class Plot:
             self.line((x, y - bar), (x, y + bar), colour, 1.4)
         self.parts.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{radius:g}" fill="{colour}"/></g>')
 
-    def cross(self, x: float, y: float, tooltip: str) -> None:
+    def cross(self, x: Number, y: Number, tooltip: str) -> None:
         """A muted x, for what is missing."""
         u, v = self.at(x, y)
         self.parts.append(
@@ -106,9 +107,16 @@ class Plot:
         )
 
     def text(
-        self, u: float, v: float, text: str, *, anchor: str = "start", colour: str = "currentColor", size: float = 11,
+        self,
+        u: Number,
+        v: Number,
+        text: str,
+        *,
+        anchor: str = "start",
+        colour: str = "currentColor",
+        size: Number = 11.0,
         bold: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Text at a position of the drawing (not of the data)."""
         weight = ' font-weight="600"' if bold else ""
         self.parts.append(
@@ -118,19 +126,19 @@ class Plot:
 
     def frame(
         self,
-        x_ticks: Sequence[tuple[float, str]],
-        y_ticks: Sequence[tuple[float, str]],
+        x_ticks: Sequence[tuple[Number, str]],
+        y_ticks: Sequence[tuple[Number, str]],
         colour: str = MUTED,
-        width: float = 1.0,
+        width: Number = 1.0,
     ) -> None:
         """Left and lower axis, light grid, tick labels."""
         for value, label in x_ticks:
             self.line((value, self.y[0]), (value, self.y[1]), MUTED, 0.3)
             u, v = self.at(value, self.y[0])
-            self.text(u, v + 13, label, anchor="middle", size=10)
+            self.text(u, v + 13, label, anchor="middle", size=10.0)
         for value, label in y_ticks:
             self.line((self.x[0], value), (self.x[1], value), MUTED, 0.3)
             u, v = self.at(self.x[0], value)
-            self.text(u - 5, v + 3.5, label, anchor="end", size=10)
+            self.text(u - 5, v + 3.5, label, anchor="end", size=10.0)
         self.line((self.x[0], self.y[0]), (self.x[1], self.y[0]), colour, width)
         self.line((self.x[0], self.y[0]), (self.x[0], self.y[1]), colour, width)

@@ -1,0 +1,229 @@
+"""The pages: what they say, and that a real browser shows them without a complaint."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.audit.run import audit_fleet
+from pipeline.config import FleetConfig
+from pipeline.errors import ConfigError
+from pipeline.report.run import write_day_page, write_fleet_page, write_fleet_report
+from pipeline.report.truth import read_truth
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import write_records
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+
+KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])
+
+
+def _config() -> FleetConfig:
+    semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
+    rig = {
+        "camera": {"image": "/i", "info": "/c", "semantics": semantics},
+        "lidar": {"points": "/p"},
+        "radar": {"points": "/r"},
+    }
+    return FleetConfig.model_validate({"fleet": {"name": "test"}, "rigs": {"default": rig}})
+
+
+def _store(lake: Lake, records: list[CalibrationRecord]) -> None:
+    for vehicle, day in sorted({(r.vehicle, r.day) for r in records}):
+        rows = [r for r in records if (r.vehicle, r.day) == (vehicle, day)]
+        write_records(lake, CALIBRATIONS, Partition(vehicle, day), rows, rows[0].work_key, "0.1.0")
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory, maker: ModuleType) -> tuple[Lake, Path, Path]:
+    """A lake with three vehicles, one of them knocked, its fleet page and truth."""
+    root = tmp_path_factory.mktemp("fleet")
+    lake, rng = Lake.at(root / "lake"), np.random.default_rng(21)
+    for vehicle, motion in (("van <1>", {}), ("b", {"radar": KNOCK}), ("c", {})):
+        status = {2: "held", 3: "refused"} if vehicle == "c" else {}
+        records = maker.vehicle_records(
+            vehicle, 4, rng, motion=lambda d, m=motion: m if d > 1 else {},
+            status=lambda d, s=status: s.get(d, "accepted"),
+        )  # fmt: skip
+        _store(lake, [_with_blind_roll(r) if r.pair == "lidar_radar" else r for r in records])
+    audit_fleet(lake, _config())
+    truth = root / "truth"
+    for day in range(4):
+        path = truth / "b" / f"2026-03-0{day + 1}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lr = maker.T_LIDAR_RADAR @ (maker.exp_se3(KNOCK) if day > 1 else np.eye(4))
+        T = {
+            "camera_lidar": maker.T_CAMERA_LIDAR,
+            "lidar_radar": lr,
+            "camera_radar": maker.T_CAMERA_LIDAR @ lr,
+        }
+        path.write_text(json.dumps({f"T_{pair}": value.tolist() for pair, value in T.items()}))
+    page = root / "fleet page.html"
+    write_fleet_report(lake, _config(), page, truth=read_truth(truth))
+    return lake, page, truth
+
+
+def _with_blind_roll(record: CalibrationRecord) -> CalibrationRecord:
+    if record.status == "refused":
+        return record
+    return replace(
+        record, observable=[k not in (0, 5) for k in range(6)], reason="not determined by the day: rx, tz"
+    )
+
+
+def test_the_fleet_page_says_first_what_moved_since_when_and_how_sure(fleet: tuple[Lake, Path, Path]) -> None:
+    text = fleet[1].read_text()
+    first = text[text.index("<h1>") :][:900]
+    assert "A sensor moved on 1 of 3 vehicles: b: radar since 2026-03-03." in first
+    assert "at most 1 in 1000 vehicle-days" in first
+    assert re.search(r"yaw \+(0\.9|1\.0)\d* ± 0\.0\d+ deg", text)
+    assert "van &lt;1&gt;" in text
+    assert "van <1>" not in text
+
+
+def test_the_fleet_page_links_every_day_page_by_a_relative_path(fleet: tuple[Lake, Path, Path]) -> None:
+    from urllib.parse import unquote
+
+    links = re.findall(r'href="([^"#]+\.html)"', fleet[1].read_text())
+    assert len(links) == 12
+    for link in links:
+        page = fleet[1].parent / unquote(link)
+        assert page.is_file()
+        back = re.search(r'href="(\.\./[^"]+)"', page.read_text())
+        assert back is not None
+        assert (page.parent / unquote(back[1])).resolve() == fleet[1].resolve()
+
+
+def test_pages_have_no_outside_resources(fleet: tuple[Lake, Path, Path]) -> None:
+    for page in [fleet[1], *fleet[1].parent.glob("*_days/*.html")]:
+        text = page.read_text()
+        assert not re.search(r'(src|href|url)\s*[=(]\s*["\']?(https?:)?//', text)
+        assert '<link rel="stylesheet' not in text
+        assert "@import" not in text
+
+
+def test_the_truth_table_counts_the_axes_within_three_sigmas(fleet: tuple[Lake, Path, Path]) -> None:
+    found = re.search(r"(\d+) of (\d+) determined axes lie within three sigmas", fleet[1].read_text())
+    assert found is not None
+    assert int(found[2]) == 4 * (6 + 6 + 4)
+    assert int(found[1]) >= int(found[2]) - 2
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "day", "answer", "kind"),
+    [
+        ("b", "2026-03-01", "Yes. All pairs are accepted", "good"),
+        ("c", "2026-03-03", "No. Nothing was accepted", "bad"),
+        ("c", "2026-03-04", "No. Nothing was accepted", "bad"),
+    ],
+)
+def test_a_day_page_answers_first_whether_its_numbers_can_be_trusted(
+    fleet: tuple[Lake, Path, Path], tmp_path: Path, vehicle: str, day: str, answer: str, kind: str
+) -> None:
+    page = write_day_page(fleet[0], Partition(vehicle, day), _config(), tmp_path / "day.html")
+    text = page.read_text()
+    body = text[text.index("<h1>") :]
+    assert answer in body[:600]
+    assert f'class="answer {kind}"' in body
+    assert body.index("answer") < body.index("axis by axis") < body.index("Provenance")
+
+
+def test_a_day_page_names_what_the_day_did_not_determine(
+    fleet: tuple[Lake, Path, Path], tmp_path: Path
+) -> None:
+    text = write_day_page(fleet[0], Partition("b", "2026-03-01"), _config(), tmp_path / "d.html").read_text()
+    assert "Not determined by this day, kept at the prior: rx (roll), tz (up)." in text
+    assert "No pictures: the lake no longer has" in text
+    assert "The radar moved on 2026-03-03" in text
+
+
+def test_the_copied_json_is_the_record(
+    fleet: tuple[Lake, Path, Path], tmp_path: Path, maker: ModuleType
+) -> None:
+    text = write_day_page(fleet[0], Partition("b", "2026-03-01"), _config(), tmp_path / "d.html").read_text()
+    found = re.search(r'id="json-camera_lidar">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    value = json.loads(found[1])
+    assert value["parent_frame"] == "camera"
+    np.testing.assert_allclose(np.array(value["T"])[:3, 3], [value["tx_m"], value["ty_m"], value["tz_m"]])
+    assert np.linalg.norm(np.array(value["T"])[:3, 3] - maker.T_CAMERA_LIDAR[:3, 3]) < 0.1
+
+
+def test_a_hostile_name_cannot_leave_its_place(tmp_path: Path, maker: ModuleType) -> None:
+    lake = Lake.at(tmp_path / "lake")
+    records = maker.vehicle_records("</script><b>x", 1, np.random.default_rng(0))
+    with pytest.raises(ConfigError):
+        Partition("a/b", "2026-03-01")
+    with pytest.raises(ConfigError):
+        _store(lake, records)
+    hostile = "</script><script>alert(1)</script>"
+    records = [replace(r, vehicle="v", work_key="k", reason=hostile, notes=[hostile]) for r in records]
+    _store(lake, records)
+    text = write_day_page(lake, Partition("v", "2026-03-01"), _config(), tmp_path / "d.html").read_text()
+    assert "<script>alert" not in text
+
+
+def test_an_empty_lake_gives_an_honest_fleet_page_and_no_day_page(tmp_path: Path) -> None:
+    lake = Lake.at(tmp_path / "lake")
+    text = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
+    assert "No audit yet" in text
+    with pytest.raises(ConfigError, match="no joint record"):
+        write_day_page(lake, Partition("v", "2026-03-01"), _config(), tmp_path / "d.html")
+
+
+def test_the_same_lake_gives_the_same_page(fleet: tuple[Lake, Path, Path], tmp_path: Path) -> None:
+    pages = [
+        write_day_page(fleet[0], Partition("b", "2026-03-02"), _config(), tmp_path / n) for n in ("1", "2")
+    ]
+    assert pages[0].read_bytes() == pages[1].read_bytes()
+
+
+@pytest.mark.browser
+def test_the_browser_check_itself_sees_planted_errors(browser: Any, tmp_path: Path) -> None:
+    for name, content in {
+        "console": "<script>console.error('planted')</script>",
+        "exception": "<script>nothing.here()</script>",
+        "image": "<img src='missing.png'>",
+        "outside": "<img src='http://127.0.0.1:9/x.png'>",
+    }.items():
+        page = tmp_path / f"{name}.html"
+        page.write_text(f"<!doctype html><title>x</title>{content}")
+        assert browser.open(page), name
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("dark", [False, True])
+def test_pages_open_without_a_complaint_and_fit_a_laptop(
+    browser: Any, fleet: tuple[Lake, Path, Path], tmp_path: Path, dark: bool
+) -> None:
+    page = write_day_page(fleet[0], Partition("b", "2026-03-04"), _config(), tmp_path / "day.html")
+    for path in (fleet[1], page):
+        assert browser.open(path, dark=dark) == []
+        assert browser.evaluate("document.documentElement.scrollWidth") <= 1366
+        assert browser.evaluate("document.querySelector('.answer').getBoundingClientRect().bottom") < 400
+        background = browser.evaluate("getComputedStyle(document.body).backgroundColor")
+        level = np.mean([int(v) for v in re.findall(r"\d+", background)[:3]])
+        assert (level < 60) if dark else (level > 200)
+        browser.screenshot(tmp_path / "shot.png")
+        assert (tmp_path / "shot.png").stat().st_size > 10_000
+
+
+@pytest.mark.browser
+def test_a_page_can_be_used_by_keyboard_alone(
+    browser: Any, fleet: tuple[Lake, Path, Path], tmp_path: Path
+) -> None:
+    page = write_day_page(fleet[0], Partition("b", "2026-03-04"), _config(), tmp_path / "day.html")
+    assert browser.open(page) == []
+    browser.press("Tab")
+    assert "Skip" in browser.evaluate("document.activeElement.textContent")
+    for _ in range(40):
+        browser.press("Tab")
+        if browser.evaluate("document.activeElement.tagName") == "BUTTON":
+            break
+    assert browser.evaluate("document.activeElement.dataset.copy") == "json-camera_lidar"
+    browser.press("Enter")
+    assert browser.evaluate("document.activeElement.textContent") in ("Copied", "Press Ctrl+C")
