@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -37,9 +38,9 @@ def _box(bbox: Any) -> tuple[float, float, float, float] | None:
     x, y, width, height, theta = (
         float(v) for v in (centre.x, centre.y, bbox.size_x, bbox.size_y, bbox.center.theta)
     )
-    if not np.all(np.isfinite([x, y, width, height, theta])) or width <= 0 or height <= 0:
+    if not math.isfinite(x + y + width + height + theta) or width <= 0 or height <= 0:
         return None
-    c, s = abs(np.cos(theta)), abs(np.sin(theta))
+    c, s = abs(math.cos(theta)), abs(math.sin(theta))
     half_x, half_y = (c * width + s * height) / 2, (s * width + c * height) / 2
     return x - half_x, y - half_y, x + half_x, y + half_y
 
@@ -48,4 +49,4 @@ def _hypothesis(result: Any) -> tuple[str, float]:
     inner = getattr(result, "hypothesis", result)
     name = str(inner.class_id if hasattr(inner, "class_id") else inner.id)
     score = float(inner.score)
-    return name, score if np.isfinite(score) else 0.0
+    return name, score if math.isfinite(score) else 0.0

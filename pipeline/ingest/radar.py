@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from pipeline.config import RadarTopics
 from pipeline.ingest.clouds import cloud_columns, first_field
@@ -15,7 +15,7 @@ from pipeline.ingest.clouds import cloud_columns, first_field
 __all__ = ["RadarCloud", "read_radar"]
 
 _POWER = ("power", "rcs", "amplitude", "intensity", "snr", "snr_db", "power_db")
-_MAX_RANGE_M = 1000.0  # no automotive radar sees farther; more is a damaged number
+_MIN_RANGE_M, _MAX_RANGE_M = 0.05, 1000.0  # no automotive radar sees farther; more is a damaged number
 _FLAT_RAD = 1e-6
 
 
@@ -45,23 +45,33 @@ def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
     kind = msgtype.rsplit("/", 1)[-1]
     xyz, range_rate, power = {"RadarScan": _scan, "RadarTracks": _tracks}.get(kind, _cloud)(message, config)
     with np.errstate(over="ignore", invalid="ignore"):
-        distance = np.linalg.norm(xyz, axis=1)
-        finite = np.isfinite(distance) & np.isfinite(range_rate)
-        near, far = finite & (distance < 0.05), finite & (distance > _MAX_RANGE_M)
-    keep = finite & ~near & ~far
-    dropped = Counter({
-        "radar_points_not_finite": int(np.sum(~finite)),
-        "radar_points_at_no_range": int(np.sum(near)),
-        "radar_points_beyond_range": int(np.sum(far)),
-    })  # fmt: skip
-    has_elevation = bool(np.any(np.abs(xyz[keep, 2]) > _FLAT_RAD * distance[keep]))
+        range2 = np.einsum("ij,ij->i", xyz, xyz)
+    keep, dropped = _within(range2, range_rate)
+    xyz = xyz[keep]
     return RadarCloud(
-        xyz[keep].astype(np.float32),
+        xyz.astype(np.float32),
         range_rate[keep].astype(np.float32),
         None if power is None else power[keep].astype(np.float32),
-        has_elevation,
-        +dropped,
+        bool(np.any(np.abs(xyz[:, 2]) > _FLAT_RAD * np.sqrt(range2[keep]))),
+        dropped,
     )
+
+
+def _within(
+    range2: Float[np.ndarray, " N"], range_rate_mps: Float[np.ndarray, " N"]
+) -> tuple[slice | Bool[np.ndarray, " N"], Counter[str]]:
+    """What to index with to keep the detections that are measurements, and how many are dropped for what."""
+    measured = np.isfinite(range_rate_mps)
+    keep = (range2 >= _MIN_RANGE_M**2) & (range2 <= _MAX_RANGE_M**2) & measured  # False for NaN
+    if keep.all():
+        return slice(None), Counter()
+    finite, near = np.isfinite(range2) & measured, range2 < _MIN_RANGE_M**2
+    dropped = {
+        "radar_points_not_finite": int(np.sum(~finite)),
+        "radar_points_at_no_range": int(np.sum(finite & near)),
+        "radar_points_beyond_range": int(np.sum(finite & ~near & ~keep)),
+    }
+    return keep, +Counter(dropped)
 
 
 _Columns = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"], Float[np.ndarray, " N"] | None]
@@ -81,8 +91,9 @@ def _cloud(message: Any, config: RadarTopics) -> _Columns:
     if any(points[n].ndim > 1 for n in used):
         raise ValueError(f"a field of {', '.join(used)} holds more than one value a point")
     # A planar radar has no z: 0 and has_elevation = False say so.
-    z = points["z"].astype(np.float64) if "z" in names else np.zeros(len(points))
-    xyz = np.stack([points["x"].astype(np.float64), points["y"].astype(np.float64), z], axis=1)
+    z = points["z"] if "z" in names else 0.0
+    xyz = np.empty((len(points), 3))
+    xyz[:, 0], xyz[:, 1], xyz[:, 2] = points["x"], points["y"], z
     doppler = points[config.doppler_field].astype(np.float64)
     power = first_field(points, _POWER)
     return xyz, _receding(doppler, config), None if power is None else power.astype(np.float64)

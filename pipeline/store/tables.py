@@ -185,7 +185,8 @@ def _writer_options(schema: TableSchema) -> dict[str, Any]:
     nested = any(pa.types.is_nested(f.type) for f in arrow)
     # JPEG and PNG don't compress further; zstd on them only costs time. Nested columns name their leaves differently.
     # Arrays: LZ4 writes in half the time of zstd and reads in a quarter, for a tenth more space (measured on a real day).
-    coded = {"image", "labels_png", "road_contrast_png"}
+    # Coordinates and times of points are noise in their low bits: compressing them doubles the time for a twelfth of the space.
+    coded = {"image", "labels_png", "road_contrast_png", "lidar_x_m", "lidar_y_m", "lidar_z_m", "lidar_time_s"}
     compressed = {
         c.name: "NONE" if c.name in coded else "LZ4" if c.is_array else "ZSTD" for c in schema.columns
     }
