@@ -1,0 +1,146 @@
+"""`boresight check` says what logs can give before anyone spends a night on them."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import ConfigError
+from pipeline.ingest.check import check_logs, doppler_speed
+from pipeline.ingest.verdict import Evidence, judge, overall
+
+GOOD = Evidence(
+    frames=120,
+    has_prior=True,
+    labels_share=1.0,
+    detections_share=1.0,
+    has_intensity=True,
+    rings=16,
+    elevation_share=1.0,
+    moving_share=0.8,
+)
+
+
+def verdict(evidence, pair, dof):
+    return next(v for v in judge(evidence) if (v.pair, v.dof) == (pair, dof))
+
+
+def changed(**fields):
+    return Evidence(**{**GOOD.__dict__, **fields})
+
+
+def test_good_evidence_gives_a_yes_and_no_evidence_a_no():
+    assert overall(judge(GOOD)) == "yes"
+    assert overall(judge(changed(frames=3))) == "no"
+    assert overall(judge(changed(has_prior=False))) == "no"
+
+
+@pytest.mark.parametrize(
+    ("lack", "pair", "dof", "word"),
+    [
+        ({"elevation_share": 0.0}, "lidar_radar", "roll, pitch and z", "elevation"),
+        ({"elevation_share": 0.0}, "camera_radar", "roll and pitch", "elevation"),
+        ({"labels_share": 0.0}, "camera_lidar", "pitch", "semantic labels"),
+        ({"moving_share": 0.0}, "lidar_radar", "time offset", "moves in 0%"),
+    ],
+)
+def test_what_is_lacking_costs_just_the_dof_that_need_it(lack, pair, dof, word):
+    evidence = changed(**lack)
+    found = verdict(evidence, pair, dof)
+    assert found.verdict == "no"
+    assert word in found.reasons[0]
+    assert overall(judge(evidence)) == "partly"
+    assert verdict(evidence, "lidar_radar", "yaw, x and y").verdict == "yes"
+
+
+def test_weak_evidence_is_called_weak_with_its_reason():
+    few = verdict(changed(frames=15), "camera_lidar", "yaw and roll")
+    assert (few.verdict, few.reasons) == ("weak", ["15 usable frames; 30 or more make it sharp"])
+    blind = verdict(changed(has_intensity=False), "camera_lidar", "pitch")
+    assert blind.verdict == "weak"
+    assert verdict(changed(has_intensity=False, rings=64), "camera_lidar", "pitch").verdict == "yes"
+    assert verdict(changed(doppler_doubt="odd"), "lidar_radar", "yaw, x and y").reasons == ["odd"]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(2, 35), st.sampled_from([None, 10.394, 40.0]), st.sampled_from([1, -1]), st.integers(0, 100))
+def test_the_speed_of_the_car_shows_in_a_scan_even_where_doppler_wraps(speed, period, sign, seed):
+    rng = np.random.default_rng(seed)
+    azimuth, elevation = rng.uniform(-0.9, 0.9, 400), rng.uniform(-0.1, 0.1, 400)
+    directions = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1
+    )
+    range_rate = -sign * speed * directions[:, 0] + rng.normal(0, 0.05, 400)
+    range_rate[:80] = rng.uniform(-20, 20, 80)  # traffic
+    if period is not None:
+        range_rate = (range_rate + period / 2) % period - period / 2
+    found, share = doppler_speed(directions, range_rate, period)
+    assert found == pytest.approx(sign * speed, abs=0.4)
+    assert share > 0.7
+
+
+def report_on(kit, tmp_path, drive, **fleet):
+    config = kit.fleet(ingest={"min_lidar_points": 500}, **fleet)
+    return check_logs([drive.mcap(tmp_path / "a.mcap")], config.rigs["default"], config.ingest)
+
+
+def test_a_complete_drive_is_fit_and_its_facts_are_right(kit, tmp_path):
+    report = report_on(kit, tmp_path, kit.Kit(frames=40).drive())
+    assert report.answer == "yes"
+    assert report.evidence == Evidence(40, True, 1.0, 1.0, True, 16, 1.0, 1.0, "")
+    assert (report.sync.sweeps, report.sync.trios) == (40, 40)
+    assert report.sync.camera_median_ms == pytest.approx(1.0)
+    assert report.sync.radar_median_ms == pytest.approx(2.0)
+    assert report.frame_ids == {"camera": ["camera_optical"], "lidar": ["lidar"], "radar": ["radar"]}
+    assert report.has_point_time
+    assert not report.has_odometry
+    rates = {t.role: t.rate_hz for t in report.topics}
+    assert rates["lidar"] == pytest.approx(10.0)
+    assert json.loads(json.dumps(report.evidence.__dict__))["rings"] == 16
+
+
+def test_a_missing_topic_is_named_with_those_that_it_might_be(kit, tmp_path):
+    drive = kit.Kit(frames=12).drive()
+    drive.messages = [("/radar/rear", *m[1:]) if m[0] == kit.RADAR else m for m in drive.messages]
+    report = report_on(kit, tmp_path, drive)
+    assert report.answer == "no"
+    assert any(kit.RADAR in line and "/radar/rear" in line for line in report.advice)
+
+
+def test_a_planar_radar_a_missing_field_and_a_wrong_sign_are_noticed(kit, tmp_path):
+    drive, planar = kit.Kit(frames=40).drive(), kit.Kit(frames=40).drive()
+    for i in range(40):
+        columns = {n: v for n, v in kit.radar(i).items() if n != "z"}
+        stamp = kit.START_NS + i * kit.PERIOD_NS
+        planar.replaced(kit.RADAR, i, planar.cloud(stamp, columns, frame_id="radar"))
+    report = report_on(kit, tmp_path, planar)
+    assert report.answer == "partly"
+    assert report.evidence.elevation_share == 0.0
+    report = report_on(kit, tmp_path, drive, radar={"doppler_field": "speed"})
+    assert report.answer == "no"
+    assert any("x, y, z, doppler, power" in p for p in report.problems)
+    report = report_on(kit, tmp_path, drive, radar={"doppler_positive": "receding"})
+    assert 'probably "approaching"' in report.evidence.doppler_doubt
+    report = report_on(kit, tmp_path, drive, radar={"doppler_period_mps": 2.0})
+    assert "doppler_period_mps = 2" in report.evidence.doppler_doubt
+
+
+def test_a_camera_frame_that_is_not_optical_is_noticed(kit, tmp_path):
+    drive = kit.Kit(frames=12).drive()
+    for i, m in enumerate(drive.messages):
+        if m[0] == "/tf_static":
+            level = [drive.transform(0, "base_link", f) for f in ("camera_optical", "lidar", "radar")]
+            drive.messages[i] = (*m[:3], drive.tf(*level))
+    assert any("optical" in line for line in report_on(kit, tmp_path, drive).advice)
+
+
+def test_unusable_logs_are_a_no_and_missing_ones_a_mistake(kit, tmp_path):
+    config = kit.fleet()
+    (tmp_path / "a.mcap").write_bytes(b"nothing")
+    report = check_logs([tmp_path / "a.mcap"], config.rigs["default"], config.ingest)
+    assert report.answer == "no"
+    assert report.problems
+    with pytest.raises(ConfigError, match="no such file"):
+        check_logs([tmp_path / "none.mcap"], config.rigs["default"], config.ingest)

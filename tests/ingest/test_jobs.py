@@ -1,0 +1,70 @@
+"""The commands around the stage: exit codes, and one JSON summary as the last line of stdout."""
+
+import json
+
+import pytest
+
+from jobs.check import check
+from jobs.ingest import ingest
+from pipeline.errors import ConfigError
+
+FLEET = """
+[fleet]
+name = "test"
+[rigs.default.camera]
+image = "/camera/image"
+info = "/camera/info"
+semantics = { source = "topics", labels = "/perception/labels", detections = "/perception/detections" }
+[rigs.default.lidar]
+points = "/lidar/points"
+[rigs.default.radar]
+points = "/radar/points"
+doppler_positive = "approaching"
+[vehicles.car]
+"""
+
+
+@pytest.fixture
+def fleet(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text(FLEET)
+    return path
+
+
+def last_line(capsys):
+    return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+
+
+def test_ingest_exits_0_when_done_or_cached_and_3_when_refused(kit, tmp_path, fleet, capsys):
+    log = kit.Kit().drive().mcap(tmp_path / "a.mcap")
+    common = {"fleet": fleet, "lake": str(tmp_path / "lake"), "vehicle": "car", "day": "2023-11-14"}
+    for status in ("done", "cached"):
+        assert ingest(log, **common) == 0
+        summary = last_line(capsys)
+        assert (summary["command"], summary["status"], summary["rows"]) == ("ingest", status, 4)
+    assert ingest(kit.Kit().drive().without(kit.LIDAR).mcap(tmp_path / "b.mcap"), **common) == 3
+    assert kit.LIDAR in last_line(capsys)["reason"]
+    with pytest.raises(ConfigError, match="at least one log"):
+        ingest(**common)
+
+
+def test_check_exits_0_1_2_for_yes_partly_no(kit, tmp_path, fleet, capsys):
+    good = kit.Kit(frames=40).drive()
+    assert check(fleet, good.mcap(tmp_path / "good.mcap")) == 0
+    assert last_line(capsys)["status"] == "yes"
+    assert check(fleet, good.without(kit.LABELS).mcap(tmp_path / "unlabelled.mcap")) == 1
+    summary = last_line(capsys)
+    assert summary["status"] == "partly"
+    assert summary["pairs"] == {"camera_lidar": "no", "lidar_radar": "partly", "camera_radar": "no"}
+    assert check(fleet, good.without(kit.RADAR).mcap(tmp_path / "blind.mcap")) == 2
+    assert kit.RADAR in capsys.readouterr().err
+
+
+def test_check_as_json_is_one_object_on_stdout(kit, tmp_path, fleet, capsys):
+    assert check(fleet, kit.Kit(frames=40).drive().mcap(tmp_path / "a.mcap"), json=True) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["answer"] == "yes"
+    assert {v["pair"] for v in report["verdicts"]} == {"camera_lidar", "lidar_radar", "camera_radar"}
+    assert report["sync"]["trios"] == 40
+    with pytest.raises(ConfigError, match="no rig"):
+        check(fleet, tmp_path / "a.mcap", rig="truck")
