@@ -19,13 +19,13 @@ from pipeline.prior import perturbed, prior_key, read_prior
 from pipeline.results import Progress, StageResult, silent
 from pipeline.solve.alignment import alignment_of
 from pipeline.solve.curvature import blocks_of
-from pipeline.solve.methods import PAPER_METHODS, solver_of
+from pipeline.solve.methods import COMPOSED, PAPER_METHODS, solver_of
 from pipeline.solve.select import Selection, select_frames
 from pipeline.solve.trigger import exceeded, trigger_metrics
 from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.tables import read_manifest, read_records, read_rows, write_records
 from pipeline.verify.holdout import HeldOutTest, paired_test
-from pipeline.verify.verdict import Limits, judge, loop_doubts
+from pipeline.verify.verdict import Limits, Verdict, judge, loop_doubts
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.versions import CODE_VERSION
@@ -131,27 +131,23 @@ def calibrate_observations(
     )
     progress(2, 4, "judge on held-out frames")
     after = trigger_metrics(sample, {pair: solution.pairs[pair].T for pair in PAIRS})
-    doubts = loop_doubts(solution)
-    limits = Limits(np.radians(fleet.solve.search_rotation_deg), fleet.solve.search_translation_m)
-    records = []
-    for pair in PAIRS:
-        held = [observations[i] for i in selection.holdout[pair]]
-        test = _held_out_test(pair, held, prior, solution)
-        verdict = judge(
-            solution.pairs[pair],
-            prior.of(pair),
-            prior.covariance(pair),
-            test,
-            [*solution.doubts.get(pair, []), *doubts],
-            limits,
-            calibrated=pair in active,
+    verdicts, tests = _judge_all(observations, selection, prior, solution, fleet, active)
+    records = [
+        record_of(
+            about,
+            pair,
+            solution,
+            prior,
+            verdicts[pair],
+            tests[pair],
+            selection,
+            observations,
+            before=before[pair],
+            after=after[pair],
+            triggered=bool(fired[pair]),
         )
-        records.append(
-            record_of(
-                about, pair, solution, prior, verdict, test, selection, observations,
-                before=before[pair], after=after[pair], triggered=bool(fired[pair]),
-            )
-        )  # fmt: skip
+        for pair in PAIRS
+    ]
     progress(4, 4, "done")
     return records
 
@@ -160,6 +156,36 @@ def _observations(lake: Lake, partition: Partition) -> list[Observation]:
     if read_manifest(lake, OBSERVATIONS, partition) is None:
         raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
     return read_rows(lake, OBSERVATIONS, partition, Observation)
+
+
+def _judge_all(
+    observations: Sequence[Observation],
+    selection: Selection,
+    prior: Prior,
+    solution: Solution,
+    fleet: FleetConfig,
+    active: Sequence[str],
+) -> tuple[dict[str, Verdict], dict[str, HeldOutTest | None]]:
+    """Verdict and held-out test of each pair; pairs that a method composes come after their factors."""
+    doubts = loop_doubts(solution)
+    limits = Limits(np.radians(fleet.solve.search_rotation_deg), fleet.solve.search_translation_m)
+    composed = COMPOSED.get(solution.method, ())
+    verdicts: dict[str, Verdict] = {}
+    tests: dict[str, HeldOutTest | None] = {}
+    for pair in sorted(PAIRS, key=lambda p: p in composed):
+        held = [observations[i] for i in selection.holdout[pair]]
+        tests[pair] = _held_out_test(pair, held, prior, solution)
+        verdicts[pair] = judge(
+            solution.pairs[pair],
+            prior.of(pair),
+            prior.covariance(pair),
+            tests[pair],
+            [*solution.doubts.get(pair, []), *doubts],
+            limits,
+            calibrated=pair in active,
+            factors=tuple(verdicts.values()) if pair in composed else (),
+        )
+    return verdicts, tests
 
 
 def _held_out_test(

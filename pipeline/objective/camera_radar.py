@@ -16,13 +16,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.objective.kernels import FoldedFrames, fold_frames, frame_costs
 from pipeline.objective.semantics import (
     SKY,
     camera_at_label_size,
     distance_cost,
-    full_camera,
     in_camera,
     labels_of,
     safely_in_view,
@@ -30,7 +28,7 @@ from pipeline.objective.semantics import (
 )
 from schemas.observations import Observation
 
-__all__ = ["CameraRadarLoss", "azimuth_cost", "camera_radar_loss"]
+__all__ = ["CameraRadarLoss", "camera_radar_loss"]
 
 SCALE_RAD = np.radians(2.0)
 PENALTY = 1.0
@@ -115,28 +113,4 @@ def _padded(arrays: list[np.ndarray], fill: float) -> np.ndarray:
     out = np.full((len(arrays), longest, 2), fill)
     for row, a in zip(out, arrays, strict=True):
         row[: len(a)] = a
-    return out
-
-
-def azimuth_cost(
-    observations: Sequence[Observation], T_camera_radar: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, " F"]:
-    """Azimuth misfit of tracked clusters to the nearest road user's box, for held-out verdicts; lower is better.
-
-    Elevation is left out on purpose: returns lie below the boxes' centres, so it prefers a biased pose
-    (evidence on the real logs, 0.5-1 deg). NaN where a frame has no tracked cluster in range or no road user.
-    """
-    out = np.full(len(observations), np.nan)
-    for k, observation in enumerate(observations):
-        tracks = _in_range(observation.radar_track_xyz_m)
-        boxes = observation.road_user_boxes_px.astype(np.float64).reshape(-1, 4)
-        if not len(tracks) or not len(boxes):
-            continue
-        camera = full_camera(observation)
-        rays = camera.unproject((boxes[:, :2] + boxes[:, 2:]) / 2)
-        centres = camera_direction_angles(rays[np.isfinite(rays).all(axis=1)])[:, 0]
-        azimuth = camera_direction_angles(in_camera(T_camera_radar, tracks))[:, 0]
-        if len(centres):
-            nearest = np.abs(azimuth[:, None] - centres[None]).min(axis=1)
-            out[k] = distance_cost(nearest, SCALE_RAD / 2).mean()
     return out

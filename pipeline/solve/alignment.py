@@ -1,7 +1,7 @@
 """Alignment costs of frames at a pose: what held-out frames are judged by, whatever the method.
 
 The judge is the same for all methods: the sharp edges and road markings of method `joint` for camera-lidar,
-its registration likelihood for lidar-radar, azimuths of tracked clusters against road users' boxes for
+its registration likelihood for lidar-radar, azimuths of moving clusters against road users' boxes for
 camera-radar. The paper's losses can't judge: their minimum lies off the truth.
 """
 
@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pipeline.objective.camera_radar import azimuth_cost
 from pipeline.objective.problem import Prior
 from pipeline.solve.camera_lidar import camera_lidar_cost
+from pipeline.solve.camera_radar import camera_radar_cost
 from pipeline.solve.lidar_radar import lidar_radar_cost
 from schemas.observations import Observation
 
@@ -40,6 +40,6 @@ def alignment_of(pair: str, observations: Sequence[Observation], prior: Prior) -
         return lidar_radar_cost(observations, T, dt_s)
 
     def camera_radar(T: np.ndarray, _dt_s: float) -> np.ndarray:
-        return azimuth_cost(observations, T)
+        return camera_radar_cost(observations, T)
 
     return {"camera_lidar": camera_lidar, "lidar_radar": lidar_radar, "camera_radar": camera_radar}[pair]

@@ -49,6 +49,7 @@ def judge(
     limits: Limits,
     *,
     calibrated: bool = True,
+    factors: Sequence[Verdict] = (),
 ) -> Verdict:
     """Decide on one pair.
 
@@ -60,6 +61,8 @@ def judge(
         doubts: reasons found while solving for not trusting the pair.
         limits: thresholds.
         calibrated: False where no trigger asked for this pair.
+        factors: verdicts of the pairs that this one is composed of; empty where it was estimated. A composed pair is as
+            good as its factors: it need not align better on its own held-out frames, but it may not align worse.
     """
     if not calibrated:
         return Verdict("held", "not triggered: the prior stays")
@@ -68,7 +71,15 @@ def judge(
     reasons = [*doubts, *_range_reasons(estimate, T_prior, prior_covariance, limits)]
     if not estimate.observable.any():
         reasons.append("the day determines no degree of freedom")
-    reasons += _holdout_reasons(estimate, T_prior, test, limits)
+    if factors:
+        reasons += (
+            []
+            if all(f.status == "accepted" for f in factors)
+            else ["composed of a pair that is not accepted"]
+        )
+        reasons += _worse(test, limits)
+    else:
+        reasons += _holdout_reasons(estimate, T_prior, test, limits)
     if reasons:
         return Verdict("held", "; ".join(reasons))
     kept = [name for name, seen in zip(DOF_NAMES, estimate.observable, strict=True) if not seen]
@@ -131,11 +142,8 @@ def _holdout_reasons(
         return [
             f"too few held-out frames to judge: {0 if test is None else test.frames}, needs {limits.min_holdout}"
         ]
-    if test.z > limits.z:
-        change = f"{test.after:.4g} after {test.before:.4g}, z = {test.z:.1f}"
-        return [f"held-out frames align worse than at the prior ({change})"]
-    if test.z < -limits.z:
-        return []
+    if abs(test.z) > limits.z:
+        return _worse(test, limits)
     # Neither better nor worse: fine as long as the result says the same as the prior.
     sigma = np.sqrt(np.diag(estimate.covariance))
     ratio = np.where(estimate.observable, np.abs(moved(estimate.T, T_prior)) / sigma, 0.0)
@@ -144,3 +152,10 @@ def _holdout_reasons(
         claim = f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} of its sigmas"
         return [f"{claim}, and held-out frames align no better (z = {test.z:.1f})"]
     return []
+
+
+def _worse(test: HeldOutTest | None, limits: Limits) -> list[str]:
+    if test is None or test.z <= limits.z:
+        return []
+    change = f"{test.after:.4g} after {test.before:.4g}, z = {test.z:.1f}"
+    return [f"held-out frames align worse than at the prior ({change})"]

@@ -87,6 +87,16 @@ def test_a_day_that_determines_nothing_is_held():
     assert "no degree of freedom" in verdict(estimate(0.0, observable=[0] * 6), SAME).reason
 
 
+def test_a_composed_pair_is_as_good_as_its_factors():
+    good, bad = verdict(estimate(1.5), BETTER), verdict(estimate(1.5), WORSE)
+    assert verdict(estimate(1.0), SAME, factors=[good, good]).status == "accepted"
+    assert (
+        verdict(estimate(1.0), BETTER, factors=[good, bad]).reason
+        == "composed of a pair that is not accepted"
+    )
+    assert "align worse" in verdict(estimate(1.0), WORSE, factors=[good, good]).reason
+
+
 def test_too_few_frames_are_refused():
     found = verdict(replace(estimate(1.0), frames_used=3), BETTER)
     assert (found.status, found.reason) == ("refused", "too few frames: 3, needs 8")
