@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import no_type_check
 
+import numba
 import numpy as np
 from jaxtyping import Float, Float32
 
@@ -145,6 +147,15 @@ class Terms:
         narrow = self.edges.gap_rad * self.camera[1] <= max_gap_px
         return replace(self, edges=self.edges.chosen(narrow))
 
+    def at_most(self, points: int, rng: np.random.Generator) -> Terms:
+        """With at most about so many edges, and markings, drawn at random."""
+        share = [min(1.0, points / max(len(p.xyz_m), 1)) for p in (self.edges, self.markings)]
+        edges, markings = (
+            p if s >= 1.0 else p.chosen(rng.random(len(p.xyz_m)) < s)
+            for p, s in zip((self.edges, self.markings), share, strict=True)
+        )
+        return replace(self, edges=edges, markings=markings)
+
     def of_frames(self, frames: np.ndarray) -> Terms:
         """Some of the frames."""
         maps = replace(
@@ -167,15 +178,8 @@ class Terms:
         The image shows the lidar clock's time `-dt` (stamp_camera = stamp_lidar + dt). The car was then dt earlier on its way,
         so what stands still lay dt times the own velocity further ahead: p' = Rz(yaw_rate dt) (p + v dt).
         """
-        angle = at.dt_s[:, None] * self.yaw_rate  # P F
-        c, s, o = np.cos(angle), np.sin(angle), np.zeros_like(angle)
-        turn = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1], -1)], -2)
-        shift = (turn @ (at.dt_s[:, None, None] * self.velocity_lidar)[..., None])[..., 0]
-        out = np.empty((*angle.shape, 3, 4), np.float32)
-        R = at.T_camera_lidar[:, None, :3, :3]
-        out[..., :3] = R @ turn
-        out[..., 3] = (R @ shift[..., None])[..., 0] + at.T_camera_lidar[:, None, :3, 3]
-        return out.reshape(*angle.shape, 12)
+        R, t = at.T_camera_lidar[:, :3, :3], at.T_camera_lidar[:, :3, 3]
+        return _moving_poses(R, t, at.dt_s, self.velocity_lidar, self.yaw_rate)
 
     def edge_score(self, at: Alignments, level: Level) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the edges."""
@@ -267,6 +271,26 @@ class Terms:
         unit = replace(level, delta=1.0)
         delta = float(np.clip(self.marking_score(at, unit).sum() / max(len(m.xyz_m), 1), 0.0, 1.0))
         return replace(level, match=match, chance=chance, delta=delta)
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True)
+def _moving_poses(
+    R: np.ndarray, t: np.ndarray, dt_s: np.ndarray, velocity: np.ndarray, yaw_rate: np.ndarray
+) -> np.ndarray:
+    """[R Rz(yaw_rate dt) | R Rz(yaw_rate dt) v dt + t] as rows, for each pose and frame."""
+    count, frames = R.shape[0], velocity.shape[0]
+    out = np.empty((count, frames, 12), np.float32)
+    for p in range(count):
+        for f in range(frames):
+            c, s = np.cos(yaw_rate[f] * dt_s[p]), np.sin(yaw_rate[f] * dt_s[p])
+            for i in range(3):
+                a, b, d = c * R[p, i, 0] + s * R[p, i, 1], c * R[p, i, 1] - s * R[p, i, 0], R[p, i, 2]
+                ahead = a * velocity[f, 0] + b * velocity[f, 1] + d * velocity[f, 2]
+                row = 4 * i
+                out[p, f, row], out[p, f, row + 1], out[p, f, row + 2] = a, b, d
+                out[p, f, row + 3] = ahead * dt_s[p] + t[p, i]
+    return out
 
 
 def _weights(markings: Points, level: Level) -> np.ndarray:

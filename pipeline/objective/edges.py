@@ -8,6 +8,8 @@ random pixel. A class whose boundaries say nothing gets a small pi and loses its
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numba
 import numpy as np
 from jaxtyping import Float32, Int8, Int64, UInt8
@@ -20,7 +22,6 @@ CHANCE_BINS = 128
 _FEWEST_OF_KIND = 40  # fewer tell no share from chance
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
 def edge_scores(
     camera: Float32[np.ndarray, "18"],
     offsets: Int8[np.ndarray, "F 4 H W"],
@@ -51,16 +52,38 @@ def edge_scores(
         chance: density of |r| at random places [1/px], by kind, in bins of one pixel.
         sigma_px: scale of the kernel (1 + (r/s)^2)^-2.
     """
+    width_px = np.hypot(np.float32(sigma_px), gap_rad * camera[1] * np.float32(1 / np.sqrt(12)))
+    # 2/pi makes (1 + x^2)^-2 a density
+    gain = match[:, None] * np.float32(2 / np.pi) / chance
+    return _edge_loop(camera, offsets, points, side, kind, 1 / width_px, start, poses, focal, 1 - match, gain)
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _edge_loop(
+    camera: np.ndarray,
+    offsets: np.ndarray,
+    points: np.ndarray,
+    side: np.ndarray,
+    kind: np.ndarray,
+    sharpness: np.ndarray,
+    start: np.ndarray,
+    poses: np.ndarray,
+    focal: np.ndarray,
+    base: np.ndarray,
+    gain: np.ndarray,
+) -> np.ndarray:
+    """The sum of log(base + gain sharpness (1 + (r sharpness)^2)^-2) over each frame's points."""
     count, frames = poses.shape[0], poses.shape[1]
     height, width = offsets.shape[2], offsets.shape[3]
     out = np.zeros((count, frames), np.float32)
-    f4 = np.float32
-    s2, beam = f4(sigma_px * sigma_px), camera[1] * camera[1] * f4(1 / 12)
+    f4, i4 = np.float32, np.int32
+    half, one = f4(0.5), f4(1.0)
     u_max, v_max = f4(width - 1), f4(height - 1)
     for f in range(frames):
         for p in range(count):
             m, s = poses[p, f], focal[p]
-            total = f4(0.0)
+            total, product, factors = f4(0.0), one, 0
             for i in range(start[f], start[f + 1]):
                 x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
                 x = m[0] * x0 + m[1] * y0 + m[2] * z0 + m[3]
@@ -70,23 +93,26 @@ def edge_scores(
                 u, v = camera[3] + s * (u - camera[3]), camera[4] + s * (v - camera[4])
                 if not valid or u < f4(0) or v < f4(0) or u > u_max or v > v_max:
                     continue
-                c = side[i]
-                iu, iv = int(u + f4(0.5)), int(v + f4(0.5))
+                c, n = side[i], kind[i]
+                iu, iv = i4(u + half), i4(v + half)
                 k = offsets[f, c, iv, iu]
-                pi = match[kind[i]]
-                if k == -128:
-                    total += np.log(f4(1) - pi)
-                    continue
-                r = f4(k) + f4(0.5) + (f4(iu) - u if c < 2 else f4(iv) - v)
-                si2 = s2 + gap_rad[i] * gap_rad[i] * beam
-                q = f4(1) + r * r / si2
-                # 2/pi makes (1 + x^2)^-2 a density
-                density = f4(0.63661977) / (np.sqrt(si2) * q * q)
-                total += np.log(f4(1) - pi + pi * density / chance[kind[i], min(int(abs(r)), 127)])
-            out[p, f] = total
+                ratio = base[n]
+                if k != -128:
+                    r = f4(k) + half + (f4(iu) - u if c < 2 else f4(iv) - v)
+                    x = r * sharpness[i]
+                    q = one + x * x
+                    ratio += gain[n, min(i4(abs(r)), i4(127))] * sharpness[i] / (q * q)
+                # One logarithm for eight factors: each is above 1e-4 and below 1e4.
+                product *= ratio
+                factors += 1
+                if factors == 8:
+                    total += np.log(product)
+                    product, factors = one, 0
+            out[p, f] = total + np.log(product)
     return out
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def edge_gradients(
     camera: np.ndarray,
@@ -150,6 +176,7 @@ def edge_gradients(
     return gradient, information
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def edge_residuals(
     camera: np.ndarray,

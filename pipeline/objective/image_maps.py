@@ -7,11 +7,12 @@ from a pixel's centre along the boundary's axis: exact in one byte, and good for
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, no_type_check
 
 import cv2
 import numba
 import numpy as np
+from jaxtyping import Bool, Int8, UInt8
 
 from pipeline.geometry.cameras import Camera
 
@@ -34,10 +35,12 @@ NO_BOUNDARY = -128  # no boundary of this direction within REACH_PX
 REACH_PX = 96
 CONTRAST_STEP = 1 / 32  # of a standard deviation: one byte reaches +-4
 _MIN_ROAD_PX_IN_ROW = 12
+_ROAD = 0
 # How near to the camera a label's surfaces lie against a neighbouring label's: a boundary's foreground is the nearer
 # side. Sky is behind all, ground behind what stands on it, walls and plants behind poles and road users.
 _SKY, _GROUND, _BACKDROP, _OBJECT = 0, 1, 2, 3
-_DEPTH_ORDER = np.full(256, 255, np.uint8)
+_UNKNOWN = 255
+_DEPTH_ORDER = np.full(256, _UNKNOWN, np.uint8)
 _DEPTH_ORDER[[10]] = _SKY
 _DEPTH_ORDER[[0, 1, 9]] = _GROUND
 _DEPTH_ORDER[[2, 3, 4, 8]] = _BACKDROP
@@ -67,57 +70,85 @@ def camera_of(observation: Observation) -> Camera:
     )
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True)
+def _boundary_sides(order: np.ndarray, a: int, b: int) -> tuple[bool, bool]:
+    """Whether the boundary between labels a (left or above) and b has its foreground at a, at b (or may have both)."""
+    near_a, near_b = order[a], order[b]
+    if a == b or near_a == _UNKNOWN or near_b == _UNKNOWN:
+        return False, False
+    if near_a == near_b:  # two backdrops, or two kinds of ground: the labels say nothing of which is nearer
+        return near_a == _OBJECT, near_a == _OBJECT
+    return near_a > near_b, near_b > near_a
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def _scan(order: np.ndarray, labels: np.ndarray, out: np.ndarray) -> None:
-    """Fill out[4, H, W] with offsets to the nearest boundary of each direction class along its axis."""
+    """Fill out[4, H, W] with offsets to the nearest boundary of each direction class along its axis.
+
+    One sweep down-right carries the last boundary behind, one sweep up-left the next one ahead; both run along rows.
+    """
     height, width = labels.shape
-    out[:] = -128
-    # axis 0: along u, classes LEFT 0 (foreground left) and RIGHT 1; axis 1: along v, ABOVE 2 and BELOW 3
-    for axis in range(2):
-        lines = height if axis == 0 else width
-        length = width if axis == 0 else height
-        for line in range(lines):
-            for side in range(2):
-                last = -10000
-                for i in range(length - 1):
-                    if axis == 0:
-                        a, b = labels[line, i], labels[line, i + 1]
-                    else:
-                        a, b = labels[i, line], labels[i + 1, line]
-                    is_boundary = False
-                    if a != b:
-                        oa, ob = order[a], order[b]
-                        if oa != 255 and ob != 255:
-                            # Two backdrops, or two kinds of ground: the labels say nothing of which is nearer.
-                            if oa == ob:
-                                is_boundary = oa == 3
-                            else:
-                                is_boundary = (oa > ob) == (side == 0)
-                    if is_boundary:
-                        first = max(last + 1 if last >= 0 else 0, i - 96)
-                        if last >= 0:
-                            first = max(first, (last + i) // 2 + 1)
-                        for j in range(first, i + 1):
-                            if axis == 0:
-                                out[side, line, j] = i - j
-                            else:
-                                out[2 + side, j, line] = i - j
-                        for j in range(i + 1, min(length, i + 97)):
-                            if axis == 0:
-                                out[side, line, j] = i - j
-                            else:
-                                out[2 + side, j, line] = i - j
-                        last = i
+    behind = np.full((2, width), -10000)
+    ahead = np.full((2, width), 10000)
+    for i in range(height):
+        left, right = -10000, -10000
+        for j in range(width):
+            out[0, i, j] = left - j if j - left <= REACH_PX else NO_BOUNDARY
+            out[1, i, j] = right - j if j - right <= REACH_PX else NO_BOUNDARY
+            out[2, i, j] = behind[0, j] - i if i - behind[0, j] <= REACH_PX else NO_BOUNDARY
+            out[3, i, j] = behind[1, j] - i if i - behind[1, j] <= REACH_PX else NO_BOUNDARY
+            if j + 1 < width:
+                first, second = _boundary_sides(order, labels[i, j], labels[i, j + 1])
+                left, right = (j if first else left), (j if second else right)
+            if i + 1 < height:
+                first, second = _boundary_sides(order, labels[i, j], labels[i + 1, j])
+                if first:
+                    behind[0, j] = i
+                if second:
+                    behind[1, j] = i
+    for i in range(height - 1, -1, -1):
+        left, right = 10000, 10000
+        for j in range(width - 1, -1, -1):
+            if j + 1 < width:
+                first, second = _boundary_sides(order, labels[i, j], labels[i, j + 1])
+                left, right = (j if first else left), (j if second else right)
+            if i + 1 < height:
+                first, second = _boundary_sides(order, labels[i, j], labels[i + 1, j])
+                if first:
+                    ahead[0, j] = i
+                if second:
+                    ahead[1, j] = i
+            _nearer(out, 0, i, j, left - j)
+            _nearer(out, 1, i, j, right - j)
+            _nearer(out, 2, i, j, ahead[0, j] - i)
+            _nearer(out, 3, i, j, ahead[1, j] - i)
 
 
-def boundary_offsets(labels: np.ndarray) -> np.ndarray:
-    """Offsets to boundaries, int8 [4, H, W]; the boundary lies at pixel + offset + 1/2; NO_BOUNDARY where none is in reach."""
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True, inline="always")
+def _nearer(out: np.ndarray, side: int, i: int, j: int, offset: int) -> None:
+    """Keep the nearer of two boundaries; offset k stands for k + 1/2, so k ahead and -1 - k behind are equally far."""
+    if offset <= REACH_PX:
+        held = out[side, i, j]
+        if held == NO_BOUNDARY or offset < -1 - held:
+            out[side, i, j] = offset
+
+
+def boundary_offsets(labels: UInt8[np.ndarray, "H W"]) -> Int8[np.ndarray, "4 H W"]:
+    """Offsets to boundaries by direction class.
+
+    The boundary lies at pixel + offset + 1/2; NO_BOUNDARY where none is in reach.
+    """
     out = np.empty((4, *labels.shape), np.int8)
     _scan(_DEPTH_ORDER, labels, out)
     return out
 
 
-def contrast_levels(contrast: np.ndarray, is_road: np.ndarray, blurs_px: tuple[float, ...]) -> np.ndarray:
+def contrast_levels(
+    contrast: UInt8[np.ndarray, "H W"], is_road: Bool[np.ndarray, "H W"], blurs_px: tuple[float, ...]
+) -> Int8[np.ndarray, "L H W"]:
     """Blurred road contrast, int8 [L, H, W]: zero mean and unit spread along each row of the road, 0 outside.
 
     Normalised by row, because contrast grows towards the horizon and would pull every point there.
@@ -131,15 +162,21 @@ def contrast_levels(contrast: np.ndarray, is_road: np.ndarray, blurs_px: tuple[f
     value = contrast[band].astype(np.float32) * inside
     count = np.maximum(_row_sums(inside), 1.0)
     for level, blur in enumerate(blurs_px):
-        kernel = (2 * round(2.5 * blur) + 1,) * 2
-        weight = cv2.GaussianBlur(inside, kernel, blur)
-        smooth = inside * cv2.GaussianBlur(value, kernel, blur) / np.maximum(weight, 0.05)
+        smooth = inside * _blurred(value, blur) / np.maximum(_blurred(inside, blur), 0.05)
         mean = _row_sums(smooth) / count
         variance = _row_sums(smooth * smooth) / count - mean * mean
         # One grey level of spread: below it a road is plain, and its noise must not be blown up to unit size.
         standard = inside * (smooth - mean) / (np.sqrt(np.maximum(variance, 0.0)) + 1.0)
         out[level, band] = np.clip(standard, -2.0, 3.9) / CONTRAST_STEP
     return out
+
+
+def _blurred(x: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Gaussian blur, by two boxes where it is wide (their cost does not grow with the width)."""
+    if sigma_px < 2.0:
+        return cv2.GaussianBlur(x, (2 * round(2.5 * sigma_px) + 1,) * 2, sigma_px)
+    size = (round(np.sqrt(6 * sigma_px**2 + 1)) | 1,) * 2  # each box has half of the variance
+    return cv2.blur(cv2.blur(x, size), size)
 
 
 def _row_sums(x: np.ndarray) -> np.ndarray:
@@ -150,15 +187,17 @@ def _row_sums(x: np.ndarray) -> np.ndarray:
 def prepare_maps(observations: Sequence[Observation], blurs_px: tuple[float, ...]) -> CameraMaps:
     """Decode and prepare the maps of frames that share one camera and one label size."""
     first = observations[0]
-    camera = camera_of(first).scaled(first.label_scale)
-    offsets, contrast, labels = [], [], []
-    for o in observations:
-        label = cv2.imdecode(np.frombuffer(o.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
-        labels.append(label)
-        offsets.append(boundary_offsets(label))
-        if o.road_contrast_png is None:
-            contrast.append(np.zeros((len(blurs_px), *label.shape), np.int8))
-        else:
-            image = cv2.imdecode(np.frombuffer(o.road_contrast_png, np.uint8), cv2.IMREAD_GRAYSCALE)
-            contrast.append(contrast_levels(image, label == 0, blurs_px))
-    return CameraMaps(camera, np.stack(offsets), np.stack(contrast, 1), np.stack(labels))
+    labels = np.stack([_decoded(o.labels_png) for o in observations])
+    count, size = len(observations), labels.shape[1:]
+    offsets = np.empty((count, 4, *size), np.int8)
+    contrast = np.zeros((len(blurs_px), count, *size), np.int8)
+    for f, o in enumerate(observations):
+        _scan(_DEPTH_ORDER, labels[f], offsets[f])
+        if o.road_contrast_png is not None:
+            contrast[:, f] = contrast_levels(_decoded(o.road_contrast_png), labels[f] == _ROAD, blurs_px)
+    return CameraMaps(camera_of(first).scaled(first.label_scale), offsets, contrast, labels)
+
+
+def _decoded(png: bytes) -> UInt8[np.ndarray, "H W"]:
+    """A mono8 image."""
+    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)

@@ -28,6 +28,7 @@ __all__ = ["AlignmentState", "camera_lidar_cost", "camera_lidar_information", "e
 _FEWEST_FRAMES = 5
 _RESTARTS = 2
 _COARSE_POINTS = 9000  # per restart: a basin needs no more
+_FINE_POINTS = 24000  # of edges, and of markings; more say the same again
 # Kernel widths [label px] and contrast levels, from wide to sharp.
 _COARSE = Level.wide(10.0, 0, match=0.1)
 # Nats per point of class information against log likelihood ratios: over the search box both then vary alike.
@@ -103,7 +104,7 @@ def estimate_camera_lidar(
         raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
 
     starts = [_basin(terms, prior, config, rng) for _ in range(_RESTARTS)]
-    sharp = terms.sharp(_MAX_GAP_PX)
+    sharp = terms.sharp(_MAX_GAP_PX).at_most(_FINE_POINTS, rng)
     thin = sharp.thinned(0.35, rng)
     first = Level.wide(*_LADDER[0])
     ends = [_climb(thin, s, first, prior, config, steps=5) for s in starts]
