@@ -18,9 +18,18 @@ from pipeline.geometry.se3 import hat, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical, to_spherical
 from schemas.observations import Observation
 
-__all__ = ["BOX_CLASSES", "BoxPairs", "box_equations", "box_pairs", "elevation_residuals"]
+__all__ = [
+    "BOX_CLASSES",
+    "BoxPairs",
+    "VehicleBoxes",
+    "box_equations",
+    "box_pairs",
+    "elevation_residuals",
+    "vehicle_boxes",
+]
 
 BOX_CLASSES = (("car",), ("truck", "bus"))
+_KIND_OF = {name: kind for kind, names in enumerate(BOX_CLASSES) for name in names}
 BIAS_SIGMA_RAD = np.radians(1.0)  # returns lie up to half a box below its centre; real logs showed 0.5-1 deg
 _HEIGHT_M = (1.5, 2.9)
 _RANGE_FACTOR = 1.8  # box height to range: vans to low cars, poor boxes
@@ -28,6 +37,19 @@ _RANGE_M = (3.0, 60.0)
 _DEPTH_M = 3.5  # detections of one vehicle lie within this range interval
 _LEAST_HEIGHT_PX = 12.0
 _LEAST_SIGMA_RAD = np.radians(0.3)  # box edges are no better
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleBoxes:
+    """Boxes as directions from the camera, left and up positive."""
+
+    kind: Int64[np.ndarray, " B"]  # index into BOX_CLASSES
+    azimuth_rad: Float[np.ndarray, " B"]  # of the centre
+    elevation_rad: Float[np.ndarray, " B"]
+    left_rad: Float[np.ndarray, " B"]  # azimuths of the sides
+    right_rad: Float[np.ndarray, " B"]
+    expected_m: Float[np.ndarray, " B"]  # range that the height suggests
+    frame: Int64[np.ndarray, " B"]  # index into the observations given
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +69,21 @@ class BoxPairs:
         return len(self.kind)
 
 
+def vehicle_boxes(observations: Sequence[Observation]) -> VehicleBoxes:
+    """Whole, unoccluded vehicle boxes of frames whose radar measures elevation."""
+    rows = [np.zeros((0, 6))]
+    frames = [np.zeros(0, np.int64)]
+    for index, o in enumerate(observations):
+        if o.radar_has_elevation and len(o.road_user_boxes_px) and len(o.radar_xyz_m):
+            rows.append(_boxes_of_frame(o))
+            frames.append(np.full(len(rows[-1]), index, np.int64))
+    table = np.concatenate(rows)
+    return VehicleBoxes(table[:, 0].astype(np.int64), *table[:, 1:].T, np.concatenate(frames))
+
+
 def box_pairs(
     observations: Sequence[Observation],
+    boxes: VehicleBoxes,
     T_camera_radar: Float[np.ndarray, "4 4"],
     elevation_gate_rad: float,
     least_detections: int = 2,
@@ -56,25 +91,24 @@ def box_pairs(
     """Find the detections of each unoccluded vehicle box.
 
     Args:
-        observations: frames; those whose radar measures no elevation give nothing.
+        observations: frames.
+        boxes: from `vehicle_boxes` of the same frames.
         T_camera_radar: a pose whose azimuth is right to about a box's width.
         elevation_gate_rad: detections farther from the box's centre belong to something else.
         least_detections: fewer tell nothing.
     """
     rows: list[tuple[np.ndarray, float, float, int, int, int]] = []
-    for index, o in enumerate(observations):
-        if not o.radar_has_elevation or not len(o.road_user_boxes_px) or not len(o.radar_xyz_m):
-            continue
-        radar = o.radar_xyz_m.astype(np.float64)
+    for index in np.unique(boxes.frame):
+        radar = observations[index].radar_xyz_m.astype(np.float64)
         in_camera = transform_points(T_camera_radar, radar)
         angles = camera_direction_angles(in_camera)
         distance = np.linalg.norm(in_camera, axis=1)
-        measured = to_spherical(radar)
-        for kind, centre, sides, expected_m in _vehicle_boxes(o):
-            chosen = _detections_of(angles, distance, centre, sides, expected_m, elevation_gate_rad)
+        for b in np.flatnonzero(boxes.frame == index):
+            chosen = _detections_of(angles, distance, boxes, int(b), elevation_gate_rad)
             if len(chosen) >= least_detections:
-                middle = from_spherical(np.median(measured[chosen], axis=0))
-                rows.append((middle, centre[0], centre[1], len(chosen), kind, index))
+                middle = from_spherical(np.median(to_spherical(radar[chosen]), axis=0))
+                centre = boxes.azimuth_rad[b], boxes.elevation_rad[b]
+                rows.append((middle, *centre, len(chosen), int(boxes.kind[b]), int(index)))
     if not rows:
         none = np.zeros(0)
         return BoxPairs(np.zeros((0, 3)), none, none, *(np.zeros(0, np.int64) for _ in range(3)))
@@ -132,43 +166,46 @@ def box_equations(
     return H, g, sigma
 
 
-def _vehicle_boxes(o: Observation) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
-    """Whole, unoccluded vehicle boxes: class index, centre (az, el), (az of left and right side), range by height [m]."""
+def _boxes_of_frame(o: Observation) -> np.ndarray:
+    """Rows (class index, azimuth, elevation, azimuth of left and right side, range by height) of one frame's boxes."""
     camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
     boxes = o.road_user_boxes_px.astype(np.float64)
     x0, y0, x1, y1 = boxes.T
     inside = (x0 > 3) & (y0 > 3) & (x1 < o.image_width_px - 4) & (y1 < o.image_height_px - 4)
-    out = []
-    for b, name in enumerate(o.road_user_classes):
-        kind = next((k for k, names in enumerate(BOX_CLASSES) if name in names), -1)
-        if kind < 0 or not inside[b] or y1[b] - y0[b] < _LEAST_HEIGHT_PX:
-            continue
-        overlap = np.minimum(x1, x1[b]) - np.maximum(x0, x0[b])
-        if np.any((y1 > y1[b] + 1) & (overlap > 0.3 * (x1[b] - x0[b]))):
-            continue  # something nearer stands before it
-        xm, ym = 0.5 * (x0[b] + x1[b]), 0.5 * (y0[b] + y1[b])
-        rays = camera.unproject(np.array([[xm, ym], [x0[b], ym], [x1[b], ym], [xm, y0[b]], [xm, y1[b]]]))
-        if not np.isfinite(rays).all():
-            continue
-        angle = camera_direction_angles(rays)
-        height_rad = angle[3, 1] - angle[4, 1]
-        out.append((kind, angle[0], angle[1:3, 0], _HEIGHT_M[kind] / max(height_rad, 1e-3)))
-    return out
+    kinds = np.array([_KIND_OF.get(name, -1) for name in o.road_user_classes], int)
+    whole = inside & (kinds >= 0) & (y1 - y0 >= _LEAST_HEIGHT_PX)
+    chosen = [b for b in np.flatnonzero(whole) if not _is_occluded(boxes, b)]
+    xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+    pixels = np.stack([np.stack(uv, -1)[chosen] for uv in ((xm, ym), (x0, ym), (x1, ym), (xm, y0), (xm, y1))])
+    angle = camera_direction_angles(camera.unproject(pixels))
+    height_rad = np.maximum(angle[3, :, 1] - angle[4, :, 1], 1e-3)
+    kind = kinds[chosen]
+    expected_m = np.array(_HEIGHT_M)[kind] / height_rad
+    columns = (kind, angle[0, :, 0], angle[0, :, 1], angle[1, :, 0], angle[2, :, 0], expected_m)
+    rows = np.stack([c.astype(np.float64) for c in columns], -1)
+    return rows[np.isfinite(rows).all(1)]
+
+
+def _is_occluded(boxes: np.ndarray, b: int) -> bool:
+    """Something that stands nearer (its foot is lower) covers part of the box."""
+    x0, _, x1, y1 = boxes.T
+    overlap = np.minimum(x1, x1[b]) - np.maximum(x0, x0[b])
+    return bool(np.any((y1 > y1[b] + 1) & (overlap > 0.3 * (x1[b] - x0[b]))))
 
 
 def _detections_of(
     angles: np.ndarray,
     distance: np.ndarray,
-    centre: np.ndarray,
-    sides: np.ndarray,
-    expected_m: float,
+    boxes: VehicleBoxes,
+    b: int,
     elevation_gate: float,
 ) -> np.ndarray:
-    """Indices of the detections between the box's sides in the most populated range interval near the expected range."""
+    """Detections between the box's sides in the most populated range interval near the expected range."""
+    expected_m = boxes.expected_m[b]
     near = np.flatnonzero(
-        (angles[:, 0] < sides[0])
-        & (angles[:, 0] > sides[1])
-        & (np.abs(angles[:, 1] - centre[1]) < elevation_gate)
+        (angles[:, 0] < boxes.left_rad[b])
+        & (angles[:, 0] > boxes.right_rad[b])
+        & (np.abs(angles[:, 1] - boxes.elevation_rad[b]) < elevation_gate)
         & (distance > max(_RANGE_M[0], expected_m / _RANGE_FACTOR))
         & (distance < min(_RANGE_M[1], expected_m * _RANGE_FACTOR))
     )

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import hat, inverse, transform_points
+from pipeline.geometry.se3 import hat, transform_points
 from pipeline.geometry.spherical import camera_direction_angles
 from schemas.observations import Observation
 
@@ -48,15 +48,22 @@ class MovingClusters:
     point_radar_m: Float[np.ndarray, "B 3"]
     relative_mps: Float[np.ndarray, "B 3"]  # velocity relative to the radar along the line of sight
     stamp_gap_s: Float[np.ndarray, " B"]  # radar stamp minus lidar stamp
-    frame: Int64[np.ndarray, " B"]
+    frame: Int64[np.ndarray, " B"]  # index into the observations given
+    lidar_centres_m: list[np.ndarray]  # per observation: lidar clusters that can be road users
+    box_azimuths: list[tuple[np.ndarray, np.ndarray]]  # per observation: azimuth and range by height of boxes
 
     @property
     def count(self) -> int:
         """Number of clusters."""
         return len(self.frame)
 
+    @property
+    def observations(self) -> int:
+        """Number of observations that they were taken from."""
+        return len(self.box_azimuths)
+
     def at_lidar_time(self, dt_s: float) -> Float[np.ndarray, "B 3"]:
-        """Where they were at the lidar's stamp, radar axes, for a radar time offset dt (stamp_lidar = stamp_radar + dt)."""
+        """Where they were at the lidar's stamp, radar axes; stamp_lidar = stamp_radar + dt."""
         return self.point_radar_m - self.relative_mps * (self.stamp_gap_s + dt_s)[:, None]
 
 
@@ -84,12 +91,13 @@ def moving_clusters(observations: Sequence[Observation], least_detections: int =
         np.array(speeds).reshape(-1, 3),
         np.array(gaps, np.float64),
         np.array(frames, np.int64),
+        [_object_centres(o) for o in observations],
+        [_box_azimuths(o) for o in observations],
     )
 
 
 def lidar_azimuth_residuals(
     clusters: MovingClusters,
-    observations: Sequence[Observation],
     T_lidar_radar: Float[np.ndarray, "4 4"],
     dt_s: float,
     gate_m: float = _GATE_M,
@@ -102,19 +110,16 @@ def lidar_azimuth_residuals(
     """
     points = clusters.at_lidar_time(dt_s)
     in_lidar = transform_points(T_lidar_radar, points)
-    T_radar_lidar = inverse(T_lidar_radar)
     residual, J, frame = [], [], []
     for b in range(clusters.count):
-        o = observations[clusters.frame[b]]
-        centres = o.lidar_cluster_centre_m.astype(np.float64)
+        centres = clusters.lidar_centres_m[clusters.frame[b]]
         if not len(centres):
             continue
-        size = np.max(o.lidar_cluster_max_m[:, :2] - o.lidar_cluster_min_m[:, :2], axis=1)
-        gap = np.linalg.norm(centres[:, :2] - in_lidar[b, :2], axis=1) + np.where(size > _LARGEST_M, 1e3, 0.0)
-        n = int(np.argmin(gap))
-        if gap[n] > gate_m:
+        square = (centres[:, 0] - in_lidar[b, 0]) ** 2 + (centres[:, 1] - in_lidar[b, 1]) ** 2
+        n = int(np.argmin(square))
+        if square[n] > gate_m**2:
             continue
-        q = transform_points(T_radar_lidar, centres[n])
+        q = T_lidar_radar[:3, :3].T @ (centres[n] - T_lidar_radar[:3, 3])
         h2 = q[0] ** 2 + q[1] ** 2
         measured = np.arctan2(points[b, 1], points[b, 0])
         gradient = np.array([-q[1], q[0], 0.0]) / h2 @ T_lidar_radar[:3, :3].T
@@ -127,7 +132,6 @@ def lidar_azimuth_residuals(
 
 def camera_azimuth_residuals(
     clusters: MovingClusters,
-    observations: Sequence[Observation],
     T_camera_radar: Float[np.ndarray, "4 4"],
     gate_rad: float,
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
@@ -138,10 +142,9 @@ def camera_azimuth_residuals(
     """
     in_camera = transform_points(T_camera_radar, clusters.point_radar_m)
     angles = camera_direction_angles(in_camera)
-    boxes = {int(f): _box_angles(observations[f]) for f in np.unique(clusters.frame)}
     residual, J, frame = [], [], []
     for b in range(clusters.count):
-        azimuth, expected_m = boxes[int(clusters.frame[b])]
+        azimuth, expected_m = clusters.box_azimuths[clusters.frame[b]]
         x, _, z = in_camera[b]
         if z < 1.0 or not len(azimuth):
             continue
@@ -160,24 +163,20 @@ def camera_azimuth_residuals(
 
 def azimuth_equations_lidar(
     clusters: MovingClusters,
-    observations: Sequence[Observation],
     T_lidar_radar: Float[np.ndarray, "4 4"],
     dt_s: float,
 ) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
     """Per frame, information and gradient of the robust azimuth cost of moving clusters against the lidar."""
-    return _robust(*lidar_azimuth_residuals(clusters, observations, T_lidar_radar, dt_s), len(observations))
+    return _robust(*lidar_azimuth_residuals(clusters, T_lidar_radar, dt_s), clusters.observations)
 
 
 def azimuth_equations_camera(
     clusters: MovingClusters,
-    observations: Sequence[Observation],
     T_camera_radar: Float[np.ndarray, "4 4"],
     gate_rad: float,
 ) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
     """The same against camera boxes; unknowns are the left twist of T_camera_radar."""
-    return _robust(
-        *camera_azimuth_residuals(clusters, observations, T_camera_radar, gate_rad), len(observations)
-    )
+    return _robust(*camera_azimuth_residuals(clusters, T_camera_radar, gate_rad), clusters.observations)
 
 
 def _robust(
@@ -194,18 +193,22 @@ def _robust(
     return H, g, sigma
 
 
-def _box_angles(o: Observation) -> tuple[np.ndarray, np.ndarray]:
+def _box_azimuths(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth of the centre and range by height of each road-user box."""
     if not len(o.road_user_boxes_px):
         return np.zeros(0), np.zeros(0)
     camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
     x0, y0, x1, y1 = o.road_user_boxes_px.astype(np.float64).T
-    xm = 0.5 * (x0 + x1)
-    rays = camera.unproject(
-        np.stack([np.stack([xm, 0.5 * (y0 + y1)], -1), np.stack([xm, y0], -1), np.stack([xm, y1], -1)])
-    )
+    xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+    rays = camera.unproject(np.stack([np.stack([xm, y], -1) for y in (ym, y0, y1)]))
     angle = camera_direction_angles(rays)
     height = np.array([_HEIGHT_M.get(name, 1.5) for name in o.road_user_classes])
     ok = np.isfinite(angle).all(axis=(0, 2))
     extent = np.maximum(angle[1, :, 1] - angle[2, :, 1], 1e-3)
     return angle[0, ok, 0], (height / extent)[ok]
+
+
+def _object_centres(o: Observation) -> np.ndarray:
+    """Centres of lidar clusters that can be road users."""
+    size = np.max(o.lidar_cluster_max_m[:, :2] - o.lidar_cluster_min_m[:, :2], axis=1, initial=0.0)
+    return o.lidar_cluster_centre_m[size <= _LARGEST_M].astype(np.float64)

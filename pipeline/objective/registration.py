@@ -1,4 +1,4 @@
-"""Static radar detections against the lidar map: whitened soft assignment, in the radar's own azimuth, elevation, range.
+"""Static radar detections against the lidar map: whitened soft assignment in the radar's azimuth, elevation, range.
 
 Each static detection is drawn from one of the lidar points near it (or their mirror images below the ground, or
 nothing): weights are Gaussian in azimuth, elevation and range with the radar's own sigmas. The ground stays in the map.

@@ -3,7 +3,7 @@
 Long on purpose: a detection's assignments are formed, weighed and summed without being stored.
 """
 # numba infers the types of the arguments; annotations would only repeat RegistrationFrames.
-# ruff: noqa: ANN001, ANN202, C901, D103, PLR0912, PLR0914, PLR0915
+# ruff: noqa: ANN001, ANN202, C901, PLR0915
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _jacobian(J, x, y, z, R, t, v, w):
 def accumulate_frames(
     T, tau, velocity, yaw_rate, radar, radar_first, lidar, lidar_first, plane, has_plane, use_elevation, sigma,
     outlier, bounce_prior, stride, max_range, H, g, info, stats,
-):  # fmt: skip
+) -> None:  # fmt: skip
     """Normal equations of each frame: H (2, F, 7, 7) and g (2, F, 7) for (azimuth and range, elevation), information.
 
     `info` is H less what the uncertain assignment takes away (Louis 1982), row by row.

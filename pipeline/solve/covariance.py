@@ -1,6 +1,6 @@
 """How sure a pose is: information matrix, block bootstrap over drives, and a stated bias floor.
 
-An information matrix alone is too sure (on real logs 6 times in yaw), since residuals of one scene err together. Blocks
+An information matrix alone is too sure (on real logs 6 times in yaw): residuals of one scene err together. Blocks
 of frames that share no scene are resampled instead: each resampled day moves the estimate by one Newton step, and the
 spread of these steps, plus what the prior leaves open, is the covariance. No direction becomes surer than the information
 says. What no resampling shows, a bias common to all frames, is added as a floor that the caller states per DoF.

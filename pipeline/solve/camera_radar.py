@@ -1,0 +1,165 @@
+"""Camera-radar without the lidar: moving clusters against boxes in azimuth, detections in boxes in elevation.
+
+Its translation stays at the prior (angles of far objects say nothing of it). Method `joint` composes camera-radar
+from the other two; this estimate is what that composition is checked against.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.config import SolveConfig
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, log_se3, transform_points
+from pipeline.objective.boxes import (
+    BIAS_SIGMA_RAD,
+    BOX_CLASSES,
+    VehicleBoxes,
+    box_equations,
+    box_pairs,
+    vehicle_boxes,
+)
+from pipeline.objective.moving import (
+    MovingClusters,
+    azimuth_equations_camera,
+    camera_azimuth_residuals,
+    moving_clusters,
+)
+from pipeline.objective.problem import PairEstimate, Prior
+from pipeline.solve.covariance import blocks_of, bootstrap_covariance, posterior
+from schemas.observations import Observation
+
+__all__ = ["camera_radar_cost", "estimate_camera_radar"]
+
+_SCAN_STEP_RAD = np.radians(0.5)
+_GATES_RAD = np.radians([4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0])
+_ELEVATION_GATE_RAD = np.radians([12.0, 7.0])
+_MATCH_RAD = np.radians(1.0)  # half a car at 40 m
+# Boxes of cars seen from behind and aside are not centred on where radars see them; constants of elevation.
+_BIAS_FLOOR = np.array([np.radians(0.3), np.radians(0.15), np.radians(0.3), 0.0, 0.0, 0.0])
+
+
+def estimate_camera_radar(
+    observations: Sequence[Observation], prior: Prior, config: SolveConfig, rng: np.random.Generator
+) -> PairEstimate:
+    """Estimate the rotation of T_camera_radar from what camera and radar both see; never uses the lidar.
+
+    Args:
+        observations: frames.
+        prior: start and prior; translation stays there.
+        config: search range, resampling.
+        rng: resamples.
+    """
+    clusters, boxes_seen = moving_clusters(observations), vehicle_boxes(observations)
+    T0 = prior.T_camera_radar
+    prior_covariance = prior.covariance("camera_radar")
+    prior_H = np.zeros((6 + len(BOX_CLASSES),) * 2)
+    prior_H[:6, :6] = np.linalg.inv(prior_covariance)
+    prior_H[6:, 6:] = np.eye(len(BOX_CLASSES)) / BIAS_SIGMA_RAD**2
+    T, bias = _scan_azimuth(clusters, T0, config), np.zeros(len(BOX_CLASSES))
+    for k, gate in enumerate(_GATES_RAD):
+        H, g, box_sigma, azimuth_sigma, boxes = _equations(
+            clusters, boxes_seen, observations, T, bias, gate, k
+        )
+        x = np.concatenate([log_se3(T @ np.linalg.inv(T0)), bias])
+        # A prior that the data contradict by many sigmas loses weight (Cauchy), as in the lidar-radar half.
+        weight = 1 / (1 + float(x[:3] @ x[:3]) / (2.5 * 1.5 * prior.rotation_sigma_rad) ** 2)
+        pull = prior_H.copy()
+        pull[:3, :3] *= weight
+        step = -np.linalg.solve(H.sum(0) + pull, g.sum(0) + pull @ x)
+        step *= min(1.0, 0.05 / max(float(np.abs(step).max()), 1e-9))
+        T, bias = exp_se3(step[:6]) @ T, bias + step[6:]
+    block = blocks_of(np.array([o.drive for o in observations]), config.bootstrap_blocks)
+    covariance = bootstrap_covariance(H, g, prior_H, block, rng)[:6, :6]
+    after = posterior(covariance, prior_covariance, _BIAS_FLOOR)
+    seen = len(np.unique(clusters.frame))
+    diagnostics = {
+        "box_sigma_rad": box_sigma,
+        "azimuth_sigma_rad": azimuth_sigma,
+        "boxes": float(boxes),
+        "moving_clusters": float(clusters.count),
+    }
+    return PairEstimate(
+        "camera_radar",
+        T,
+        after.covariance,
+        after.observability,
+        after.observable,
+        seen,
+        {"no moving cluster": len(observations) - seen},
+        diagnostics={k: v for k, v in diagnostics.items() if np.isfinite(v)},
+        notes=["translation stays at the prior"],
+    )
+
+
+def camera_radar_cost(
+    observations: Sequence[Observation], T_camera_radar: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, " F"]:
+    """Cost of each frame at a pose for held-out verdicts: robust azimuth distance of moving clusters to boxes, 0..1.
+
+    Clusters in the camera's view count, those without any box within 3 deg as 1. NaN where a frame has none or no
+    boxes.
+    """
+    clusters = moving_clusters(observations)
+    out = np.full(len(observations), np.nan)
+    if not clusters.count:
+        return out
+    visible = _in_view(clusters, observations, T_camera_radar)
+    residual, _, frame = camera_azimuth_residuals(clusters, T_camera_radar, 3 * _MATCH_RAD)
+    gain = np.bincount(frame, 1 / (1 + (residual / _MATCH_RAD) ** 2), minlength=len(observations))
+    total = np.bincount(clusters.frame[visible], minlength=len(observations))
+    told = (total > 0) & np.array([len(o.road_user_classes) > 0 for o in observations])
+    out[told] = 1 - np.minimum(gain[told] / total[told], 1.0)
+    return out
+
+
+def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig) -> np.ndarray:
+    """The turn about the camera's vertical under which most moving clusters meet a box, near turns first."""
+    reach = np.radians(1.2 * config.search_rotation_deg)
+    turns = np.arange(-np.ceil(reach / _SCAN_STEP_RAD), np.ceil(reach / _SCAN_STEP_RAD) + 1) * _SCAN_STEP_RAD
+    poses = [
+        from_rotation_translation(exp_so3(np.array([0.0, a, 0.0])) @ T0[:3, :3], T0[:3, 3]) for a in turns
+    ]
+    scores = []
+    for T, turn in zip(poses, turns, strict=True):
+        residual, _, _ = camera_azimuth_residuals(clusters, T, 3 * _MATCH_RAD)
+        # The search box as a weak prior: chance matches must not carry an estimate away where nothing moves.
+        scores.append(float(np.sum(1 / (1 + (residual / _MATCH_RAD) ** 2))) - 2.0 * (turn / reach) ** 2)
+    return poses[int(np.argmax(scores))]
+
+
+def _equations(
+    clusters: MovingClusters,
+    boxes: VehicleBoxes,
+    observations: Sequence[Observation],
+    T: np.ndarray,
+    bias: np.ndarray,
+    gate: float,
+    step: int,
+) -> tuple[np.ndarray, np.ndarray, float, float, int]:
+    F = len(observations)
+    pairs = box_pairs(observations, boxes, T, float(_ELEVATION_GATE_RAD[min(step // 4, 1)]))
+    # With the radar's own frame in the lidar's place, the left twist is that of T_camera_radar.
+    H, g, box_sigma = box_equations(pairs, np.eye(4), T, bias, F)
+    Ha, ga, azimuth_sigma = azimuth_equations_camera(clusters, T, float(gate))
+    H[:, :6, :6] += Ha
+    g[:, :6] += ga
+    return H, g, box_sigma, azimuth_sigma, pairs.count
+
+
+def _in_view(
+    clusters: MovingClusters, observations: Sequence[Observation], T_camera_radar: np.ndarray
+) -> np.ndarray:
+    """Clusters whose azimuth the camera covers."""
+    points = transform_points(T_camera_radar, clusters.point_radar_m)
+    out = np.zeros(clusters.count, bool)
+    for f in np.unique(clusters.frame):
+        o = observations[f]
+        camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+        index = np.flatnonzero(clusters.frame == f)
+        uv, valid = camera.project(points[index])
+        out[index] = valid & (uv[:, 0] > 0) & (uv[:, 0] < o.image_width_px - 1)
+    return out

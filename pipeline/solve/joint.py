@@ -1,0 +1,180 @@
+"""Method `joint`: camera-lidar, then lidar-radar with the camera's help, camera-radar composed; checked three ways.
+
+The hard loop `T_camera_radar = T_camera_lidar T_lidar_radar` leaves 12 unknowns. They are solved one pair after the
+other: the camera-lidar terms know their pose ten times better than any radar term could tell them, so a common last
+step moves nothing but noise. What a constructed loop cannot show is asked of estimates that were not used:
+camera-radar without the lidar, disjoint halves, restarts, and the registration's own opinion of roll and pitch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pipeline.config import SolveConfig
+from pipeline.errors import SolveError
+from pipeline.geometry.se3 import compose_covariance, inverse, log_so3
+from pipeline.objective.problem import PairEstimate, Prior, Solution
+from pipeline.results import Progress, silent
+from pipeline.solve.camera_lidar import estimate_camera_lidar
+from pipeline.solve.camera_radar import estimate_camera_radar
+from pipeline.solve.lidar_radar import estimate_lidar_radar
+from schemas.calibrations import PAIRS
+from schemas.observations import Observation
+
+__all__ = ["compose_pairs", "solve_joint"]
+
+_SIGMAS = 3.0
+_RESTART_ROTATION_RAD, _RESTART_SHIFT_M = np.radians(0.15), 0.05
+
+
+def solve_joint(
+    observations: Mapping[str, Sequence[Observation]],
+    prior: Prior,
+    config: SolveConfig,
+    *,
+    seed: int,
+    triggered: Sequence[str] = PAIRS,
+    progress: Progress = silent,
+) -> Solution:
+    """Solve all three pairs.
+
+    Args:
+        observations: selected frames per pair.
+        prior: start and weak prior.
+        config: effort.
+        seed: decides everything random.
+        triggered: pairs to estimate; camera_radar follows from the other two. Others keep the prior.
+        progress: told about each pair.
+
+    Returns:
+        The solution; a pair that the day cannot determine keeps its prior, with a doubt that says why.
+    """
+    doubts: dict[str, list[str]] = {pair: [] for pair in PAIRS}
+    wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
+    progress(0, 3, "camera-lidar")
+    camera_lidar = _kept("camera_lidar", prior)
+    if "camera_lidar" in wanted:
+        try:
+            camera_lidar = estimate_camera_lidar(
+                observations["camera_lidar"], prior, config, np.random.default_rng([seed, 0])
+            )
+        except SolveError as err:
+            doubts["camera_lidar"].append(err.reason)
+    progress(1, 3, "lidar-radar")
+    lidar_radar = _kept("lidar_radar", prior)
+    if "lidar_radar" in wanted:
+        try:
+            lidar_radar = estimate_lidar_radar(
+                observations["lidar_radar"],
+                prior,
+                camera_lidar.T,
+                config,
+                np.random.default_rng([seed, 1]),
+                covariance_camera_lidar=camera_lidar.covariance,
+            )
+        except SolveError as err:
+            doubts["lidar_radar"].append(err.reason)
+    progress(2, 3, "camera-radar")
+    alone = estimate_camera_radar(
+        observations["camera_radar"], prior, config, np.random.default_rng([seed, 2])
+    )
+    camera_radar, loop_rad, open_loop = compose_pairs(camera_lidar, lidar_radar, alone, prior)
+    doubts["lidar_radar"] += _lidar_radar_doubts(lidar_radar)
+    doubts["camera_radar"] += [*doubts["camera_lidar"], *doubts["lidar_radar"], *open_loop]
+    pairs = {"camera_lidar": camera_lidar, "camera_radar": camera_radar, "lidar_radar": lidar_radar}
+    progress(3, 3, "done")
+    return Solution("joint", pairs, loop_rad, None, {pair: why for pair, why in doubts.items() if why})
+
+
+def compose_pairs(
+    camera_lidar: PairEstimate, lidar_radar: PairEstimate, alone: PairEstimate, prior: Prior
+) -> tuple[PairEstimate, float | None, list[str]]:
+    """Camera-radar by the loop, and how far the camera-radar estimate that never saw the lidar is from it.
+
+    Returns:
+        The composed estimate; the loop's angle over the rotations that `alone` determined (None where it determined
+        none; its translation is the prior's, so no translation is compared); doubts where that angle is beyond sigma.
+    """
+    T = camera_lidar.T @ lidar_radar.T
+    covariance = compose_covariance(camera_lidar.T, camera_lidar.covariance, lidar_radar.covariance)
+    before = prior.covariance("camera_radar")
+    observability = np.clip(1 - np.diag(covariance) / np.diag(before), 0.0, 1.0)
+    difference = log_so3((T @ inverse(alone.T))[:3, :3])
+    sigma = np.sqrt(np.diag(covariance)[:3] + np.diag(alone.covariance)[:3])
+    known = alone.observable[:3]
+    doubts = [
+        f"without the lidar {name} turns by {np.degrees(d):+.2f} deg against the loop, sigma {np.degrees(s):.2f} deg"
+        for name, d, s, k in zip(("pitch", "yaw", "roll"), -difference, sigma, known, strict=True)
+        if k and abs(d) > _SIGMAS * s
+    ]
+    loop_rad = float(np.linalg.norm(difference[known])) if known.any() else None
+    diagnostics = {f"alone_{k}": v for k, v in alone.diagnostics.items()}
+    diagnostics |= {f"alone_{n}_rad": float(d) for n, d in zip(("rx", "ry", "rz"), -difference, strict=True)}
+    diagnostics |= {f"alone_{n}_sigma_rad": float(s) for n, s in zip(("rx", "ry", "rz"), sigma, strict=True)}
+    if known.any():
+        diagnostics["loop_rotation_sigma_rad"] = float(np.sqrt(np.sum(sigma[known] ** 2)))
+    estimate = PairEstimate(
+        "camera_radar",
+        T,
+        covariance,
+        observability,
+        observability >= 0.5,
+        min(camera_lidar.frames_used, lidar_radar.frames_used),
+        {},
+        *_time_offset(camera_lidar, lidar_radar),
+        diagnostics,
+        [
+            "composed of camera-lidar and lidar-radar, their errors taken as independent",
+            "loop: camera-radar without the lidar, rotations only (its translation is the prior's)",
+        ],
+    )
+    return estimate, loop_rad, doubts
+
+
+def _time_offset(camera_lidar: PairEstimate, lidar_radar: PairEstimate) -> tuple[float | None, float | None]:
+    """stamp_camera = stamp_lidar + dt_cl = stamp_radar + dt_lr + dt_cl."""
+    offsets = (camera_lidar.time_offset_s, lidar_radar.time_offset_s)
+    sigmas = (camera_lidar.time_offset_sigma_s, lidar_radar.time_offset_sigma_s)
+    if None in offsets or None in sigmas:
+        return None, None
+    return float(sum(o for o in offsets if o is not None)), float(
+        np.hypot(*(s for s in sigmas if s is not None))
+    )
+
+
+def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:
+    """Restarts, halves, and the registration against the camera's boxes."""
+    d = estimate.diagnostics
+    doubts: list[str] = []
+    if not d:
+        return doubts
+    if abs(d["restarts_rz_rad"]) > _RESTART_ROTATION_RAD or d["restarts_xy_m"] > _RESTART_SHIFT_M:
+        doubts.append(
+            f"restarts disagree by {np.degrees(d['restarts_rz_rad']):+.2f} deg of yaw and {d['restarts_xy_m']:.2f} m"
+        )
+    # Two halves differ by twice the error of the whole, if their errors are independent.
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    for k, (name, key) in enumerate(
+        zip(
+            ("roll", "pitch", "yaw", "x", "y", "z"),
+            ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m"),
+            strict=True,
+        )
+    ):
+        if estimate.observable[k] and abs(d[f"halves_{key}"]) > _SIGMAS * 2 * sigma[k]:
+            size = f"{np.degrees(d[f'halves_{key}']):+.2f} deg" if k < 3 else f"{d[f'halves_{key}']:+.3f} m"
+            doubts.append(f"disjoint halves disagree in {name} by {size}")
+    for k, name in ((0, "roll"), (1, "pitch")):
+        offset, floor = d[f"registration_{name}_offset_rad"], d[f"registration_{name}_sigma_rad"]
+        if estimate.observable[k] and abs(offset) > _SIGMAS * np.hypot(floor, sigma[k]):
+            doubts.append(
+                f"the registration would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
+            )
+    return doubts
+
+
+def _kept(pair: str, prior: Prior) -> PairEstimate:
+    """The prior, where a pair is not estimated."""
+    return PairEstimate(pair, prior.of(pair), prior.covariance(pair), np.zeros(6), np.zeros(6, bool), 0)
