@@ -16,6 +16,7 @@ from schemas.drift import DriftFinding
 
 __all__ = ["DofRow", "PairView", "answer_for", "drift_sentence", "pair_view", "sigmas_of"]
 
+_SAID_BY_THE_AXES = "not determined by the day"  # the page lists those axes by name
 _ADVICE = {
     "accepted": "use it",
     "held": "keep the prior",
@@ -90,7 +91,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
         title=PAIR_TITLES[record.pair],
         status=record.status,
         advice=_ADVICE[record.status],
-        reason=record.reason,
+        reason="" if record.reason.startswith(_SAID_BY_THE_AXES) else record.reason,
         known_to=_known_to(sigma, observable),
         undetermined=", ".join(unseen) if sigma is not None else "",
         moved_by=_moved_by(T, T_prior),
@@ -110,16 +111,30 @@ def pair_view(record: CalibrationRecord) -> PairView:
     )
 
 
-def answer_for(views: Sequence[PairView]) -> tuple[str, str]:
-    """The first thing on the page: (good, partly or bad; a sentence) on whether these numbers may go on the car."""
+def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFinding]) -> tuple[str, str]:
+    """The first thing on the page: (good, partly or bad; a sentence) on whether these numbers may go on the car.
+
+    Args:
+        views: the day's pairs.
+        day: the page's day; a sensor that moved after it makes its pairs outdated.
+        findings: the vehicle's current findings.
+    """
     accepted = [v.title for v in views if v.status == "accepted"]
-    other = [v.title for v in views if v.status != "accepted"]
-    if not views:
-        return "bad", "No. There is no calibration record for this day."
-    if not other:
-        return "good", "Yes. All pairs are accepted: they may go on the car, with the sigmas below."
+    moved = next(
+        (f for f in findings if f.moved_sensor and f.status == "RED" and (f.start_day or "") > day), None
+    )
     if not accepted:
         return "bad", "No. Nothing was accepted: keep the transforms that the car has."
+    if moved is not None:
+        left = [t for t in accepted if moved.moved_sensor not in t.split("-")]
+        still = f" Only {', '.join(left)} still holds." if left else ""
+        return (
+            "bad",
+            f"Not any more. The {moved.moved_sensor} moved on {moved.start_day}, after this day.{still}",
+        )
+    other = [v.title for v in views if v.status != "accepted"]
+    if not other:
+        return "good", "Yes. All pairs are accepted: they may go on the car, with the sigmas below."
     return "partly", f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."
 
 

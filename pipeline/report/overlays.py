@@ -104,7 +104,7 @@ def close_up(scene: Scene, state: Extrinsics, window: Window, zoom: int) -> Imag
     picture = _dimmed(picture, 0.85)
     sweep = _project(camera, state.T_camera_lidar, scene.frame.lidar_xyz_m)
     edges = _project(camera, state.T_camera_lidar, scene.observation.lidar_edge_xyz_m)
-    for (uv, distance), radius, ring in ((sweep, max(2, zoom // 2), False), (edges, max(4, zoom), True)):
+    for (uv, distance), radius, ring in ((sweep, 2, False), (edges, 4, True)):
         at = (uv - (x0, y0) + 0.5) * zoom - 0.5
         inside = (at > -radius).all(axis=1) & (at < (width * zoom + radius, height * zoom + radius)).all(
             axis=1

@@ -49,11 +49,22 @@ def frame_residuals(
     return {pair: values[:, k] for k, pair in enumerate(MEASURES)}
 
 
-def boundary_distance_px(observation: Observation, uv: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " N"]:
-    """Distance of pixels to the nearest sideways change of label, in full-image pixels; inf where there is none."""
+def boundary_distance_px(
+    observation: Observation, uv: Float[np.ndarray, "N 2"], only: Sequence[int] = ()
+) -> Float[np.ndarray, " N"]:
+    """Distance of pixels to the nearest sideways change of label, in full-image pixels; inf where there is none.
+
+    Args:
+        observation: holds the label image.
+        uv: full-image pixels.
+        only: labels of which one must lie at the change; empty = any.
+    """
     labels = _decode_labels(observation)
     change = np.zeros(labels.shape, bool)
     change[:, 1:] = labels[:, 1:] != labels[:, :-1]
+    if only:
+        chosen = np.isin(labels, only)
+        change[:, 1:] &= chosen[:, 1:] | chosen[:, :-1]
     if not change.any() or not len(uv):
         return np.full(len(uv), np.inf)
     distance = cv2.distanceTransform((~change).astype(np.uint8), cv2.DIST_L2, 3) / observation.label_scale

@@ -75,7 +75,7 @@ def write_day_page(
         fleet_link=fleet_link,
         method=method,
         environment=next(iter(records.values())).environment,
-        answer=answer_for(views),
+        answer=answer_for(views, partition.day, findings),
         drift=drift_sentence(findings),
         pairs=views,
         labels=labels,

@@ -15,6 +15,9 @@ from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 __all__ = ["choose_frames", "choose_windows"]
 
 _MIN_EDGES = 4  # fewer do not show a silhouette
+_WINDOW_RAD, _WINDOW_MIN_PX = 0.12, 72  # 7 deg: two tenths of a degree are then 3 % of the width
+# Poles, lights, signs and road users: what has an outline in picture and sweep alike (foliage and fences have not).
+_CLEAR_LABELS = (5, 6, 7, 11, 12, 13, 14, 15, 16, 17, 18)
 _NEAREST_M, _FARTHEST_M = 4.0, 45.0  # nearer fills the window, further is a few pixels
 _REACH_RAD = 0.003  # 0.17 deg, as wide as a mask's boundary is uncertain
 
@@ -35,7 +38,8 @@ def choose_windows(observation: Observation, T_camera_lidar: np.ndarray, count: 
     agree with the picture only because a person looks at it.
     """
     uv, weight = _weighted_edges(observation, T_camera_lidar)
-    width = round(observation.image_width_px / 8)
+    focal_px = camera_of(observation).focal_px[0]
+    width = round(min(max(_WINDOW_RAD * focal_px, _WINDOW_MIN_PX), observation.image_width_px / 4))
     size = np.array([width, round(width * 0.62)])
     windows: list[Window] = []
     while len(windows) < count and len(uv) >= _MIN_EDGES:
@@ -67,5 +71,5 @@ def _weighted_edges(
     distance = np.linalg.norm(points, axis=1)
     valid &= camera.contains(uv, margin_px=8) & (distance > _NEAREST_M) & (distance < _FARTHEST_M)
     uv = uv[valid]
-    is_near = boundary_distance_px(observation, uv) < _REACH_RAD * camera.focal_px[0]
+    is_near = boundary_distance_px(observation, uv, _CLEAR_LABELS) < _REACH_RAD * camera.focal_px[0]
     return uv, np.where(is_near, 1.0, -0.15)

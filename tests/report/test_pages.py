@@ -136,7 +136,7 @@ def test_a_day_page_names_what_the_day_did_not_determine(
     fleet: tuple[Lake, Path, Path], tmp_path: Path
 ) -> None:
     text = write_day_page(fleet[0], Partition("b", "2026-03-01"), _config(), tmp_path / "d.html").read_text()
-    assert "Not determined by this day, kept at the prior: rx (roll), tz (up)." in text
+    assert "Not determined by this day: rx (roll), tz (up)." in text
     assert "No pictures: the lake no longer has" in text
     assert "The radar moved on 2026-03-03" in text
 
