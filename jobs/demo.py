@@ -51,7 +51,7 @@ def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = No
     outcomes = watch_night(night, work, "process", workers)
     _say("[bold]3/3[/]  the audit: which sensor moved, and since when")
     truth = read_truth(out / "truth")
-    findings, pages = close_night(night, None, None, out / "report" / "fleet.html", truth)
+    findings, pages = close_night(night, None, out / "report" / "fleet.html", truth)
     errors = print_comparison(night.lake, night.method, truth, days[-1], findings)
     code = exit_code([o.status for o in outcomes])
     seconds = time.monotonic() - began

@@ -54,7 +54,8 @@ def nightly(
     night = Night(config, fleet, tables, method or config.audit.method, seed)
     days = find_vehicle_days(logs, from_day, to_day)
     outcomes = watch_night(night, days, executor, workers)
-    findings, pages = close_night(night, from_day, to_day, report or tables.root / "report" / "fleet.html")
+    page = report or tables.root / "report" / "fleet.html"
+    findings, pages = close_night(night, to_day, page) if outcomes else ([], [])
     code = exit_code([o.status for o in outcomes])
     print_summary(
         "nightly",
@@ -88,14 +89,17 @@ def watch_night(
 
 
 def close_night(
-    night: Night, from_day: str | None, to_day: str | None, report: Path, truth: Any = None
+    night: Night, to_day: str | None, report: Path, truth: Any = None
 ) -> tuple[list[DriftFinding], list[str]]:
-    """Audit the fleet and write its pages; returns the findings and the pages, the fleet's first."""
+    """Audit the fleet and write its pages; returns the findings and the pages, the fleet's first.
+
+    However few days the night was about, the charts look back over `audit.window_days`.
+    """
     from jobs.summary import progress_reporter
     from pipeline.stages import AUDIT, REPORT
 
     with progress_reporter("audit") as progress:
-        findings = AUDIT.load()(night.lake, night.fleet, from_day, to_day, night.method, progress)
+        findings = AUDIT.load()(night.lake, night.fleet, None, to_day, night.method, progress)
     if not findings:
         return [], []
     with progress_reporter("report") as progress:

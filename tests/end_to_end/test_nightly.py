@@ -1,0 +1,170 @@
+"""The installed command on a small simulated fleet: good days, poisoned ones, killed workers, an order to stop."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_manifest, read_records
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.frames import FRAMES
+from schemas.observations import OBSERVATIONS
+
+BORESIGHT = f"{sys.prefix}/bin/boresight"
+DAYS = ("2026-03-02", "2026-03-03")
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """Two vehicles for two days in three containers, one poisoned log, one vehicle that fleet.toml does not know."""
+    out = tmp_path_factory.mktemp("fleet")
+    simulate_fleet(FleetSpec(vehicles=2, days=2, frames=12, drives=2, container="mixed"), out)
+    poisoned = out / "logs" / "vehicle-3" / DAYS[0]
+    poisoned.mkdir(parents=True)
+    (poisoned / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(range(256)) * 100)
+    with (out / "fleet.toml").open("a") as file:
+        file.write('\n[vehicles."vehicle-3"]\nrig = "demo"\n')
+    stranger = out / "logs" / "stranger" / DAYS[0]
+    source = next((out / "logs" / "vehicle-1" / DAYS[0]).iterdir())
+    shutil.copytree(source, stranger / source.name) if source.is_dir() else (
+        stranger.mkdir(parents=True),
+        shutil.copy(source, stranger),
+    )
+    return out
+
+
+def command(fleet, lake, *options, vehicles="{vehicle}"):
+    logs = f"{fleet}/logs/{vehicles}/{{day}}/*"
+    return [
+        BORESIGHT,
+        "nightly",
+        "--fleet",
+        f"{fleet}/fleet.toml",
+        "--lake",
+        str(lake),
+        "--logs",
+        logs,
+        *options,
+    ]
+
+
+def run(*arguments):
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False, timeout=300)
+    return done.returncode, json.loads(done.stdout.splitlines()[-1]), done.stderr
+
+
+def good_days(lake):
+    """Vehicle-days with a record of every pair."""
+    found = read_records(Lake.at(lake), CALIBRATIONS, CalibrationRecord)
+    pairs = {}
+    for record in found:
+        pairs.setdefault((record.vehicle, record.day), set()).add(record.pair)
+    return {key for key, of_day in pairs.items() if of_day == set(PAIRS)}
+
+
+WANTED = {(v, d) for v in ("vehicle-1", "vehicle-2") for d in DAYS}
+
+
+@pytest.fixture(scope="module")
+def first_night(fleet, tmp_path_factory):
+    lake = tmp_path_factory.mktemp("night") / "lake"
+    return lake, *run(*command(fleet, lake, "--workers", "2"))
+
+
+@pytest.mark.slow
+def test_the_night_calibrates_what_it_can_and_refuses_the_rest_with_reasons(first_night):
+    lake, code, summary, stderr = first_night
+    assert code == 3
+    assert summary["vehicle_days"] == 6
+    assert summary["failed"] == 0
+    problems = {(p["vehicle"], p["day"]): p for p in summary["problems"] if p["status"] == "refused"}
+    assert "no vehicle 'stranger'" in problems["stranger", DAYS[0]]["reason"]
+    assert problems["vehicle-3", DAYS[0]]["reason"]
+    assert good_days(lake) == WANTED | {("vehicle-3", DAYS[0])}
+    refused = read_records(Lake.at(lake), CALIBRATIONS, CalibrationRecord, vehicle="vehicle-3")
+    assert {r.status for r in refused} == {"refused"}
+    assert all(json.loads(line) for line in stderr.splitlines())  # JSON lines without a terminal
+    assert Path(summary["report"]).stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_every_table_of_the_lake_says_what_it_was_made_from(first_night):
+    lake = Lake.at(first_night[0])
+    for vehicle, day in WANTED:
+        frames = read_manifest(lake, FRAMES, Partition(vehicle, day))
+        observations = read_manifest(lake, OBSERVATIONS, Partition(vehicle, day))
+        assert frames.rows == 12
+        assert observations.inputs == [frames.work_key]
+        records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day)
+        assert {tuple(r.inputs) for r in records} == {(observations.work_key,)}
+
+
+@pytest.mark.slow
+def test_a_second_night_finds_nothing_to_do_and_changes_no_byte(fleet, first_night):
+    lake, code, summary, _ = first_night
+    tables = [p for p in lake.rglob("*.parquet") if "drift" not in p.parts]
+    before = {p: p.read_bytes() for p in tables}
+    again_code, again, _ = run(*command(fleet, lake, "--executor", "inline"))
+    assert again_code == code
+    assert again["done"] == 0
+    assert again["cached"] == summary["done"] + summary["cached"]
+    assert {p: p.read_bytes() for p in before} == before
+    after = {p for p in lake.rglob("*.parquet") if "drift" not in p.parts}
+    assert after == set(before)
+
+
+def nightly_with_workers(fleet, lake):
+    """A night in the background, and its workers once they are at work."""
+    arguments = command(fleet, lake, "--workers", "2", vehicles="{vehicle}")
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        children = psutil.Process(process.pid).children(recursive=True)
+        workers = [c for c in children if "spawn_main" in " ".join(c.cmdline())]
+        if len(workers) == 2 and any(Path(lake).rglob("*.parquet")):
+            return process, workers
+        time.sleep(0.02)
+    process.kill()
+    raise AssertionError("no workers came to work")
+
+
+@pytest.mark.slow
+def test_a_killed_worker_costs_time_and_no_vehicle_day(fleet, tmp_path):
+    lake = tmp_path / "lake"
+    process, workers = nightly_with_workers(fleet, lake)
+    workers[0].kill()
+    out, _ = process.communicate(timeout=300)
+    summary = json.loads(out.splitlines()[-1])
+    assert process.returncode == 3
+    assert summary["failed"] == 0
+    assert summary["vehicle_days"] == 6
+    assert good_days(lake) >= WANTED
+
+
+@pytest.mark.slow
+def test_sigterm_stops_the_night_cleanly_and_the_next_one_goes_on(fleet, tmp_path):
+    lake = tmp_path / "lake"
+    process, workers = nightly_with_workers(fleet, lake)
+    process.send_signal(signal.SIGTERM)
+    out, _ = process.communicate(timeout=30)
+    assert process.returncode == 143
+    assert json.loads(out.splitlines()[-1])["status"] == "stopped"
+    assert psutil.wait_procs(workers, timeout=5)[1] == []
+    assert not list(lake.rglob("*.tmp"))
+    code, summary, _ = run(*command(fleet, lake, "--workers", "2"))
+    assert (code, summary["failed"]) == (3, 0)
+    assert good_days(lake) >= WANTED
+
+
+def test_days_outside_the_window_are_not_touched(fleet, tmp_path):
+    code, summary, _ = run(*command(fleet, tmp_path / "lake", "--from", "2027-01-01"))
+    assert (code, summary["vehicle_days"]) == (0, 0)
+    assert not list((tmp_path / "lake").rglob("*.parquet"))
