@@ -25,7 +25,7 @@ _PLANE_REACH_M = 35.0  # further out a plane is a poor model of a road
 _MAX_TILT_RAD = 0.26  # 15 deg: mounting plus road; a steeper "ground" is a bank or a wall
 _HEIGHT_RANGE_M = (0.3, 4.0)  # lidar above the road: bumper to truck roof
 _HYPOTHESES = 800
-_TRUSTED_M = 10.0
+_TRUSTED_AHEAD_M, _TRUSTED_ASIDE_M = 10.0, 3.0
 _FLAT_M = 0.25
 _MIN_SUPPORT = 40  # cells of 1 m^2
 _SECTORS = 120
@@ -75,9 +75,9 @@ def _lowest_of_cells(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first = np.flatnonzero(np.append(True, np.any(np.diff(cell[order], axis=0) != 0, axis=1)))
     low = near[order[first]]
     top_m = near[order[np.append(first[1:], len(order)) - 1], 2]
-    # The vehicle stands on the ground that is wanted: near cells count more than ditches and banks beside the
-    # road, and cells with something standing in them, whose lowest point may be a bumper, count less.
-    weight = 1 / (1 + (np.hypot(low[:, 0], low[:, 1]) / _TRUSTED_M) ** 2)
+    # The vehicle stands on the ground that is wanted: cells near it and along its way count more than ditches
+    # and banks beside the road; cells with something standing in them, whose lowest point may be a bumper, less.
+    weight = 1 / (1 + (low[:, 0] / _TRUSTED_AHEAD_M) ** 2 + (low[:, 1] / _TRUSTED_ASIDE_M) ** 2)
     return low, np.where(top_m - low[:, 2] < _FLAT_M, weight, 0.2 * weight)
 
 
@@ -147,7 +147,8 @@ def _walk(height: np.ndarray, start: np.ndarray, sectors: int, bins: int, inlier
         for b in range(bins):
             cell = height[start[s * bins + b] : start[s * bins + b + 1]]
             reach = inlier_m + _SLOPE * _BIN_M * min(gap, 4)
-            fits = np.sort(cell[np.abs(cell - level) < reach])
+            # Upwards half as much: what rises out of a gap without ground is more often a bonnet than a hill.
+            fits = np.sort(cell[(cell - level > -reach) & (cell - level < (inlier_m + reach) / 2)])
             if fits.size >= 2:
                 # The lower part: the upper one may be the foot of an object.
                 level, gap = fits[int(0.3 * (fits.size - 1))], 1

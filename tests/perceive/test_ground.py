@@ -67,6 +67,40 @@ def test_every_seed_finds_the_same_ground():
     assert np.max(np.ptp(planes[:, :3], axis=0)) < 0.005
 
 
+def spread(rng, low, high, count):
+    return rng.uniform(low, high, (count, 3))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_road_between_deep_ditches_is_the_ground_and_not_the_ditches(seed):
+    # Real case: crowned asphalt, 0.8 m lower on both sides over much more area than the road has.
+    rng = np.random.default_rng(seed)
+    road = spread(rng, [-30, -3.5, -1.72], [30, 3.5, -1.68], 2500)
+    ditches = [
+        spread(rng, [-30, 5, -2.55], [30, 15, -2.45], 4000),
+        spread(rng, [-30, -15, -2.55], [30, -5, -2.45], 4000),
+    ]
+    plane = find_ground(np.concatenate([road, *ditches]).astype(np.float32), 0.15, rng).plane
+    assert plane[3] == pytest.approx(1.7, abs=0.06)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_lane_between_parked_cars_is_the_ground_and_not_their_bonnets(seed):
+    # Real case: a car park, where a tenth of the cells show asphalt and the lowest points of the rest are cars.
+    rng = np.random.default_rng(seed)
+    lane = spread(rng, [3, -2.5, -1.72], [18, 2.5, -1.68], 1500)
+    bonnets, fronts = [], []
+    for side in (-1, 1):
+        for x in np.arange(-20, 30, 2.6):
+            high = rng.uniform(-1.1, -0.4)  # no two cars have bonnets of one height
+            bonnets.append(spread(rng, [x, 3.0, high - 0.05], [x + 1.8, 7.5, high + 0.05], 60) * [1, side, 1])
+            fronts.append(spread(rng, [x, 3.0, -1.65], [x + 1.8, 3.05, -0.8], 60) * [1, side, 1])
+    ground = find_ground(np.concatenate([lane, *bonnets, *fronts]).astype(np.float32), 0.15, rng)
+    assert ground.plane[3] == pytest.approx(1.7, abs=0.06)
+    assert ground.is_ground[: len(lane)].mean() > 0.9
+    assert ground.is_ground[len(lane) :][: 60 * len(bonnets)].mean() < 0.05
+
+
 def test_a_rising_road_is_followed_beyond_the_plane():
     # 5 % steeper from 20 m on: 1 m over the plane at 40 m.
     rng = np.random.default_rng(3)

@@ -33,6 +33,17 @@ def test_an_object_of_two_far_rings_stays_one_cluster():
     assert set(label.tolist()) == {0}
 
 
+def test_the_few_points_of_a_far_truck_are_still_an_object():
+    # 0.3 deg between beams: 0.3 m at 60 m, where eps alone reaches two neighbours on either side.
+    y = np.arange(-1.6, 1.6, 0.3)
+    truck = np.stack([np.full_like(y, 60.0), y, np.full_like(y, -0.2)], 1).astype(np.float32)
+    assert set(cluster_objects(truck, np.zeros(len(y), bool), 0.7, 8).tolist()) == {0}
+    near = truck - np.array([50, 0, 0], np.float32)
+    assert set(cluster_objects(near, np.zeros(len(y), bool), 0.7, 8).tolist()) == {
+        -1
+    }  # near, it would be denser
+
+
 def test_ground_and_the_own_vehicle_belong_to_no_object():
     points, _ = scene(np.random.default_rng(1))
     ground = np.arange(len(points)) % 3 == 0
