@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, to_quaternion, transform_points
-from schemas.observations import Observation
+from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # camera axes of lidar axes
 T_CAMERA_LIDAR = from_rotation_translation(
@@ -51,7 +51,10 @@ def make_observation(
     drivable = np.column_stack([cells, np.full(len(cells), GROUND_M)])
     azimuth, reach = free_sector(transform_points(inverse(T_LIDAR_RADAR), drivable))
     cloud = np.concatenate([*clusters, ground])
+    edges, sides = silhouettes(centres)
     tracks = transform_points(inverse(T_LIDAR_RADAR), centres)
+    moving = np.repeat(tracks, 3, axis=0) + rng.normal(size=(3 * len(tracks), 3)) * 0.1
+    static = transform_points(inverse(T_LIDAR_RADAR), cloud[rng.integers(0, len(cloud), 60)])
     stamp_ns = int((1_000 + stamp_s) * 1e9)
     n = len(centres)
     values = {
@@ -71,14 +74,17 @@ def make_observation(
         "lidar_cluster_centre_m": centres.astype(np.float32),
         "lidar_cluster_min_m": (centres - HALF_SIZE_M).astype(np.float32),
         "lidar_cluster_max_m": (centres + HALF_SIZE_M).astype(np.float32),
-        "lidar_edge_xyz_m": np.zeros((0, 3), np.float32), "lidar_edge_side": np.zeros(0, np.uint8),
-        "lidar_edge_jump_m": np.zeros(0, np.float32), "lidar_edge_gap_rad": np.zeros(0, np.float32),
-        "lidar_edge_points": np.zeros(0, np.int32),
+        "lidar_edge_xyz_m": edges.astype(np.float32), "lidar_edge_side": sides,
+        "lidar_edge_jump_m": np.full(len(edges), 9.0, np.float32),
+        "lidar_edge_gap_rad": np.full(len(edges), 0.003, np.float32),
+        "lidar_edge_points": np.full(len(edges), 80, np.int32),
         "marking_xyz_m": np.zeros((0, 3), np.float32), "marking_z": np.zeros(0, np.float32),
         "ground_plane": np.array([0, 0, 1.0, -GROUND_M]), "lidar_drivable_xyz_m": drivable.astype(np.float32),
-        "radar_xyz_m": tracks.astype(np.float32), "radar_power_db": None,
-        "radar_residual_mps": np.full(n, 5.0, np.float32), "radar_motion": np.ones(n, np.uint8),
-        "radar_cluster": np.arange(n, dtype=np.int32), "radar_has_elevation": True,
+        "radar_xyz_m": np.concatenate([moving, static]).astype(np.float32), "radar_power_db": None,
+        "radar_residual_mps": np.r_[np.full(3 * n, 5.0), np.zeros(len(static))].astype(np.float32),
+        "radar_motion": np.r_[np.ones(3 * n), np.zeros(len(static))].astype(np.uint8),
+        "radar_cluster": np.r_[np.repeat(np.arange(n), 3), np.full(len(static), -1)].astype(np.int32),
+        "radar_has_elevation": True,
         "radar_velocity_mps": np.array([10.0, 0, 0]), "radar_velocity_cov": np.eye(3) * 0.01,
         "radar_track_xyz_m": tracks.astype(np.float32), "radar_track_velocity_mps": np.ones((n, 3), np.float32),
         "radar_track_id": np.arange(n, dtype=np.int32), "radar_track_age": np.ones(n, np.int32),
@@ -105,6 +111,19 @@ def surface(rng: np.random.Generator, points: int = 80) -> np.ndarray:
     p[rear, 0] = -HALF_SIZE_M[0]
     p[~rear, 1] = np.sign(p[~rear, 1]) * HALF_SIZE_M[1]
     return p
+
+
+def silhouettes(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the upright edges that bound each car to the left and right, and where the car lies from them."""
+    points, sides = [], []
+    for centre in centres:
+        corners = centre + CORNERS * HALF_SIZE_M
+        azimuth = np.arctan2(corners[:, 1], corners[:, 0])
+        for corner, side in ((corners[azimuth.argmax()], EDGE_RIGHT), (corners[azimuth.argmin()], EDGE_LEFT)):
+            heights = centre[2] + np.linspace(-0.7, 0.7, 8)
+            points.append(np.column_stack([np.tile(corner[:2], (8, 1)), heights]))
+            sides += [side] * 8
+    return np.concatenate(points), np.array(sides, np.uint8)
 
 
 def draw(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

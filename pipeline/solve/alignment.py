@@ -34,7 +34,10 @@ def alignment_of(pair: str, observations: Sequence[Observation], prior: Prior) -
     """
 
     def camera_lidar(T: np.ndarray, dt_s: float) -> np.ndarray:
-        return camera_lidar_cost(observations, T, dt_s, T_lidar_radar=prior.T_lidar_radar)
+        told = np.array([len(o.lidar_edge_xyz_m) + len(o.marking_xyz_m) > 0 for o in observations])
+        return np.where(
+            told, camera_lidar_cost(observations, T, dt_s, T_lidar_radar=prior.T_lidar_radar), np.nan
+        )
 
     def lidar_radar(T: np.ndarray, dt_s: float) -> np.ndarray:
         return lidar_radar_cost(observations, T, dt_s)

@@ -84,7 +84,7 @@ def test_one_record_per_pair_with_every_column_filled(solved):
         assert record.inputs == ["k1"]
         assert record.covariance.shape == (6, 6)
         assert np.all(np.linalg.eigvalsh(record.covariance) > 0)
-        assert record.alignment_before > 0
+        assert record.alignment_before != record.alignment_after
         assert record.trigger_before
         assert set(record.trigger_before) == set(record.trigger_after)
         assert record.diagnostics["holdout_frames"] >= 3
@@ -122,23 +122,21 @@ def test_the_same_work_is_done_once(solved):
     assert len(records_of(lake)) == before
 
 
-def test_other_seed_method_or_config_is_other_work(solved):
-    lake, first = solved
-    keys = {first.work_key}
-    keys.add(
-        calibrate_day(DAY, fleet_of(), lake, method="joint-optimisation", perturb=(2.0, 0.1), seed=5).work_key
-    )
-    keys.add(
-        calibrate_day(
-            DAY, fleet_of(), lake, method="pairwise-optimisation", perturb=(2.0, 0.1), seed=6
-        ).work_key
-    )
-    tight = fleet_of(solve={"paper_generations": 11})
-    keys.add(
-        calibrate_day(DAY, tight, lake, method="pairwise-optimisation", perturb=(2.0, 0.1), seed=5).work_key
-    )
-    assert len(keys) == 4
-    assert len(records_of(lake)) == 12
+def test_other_seed_method_perturbation_or_config_is_other_work(tmp_path):
+    lake = Lake.at(tmp_path)
+    ways = [
+        (fleet_of(), {"method": "joint", "seed": 5}),
+        (fleet_of(), {"method": "joint", "seed": 6}),
+        (fleet_of(), {"method": "pairwise-optimisation", "seed": 5}),
+        (fleet_of(), {"method": "joint", "seed": 5, "perturb": (2.0, 0.1)}),
+        (fleet_of(solve={"paper_generations": 11}), {"method": "joint", "seed": 5}),
+        (fleet_of(trigger={"when": "triggered"}), {"method": "joint", "seed": 5}),
+    ]
+    keys = {calibrate_day(DAY, fleet, lake, **way).work_key for fleet, way in ways}
+    assert len(keys) == len(ways)
+    assert len(records_of(lake)) == 3 * len(ways)
+    audit = fleet_of(audit={"baseline_days": 5})
+    assert calibrate_day(DAY, audit, lake, method="joint", seed=5).status == "cached"  # no part of this stage
 
 
 def test_a_day_without_observations_is_refused_with_the_reason(tmp_path):
