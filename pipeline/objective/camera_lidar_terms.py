@@ -199,6 +199,19 @@ class Terms:
             level.sigma_px,
         )
 
+    def edge_excess(self, at: Alignments, level: Level) -> Float[np.ndarray, "P F"]:
+        """Edge score minus what the same edges score when the image is shifted: 0 for a pose that matches by chance.
+
+        So poses that see different numbers of edges compare: those that turn them out of view win nothing.
+        """
+        shifted = np.zeros((len(at.dt_s), self.frames))
+        shifts = [(u, v) for u in (-47.0, -31.0, 29.0, 43.0) for v in (-37.0, 0.0, 41.0)]
+        for u, v in shifts:
+            camera = self.camera.copy()
+            camera[3:5] += np.float32(u), np.float32(v)
+            shifted += replace(self, camera=camera).edge_score(at, level)
+        return self.edge_score(at, level) - shifted / len(shifts)
+
     def marking_score(self, at: Alignments, level: Level) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the markings."""
         m, contrast = self.markings, self.maps.contrast[level.contrast_level]

@@ -142,7 +142,8 @@ def camera_lidar_cost(
     if velocity_lidar is None:
         velocity_lidar = lidar_velocities(observations, np.eye(4) if T_lidar_radar is None else T_lidar_radar)
     terms = prepare_terms(observations, T_camera_lidar, velocity_lidar, reach_rad=0.0).sharp(_MAX_GAP_PX)
-    return -terms.score(AlignmentState(T_camera_lidar, dt_s).alone, _VERDICT)[0]
+    at = AlignmentState(T_camera_lidar, dt_s).alone
+    return -(terms.edge_excess(at, _VERDICT) + terms.marking_score(at, _VERDICT))[0]
 
 
 def camera_lidar_information(
