@@ -2,7 +2,8 @@
 
 Optical frame: x right, y down, z forward [m]; pixels: u right, v down, (0, 0) = centre of the first pixel.
 
-Source: OpenCV calib3d "Detailed description" (pinhole, rational) and "Fisheye camera model" (Kannala, Brandt 2006, eq. 6).
+Source: OpenCV calib3d "Detailed description" (pinhole, rational) and "Fisheye camera model" (Kannala and
+Brandt 2006, eq. 6).
 """
 
 from __future__ import annotations
@@ -75,7 +76,10 @@ class Camera:
     def project(
         self, points_camera: Float[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
-        """Pixels of points, and a mask that is False behind the camera or outside the model's valid angle (pixels there mean nothing)."""
+        """Pixels of points, and a mask that is False where they mean nothing.
+
+        That is behind the camera and outside the angle up to which the model is one-to-one.
+        """
         x, y, z = points_camera.astype(np.float64).reshape(-1, 3).T
         if self.model == "equidistant":
             valid, xd, yd = self._equidistant(x, y, z)
@@ -112,8 +116,9 @@ class Camera:
         return (J * np.array([[self.K[0, 0]], [self.K[1, 1]]])).reshape(*points_camera.shape[:-1], 2, 3)
 
     def fast_polynomial(self, degree: int = 9) -> tuple[Float[np.ndarray, " P"], float]:
-        """k(c) with `u = cx + fx k x/|p|`, `v = cy + fy k y/|p|`, c = z/|p|: coefficients, lowest power first, and the fit's largest error [px].
+        """k(c) with `u = cx + fx k x/|p|`, `v = cy + fy k y/|p|`, c = z/|p|, and the fit's largest error [px].
 
+        Coefficients come lowest power first.
         Only for `equidistant`: replaces atan2 in hot loops by a polynomial over the angles that the image can show.
         """
         if self.model != "equidistant":

@@ -61,7 +61,7 @@ def exp_so3(phi: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3
 
 
 def log_so3(R: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Rotation vector [rad] of a rotation matrix; angle in [0, pi]. Well conditioned everywhere (through the quaternion)."""
+    """Rotation vector [rad] of a rotation matrix, angle in [0, pi]; well conditioned everywhere."""
     q = _quaternion_of_rotation(R)
     q = np.where(q[..., :1] < 0, -q, q)
     v = q[..., 1:]
@@ -180,9 +180,9 @@ def from_quaternion(
 def perturb_exactly(
     T: Float[np.ndarray, "4 4"], rotation_rad: float, translation_m: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "4 4"]:
-    """Turn T by exactly `rotation_rad` about a random axis and shift it by exactly `translation_m` in a random direction.
+    """Turn T by exactly `rotation_rad` about a random axis and shift it exactly `translation_m` in a random direction.
 
-    Rotation acts about the parent's axes on the rotation part alone, so that both amounts are exact whatever the lever arm.
+    Rotation acts about the parent's axes on the rotation part alone: both amounts are exact whatever the lever arm.
     """
     axis, direction = rng.normal(size=3), rng.normal(size=3)
     R = exp_so3(rotation_rad * axis / np.linalg.norm(axis)) @ T[:3, :3]

@@ -9,7 +9,7 @@ __all__ = ["camera_direction_angles", "from_spherical", "spherical_jacobian", "t
 
 
 def to_spherical(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """(azimuth, elevation [rad], range [m]): azimuth positive to the left of x, elevation positive upwards; 0, 0, 0 at the origin."""
+    """(azimuth, elevation [rad], range [m]), azimuth positive to the left, elevation upwards; 0, 0, 0 at the origin."""
     x, y, z = np.moveaxis(points, -1, 0)
     return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), np.sqrt(x * x + y * y + z * z)], -1)
 
@@ -38,7 +38,7 @@ def spherical_jacobian(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarra
 
 
 def camera_direction_angles(points_camera: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-    """(azimuth, elevation) [rad] of points in the optical frame: azimuth positive to the left, elevation positive upwards."""
+    """(azimuth, elevation) [rad] of points in the optical frame, azimuth positive to the left, elevation upwards."""
     x, y, z = np.moveaxis(points_camera, -1, 0)
     return np.stack([np.arctan2(-x, z), np.arctan2(-y, np.hypot(x, z))], -1)
 

@@ -79,6 +79,6 @@ def _partition_of(folder: Path) -> Partition | None:
 
 
 def work_key(stage: str, code_version: str, config: str, inputs: list[str]) -> str:
-    """Hash that changes exactly when the output of a stage may change: code version, config hash and input work keys."""
+    """Hash that changes exactly when a stage's output may change: code version, config hash, input work keys."""
     payload = json.dumps([stage, code_version, config, sorted(inputs)])
     return hashlib.sha256(payload.encode()).hexdigest()[:20]
