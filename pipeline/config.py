@@ -213,13 +213,17 @@ class FleetConfig(_Section):
     def _vehicles_name_known_rigs(self) -> FleetConfig:
         for name, vehicle in self.vehicles.items():
             if vehicle.rig not in self.rigs:
-                raise ValueError(f"vehicles.{name}.rig = {vehicle.rig!r}, but rigs has only {sorted(self.rigs)}")
+                raise ValueError(
+                    f"vehicles.{name}.rig = {vehicle.rig!r}, but rigs has only {sorted(self.rigs)}"
+                )
         return self
 
     def rig_of(self, vehicle: str, *, file: str = "fleet.toml") -> Rig:
         """The rig of a vehicle; ConfigError where the vehicle is not in the file."""
         if vehicle not in self.vehicles:
-            raise ConfigError(file, f"vehicles.{vehicle}", f"unknown vehicle; the file has {sorted(self.vehicles)}")
+            raise ConfigError(
+                file, f"vehicles.{vehicle}", f"unknown vehicle; the file has {sorted(self.vehicles)}"
+            )
         return self.rigs[self.vehicles[vehicle].rig]
 
 

@@ -11,7 +11,11 @@ from schemas.columns import TableSchema, array, scalar, transform_columns
 __all__ = ["CALIBRATIONS", "DOF_NAMES", "FRAMES_OF_PAIR", "METHODS", "PAIRS", "STATUSES", "CalibrationRecord"]
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
-FRAMES_OF_PAIR = {"camera_lidar": ("camera", "lidar"), "camera_radar": ("camera", "radar"), "lidar_radar": ("lidar", "radar")}
+FRAMES_OF_PAIR = {
+    "camera_lidar": ("camera", "lidar"),
+    "camera_radar": ("camera", "radar"),
+    "lidar_radar": ("lidar", "radar"),
+}
 METHODS = ("joint", "tracking", "pairwise-optimisation", "joint-optimisation", "pairwise-ssl", "joint-ssl")
 STATUSES = ("accepted", "held", "refused")
 # Order of the covariance and of every per-DoF list: left perturbation T <- exp(xi) T, rotation vector then translation,
@@ -29,34 +33,73 @@ CALIBRATIONS = TableSchema(
         scalar("parent_frame", "string", "a of T_a_b"),
         scalar("child_frame", "string", "b of T_a_b"),
         *transform_columns("", "the estimate of T_parent_child; null where refused", nullable=True),
-        array("covariance", "<f8", (6, 6), "of (rx ry rz tx ty tz), left perturbation in parent axes [rad, m]; null where refused", nullable=True),
-        scalar("observability", "list<float64>", "per DoF: 1 - posterior/prior variance along it, 0 = the day said nothing, 1 = all", nullable=True),
-        scalar("observable", "list<bool>", "per DoF: the day determined it; else it keeps prior and prior sigma", nullable=True),
+        array(
+            "covariance",
+            "<f8",
+            (6, 6),
+            "of (rx ry rz tx ty tz), left perturbation in parent axes [rad, m]; null where refused",
+            nullable=True,
+        ),
+        scalar(
+            "observability",
+            "list<float64>",
+            "per DoF: 1 - posterior/prior variance along it, 0 = the day said nothing, 1 = all",
+            nullable=True,
+        ),
+        scalar(
+            "observable",
+            "list<bool>",
+            "per DoF: the day determined it; else it keeps prior and prior sigma",
+            nullable=True,
+        ),
         *transform_columns("prior_", "the prior; null where none was given", nullable=True),
         array("prior_covariance", "<f8", (6, 6), "of the prior, same order", nullable=True),
-        scalar("status", "string", "accepted (use it), held (computed, the prior stays current), refused (nothing computed)"),
+        scalar(
+            "status",
+            "string",
+            "accepted (use it), held (computed, the prior stays current), refused (nothing computed)",
+        ),
         scalar("reason", "string", "why, in words; empty where accepted without remark"),
         scalar("trigger_before", "map<string,float64>", "the paper's trigger metrics at the prior"),
         scalar("trigger_after", "map<string,float64>", "the same at the result"),
         scalar("triggered", "bool", "a trigger metric exceeded its threshold at the prior"),
-        scalar("alignment_before", "float64", "alignment cost on held-out frames at the prior (lower is better)", nullable=True),
+        scalar(
+            "alignment_before",
+            "float64",
+            "alignment cost on held-out frames at the prior (lower is better)",
+            nullable=True,
+        ),
         scalar("alignment_after", "float64", "the same at the result", nullable=True),
         scalar("frames_total", "int64", "frames of the day"),
         scalar("frames_used", "int64", "frames that this pair was estimated from"),
         scalar("frames_rejected", "map<string,int64>", "frames not used, by reason"),
-        scalar("loop_rotation_rad", "float64", "angle of the loop of the three INDEPENDENT pair estimates", nullable=True),
+        scalar(
+            "loop_rotation_rad",
+            "float64",
+            "angle of the loop of the three INDEPENDENT pair estimates",
+            nullable=True,
+        ),
         scalar("loop_translation_m", "float64", "its translation", nullable=True),
         scalar("environment", "string", "highway, urban, mixed or unknown"),
-        scalar("time_offset_s", "float64", "dt: stamp_parent = stamp_child + dt; null where not estimated", nullable=True),
+        scalar(
+            "time_offset_s",
+            "float64",
+            "dt: stamp_parent = stamp_child + dt; null where not estimated",
+            nullable=True,
+        ),
         scalar("time_offset_sigma_s", "float64", "its sigma", nullable=True),
         scalar("notes", "list<string>", "what was assumed, what the drive still lacks"),
-        scalar("diagnostics", "map<string,float64>", "numbers behind the verdict (restarts, halves, biases), names with units"),
+        scalar(
+            "diagnostics",
+            "map<string,float64>",
+            "numbers behind the verdict (restarts, halves, biases), names with units",
+        ),
         scalar("work_key", "string", "hash of code version, config, inputs"),
         scalar("code_version", "string", "boresight version"),
         scalar("seed", "int64", "random seed"),
         scalar("inputs", "list<string>", "work keys or paths of what was read"),
     ),
-    "One row per pair and method. boresight show calibrations --json prints these names plus T as a 4x4 row-major matrix.",
+    "One row per pair and method. boresight show calibrations --json prints these names plus T, 4x4 row-major.",
 )
 
 

@@ -1,7 +1,7 @@
 """How a table is described once, and what follows from it: Arrow schema and JSON Schema.
 
 A table is a tuple of `Column`s. Arrays travel as `binary` blobs, one per attribute, little-endian and C-ordered
-(Parquet reads them 4-10x faster than list columns); the column's Arrow field metadata says dtype, shape and unit, so any
+(Parquet reads them 4-10x faster than list columns); the column's Arrow field metadata says dtype and shape, so any
 engine can decode them: `numpy.frombuffer(blob, dtype).reshape(shape)`.
 """
 

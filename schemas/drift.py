@@ -1,4 +1,4 @@
-"""Table `drift`: what the control charts say of each vehicle, pair and DoF. Append-only, one row per chart and audit."""
+"""Table `drift`: what the control charts say of each vehicle, pair and DoF. Append-only, a row per chart and audit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ DRIFT = TableSchema(
         scalar("method", "string", "method of the audited records"),
         scalar("pair", "string", "camera_lidar, camera_radar or lidar_radar"),
         scalar("dof", "string", "rx, ry, rz, tx, ty, tz in parent axes"),
-        scalar("status", "string", "GREEN, YELLOW (a change below the limit that matters, or not yet sure), RED, UNKNOWN (too little data)"),
+        scalar(
+            "status",
+            "string",
+            "GREEN, YELLOW (a change below the limit that matters, or not yet sure), RED, UNKNOWN (too little data)",
+        ),
         scalar("reason", "string", "in words"),
         scalar("days_used", "int64", "day estimates on the chart"),
         scalar("statistic", "float64", "the chart's alarm statistic at its maximum", nullable=True),
@@ -31,9 +35,24 @@ DRIFT = TableSchema(
         scalar("magnitude", "float64", "size of the change [rad or m]", nullable=True),
         scalar("magnitude_sigma", "float64", "its sigma", nullable=True),
         scalar("limit", "float64", "size that matters for this pair and DoF [rad or m]"),
-        scalar("moved_sensor", "string", "camera, lidar or radar: the sensor that two shifted pairs share", nullable=True),
-        scalar("moved_probability", "float64", "of moved_sensor against the other two, 0..1; null where nothing moved", nullable=True),
-        scalar("moved_motion", "list<float64>", "rotation vector [rad] and shift [m] of the moved sensor in its own axes", nullable=True),
+        scalar(
+            "moved_sensor",
+            "string",
+            "camera, lidar or radar: the sensor that two shifted pairs share",
+            nullable=True,
+        ),
+        scalar(
+            "moved_probability",
+            "float64",
+            "of moved_sensor against the other two, 0..1; null where nothing moved",
+            nullable=True,
+        ),
+        scalar(
+            "moved_motion",
+            "list<float64>",
+            "rotation vector [rad] and shift [m] of the moved sensor in its own axes",
+            nullable=True,
+        ),
         scalar("moved_motion_sigma", "list<float64>", "their sigmas", nullable=True),
         scalar("work_key", "string", "hash of code version, config, inputs"),
         scalar("inputs", "list<string>", "work keys of the records on the chart"),

@@ -1,4 +1,4 @@
-"""Table `frames`: one row per synchronised camera-lidar-radar trio of a vehicle-day. Written by ingest, read by perceive."""
+"""Table `frames`: one row per synchronised camera-lidar-radar trio of a vehicle-day. From ingest, for perceive."""
 
 from __future__ import annotations
 
@@ -17,23 +17,49 @@ FRAMES = TableSchema(
     (
         scalar("frame_index", "int32", "0, 1, 2, ... in order of stamp within the vehicle-day"),
         scalar("log", "string", "file name of the log that the trio came from"),
-        scalar("drive", "int32", "continuous stretch of driving; grows where the log changes or stamps gap by more than 10 s"),
+        scalar(
+            "drive",
+            "int32",
+            "continuous stretch of driving; grows where the log changes or stamps gap by more than 10 s",
+        ),
         scalar("stamp_ns", "int64", "the trio's time = the lidar's stamp"),
         scalar("camera_stamp_ns", "int64", "stamp of the image"),
         scalar("lidar_stamp_ns", "int64", "stamp of the sweep; per-point times count from it"),
         scalar("radar_stamp_ns", "int64", "stamp of the radar scan"),
-        scalar("image", "binary", "JPEG or PNG bytes exactly as logged (raw Image topics are encoded as PNG)"),
+        scalar(
+            "image", "binary", "JPEG or PNG bytes exactly as logged (raw Image topics are encoded as PNG)"
+        ),
         scalar("image_format", "string", "'jpeg' or 'png'"),
         scalar("image_width_px", "int32", "width that the intrinsics refer to"),
         scalar("image_height_px", "int32", "height that the intrinsics refer to"),
-        scalar("camera_model", "string", "'plumb_bob', 'rational_polynomial' or 'equidistant' (Kannala-Brandt; D = 0 is f-theta)"),
+        scalar(
+            "camera_model",
+            "string",
+            "'plumb_bob', 'rational_polynomial' or 'equidistant' (Kannala-Brandt; D = 0 is f-theta)",
+        ),
         array("camera_K", "<f8", (3, 3), "camera matrix [px]"),
         array("camera_D", "<f8", ("N",), "distortion coefficients in ROS order"),
-        scalar("labels_png", "binary", "logged semantic label image, PNG mono8, labels of the config's label_set", nullable=True),
-        array("detection_boxes_px", "<f4", ("N", 4), "logged road users: x0 y0 x1 y1 in full-image pixels", nullable=True),
+        scalar(
+            "labels_png",
+            "binary",
+            "logged semantic label image, PNG mono8, labels of the config's label_set",
+            nullable=True,
+        ),
+        array(
+            "detection_boxes_px",
+            "<f4",
+            ("N", 4),
+            "logged road users: x0 y0 x1 y1 in full-image pixels",
+            nullable=True,
+        ),
         scalar("detection_classes", "list<string>", "their classes as logged", nullable=True),
         array("detection_scores", "<f4", ("N",), "their scores, 0..1", nullable=True),
-        array("lidar_x_m", "<f4", ("N",), "points in the lidar frame, de-skewed to lidar_stamp_ns where lidar_deskewed"),
+        array(
+            "lidar_x_m",
+            "<f4",
+            ("N",),
+            "points in the lidar frame, de-skewed to lidar_stamp_ns where lidar_deskewed",
+        ),
         array("lidar_y_m", "<f4", ("N",), "see lidar_x_m"),
         array("lidar_z_m", "<f4", ("N",), "see lidar_x_m"),
         array("lidar_intensity", "<f4", ("N",), "reflectivity as logged", nullable=True),
@@ -43,17 +69,29 @@ FRAMES = TableSchema(
         array("radar_x_m", "<f4", ("N",), "detections in the radar frame"),
         array("radar_y_m", "<f4", ("N",), "see radar_x_m"),
         array("radar_z_m", "<f4", ("N",), "see radar_x_m; 0 where the radar measures no elevation"),
-        array("radar_range_rate_mps", "<f4", ("N",), "Doppler as range rate: positive = receding, whatever the log's sign; not ego-compensated"),
+        array(
+            "radar_range_rate_mps",
+            "<f4",
+            ("N",),
+            "Doppler as range rate: positive = receding, whatever the log's sign; not ego-compensated",
+        ),
         array("radar_power_db", "<f4", ("N",), "power or RCS as logged", nullable=True),
         scalar("radar_has_elevation", "bool", "False where all elevations are 0"),
-        scalar("doppler_period_mps", "float64", "range rates are known modulo this; null = unambiguous", nullable=True),
+        scalar(
+            "doppler_period_mps",
+            "float64",
+            "range rates are known modulo this; null = unambiguous",
+            nullable=True,
+        ),
         scalar("ego_speed_mps", "float64", "forward speed from odometry at stamp_ns", nullable=True),
-        scalar("ego_yaw_rate_radps", "float64", "yaw rate from odometry, positive to the left", nullable=True),
+        scalar(
+            "ego_yaw_rate_radps", "float64", "yaw rate from odometry, positive to the left", nullable=True
+        ),
         *transform_columns("ego_", "T_odom_vehicle at stamp_ns from odometry", nullable=True),
         *transform_columns("prior_camera_lidar_", "T_camera_lidar from tf_static", nullable=True),
         *transform_columns("prior_lidar_radar_", "T_lidar_radar from tf_static", nullable=True),
     ),
-    "One synchronised trio per row, in order of stamp. Camera: optical frame; lidar and radar: x forward, y left, z up.",
+    "One trio per row, in order of stamp. Camera: optical frame; lidar and radar: x forward, y left, z up.",
 )
 
 
