@@ -70,7 +70,7 @@ def render(
     """BGR image, uint8."""
     mesh, shadows = moment.mesh, moment.standing.shadows
     # Sun and sky add up to about 1 on a white surface facing the sun; at night only a street-lamp glow is left.
-    sun_light, sky_light = (0.02, 0.10) if night else (0.95, 0.42)
+    sun_light, sky_light, sky_radiance = (0.01, 0.06, 0.006) if night else (0.95, 0.42, 1.0)
     blobs = np.array(
         [_footprint(a.T_map_actor, moment.standing.origin, a.kind) for a in moment.actors], np.float32
     ).reshape(-1, 8)
@@ -91,6 +91,7 @@ def render(
         sun.astype(np.float32),
         sun_light,
         sky_light,
+        sky_radiance,
         shadows.light,
         shadows.s0,
         shadows.d0,

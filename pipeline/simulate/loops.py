@@ -151,7 +151,7 @@ def _sky(x, y, z, sx, sy, sz):
     a = np.sqrt(up)
     r, g, b = 0.74 - 0.52 * a, 0.80 - 0.40 * a, 0.88 - 0.18 * a
     if up > 0.01:
-        px, py = x / (up + 0.12), y / (up + 0.12)
+        px, py = x / (up + 0.12) + 97.0 * sx, y / (up + 0.12)  # other clouds on every drive
         n = (
             0.55 * value_noise(px * 1.3 + 31, py * 1.3)
             + 0.3 * value_noise(px * 3.1, py * 3.1 + 9)
@@ -182,6 +182,7 @@ def shade(
     sun,
     sun_light,
     sky_light,
+    sky_gain,
     light,
     s0,
     d0,
@@ -191,7 +192,6 @@ def shade(
     """Linear RGB of each pixel."""
     height, width = seen.shape
     out = np.empty((height, width, 3), np.float32)
-    sky_gain = sky_light + sun_light * 0.62
     for i in range(height):
         for j in range(width):
             dx, dy, dz = rays[i, j, 0], rays[i, j, 1], rays[i, j, 2]

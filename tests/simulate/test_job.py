@@ -1,0 +1,46 @@
+import json
+
+import pytest
+
+from jobs.simulate import simulate
+from pipeline.errors import ConfigError
+
+
+def test_the_job_ends_with_one_line_of_json_that_says_where_things_are(tmp_path, capsys):
+    code = simulate(
+        out=tmp_path, vehicles=1, days=2, frames=3, container="mixed", faults="vehicle-1:1:radar:yaw:1.2"
+    )
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert code == 0
+    assert (summary["command"], summary["status"], summary["frames"], summary["logs"]) == (
+        "simulate",
+        "done",
+        6,
+        6,
+    )
+    assert sorted(p.name for p in (tmp_path / "truth" / "vehicle-1").iterdir()) == [
+        "2026-03-02.json",
+        "2026-03-03.json",
+    ]
+    kinds = {p.suffix for p in (tmp_path / "logs" / "vehicle-1" / "2026-03-02").iterdir()}
+    assert kinds == {".mcap", ".bag", ""}
+
+
+def test_the_job_records_reflectors_where_asked(tmp_path, capsys, monkeypatch):
+    import pipeline.simulate.reflectors as module
+
+    full = module.simulate_reflectors
+    monkeypatch.setattr(
+        module, "simulate_reflectors", lambda spec, v, d, out: full(spec, v, d, out, frames=2)
+    )
+    simulate(out=tmp_path, vehicles=1, days=1, frames=1, reflectors=True)
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert json.loads((tmp_path / "reflectors/vehicle-1/2026-03-02.json").read_text())["frames"] == 2
+    assert len(summary["reflectors"]) == 1
+
+
+@pytest.mark.parametrize("wrong", [{"first_day": "yesterday"}, {"faults": "x"}, {"frames": 0}])
+def test_the_job_refuses_what_cannot_be_before_it_writes_anything(wrong, tmp_path):
+    with pytest.raises(ConfigError):
+        simulate(out=tmp_path / "out", **wrong)
+    assert not (tmp_path / "out").exists()
