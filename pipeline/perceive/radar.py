@@ -30,6 +30,7 @@ _GRID_SIGMA_MPS = 0.3  # covers the grid's own error
 _GRID_POINTS = 200
 _MIN_POINTS = 12  # fewer say nothing about which of them stand still
 _MIN_STATIC_FRACTION = 0.35
+_MIN_STATIC_FRACTION_WITH_HINT = 0.1
 _NOISE_FLOOR_MPS = 0.03
 
 
@@ -196,7 +197,10 @@ def _fit_static_world(
             best = value, fit
     assert best is not None
     r = _wrapped(rate + u @ best[1][0], period)
-    return best[1] if np.mean(np.abs(r) < gate) >= _MIN_STATIC_FRACTION else None
+    static = np.abs(r) < gate
+    # A bus alongside may answer with most detections of a scan; odometry tells which of the others stand still.
+    least = _MIN_STATIC_FRACTION if hint is None else _MIN_STATIC_FRACTION_WITH_HINT
+    return best[1] if static.sum() >= _MIN_POINTS and np.mean(static) >= least else None
 
 
 def _search_points(u: np.ndarray, power: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:

@@ -137,3 +137,17 @@ def test_clusters_join_across_the_wrap_of_the_doppler():
     everything = np.ones(3, bool)
     assert len(set(cluster_moving(xyz, rate, everything, PERIOD_MPS, 1.8))) == 1
     assert len(set(cluster_moving(xyz, rate, everything, 0.0, 1.8))) == 2
+
+
+def test_odometry_finds_the_static_world_beside_a_bus_that_fills_the_scan():
+    rng = np.random.default_rng(12)
+    xyz, rate, _ = scan(rng, np.array([11.0, 0.0, 0.0]), points=80)
+    bus = rng.uniform([4, 3, -1], [14, 4, 1], (260, 3))
+    u = bus / np.linalg.norm(bus, axis=1, keepdims=True)
+    bus_rate = -u @ [11.0, 0.0, 0.0] - 12.0 * u[:, 0]
+    xyz = np.concatenate([xyz, bus]).astype(np.float32)
+    rate = np.concatenate([rate, bus_rate]).astype(np.float32)
+    found = radar_motion(xyz, rate, None, 40.0, 10.6, True, CONFIG, rng)
+    assert found.velocity_mps[0] == pytest.approx(11.0, abs=0.1)
+    assert np.mean(found.motion[:80] == STATIC) > 0.9
+    assert np.mean(found.motion[80:] == MOVING) > 0.9
