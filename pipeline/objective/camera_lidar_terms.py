@@ -1,6 +1,7 @@
 """The camera-lidar terms of method `joint`, prepared from observations and evaluated for many poses at once.
 
-Source: evidence of this project on simulated and real logs: directed edges, reflectivity on the road, camera time offset.
+Source: evidence of this project on simulated and real logs: directed edges, reflectivity on the road,
+    camera time offset.
 """
 
 from __future__ import annotations
@@ -13,7 +14,14 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32
 
-from pipeline.geometry.cameras import Camera
+from pipeline.objective.camera_lidar_points import (
+    CLASSES,
+    EDGE_KINDS,
+    Points,
+    gather_classes,
+    gather_edges,
+    gather_markings,
+)
 from pipeline.objective.class_information import class_information
 from pipeline.objective.edges import (
     CHANCE_BINS,
@@ -28,24 +36,12 @@ from pipeline.objective.projection_loops import camera_parameters
 from pipeline.objective.reflectivity import marking_gradients, marking_scores
 from schemas.observations import Observation
 
-__all__ = ["Alignments", "CONTRAST_BLURS_PX", "Level", "Points", "Terms", "lidar_velocities", "prepare_terms"]
+__all__ = ["CONTRAST_BLURS_PX", "Alignments", "Level", "Terms", "lidar_velocities", "prepare_terms"]
 
 CONTRAST_BLURS_PX = (6.0, 3.0, 1.5)
-# Markings brighter than this stand out of their ring (lane paint, patches).
-_MARKING_Z = 2.5
-# Edges that match alike: direction, height above the road [m], and size of the object (thirds of the day's edges). Low and
-# compact things (poles, cars) have boundaries in the labels, tall and large ones (plants, walls) mostly not.
-_HEIGHTS_M = (1.0, 2.0)
-_SIZE_QUANTILES = (1 / 3, 2 / 3)
-_KINDS = 4 * (len(_HEIGHTS_M) + 1) * (len(_SIZE_QUANTILES) + 1)
-# Classes of the mutual information: height above the road and range [m].
-_CLASS_HEIGHTS_M = (0.25, 1.0, 2.5, 5.0)
-_CLASS_RANGES_M = (12.0, 25.0)
-_CLASSES = (len(_CLASS_HEIGHTS_M) + 1) * (len(_CLASS_RANGES_M) + 1)
-_CLASS_STRIDE = 8  # of the sampled cloud: neighbours say the same
 _CHANCE_SHIFT_PX = 60.0  # far enough to be elsewhere, near enough to see the same scene
 # Chance density of an edge's distance before the data has been asked: boundaries every hundred pixels.
-_EVEN_CHANCE = np.full((_KINDS, CHANCE_BINS), 1 / 100, np.float32)
+_EVEN_CHANCE = np.full((EDGE_KINDS, CHANCE_BINS), 1 / 100, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +59,7 @@ class Level:
     @staticmethod
     def wide(sigma_px: float, contrast_level: int, match: float = 0.25) -> Level:
         """A level that presumes nothing of the data."""
-        return Level(sigma_px, contrast_level, np.full(_KINDS, match, np.float32), _EVEN_CHANCE)
+        return Level(sigma_px, contrast_level, np.full(EDGE_KINDS, match, np.float32), _EVEN_CHANCE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,41 +75,6 @@ class Alignments:
         """Candidates without time offset and with the camera's own focal length."""
         count = len(T_camera_lidar)
         return Alignments(T_camera_lidar, np.zeros(count), np.ones(count))
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """Points of F frames, one after the other: frame f has rows start[f]:start[f+1]; lidar frame."""
-
-    xyz_m: np.ndarray
-    start: np.ndarray
-    side: np.ndarray
-    kind: np.ndarray
-    gap_rad: np.ndarray
-
-    def chosen(self, keep: np.ndarray) -> Points:
-        """The points of a mask."""
-        counts = np.concatenate([[0], np.cumsum(keep)])
-        return Points(
-            np.ascontiguousarray(self.xyz_m[keep]),
-            counts[self.start],
-            self.side[keep],
-            self.kind[keep],
-            self.gap_rad[keep],
-        )
-
-    def of_frames(self, frames: np.ndarray) -> Points:
-        """The points of some frames, in the order given."""
-        rows = [np.arange(self.start[f], self.start[f + 1]) for f in frames]
-        start = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(np.int64)
-        index = np.concatenate(rows) if rows else np.empty(0, np.int64)
-        return Points(
-            np.ascontiguousarray(self.xyz_m[index]),
-            start,
-            self.side[index],
-            self.kind[index],
-            self.gap_rad[index],
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,12 +96,10 @@ class Terms:
 
     def thinned(self, fraction: float, rng: np.random.Generator) -> Terms:
         """The same frames with a random share of the points."""
-        edges, markings, classes = (p.chosen(rng.random(len(p.xyz_m)) < fraction) for p in self._points)
+        edges, markings, classes = (
+            p.chosen(rng.random(len(p.xyz_m)) < fraction) for p in (self.edges, self.markings, self.classes)
+        )
         return replace(self, edges=edges, markings=markings, classes=classes)
-
-    @property
-    def _points(self) -> tuple[Points, Points, Points]:
-        return self.edges, self.markings, self.classes
 
     def sharp(self, max_gap_px: float) -> Terms:
         """Without the edges whose interval is wider than `max_gap_px`: those make the basin, not the accuracy."""
@@ -167,7 +126,9 @@ class Terms:
         return Terms(
             maps,
             self.camera,
-            *(p.of_frames(frames) for p in self._points),
+            self.edges.of_frames(frames),
+            self.markings.of_frames(frames),
+            self.classes.of_frames(frames),
             self.velocity_lidar[frames],
             self.yaw_rate[frames],
         )
@@ -175,8 +136,9 @@ class Terms:
     def poses(self, at: Alignments) -> Float32[np.ndarray, "P F 12"]:
         """Rows of the transform from each frame's lidar points to its image [P, F, 12].
 
-        The image shows the lidar clock's time `-dt` (stamp_camera = stamp_lidar + dt). The car was then dt earlier on its way,
-        so what stands still lay dt times the own velocity further ahead: p' = Rz(yaw_rate dt) (p + v dt).
+        The image shows the lidar clock's time `-dt` (stamp_camera = stamp_lidar + dt). The car was then dt
+        earlier on its way, so what stands still lay dt times the own velocity further ahead: p' =
+        Rz(yaw_rate dt) (p + v dt).
         """
         R, t = at.T_camera_lidar[:, :3, :3], at.T_camera_lidar[:, :3, 3]
         return _moving_poses(R, t, at.dt_s, self.velocity_lidar, self.yaw_rate)
@@ -224,7 +186,7 @@ class Terms:
         """Mutual information of lidar class and label, nats per point; for the basin only."""
         c = self.classes
         return class_information(
-            self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, self.poses(at), _CLASSES
+            self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, self.poses(at), CLASSES
         )
 
     def score(self, at: Alignments, level: Level) -> Float[np.ndarray, "P F"]:
@@ -264,7 +226,7 @@ class Terms:
         a, b = level.edge_weight, level.marking_weight
         return a * g_edges + b * g_marks, a * I_edges + b * I_marks
 
-    def mean_match(self, level: Level) -> Float[np.ndarray, "4"]:
+    def mean_match(self, level: Level) -> Float[np.ndarray, " 4"]:
         """Share of matching edges by direction, over the edges that there are."""
         share = level.match[self.edges.kind]
         counts = np.bincount(self.edges.side, minlength=4)
@@ -278,7 +240,7 @@ class Terms:
         elsewhere = rng.uniform(-_CHANCE_SHIFT_PX, _CHANCE_SHIFT_PX, still.shape).astype(np.float32)
         at_chance = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses, focal, elsewhere)
         here = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses, focal, still)
-        chance = chance_of(at_chance, e.kind, _KINDS)
+        chance = chance_of(at_chance, e.kind, EDGE_KINDS)
         sigma = np.hypot(level.sigma_px, e.gap_rad * self.camera[1] / np.sqrt(12))
         match = fit_match_share(here, e.kind, sigma, chance)
         unit = replace(level, delta=1.0)
@@ -315,8 +277,8 @@ def lidar_velocities(
 ) -> Float[np.ndarray, "F 3"]:
     """Own velocity in lidar axes [m/s]: the speed along the heading that the radar's Doppler shows (0 where unknown).
 
-    One heading for the day, in the horizontal plane: the mount's yaw. A single frame's heading is noisier than it varies, and
-    the radar's vertical velocity is no measurement.
+    One heading for the day, in the horizontal plane: the mount's yaw. A single frame's heading is noisier
+    than it varies, and the radar's vertical velocity is no measurement.
     """
     speed = np.array([o.ego_speed_mps if o.ego_speed_mps is not None else 0.0 for o in observations])
     moving = [
@@ -340,81 +302,7 @@ def prepare_terms(
 ) -> Terms:
     """Decode maps and gather the points that can come into view within `reach_rad` of a pose."""
     maps = prepare_maps(observations, CONTRAST_BLURS_PX)
-    edges = _gather(
-        [
-            (o.lidar_edge_xyz_m, o.lidar_edge_side, k, o.lidar_edge_gap_rad)
-            for o, k in zip(observations, _kinds(observations), strict=True)
-        ],
-        T_camera_lidar,
-        maps.camera,
-        reach_rad,
-    )
-    bright = [o.marking_xyz_m[o.marking_z > _MARKING_Z] for o in observations]
-    plain = [np.zeros(len(b), np.uint8) for b in bright]
-    columns = list(zip(bright, plain, plain, plain, strict=True))
-    markings = _gather(columns, T_camera_lidar, maps.camera, reach_rad)
-    classes = _gather([_height_classes(o) for o in observations], T_camera_lidar, maps.camera, reach_rad)
+    view = (observations, T_camera_lidar, maps.camera, reach_rad)
+    edges, markings, classes = gather_edges(*view), gather_markings(*view), gather_classes(*view)
     yaw_rate = np.array([o.ego_yaw_rate_radps or 0.0 for o in observations])
     return Terms(maps, camera_parameters(maps.camera), edges, markings, classes, velocity_lidar, yaw_rate)
-
-
-def _kinds(observations: Sequence[Observation]) -> list[np.ndarray]:
-    """Kind of each edge: direction, height and size class."""
-    sizes = np.concatenate([o.lidar_edge_points for o in observations])
-    limits = np.quantile(sizes, _SIZE_QUANTILES) if len(sizes) else np.zeros(len(_SIZE_QUANTILES))
-    out = []
-    for o in observations:
-        if o.ground_plane is None:  # the middle class says least
-            height = np.full(len(o.lidar_edge_side), np.mean(_HEIGHTS_M))
-        else:
-            height = o.lidar_edge_xyz_m @ o.ground_plane[:3] + o.ground_plane[3]
-        class_ = np.digitize(height, _HEIGHTS_M) * 3 + np.digitize(o.lidar_edge_points, limits, right=True)
-        out.append((o.lidar_edge_side * 9 + class_).astype(np.uint8))
-    return out
-
-
-def _height_classes(o: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Every eighth point of the sampled cloud with its class; none where the road was not found."""
-    xyz = o.lidar_map_xyz_m[::_CLASS_STRIDE] if o.ground_plane is not None else o.lidar_map_xyz_m[:0]
-    plane = o.ground_plane if o.ground_plane is not None else np.zeros(4)
-    height = np.digitize(xyz @ plane[:3] + plane[3], _CLASS_HEIGHTS_M)
-    class_ = (height * 3 + np.digitize(np.linalg.norm(xyz, axis=1), _CLASS_RANGES_M)).astype(np.uint8)
-    return xyz, class_, class_, np.zeros(len(xyz), np.float32)
-
-
-def _gather(
-    frames: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
-    T_camera_lidar: np.ndarray,
-    camera: Camera,
-    reach_rad: float,
-) -> Points:
-    """Points of all frames in or near the camera's field of view."""
-    border = np.array(
-        [
-            [u, v]
-            for u in (0.0, camera.width_px / 2, camera.width_px)
-            for v in (0.0, camera.height_px / 2, camera.height_px)
-        ]
-    )
-    rays = camera.unproject(border)
-    rays = rays[np.isfinite(rays).all(1)]
-    azimuth, elevation = (
-        np.arctan2(rays[:, 0], rays[:, 2]),
-        np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2])),
-    )
-    kept, counts = [], [0]
-    for xyz, side, kind, gap in frames:
-        q = xyz @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-        a, e = np.arctan2(q[:, 0], q[:, 2]), np.arctan2(q[:, 1], np.hypot(q[:, 0], q[:, 2]))
-        near = (a > azimuth.min() - reach_rad) & (a < azimuth.max() + reach_rad)
-        near &= (e > elevation.min() - reach_rad) & (e < elevation.max() + reach_rad)
-        kept.append((xyz[near], side[near], kind[near], gap[near]))
-        counts.append(counts[-1] + int(near.sum()))
-    columns = [np.concatenate(c) for c in zip(*kept, strict=True)]
-    return Points(
-        np.ascontiguousarray(columns[0], np.float32),
-        np.array(counts, np.int64),
-        columns[1].astype(np.uint8),
-        columns[2].astype(np.uint8),
-        columns[3].astype(np.float32),
-    )

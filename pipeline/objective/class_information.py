@@ -2,11 +2,13 @@
 
 Biased by half a degree of pitch on real logs, so it has no part in the final estimate.
 
-Source: Pandey, McBride, Savarese, Eustice 2015, "Automatic extrinsic calibration of vision and lidar by maximizing mutual
-information", with semantic classes in place of brightness.
+Source: Pandey, McBride, Savarese, Eustice 2015, "Automatic extrinsic calibration of vision and lidar by
+    maximizing mutual information", with semantic classes in place of brightness.
 """
 
 from __future__ import annotations
+
+from typing import no_type_check
 
 import numba
 import numpy as np
@@ -19,9 +21,10 @@ __all__ = ["LABEL_CLASSES", "class_information"]
 LABEL_CLASSES = 20  # 19 Cityscapes classes and void
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def class_information(
-    camera: Float32[np.ndarray, "18"],
+    camera: Float32[np.ndarray, " 18"],
     labels: UInt8[np.ndarray, "F H W"],
     points: Float32[np.ndarray, "N 3"],
     kind: UInt8[np.ndarray, " N"],
@@ -53,6 +56,7 @@ def class_information(
     return out
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def _information(table: np.ndarray) -> float:
     """Mutual information of a table of counts, times its total [nats]."""

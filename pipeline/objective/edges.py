@@ -1,9 +1,10 @@
 """Directed edges: depth jumps of the lidar against mask boundaries of the same direction.
 
-Each projected jump has a nearest boundary of its own direction class at the signed distance r along that boundary's axis.
-Only some jumps match (on real logs one in five is more than chance), so the score is not a sum of squares but the
-log likelihood ratio of the mixture `pi N(r; s) + (1 - pi) c(r)` against chance alone, c(r): how far boundaries lie from a
-random pixel. A class whose boundaries say nothing gets a small pi and loses its weight by itself.
+Each projected jump has a nearest boundary of its own direction class at the signed distance r along that
+boundary's axis. Only some jumps match (on real logs one in five is more than chance), so the score is not a
+sum of squares but the log likelihood ratio of the mixture `pi N(r; s) + (1 - pi) c(r)` against chance
+alone, c(r): how far boundaries lie from a random pixel. A class whose boundaries say nothing gets a small
+pi and loses its weight by itself.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _FEWEST_OF_KIND = 40  # fewer tell no share from chance
 
 
 def edge_scores(
-    camera: Float32[np.ndarray, "18"],
+    camera: Float32[np.ndarray, " 18"],
     offsets: Int8[np.ndarray, "F 4 H W"],
     points: Float32[np.ndarray, "N 3"],
     side: UInt8[np.ndarray, " N"],
@@ -46,7 +47,8 @@ def edge_scores(
         kind: statistical class of each jump: those that match alike.
         gap_rad: angle between its two beams; widens its kernel by the sd of an even distribution over it.
         start: F + 1 offsets.
-        poses: rows of the 3x4 transform into the camera, per pose and frame (frames differ by time offset times speed).
+        poses: rows of the 3x4 transform into the camera, per pose and frame (frames differ by time offset
+            times speed).
         focal: focal length in units of the camera's, by pose.
         match: share of jumps that match, by kind.
         chance: density of |r| at random places [1/px], by kind, in bins of one pixel.
@@ -129,8 +131,9 @@ def edge_gradients(
     chance: np.ndarray,
     sigma_px: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Per frame: gradient [F, 8] of the score by (rotation, translation, time offset, focal scale), and its information.
+    """Gradient [F, 8] of each frame's score and its information [F, 8, 8].
 
+    By rotation, translation, time offset and focal scale.
     Left perturbation of T_camera_lidar; `poses` [F, 12] and `velocity` [F, 3] (camera axes, m/s) at the pose. The
     information is Gauss-Newton's: residuals weighted by how likely they are matches (iterated re-weighting).
     """
@@ -188,7 +191,10 @@ def edge_residuals(
     focal: float,
     shift_px: np.ndarray,
 ) -> np.ndarray:
-    """Signed distance of each jump, moved by `shift_px` [N, 2], to its boundary: NaN outside the image, 127 without boundary."""
+    """Signed distance [px] of each jump, moved by `shift_px` [N, 2], to its boundary.
+
+    NaN outside the image, 127 where no boundary is in reach.
+    """
     height, width = offsets.shape[2], offsets.shape[3]
     out = np.full(points.shape[0], np.nan, np.float32)
     for f in range(start.shape[0] - 1):

@@ -1,4 +1,4 @@
-"""What the camera-lidar terms look up in an image: signed offsets to mask boundaries by direction, road contrast, labels.
+"""What camera-lidar terms look up in an image: offsets to mask boundaries by direction, road contrast, labels.
 
 All maps are at label size. Boundaries lie between pixels, so an offset is stored as the integer k of k + 1/2 pixels
 from a pixel's centre along the boundary's axis: exact in one byte, and good for every kernel width.
@@ -75,7 +75,7 @@ def camera_of(observation: Observation) -> Camera:
 def _boundary_sides(order: np.ndarray, a: int, b: int) -> tuple[bool, bool]:
     """Whether the boundary between labels a (left or above) and b has its foreground at a, at b (or may have both)."""
     near_a, near_b = order[a], order[b]
-    if a == b or near_a == _UNKNOWN or near_b == _UNKNOWN:
+    if a == b or _UNKNOWN in (near_a, near_b):
         return False, False
     if near_a == near_b:  # two backdrops, or two kinds of ground: the labels say nothing of which is nearer
         return near_a == _OBJECT, near_a == _OBJECT
@@ -89,50 +89,45 @@ def _scan(order: np.ndarray, labels: np.ndarray, out: np.ndarray) -> None:
 
     One sweep down-right carries the last boundary behind, one sweep up-left the next one ahead; both run along rows.
     """
+    out[:] = NO_BOUNDARY
     height, width = labels.shape
-    behind = np.full((2, width), -10000)
-    ahead = np.full((2, width), 10000)
+    last = np.full((2, width), -10000)
     for i in range(height):
-        left, right = -10000, -10000
+        across = np.full(2, -10000)
         for j in range(width):
-            out[0, i, j] = left - j if j - left <= REACH_PX else NO_BOUNDARY
-            out[1, i, j] = right - j if j - right <= REACH_PX else NO_BOUNDARY
-            out[2, i, j] = behind[0, j] - i if i - behind[0, j] <= REACH_PX else NO_BOUNDARY
-            out[3, i, j] = behind[1, j] - i if i - behind[1, j] <= REACH_PX else NO_BOUNDARY
-            if j + 1 < width:
-                first, second = _boundary_sides(order, labels[i, j], labels[i, j + 1])
-                left, right = (j if first else left), (j if second else right)
-            if i + 1 < height:
-                first, second = _boundary_sides(order, labels[i, j], labels[i + 1, j])
-                if first:
-                    behind[0, j] = i
-                if second:
-                    behind[1, j] = i
+            for side in range(2):
+                _nearer(out, side, i, j, across[side] - j)
+                _nearer(out, 2 + side, i, j, last[side, j] - i)
+            _note_boundaries(order, labels, i, j, across, last)
+    following = np.full((2, width), 10000)
     for i in range(height - 1, -1, -1):
-        left, right = 10000, 10000
+        across = np.full(2, 10000)
         for j in range(width - 1, -1, -1):
-            if j + 1 < width:
-                first, second = _boundary_sides(order, labels[i, j], labels[i, j + 1])
-                left, right = (j if first else left), (j if second else right)
-            if i + 1 < height:
-                first, second = _boundary_sides(order, labels[i, j], labels[i + 1, j])
-                if first:
-                    ahead[0, j] = i
-                if second:
-                    ahead[1, j] = i
-            _nearer(out, 0, i, j, left - j)
-            _nearer(out, 1, i, j, right - j)
-            _nearer(out, 2, i, j, ahead[0, j] - i)
-            _nearer(out, 3, i, j, ahead[1, j] - i)
+            _note_boundaries(order, labels, i, j, across, following)
+            for side in range(2):
+                _nearer(out, side, i, j, across[side] - j)
+                _nearer(out, 2 + side, i, j, following[side, j] - i)
 
 
-@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True, inline="always")
+def _note_boundaries(
+    order: np.ndarray, labels: np.ndarray, i: int, j: int, across: np.ndarray, along: np.ndarray
+) -> None:
+    """Note the boundaries right of and below a pixel, by the side of their foreground."""
+    if j + 1 < labels.shape[1]:
+        here, there = _boundary_sides(order, labels[i, j], labels[i, j + 1])
+        across[0], across[1] = (j if here else across[0]), (j if there else across[1])
+    if i + 1 < labels.shape[0]:
+        here, there = _boundary_sides(order, labels[i, j], labels[i + 1, j])
+        along[0, j], along[1, j] = (i if here else along[0, j]), (i if there else along[1, j])
+
+
 @numba.njit(cache=True, nogil=True, inline="always")
 def _nearer(out: np.ndarray, side: int, i: int, j: int, offset: int) -> None:
-    """Keep the nearer of two boundaries; offset k stands for k + 1/2, so k ahead and -1 - k behind are equally far."""
-    if offset <= REACH_PX:
+    """Keep the nearer of two boundaries; offset k stands for k + 1/2: k ahead is as far as -1 - k behind."""
+    if -REACH_PX <= offset <= REACH_PX:
         held = out[side, i, j]
-        if held == NO_BOUNDARY or offset < -1 - held:
+        if held == NO_BOUNDARY or abs(2 * offset + 1) < abs(2 * held + 1):
             out[side, i, j] = offset
 
 

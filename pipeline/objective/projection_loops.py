@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, no_type_check
 
 import numba
 import numpy as np
@@ -18,8 +18,9 @@ _MIN_DEPTH_M = 0.3
 
 
 def camera_parameters(camera: Camera) -> np.ndarray:
-    """The camera as float32[18]: model, fx, fy, cx, cy, largest tangent squared (or smallest cosine), 10 coefficients.
+    """The camera as float32[18] for compiled loops.
 
+    Model, fx, fy, cx, cy, largest tangent squared (or smallest cosine), 10 coefficients, two spare.
     Coefficients: k1 k2 p1 p2 k3 k4 k5 k6 of the pinhole models, or the polynomial k(c) of `Camera.fast_polynomial`.
     """
     out = np.zeros(18, np.float32)
@@ -43,6 +44,7 @@ def camera_parameters(camera: Camera) -> np.ndarray:
     return out
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(inline="always", fastmath=True, nogil=True)
 def project_point(c: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, bool]:
     """(u, v, valid) of a point in the optical frame."""
@@ -73,6 +75,7 @@ def project_point(c: np.ndarray, x: float, y: float, z: float) -> tuple[float, f
     return c[3] + c[1] * a, c[4] + c[2] * b, True
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(nogil=True, cache=True)
 def project_with_jacobian(
     c: np.ndarray, x: float, y: float, z: float

@@ -1,12 +1,15 @@
 """Lidar reflectivity against image brightness on the road: what gives pitch, roll and yaw with only 16 rings.
 
 Ground points that are brighter than their ring should meet pixels that are brighter than their row of the road. The
-score is the log likelihood ratio of two normal laws of unit spread whose means differ by `delta` (what marked points see
-more than the road): `delta c - delta^2/2`, linear in the contrast c. `delta` comes from the data, so a lidar without
-useful intensity, or a road without paint, takes the term's weight away by itself.
+score is the log likelihood ratio of two normal laws of unit spread whose means differ by `delta` (what
+marked points see more than the road): `delta c - delta^2/2`, linear in the contrast c. `delta` comes from
+the data, so a lidar without useful intensity, or a road without paint, takes the term's weight away by
+itself.
 """
 
 from __future__ import annotations
+
+from typing import no_type_check
 
 import numba
 import numpy as np
@@ -17,9 +20,10 @@ from pipeline.objective.projection_loops import project_point, project_with_jaco
 __all__ = ["marking_gradients", "marking_scores"]
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def marking_scores(
-    camera: Float32[np.ndarray, "18"],
+    camera: Float32[np.ndarray, " 18"],
     contrast: Int8[np.ndarray, "F H W"],
     points: Float32[np.ndarray, "N 3"],
     weight: Float32[np.ndarray, " N"],
@@ -56,6 +60,7 @@ def marking_scores(
     return out
 
 
+@no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def marking_gradients(
     camera: np.ndarray,
@@ -67,10 +72,11 @@ def marking_gradients(
     focal: float,
     velocity: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Per frame: gradient [F, 8] of the score by (rotation, translation, time offset, focal scale), and its information.
+    """Gradient [F, 8] of each frame's score and its information [F, 8, 8].
 
-    As in `edge_gradients`. The score is linear in the contrast, so the information is that of the likelihood: the outer
-    product of each point's gradient.
+    By rotation, translation, time offset and focal scale.
+    As in `edge_gradients`. The score is linear in the contrast, so the information is that of the
+    likelihood: the outer product of each point's gradient.
     """
     frames = poses.shape[0]
     height, width = contrast.shape[1], contrast.shape[2]

@@ -78,8 +78,9 @@ def lidar_edges(
 def rows_by_elevation(azimuth_elevation_range: Float[np.ndarray, "N 3"]) -> Int32[np.ndarray, " N"]:
     """Row numbers, upwards, for a lidar that does not log its rings.
 
-    Elevations of a multi-beam lidar crowd around one value per beam; rows are the crowds. Where de-skewing has smeared
-    the crowds into each other, rows become even bins of the azimuth step, which is right for square grids.
+    Elevations of a multi-beam lidar crowd around one value per beam; rows are the crowds. Where de-skewing
+    has smeared the crowds into each other, rows become even bins of the azimuth step, which is right for
+    square grids.
     """
     elevation = azimuth_elevation_range[:, 1]
     order = np.argsort(elevation, kind="stable")

@@ -1,4 +1,4 @@
-"""Paint and patches on the road, as lidar reflectivity and as image brightness: what sparse lidars know of pitch and roll."""
+"""Paint on the road, as lidar reflectivity and as image brightness: what sparse lidars know of pitch and roll."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def lidar_markings(
 ) -> Markings:
     """Ground points and how far their reflectivity stands out of the road at the same ring or range.
 
-    Reflectivity falls with range and incidence and differs from beam to beam, so it is compared only within a band: a ring,
-    or 15 % of range where rings are not logged (rings near the horizon are split by range too). Nothing without intensity.
+    Reflectivity falls with range and incidence and differs from beam to beam, so it is compared only within
+    a band: a ring, or 15 % of range where rings are not logged (rings near the horizon are split by range
+    too). Nothing without intensity.
     """
     range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
     if intensity is None or not is_ground.any():

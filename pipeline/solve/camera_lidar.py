@@ -1,9 +1,10 @@
 """Camera-lidar half of method `joint`: T_camera_lidar and the camera's time offset from a day of observations.
 
-A small differential evolution finds the basin (wide kernels, few points, restarts), annealed response surfaces find the
-optimum, and the frames' own curvatures and gradients say how sure it is. Weights of the terms come from the data: the
-share of matching edges, the contrast under markings, and how much a term's gradient scatters from frame to frame
-against what its curvature promises (composite likelihood: Varin, Reid, Firth 2011, section 2.3).
+A small differential evolution finds the basin (wide kernels, few points, restarts), annealed response
+surfaces find the optimum, and the frames' own curvatures and gradients say how sure it is. Weights of the
+terms come from the data: the share of matching edges, the contrast under markings, and how much a term's
+gradient scatters from frame to frame against what its curvature promises (composite likelihood: Varin,
+Reid, Firth 2011, section 2.3).
 """
 
 from __future__ import annotations
@@ -39,9 +40,11 @@ _MAX_GAP_PX = 5.0  # edges whose interval is wider (16 rings: 30 px) are for the
 # Typical distance of what edges and markings lie on: turns a width in pixels into metres.
 _TYPICAL_RANGE_M = 12.0
 _TYPICAL_SPEED_MPS = 8.0
-# Intrinsics are known to about this; free within it, so that the pose along the optical axis is not surer than they are.
+# Intrinsics are known to about this; free within it, so that the pose along the optical axis is not surer
+# than they are.
 _FOCAL_SIGMA = 0.003
-# What no resampling shows: mask dilation, focal length off by 0.1-0.5 %, rolling shutter (evidence/method.md, section 4).
+# What no resampling shows: mask dilation, focal length off by 0.1-0.5 %, rolling shutter
+# (evidence/method.md, section 4).
 _BIAS_FLOOR = np.array([np.radians(0.03)] * 3 + [0.01] * 3)
 
 
@@ -86,8 +89,8 @@ def estimate_camera_lidar(
         prior: start, and weak information about pose; dt has prior 0 +- `time_offset_sigma_s`.
         config: search box and resampling.
         rng: decides everything random.
-        velocity_lidar: own velocity per observation in lidar axes [m/s]; by default the speed along the heading that the
-            radar's Doppler and the prior T_lidar_radar show.
+        velocity_lidar: own velocity per observation in lidar axes [m/s]; by default the speed along the
+            heading that the radar's Doppler and the prior T_lidar_radar show.
 
     Raises:
         SolveError: too few frames, or nothing to align in them.
@@ -148,10 +151,15 @@ def camera_lidar_cost(
 
 def camera_lidar_information(
     terms: Terms, T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float, level: Level | None = None
-) -> tuple[Float[np.ndarray, " 8"], Float[np.ndarray, "8 8"]]:
-    """Gradient of the COST (minus score) and Gauss-Newton information by (left perturbation, dt), for joint assembly."""
+) -> tuple[Float[np.ndarray, " 7"], Float[np.ndarray, "7 7"]]:
+    """Gradient of the COST (minus score) and information by (left perturbation, dt), for a joint solver.
+
+    The focal scale is marginalised within its prior, so the translation along the optical axis says what it is worth.
+    """
     gradient, information = terms.gradient(AlignmentState(T_camera_lidar, dt_s).alone, level or _VERDICT)
-    return -gradient.sum(0), information.sum(0)
+    g, I = -gradient.sum(0), information.sum(0)
+    focal = I[7, 7] + _FOCAL_SIGMA**-2
+    return g[:7] - I[:7, 7] * g[7] / focal, I[:7, :7] - np.outer(I[:7, 7], I[7, :7]) / focal
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
@@ -239,8 +247,8 @@ def _climb(
 ) -> AlignmentState:
     """Maximise by response surfaces: the score is rough at the scale of a pixel, and a quadratic over a ball is not.
 
-    Newton steps, with at least half the curvature that the frames' gradients promise by their scatter (Fisher scoring): a
-    direction that the roughness makes flat or convex would send the step anywhere.
+    Newton steps, with at least half the curvature that the frames' gradients promise by their scatter
+    (Fisher scoring): a direction that the roughness makes flat or convex would send the step anywhere.
     """
     scale = 1.8 * _scales(terms, level)
     for _ in range(steps):
@@ -274,8 +282,8 @@ def _derivatives(
 def _weighted(terms: Terms, state: AlignmentState, level: Level) -> Level:
     """Scale each term so that its curvature equals the scatter of its gradient over frames.
 
-    Points of one frame err together (one mask boundary, one lane line), so a sum of log likelihood ratios promises too much,
-    and by another factor for each term.
+    Points of one frame err together (one mask boundary, one lane line), so a sum of log likelihood ratios
+    promises too much, and by another factor for each term.
     """
     scale = _scales(terms, level)
     weights = []
@@ -346,7 +354,8 @@ def _conclude(
         + [prior.translation_sigma_m**-2] * 3
         + [config.time_offset_sigma_s**-2, _FOCAL_SIGMA**-2]
     )
-    # After `_weighted`, the scatter of the frames' gradients is the curvature, without its roughness (Bartlett's identity).
+    # After `_weighted`, the scatter of the frames' gradients is the curvature, without its roughness
+    # (Bartlett's identity).
     information = gradient[:, :, None] * gradient[:, None, :]
     block = blocks_of(np.array([o.drive for o in frames]), config.bootstrap_blocks)
     covariance = bootstrap_covariance(information, -gradient, prior_information, block, rng)

@@ -1,7 +1,7 @@
 """A small differential evolution over whole populations at once: finds the basin, leaves accuracy to others.
 
-Source: Storn, Price 1997; the mix of rand/1 and current-to-best/1 with dithered F is measured in this project to reach the
-basin with 30-60 evaluations of a few per cent of the points.
+Source: Storn, Price 1997; the mix of rand/1 and current-to-best/1 with dithered F is measured in this
+    project to reach the basin with 30-60 evaluations of a few per cent of the points.
 """
 
 from __future__ import annotations
