@@ -78,7 +78,8 @@ def vehicle_boxes(observations: Sequence[Observation]) -> VehicleBoxes:
             rows.append(_boxes_of_frame(o))
             frames.append(np.full(len(rows[-1]), index, np.int64))
     table = np.concatenate(rows)
-    return VehicleBoxes(table[:, 0].astype(np.int64), *table[:, 1:].T, np.concatenate(frames))
+    kind, *columns = table.T
+    return VehicleBoxes(kind.astype(np.int64), *columns, frame=np.concatenate(frames))
 
 
 def box_pairs(
@@ -174,7 +175,7 @@ def _boxes_of_frame(o: Observation) -> np.ndarray:
     inside = (x0 > 3) & (y0 > 3) & (x1 < o.image_width_px - 4) & (y1 < o.image_height_px - 4)
     kinds = np.array([_KIND_OF.get(name, -1) for name in o.road_user_classes], int)
     whole = inside & (kinds >= 0) & (y1 - y0 >= _LEAST_HEIGHT_PX)
-    chosen = [b for b in np.flatnonzero(whole) if not _is_occluded(boxes, b)]
+    chosen = [b for b in np.flatnonzero(whole) if not _is_occluded(boxes, int(b))]
     xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
     pixels = np.stack([np.stack(uv, -1)[chosen] for uv in ((xm, ym), (x0, ym), (x1, ym), (xm, y0), (xm, y1))])
     angle = camera_direction_angles(camera.unproject(pixels))

@@ -87,12 +87,17 @@ def _sort_into_cells(n, sph, a0, r0, cell_a, cell_r, n_a, n_r, start, order, cel
 
 @no_type_check
 @_jit
-def _jacobian(J, x, y, z, R, t, v, w):
-    """d(azimuth, elevation, range of a static lidar point in the radar frame)/d(left twist of T_lidar_radar, tau)."""
-    # Lidar coordinates of the radar point, whose spherical coordinates move by R^T ([p]x dphi - drho) - velocity dtau.
-    px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
-    py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
-    pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+def _jacobian(J, x, y, z, R, t, v, w, tau):
+    """d(azimuth, elevation, range of a static lidar point in the radar frame)/d(left twist of T_lidar_radar, tau).
+
+    The lidar point is the one that appears at (x, y, z): q' = q - (v + w x q) tau with q = T_radar_lidar p.
+    """
+    turn = w * tau
+    qx, qy, qz = x + v[0] * tau, y + v[1] * tau, z + v[2] * tau
+    qx, qy = qx - turn * qy, qy + turn * qx
+    px = R[0, 0] * qx + R[0, 1] * qy + R[0, 2] * qz + t[0]
+    py = R[1, 0] * qx + R[1, 1] * qy + R[1, 2] * qz + t[1]
+    pz = R[2, 0] * qx + R[2, 1] * qy + R[2, 2] * qz + t[2]
     h2 = x * x + y * y
     h = np.sqrt(h2)
     r2 = h2 + z * z
@@ -104,7 +109,9 @@ def _jacobian(J, x, y, z, R, t, v, w):
             s0, s1, s2 = -x * z / (h * r2), -y * z / (h * r2), h / r2
         else:
             s0, s1, s2 = x / r, y / r, z / r
-        # u = R s: gradient in lidar axes; u . ([p]x w) = (u x p) . w
+        J[row, 6] = -(s0 * (v[0] - w * qy) + s1 * (v[1] + w * qx) + s2 * v[2])
+        s0, s1 = s0 - turn * s1, s1 + turn * s0
+        # u = R s: gradient in lidar axes; dq = R^T ([p]x dphi - drho), u . ([p]x w) = (u x p) . w
         u0 = R[0, 0] * s0 + R[0, 1] * s1 + R[0, 2] * s2
         u1 = R[1, 0] * s0 + R[1, 1] * s1 + R[1, 2] * s2
         u2 = R[2, 0] * s0 + R[2, 1] * s1 + R[2, 2] * s2
@@ -112,7 +119,6 @@ def _jacobian(J, x, y, z, R, t, v, w):
         J[row, 1] = u2 * px - u0 * pz
         J[row, 2] = u0 * py - u1 * px
         J[row, 3], J[row, 4], J[row, 5] = -u0, -u1, -u2
-        J[row, 6] = -(s0 * (v[0] - w * y) + s1 * (v[1] + w * x) + s2 * v[2])
 
 
 @no_type_check
@@ -194,7 +200,7 @@ def accumulate_frames(
             stats[f, 5] += gamma * share * q1
             stats[f, 6] += gamma * q2
             stats[f, 7] += gamma * share
-            _jacobian(J, x, y, z, R, t, velocity[f], yaw_rate[f])
+            _jacobian(J, x, y, z, R, t, velocity[f], yaw_rate[f], tau[f])
             for row in range(3):
                 if row == 1 and not use_elevation[f]:
                     continue

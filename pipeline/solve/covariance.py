@@ -2,7 +2,7 @@
 
 An information matrix alone is too sure (on real logs 6 times in yaw): residuals of one scene err together. Blocks
 of frames that share no scene are resampled instead: each resampled day moves the estimate by one Newton step, and the
-spread of these steps, plus what the prior leaves open, is the covariance. No direction becomes surer than the information
+spread of these steps, plus what the prior leaves open, is the covariance. No direction becomes surer than information
 says. What no resampling shows, a bias common to all frames, is added as a floor that the caller states per DoF.
 
 Source: Efron & Tibshirani 1993, ch. 8 (blocks); White 1982 (the sandwich that one Newton step per resample tends to).

@@ -135,13 +135,10 @@ def compose_pairs(
 
 def _time_offset(camera_lidar: PairEstimate, lidar_radar: PairEstimate) -> tuple[float | None, float | None]:
     """stamp_camera = stamp_lidar + dt_cl = stamp_radar + dt_lr + dt_cl."""
-    offsets = (camera_lidar.time_offset_s, lidar_radar.time_offset_s)
-    sigmas = (camera_lidar.time_offset_sigma_s, lidar_radar.time_offset_sigma_s)
-    if None in offsets or None in sigmas:
+    a, b = camera_lidar.time_offset_s, lidar_radar.time_offset_s
+    if a is None or b is None:
         return None, None
-    return float(sum(o for o in offsets if o is not None)), float(
-        np.hypot(*(s for s in sigmas if s is not None))
-    )
+    return a + b, float(np.hypot(camera_lidar.time_offset_sigma_s or 0.0, lidar_radar.time_offset_sigma_s or 0.0))
 
 
 def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:

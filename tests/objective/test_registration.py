@@ -1,0 +1,166 @@
+"""Static radar detections against the lidar map: Jacobians, gradient, basin, what elevation and sigmas mean."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, transform_points
+from pipeline.geometry.spherical import to_spherical
+from pipeline.objective.registration import (
+    SIGMA_START,
+    RegistrationFrames,
+    normal_equations,
+    registration_frames,
+    updated_sigma,
+)
+from tests.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
+
+RADAR = np.array([12.0, -4.0, 1.1])
+VELOCITY = np.array([9.0, -0.4, 0.2])
+YAW_RATE = 0.3
+GAP_S = 0.004
+
+
+def one_pair(lidar_point):
+    """A single detection and a single lidar point."""
+    return RegistrationFrames(
+        RADAR[None], np.array([0, 1]), lidar_point[None], np.array([0, 1]), np.zeros((1, 4)), np.array([False]),
+        np.array([True]), VELOCITY[None], np.array([YAW_RATE]), np.array([GAP_S]), np.array([0]), np.array([0]),
+    )  # fmt: skip
+
+
+def seen_by_radar(T, tau, lidar_point):
+    """The model written down plainly: where a static lidar point appears to a radar that looks tau later."""
+    q = transform_points(inverse(T), lidar_point)
+    return to_spherical(q - (VELOCITY + np.cross([0, 0, YAW_RATE], q)) * tau)
+
+
+def matching_lidar_point(tau):
+    A = np.eye(3) - tau * np.array([[0, -YAW_RATE, 0], [YAW_RATE, 0, 0], [0, 0, 0]])
+    return transform_points(T_LIDAR_RADAR, np.linalg.solve(A, RADAR + VELOCITY * tau))
+
+
+def test_jacobian_agrees_with_central_differences():
+    dt, tau = 0.03, 0.03 + GAP_S
+    point = matching_lidar_point(tau)
+    assert np.allclose(seen_by_radar(T_LIDAR_RADAR, tau, point), to_spherical(RADAR))
+    J, h = np.zeros((3, 7)), 1e-6
+    for k in range(7):
+        step = np.zeros(7)
+        step[k] = h
+        ahead = seen_by_radar(exp_se3(step[:6]) @ T_LIDAR_RADAR, tau + step[6], point)
+        behind = seen_by_radar(exp_se3(-step[:6]) @ T_LIDAR_RADAR, tau - step[6], point)
+        J[:, k] = (ahead - behind) / (2 * h) / SIGMA_START
+    N = normal_equations(one_pair(point), T_LIDAR_RADAR, dt, SIGMA_START, 0.0, outlier=1e-12)
+    scale = np.abs(J).max()
+    assert np.allclose(N.H[0, 0], J[[0, 2]].T @ J[[0, 2]], atol=3e-4 * scale**2)
+    assert np.allclose(N.H[1, 0], J[1:2].T @ J[1:2], atol=3e-4 * scale**2)
+
+
+def test_gradient_agrees_with_differences_of_the_cost():
+    tau = GAP_S
+    frames = one_pair(matching_lidar_point(tau))
+    T = exp_se3(np.array([0.004, 0.006, -0.003, 0.05, -0.04, 0.02])) @ T_LIDAR_RADAR
+    N = normal_equations(frames, T, 0.0, SIGMA_START, 0.0, outlier=0.3)
+    gradient = N.g[:, 0].sum(0)
+    h = 1e-6
+    for k in range(6):
+        step = np.zeros(6)
+        step[k] = h
+        ahead = normal_equations(frames, exp_se3(step) @ T, 0.0, SIGMA_START, 0.0, outlier=0.3).cost[0]
+        behind = normal_equations(frames, exp_se3(-step) @ T, 0.0, SIGMA_START, 0.0, outlier=0.3).cost[0]
+        # J stands at the detection, not at the lidar point: a per cent at these offsets.
+        assert gradient[k] == pytest.approx(
+            (ahead - behind) / (2 * h), rel=0.03, abs=0.02 * np.abs(gradient).max()
+        )
+
+
+def test_an_uncertain_assignment_informs_less_than_a_certain_one():
+    point = matching_lidar_point(GAP_S)
+    frames = one_pair(point)
+    tangent = np.cross([0, 0, 1.0], RADAR / np.linalg.norm(RADAR))
+    wall = np.stack([point + s * T_LIDAR_RADAR[:3, :3] @ tangent for s in np.linspace(-0.3, 0.3, 21)])
+    along_wall = replace(frames, lidar_m=wall, lidar_first=np.array([0, 21]))
+    one, many = (
+        normal_equations(f, T_LIDAR_RADAR, 0.0, SIGMA_START, 0.0, outlier=1e-9) for f in (frames, along_wall)
+    )
+    assert many.information[0, 0, 2, 2] < 0.2 * one.information[0, 0, 2, 2]  # yaw slides along the wall
+    # Translation along the line of sight (range) stays as well known as before.
+    u = np.r_[T_LIDAR_RADAR[:3, :3] @ RADAR / np.linalg.norm(RADAR)]
+    assert u @ many.information[0, 0, 3:6, 3:6] @ u > 0.9 * u @ one.information[0, 0, 3:6, 3:6] @ u
+
+
+def test_the_cost_is_least_at_the_truth():
+    frames = registration_frames(street_day(12), T_LIDAR_RADAR, np.random.default_rng(0))
+
+    def cost(T, dt=DT_S):
+        return normal_equations(frames, T, dt, SIGMA, 0.0, 0.2).cost.mean()
+
+    def moved(axis, size):
+        xi = np.zeros(6)
+        xi[axis] = size
+        return exp_se3(xi) @ T_LIDAR_RADAR
+
+    best = cost(T_LIDAR_RADAR)
+    for axis, size in ((2, np.radians(0.3)), (3, 0.08), (4, 0.08)):
+        assert cost(moved(axis, size)) > best
+        assert cost(moved(axis, -size)) > best
+    assert cost(T_LIDAR_RADAR, DT_S + 0.03) > best
+    assert cost(T_LIDAR_RADAR, DT_S - 0.03) > best
+
+
+def test_sigmas_are_found_from_the_data():
+    frames = registration_frames(street_day(20), T_LIDAR_RADAR, np.random.default_rng(0))
+    sigma, bounce = SIGMA_START.copy(), 0.12
+    for _ in range(15):
+        equations = normal_equations(frames, T_LIDAR_RADAR, DT_S, sigma, bounce, 0.2)
+        sigma, bounce = updated_sigma(equations, sigma, bounce)
+    # The nearest surfaces absorb some of the noise: never more than the truth, never half of it.
+    assert np.all(sigma < 1.25 * SIGMA)
+    assert np.all(sigma > 0.45 * SIGMA)
+    assert bounce < 0.05
+
+
+def test_ground_bounces_are_recognised():
+    day = street_day(10)
+    mirrored = []
+    for o in day:
+        lidar = transform_points(T_LIDAR_RADAR, o.radar_xyz_m.astype(np.float64))
+        bounce = (np.arange(len(lidar)) % 2 == 0) & (lidar[:, 2] > -0.5)
+        lidar[bounce, 2] = 2 * -1.7 - lidar[bounce, 2]
+        xyz = transform_points(inverse(T_LIDAR_RADAR), lidar)
+        mirrored.append(replace(o, radar_xyz_m=xyz.astype(np.float32)))
+    shares = []
+    for observations in (day, mirrored):
+        frames = registration_frames(observations, T_LIDAR_RADAR, np.random.default_rng(0))
+        shares.append(normal_equations(frames, T_LIDAR_RADAR, DT_S, SIGMA, 0.12, 0.2).bounced)
+    assert shares[1] > 3 * shares[0] + 0.03
+
+
+def test_a_radar_without_elevation_gives_no_elevation_rows():
+    frames = registration_frames(street_day(4, elevation=False), T_LIDAR_RADAR, np.random.default_rng(0))
+    N = normal_equations(frames, T_LIDAR_RADAR, DT_S, SIGMA_START)
+    assert not N.H[1].any()
+    assert N.H[0].any()
+
+
+def test_frames_without_static_detections_are_left_out():
+    day = street_day(4)
+    empty = replace(day[1], radar_motion=np.ones_like(day[1].radar_motion))
+    lost = replace(day[2], radar_velocity_mps=None)
+    frames = registration_frames([day[0], empty, lost, day[3]], T_LIDAR_RADAR, np.random.default_rng(0))
+    assert frames.frame.tolist() == [0, 3]
+    none = registration_frames([empty], T_LIDAR_RADAR, np.random.default_rng(0))
+    assert none.count == 0
+
+
+def test_a_subset_gives_the_same_equations_as_its_frames_in_the_whole():
+    frames = registration_frames(street_day(6), T_LIDAR_RADAR, np.random.default_rng(0))
+    T = from_rotation_translation(
+        exp_so3(np.array([0.0, 0.0, 0.01])) @ T_LIDAR_RADAR[:3, :3], T_LIDAR_RADAR[:3, 3]
+    )
+    index = np.array([1, 4])
+    whole, part = (normal_equations(f, T, 0.0, SIGMA_START) for f in (frames, frames.subset(index)))
+    assert np.array_equal(whole.H[:, index], part.H)
+    assert np.array_equal(whole.cost[index], part.cost)
