@@ -57,7 +57,7 @@ def _encode(value: Any, column: Column, table: str) -> Any:
         isinstance(w, int) and w != s for w, s in zip(wanted, array.shape, strict=False)
     ):
         raise ContractError(table, f"column {column.name} has shape {array.shape}, not {wanted}")
-    return array.tobytes()
+    return array.tobytes()  # a copy: pyarrow 26 never frees the buffer of a memoryview that it is given
 
 
 def _decode_column(values: pa.ChunkedArray, column: Column) -> list[Any]:

@@ -1,456 +1,40 @@
-"""Small real logs, written by the public writers of mcap and rosbags: MCAP, ROS 1 bag, ROS 2 bag."""
+"""Fixtures of this room: small real logs, and the stage run on them."""
 
 from __future__ import annotations
 
 import sqlite3
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
-import cv2
-import mcap.writer
-import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as BagWriter
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as FolderWriter
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.config import FleetConfig
 from pipeline.ingest.run import ingest_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
 from schemas.frames import FRAMES, Frame
-
-START_NS = 1_700_000_000 * 10**9
-PERIOD_NS = 100_000_000
-IMAGE, INFO, LIDAR, RADAR = "/camera/image", "/camera/info", "/lidar/points", "/radar/points"
-LABELS, DETECTIONS, ODOMETRY = "/perception/labels", "/perception/detections", "/odometry"
-WIDTH, HEIGHT = 96, 64
-_DATATYPE = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-_NEW_DETECTIONS = {
-    "vision_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
-    "vision_msgs/msg/Pose2D": "vision_msgs/Point2D position\nfloat64 theta\n",
-    "vision_msgs/msg/BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
-    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
-    "vision_msgs/msg/ObjectHypothesisWithPose": (
-        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
-    ),
-    "vision_msgs/msg/Detection2D": (
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox2D bbox\nstring id\n"
-    ),
-    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections\n",
-}
-_OLD_DETECTIONS = {
-    "vision_msgs/msg/BoundingBox2D": "geometry_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
-    "vision_msgs/msg/ObjectHypothesisWithPose": (
-        "string id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose\n"
-    ),
-    "vision_msgs/msg/Detection2D": (
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox2D bbox\n"
-    ),
-    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections\n",
-}
-_RADAR = {
-    "radar_msgs/msg/RadarReturn": (
-        "float32 range\nfloat32 azimuth\nfloat32 elevation\nfloat32 doppler_velocity\nfloat32 amplitude\n"
-    ),
-    "radar_msgs/msg/RadarScan": "std_msgs/Header header\nradar_msgs/RadarReturn[] returns\n",
-}
-_NEW_TRACKS = {
-    "radar_msgs/msg/RadarTrack": (
-        "unique_identifier_msgs/UUID uuid\ngeometry_msgs/Point position\ngeometry_msgs/Vector3 velocity\n"
-        "geometry_msgs/Vector3 acceleration\ngeometry_msgs/Vector3 size\nuint16 classification\n"
-    ),
-    "radar_msgs/msg/RadarTracks": "std_msgs/Header header\nradar_msgs/RadarTrack[] tracks\n",
-}
-_OLD_TRACKS = {
-    "radar_msgs/msg/RadarTrack": (
-        "uint16 track_id\ngeometry_msgs/Point position\ngeometry_msgs/Vector3 velocity\n"
-        "geometry_msgs/Vector3 acceleration\ngeometry_msgs/Vector3 size\nstring classification\n"
-    ),
-    "radar_msgs/msg/RadarTracks": "std_msgs/Header header\nradar_msgs/RadarTrack[] tracks\n",
-}
-
-
-@dataclass
-class Kit:
-    """Makes messages of one ROS generation and writes them as logs."""
-
-    ros: int = 2
-    old_types: bool = False
-    frames: int = 4
-    messages: list[tuple[str, str, int, Any]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.store = get_typestore(Stores.ROS2_HUMBLE if self.ros == 2 else Stores.ROS1_NOETIC)
-        for name in [n for n in self.store.fielddefs if n.startswith(("vision_msgs/", "radar_msgs/"))]:
-            del self.store.fielddefs[name]
-        detections, tracks = (
-            (_OLD_DETECTIONS, _OLD_TRACKS) if self.old_types else (_NEW_DETECTIONS, _NEW_TRACKS)
-        )
-        if self.ros == 1:
-            tracks = _OLD_TRACKS  # rosbags' ROS 1 store lacks UUID and tf2
-            tracks |= {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
-        for name, text in {**detections, **_RADAR, **tracks}.items():
-            self.store.register(get_types_from_msg(text, name))
-
-    # -- messages ------------------------------------------------------------
-
-    def new(self, kind: str, **fields: Any) -> Any:
-        return self.store.types[kind](**fields)
-
-    def header(self, stamp_ns: int, frame_id: str) -> Any:
-        stamp = self.new("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        sequence = {"seq": 0} if self.ros == 1 else {}
-        return self.new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id, **sequence)
-
-    def vector(self, kind: str, x: float, y: float, z: float) -> Any:
-        return self.new(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
-
-    def quaternion(self, w: float, x: float, y: float, z: float) -> Any:
-        return self.new("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w))
-
-    def compressed(
-        self, stamp_ns: int, data: bytes, form: str = "jpeg", frame_id: str = "camera_optical"
-    ) -> Any:
-        array = np.frombuffer(data, np.uint8)
-        return self.new(
-            "sensor_msgs/msg/CompressedImage", header=self.header(stamp_ns, frame_id), format=form, data=array
-        )
-
-    def image(self, stamp_ns: int, pixels: np.ndarray, encoding: str, step: int | None = None) -> Any:
-        height, width = pixels.shape[:2]
-        rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(height, -1)
-        if step is not None:
-            rows = np.pad(rows, ((0, 0), (0, step - rows.shape[1])), constant_values=77)
-        return self.new(
-            "sensor_msgs/msg/Image",
-            header=self.header(stamp_ns, "camera_optical"),
-            height=height,
-            width=width,
-            encoding=encoding,
-            is_bigendian=0,
-            step=rows.shape[1],
-            data=rows.reshape(-1),
-        )
-
-    def info(
-        self, stamp_ns: int, focal_px: float = 80.0, model: str = "plumb_bob", D: Any = (0.0,) * 5
-    ) -> Any:
-        K = np.array(
-            [focal_px, 0, WIDTH / 2, 0, focal_px, HEIGHT / 2, 0, 0, 1 if focal_px else 0], np.float64
-        )
-        P = np.zeros(12)
-        roi = self.new(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
-        names = ("d", "k", "r", "p") if self.ros == 2 else ("D", "K", "R", "P")
-        arrays = dict(zip(names, (np.array(D, np.float64), K, np.eye(3).reshape(-1), P), strict=True))
-        return self.new(
-            "sensor_msgs/msg/CameraInfo",
-            header=self.header(stamp_ns, "camera_optical"),
-            height=HEIGHT,
-            width=WIDTH,
-            distortion_model=model,
-            binning_x=0,
-            binning_y=0,
-            roi=roi,
-            **arrays,
-        )
-
-    def cloud(
-        self,
-        stamp_ns: int,
-        columns: dict[str, np.ndarray],
-        *,
-        frame_id: str = "lidar",
-        big_endian: bool = False,
-        padding: int = 0,
-        rows: int = 1,
-        row_padding: int = 0,
-        counts: dict[str, int] | None = None,
-    ) -> Any:
-        """A PointCloud2 of these columns in this order; dtypes are the columns' own."""
-        order, counts, offset, fields, names = ">" if big_endian else "<", counts or {}, padding, [], []
-        for name, values in columns.items():
-            code = values.dtype.str[1:]
-            fields.append(
-                self.new(
-                    "sensor_msgs/msg/PointField",
-                    name=name,
-                    offset=offset,
-                    datatype=_DATATYPE[code],
-                    count=counts.get(name, 1),
-                )
-            )
-            names.append((name, order + code, offset, values.shape[1:]))
-            offset += values.dtype.itemsize * int(np.prod(values.shape[1:], dtype=int)) + padding
-        dtype = np.dtype(
-            {
-                "names": [n[0] for n in names],
-                "formats": [(n[1], n[3]) for n in names],
-                "offsets": [n[2] for n in names],
-                "itemsize": max(offset, 1),
-            }
-        )
-        count = len(next(iter(columns.values())))
-        points = np.full(count * dtype.itemsize, 0xAB, np.uint8).view(dtype)
-        for name, values in columns.items():
-            points[name] = values
-        data = points.view(np.uint8).reshape(rows, -1)
-        data = np.pad(data, ((0, 0), (0, row_padding)), constant_values=0xCD)
-        return self.new(
-            "sensor_msgs/msg/PointCloud2",
-            header=self.header(stamp_ns, frame_id),
-            height=rows,
-            width=count // rows,
-            fields=fields,
-            is_bigendian=big_endian,
-            point_step=dtype.itemsize,
-            row_step=data.shape[1],
-            data=data.reshape(-1),
-            is_dense=False,
-        )
-
-    def transform(
-        self, stamp_ns: int, parent: str, child: str, q: Any = (1, 0, 0, 0), t: Any = (0, 0, 0)
-    ) -> Any:
-        body = self.new(
-            "geometry_msgs/msg/Transform",
-            translation=self.vector("Vector3", *t),
-            rotation=self.quaternion(*q),
-        )
-        return self.new(
-            "geometry_msgs/msg/TransformStamped",
-            header=self.header(stamp_ns, parent),
-            child_frame_id=child,
-            transform=body,
-        )
-
-    def tf(self, *transforms: Any) -> Any:
-        return self.new("tf2_msgs/msg/TFMessage", transforms=list(transforms))
-
-    def odometry(self, stamp_ns: int, x: float, yaw: float, speed: float, yaw_rate: float) -> Any:
-        covariance = np.zeros(36)
-        pose = self.new(
-            "geometry_msgs/msg/Pose",
-            position=self.vector("Point", x, 0, 0),
-            orientation=self.quaternion(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)),
-        )
-        twist = self.new(
-            "geometry_msgs/msg/Twist",
-            linear=self.vector("Vector3", speed, 0, 0),
-            angular=self.vector("Vector3", 0, 0, yaw_rate),
-        )
-        return self.new(
-            "nav_msgs/msg/Odometry",
-            header=self.header(stamp_ns, "odom"),
-            child_frame_id="base_link",
-            pose=self.new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
-            twist=self.new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance),
-        )
-
-    def detections(self, stamp_ns: int, boxes: list[tuple[float, float, float, float, str, float]]) -> Any:
-        """Boxes as centre x, y, width, height, class, score."""
-        origin = self.new(
-            "geometry_msgs/msg/Pose",
-            position=self.vector("Point", 0, 0, 0),
-            orientation=self.quaternion(1, 0, 0, 0),
-        )
-        pose = self.new("geometry_msgs/msg/PoseWithCovariance", pose=origin, covariance=np.zeros(36))
-        header, found = self.header(stamp_ns, "camera_optical"), []
-        for x, y, width, height, name, score in boxes:
-            kind = "vision_msgs/msg/ObjectHypothesisWithPose"
-            if self.old_types:
-                result = self.new(kind, id=name, score=score, pose=pose)
-                centre, rest = self.new("geometry_msgs/msg/Pose2D", x=x, y=y, theta=0.0), {}
-            else:
-                hypothesis = self.new("vision_msgs/msg/ObjectHypothesis", class_id=name, score=score)
-                result, rest = self.new(kind, hypothesis=hypothesis, pose=pose), {"id": ""}
-                point = self.new("vision_msgs/msg/Point2D", x=x, y=y)
-                centre = self.new("vision_msgs/msg/Pose2D", position=point, theta=0.0)
-            bbox = self.new("vision_msgs/msg/BoundingBox2D", center=centre, size_x=width, size_y=height)
-            found.append(
-                self.new("vision_msgs/msg/Detection2D", header=header, results=[result], bbox=bbox, **rest)
-            )
-        return self.new("vision_msgs/msg/Detection2DArray", header=header, detections=found)
-
-    # -- a drive -------------------------------------------------------------
-
-    def drive(self, start_ns: int = START_NS) -> Kit:
-        """Append a drive: tf_static once, then the six messages of every frame."""
-        optical = (0.5, -0.5, 0.5, -0.5)
-        self.add(
-            "/tf_static",
-            "tf2_msgs/msg/TFMessage",
-            start_ns,
-            self.tf(
-                self.transform(start_ns, "base_link", "camera_optical", optical, (1.5, 0, 1.4)),
-                self.transform(start_ns, "base_link", "lidar", t=(1.0, 0, 1.8)),
-                self.transform(start_ns, "base_link", "radar", t=(3.6, 0.1, 0.5)),
-            ),
-        )
-        for i in range(self.frames):
-            stamp = start_ns + i * PERIOD_NS
-            self.add(INFO, "sensor_msgs/msg/CameraInfo", stamp, self.info(stamp + 1_000_000))
-            self.add(
-                IMAGE, "sensor_msgs/msg/CompressedImage", stamp, self.compressed(stamp + 1_000_000, jpeg(i))
-            )
-            labels = self.compressed(stamp + 1_000_000, label_png(i), "mono8; png compressed")
-            self.add(LABELS, "sensor_msgs/msg/CompressedImage", stamp, labels)
-            boxes = [(20.0 + i, 30.0, 10.0, 8.0, "car", 0.9)]
-            self.add(
-                DETECTIONS,
-                "vision_msgs/msg/Detection2DArray",
-                stamp,
-                self.detections(stamp + 1_000_000, boxes),
-            )
-            self.add(LIDAR, "sensor_msgs/msg/PointCloud2", stamp, self.cloud(stamp, lidar_columns(i)))
-            scan = self.cloud(stamp - 2_000_000, radar_columns(i), frame_id="radar")
-            self.add(RADAR, "sensor_msgs/msg/PointCloud2", stamp, scan)
-        return self
-
-    def add(self, topic: str, kind: str, log_time_ns: int, message: Any) -> None:
-        self.messages.append((topic, kind, log_time_ns, message))
-
-    def without(self, topic: str) -> Kit:
-        self.messages = [m for m in self.messages if m[0] != topic]
-        return self
-
-    def replaced(self, topic: str, number: int, message: Any) -> Kit:
-        """Put another message in the place of the `number`-th of a topic."""
-        place = [i for i, m in enumerate(self.messages) if m[0] == topic][number]
-        _, kind, log_time, _ = self.messages[place]
-        self.messages[place] = (topic, getattr(message, "__msgtype__", kind), log_time, message)
-        return self
-
-    # -- containers ----------------------------------------------------------
-
-    def mcap(
-        self, path: Path, *, compression: str = "ZSTD", chunk_size: int = 40_000, **options: Any
-    ) -> Path:
-        with path.open("wb") as stream:
-            writer = mcap.writer.Writer(
-                stream, chunk_size=chunk_size, compression=mcap.writer.CompressionType[compression], **options
-            )
-            writer.start(profile="ros2", library="test")
-            schemas: dict[str, int] = {}
-            channels: dict[tuple[str, str], int] = {}
-            for topic, kind, log_time, message in self.messages:
-                if kind not in schemas:
-                    text = self.store.generate_msgdef(kind, ros_version=2)[0]
-                    schemas[kind] = writer.register_schema(kind, "ros2msg", text.encode())
-                if (topic, kind) not in channels:
-                    channels[topic, kind] = writer.register_channel(topic, "cdr", schemas[kind])
-                data = bytes(self.store.serialize_cdr(message, kind))
-                writer.add_message(channels[topic, kind], log_time, data, log_time)
-            writer.finish()
-        return path
-
-    def bag(self, path: Path, compression: str | None = None) -> Path:
-        writer = BagWriter(path)
-        if compression is not None:
-            writer.set_compression(BagWriter.CompressionFormat[compression])
-        writer.chunk_threshold = 40_000
-        with writer:
-            connections: dict[tuple[str, str], Any] = {}
-            for topic, kind, log_time, message in self.messages:
-                if (topic, kind) not in connections:
-                    connections[topic, kind] = writer.add_connection(topic, kind, typestore=self.store)
-                writer.write(
-                    connections[topic, kind], log_time, bytes(self.store.serialize_ros1(message, kind))
-                )
-        return path
-
-    def folder(self, path: Path, storage: str = "SQLITE3") -> Path:
-        with FolderWriter(path, version=9, storage_plugin=StoragePlugin[storage]) as writer:
-            connections: dict[tuple[str, str], Any] = {}
-            for topic, kind, log_time, message in self.messages:
-                if (topic, kind) not in connections:
-                    connections[topic, kind] = writer.add_connection(topic, kind, typestore=self.store)
-                writer.write(
-                    connections[topic, kind], log_time, bytes(self.store.serialize_cdr(message, kind))
-                )
-        return path
-
-
-def lidar_columns(i: int, count: int = 800) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(100 + i)
-    xyz = rng.uniform((2, -20, -1.7), (60, 20, 3), (count, 3)).astype(np.float32)
-    return {
-        "x": xyz[:, 0],
-        "y": xyz[:, 1],
-        "z": xyz[:, 2],
-        "intensity": rng.uniform(0, 255, count).astype(np.float32),
-        "ring": (np.arange(count) % 16).astype(np.uint16),
-        "time": np.linspace(-0.1, 0, count).astype(np.float32),
-    }
-
-
-def radar_columns(i: int, count: int = 60) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(200 + i)
-    xyz = rng.uniform((5, -20, -1), (80, 20, 2), (count, 3)).astype(np.float32)
-    doppler = (10.0 * xyz[:, 0] / np.linalg.norm(xyz, axis=1)).astype(np.float32)  # approaching at 10 m/s
-    return {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "doppler": doppler, "power": doppler * 0 + 30}
-
-
-def jpeg(i: int) -> bytes:
-    pixels = np.random.default_rng(i).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-    return cv2.imencode(".jpg", pixels)[1].tobytes()
-
-
-def label_png(i: int) -> bytes:
-    return cv2.imencode(".png", np.random.default_rng(i).integers(0, 19, (HEIGHT, WIDTH), np.uint8))[
-        1
-    ].tobytes()
-
-
-def fleet_config(**sections: Any) -> FleetConfig:
-    camera = {
-        "image": IMAGE,
-        "info": INFO,
-        "semantics": {"source": "topics", "labels": LABELS, "detections": DETECTIONS},
-    }
-    rig = {
-        "camera": camera,
-        "lidar": {"points": LIDAR},
-        "radar": {"points": RADAR, "doppler_positive": "approaching"},
-        "ego": {"odometry": ODOMETRY},
-    }
-    for name in ("radar", "prior"):
-        rig[name] = {**rig.get(name, {}), **sections.pop(name, {})}
-    return FleetConfig.model_validate(
-        {"fleet": {"name": "test"}, "rigs": {"default": rig}, "vehicles": {"car": {}}, **sections}
-    )
+from tests import written_logs
 
 
 @pytest.fixture(scope="session")
 def kit() -> SimpleNamespace:
     """Everything that the tests of this room write logs with."""
-    return SimpleNamespace(
-        Kit=Kit,
-        fleet=fleet_config,
-        jpeg=jpeg,
-        label_png=label_png,
-        lidar=lidar_columns,
-        radar=radar_columns,
-        START_NS=START_NS,
-        PERIOD_NS=PERIOD_NS,
-        WIDTH=WIDTH,
-        HEIGHT=HEIGHT,
-        IMAGE=IMAGE,
-        INFO=INFO,
-        LIDAR=LIDAR,
-        RADAR=RADAR,
-        LABELS=LABELS,
-        DETECTIONS=DETECTIONS,
-        ODOMETRY=ODOMETRY,
-        sqlite=sqlite3,
+    names = (
+        "Kit",
+        "IMAGE",
+        "INFO",
+        "LIDAR",
+        "RADAR",
+        "LABELS",
+        "DETECTIONS",
+        "ODOMETRY",
+        "START_NS",
+        "PERIOD_NS",
     )
+    functions = {"fleet": "fleet_config", "lidar": "lidar_columns", "radar": "radar_columns"}
+    same = {n: n for n in (*names, "WIDTH", "HEIGHT", "jpeg", "label_png")}
+    found = {short: getattr(written_logs, name) for short, name in (same | functions).items()}
+    return SimpleNamespace(sqlite=sqlite3, **found)
 
 
 @pytest.fixture
@@ -459,7 +43,7 @@ def run_ingest(tmp_path):
 
     def run(*logs: Path, fleet: FleetConfig | None = None, name: str = "lake", file: str = "fleet.toml"):
         lake, day = Lake.at(tmp_path / name), Partition("car", "2023-11-14")
-        result = ingest_day(list(logs), day, fleet or fleet_config(), lake, fleet_file=file)
+        result = ingest_day(list(logs), day, fleet or written_logs.fleet_config(), lake, fleet_file=file)
         frames = read_rows(lake, FRAMES, day, Frame) if result.rows else []
         return result, frames
 
