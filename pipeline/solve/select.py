@@ -27,7 +27,8 @@ __all__ = ["MIN_FRAMES", "MIN_HOLDOUT", "Selection", "hold_out", "select_frames"
 
 MIN_FRAMES = 8  # fewer carry no calibration: 10 frames already scatter by 0.1 deg (evidence on the real logs)
 MIN_HOLDOUT = 3
-_BLOCK_S = 10.0
+_BLOCKS_S = (10.0, 7.0, 5.0, 4.0, 3.0, 20.0)
+_JUDGING_BLOCKS = 4
 # What makes a frame worth having, by pair.
 _CONTENT = {
     "camera_lidar": ("lidar_edge_xyz_m", "marking_xyz_m", "lidar_cluster_centre_m"),
@@ -116,24 +117,40 @@ def unmet_conditions(
 def hold_out(observations: Sequence[Observation], fraction: float) -> list[bool | None]:
     """Split a day into blocks of time: True = judges, False = fits, None = too near in time to a frame of the fit.
 
-    Every k-th block (k = 1/fraction) judges, so that both parts see all of the day; blocks are at most 10 s
-    long and never cross a drive.
+    Every k-th block judges, so that both parts see all of the day; blocks never cross a drive. Of several
+    lengths of block the split is taken that comes nearest to the fraction, loses few frames next to the fit,
+    and judges by at least _JUDGING_BLOCKS blocks.
     """
     if not observations:
         return []
     stamps = np.array([o.stamp_ns for o in observations]) * 1e-9
-    drives = np.array([o.drive for o in observations])
-    every = max(2, round(1 / fraction))
-    spans = sum(float(np.ptp(stamps[drives == d])) for d in np.unique(drives))
-    block_s = float(np.clip(spans / (2 * every), 2 * _GUARD_S, _BLOCK_S))
-    start = {d: stamps[drives == d].min() for d in np.unique(drives)}
-    blocks = [(int(d), int((s - start[d]) // block_s)) for s, d in zip(stamps, drives, strict=True)]
-    order = {block: k for k, block in enumerate(dict.fromkeys(blocks))}
-    # The middle one of every k, so that a day of fewer than k blocks still holds one out.
-    judges = np.array([order[b] % every == min(every // 2, len(order) - 1) for b in blocks])
-    fits = stamps[~judges]
-    near = np.array([len(fits) > 0 and np.abs(fits - s).min() < _GUARD_S for s in stamps])
-    return [None if j and n else bool(j) for j, n in zip(judges, near, strict=True)]
+    drives = np.unique([o.drive for o in observations], return_inverse=True)[1].ravel()
+    start = np.array([stamps[drives == d].min() for d in range(drives.max() + 1)])
+    best, best_score = np.zeros(len(stamps), int), np.inf
+    for block_s in _BLOCKS_S:
+        count = 1 + int((stamps - start[drives]).max() // block_s)
+        block = drives * count + ((stamps - start[drives]) // block_s).astype(int)
+        order = np.unique(block, return_inverse=True)[1].ravel()
+        for every in {max(2, round(1 / fraction) + step) for step in (-2, -1, 0)}:
+            # The middle one of every k, so that a day of fewer than k blocks still holds one out.
+            judges = order % every == min(every // 2, order.max())
+            roles = np.where(judges, np.where(_near(stamps, stamps[~judges]), -1, 1), 0)
+            blocks = len(np.unique(order[roles == 1]))
+            score = 2 * abs(np.mean(roles == 1) - fraction) + np.mean(roles == -1)
+            score += 0.1 * max(0, _JUDGING_BLOCKS - blocks)
+            if score < best_score - 1e-9:
+                best, best_score = roles, score
+    return [None if role < 0 else bool(role) for role in best]
+
+
+def _near(stamps: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """True where one of `others` lies within _GUARD_S."""
+    if not len(others):
+        return np.zeros(len(stamps), bool)
+    others = np.sort(others)
+    k = np.searchsorted(others, stamps)
+    before, after = others[np.maximum(k - 1, 0)], others[np.minimum(k, len(others) - 1)]
+    return np.minimum(np.abs(stamps - before), np.abs(stamps - after)) < _GUARD_S
 
 
 def _scores(observations: Sequence[Observation], pair: str) -> np.ndarray:

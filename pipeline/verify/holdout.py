@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import ndtri, stdtr
 
 __all__ = ["HeldOutTest", "paired_test"]
 
@@ -22,13 +23,17 @@ class HeldOutTest:
 
     @property
     def z(self) -> float:
-        """Difference after - before in standard errors: negative = better aligned; 0 where nothing changed."""
+        """How sure after - before is, as a normal deviate: negative = better aligned, 0 where nothing changed.
+
+        Student's t with one degree of freedom less than blocks, carried over to the normal of the same probability:
+        two blocks that agree by chance are no 30-sigma proof. Within +-8.
+        """
         difference = self.after - self.before
         if difference == 0:
             return 0.0
-        return (
-            difference / self.standard_error if self.standard_error > 0 else float(np.sign(difference)) * 1e3
-        )
+        ratio = abs(difference) / self.standard_error if self.standard_error > 0 else np.inf
+        tail = max(float(stdtr(max(self.blocks - 1, 1), -ratio)), 1e-15)
+        return float(-np.sign(difference) * ndtri(tail))
 
 
 def paired_test(

@@ -40,7 +40,7 @@ def test_conditions_of_a_sensor_that_is_not_in_the_pair_do_not_count(day):
 
 
 def test_held_out_frames_are_no_neighbours_of_the_fit():
-    day = make_day(300, step_s=0.1, per_drive=150)
+    day = make_day(160, step_s=0.2, per_drive=80)
     chosen = select_frames(day, CONFIG, paper=True)
     stamps = np.array([o.stamp_ns for o in day]) * 1e-9
     for pair in PAIRS:

@@ -172,5 +172,14 @@ def test_paired_test_leaves_out_frames_that_cannot_tell():
     assert paired_test(np.full(3, np.nan), np.ones(3), np.arange(3)) is None
 
 
+def test_two_blocks_are_no_proof_however_well_they_agree():
+    before = np.zeros(8)
+    blocks = np.repeat([0, 1], 4)
+    after = np.repeat([1.0, 1.1], 4)
+    found = paired_test(before, after, blocks)
+    assert (after.mean() - 0) / found.standard_error > 15
+    assert 1 < found.z < 2.5
+
+
 def test_nothing_changed_is_neither_better_nor_worse():
     assert paired_test(np.ones(5), np.ones(5), np.arange(5)).z == 0
