@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,6 +54,7 @@ def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = No
     truth = read_truth(out / "truth")
     findings, pages = close_night(night, None, out / "report" / "fleet.html", truth)
     errors = print_comparison(night.lake, night.method, truth, days[-1], findings)
+    (out / "comparison.json").write_text(json.dumps(errors, indent=1) + "\n")
     code = exit_code([o.status for o in outcomes])
     seconds = time.monotonic() - began
     _say(f"\n[bold]{pages[0] if pages else 'no report'}[/]  open it in a browser ({seconds:.0f} s in all)")
@@ -64,7 +66,7 @@ def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = No
         vehicle_days=len(outcomes),
         moved=moved_sensors(findings),
         knocked=[{"vehicle": f.vehicle, "sensor": f.sensor, "since": days[f.day]} for f in spec.faults],
-        errors=errors,
+        comparison=out / "comparison.json",
     )
     return code
 

@@ -30,7 +30,7 @@ def print_comparison(
 
     Both are shown as what differs from the prior, i.e. what the drawing did not know: rotation vector [deg] and
     shift of the child's origin [cm], in the axes of the pair's parent sensor. An estimate in brackets is a DoF
-    that the day did not determine: it stays at the prior.
+    that the day did not determine.
 
     Returns:
         For each record: errors of rotation [deg] and translation [m] against the truth, before and after.
@@ -44,14 +44,13 @@ def print_comparison(
     found = current_records(
         [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, day=day) if r.method == method]
     )
-    console = Console(highlight=False, width=None if Console().is_terminal else 150)
+    console = Console(highlight=False, width=None if Console().is_terminal else 120)
     table, errors = _table(day), []
     for record in found:
         T_true = truth[record.vehicle, record.day][record.pair]
         errors.append(_errors(record, T_true))
         for row in _rows(record, T_true):
             table.add_row(*row)
-        table.add_section()
     console.print(table)
     for line in _drift_lines(findings):
         console.print(line)
@@ -59,17 +58,22 @@ def print_comparison(
 
 
 def _table(day: str) -> Table:
+    from rich import box
     from rich.table import Table
 
     table = Table(
-        title=f"What the drawing did not know, {day}: true and estimated", title_style="bold", pad_edge=False
+        title=f"What the drawing did not know, {day}",
+        title_style="bold",
+        caption="true: from the simulator. In brackets: the day did not determine it.",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
     )
-    for name, justify in (("vehicle", "left"), ("pair", "left"), ("verdict", "left"), ("", "left")):
-        table.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    for name in ("vehicle", "pair", "verdict", ""):
+        table.add_column(name, no_wrap=True)
     for axis in "xyz":
-        table.add_column(f"{axis}: true", justify="right", no_wrap=True)
-        table.add_column("estimate", justify="right", no_wrap=True)
-        table.add_column("± sigma", justify="right", no_wrap=True, style="dim")
+        table.add_column(f"{axis} true", justify="right", no_wrap=True, style="cyan")
+        table.add_column("estimate ± 1σ", justify="right", no_wrap=True)
     return table
 
 
@@ -83,17 +87,14 @@ def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
     true, estimate = change_between(T_prior, T_true), change_between(T_prior, T)
     sigma = np.sqrt(np.diag(change_covariance(T, record.covariance)))
     seen = record.observable or [True] * 6
-    scale = np.array([np.degrees(1)] * 3 + [100.0] * 3)
     rows = []
-    for first, unit in ((0, "deg"), (3, "cm")):
-        head = [record.vehicle, record.pair, _STATUS[record.status]] if first == 0 else ["", "", ""]
-        cells = [f"rotation {unit}" if first == 0 else f"shift {unit}"]
-        digits = 2 if first == 0 else 1
+    for first, unit, scale, digits in ((0, "deg", np.degrees(1), 2), (3, "cm", 100.0, 1)):
+        head = [record.vehicle, record.pair, _STATUS[record.status]] if first == 0 else [""] * 3
+        cells = [f"turn {unit}" if first == 0 else f"shift {unit}"]
         for i in range(first, first + 3):
-            values = (true[i] * scale[i], estimate[i] * scale[i])
-            shown = f"{values[1]:+.{digits}f}"
-            cells += [f"{values[0]:+.{digits}f}", shown if seen[i] else f"[dim]({shown})[/]"]
-            cells.append(f"{sigma[i] * scale[i]:.{digits}f}")
+            shown = f"{estimate[i] * scale:+.{digits}f} ± {sigma[i] * scale:.{digits}f}"
+            cells.append(f"{true[i] * scale:+.{digits}f}")
+            cells.append(f"{shown} " if seen[i] else f"[dim]({shown})[/]")
         rows.append(head + cells)
     return rows
 
