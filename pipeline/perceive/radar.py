@@ -1,7 +1,8 @@
 """The radar's own velocity from the Doppler of the static world, and what moves in it.
 
 Range rate of a static point in direction u seen from a radar with velocity v: `-u . v`, known only modulo
-the Doppler period where the radar is ambiguous. Wide fields of view lift that: points at 30 deg to the side see 13 % less than points ahead, so a wrong multiple of the period does not fit.
+the Doppler period where the radar is ambiguous. Wide fields of view lift that: points at 30 deg to the side
+see 13 % less than points ahead, so a wrong multiple of the period does not fit.
 
 Source: Kellner et al. 2013, "Instantaneous ego-motion estimation using Doppler radar" (their sine fit, here
 with wrapped residuals and a grid of hypotheses instead of RANSAC, which makes it deterministic).

@@ -1,6 +1,7 @@
 """Models behind manifests: heads, letterboxes, alignment of logits, and errors that name manifest and key."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -247,3 +248,46 @@ def test_both_models_together_give_a_frames_semantics(tmp_path, made_frame):
     assert found.labels.shape == (frame.image_height_px // 2, frame.image_width_px // 2)
     assert found.detections.classes == ["car", "person"]
     assert 0 < np.mean(found.labels == 3) < 1
+
+
+def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, made_frame):
+    from pipeline.config import load_fleet
+    from pipeline.perceive.run import perceive_day
+    from pipeline.store.partitions import Lake, Partition
+    from pipeline.store.tables import read_rows, write_partition
+    from schemas.frames import FRAMES
+    from schemas.observations import OBSERVATIONS, Observation
+
+    segmenter(tmp_path)
+    detector(tmp_path, rows_of(BOXES[:1], [2], [0.9], [1.0]), "yolov5")
+    toml = tmp_path / "fleet.toml"
+    toml.write_text(
+        '[fleet]\nname = "made"\n[rigs.default.camera]\nimage = "/i"\ninfo = "/c"\n'
+        'semantics = { source = "onnx", segmenter = "seg.toml", detector = "det.toml" }\n'
+        '[rigs.default.lidar]\npoints = "/p"\n[rigs.default.radar]\npoints = "/r"\n[vehicles.car-1]\n'
+    )
+    lake, day = Lake.at(tmp_path / "lake"), Partition("car-1", "2026-03-02")
+    with write_partition(lake, FRAMES, day, "frames-key", "test") as writer:
+        # The car logged no semantics: the models give them.
+        bare = {
+            "labels_png": None,
+            "detection_boxes_px": None,
+            "detection_classes": None,
+            "detection_scores": None,
+        }
+        writer.append([replace(made_frame(i), **bare) for i in range(2)])
+        writer.describe(kept={}, rejected={})
+    first = perceive_day(day, load_fleet(toml), lake, fleet_file=toml)
+    assert (first.status, first.rows) == ("done", 2)
+    assert [o.road_user_classes for o in read_rows(lake, OBSERVATIONS, day, Observation)] == [
+        ["car"],
+        ["car"],
+    ]
+    assert perceive_day(day, load_fleet(toml), lake, fleet_file=toml).status == "cached"
+    detector(tmp_path, rows_of(BOXES[:1], [0], [0.9], [1.0]), "yolov5")
+    again = perceive_day(day, load_fleet(toml), lake, fleet_file=toml)
+    assert again.status == "done"
+    assert [o.road_user_classes for o in read_rows(lake, OBSERVATIONS, day, Observation)] == [
+        ["person"],
+        ["person"],
+    ]
