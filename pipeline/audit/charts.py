@@ -47,11 +47,13 @@ class Chart:
         day: ordinals (days of the calendar, gaps allowed), rising.
         value: estimates [rad or m], relative to any fixed reference.
         sigma: their standard deviations, day biases included.
+        accepted: False for days that were held; None = all accepted.
     """
 
     day: np.ndarray
     value: np.ndarray
     sigma: np.ndarray
+    accepted: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,8 @@ def judge_chart(
         baseline_days: the chart says nothing, unless it alarms, until it has one day more than this.
 
     Returns:
-        RED: a lasting change of at least `limit`. YELLOW: a smaller one, or one that rests on a single day.
+        RED: a lasting change of at least `limit`. YELLOW: a smaller one, or one that rests on a single day or
+            has no accepted day on one side.
         GREEN: no change, and one of size `limit` would be seen. UNKNOWN: too few days, or sigmas too large
             to see one.
     """
@@ -213,6 +216,10 @@ def _alarm_status(chart: Chart, z: np.ndarray, change: Change, limit: float) -> 
     gain = float(np.max(z**2)) if change.kind == "step" else float(np.max(ramp_fits(chart)[0]))
     if gain < _outlier_gain(chart) + _CLEAR_ODDS:
         return "YELLOW", "one day stands out: the next day will tell whether it lasts"
+    if chart.accepted is not None:
+        is_after = chart.day >= change.day
+        if not (chart.accepted[is_after].any() and chart.accepted[~is_after].any()):
+            return "YELLOW", "rests on days whose calibration was held"
     if abs(change.size) < limit:
         return "YELLOW", "a change below the size that matters"
     return "RED", "a lasting change of a size that matters"

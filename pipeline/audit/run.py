@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -61,7 +62,8 @@ def audit_fleet(
             by_vehicle.setdefault(record.vehicle, []).append(record)
     if not any(by_vehicle.values()):
         return []
-    days = {vehicle: _pairs(rows) for vehicle, rows in by_vehicle.items()}
+    factor = fleet.audit.held_sigma_factor
+    days = {vehicle: _pairs(rows, factor) for vehicle, rows in by_vehicle.items()}
     scatter = _scatter(list(days.values()))
     findings: list[DriftFinding] = []
     for done, vehicle in enumerate(sorted(by_vehicle)):
@@ -88,18 +90,21 @@ def _window(
     return first, last
 
 
-def _pairs(records: Sequence[CalibrationRecord]) -> dict[str, PairDays]:
-    """Accepted estimates by pair; held and refused days are gaps: nothing vouches for their numbers."""
+def _pairs(records: Sequence[CalibrationRecord], held_sigma_factor: float) -> dict[str, PairDays]:
+    """Estimates by pair, with larger sigmas where the day was held; refused days are gaps."""
     pairs = {}
     for pair in PAIRS:
-        rows = [r for r in records if r.pair == pair and r.status == "accepted" and r.covariance is not None]
+        rows = [r for r in records if r.pair == pair and r.status != "refused" and r.covariance is not None]
         transforms = [transform_of(r) for r in rows]
         if rows:
+            factor = np.array([1.0 if r.status == "accepted" else held_sigma_factor for r in rows])
+            covariance = np.stack([r.covariance for r in rows if r.covariance is not None])
             pairs[pair] = PairDays(
                 np.array([dt.date.fromisoformat(r.day).toordinal() for r in rows]),
                 np.stack([T for T in transforms if T is not None]),
-                np.stack([r.covariance for r in rows if r.covariance is not None]),
+                covariance * factor[:, None, None] ** 2,
                 np.array([r.observable or [True] * 6 for r in rows], dtype=bool),
+                np.array([r.status == "accepted" for r in rows], dtype=bool),
             )
     return pairs
 
@@ -129,6 +134,7 @@ def _write(
     for pair in PAIRS:
         for dof in DOF_NAMES:
             chart = verdict.charts.get((pair, dof)) or _no_data(records, pair)
+            chart = _with_last_day(chart, records, pair)
             base = DriftFinding(
                 vehicle, last, method, pair, dof, chart.status, chart.reason, chart.days_used,
                 limit_of(pair, dof, fleet.audit), key, inputs=inputs,
@@ -162,10 +168,19 @@ def _finding(base: DriftFinding, chart: ChartVerdict, moved: Attribution | None)
     return DriftFinding(**fields)
 
 
+def _with_last_day(chart: ChartVerdict, records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:
+    """Say so where the vehicle drove on after the last estimate of a pair."""
+    days = [r.day for r in records if r.pair == pair and r.status != "refused"]
+    last = max((r.day for r in records), default="")
+    if not days or max(days) == last:
+        return chart
+    return replace(chart, reason=f"{chart.reason}; no estimate after {max(days)}")
+
+
 def _no_data(records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:
     found = [r.status for r in records if r.pair == pair]
     counts = ", ".join(f"{found.count(s)} {s}" for s in ("held", "refused") if s in found)
-    reason = f"no accepted day in the window ({counts})" if counts else "no record in the window"
+    reason = f"no estimate in the window ({counts})" if counts else "no record in the window"
     return ChartVerdict("UNKNOWN", reason, 0, None, None, None, None)
 
 

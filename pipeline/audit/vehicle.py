@@ -19,19 +19,21 @@ __all__ = ["PairDays", "VehicleVerdict", "charts_of", "judge_vehicle", "limit_of
 
 @dataclass(frozen=True, eq=False)
 class PairDays:
-    """Accepted day estimates of one pair.
+    """Day estimates of one pair. Held days are among them: a large knock is just what the verdict holds.
 
     Args:
         day: ordinals of the calendar, rising.
         T: estimates of T_parent_child.
         covariance: theirs (left perturbation, rad and m).
         observable: per day and DoF; what a day did not determine is not on the charts.
+        accepted: False for held days; their covariance is already enlarged.
     """
 
     day: np.ndarray
     T: np.ndarray
     covariance: np.ndarray
     observable: np.ndarray
+    accepted: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ def charts_of(pair_days: PairDays) -> dict[str, Chart]:
     charts = {}
     for k, dof in enumerate(DOF_NAMES):
         seen = pair_days.observable[:, k]
-        charts[dof] = Chart(pair_days.day[seen], value[seen, k], sigma[seen, k])
+        charts[dof] = Chart(pair_days.day[seen], value[seen, k], sigma[seen, k], pair_days.accepted[seen])
     return charts
 
 
@@ -70,7 +72,7 @@ def judge_vehicle(
     """Judge all charts of a vehicle.
 
     Args:
-        pairs: accepted day estimates by pair; a pair may be missing.
+        pairs: day estimates by pair; a pair may be missing.
         scatter: by (pair, dof), factor on the sigmas, see `pooled_scatter`.
         config: limits and the false-alarm budget.
     """
@@ -82,7 +84,7 @@ def judge_vehicle(
     probability = config.false_alarms_per_1000_vehicle_days / 1000 / max(live, 1)
     verdicts = {}
     for key, chart in charts.items():
-        scaled = Chart(chart.day, chart.value, chart.sigma * scatter.get(key, 1.0))
+        scaled = Chart(chart.day, chart.value, chart.sigma * scatter.get(key, 1.0), chart.accepted)
         verdict = judge_chart(scaled, limit_of(*key, config), probability, config.baseline_days)
         verdicts[key] = _explain_blindness(verdict, len(pairs[key[0]].day))
     if not any(v.change for v in verdicts.values()):

@@ -31,7 +31,8 @@ class DriftPanel:
     sigma: Sequence[float]
     limit: float
     start: tuple[int, int, int] | None = None  # first day with the new value, earliest, latest
-    missing: Sequence[int] = field(default=())  # held, refused or undetermined days
+    missing: Sequence[int] = field(default=())  # refused or undetermined days
+    held: Sequence[int] = field(default=())  # days whose calibration was held
 
 
 def sigma_figure(
@@ -170,9 +171,11 @@ def _drift_panel(
         plot.line((first - 0.5, plot.y[0]), (first - 0.5, plot.y[1]), colour, 1.2, "4 3")
     for day, value, sigma in zip(panel.day, panel.value, panel.sigma, strict=True):
         v, s = scaled(value, panel.dof), scaled(sigma, panel.dof)
-        plot.dot(float(day), v, colour, f"{day_labels.get(day, '')}: {v:+.3f} ± {s:.3f} {unit}", bar=s)
+        note = " (held)" if day in panel.held else ""
+        tooltip = f"{day_labels.get(day, '')}: {v:+.3f} ± {s:.3f} {unit}{note}"
+        plot.dot(float(day), v, colour, tooltip, bar=s, opacity=0.45 if note else 1.0)
     for day in panel.missing:
-        plot.cross(float(day), 0.0, f"{day_labels.get(day, '')}: held, refused or not determined")
+        plot.cross(float(day), 0.0, f"{day_labels.get(day, '')}: refused or not determined")
     if not len(panel.day):
         plot.text(plot.left + plot.width / 2, plot.top + 26, "not determined", anchor="middle", colour=MUTED)
 

@@ -116,7 +116,7 @@ def drift_panels(
     panels = []
     for pair in PAIRS:
         rows = [r for r in records if (r.vehicle, r.pair) == (vehicle, pair)]
-        used = [r for r in rows if r.status == "accepted" and r.covariance is not None]
+        used = [r for r in rows if r.status != "refused" and r.covariance is not None]
         for k, dof in enumerate(DOF_NAMES):
             finding = next((f for f in findings if (f.vehicle, f.pair, f.dof) == (vehicle, pair, dof)), None)
             if finding is not None:
@@ -149,17 +149,11 @@ def _panel(
     if before.any():
         value = value - np.average(value[before], weights=sigma[before] ** -2)
     missing = sorted({_ordinal(r.day) for r in rows} - set(day))
+    held = [_ordinal(r.day) for r in seen if r.status == "held"]
+    values, sigmas = value.tolist(), sigma.tolist()
     return DriftPanel(
-        finding.pair,
-        finding.dof,
-        finding.status,
-        day,
-        value.tolist(),
-        sigma.tolist(),
-        finding.limit,
-        start,
-        missing,
-    )
+        finding.pair, finding.dof, finding.status, day, values, sigmas, finding.limit, start, missing, held
+    )  # fmt: skip
 
 
 def _cell(records: Sequence[CalibrationRecord], vehicle: str, day: str, link: str) -> DayCell:

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.figure import Figure
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import transform_points
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = ["Extrinsics", "Scene", "Window", "camera_of", "close_up", "decode_image", "front_view", "top_view"]
+__all__ = ["Extrinsics", "Scene", "Window", "camera_of", "close_up", "decode_image", "front_view"]
 
 Image = UInt8[np.ndarray, "H W 3"]
 _NEAR_M, _FAR_M = 4.0, 80.0  # ends of the colour scale; logarithmic between
@@ -111,32 +110,6 @@ def close_up(scene: Scene, state: Extrinsics, window: Window, zoom: int) -> Imag
         )
         _dots(picture, at[inside], distance[inside], radius, outline=ring)
     return picture
-
-
-def top_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> Figure:
-    """View from above in the lidar frame: lidar by height, radar black; left half at `before`, right at `after`."""
-    figure = Figure(figsize=(6.6, 5.9), dpi=110, layout="constrained", facecolor="white")
-    axes = figure.subplots()
-    lidar = scene.frame.lidar_xyz_m
-    lidar = lidar[(lidar[:, 0] > -10) & (lidar[:, 0] < 70) & (np.abs(lidar[:, 1]) < 40)]
-    lidar = lidar[:: max(1, len(lidar) // 25_000)]
-    height = np.clip(lidar[:, 2] - np.percentile(lidar[:, 2], 5), 0, 4) if len(lidar) else lidar[:, 2]
-    dots = axes.scatter(-lidar[:, 1], lidar[:, 0], c=height, s=3, cmap="turbo", vmin=0, vmax=4, linewidths=0)
-    radar = scene.frame.radar_xyz_m
-    for state, side in ((before, 1), (after, -1)):
-        points = transform_points(state.T_lidar_radar, radar)
-        points = points[points[:, 1] * side > 0]
-        axes.scatter(-points[:, 1], points[:, 0], c="black", s=5, marker="o", linewidths=0)
-    axes.axvline(0, color="black", linewidth=1)
-    axes.set(
-        xlim=(-30, 30), ylim=(-3, 60), xlabel="to the right of the lidar [m]", ylabel="ahead of the lidar [m]"
-    )
-    axes.set_aspect("equal")
-    for text, x, align in ((labels[0], 0.02, "left"), (labels[1], 0.98, "right")):
-        box = {"facecolor": "white", "edgecolor": "black", "boxstyle": "round"}
-        axes.text(x, 0.97, text, transform=axes.transAxes, ha=align, va="top", weight="bold", bbox=box)
-    figure.colorbar(dots, ax=axes, shrink=0.75, aspect=40, pad=0.01, label="lidar: height above ground [m]")
-    return figure
 
 
 def _draw(image: np.ndarray, scene: Scene, camera: Camera, scale: float, state: Extrinsics) -> np.ndarray:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.report.encode import jpeg_uri, png_uri
-from pipeline.report.overlays import Extrinsics, Scene, camera_of, close_up, front_view, top_view
+from pipeline.report.above import top_view
+from pipeline.report.encode import jpeg_uri
+from pipeline.report.overlays import Extrinsics, Scene, camera_of, close_up, front_view
 from pipeline.report.scenes import choose_windows
 
 __all__ = ["ScenePictures", "scene_pictures"]
@@ -52,7 +53,7 @@ def _pictures(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple
         scene.frame.log,
         scene.frame.drive,
         jpeg_uri(front_view(scene, before, after, labels)),
-        png_uri(top_view(scene, before, after, labels)),
+        top_view(scene, before, after, labels),
         close_ups,
         zoom,
         f"{angle:.1f}",

@@ -18,7 +18,7 @@ from pipeline.geometry.se3 import transform_points
 from pipeline.report.overlays import Extrinsics, camera_of
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
-__all__ = ["MEASURES", "boundary_distance_px", "frame_residuals"]
+__all__ = ["MEASURES", "at_pixels", "boundary_distance_px", "frame_residuals"]
 
 # pair -> what is measured; more is better
 MEASURES = {
@@ -34,29 +34,26 @@ _MIN_POINTS = 5  # shares of fewer say nothing
 
 
 def frame_residuals(
-    observations: Sequence[Observation], state: Extrinsics
-) -> dict[str, Float[np.ndarray, " F"]]:
-    """Measure per pair and frame, as MEASURES says; NaN where a frame has too little to tell."""
-    rows = [
-        (
-            _on_silhouette(o, state.T_camera_lidar),
-            _in_boxes(o, state.T_camera_radar),
-            _on_structure(o, state.T_lidar_radar),
-        )
-        for o in observations
-    ]
-    values = np.array(rows, dtype=np.float64).reshape(-1, 3)
-    return {pair: values[:, k] for k, pair in enumerate(MEASURES)}
+    observations: Sequence[Observation], states: Sequence[Extrinsics]
+) -> list[dict[str, Float[np.ndarray, " F"]]]:
+    """Measure per state, pair and frame, as MEASURES says; NaN where a frame has too little to tell."""
+    values = np.full((len(states), len(MEASURES), len(observations)), np.nan)
+    for f, observation in enumerate(observations):
+        boundary = boundary_distance_px(observation)
+        for s, state in enumerate(states):
+            values[s, :, f] = (
+                _on_silhouette(observation, boundary, state.T_camera_lidar),
+                _in_boxes(observation, state.T_camera_radar),
+                _on_structure(observation, state.T_lidar_radar),
+            )
+    return [dict(zip(MEASURES, of_state, strict=True)) for of_state in values]
 
 
-def boundary_distance_px(
-    observation: Observation, uv: Float[np.ndarray, "N 2"], only: Sequence[int] = ()
-) -> Float[np.ndarray, " N"]:
-    """Distance of pixels to the nearest sideways change of label, in full-image pixels; inf where there is none.
+def boundary_distance_px(observation: Observation, only: Sequence[int] = ()) -> Float[np.ndarray, "H W"]:
+    """Distance of each label pixel to the nearest sideways change of label, in full-image pixels; inf without one.
 
     Args:
         observation: holds the label image.
-        uv: full-image pixels.
         only: labels of which one must lie at the change; empty = any.
     """
     labels = _decode_labels(observation)
@@ -65,12 +62,18 @@ def boundary_distance_px(
     if only:
         chosen = np.isin(labels, only)
         change[:, 1:] &= chosen[:, 1:] | chosen[:, :-1]
-    if not change.any() or not len(uv):
-        return np.full(len(uv), np.inf)
-    distance = cv2.distanceTransform((~change).astype(np.uint8), cv2.DIST_L2, 3) / observation.label_scale
+    if not change.any():
+        return np.full(labels.shape, np.inf)
+    return cv2.distanceTransform((~change).astype(np.uint8), cv2.DIST_L2, 3) / float(observation.label_scale)
+
+
+def at_pixels(
+    label_map: Float[np.ndarray, "H W"], observation: Observation, uv: Float[np.ndarray, "N 2"]
+) -> Float[np.ndarray, " N"]:
+    """Values of a map at label size at full-image pixels; the nearest one beyond the border."""
     at = np.round((uv + 0.5) * observation.label_scale - 0.5).astype(int)
-    column, row = (np.clip(at[:, k], 0, labels.shape[1 - k] - 1) for k in (0, 1))
-    return distance[row, column].astype(np.float64)
+    column, row = (np.clip(at[:, k], 0, label_map.shape[1 - k] - 1) for k in (0, 1))
+    return label_map[row, column].astype(np.float64)
 
 
 def _decode_labels(observation: Observation) -> np.ndarray:
@@ -78,15 +81,15 @@ def _decode_labels(observation: Observation) -> np.ndarray:
     return np.zeros((1, 1), np.uint8) if labels is None else labels
 
 
-def _on_silhouette(observation: Observation, T_camera_lidar: np.ndarray) -> float:
+def _on_silhouette(observation: Observation, boundary: np.ndarray, T_camera_lidar: np.ndarray) -> float:
     sideways = np.isin(observation.lidar_edge_side, (EDGE_LEFT, EDGE_RIGHT))
     camera = camera_of(observation)
     uv, valid = camera.project(_seen_from(T_camera_lidar, observation.lidar_edge_xyz_m[sideways]))
-    uv = uv[valid & camera.contains(uv, margin_px=2)]
+    uv = uv[valid & camera.contains(uv, margin_px=2.0)]
     if len(uv) < _MIN_POINTS:
         return float("nan")
     return float(
-        100 * np.mean(boundary_distance_px(observation, uv) < _ON_SILHOUETTE_RAD * camera.focal_px[0])
+        100 * np.mean(at_pixels(boundary, observation, uv) < _ON_SILHOUETTE_RAD * camera.focal_px[0])
     )
 
 

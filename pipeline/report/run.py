@@ -34,7 +34,7 @@ from schemas.observations import OBSERVATIONS, Observation
 __all__ = ["write_day_page", "write_fleet_page", "write_fleet_report"]
 
 _SCENES = 3
-_RESIDUAL_FRAMES = 60  # evenly spread; more dots say nothing more
+_FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 _CHARTS = 24  # vehicles without an alarm whose charts still go on the fleet page
 
 
@@ -214,10 +214,10 @@ def _pictures(
     observations = [o for chunk in iterate_rows(lake, OBSERVATIONS, partition, Observation) for o in chunk]
     if not observations:
         return [], "", "no frame of the day could be used"
-    some = np.unique(np.linspace(0, len(observations) - 1, _RESIDUAL_FRAMES).astype(int))
+    some = np.unique(np.linspace(0, len(observations) - 1, _FRAMES_LOOKED_AT).astype(int))
     spread = [observations[i] for i in some]
-    residuals = residual_figure(frame_residuals(spread, before), frame_residuals(spread, after))
-    chosen = [observations[i] for i in choose_frames(observations, after.T_camera_lidar, _SCENES)]
+    residuals = residual_figure(*frame_residuals(spread, (before, after)))
+    chosen = [spread[i] for i in choose_frames(spread, after.T_camera_lidar, _SCENES)]
     rows = [o.frame_index for o in chosen]
     frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
     scenes = [Scene(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]

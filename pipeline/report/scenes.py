@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from pipeline.geometry.se3 import transform_points
 from pipeline.report.overlays import Window, camera_of
-from pipeline.report.residuals import boundary_distance_px
+from pipeline.report.residuals import at_pixels, boundary_distance_px
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["choose_frames", "choose_windows"]
@@ -69,7 +69,10 @@ def _weighted_edges(
     camera = camera_of(observation)
     uv, valid = camera.project(points)
     distance = np.linalg.norm(points, axis=1)
-    valid &= camera.contains(uv, margin_px=8) & (distance > _NEAREST_M) & (distance < _FARTHEST_M)
+    valid &= camera.contains(uv, margin_px=8.0) & (distance > _NEAREST_M) & (distance < _FARTHEST_M)
     uv = uv[valid]
-    is_near = boundary_distance_px(observation, uv, _CLEAR_LABELS) < _REACH_RAD * camera.focal_px[0]
+    is_near = (
+        at_pixels(boundary_distance_px(observation, _CLEAR_LABELS), observation, uv)
+        < _REACH_RAD * camera.focal_px[0]
+    )
     return uv, np.where(is_near, 1.0, -0.15)

@@ -77,6 +77,7 @@ def test_a_vehicle_raises_no_more_false_alarms_than_its_budget(maker: ModuleType
                 np.stack([transform_of(r) for r in rows]),
                 np.stack([r.covariance for r in rows]),
                 np.ones((4, 6), bool),
+                np.ones(4, bool),
             )
         verdict = judge_vehicle(pairs, {}, config)
         alarms += any(v.change for v in verdict.charts.values())
@@ -94,7 +95,7 @@ def test_a_slow_drift_of_the_camera_is_told_from_a_knock(tmp_path: Path, maker: 
     assert (yaw.kind, yaw.moved_sensor) == ("slow drift", "camera")
 
 
-def test_held_and_refused_days_are_gaps(tmp_path: Path, maker: ModuleType) -> None:
+def test_refused_days_are_gaps_and_held_days_weigh_less(tmp_path: Path, maker: ModuleType) -> None:
     rng = np.random.default_rng(5)
     lake = Lake.at(tmp_path)
     status = {3: "held", 4: "refused", 8: "refused"}
@@ -110,9 +111,34 @@ def test_held_and_refused_days_are_gaps(tmp_path: Path, maker: ModuleType) -> No
     )
     findings = audit_fleet(lake, _fleet("v"))
     yaw = next(f for f in findings if (f.pair, f.dof) == ("lidar_radar", "rz"))
-    assert (yaw.status, yaw.days_used) == ("RED", 7)
-    assert (yaw.start_day_earliest, yaw.start_day_latest) == ("2026-03-04", "2026-03-06")
+    assert (yaw.status, yaw.days_used) == ("RED", 8)
+    assert (yaw.start_day_earliest, yaw.start_day_latest) == ("2026-03-05", "2026-03-06")
     assert yaw.start_day == "2026-03-06"
+
+
+def test_a_knock_so_large_that_every_later_day_is_held_is_still_told(
+    tmp_path: Path, maker: ModuleType
+) -> None:
+    rng = np.random.default_rng(15)
+    lake = Lake.at(tmp_path)
+    _write(
+        lake,
+        maker.vehicle_records(
+            "v", 6, rng, motion=lambda d: {"radar": 8 * KNOCK} if d > 2 else {},
+            status=lambda d: "held" if d > 2 else "accepted",
+        ),
+    )  # fmt: skip
+    yaw = next(f for f in audit_fleet(lake, _fleet("v")) if (f.pair, f.dof) == ("lidar_radar", "rz"))
+    assert (yaw.status, yaw.start_day, yaw.moved_sensor) == ("YELLOW", "2026-03-04", "radar")
+    assert "held" in yaw.reason
+
+
+def test_a_vehicle_that_drives_on_without_estimates_says_so(tmp_path: Path, maker: ModuleType) -> None:
+    lake = Lake.at(tmp_path)
+    status = lambda d: "refused" if d > 3 else "accepted"  # noqa: E731
+    _write(lake, maker.vehicle_records("v", 6, np.random.default_rng(16), status=status))
+    reasons = {f.reason for f in audit_fleet(lake, _fleet("v"))}
+    assert all(r.endswith("no estimate after 2026-03-04") for r in reasons)
 
 
 def test_what_no_day_determined_is_unknown_and_so_is_a_vehicle_without_records(

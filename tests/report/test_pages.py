@@ -116,7 +116,13 @@ def test_the_truth_table_counts_the_axes_within_three_sigmas(fleet: tuple[Lake, 
 @pytest.mark.parametrize(
     ("vehicle", "day", "answer", "kind"),
     [
-        ("b", "2026-03-01", "Yes. All pairs are accepted", "good"),
+        ("b", "2026-03-04", "Yes. All pairs are accepted", "good"),
+        (
+            "b",
+            "2026-03-01",
+            "Not any more. The radar moved on 2026-03-03, after this day. Only camera-lidar",
+            "bad",
+        ),
         ("c", "2026-03-03", "No. Nothing was accepted", "bad"),
         ("c", "2026-03-04", "No. Nothing was accepted", "bad"),
     ],
