@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import hat, transform_points
-from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.geometry.spherical import camera_direction_angles, wrap_angle
 from schemas.observations import Observation
 
 __all__ = [
@@ -110,24 +110,24 @@ def lidar_azimuth_residuals(
     """
     points = clusters.at_lidar_time(dt_s)
     in_lidar = transform_points(T_lidar_radar, points)
-    residual, J, frame = [], [], []
+    chosen: list[int] = []
+    partners: list[np.ndarray] = []
     for b in range(clusters.count):
         centres = clusters.lidar_centres_m[clusters.frame[b]]
         if not len(centres):
             continue
         square = (centres[:, 0] - in_lidar[b, 0]) ** 2 + (centres[:, 1] - in_lidar[b, 1]) ** 2
         n = int(np.argmin(square))
-        if square[n] > gate_m**2:
-            continue
-        q = T_lidar_radar[:3, :3].T @ (centres[n] - T_lidar_radar[:3, 3])
-        h2 = q[0] ** 2 + q[1] ** 2
-        measured = np.arctan2(points[b, 1], points[b, 0])
-        gradient = np.array([-q[1], q[0], 0.0]) / h2 @ T_lidar_radar[:3, :3].T
-        residual.append(float(np.arctan2(q[1], q[0]) - measured))
-        # The lidar point moves against the sensor: dq = R^T ([p]x dphi - drho).
-        J.append(np.concatenate([gradient @ hat(centres[n]), -gradient]))
-        frame.append(int(clusters.frame[b]))
-    return np.array(residual), np.array(J).reshape(-1, 6), np.array(frame, np.int64)
+        if square[n] <= gate_m**2:
+            chosen.append(b)
+            partners.append(centres[n])
+    p = np.array(partners).reshape(-1, 3)
+    q = transform_points(inverse(T_lidar_radar), p)
+    h2 = q[:, 0] ** 2 + q[:, 1] ** 2
+    residual = wrap_angle(np.arctan2(q[:, 1], q[:, 0]) - np.arctan2(points[chosen, 1], points[chosen, 0]))
+    gradient = np.stack([-q[:, 1] / h2, q[:, 0] / h2, np.zeros(len(q))], -1) @ T_lidar_radar[:3, :3].T
+    # The lidar point moves against the sensor: dq = R^T ([p]x dphi - drho), and g . (p x dphi) = (g x p) . dphi.
+    return residual, np.concatenate([np.cross(gradient, p), -gradient], 1), clusters.frame[chosen]
 
 
 def camera_azimuth_residuals(
@@ -141,24 +141,30 @@ def camera_azimuth_residuals(
         Residuals [rad] of the clusters that found a box within `gate_rad`, d/d(left twist of T_camera_radar), frames.
     """
     in_camera = transform_points(T_camera_radar, clusters.point_radar_m)
-    angles = camera_direction_angles(in_camera)
-    residual, J, frame = [], [], []
-    for b in range(clusters.count):
-        azimuth, expected_m = clusters.box_azimuths[clusters.frame[b]]
-        x, _, z = in_camera[b]
-        if z < 1.0 or not len(azimuth):
+    azimuth = camera_direction_angles(in_camera)[:, 0]
+    distance = np.linalg.norm(in_camera, axis=1)
+    chosen: list[int] = []
+    residual: list[float] = []
+    for b in np.flatnonzero(in_camera[:, 2] > 1.0):
+        box_azimuth, expected_m = clusters.box_azimuths[clusters.frame[b]]
+        if not len(box_azimuth):
             continue
-        ratio = np.linalg.norm(in_camera[b]) / expected_m
+        ratio = distance[b] / expected_m
         fits = (ratio < _RANGE_FACTOR) & (ratio > 1 / _RANGE_FACTOR)
-        gap = np.where(fits, np.abs(angles[b, 0] - azimuth), np.inf)
+        gap = np.where(fits, np.abs(azimuth[b] - box_azimuth), np.inf)
         n = int(np.argmin(gap))
-        if gap[n] > gate_rad:
-            continue
-        gradient = np.array([-z, 0.0, x]) / (x * x + z * z)  # azimuth = atan2(-x, z)
-        residual.append(float(angles[b, 0] - azimuth[n]))
-        J.append(np.concatenate([-gradient @ hat(in_camera[b]), gradient]))
-        frame.append(int(clusters.frame[b]))
-    return np.array(residual), np.array(J).reshape(-1, 6), np.array(frame, np.int64)
+        if gap[n] <= gate_rad:
+            chosen.append(int(b))
+            residual.append(azimuth[b] - box_azimuth[n])
+    p = in_camera[chosen]
+    h2 = p[:, 0] ** 2 + p[:, 2] ** 2
+    # azimuth = atan2(-x, z); dp = dphi x p + drho
+    gradient = np.stack([-p[:, 2] / h2, np.zeros(len(p)), p[:, 0] / h2], -1)
+    return (
+        np.array(residual, np.float64),
+        np.concatenate([np.cross(p, gradient), gradient], 1),
+        clusters.frame[chosen],
+    )
 
 
 def azimuth_equations_lidar(

@@ -290,9 +290,11 @@ def _linearise(
         g[:, columns] += gb
     if widen == 1.0:  # partners are found only once the clusters lie near them
         Hm, gm, mover_sigma = azimuth_equations_lidar(problem.movers, state.T_lidar_radar, state.dt_s)
+        # As with static detections, azimuths say yaw, x and y; roll would come from heights that clusters lack.
+        flat = _AZIMUTH_RANGE_DOF[:3]
         for array in (H, info):
-            array[:, :6, :6] += Hm
-        g[:, :6] += gm
+            array[np.ix_(np.arange(F), flat, flat)] += Hm[:, flat[:, None], flat]
+        g[:, flat] += gm[:, flat]
     prior_H, prior_g = _prior_equations(problem, state)
     boxes = 0 if pairs is None else pairs.count
     return _Linear(H, info, g, prior_H, prior_g, equations, box_sigma, boxes, mover_sigma, registration_step)

@@ -1,0 +1,146 @@
+"""Lidar-radar of method `joint` on streets with known truth: basin, time offset, honest sigmas, faults."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.config import SolveConfig
+from pipeline.errors import SolveError
+from pipeline.geometry.se3 import exp_se3, log_se3, perturb_exactly
+from pipeline.objective.problem import Prior
+from pipeline.solve.camera_radar import camera_radar_cost, estimate_camera_radar
+from pipeline.solve.lidar_radar import estimate_lidar_radar, lidar_radar_cost
+from tests.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
+from tests.solve_scenes import T_CAMERA_LIDAR
+
+CONFIG = SolveConfig()
+SIGMA_ROTATION = np.radians(2.0)
+SIGMA_SHIFT = 0.05
+
+
+def prior_off_by(rotation_deg, shift_m, seed=0):
+    rng = np.random.default_rng(seed)
+    T = perturb_exactly(T_LIDAR_RADAR, np.radians(rotation_deg), shift_m, rng)
+    return Prior(T_CAMERA_LIDAR, T, SIGMA_ROTATION, SIGMA_SHIFT)
+
+
+def solve(day, prior, camera=T_CAMERA_LIDAR, seed=0):
+    return estimate_lidar_radar(day, prior, camera, CONFIG, np.random.default_rng(seed))
+
+
+def error_of(estimate):
+    return log_se3(estimate.T @ np.linalg.inv(T_LIDAR_RADAR))
+
+
+@pytest.fixture(scope="module")
+def day():
+    return street_day(40)
+
+
+@pytest.mark.parametrize(("rotation_deg", "shift_m"), [(2, 0.1), (5, 0.3), (10, 0.3)])
+def test_wrong_priors_lead_to_the_truth(day, rotation_deg, shift_m):
+    for seed in range(2):
+        found = solve(day, prior_off_by(rotation_deg, shift_m, seed))
+        error, sigma = error_of(found), np.sqrt(np.diag(found.covariance))
+        assert abs(error[2]) < np.radians(0.12)
+        assert np.abs(error[3:5]).max() < 0.06
+        assert np.all(np.abs(error[:5]) < 3 * sigma[:5])
+        assert abs(found.time_offset_s - DT_S) < 3 * found.time_offset_sigma_s
+
+
+def test_errors_have_the_spread_that_the_covariance_says():
+    z = []
+    for seed in range(8):
+        found = solve(street_day(24, seed=100 + seed), prior_off_by(1.5, 0.04, seed), seed=seed)
+        pose = error_of(found)[:5] / np.sqrt(np.diag(found.covariance))[:5]
+        z.append([*pose, (found.time_offset_s - DT_S) / found.time_offset_sigma_s])
+    assert np.all(np.abs(z) < 3.5)
+    # Bias floors stand for what these scenes do not have, so errors may be smaller, never larger.
+    assert np.sqrt(np.mean(np.square(z))) < 1.3
+
+
+def test_the_same_seed_gives_the_same_numbers(day):
+    a, b = (solve(day[:12], prior_off_by(2, 0.1), seed=3) for _ in range(2))
+    assert np.array_equal(a.T, b.T)
+    assert np.array_equal(a.covariance, b.covariance)
+    assert a.diagnostics == b.diagnostics
+
+
+def test_a_radar_without_elevation_leaves_roll_and_pitch_to_the_prior():
+    prior = prior_off_by(2, 0.1, 1)
+    found = solve(street_day(24, elevation=False), prior)
+    kept = log_se3(found.T @ np.linalg.inv(prior.T_lidar_radar))
+    assert not found.observable[[0, 1, 5]].any()
+    assert np.abs(kept[:2]).max() < np.radians(0.1)
+    assert np.sqrt(found.covariance[0, 0]) >= SIGMA_ROTATION
+    assert abs(error_of(found)[2]) < np.radians(0.2)
+    assert any("roll, pitch" in note for note in found.notes)
+
+
+def test_boxes_make_roll_surer(day):
+    with_camera, without = (solve(day, prior_off_by(1, 0.02), camera) for camera in (T_CAMERA_LIDAR, None))
+    assert with_camera.covariance[0, 0] < without.covariance[0, 0]
+    assert with_camera.diagnostics["boxes"] > 20
+    assert without.diagnostics["boxes"] == 0
+
+
+def test_a_coarse_lidar_is_not_trusted_with_roll(day):
+    coarse = [
+        replace(o, lidar_edge_gap_rad=np.full_like(o.lidar_edge_gap_rad, np.radians(2.0))) for o in day[:20]
+    ]
+    found = solve(coarse, prior_off_by(1, 0.02), None)
+    assert not found.observable[0]
+    assert found.diagnostics["registration_roll_sigma_rad"] > np.radians(4.0)
+
+
+def test_a_standing_car_does_not_determine_the_time_offset():
+    still = [replace(o, radar_velocity_mps=np.zeros(3)) for o in street_day(16, dt_s=0.0)]
+    found = solve(still, prior_off_by(1, 0.02))
+    assert found.time_offset_sigma_s > 0.9 * CONFIG.time_offset_sigma_s
+
+
+def test_too_few_frames_are_refused(day):
+    with pytest.raises(SolveError, match="lidar-radar needs 5 frames"):
+        solve(day[:3], prior_off_by(1, 0.02))
+    deaf = [replace(o, radar_velocity_mps=None) for o in day]
+    with pytest.raises(SolveError, match="the day has 0"):
+        solve(deaf, prior_off_by(1, 0.02))
+
+
+def test_half_of_a_day_that_was_turned_is_found(day):
+    yaw = np.radians(0.4)
+    turn = exp_se3(np.array([0, 0, -yaw, 0, 0, 0]))
+    turned = [replace(o, radar_xyz_m=(o.radar_xyz_m @ turn[:3, :3].T).astype(np.float32)) for o in day[20:]]
+    first, second = (solve(part, prior_off_by(1, 0.02)) for part in (day[:20], turned))
+    change = log_se3(second.T @ np.linalg.inv(first.T))
+    assert abs(change[2] - yaw) < np.radians(0.1)
+
+
+def test_held_out_costs_prefer_the_truth_and_name_frames_that_cannot_tell(day):
+    frames = [
+        *day[:8],
+        replace(day[8], radar_velocity_mps=None, radar_cluster=np.full_like(day[8].radar_cluster, -1)),
+    ]
+    wrong = exp_se3(np.array([0, 0, np.radians(1.0), 0, 0, 0])) @ T_LIDAR_RADAR
+    right_cost, wrong_cost = (lidar_radar_cost(frames, T, DT_S) for T in (T_LIDAR_RADAR, wrong))
+    assert np.mean(right_cost[:8] < wrong_cost[:8]) > 0.8
+    assert np.isnan(right_cost[8])
+    camera_right, camera_wrong = (
+        camera_radar_cost(frames, T_CAMERA_LIDAR @ T) for T in (T_LIDAR_RADAR, wrong)
+    )
+    assert np.nanmean(camera_right) < np.nanmean(camera_wrong)
+    assert np.isnan(camera_right[8])
+
+
+def test_camera_and_radar_alone_find_their_azimuth(day):
+    T_true = T_CAMERA_LIDAR @ T_LIDAR_RADAR
+    for seed in range(3):
+        found = estimate_camera_radar(day, prior_off_by(4, 0.05, seed), CONFIG, np.random.default_rng(0))
+        error = log_se3(found.T @ np.linalg.inv(T_true))
+        assert abs(error[1]) < np.radians(0.5)
+        assert np.all(
+            np.abs(error[:3])[found.observable[:3]]
+            < 3.5 * np.sqrt(np.diag(found.covariance))[:3][found.observable[:3]]
+        )
+        assert not found.observable[3:].all()
