@@ -28,12 +28,11 @@ def report(
         method: method of the records; default: audit.method.
         truth: JSON with the true extrinsics of a simulated fleet, shown beside the estimates.
     """
-    from pipeline.report.run import write_day_page, write_fleet_report
-    from pipeline.report.truth import read_truth
-
     from jobs.summary import print_summary
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
+    from pipeline.report.run import write_day_page, write_fleet_report
+    from pipeline.report.truth import read_truth
     from pipeline.store.partitions import Lake, Partition
 
     if (vehicle is None) != (day is None):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -9,6 +10,7 @@ if TYPE_CHECKING:
 
 __all__ = ["show"]
 
+_PIPE_WIDTH = 200
 Table = Literal["calibrations", "drift", "frames", "observations"]
 
 
@@ -99,7 +101,8 @@ def _print_table(table: Table, rows: list[dict[str, Any]]) -> None:
     colours |= {"GREEN": "green", "YELLOW": "yellow", "RED": "red", "UNKNOWN": "dim"}
     for line in lines:
         view.add_row(*(f"[{colours[c]}]{c}[/]" if c in colours else c for c in line.values()))
-    Console().print(view)
+    # Into a pipe or file nothing needs to fit a window.
+    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH).print(view)
 
 
 def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:

@@ -36,6 +36,7 @@ _START_DROP = 6.0
 # step: odds of 20.
 _CLEAR_ODDS = 6.0
 _BLIND_SIGMAS = 2.0  # a chart sees a change that is at least this many sigmas of its best-placed split
+_LASTING = "a lasting change of a size that matters"
 _MIN_SCATTER_DAYS = 6  # successive differences below which their spread says nothing
 
 
@@ -167,8 +168,7 @@ def judge_chart(
         baseline_days: the chart says nothing, unless it alarms, until it has one day more than this.
 
     Returns:
-        RED: a lasting change of at least `limit`. YELLOW: a smaller one, or one that rests on a single day or
-            has no accepted day on one side.
+        RED: a lasting change of at least `limit`. YELLOW: a smaller one, or one that rests on a single day.
         GREEN: no change, and one of size `limit` would be seen. UNKNOWN: too few days, or sigmas too large
             to see one.
     """
@@ -216,13 +216,16 @@ def _alarm_status(chart: Chart, z: np.ndarray, change: Change, limit: float) -> 
     gain = float(np.max(z**2)) if change.kind == "step" else float(np.max(ramp_fits(chart)[0]))
     if gain < _outlier_gain(chart) + _CLEAR_ODDS:
         return "YELLOW", "one day stands out: the next day will tell whether it lasts"
-    if chart.accepted is not None:
-        is_after = chart.day >= change.day
-        if not (chart.accepted[is_after].any() and chart.accepted[~is_after].any()):
-            return "YELLOW", "rests on days whose calibration was held"
     if abs(change.size) < limit:
         return "YELLOW", "a change below the size that matters"
-    return "RED", "a lasting change of a size that matters"
+    if chart.accepted is None:
+        return "RED", _LASTING
+    is_after = chart.day >= change.day
+    # Held days agree by chance only within their enlarged sigmas, so two of them stand for an accepted one.
+    doubtful = [side for side in (is_after, ~is_after) if not chart.accepted[side].any()]
+    if any(side.sum() < 2 for side in doubtful):
+        return "YELLOW", "rests on a single day, whose calibration was held"
+    return "RED", _LASTING + ("; rests on days whose calibration was held" if doubtful else "")
 
 
 def _outlier_gain(chart: Chart) -> float:

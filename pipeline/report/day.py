@@ -144,13 +144,7 @@ def drift_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
     if not findings:
         return "UNKNOWN", "No audit yet."
     if not alarms:
-        seen = sum(f.status == "GREEN" for f in findings)
-        if not seen:
-            return "UNKNOWN", "Too little data to say whether a sensor moved."
-        return (
-            "GREEN",
-            f"No sensor moved ({seen} of {len(findings)} charts would show a change that matters).",
-        )
+        return _quiet_sentence(findings)
     status = "RED" if any(f.status == "RED" for f in alarms) else "YELLOW"
     best = max(alarms, key=lambda f: (f.status == "RED", f.moved_sensor is not None, f.statistic or 0.0))
     if best.moved_sensor is None:
@@ -159,6 +153,18 @@ def drift_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
     motion = motion_in_words(best.moved_sensor, best.moved_motion or [], best.moved_motion_sigma or [])
     kind = "moved on" if best.kind == "step" else "has been drifting since"
     return status, f"The {best.moved_sensor} {kind} {best.start_day}: {motion}."
+
+
+def _quiet_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
+    """GREEN only where a turn of either sensor against the lidar would have shown; else it is not known yet."""
+    green = [f for f in findings if f.status == "GREEN"]
+    turns = {f.pair for f in green if f.dof.startswith("r")}
+    count = f"{len(green)} of {len(findings)} charts would show a change that matters"
+    if "camera_lidar" in turns and turns & {"lidar_radar", "camera_radar"}:
+        return "GREEN", f"No sensor moved ({count})."
+    if any(f.days_used > 1 for f in findings):
+        return "UNKNOWN", f"No change seen, but the days so far could hide one that matters ({count})."
+    return "UNKNOWN", "Too little data to say whether a sensor moved."
 
 
 def _dof_rows(

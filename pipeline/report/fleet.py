@@ -95,12 +95,15 @@ def headline_for(findings: Sequence[DriftFinding], views: Sequence[FindingView])
     if not vehicles:
         return "UNKNOWN", "No audit yet: run boresight audit."
     if not views:
-        if not any(f.status == "GREEN" for f in findings):
-            return (
-                "UNKNOWN",
-                f"Too little data to say whether a sensor moved on {_count(vehicles, 'vehicle')}.",
-            )
-        return "GREEN", f"No sensor moved on {_count(vehicles, 'vehicle')}."
+        quiet = {
+            v: drift_sentence([f for f in findings if f.vehicle == v])[0]
+            for v in {f.vehicle for f in findings}
+        }
+        unsure = sum(status != "GREEN" for status in quiet.values())
+        if not unsure:
+            return "GREEN", f"No sensor moved on {_count(vehicles, 'vehicle')}."
+        where = f"on {unsure} of {_count(vehicles, 'vehicle')}"
+        return "UNKNOWN", f"No change seen, but {where} the days so far could hide one that matters."
     red = [v for v in views if v.status == "RED"]
     named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in (red or views)[:3]]
     more = "" if len(views) <= 3 else f" and {len(views) - 3} more"

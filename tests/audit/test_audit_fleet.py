@@ -63,10 +63,10 @@ def test_a_knocked_radar_is_found_on_its_vehicle_sensor_and_day(tmp_path: Path, 
 
 def test_a_vehicle_raises_no_more_false_alarms_than_its_budget(maker: ModuleType) -> None:
     rng = np.random.default_rng(2)
-    config = AuditConfig(false_alarms_per_1000_vehicle_days=100.0)  # 0.1 per audit: 300 audits can tell
+    config = AuditConfig(false_alarms_per_1000_vehicle_days=200.0)  # 0.2 per audit: 120 audits can tell
     from pipeline.store.current import transform_of
 
-    trials, alarms = 300, 0
+    trials, alarms = 120, 0
     for _ in range(trials):
         records = maker.vehicle_records("v", 4, rng)
         pairs = {}
@@ -81,7 +81,7 @@ def test_a_vehicle_raises_no_more_false_alarms_than_its_budget(maker: ModuleType
             )
         verdict = judge_vehicle(pairs, {}, config)
         alarms += any(v.change for v in verdict.charts.values())
-    assert 0 < alarms <= trials * 0.1 + 3 * np.sqrt(trials * 0.1 * 0.9)
+    assert 0 < alarms <= trials * 0.2 + 3 * np.sqrt(trials * 0.2 * 0.8)
 
 
 def test_a_slow_drift_of_the_camera_is_told_from_a_knock(tmp_path: Path, maker: ModuleType) -> None:
@@ -129,8 +129,8 @@ def test_a_knock_so_large_that_every_later_day_is_held_is_still_told(
         ),
     )  # fmt: skip
     yaw = next(f for f in audit_fleet(lake, _fleet("v")) if (f.pair, f.dof) == ("lidar_radar", "rz"))
-    assert (yaw.status, yaw.start_day, yaw.moved_sensor) == ("YELLOW", "2026-03-04", "radar")
-    assert "held" in yaw.reason
+    assert (yaw.status, yaw.start_day, yaw.moved_sensor) == ("RED", "2026-03-04", "radar")
+    assert "rests on days whose calibration was held" in yaw.reason
 
 
 def test_a_vehicle_that_drives_on_without_estimates_says_so(tmp_path: Path, maker: ModuleType) -> None:

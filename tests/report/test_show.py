@@ -1,0 +1,68 @@
+"""`boresight show`: records as JSON and nothing else."""
+
+import json
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from jobs.show import show
+from pipeline.geometry.se3 import from_quaternion
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import write_records
+from schemas.calibrations import CALIBRATIONS
+
+
+@pytest.fixture
+def lake(tmp_path: Path, maker: ModuleType) -> Path:
+    """Two days of one vehicle, the first calibrated twice; the second refused."""
+    rng = np.random.default_rng(1)
+    for key in ("first", "second"):
+        rows = maker.vehicle_records("v", 1, rng)
+        write_records(Lake.at(tmp_path), CALIBRATIONS, Partition("v", rows[0].day), rows, key, "0.1.0")
+    rows = [
+        r for r in maker.vehicle_records("v", 2, rng, status=lambda _: "refused") if r.day == "2026-03-02"
+    ]
+    write_records(Lake.at(tmp_path), CALIBRATIONS, Partition("v", "2026-03-02"), rows, "third", "0.1.0")
+    return tmp_path
+
+
+def test_json_has_every_column_and_the_transform_as_a_matrix(
+    lake: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert show("calibrations", lake=str(lake), json=True) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) == 9
+    for row in rows:
+        assert set(row) == {c.name for c in CALIBRATIONS.columns} | {"T"}
+        if row["status"] == "refused":
+            assert row["T"] is None
+            continue
+        q, t = [row[f"q{k}"] for k in "wxyz"], [row[f"t{k}_m"] for k in "xyz"]
+        np.testing.assert_allclose(row["T"], from_quaternion(np.array(q), np.array(t)), atol=1e-12)
+        assert np.shape(row["covariance"]) == (6, 6)
+
+
+def test_filters_choose_vehicle_day_and_method(lake: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for kwargs, count in (
+        ({"vehicle": "v", "day": "2026-03-01"}, 6),
+        ({"vehicle": "v", "day": "2026-03-01", "current": True}, 3),
+        ({"method": "tracking"}, 0),
+        ({"vehicle": "w"}, 0),
+    ):
+        assert show("calibrations", lake=str(lake), json=True, **kwargs) == 0
+        assert len(json.loads(capsys.readouterr().out)) == count
+
+
+def test_a_lake_without_records_is_an_empty_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for table in ("calibrations", "drift", "frames", "observations"):
+        assert show(table, lake=str(tmp_path / "none"), json=True) == 0
+        assert json.loads(capsys.readouterr().out) == []
+
+
+def test_the_table_for_people_names_status_and_reason(lake: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert show("calibrations", lake=str(lake)) == 0
+    text = capsys.readouterr().out
+    assert "calibrations: 9 rows" in text
+    assert "refused" in text
