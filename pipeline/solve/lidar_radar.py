@@ -63,6 +63,7 @@ _DT_FLOOR_S = 0.002  # halves of a real day differed by 3 ms where resampling sa
 # of roll and 1-2 deg of pitch; simulation with 0.4 deg showed 0.3 deg. z by the same angle at 10 m.
 _ROLL_SPACINGS, _PITCH_SPACINGS, _Z_DISTANCE_M = 2.5, 0.8, 10.0
 _DEFAULT_SPACING_RAD = np.radians(1.0)
+_CAMERA_SIGMA_RAD = np.radians(0.5)  # a camera less sure than what its boxes tell is left out
 _AZIMUTH_RANGE_DOF = np.array([2, 3, 4, 6])
 _ELEVATION_DOF = np.array([0, 1, 5])
 _DOF_UNITS = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
@@ -156,6 +157,11 @@ def estimate_lidar_radar(
         raise SolveError(
             f"lidar-radar needs {_FEWEST_FRAMES} frames with static detections, the day has {frames.count}"
         )
+    if (
+        covariance_camera_lidar is not None
+        and np.diag(covariance_camera_lidar)[:3].max() > _CAMERA_SIGMA_RAD**2
+    ):
+        T_camera_lidar = None  # its own error would go into roll and pitch
     problem = _Problem(
         observations,
         frames,
