@@ -20,6 +20,7 @@ def simulate(
     environments: Literal["mixed", "urban", "highway"] = "mixed",
     container: Literal["mcap", "ros1", "db3", "mixed"] = "mcap",
     faults: str = "",
+    remount_deg: float | None = None,
     reflectors: bool = False,
     seed: int = 1,
     workers: int = 1,
@@ -38,6 +39,8 @@ def simulate(
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
         faults: vehicle:day:sensor:kind:amount, several with commas; kinds: yaw pitch roll [deg], x y z [m],
             drift-... per day, time [s], missing, swap, intrinsics, labels, night, few.
+        remount_deg: sd per axis by which every day's mounting differs from the day before, as when a rig is taken off
+            every evening; fixed sensors move by hundredths of a degree, which is the default.
         reflectors: also record three corner reflectors on every vehicle's last day, under OUT/reflectors.
         seed: same seed, same logs.
         workers: processes.
@@ -59,6 +62,7 @@ def simulate(
         container=container,
         faults=named,
         seed=seed,
+        remount_deg=remount_deg,
     )
     with progress_reporter(f"simulate {vehicles} x {days}") as progress:
         result = simulate_fleet(spec, out, progress, workers)

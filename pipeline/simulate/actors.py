@@ -166,7 +166,7 @@ def _truck(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
         colour,
     )
     axles = (-half + 1.0, -half + 2.2, half - 1.3) if cargo > 7.5 else (-half + 1.5, half - 1.3)
-    _wheels(b, axles, w, 0.5, "truck_tyre", "truck_tyre")
+    _wheels(b, axles, w + 0.03, 0.5, "truck_tyre", "truck_tyre")
     for side in (-1, 1):
         b.box((-half, side * (w - 0.25), 0.95), (0.08, 0.4, 0.18), "truck_tail")
     b.box((-half - 0.02, 0, 0.62), (0.10, 2.3, 0.14), "truck_paint", (0.3, 0.3, 0.3))
@@ -186,7 +186,7 @@ def _bus(b: MeshBuilder, colour: Colour) -> None:
     for x in np.linspace(-half + 1.4, half - 1.4, 7):
         for side in (-1, 1):
             b.box((float(x), side * (w - 0.01), 1.85), (0.12, 0.06, 1.2), "bus_paint", colour)
-    _wheels(b, (-half + 2.6, half - 2.6), w, 0.48, "bus_tyre", "bus_tyre")
+    _wheels(b, (-half + 2.6, half - 2.6), w + 0.03, 0.48, "bus_tyre", "bus_tyre")
 
 
 def _person(b: MeshBuilder, rng: np.random.Generator, cloth: str, stride_m: float, seated: bool) -> None:

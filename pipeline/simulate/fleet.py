@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
 from multiprocessing import get_context
 from pathlib import Path
@@ -49,6 +49,7 @@ class FleetSpec:
     container: str = "mcap"  # mcap, ros1, db3, mixed
     faults: tuple[Fault, ...] = ()
     seed: int = 1
+    remount_deg: float | None = None  # sd per axis and day; None = the rig's (fixed sensors: hundredths)
     semantics: SemanticsSpec = field(default_factory=SemanticsSpec)
 
     def __post_init__(self) -> None:
@@ -169,7 +170,11 @@ def simulate_vehicle_day(
 
 def mounting_on(spec: FleetSpec, vehicle: int, day: int) -> Mounting:
     """Where the sensors of a vehicle are on a day, faults included."""
-    mounting = mounting_of(rig_named(spec.rig), spec.seed, vehicle, day)
+    rig = rig_named(spec.rig)
+    if spec.remount_deg is not None:  # the paper takes its rig off every evening: lever arms move along
+        shift_m = rig.remount_translation_m * max(spec.remount_deg / rig.remount_rotation_deg, 1.0) / 4
+        rig = replace(rig, remount_rotation_deg=spec.remount_deg, remount_translation_m=shift_m)
+    mounting = mounting_of(rig, spec.seed, vehicle, day)
     return shaken(mounting, spec.faults, vehicle_names(spec)[vehicle], day)
 
 

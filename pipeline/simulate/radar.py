@@ -209,7 +209,7 @@ def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: n
     aer_image = to_spherical(transform_points(inverse(T_vehicle_radar), image))
     n = len(cells.snr)
     mirror = (
-        0.75 * rng.random(n) * np.exp(1j * rng.uniform(0, 2 * np.pi, n)) * (~cells.ground & (height > 0.15))
+        0.6 * rng.random(n) * np.exp(1j * rng.uniform(0, 2 * np.pi, n)) * (~cells.ground & (height > 0.15))
     )
     apart = aer_image[:, 1] - cells.aer[:, 1]
     resolved = np.abs(apart) > np.radians(spec.elevation_resolution_deg)

@@ -64,6 +64,12 @@ def test_the_daily_remount_is_small_beside_a_knock():
     assert 0.005 < np.mean(turns) < 0.15
 
 
+def test_a_rig_that_is_taken_off_every_evening_comes_back_otherwise():
+    spec = FleetSpec(**QUIET, remount_deg=0.5)
+    first, second = (mounting_on(spec, 0, day).truth()["T_lidar_radar"] for day in (0, 1))
+    assert 0.2 < np.degrees(np.linalg.norm(log_so3((first @ inverse(second))[:3, :3]))) < 4.0
+
+
 @pytest.fixture
 def logged(read, the_log):
     def run(spec, out):
