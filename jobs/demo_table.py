@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["print_comparison"]
 
+_WIDTH = 124  # of the table; a narrower terminal wraps lines, which reads better than cut names
 _STATUS = {"accepted": "[green]accepted[/]", "held": "[yellow]held[/]", "refused": "[yellow]refused[/]"}
 
 
@@ -44,7 +45,8 @@ def print_comparison(
     found = current_records(
         [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, day=day) if r.method == method]
     )
-    console = Console(highlight=False, width=None if Console().is_terminal else 120)
+    console = Console(highlight=False)
+    console.width = max(console.width, _WIDTH)
     table, errors = _table(day), []
     for record in found:
         T_true = truth[record.vehicle, record.day][record.pair]
@@ -73,7 +75,7 @@ def _table(day: str) -> Table:
         table.add_column(name, no_wrap=True)
     for axis in "xyz":
         table.add_column(f"{axis} true", justify="right", no_wrap=True, style="cyan")
-        table.add_column("estimate ± 1σ", justify="right", no_wrap=True)
+        table.add_column("estimate, sigma", justify="right", no_wrap=True)
     return table
 
 
