@@ -96,6 +96,7 @@ def first_field(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray | None
     return None
 
 
+@np.errstate(all="ignore")  # damaged numbers become inf or nan, and those are dropped
 def read_lidar(message: Any, stamp_ns: int, max_range_m: float) -> LidarCloud:
     """A sweep's finite points within range; intensity, ring and time where the cloud has them.
 
@@ -109,8 +110,7 @@ def read_lidar(message: Any, stamp_ns: int, max_range_m: float) -> LidarCloud:
     """
     points = cloud_columns(message)
     x, y, z = _coordinates(points)
-    with np.errstate(over="ignore", invalid="ignore"):
-        range2 = x * x + y * y + z * z
+    range2 = x * x + y * y + z * z
     keep, dropped = _within(range2, max_range_m)
     intensity, ring = first_field(points, _INTENSITY), first_field(points, _RING)
     return LidarCloud(
@@ -130,8 +130,7 @@ def _coordinates(points: np.ndarray) -> list[Float32[np.ndarray, " N"]]:
         raise ValueError(f"no fields x, y, z; there are {', '.join(names) or 'none'}")
     if any(points[n].ndim > 1 for n in "xyz"):
         raise ValueError("a field of x, y, z holds more than one value a point")
-    with np.errstate(over="ignore", invalid="ignore"):  # a float64 beyond float32 becomes inf and is dropped
-        return [points[n].astype(np.float32) for n in "xyz"]
+    return [points[n].astype(np.float32) for n in "xyz"]
 
 
 def _within(

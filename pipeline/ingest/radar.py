@@ -30,6 +30,7 @@ class RadarCloud:
     dropped: Counter[str] = field(default_factory=Counter)
 
 
+@np.errstate(all="ignore")  # damaged numbers become inf or nan, and those are dropped
 def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
     """Detections of one radar message, those that are not finite or at no range dropped and counted.
 
@@ -44,8 +45,7 @@ def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
     """
     kind = msgtype.rsplit("/", 1)[-1]
     xyz, range_rate, power = {"RadarScan": _scan, "RadarTracks": _tracks}.get(kind, _cloud)(message, config)
-    with np.errstate(over="ignore", invalid="ignore"):
-        range2 = np.einsum("ij,ij->i", xyz, xyz)
+    range2 = np.einsum("ij,ij->i", xyz, xyz)
     keep, dropped = _within(range2, range_rate)
     xyz = xyz[keep]
     return RadarCloud(
@@ -106,11 +106,9 @@ def _scan(message: Any, config: RadarTopics) -> _Columns:
     ).reshape(-1, 5)
     distance, azimuth, elevation, doppler, amplitude = raw.T
     azimuth = azimuth if config.azimuth_positive == "left" else -azimuth
-    with np.errstate(over="ignore", invalid="ignore"):
-        xyz = distance[:, None] * np.stack(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
-            axis=1,
-        )
+    level = np.cos(elevation)
+    directions = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
+    xyz = distance[:, None] * directions
     return xyz, _receding(doppler, config), amplitude
 
 
@@ -121,8 +119,7 @@ def _tracks(message: Any, _config: RadarTopics) -> _Columns:
     velocity = np.array(
         [(t.velocity.x, t.velocity.y, t.velocity.z) for t in message.tracks], np.float64
     ).reshape(-1, 3)
-    with np.errstate(all="ignore"):
-        range_rate = np.einsum("ij,ij->i", xyz, velocity) / np.linalg.norm(xyz, axis=1)
+    range_rate = np.einsum("ij,ij->i", xyz, velocity) / np.linalg.norm(xyz, axis=1)
     return xyz, range_rate, None
 
 

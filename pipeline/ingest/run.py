@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,11 +11,11 @@ from jaxtyping import Int64
 
 from pipeline.config import FleetConfig, IngestConfig, Rig, config_hash
 from pipeline.errors import ConfigError, ContractError
-from pipeline.geometry.se3 import from_rotation_translation
 from pipeline.ingest.index import DayIndex, index_logs, topics_of
 from pipeline.ingest.messages import FrameBuilder, Rejected, Trio
 from pipeline.ingest.readers import content_identity
 from pipeline.ingest.sync import Rejection, match_nearest, match_trios, number_drives
+from pipeline.prior import read_transforms
 from pipeline.results import Progress, StageResult, silent
 from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.tables import Manifest, read_manifest, write_partition
@@ -157,23 +156,8 @@ def read_file_prior(rig: Rig, fleet_file: str) -> tuple[np.ndarray, np.ndarray] 
     """
     if rig.prior.file is None:
         return None
-    path = Path(fleet_file).parent / rig.prior.file
-    try:
-        raw = json.loads(path.read_text())
-        found = [np.array(raw[name], np.float64) for name in ("T_camera_lidar", "T_lidar_radar")]
-    except (OSError, ValueError, KeyError, TypeError) as err:
-        raise ConfigError(str(path), "", f"is no prior file: {type(err).__name__}: {err}") from err
-    for name, T in zip(("T_camera_lidar", "T_lidar_radar"), found, strict=True):
-        rigid = (
-            T.shape == (4, 4)
-            and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-4)
-            and np.linalg.det(T[:3, :3]) > 0
-        )
-        if not rigid or not np.allclose(T[3], [0, 0, 0, 1]):
-            raise ConfigError(str(path), name, "is no rigid 4x4 transform")
-    return from_rotation_translation(found[0][:3, :3], found[0][:3, 3]), from_rotation_translation(
-        found[1][:3, :3], found[1][:3, 3]
-    )
+    transforms = read_transforms(Path(fleet_file).parent / rig.prior.file)
+    return transforms["camera_lidar"], transforms["lidar_radar"]
 
 
 def _manifest(lake: Lake, partition: Partition) -> Manifest | None:

@@ -246,7 +246,7 @@ def test_a_prior_file_stands_in_for_tf_static_and_enters_the_work_key(kit, tmp_p
     file = tmp_path / "prior.json"
     fleet = kit.fleet(prior={"source": "file", "file": "prior.json"})
     toml = str(tmp_path / "fleet.toml")
-    with pytest.raises(ConfigError, match="no prior file"):
+    with pytest.raises(ConfigError, match=r"prior\.json"):
         run_ingest(log, fleet=fleet, file=toml)
     file.write_text(json.dumps({"T_camera_lidar": T.tolist(), "T_lidar_radar": np.eye(4).tolist()}))
     first, frames = run_ingest(log, fleet=fleet, file=toml)
@@ -257,5 +257,5 @@ def test_a_prior_file_stands_in_for_tf_static_and_enters_the_work_key(kit, tmp_p
     assert run_ingest(log, fleet=fleet, file=toml)[0].work_key != first.work_key
     T[0, 0] = 2.0
     file.write_text(json.dumps({"T_camera_lidar": T.tolist(), "T_lidar_radar": np.eye(4).tolist()}))
-    with pytest.raises(ConfigError, match="no rigid"):
+    with pytest.raises(ConfigError, match="no rotation"):
         run_ingest(log, fleet=fleet, file=toml)

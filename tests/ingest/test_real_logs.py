@@ -115,6 +115,6 @@ def test_check_finds_the_day_fit_and_notices_a_wrong_doppler_sign(logs):
     assert report.evidence.doppler_doubt == ""
     assert {v.verdict for v in report.verdicts if v.pair == "camera_lidar"} == {"yes", "weak"}
     wrong = rig.model_copy(update={"radar": rig.radar.model_copy(update={"doppler_positive": "receding"})})
-    assert 'probably "approaching"' in check_logs(logs, wrong, fleet.ingest).evidence.doppler_doubt
+    assert 'probably "approaching"' in check_logs(logs[:1], wrong, fleet.ingest).evidence.doppler_doubt
     short = rig.model_copy(update={"radar": rig.radar.model_copy(update={"doppler_period_mps": 5.0})})
-    assert "doppler_period_mps = 5" in check_logs(logs, short, fleet.ingest).evidence.doppler_doubt
+    assert "doppler_period_mps = 5" in check_logs(logs[:1], short, fleet.ingest).evidence.doppler_doubt
