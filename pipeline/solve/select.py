@@ -23,10 +23,10 @@ from pipeline.errors import SolveError
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS
 from schemas.observations import Observation
 
-__all__ = ["MIN_FRAMES", "MIN_HOLDOUT", "Selection", "hold_out", "select_frames", "unmet_conditions"]
+__all__ = ["MIN_FRAMES", "Selection", "hold_out", "missing_content", "select_frames", "unmet_conditions"]
 
 MIN_FRAMES = 8  # fewer carry no calibration: 10 frames already scatter by 0.1 deg (evidence on the real logs)
-MIN_HOLDOUT = 3
+_SCARCE, _BRISK_MPS = 0.1, 5.0
 _BLOCKS_S = (10.0, 7.0, 5.0, 4.0, 3.0, 20.0)
 _JUDGING_BLOCKS = 4
 # What makes a frame worth having, by pair.
@@ -87,6 +87,7 @@ def select_frames(
         passed[pair] = sum(1 for r in reasons if not r)
         rejected[pair] = _count_rejected(reasons, held, chosen, paper=paper)
         notes[pair] = _notes(pair, passed[pair], [i for i in chosen if reasons[i]], len(chosen), paper=paper)
+        notes[pair] += missing_content([observations[i] for i in chosen], pair)
     return Selection(fit, holdout, passed, rejected, notes)
 
 
@@ -112,6 +113,25 @@ def unmet_conditions(
         or (radar and not len(observation.radar_xyz_m)),
     }
     return [name for name, is_unmet in unmet.items() if is_unmet]
+
+
+def missing_content(observations: Sequence[Observation], pair: str) -> list[str]:
+    """What the chosen frames lack for a pair, in words: what to drive next time."""
+    missing = []
+    speeds = np.array([abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None])
+    if len(speeds) and np.mean(speeds > _BRISK_MPS) < _SCARCE:
+        missing.append(f"hardly a frame faster than {_BRISK_MPS:.0f} m/s: time offsets stay unknown")
+    if "radar" in FRAMES_OF_PAIR[pair]:
+        if np.mean([len(o.radar_track_xyz_m) > 0 for o in observations]) < _SCARCE:
+            missing.append("hardly any moving road users for the radar")
+        if not any(o.radar_has_elevation for o in observations):
+            missing.append("the radar measures no elevation: its roll, pitch and height stay at the prior")
+    if (
+        "camera" in FRAMES_OF_PAIR[pair]
+        and np.mean([len(o.road_user_boxes_px) > 0 for o in observations]) < _SCARCE
+    ):
+        missing.append("hardly any road users in the images")
+    return missing
 
 
 def hold_out(observations: Sequence[Observation], fraction: float) -> list[bool | None]:

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.config import SelectConfig
 from pipeline.errors import SolveError
-from pipeline.solve.select import MIN_FRAMES, hold_out, select_frames, unmet_conditions
+from pipeline.solve.select import MIN_FRAMES, hold_out, missing_content, select_frames, unmet_conditions
 from schemas.calibrations import PAIRS
 from tests.solve_scenes import make_day
 
@@ -93,6 +93,15 @@ def test_where_the_paper_leaves_too_few_frames_the_nearest_fill_up_and_the_recor
     assert len(chosen.fit["camera_lidar"]) == 30
     assert "hold for 4 frames" in chosen.notes["camera_lidar"][0]
     assert chosen.notes["lidar_radar"] == []
+
+
+def test_what_the_drive_lacks_is_said_per_pair(day):
+    assert all(missing_content(day, pair) == [] for pair in PAIRS)
+    slow = [make_changed(o, ego_speed_mps=1.0, radar_has_elevation=False) for o in day]
+    assert "time offsets" in missing_content(slow, "camera_lidar")[0]
+    assert "no elevation" in missing_content(slow, "lidar_radar")[1]
+    empty = [make_changed(o, radar_track_xyz_m=np.zeros((0, 3), np.float32)) for o in day]
+    assert missing_content(empty, "lidar_radar") == ["hardly any moving road users for the radar"]
 
 
 def test_too_few_frames_are_an_error_that_names_the_pair_and_the_reasons():

@@ -1,0 +1,139 @@
+"""The commands calibrate and evaluate: what they print, what they return."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jobs.calibrate import calibrate, parse_perturb
+from jobs.evaluate import evaluate
+from pipeline.errors import ConfigError
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import write_partition
+from pipeline.verify.targets import DEFAULT_TARGETS
+from schemas.observations import OBSERVATIONS
+from tests.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+
+FLEET = """
+[fleet]
+name = "f"
+[rigs.default.camera]
+image = "/i"
+info = "/c"
+semantics = { source = "topics", labels = "/l", detections = "/d" }
+[rigs.default.lidar]
+points = "/p"
+[rigs.default.radar]
+points = "/r"
+[vehicles.v]
+[select]
+frames = 12
+[solve]
+paper_population = 12
+paper_generations = 5
+"""
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("work")
+    (folder / "fleet.toml").write_text(FLEET)
+    with write_partition(
+        Lake.at(folder / "lake"), OBSERVATIONS, Partition("v", "2024-05-06"), "k", "0"
+    ) as writer:
+        writer.append(make_day(24))
+        writer.describe(kept={}, rejected={})
+    truth = {"T_camera_lidar": T_CAMERA_LIDAR.tolist(), "T_lidar_radar": T_LIDAR_RADAR.tolist()}
+    (folder / "truth" / "v").mkdir(parents=True)
+    (folder / "truth" / "v" / "2024-05-06.json").write_text(json.dumps(truth))
+    return folder
+
+
+def run(workplace, day="2024-05-06"):
+    return calibrate(
+        fleet=workplace / "fleet.toml",
+        lake=str(workplace / "lake"),
+        vehicle="v",
+        day=day,
+        method="pairwise-optimisation",
+        perturb="1,0.05",
+        seed=2,
+    )
+
+
+def last_line(capsys):
+    return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+
+
+def test_calibrate_ends_with_one_summary_and_the_code_of_its_verdicts(workplace, capsys):
+    code = run(workplace)
+    summary = last_line(capsys)
+    assert summary["status"] == "done"
+    assert sum(summary["pairs"].values()) == 3
+    assert code == (3 if summary["pairs"]["held"] else 0)
+    assert run(workplace) == code
+    assert last_line(capsys)["status"] == "cached"
+
+
+def test_a_day_without_observations_returns_3(workplace, capsys):
+    assert run(workplace, day="2024-01-01") == 3
+    assert last_line(capsys)["pairs"] == {"accepted": 0, "held": 0, "refused": 3}
+
+
+def test_evaluate_compares_with_a_folder_or_a_file_of_truth_and_writes_the_table(workplace, capsys):
+    run(workplace)
+    out = workplace / "table.md"
+    assert evaluate(lake=str(workplace / "lake"), truth=workplace / "truth", out=out) == 0
+    summary = last_line(capsys)
+    assert summary["runs"] == 1
+    assert "| pairwise-optimisation | all | 1 |" in out.read_text()
+    file = workplace / "truth" / "v" / "2024-05-06.json"
+    assert evaluate(lake=str(workplace / "lake"), truth=file) == 0
+
+
+def test_evaluate_reads_picked_reflectors(workplace):
+    run(workplace)
+    pixels = CAMERA.project(transform_points(T_CAMERA_LIDAR, DEFAULT_TARGETS))[0]
+    radar = transform_points(inverse(T_LIDAR_RADAR), DEFAULT_TARGETS)
+    columns = zip(pixels, DEFAULT_TARGETS, radar, strict=True)
+    content = {
+        "camera": {"model": "plumb_bob", "K": CAMERA.K.tolist(), "D": [], "width_px": 640, "height_px": 320},
+        "targets": [{"pixel": [*p], "lidar_m": [*q], "radar_m": [*r]} for p, q, r in columns],
+    }
+    path = workplace / "picks.json"
+    path.write_text(json.dumps(content))
+    by_truth, by_picks = workplace / "a.md", workplace / "b.md"
+    evaluate(lake=str(workplace / "lake"), truth=workplace / "truth", out=by_truth)
+    assert evaluate(lake=str(workplace / "lake"), reflectors=path, out=by_picks) == 0
+    rows = [
+        next(line for line in f.read_text().splitlines() if "| pairwise-opt" in line)
+        for f in (by_truth, by_picks)
+    ]
+    numbers = [np.array([float(v) for v in row.split("|")[4].split("/")]) for row in rows]
+    np.testing.assert_allclose(*numbers, atol=0.05)
+    path.write_text(json.dumps(content | {"targets": [{"pixel": [1, 2]}]}))
+    with pytest.raises(ConfigError, match="no readable reflector file"):
+        evaluate(lake=str(workplace / "lake"), reflectors=path)
+
+
+def test_evaluate_wants_exactly_one_kind_of_truth(workplace):
+    with pytest.raises(ConfigError, match="either --truth or --reflectors"):
+        evaluate(lake=str(workplace / "lake"))
+
+
+def test_records_without_a_truth_are_counted_not_compared(workplace, capsys, tmp_path):
+    run(workplace)
+    assert evaluate(lake=str(workplace / "lake"), truth=tmp_path) == 3
+    assert last_line(capsys)["runs_without_truth"] >= 1
+
+
+@pytest.mark.parametrize("text", ["2", "2,0.1,3", "a,b", "-1,0", "200,0", "1,nan"])
+def test_perturb_must_be_two_possible_numbers(text):
+    with pytest.raises(ConfigError, match="perturb"):
+        parse_perturb(text)
+
+
+def test_perturb_is_degrees_and_metres():
+    assert parse_perturb("2,0.1") == (2.0, 0.1)
+    assert parse_perturb(None) is None
