@@ -129,7 +129,11 @@ def index_logs(paths: Sequence[Path], rig: Rig, *, survey: bool = False) -> DayI
             continue
         index.log_names.append(path.name)
         index.trees.append(TransformTree())
-        _index_log(index, len(index.logs) - 1, topics, survey=survey)
+        try:
+            _index_log(index, len(index.logs) - 1, topics, survey=survey)
+        except OSError as err:  # a disk or share that fails half-way: what was read so far counts
+            index.complain(f"{path}: cannot be read further: {err}")
+            index.damage["logs_lost_while_reading"] += 1
     for topic, role in topics.items():
         if role in _NEEDED and topic not in index.topics_seen:
             index.complain(f"topic {topic} ({role}) has no message in any log")

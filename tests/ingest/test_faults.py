@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigError
+from pipeline.ingest.mcap_log import McapLog
 from pipeline.ingest.sync import Rejection
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest
@@ -38,6 +39,23 @@ def test_one_bad_log_does_not_cost_the_others(kit, tmp_path, run_ingest):
     assert (result.status, len(frames)) == ("done", 4)
     assert result.rejected["unreadable_logs"] == 1
     assert "bad.bag" in result.reason
+
+
+def test_a_disk_that_fails_half_way_costs_the_rest_of_the_log(kit, tmp_path, run_ingest, monkeypatch):
+    log = kit.Kit(frames=20).drive().mcap(tmp_path / "a.mcap")
+    whole, reads = McapLog._content, []
+
+    def failing(self, start, length):
+        reads.append(start)
+        if len(reads) == 30:
+            raise OSError(5, "Input/output error")
+        return whole(self, start, length)
+
+    monkeypatch.setattr(McapLog, "_content", failing)
+    result, frames = run_ingest(log)
+    assert 0 < len(frames) < 20
+    assert "Input/output error" in result.reason
+    assert result.rejected["logs_lost_while_reading"] == 1
 
 
 @pytest.mark.parametrize("container", ["mcap", "bag", "db3"])
