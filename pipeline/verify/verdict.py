@@ -67,7 +67,8 @@ def judge(
     if not calibrated:
         return Verdict("held", "not triggered: the prior stays")
     if estimate.frames_used < limits.min_frames:
-        return Verdict("refused", f"too few frames: {estimate.frames_used}, needs {limits.min_frames}")
+        few = f"too few frames: {estimate.frames_used}, needs {limits.min_frames}"
+        return Verdict("refused", "; ".join([*doubts, few]))
     reasons = [*doubts, *_range_reasons(estimate, T_prior, prior_covariance, limits)]
     if not estimate.observable.any():
         reasons.append("the day determines no degree of freedom")

@@ -100,6 +100,8 @@ def test_a_composed_pair_is_as_good_as_its_factors():
 def test_too_few_frames_are_refused():
     found = verdict(replace(estimate(1.0), frames_used=3), BETTER)
     assert (found.status, found.reason) == ("refused", "too few frames: 3, needs 8")
+    why = verdict(replace(estimate(1.0), frames_used=0), BETTER, doubts=["hardly any depth edges"]).reason
+    assert why == "hardly any depth edges; too few frames: 0, needs 8"
 
 
 def test_an_untriggered_pair_keeps_the_prior():
