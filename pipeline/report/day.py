@@ -19,8 +19,8 @@ __all__ = ["DofRow", "PairView", "answer_for", "drift_sentence", "pair_view", "s
 _SAID_BY_THE_AXES = "not determined by the day"  # the page lists those axes by name
 _ADVICE = {
     "accepted": "use it",
-    "held": "keep the prior",
-    "refused": "keep the prior",
+    "held": "do not use it",
+    "refused": "nothing to use",
 }
 
 
@@ -120,19 +120,21 @@ def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFind
         findings: the vehicle's current findings.
     """
     accepted = [v.title for v in views if v.status == "accepted"]
-    moved = next(
-        (f for f in findings if f.moved_sensor and f.status == "RED" and (f.start_day or "") > day), None
-    )
+    other = [v.title for v in views if v.status != "accepted"]
+    moved = next((f for f in findings if f.moved_sensor and f.status == "RED"), None)
+    sensor = moved.moved_sensor if moved else None
+    touched = [t for t in (v.title for v in views) if sensor in t.split("-")]
+    if moved is not None and (moved.start_day or "") > day and set(touched) & set(accepted):
+        left = [t for t in accepted if t not in touched]
+        still = f" Only {', '.join(left)} still holds." if left else ""
+        return "bad", f"Not any more. The {sensor} moved on {moved.start_day}, after this day.{still}"
+    unsafe = [t for t in other if t in touched]
+    if moved is not None and unsafe:
+        first = f"Only {', '.join(accepted)} may be used." if accepted else "No."
+        why = f"the {sensor} moved on {moved.start_day}, and this day's numbers were not accepted"
+        return "bad", f"{first} Nothing is safe for {', '.join(unsafe)}: {why}."
     if not accepted:
         return "bad", "No. Nothing was accepted: keep the transforms that the car has."
-    if moved is not None:
-        left = [t for t in accepted if moved.moved_sensor not in t.split("-")]
-        still = f" Only {', '.join(left)} still holds." if left else ""
-        return (
-            "bad",
-            f"Not any more. The {moved.moved_sensor} moved on {moved.start_day}, after this day.{still}",
-        )
-    other = [v.title for v in views if v.status != "accepted"]
     if not other:
         return "good", "Yes. All pairs are accepted: they may go on the car, with the sigmas below."
     return "partly", f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."

@@ -108,7 +108,7 @@ def write_fleet_page(
         links: day pages by (vehicle, day), relative to `out`.
     """
     method = method or fleet.audit.method
-    records = _fleet_records(lake, method)
+    records = _fleet_records(lake, method, fleet.audit.window_days)
     findings = _drift(lake, method)
     days = sorted({r.day for r in records})
     views = finding_views(findings)
@@ -148,7 +148,9 @@ def write_fleet_report(
 ) -> list[Path]:
     """Write the fleet page and, in a folder beside it, the page of every vehicle-day; the fleet page comes first."""
     method = method or fleet.audit.method
-    partitions = sorted({Partition(r.vehicle, r.day) for r in _fleet_records(lake, method)})
+    partitions = sorted(
+        {Partition(r.vehicle, r.day) for r in _fleet_records(lake, method, fleet.audit.window_days)}
+    )
     folder = out.parent / f"{out.stem}_days"
     links, pages = {}, []
     for done, partition in enumerate(partitions):
@@ -172,9 +174,14 @@ def _day_records(lake: Lake, partition: Partition, method: str) -> dict[str, Cal
     return records
 
 
-def _fleet_records(lake: Lake, method: str) -> list[CalibrationRecord]:
-    records = read_records(lake, CALIBRATIONS, CalibrationRecord)
-    return current_records([r for r in records if r.method == method])
+def _fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:
+    """Current records of the last `window_days` days, as an audit sees them."""
+    records = [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
+    if not records:
+        return []
+    last = dt.date.fromisoformat(max(r.day for r in records))
+    first = (last - dt.timedelta(days=window_days - 1)).isoformat()
+    return current_records([r for r in records if r.day >= first])
 
 
 def _drift(lake: Lake, method: str, vehicle: str | None = None) -> list[DriftFinding]:

@@ -138,6 +138,32 @@ def test_a_day_page_answers_first_whether_its_numbers_can_be_trusted(
     assert body.index("answer") < body.index("axis by axis") < body.index("Provenance")
 
 
+def test_a_held_day_after_a_move_says_that_nothing_is_safe(maker: ModuleType, tmp_path: Path) -> None:
+    lake = Lake.at(tmp_path / "lake")
+    records = maker.vehicle_records(
+        "v", 5, np.random.default_rng(5), motion=lambda d: {"radar": 3 * KNOCK} if d > 2 else {}
+    )
+    _store(
+        lake,
+        [replace(r, status="held") if r.day > "2026-03-03" and "radar" in r.pair else r for r in records],
+    )
+    audit_fleet(lake, _config())
+    text = write_day_page(lake, Partition("v", "2026-03-05"), _config(), tmp_path / "d.html").read_text()
+    assert (
+        "Only camera-lidar may be used. Nothing is safe for camera-radar, lidar-radar: the radar moved"
+        in text
+    )
+
+
+def test_the_fleet_page_shows_the_window_and_not_all_of_history(maker: ModuleType, tmp_path: Path) -> None:
+    lake = Lake.at(tmp_path / "lake")
+    _store(lake, maker.vehicle_records("v", 31, np.random.default_rng(5)))
+    pages = write_fleet_report(lake, _config(), tmp_path / "fleet.html")
+    assert len(pages) == 1 + 28
+    assert "2026-03-03" not in pages[0].read_text()
+    assert "2026-03-04" in pages[0].read_text()
+
+
 def test_a_day_page_names_what_the_day_did_not_determine(
     fleet: tuple[Lake, Path, Path], tmp_path: Path
 ) -> None:
