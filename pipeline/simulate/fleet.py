@@ -112,10 +112,13 @@ def simulate_fleet(
     else:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
             jobs = {pool.submit(simulate_vehicle_day, spec, v, d, out): (v, d) for v, d in work}
-            for job in as_completed(jobs):
-                v, d = jobs[job]
-                logs, done = logs + job.result(), done + spec.frames
-                progress(done, total, f"{vehicles[v]} {days[d]}")
+            try:
+                for job in as_completed(jobs):
+                    v, d = jobs[job]
+                    logs, done = logs + job.result(), done + spec.frames
+                    progress(done, total, f"{vehicles[v]} {days[d]}")
+            finally:  # stopped or failed: days not begun yet need not be
+                pool.shutdown(wait=False, cancel_futures=True)
     return {
         "vehicles": vehicles,
         "days": days,

@@ -40,14 +40,22 @@ def log_name(stem: str, container: str) -> str:
 
 @contextmanager
 def open_log(path: Path, container: str) -> Iterator[tuple[Messages, Put]]:
-    """Open a log for writing, replacing an old one; yields the message factory and `put`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.is_dir():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
+    """Open a log for writing; yields the message factory and `put`.
+
+    It appears under its name, in place of an old one, only when it is whole.
+    """
+    aside = path.parent / f".partial-{path.name}"
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
     opener = {"mcap": _mcap, "ros1": _ros1, "db3": _db3}[container]
-    with opener(path) as pair:
-        yield pair
+    try:
+        with opener(aside / path.name) as pair:
+            yield pair
+        if path.is_dir():
+            shutil.rmtree(path)
+        (aside / path.name).replace(path)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 @contextmanager

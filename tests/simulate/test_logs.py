@@ -6,7 +6,7 @@ import pytest
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet, simulate_vehicle_day
-from pipeline.simulate.logs import TOPICS
+from pipeline.simulate.logs import CONTAINERS, TOPICS, log_name, open_log
 from pipeline.simulate.reflectors import simulate_reflectors
 
 SMALL = {"vehicles": 1, "days": 1, "frames": 2, "drives": 1, "environments": "urban"}
@@ -126,3 +126,21 @@ def test_reflectors_are_picked_where_all_sensors_agree_under_the_truth(tmp_path,
     assert np.abs(pixels - np.array(picks["truth"]["pixels"])).max() < 2
     messages = read(path.with_suffix(".mcap"))
     assert sum(topic == TOPICS["lidar"] for topic, _, _ in messages) == 12
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_a_log_that_is_broken_off_leaves_the_old_one_and_nothing_else(container, tmp_path, read):
+    path = tmp_path / log_name("drive", container)
+    nominal = {"lidar": np.eye(4)}
+    with open_log(path, container) as (messages, put):
+        put(TOPICS["tf"], 5, messages.transforms(5, nominal))
+    before = sorted(p for p in tmp_path.rglob("*"))
+
+    class StopError(Exception):
+        pass
+
+    with pytest.raises(StopError), open_log(path, container) as (messages, put):
+        put(TOPICS["tf"], 7, messages.transforms(7, nominal))
+        raise StopError
+    assert sorted(p for p in tmp_path.rglob("*")) == before
+    assert [stamp for _, stamp, _ in read(path)] == [5]
