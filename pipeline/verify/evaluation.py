@@ -125,7 +125,7 @@ def table_1(comparisons: Sequence[Comparison]) -> str:
 
 
 def _honesty(groups: Mapping[tuple[str, str], Sequence[Comparison]]) -> list[str]:
-    lines = []
+    lines: list[str] = []
     for (method, environment), members in groups.items():
         z = np.abs(np.concatenate([c.normalised for c in members]))
         if environment != "all" or not len(z):
