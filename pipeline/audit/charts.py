@@ -37,6 +37,7 @@ _START_DROP = 6.0
 _CLEAR_ODDS = 6.0
 _BLIND_SIGMAS = 2.0  # a chart sees a change that is at least this many sigmas of its best-placed split
 _LASTING = "a lasting change of a size that matters"
+_SUSPECT_SIGMAS = 3.0  # from here to the alarm threshold a chart is neither green nor an alarm
 _MIN_SCATTER_DAYS = 6  # successive differences below which their spread says nothing
 
 
@@ -184,6 +185,10 @@ def judge_chart(
         return ChartVerdict(status, reason, days, statistic, threshold, visible, change)
     if days <= baseline_days:
         reason = f"{_count(days)} of data, {baseline_days + 1} needed"
+        return ChartVerdict("UNKNOWN", reason, days, statistic, threshold, visible, None)
+    size, sigma = _step_sizes(chart)
+    if np.any((np.abs(size) > limit) & (np.abs(size) > _SUSPECT_SIGMAS * sigma)):
+        reason = "a change may have begun, but it is not sure enough for an alarm"
         return ChartVerdict("UNKNOWN", reason, days, statistic, threshold, visible, None)
     if visible > limit:
         reason = "no change seen, but one of the size that matters could hide in the sigmas"

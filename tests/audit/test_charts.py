@@ -148,6 +148,12 @@ def test_green_is_only_said_where_a_change_of_the_limit_would_be_seen() -> None:
     assert "could hide" in blind.reason
 
 
+def test_what_looks_like_a_change_but_is_not_sure_is_not_called_green() -> None:
+    verdict = judge_chart(_chart(np.array([0.0, 0.0, 0.36, 0.36]), 0.1), 0.25, PROBABILITY, 2)
+    assert (verdict.status, verdict.change) == ("UNKNOWN", None)
+    assert "may have begun" in verdict.reason
+
+
 @pytest.mark.parametrize("days", [0, 1, 2])
 def test_too_few_days_are_unknown(days: int) -> None:
     assert judge_chart(_chart(np.zeros(days), 0.01), 0.25, PROBABILITY, 2).status == "UNKNOWN"
