@@ -197,7 +197,7 @@ def _held_out_test(
     estimate = solution.pairs[pair]
     cost = alignment_of(pair, held, prior)
     dt_s = estimate.time_offset_s or 0.0
-    return paired_test(cost(prior.of(pair), dt_s), cost(estimate.T, dt_s), blocks_of(held, at_least=2))
+    return paired_test(cost(prior.of(pair), dt_s), cost(estimate.T, dt_s), blocks_of(held))
 
 
 def _spread(observations: Sequence[Observation], selection: Selection) -> list[Observation]:

@@ -26,7 +26,9 @@ class Limits:
     search_rotation_rad: float
     search_translation_m: float
     prior_sigmas: float = 4.0  # a move this large happens once in 16,000 days if the prior's sigma is right
-    z: float = 1.64  # one-sided 5 %
+    worse_z: float = 1.64  # one-sided 5 %: a right result is held by chance once in 20 days at most
+    # One-sided 16 %: short days hold out some ten frames, and 5 % would hold right results that moved by 10 cm.
+    better_z: float = 1.0
     agree_sigmas: float = 3.0
     min_frames: int = 8
     min_holdout: int = 3
@@ -143,7 +145,7 @@ def _holdout_reasons(
         return [
             f"too few held-out frames to judge: {0 if test is None else test.frames}, needs {limits.min_holdout}"
         ]
-    if abs(test.z) > limits.z:
+    if test.z > limits.worse_z or test.z < -limits.better_z:
         return _worse(test, limits)
     # Neither better nor worse: fine as long as the result says the same as the prior.
     sigma = np.sqrt(np.diag(estimate.covariance))
@@ -156,7 +158,7 @@ def _holdout_reasons(
 
 
 def _worse(test: HeldOutTest | None, limits: Limits) -> list[str]:
-    if test is None or test.z <= limits.z:
+    if test is None or test.z <= limits.worse_z:
         return []
     change = f"{test.after:.4g} after {test.before:.4g}, z = {test.z:.1f}"
     return [f"held-out frames align worse than at the prior ({change})"]
