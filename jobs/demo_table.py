@@ -54,6 +54,8 @@ def print_comparison(
         for row in _rows(record, T_true):
             table.add_row(*row)
     console.print(table)
+    for record in (r for r in found if r.status == "refused"):
+        console.print(f"[yellow]refused[/]  {record.vehicle} {record.pair}: {record.reason}")
     for line in _drift_lines(findings):
         console.print(line)
     return errors
@@ -85,7 +87,7 @@ def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
 
     T, T_prior = transform_of(record), prior_of(record)
     if T is None or T_prior is None or record.covariance is None:
-        return [[record.vehicle, record.pair, _STATUS[record.status], record.reason[:40]]]
+        return [[record.vehicle, record.pair, _STATUS[record.status]]]
     true, estimate = change_between(T_prior, T_true), change_between(T_prior, T)
     sigma = np.sqrt(np.diag(change_covariance(T, record.covariance)))
     seen = record.observable or [True] * 6

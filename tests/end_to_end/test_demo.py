@@ -18,7 +18,7 @@ def demo(tmp_path_factory):
 
 def run(out):
     return subprocess.run(
-        [BORESIGHT, "demo", "--out", str(out), "--frames", "8"],
+        [BORESIGHT, "demo", "--out", str(out), "--frames", "12"],
         capture_output=True,
         text=True,
         check=False,
