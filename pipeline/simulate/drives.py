@@ -202,7 +202,15 @@ class EgoMotion:
                 * (rng.random() < 0.5)
             )
         d = np.convolve(np.pad(d, 100, mode="edge"), np.hanning(201) / np.hanning(201).sum(), mode="valid")
-        return t, s, d, speed
+        ds, dd = np.gradient(s), np.gradient(d)
+        rolling = ds > 0.3 * _STEP_S  # slower, the wheels keep the direction that they had
+        slope = np.interp(t, t[rolling], dd[rolling] / ds[rolling])
+        return (
+            t,
+            s,
+            d,
+            np.convolve(np.pad(slope, 25, mode="edge"), np.hanning(51) / np.hanning(51).sum(), mode="valid"),
+        )
 
     def arc(self, t_s: float) -> float:
         """Arc length [m] at a time."""
@@ -213,14 +221,10 @@ class EgoMotion:
 
     def poses(self, t_s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4 4"]:
         """T_map_vehicle at times; the body pitches and rolls on its springs."""
-        h = 0.01
-        before, after = self._ground(t_s - h), self._ground(t_s + h)
-        here, step = self._ground(t_s), after - before
-        # Standing still there is no direction of travel: fall back to the road's.
-        road_heading = self.road.centre(self._arcs(t_s))[3]
-        moving = np.hypot(step[:, 0], step[:, 1]) > 0.2 * h
-        heading = np.where(moving, np.arctan2(step[:, 1], step[:, 0]), road_heading)
+        here = self._ground(t_s)
+        slope = np.interp(t_s, self._profile[0], self._profile[3])
         s = self._arcs(t_s)
+        heading = self.road.centre(s)[3] + np.arctan(slope)
         z = self.road.centre(np.stack([s - 1.3, s + 1.3]))[2]
         grade = np.arctan2(z[1] - z[0], 2.6)
         rough = 0.0035 if self.layout.environment == "urban" else 0.0018

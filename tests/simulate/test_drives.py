@@ -78,3 +78,19 @@ def test_odometry_tells_our_speed_within_a_percent_or_so():
     end, start = rows[-1][1][:3, 3], rows[0][1][:3, 3]
     path = drive.ego.poses(t[[0, -1]])[:, :3, 3]
     np.testing.assert_allclose(np.linalg.norm(end - start), np.linalg.norm(path[1] - path[0]), rtol=0.02)
+
+
+def test_we_drive_where_we_look_and_never_turn_on_the_spot():
+    stops = 0
+    for seed in range(6):
+        ego = Drive(seed, "urban", 60.0, 0).ego
+        t = np.arange(1.0, 59.0, 0.05)
+        velocity, omega = ego.velocities(t)
+        speed, forward = np.linalg.norm(velocity, axis=1), ego.poses(t)[:, :3, 0]
+        stops += np.any(speed < 0.05)
+        fast = speed > 3
+        across = np.linalg.norm(velocity[fast] - speed[fast, None] * forward[fast], axis=1) / speed[fast]
+        assert np.max(across) < 0.03
+        assert np.abs(omega[speed < 0.05]).max(initial=0) < 0.02
+        assert np.abs(omega[:, 2]).max() < 0.5
+    assert stops > 0
