@@ -261,7 +261,8 @@ def _chart(
 
 def _budget(fleet: FleetConfig) -> str:
     rate = fleet.audit.false_alarms_per_1000_vehicle_days
-    return f"False alarms expected: at most {rate:g} in 1000 vehicle-days over all charts, as far as the sigmas are honest."
+    text = f"False alarms expected: at most {rate:g} in 1000 vehicle-days over all charts"
+    return f"{text}, as far as the sigmas are honest."
 
 
 def _provenance(records: Sequence[CalibrationRecord]) -> list[tuple[str, str]]:
