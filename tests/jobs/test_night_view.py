@@ -1,0 +1,43 @@
+import json
+
+from jobs.night_view import night_view
+from pipeline.fleet.nightly import DayOutcome
+
+NAMES = ["car 2026-03-02", "car 2026-03-03", "bus 2026-03-02"]
+OUTCOMES = [
+    DayOutcome("car", "2026-03-02", "done", pairs={"camera_lidar": "accepted", "lidar_radar": "accepted"}),
+    DayOutcome("car", "2026-03-03", "failed", "OSError: disk full", trace="Traceback ..."),
+    DayOutcome("tram", "2026-03-02", "refused", "no such vehicle"),
+]
+
+
+def show(names=NAMES):
+    with night_view(names, 4) as view:
+        view.watch(0, 3, 10, "ingest frames")
+        view.watch(1, 0, 0, "perceive")
+        for outcome in OUTCOMES:
+            view.finished(outcome)
+        view.ended("bus 2026-03-02")
+
+
+def test_without_a_terminal_every_vehicle_day_is_one_json_line(capsys):
+    show()
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert [(line["level"], line.get("status")) for line in lines] == [
+        ("info", "done"),
+        ("error", "failed"),
+        ("info", "refused"),
+        ("info", None),
+    ]
+    assert lines[1]["trace"].startswith("Traceback")
+    assert (lines[2]["ended"], lines[2]["total"]) == (3, 4)
+
+
+def test_on_a_terminal_every_end_is_a_line_and_bars_do_not_stay(capsys, monkeypatch):
+    monkeypatch.setattr("jobs.night_view.is_terminal", lambda: True)
+    show()
+    text = capsys.readouterr().err
+    assert "2/2 pairs accepted" in text
+    assert "disk full" in text
+    assert "refused" in text
+    assert "ingest frames" not in text.splitlines()[-1]
