@@ -1,4 +1,4 @@
-"""fleet.toml as frozen values: validated as a whole, nothing repaired, every default a physical number with its unit."""
+"""fleet.toml as frozen values: validated as a whole, nothing repaired, defaults are physical numbers with units."""
 
 from __future__ import annotations
 
@@ -190,7 +190,9 @@ class AuditConfig(_Section):
     method: str = "joint"
     false_alarms_per_1000_vehicle_days: Positive = 1.0
     baseline_days: Annotated[int, Field(gt=0)] = 2  # a chart says nothing until it has one day more than this
-    held_sigma_factor: Annotated[float, Field(ge=1)] = 2.0  # days that no held-out frame vouched for weigh less
+    held_sigma_factor: Annotated[float, Field(ge=1)] = (
+        2.0  # days that no held-out frame vouched for weigh less
+    )
     window_days: Annotated[int, Field(gt=2)] = 28  # audited days where the command names no first day
     camera_lidar_limit_deg: Positive = 0.1
     radar_limit_deg: Positive = 0.25

@@ -70,5 +70,5 @@ class Solution:
     pairs: dict[str, PairEstimate]
     loop_rotation_rad: float | None = None
     loop_translation_m: float | None = None
-    # Reasons found while solving for not trusting a pair (restarts disagree, halves disagree, camera contradicts), by pair.
+    # By pair, reasons found while solving for not trusting it: restarts or halves disagree, the camera contradicts.
     doubts: dict[str, list[str]] = field(default_factory=dict)

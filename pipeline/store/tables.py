@@ -159,7 +159,7 @@ def read_records(
     vehicle: str | None = None,
     day: str | None = None,
 ) -> list[Row]:
-    """Records of a table in order of vehicle, day and file time; the last of the same (vehicle, day, method) is the current one."""
+    """Records of a table in order of vehicle, day and file time; `current_records` keeps the last of a kind."""
     found: list[Row] = []
     for partition in lake.partitions(schema.name, vehicle, day):
         folder = lake.folder(schema.name, partition)
@@ -183,10 +183,19 @@ def _replacing(folder: Path, path: Path, schema: TableSchema) -> Iterator[pq.Par
 def _writer_options(schema: TableSchema) -> dict[str, Any]:
     arrow = schema.arrow_schema()
     nested = any(pa.types.is_nested(f.type) for f in arrow)
-    # JPEG and PNG don't compress further; zstd on them only costs time. Nested columns name their leaves differently.
-    # Arrays: LZ4 writes in half the time of zstd and reads in a quarter, for a tenth more space (measured on a real day).
-    # Coordinates and times of points are noise in their low bits: compressing them doubles the time for a twelfth of the space.
-    coded = {"image", "labels_png", "road_contrast_png", "lidar_x_m", "lidar_y_m", "lidar_z_m", "lidar_time_s"}
+    # JPEG and PNG don't compress further; zstd on them only costs time. Nested columns name their leaves apart.
+    # Arrays: LZ4 writes in half zstd's time and reads in a quarter, for a tenth more space (on a real day).
+    # Points' coordinates and times are noise in their low bits: compressing them takes twice the time for a twelfth
+    # of the space.
+    coded = {
+        "image",
+        "labels_png",
+        "road_contrast_png",
+        "lidar_x_m",
+        "lidar_y_m",
+        "lidar_z_m",
+        "lidar_time_s",
+    }
     compressed = {
         c.name: "NONE" if c.name in coded else "LZ4" if c.is_array else "ZSTD" for c in schema.columns
     }
