@@ -8,6 +8,11 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import pytest  # noqa: E402 - numeric libraries read the environment while they are imported
+from hypothesis import settings  # noqa: E402
+
+# No deadline: the machine may be busy. The same examples each time: a red run must come again when it is looked at.
+settings.register_profile("house", deadline=None, derandomize=True)
+settings.load_profile("house")
 
 REPO = Path(__file__).resolve().parent.parent
 SHARED = REPO.parent / "shared"
