@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["calibrate", "parse_perturb"]
+__all__ = ["calibrate", "parse_pair", "parse_perturb"]
 
 
 def calibrate(
@@ -60,21 +60,26 @@ def calibrate(
 
 
 def parse_perturb(text: str | None) -> tuple[float, float] | None:
-    """(degrees, metres) of "ROT_DEG,TRANS_M".
+    """(degrees, metres) of "ROT_DEG,TRANS_M"; None stays None.
+
+    Raises:
+        ConfigError: not two numbers >= 0.
+    """
+    return None if text is None else parse_pair(text, "perturb")
+
+
+def parse_pair(text: str, option: str) -> tuple[float, float]:
+    """(degrees, metres) of "ROT_DEG,TRANS_M"; `option` names the culprit.
 
     Raises:
         ConfigError: not two numbers >= 0.
     """
     from pipeline.errors import ConfigError
 
-    if text is None:
-        return None
     try:
         rotation_deg, translation_m = (float(part) for part in text.split(","))
     except ValueError as err:
-        raise ConfigError("command line", "perturb", f"{text!r} is not ROT_DEG,TRANS_M, as in 2,0.1") from err
+        raise ConfigError("command line", option, f"{text!r} is not ROT_DEG,TRANS_M, as in 2,0.1") from err
     if not (0 <= rotation_deg < 180 and 0 <= translation_m < 1e3):
-        raise ConfigError(
-            "command line", "perturb", f"{text!r}: degrees must be in 0..180, metres must be >= 0"
-        )
+        raise ConfigError("command line", option, f"{text!r}: degrees must be in 0..180, metres must be >= 0")
     return rotation_deg, translation_m

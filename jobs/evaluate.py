@@ -20,6 +20,7 @@ def evaluate(
     truth: Path | None = None,
     reflectors: Path | None = None,
     method: str | None = None,
+    truth_sigma: str = "0,0",
     out: Path | None = None,
 ) -> int:
     """Measure records by the paper's metric: azimuth, elevation and range errors at three reflectors.
@@ -31,10 +32,13 @@ def evaluate(
             {"camera": {model, K, D, width_px, height_px}, "targets": [{"pixel": [u, v], "lidar_m": [x, y, z],
             "radar_m": [x, y, z]}]}.
         method: only this method's records.
+        truth_sigma: ROT_DEG,TRANS_M: how well the truth itself is known, for the errors in sigmas.
         out: Markdown file to write; the table goes to stderr in any case.
     """
+    import math
     import sys
 
+    from jobs.calibrate import parse_pair
     from jobs.summary import print_summary
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake
@@ -48,13 +52,14 @@ def evaluate(
         r for r in read_records(Lake.at(lake), CALIBRATIONS, CalibrationRecord) if method in (None, r.method)
     ]
     picks = _read_picks(reflectors) if reflectors else None
+    known_deg, known_m = parse_pair(truth_sigma, "truth-sigma")
     compared, refused, unknown = [], 0, 0
     for run in current_runs(records):
         known = None if truth is None else _truth_of(truth, next(iter(run.values())))
         if known is None and picks is None:
             unknown += 1
             continue
-        comparison = compare(run, known, picks)
+        comparison = compare(run, known, picks, (math.radians(known_deg), known_m))
         if comparison is None:
             refused += 1
         else:

@@ -63,8 +63,16 @@ def compare(
     run: Mapping[str, CalibrationRecord],
     truth: Mapping[str, Float[np.ndarray, "4 4"]] | None,
     picks: Picks | None = None,
+    truth_sigma: tuple[float, float] = (0.0, 0.0),
 ) -> Comparison | None:
-    """Errors of one run, from truth or from picked reflectors; None where a pair was refused."""
+    """Errors of one run, from truth or from picked reflectors; None where a pair was refused.
+
+    Args:
+        run: the records of one work key, by pair.
+        truth: T of each pair.
+        picks: reflector positions, instead of a truth.
+        truth_sigma: how well the truth itself is known, per axis: rotation [rad], translation [m].
+    """
     if set(run) != set(PAIRS) or any(r.qw is None for r in run.values()):
         return None
     T = {pair: _transform(run[pair], "") for pair in PAIRS}
@@ -85,7 +93,7 @@ def compare(
         errors(T),
         errors(priors),
         {pair: run[pair].status for pair in PAIRS},
-        np.concatenate([_normalised(run[pair], T[pair], truth[pair]) for pair in PAIRS])
+        np.concatenate([_normalised(run[pair], T[pair], truth[pair], truth_sigma) for pair in PAIRS])
         if truth
         else np.zeros(0),
     )
@@ -162,8 +170,11 @@ def _transform(record: CalibrationRecord, prefix: str) -> np.ndarray:
     return from_quaternion(values[:4], values[4:])
 
 
-def _normalised(record: CalibrationRecord, T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
+def _normalised(
+    record: CalibrationRecord, T: np.ndarray, T_true: np.ndarray, truth_sigma: tuple[float, float]
+) -> np.ndarray:
     if record.covariance is None or record.observable is None:
         return np.zeros(0)
-    z = log_se3(T @ inverse(T_true)) / np.sqrt(np.diag(record.covariance))
+    of_truth = np.repeat(np.square(truth_sigma), 3)
+    z = log_se3(T @ inverse(T_true)) / np.sqrt(np.diag(record.covariance) + of_truth)
     return z[np.array(record.observable, bool)]

@@ -123,6 +123,8 @@ def test_normalised_errors_are_errors_in_sigmas():
     comparison = compare(current_runs(make_run(off_deg=0.2))[0], TRUTH)
     assert np.abs(comparison.normalised).max() == pytest.approx(1.0, rel=0.05)
     assert len(comparison.normalised) == 18
+    doubtful = compare(current_runs(make_run(off_deg=0.2))[0], TRUTH, truth_sigma=(np.radians(0.2), 0.05))
+    np.testing.assert_allclose(doubtful.normalised, comparison.normalised / np.sqrt(2))
 
 
 def test_a_repeated_run_counts_once_and_another_seed_counts_again():
