@@ -105,7 +105,8 @@ class _Bars:
         if index not in self._tasks:
             self._tasks[index] = self._bars.add_task(f"  {self._names[index]}", total=None, what="")
             self._began[self._names[index]] = time.monotonic()
-        self._bars.update(self._tasks[index], completed=done, total=total or None, what=what)
+        text = what.replace(self._names[index], "").strip()  # the name stands in front already
+        self._bars.update(self._tasks[index], completed=done, total=total or None, what=text)
 
     def finished(self, outcome: DayOutcome) -> None:
         name = f"{outcome.vehicle} {outcome.day}"
