@@ -1,0 +1,140 @@
+"""Boundary maps, analytic gradients, the sign of the time offset, and what the score says of right and wrong poses."""
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import perturb_exactly
+from pipeline.objective.camera_lidar_points import Points
+from pipeline.objective.camera_lidar_terms import Alignments, Level, Terms, lidar_velocities, prepare_terms
+from pipeline.objective.edges import chance_of, fit_match_share
+from pipeline.objective.image_maps import NO_BOUNDARY, CameraMaps, boundary_offsets, contrast_levels
+from pipeline.objective.projection_loops import camera_parameters
+from pipeline.solve.camera_lidar import AlignmentState, camera_lidar_cost
+from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
+from tests.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
+
+SKY, CAR = 10, 13
+
+
+@pytest.fixture(scope="module", params=[SPARSE, DENSE], ids=["16 rings pinhole", "dense f-theta"])
+def terms(request):
+    day = traced_day(request.param, 6, seed=2, dt_s=0.03)
+    return prepare_terms(day, T_TRUE, lidar_velocities(day, np.eye(4)), reach_rad=0.1).sharp(5.0)
+
+
+def test_each_boundary_is_found_from_both_sides_in_the_class_of_its_foreground():
+    labels = np.full((40, 60), SKY, np.uint8)
+    labels[10:30, 20:40] = CAR
+    offsets = boundary_offsets(labels)
+    row, column = offsets[:, 20, :], offsets[:, :, 30]
+    # The car's left border lies at u = 19.5, its foreground to the right of it.
+    np.testing.assert_array_equal(row[EDGE_RIGHT][:40] + 0.5 + np.arange(40), 19.5)
+    np.testing.assert_array_equal(row[EDGE_LEFT][20:] + 0.5 + np.arange(20, 60), 39.5)
+    np.testing.assert_array_equal(column[EDGE_BELOW] + 0.5 + np.arange(40), 9.5)
+    np.testing.assert_array_equal(column[EDGE_ABOVE] + 0.5 + np.arange(40), 29.5)
+    assert (offsets[:, 5, 5] == NO_BOUNDARY).all()
+
+
+def test_two_backdrops_and_unknown_labels_make_no_boundary():
+    labels = np.full((10, 30), 2, np.uint8)
+    labels[:, 10:20], labels[:, 20:] = 8, 255
+    assert (boundary_offsets(labels) == NO_BOUNDARY).all()
+
+
+def test_contrast_is_zero_outside_the_road_and_has_no_mean_along_its_rows():
+    rng = np.random.default_rng(0)
+    road = np.zeros((80, 200), bool)
+    road[20:, 30:170] = True
+    level = contrast_levels(rng.integers(0, 60, road.shape).astype(np.uint8), road, (3.0,))[0].astype(float)
+    assert (level[~road] == 0).all()
+    assert abs(level[30:, 30:170].mean()) < 2.0
+
+
+CAMERAS = {
+    "pinhole": Camera(
+        "plumb_bob", np.array([[400.0, 0, 210], [0, 420.0, 95], [0, 0, 1]]), np.zeros(5), 420, 190
+    ),
+    "distorted": Camera(
+        "rational_polynomial",
+        np.array([[400.0, 0, 210], [0, 420.0, 95], [0, 0, 1]]),
+        np.array([-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003]),
+        420,
+        190,
+    ),
+    "f-theta": Camera(
+        "equidistant", np.array([[260.0, 0, 210], [0, 250.0, 95], [0, 0, 1]]), np.zeros(4), 420, 190
+    ),
+}
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+def test_gradients_agree_with_differences_of_the_score(camera):
+    """On maps without steps (one straight boundary, an even ramp of contrast) both must be the same."""
+    rng = np.random.default_rng(0)
+    n, F = 400, 2
+    xyz = np.stack([rng.uniform(6, 30, n), rng.uniform(-2, 2, n), rng.uniform(-1, 1, n)], -1).astype(
+        np.float32
+    )
+    points = Points(
+        xyz, np.array([0, 150, n]), np.zeros(n, np.uint8), np.zeros(n, np.uint8), np.zeros(n, np.float32)
+    )
+    labels = np.full((camera.height_px, camera.width_px), SKY, np.uint8)
+    labels[:, :200] = CAR
+    offsets = np.stack([boundary_offsets(labels)] * F)
+    contrast = np.stack(
+        [np.add.outer(np.zeros(190), np.arange(420) - 210).clip(-120, 120).astype(np.int8)] * F
+    )[None]
+    maps = CameraMaps(camera, offsets, contrast, np.stack([labels] * F))
+    velocity = np.array([[12.0, 0.5, 0.0], [5.0, 0.0, 0.0]])
+    terms = Terms(maps, camera_parameters(camera), points, points, points, velocity, np.zeros(F))
+    level = Level.wide(20.0, 0)
+    state = AlignmentState(T_TRUE, 0.02, 1.001)
+    analytic = terms.gradient(state.alone, level)[0].sum(0)
+    h = np.array([1e-3] * 3 + [1e-2] * 3 + [2e-3, 2e-3])
+    value = terms.score(state.moved(np.concatenate([np.diag(h), -np.diag(h)])), level).sum(1)
+    np.testing.assert_allclose(analytic, (value[:8] - value[8:]) / (2 * h), rtol=0.02, atol=2.0)
+
+
+def test_information_is_positive_semidefinite(terms):
+    _, information = terms.gradient(AlignmentState(T_TRUE, 0.03).alone, Level.wide(3.0, 1))
+    assert np.linalg.eigvalsh(information.sum(0)).min() > -1e-6 * np.trace(information.sum(0))
+
+
+def test_score_is_best_at_the_true_pose_and_time_offset(terms):
+    level = Level.wide(3.0, 1)
+    rng = np.random.default_rng(0)
+    wrong = [perturb_exactly(T_TRUE, np.radians(1.0), 0.05, rng) for _ in range(20)]
+    T = np.stack([T_TRUE, *wrong])
+    score = terms.score(Alignments(T, np.full(21, 0.03), np.ones(21)), level).sum(1)
+    assert score.argmax() == 0
+    offsets = np.array([-0.06, 0.0, 0.03, 0.09])
+    at = Alignments(np.repeat(T_TRUE[None], 4, 0), offsets, np.ones(4))
+    assert terms.score(at, level).sum(1).argmax() == 2
+
+
+def test_positive_time_offset_moves_static_points_along_the_ego_motion(terms):
+    still = terms.poses(Alignments.of_poses(T_TRUE[None]))[0]
+    late = terms.poses(Alignments(T_TRUE[None], np.array([0.1]), np.ones(1)))[0]
+    ahead_lidar = (late - still).reshape(-1, 3, 4)[:, :, 3] @ T_TRUE[:3, :3]
+    np.testing.assert_allclose(ahead_lidar, 0.1 * terms.velocity_lidar, atol=1e-5)
+
+
+def test_held_out_cost_prefers_the_truth_to_poses_that_turn_everything_out_of_view():
+    day = traced_day(SPARSE, 6, seed=4)
+    truth = camera_lidar_cost(day, T_TRUE).sum()
+    rng = np.random.default_rng(1)
+    for degrees, metres in ((0.5, 0.03), (2.0, 0.1), (8.0, 0.2), (60.0, 0.5)):
+        assert camera_lidar_cost(day, perturb_exactly(T_TRUE, np.radians(degrees), metres, rng)).sum() > truth
+
+
+def test_share_of_matches_is_recovered_and_vanishes_where_there_are_none():
+    rng = np.random.default_rng(0)
+    chance_px = rng.uniform(-90, 90, 4000)
+    matched = np.where(rng.random(4000) < 0.3, rng.normal(0, 0.8, 4000), rng.uniform(-90, 90, 4000))
+    kind = np.repeat(np.array([0, 1], np.uint8), 4000)
+    chance = chance_of(np.tile(chance_px, 2).astype(np.float32), kind, 2)
+    here = np.concatenate([matched, rng.uniform(-90, 90, 4000)]).astype(np.float32)
+    share = fit_match_share(here, kind, np.full(8000, 1.5), chance)
+    assert share[0] == pytest.approx(0.3, abs=0.05)
+    assert share[1] < 0.03

@@ -1,0 +1,75 @@
+"""Recovery of a known pose and time offset, honest sigmas, determinism, and the cases that must be refused."""
+
+import numpy as np
+import pytest
+
+from pipeline.config import SolveConfig
+from pipeline.errors import SolveError
+from pipeline.geometry.se3 import inverse, log_so3, perturb_exactly
+from pipeline.objective.problem import Prior
+from pipeline.solve.camera_lidar import estimate_camera_lidar
+from pipeline.solve.globalise import evolve
+from tests.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
+
+
+def prior_off_by(degrees, metres, seed):
+    T = perturb_exactly(T_TRUE, np.radians(degrees), metres, np.random.default_rng(seed))
+    return Prior(T, np.eye(4), float(np.radians(2.0)), 0.05)
+
+
+@pytest.mark.parametrize(
+    ("rig", "frames", "dt_s"), [(SPARSE, 16, 0.03), (DENSE, 8, -0.02)], ids=["16 rings", "dense"]
+)
+def test_pose_and_time_offset_are_recovered_from_four_degrees(rig, frames, dt_s):
+    day = traced_day(rig, frames, seed=1, dt_s=dt_s)
+    e = estimate_camera_lidar(day, prior_off_by(4.0, 0.05, 0), SolveConfig(), np.random.default_rng(0))
+    turn = np.degrees(log_so3((e.T @ inverse(T_TRUE))[:3, :3]))
+    assert np.abs(turn).max() < 0.35
+    sigma = np.sqrt(np.diag(e.covariance))
+    assert (np.abs(np.radians(turn)) < 5 * sigma[:3]).all()
+    assert abs(e.time_offset_s - dt_s) < 0.015
+    assert e.frames_used == frames
+
+
+def test_road_without_reflectivity_leaves_the_edges_to_do_it():
+    day = traced_day(DENSE, 8, seed=1, reflective=False)
+    e = estimate_camera_lidar(day, prior_off_by(3.0, 0.05, 1), SolveConfig(), np.random.default_rng(0))
+    assert np.abs(np.degrees(log_so3((e.T @ inverse(T_TRUE))[:3, :3]))).max() < 0.3
+    assert e.diagnostics["marking_weight"] == 0.0
+
+
+def test_same_seed_gives_the_same_estimate():
+    day = traced_day(SPARSE, 6, seed=3)
+    a, b = (
+        estimate_camera_lidar(day, prior_off_by(1.0, 0.03, 2), SolveConfig(), np.random.default_rng(5))
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(a.T, b.T)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_days_of_hardly_any_frame_or_edge_are_refused():
+    day = traced_day(SPARSE, 6, seed=3)
+    with pytest.raises(SolveError, match="frames"):
+        estimate_camera_lidar(day[:3], prior_off_by(1.0, 0.03, 2), SolveConfig(), np.random.default_rng(0))
+    away = prior_off_by(0.0, 0.0, 0).T_camera_lidar.copy()
+    away[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ away[:3, :3]  # looks backwards, where nothing was traced
+    with pytest.raises(SolveError, match="edges"):
+        estimate_camera_lidar(
+            day, Prior(away, np.eye(4), 0.03, 0.05), SolveConfig(), np.random.default_rng(0)
+        )
+
+
+def test_evolution_finds_the_deep_well_among_shallow_ones_and_keeps_to_its_box():
+    seen = []
+
+    def cost(x):
+        seen.append((x.min(), x.max()))
+        shallow = 1 - np.exp(-((x - 0.6) ** 2).sum(1) / 0.02)
+        return shallow - 2 * np.exp(-((x + 0.5) ** 2).sum(1) / 0.08)
+
+    best, value = evolve(cost, -np.ones(3), np.ones(3), np.random.default_rng(0), generations=60)
+    np.testing.assert_allclose(best, -0.5, atol=0.05)
+    assert value < -0.9
+    assert min(lo for lo, _ in seen) >= -1
+    assert max(hi for _, hi in seen) <= 1
