@@ -3,7 +3,8 @@
 Each static detection is drawn from one of the lidar points near it (or their mirror images below the ground, or
 nothing): weights are Gaussian in azimuth, elevation and range with the radar's own sigmas. The ground stays in the map.
 A static lidar point p appears at `q = T_radar_lidar p - v tau - w x q tau` to a radar that looks `tau` later, where
-`tau = stamp_radar + dt - stamp_lidar` and v is the radar's own velocity; so dt is an unknown wherever the car moves.
+`tau = stamp_radar + dt - stamp_lidar` and v is the radar's own velocity; so dt is an unknown wherever the car moves,
+and so is a constant added to all ranges, which wide fields of view tell from a shift.
 
 Normal equations come apart into (azimuth, range) and elevation: on sparse lidars elevation is worth little, whatever
 its residuals say (points collapse onto the lidar's rings), and the caller weighs it.
@@ -88,14 +89,14 @@ class RegistrationFrames:
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Per frame, for (azimuth and range) and for elevation; unknowns: left twist of T_lidar_radar, then dt [s].
+    """Per frame, for (azimuth and range) and for elevation; unknowns: left twist, dt [s], range bias [m].
 
     `H` and `g` move the pose (step = -H^-1 g); `information` is what the frame really says (assignment is uncertain).
     """
 
-    H: Float[np.ndarray, "2 F 7 7"]
-    g: Float[np.ndarray, "2 F 7"]
-    information: Float[np.ndarray, "2 F 7 7"]
+    H: Float[np.ndarray, "2 F 8 8"]
+    g: Float[np.ndarray, "2 F 8"]
+    information: Float[np.ndarray, "2 F 8 8"]
     cost: Float[np.ndarray, " F"]  # minus mean log likelihood per detection
     assigned: Float[np.ndarray, " F"]  # share of detections that found a lidar point
     bounced: float  # share of the assigned that came by way of the ground
@@ -166,6 +167,7 @@ def normal_equations(
     bounce_prior: float = BOUNCE_PRIOR,
     outlier: float = 1.0,
     stride: int = 1,
+    range_bias_m: float = 0.0,
 ) -> NormalEquations:
     """Assign softly at this pose and linearise.
 
@@ -177,13 +179,15 @@ def normal_equations(
         bounce_prior: prior probability of a detection by way of the ground.
         outlier: weight of "no lidar point", in units of one lidar point at distance 0.
         stride: use every n-th detection.
+        range_bias_m: measured minus true range (the radar's own offset, and how far it sees into things).
     """
     F = frames.count
-    H, info = np.zeros((2, F, 7, 7)), np.zeros((2, F, 7, 7))
-    g, stats = np.zeros((2, F, 7)), np.zeros((F, STATS))
+    H, info = np.zeros((2, F, 8, 8)), np.zeros((2, F, 8, 8))
+    g, stats = np.zeros((2, F, 8)), np.zeros((F, STATS))
     accumulate_frames(
         np.ascontiguousarray(T_lidar_radar, np.float64),
         frames.stamp_gap_s + dt_s,
+        range_bias_m,
         frames.velocity_mps,
         frames.yaw_rate_radps,
         frames.radar_m,

@@ -3,7 +3,7 @@
 Long on purpose: a detection's assignments are formed, weighed and summed without being stored.
 """
 # numba infers the types of the arguments; annotations would only repeat RegistrationFrames.
-# ruff: noqa: ANN001, ANN202, C901, PLR0915
+# ruff: noqa: ANN001, ANN202, C901, PLR0912, PLR0915
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _sort_into_cells(n, sph, a0, r0, cell_a, cell_r, n_a, n_r, start, order, cel
 @no_type_check
 @_jit
 def _jacobian(J, x, y, z, R, t, v, w, tau):
-    """d(azimuth, elevation, range of a static lidar point in the radar frame)/d(left twist of T_lidar_radar, tau).
+    """d(azimuth, elevation, range of a static lidar point)/d(left twist of T_lidar_radar, tau, range bias).
 
     The lidar point is the one that appears at (x, y, z): q' = q - (v + w x q) tau with q = T_radar_lidar p.
     """
@@ -119,15 +119,17 @@ def _jacobian(J, x, y, z, R, t, v, w, tau):
         J[row, 1] = u2 * px - u0 * pz
         J[row, 2] = u0 * py - u1 * px
         J[row, 3], J[row, 4], J[row, 5] = -u0, -u1, -u2
+        J[row, 7] = 1.0 if row == 2 else 0.0
 
 
 @no_type_check
 @_jit
 def accumulate_frames(
-    T, tau, velocity, yaw_rate, radar, radar_first, lidar, lidar_first, plane, has_plane, use_elevation, sigma,
+    T, tau, range_bias, velocity, yaw_rate, radar, radar_first, lidar, lidar_first, plane, has_plane,
+    use_elevation, sigma,
     outlier, bounce_prior, stride, max_range, H, g, info, stats,
 ) -> None:  # fmt: skip
-    """Normal equations of each frame: H (2, F, 7, 7) and g (2, F, 7) for (azimuth and range, elevation), information.
+    """Normal equations of each frame: H (2, F, 8, 8) and g (2, F, 8) for (azimuth and range, elevation), information.
 
     `info` is H less what the uncertain assignment takes away (Louis 1982), row by row.
     """
@@ -143,13 +145,15 @@ def accumulate_frames(
     reach_a = 1.6  # rad; no radar on a car looks further to the side
     n_a, n_r = int(2 * reach_a / cell_a) + 1, int(max_range / cell_r) + 1
     start = np.empty(n_a * n_r + 1, np.int64)
-    J = np.empty((3, 7))
+    J = np.empty((3, 8))
     motion = np.empty(4)
     for f in range(len(radar_first) - 1):
         p0, p1 = lidar_first[f], lidar_first[f + 1]
         motion[:3] = velocity[f] * tau[f]
         motion[3] = yaw_rate[f] * tau[f]
         _lidar_in_radar(p0, p1, R, t, lidar, plane[f], motion, has_plane[f], sph, bounce_el)
+        for n in range(p1 - p0):
+            sph[n, 2] += range_bias
         _sort_into_cells(p1 - p0, sph, -reach_a, 0.0, cell_a, cell_r, n_a, n_r, start, order, cell_of)
         for k in range(radar_first[f], radar_first[f + 1], stride):
             x, y, z = radar[k, 0], radar[k, 1], radar[k, 2]
@@ -209,10 +213,10 @@ def accumulate_frames(
                 mean = m0 if row == 0 else (m1 if row == 1 else m2)
                 square = q0 if row == 0 else (q1 if row == 1 else q2)
                 known = weight * max(0.0, 1.0 - max(0.0, square - mean * mean))
-                for p in range(7):
+                for p in range(8):
                     jp = J[row, p] / sigma[row]
                     g[part, f, p] += weight * jp * mean
-                    for q in range(7):
+                    for q in range(8):
                         jj = jp * J[row, q] / sigma[row]
                         H[part, f, p, q] += weight * jj
                         info[part, f, p, q] += known * jj

@@ -45,7 +45,8 @@ def test_jacobian_agrees_with_central_differences():
     dt, tau = 0.03, 0.03 + GAP_S
     point = matching_lidar_point(tau)
     assert np.allclose(seen_by_radar(T_LIDAR_RADAR, tau, point), to_spherical(RADAR))
-    J, h = np.zeros((3, 7)), 1e-6
+    J, h = np.zeros((3, 8)), 1e-6
+    J[2, 7] = 1 / SIGMA_START[2]
     for k in range(7):
         step = np.zeros(7)
         step[k] = h
