@@ -276,7 +276,7 @@ def _accelerated(past: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         move[_DT] * step[_DT] <= 0
     ):  # re-association is noisy: go along the valley only where the gradient points
         move = 2 * step
-    gain = float(np.linalg.norm(move / _STEP_LIMIT) / max(np.linalg.norm(step / _STEP_LIMIT), 1e-12))
+    gain = float(np.linalg.norm(move / _STEP_LIMIT)) / max(float(np.linalg.norm(step / _STEP_LIMIT)), 1e-12)
     move = step + (move - step) * min(1.0, _MOST_GAIN / gain)
     return move / max(1.0, float(np.max(np.abs(move) / (0.3 * _STEP_LIMIT))))
 

@@ -63,8 +63,8 @@ def main() -> None:
             result = job.result() | {"commit": commit, "date": time.strftime("%Y-%m-%d")}
             out.write(json.dumps(result) + "\n")
             out.flush()
-            print(_line(result), flush=True)  # noqa: T201
-    print(table(_read(args.out)))  # noqa: T201
+            print(_line(result), flush=True)
+    print(table(_read(args.out)))
 
 
 def run_once(
