@@ -78,8 +78,9 @@ def vehicle_boxes(observations: Sequence[Observation]) -> VehicleBoxes:
             rows.append(_boxes_of_frame(o))
             frames.append(np.full(len(rows[-1]), index, np.int64))
     table = np.concatenate(rows)
-    kind, *columns = table.T
-    return VehicleBoxes(kind.astype(np.int64), *columns, frame=np.concatenate(frames))
+    kind, azimuth, elevation, left, right, expected_m = table.T
+    frame = np.concatenate(frames)
+    return VehicleBoxes(kind.astype(np.int64), azimuth, elevation, left, right, expected_m, frame)
 
 
 def box_pairs(
