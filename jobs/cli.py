@@ -98,3 +98,7 @@ def _end(command: str, reason: str, code: int) -> int:
         status = {3: "refused", INTERRUPTED: "stopped", TERMINATED: "stopped"}.get(code, "failed")
         print_summary(command, status, reason=reason, exit_code=code)
     return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
