@@ -109,6 +109,7 @@ def _scan(order: np.ndarray, labels: np.ndarray, out: np.ndarray) -> None:
                 _nearer(out, 2 + side, i, j, following[side, j] - i)
 
 
+@no_type_check
 @numba.njit(cache=True, nogil=True, inline="always")
 def _note_boundaries(
     order: np.ndarray, labels: np.ndarray, i: int, j: int, across: np.ndarray, along: np.ndarray
@@ -122,6 +123,7 @@ def _note_boundaries(
         along[0, j], along[1, j] = (i if here else along[0, j]), (i if there else along[1, j])
 
 
+@no_type_check
 @numba.njit(cache=True, nogil=True, inline="always")
 def _nearer(out: np.ndarray, side: int, i: int, j: int, offset: int) -> None:
     """Keep the nearer of two boundaries; offset k stands for k + 1/2: k ahead is as far as -1 - k behind."""
