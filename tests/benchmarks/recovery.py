@@ -38,7 +38,9 @@ from pipeline.verify.targets import errors_at_targets
 from schemas.calibrations import CalibrationRecord
 from schemas.observations import OBSERVATIONS, Observation
 
-PARTS = ("day", "first_half", "second_half")
+# Disjoint halves: every other frame sees the same streets, first and second half see different ones.
+HALVES = (("even_frames", "odd_frames"), ("first_half", "second_half"))
+PARTS = ("day", *HALVES[0], *HALVES[1])
 
 
 def main() -> None:
@@ -78,7 +80,13 @@ def run_once(
     rotation_deg, translation_m = (float(v) for v in start.split(","))
     prior = perturbed(given, (rotation_deg, translation_m), seed)
     half = len(rows) // 2
-    chosen = {"day": rows, "first_half": rows[:half], "second_half": rows[half:]}[part]
+    chosen = {
+        "day": rows,
+        "even_frames": rows[::2],
+        "odd_frames": rows[1::2],
+        "first_half": rows[:half],
+        "second_half": rows[half:],
+    }[part]
     began = time.process_time()
     result: dict[str, Any] = {"method": method, "start": start, "seed": seed, "part": part, "pairs": {}}
     try:
@@ -102,6 +110,7 @@ def _measure(record: CalibrationRecord, T_given: np.ndarray) -> dict[str, Any]:
         "az_deg": float(np.degrees(azimuth)),
         "el_deg": float(np.degrees(elevation)),
         "range_m": float(range_m),
+        "T": T.tolist(),
         "xi": log_se3(T @ inverse(T_given)).tolist(),
         "sigma": np.sqrt(np.diag(record.covariance)).tolist(),
         "observable": record.observable,
@@ -120,7 +129,7 @@ def table(results: list[dict[str, Any]]) -> str:
     lines = [
         (
             "| method | start | runs | pair | az mean / p95 [deg] | el mean / p95 [deg] | range mean / p95 [m] "
-            "| accepted | halves az / el [deg] | dt day, halves [ms] |"
+            "| accepted | even-odd, first-second half az / el [deg] | dt of day, even, odd, first, second [ms] |"
         ),
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
@@ -144,23 +153,19 @@ def _rows(members: list[dict[str, Any]]) -> Iterator[str]:
             cells.append(f"{values.mean():.3f} / {np.percentile(values, 95):.3f}")
         accepted = f"{sum(d['status'] == 'accepted' for d in day)}/{len(day)}"
         offsets = [_median([m["pairs"][pair]["time_offset_ms"] for m in parts[p]]) for p in PARTS]
-        yield " | ".join([str(len(day)), pair, *cells, accepted, _halves(parts, pair), ", ".join(offsets)])
+        halves = "; ".join(_apart(parts[a], parts[b], pair) for a, b in HALVES)
+        yield " | ".join([str(len(day)), pair, *cells, accepted, halves, ", ".join(offsets)])
 
 
-def _halves(parts: dict[str, list[dict[str, Any]]], pair: str) -> str:
-    """Mean distance between the halves' results of the same seed: parent-axis rotations as azimuth and elevation."""
-    second = {m["seed"]: m["pairs"][pair]["xi"] for m in parts["second_half"]}
+def _apart(first: list[dict[str, Any]], second: list[dict[str, Any]], pair: str) -> str:
+    """Mean distance between two halves' results from the same start, at the targets."""
+    other = {m["seed"]: m["pairs"][pair] for m in second}
     gaps = [
-        np.degrees(np.abs(np.array(m["pairs"][pair]["xi"][:3]) - np.array(second[m["seed"]][:3])))
-        for m in parts["first_half"]
-        if m["seed"] in second
+        np.degrees(errors_at_targets(pair, np.array(m["pairs"][pair]["T"]), np.array(other[m["seed"]]["T"])))
+        for m in first
+        if m["seed"] in other
     ]
-    if not gaps:
-        return "-"
-    mean = np.mean(gaps, axis=0)
-    # Camera axes: azimuth turns about y, elevation about x; lidar axes: about z and y.
-    azimuth, elevation = (mean[1], mean[0]) if pair != "lidar_radar" else (mean[2], mean[1])
-    return f"{azimuth:.3f} / {elevation:.3f}"
+    return "{:.3f} / {:.3f}".format(*np.mean(gaps, axis=0)[:2]) if gaps else "-"
 
 
 def _median(values: list[float | None]) -> str:
