@@ -69,24 +69,18 @@ def calibrate_day(
     solver_of(method)
     seed = fleet.solve.seed if seed is None else seed
     rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
+    observations = read_manifest(lake, OBSERVATIONS, partition)
+    inputs = [observations.work_key] if observations else []
     settings = {
         "method": method,
         "perturb": perturb,
         "seed": seed,
         "prior_file": prior_key(rig.prior, fleet_file),
     }
-    observations = read_manifest(lake, OBSERVATIONS, partition)
-    inputs = [observations.work_key] if observations else []
     resolved = config_hash(fleet.select, fleet.trigger, fleet.solve, rig.prior, settings)
     key = work_key("calibrate", CODE_VERSION, resolved, inputs)
     about = Inputs(partition, method, key, seed, tuple(inputs))
-    recorded = [
-        r
-        for r in read_records(
-            lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle, day=partition.day
-        )
-        if r.work_key == key
-    ]
+    recorded = _recorded(lake, partition, key)
     if recorded:
         return _result(about, recorded, "cached", lake)
     prior: Prior | None = None
@@ -198,6 +192,13 @@ def _held_out_test(
     cost = alignment_of(pair, held, prior)
     dt_s = estimate.time_offset_s or 0.0
     return paired_test(cost(prior.of(pair), dt_s), cost(estimate.T, dt_s), blocks_of(held))
+
+
+def _recorded(lake: Lake, partition: Partition, key: str) -> list[CalibrationRecord]:
+    """What the same work has recorded already."""
+    vehicle, day = partition.vehicle, partition.day
+    records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day)
+    return [r for r in records if r.work_key == key]
 
 
 def _spread(observations: Sequence[Observation], selection: Selection) -> list[Observation]:
