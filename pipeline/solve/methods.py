@@ -17,11 +17,15 @@ __all__ = ["COMPOSED", "METHOD", "PAPER_METHODS", "Solver", "solver_of"]
 
 METHOD: dict[str, str] = {
     "joint": "pipeline.solve.joint:solve_joint",
+    "tracking": "pipeline.solve.tracking:solve_tracking",
     "pairwise-optimisation": "pipeline.solve.pairwise:solve_pairwise",
     "joint-optimisation": "pipeline.solve.joint_optimisation:solve_joint_optimisation",
 }
 # Pairs that a method composes of the other two instead of estimating them.
-COMPOSED: dict[str, tuple[str, ...]] = {"joint": ("camera_radar",)}
+COMPOSED: dict[str, tuple[str, ...]] = {
+    "joint": ("camera_radar",),
+    "tracking": ("camera_radar",),
+}
 # Methods that take the paper's frame conditions and judge by the paper's losses.
 PAPER_METHODS = ("pairwise-optimisation", "joint-optimisation")
 
