@@ -20,7 +20,7 @@ from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import to_spherical, wrap_angle
 from pipeline.solve.tracks import Track
 
-__all__ = ["Association", "associate", "bearing_sigma_rad", "shared_rows"]
+__all__ = ["Association", "Shared", "associate", "bearing_sigma_rad", "shared_rows", "shared_sightings"]
 
 _LEAST_SHARED = 2
 _MOST_COUNTED = 8  # sightings of one track err together: a longer one is not ever more certain
@@ -45,9 +45,20 @@ class Association:
         return len(self.reference)
 
 
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """Sightings in the same frames, by pairs of tracks seen by both at least twice, one pair after the other."""
+
+    reference: Int64[np.ndarray, " P"]
+    other: Int64[np.ndarray, " P"]
+    first: Int64[np.ndarray, " P"]  # of each pair's sightings
+    count: Int64[np.ndarray, " P"]
+    of_reference: Track  # S sightings each, row by row of the same frame
+    of_other: Track
+
+
 def associate(
-    reference: Sequence[Track],
-    other: Sequence[Track],
+    shared: Shared,
     T_other_reference: Float[np.ndarray, "4 4"],
     rotation_sigma_rad: float,
     *,
@@ -56,22 +67,45 @@ def associate(
     """Pair tracks one to one so that the sum of scores is largest; pairs outside the gates are not made.
 
     Args:
-        reference: tracks of the reference sensor, level axes.
-        other: tracks of the other sensor, its level axes.
+        shared: what reference and other sensor saw in the same frames, level axes.
         T_other_reference: transform between the level axes, as believed.
         rotation_sigma_rad: how uncertain its rotation is per axis.
         elevation: False where one of the two measures none.
     """
-    score = np.zeros((len(reference), len(other)))
-    last = [(t.frame[0], t.frame[-1]) for t in other]
-    for i, a in enumerate(reference):
-        for j, b in enumerate(other):
-            if a.drive == b.drive and a.frame[-1] > last[j][0] and a.frame[0] < last[j][1]:
-                score[i, j] = _score(a, b, T_other_reference, rotation_sigma_rad, elevation=elevation)
+    if not len(shared.first):
+        return Association(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+    score = np.zeros((shared.reference.max() + 1, shared.other.max() + 1))
+    found = _scores(shared, T_other_reference, rotation_sigma_rad, elevation=elevation)
+    score[shared.reference, shared.other] = found
     rows, columns = linear_sum_assignment(score, maximize=True)
     kept = score[rows, columns] > 0
     return Association(
         rows[kept].astype(np.int64), columns[kept].astype(np.int64), score[rows, columns][kept]
+    )
+
+
+def shared_sightings(reference: Sequence[Track], other: Sequence[Track]) -> Shared:
+    """All pairs of tracks of one drive that were seen in at least two frames by both."""
+    rows = [(i, k, t.drive, int(f)) for i, t in enumerate(reference) for k, f in enumerate(t.frame)]
+    at: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for j, t in enumerate(other):
+        for k, f in enumerate(t.frame):
+            at.setdefault((t.drive, int(f)), []).append((j, k))
+    joined = np.array(
+        sorted((i, j, k, m) for i, k, drive, f in rows for j, m in at.get((drive, f), ())), np.int64
+    ).reshape(-1, 4)
+    _, first, count = np.unique(joined[:, :2], axis=0, return_index=True, return_counts=True)
+    often = count >= _LEAST_SHARED
+    joined = joined[np.repeat(often, count)]
+    count = count[often].astype(np.int64)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]]).astype(np.int64) if len(count) else count
+    return Shared(
+        joined[first, 0],
+        joined[first, 1],
+        first,
+        count,
+        _gathered(reference, joined[:, 0], joined[:, 2]),
+        _gathered(other, joined[:, 1], joined[:, 3]),
     )
 
 
@@ -86,37 +120,64 @@ def bearing_sigma_rad(range_m: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N
     return np.hypot(_ANGLE_SIGMA_RAD, _CENTRE_SIGMA_M / np.maximum(range_m, 1.0))
 
 
-def _score(a: Track, b: Track, T_b_a: np.ndarray, rotation_sigma_rad: float, *, elevation: bool) -> float:
-    """Evidence that both are one object: (gate - mean squared deviation) per shared sighting; 0 outside the gates."""
-    rows_a, rows_b = shared_rows(a, b)
-    if len(rows_a) < _LEAST_SHARED:
-        return 0.0
-    expected = to_spherical(transform_points(T_b_a, a.position_m[rows_a]))
-    seen = to_spherical(b.position_m[rows_b])
-    # Ranges about the other sensor's origin and range rates along its line of sight: no rotation enters.
-    from_origin = a.position_m[rows_a] - inverse(T_b_a)[:3, 3]
-    rate_a = _along(a.velocity_mps[rows_a], from_origin)
-    rate_b = _along(b.velocity_mps[rows_b], b.position_m[rows_b])
-    range_var = a.range_sigma_m[rows_a] ** 2 + b.range_sigma_m[rows_b] ** 2 + _RANGE_OFFSET_SIGMA_M**2
-    rate_var = a.rate_sigma_mps[rows_a] ** 2 + b.rate_sigma_mps[rows_b] ** 2
+def _scores(
+    shared: Shared, T_b_a: np.ndarray, rotation_sigma_rad: float, *, elevation: bool
+) -> Float[np.ndarray, " P"]:
+    """Evidence for each pair of tracks that both are one object; 0 outside the gates.
+
+    It is what the gate leaves over the mean squared deviation, times sightings, less the constant's square.
+    """
+    a, b, first, count = shared.of_reference, shared.of_other, shared.first, shared.count
+    expected = to_spherical(transform_points(T_b_a, a.position_m))
+    seen = to_spherical(b.position_m)
     sigma = bearing_sigma_rad(seen[:, 2])
-    axes = (0, 1) if elevation else (0,)
-    gap = wrap_angle(seen[:, axes] - expected[:, axes])
-    constant = np.median(gap, axis=0)
+    axes = 2 if elevation else 1
+    gap = wrap_angle(seen[:, :axes] - expected[:, :axes])
+    constant = np.stack([_medians(gap[:, k], first, count) for k in range(axes)], axis=1)
+    # Ranges about the other sensor's origin and range rates along its line of sight: no rotation enters.
+    rate_a = _along(a.velocity_mps, a.position_m - inverse(T_b_a)[:3, 3])
+    rate_b = _along(b.velocity_mps, b.position_m)
+    range_var = a.range_sigma_m**2 + b.range_sigma_m**2 + _RANGE_OFFSET_SIGMA_M**2
+    rate_var = a.rate_sigma_mps**2 + b.rate_sigma_mps**2
     squares = np.column_stack(
         [
             (seen[:, 2] - expected[:, 2]) ** 2 / range_var,
             (rate_b - rate_a) ** 2 / rate_var,
-            ((gap - constant) / sigma[:, None]) ** 2,
+            ((gap - np.repeat(constant, count, axis=0)) / sigma[:, None]) ** 2,
         ]
     )
     deviation = np.minimum(squares, _MOST_SQUARE).sum(axis=1)
-    constant_square = float(np.sum(constant**2)) / (rotation_sigma_rad**2 + float(np.median(sigma)) ** 2)
-    mean = float(np.mean(deviation))
-    if mean > _GATE or constant_square > _CONSTANT_SIGMAS**2 * len(axes):
-        return 0.0
-    return max(min(len(rows_a), _MOST_COUNTED) * (_GATE - mean) - constant_square, 0.0)
+    left = _GATE - np.add.reduceat(deviation, first) / count
+    typical = _medians(sigma, first, count)
+    constant_square = np.sum(constant**2, axis=1) / (rotation_sigma_rad**2 + typical**2)
+    inside = (left > 0) & (constant_square < _CONSTANT_SIGMAS**2 * axes)
+    return np.where(inside, np.maximum(np.minimum(count, _MOST_COUNTED) * left - constant_square, 0.0), 0.0)
+
+
+def _medians(value: np.ndarray, first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Median of each stretch of values."""
+    ordered = value[np.lexsort((value, np.repeat(np.arange(len(first)), count)))]
+    return 0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2])
 
 
 def _along(velocity: np.ndarray, sight: np.ndarray) -> np.ndarray:
     return np.sum(velocity * sight, axis=1) / np.maximum(np.linalg.norm(sight, axis=1), 1e-6)
+
+
+def _gathered(tracks: Sequence[Track], track: np.ndarray, row: np.ndarray) -> Track:
+    """The named sightings of many tracks in one, in the order named."""
+    if not len(track):
+        none, nothing = np.zeros(0, np.int64), np.zeros(0)
+        return Track(-1, none, none, nothing, np.zeros((0, 3)), np.zeros((0, 3)), nothing, nothing)
+    start = np.concatenate([[0], np.cumsum([t.sightings for t in tracks])[:-1]])
+    rows = start[track] + row
+    return Track(
+        -1,
+        np.concatenate([t.frame for t in tracks])[rows],
+        np.concatenate([t.detection for t in tracks])[rows],
+        np.concatenate([t.stamp_s for t in tracks])[rows],
+        np.concatenate([t.position_m for t in tracks])[rows],
+        np.concatenate([t.velocity_mps for t in tracks])[rows],
+        np.concatenate([t.rate_sigma_mps for t in tracks])[rows],
+        np.concatenate([t.range_sigma_m for t in tracks])[rows],
+    )

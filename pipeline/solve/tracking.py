@@ -24,7 +24,13 @@ from pipeline.geometry.se3 import compose_covariance, inverse, log_so3
 from pipeline.geometry.spherical import to_spherical
 from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.results import Progress, silent
-from pipeline.solve.association import Association, associate, bearing_sigma_rad, shared_rows
+from pipeline.solve.association import (
+    Association,
+    associate,
+    bearing_sigma_rad,
+    shared_rows,
+    shared_sightings,
+)
 from pipeline.solve.bearings import AlignedBearings, Bearings, align_bearings, consistency
 from pipeline.solve.covariance import posterior
 from pipeline.solve.object_tracks import box_centres, camera_tracks, lidar_tracks, motions, radar_tracks
@@ -144,10 +150,9 @@ def calibrate_pair(
     """
     T, covariance = prior.of(pair), prior.covariance(pair)
     sigma, before = prior.rotation_sigma_rad, None
+    shared = shared_sightings(tracks.lidar, tracks.other)
     for _ in range(_ROUNDS):
-        found = associate(
-            tracks.lidar, tracks.other, _level_transform(T, tracks), sigma, elevation=tracks.elevation
-        )
+        found = associate(shared, _level_transform(T, tracks), sigma, elevation=tracks.elevation)
         bearings, used = _bearings(tracks, found, frames)
         if bearings.tracks < MIN_TRACKS:
             raise SolveError(_too_few(pair, tracks, bearings.tracks))

@@ -9,7 +9,7 @@ from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3, transform_points
 from pipeline.objective.problem import Prior
-from pipeline.solve.association import associate
+from pipeline.solve.association import associate, shared_sightings
 from pipeline.solve.bearings import Bearings, align_bearings, consistency
 from pipeline.solve.methods import solver_of
 from pipeline.solve.object_tracks import lidar_tracks, motions, turn_between
@@ -137,14 +137,14 @@ def test_association_follows_the_motion_not_the_nearest_position():
     radar = [
         replace(t, position_m=t.position_m + s * [0.25, 0, 0]) for t, s in zip(radar, shift, strict=True)
     ]
-    found = associate(lidar, radar, np.eye(4), np.radians(3.0))
+    found = associate(shared_sightings(lidar, radar), np.eye(4), np.radians(3.0))
     assert sorted(zip(found.reference.tolist(), found.other.tolist(), strict=True)) == [(0, 1), (1, 0)]
 
 
 def test_tracks_that_contradict_each_other_are_not_paired():
     path = np.array([30.0, 2, 0]) + np.array([5.0, 0, 0]) * STEP_S * np.arange(6)[:, None]
     lidar = [make_track(path, np.array([5.0, 0, 0]))]
-    assert associate(lidar, lidar, np.eye(4), np.radians(1)).count == 1
+    assert associate(shared_sightings(lidar, lidar), np.eye(4), np.radians(1)).count == 1
     for other in (
         make_track(path + [15.0, 0, 0], np.array([5.0, 0, 0])),  # too far
         make_track(path, np.array([-8.0, 0, 0])),  # the wrong way
@@ -152,7 +152,7 @@ def test_tracks_that_contradict_each_other_are_not_paired():
         make_track(path, np.array([5.0, 0, 0]), first_frame=5),  # another time
         make_track(path, np.array([5.0, 0, 0]), drive=1),
     ):
-        assert associate(lidar, [other], np.eye(4), np.radians(1)).count == 0
+        assert associate(shared_sightings(lidar, [other]), np.eye(4), np.radians(1)).count == 0
 
 
 @pytest.mark.parametrize(("turn", "expected"), [(0.0, False), (1.0, True)])
