@@ -10,17 +10,27 @@ Reid, Firth 2011, section 2.3).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
-from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, log_so3
+from pipeline.geometry.changes import change_jacobian
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3
 from pipeline.objective.camera_lidar_terms import Alignments, Level, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.problem import PairEstimate, Prior
-from pipeline.solve.covariance import blocks_of, bootstrap_covariance, posterior, spread_to_covariance
+from pipeline.solve.camera_lidar_ascent import (
+    FOCAL_SIGMA,
+    NOTHING,
+    AlignmentState,
+    climb,
+    derivatives,
+    scales,
+    weighted,
+)
+from pipeline.solve.covariance import OBSERVABLE, blocks_of, held_covariance, response
 from pipeline.solve.globalise import evolve
 from schemas.observations import Observation
 
@@ -37,43 +47,13 @@ _CLASS_WEIGHT_PER_POINT = 0.12
 _LADDER = ((4.0, 0), (2.5, 1), (1.5, 2))
 _VERDICT = Level.wide(1.5, 2)
 _MAX_GAP_PX = 5.0  # edges whose interval is wider (16 rings: 30 px) are for the basin only
-# Typical distance of what edges and markings lie on: turns a width in pixels into metres.
-_TYPICAL_RANGE_M = 12.0
-_TYPICAL_SPEED_MPS = 8.0
-# Intrinsics are known to about this; free within it, so that the pose along the optical axis is not surer
-# than they are.
-_FOCAL_SIGMA = 0.003
 # What no resampling shows: mask dilation, focal length off by 0.1-0.5 %, rolling shutter
 # (evidence/method.md, section 4).
-# Along the optical axis more: lane lines pull tz (and with it dt) without resisting it, by 3-10 cm on real logs.
-_BIAS_FLOOR = np.array([np.radians(0.03)] * 3 + [0.01, 0.01, 0.04])
+_BIAS_FLOOR = np.array([np.radians(0.03)] * 3 + [0.01, 0.01, 0.01])
+# Along the optical axis more: lane lines pull tz without resisting it, and dt and the others follow.
+_TZ, _TZ_BIAS_M = 5, 0.10
 _TIME_OFFSET_FLOOR_S = 0.004
-
-
-@dataclass(frozen=True, eq=False)
-class AlignmentState:
-    """A pose, its time offset and focal scale."""
-
-    T_camera_lidar: np.ndarray
-    dt_s: float = 0.0
-    focal: float = 1.0
-
-    def moved(self, xi: Float[np.ndarray, "P 8"]) -> Alignments:
-        """Candidates at steps (left perturbation, dt, focal scale)."""
-        return Alignments(
-            exp_se3(xi[:, :6]) @ self.T_camera_lidar, self.dt_s + xi[:, 6], self.focal + xi[:, 7]
-        )
-
-    def stepped(self, xi: Float[np.ndarray, " 8"]) -> AlignmentState:
-        """The state one step on."""
-        return AlignmentState(
-            exp_se3(xi[:6]) @ self.T_camera_lidar, self.dt_s + float(xi[6]), self.focal + float(xi[7])
-        )
-
-    @property
-    def alone(self) -> Alignments:
-        """The state as one candidate."""
-        return self.moved(np.zeros((1, 8)))
+_HOLD_ROUNDS = 3  # to hold one degree of freedom can leave another undetermined
 
 
 def estimate_camera_lidar(
@@ -112,19 +92,24 @@ def estimate_camera_lidar(
     sharp = terms.sharp(_MAX_GAP_PX).at_most(_FINE_POINTS, rng)
     thin = sharp.thinned(0.35, rng)
     first = Level.wide(*_LADDER[0])
-    ends = [_climb(thin, s, first, prior, config, steps=5) for s in starts]
+    ends = [climb(thin, s, first, prior, config, steps=5) for s in starts]
     scores = [float(sharp.score(e.alone, first).sum()) for e in ends]
     best = int(np.argmax(scores))
     state, level = ends[best], first
     for sigma_px, contrast in _LADDER[1:]:
-        level = _weighted(sharp, state, sharp.fitted(state.alone, Level.wide(sigma_px, contrast), rng))
-        state = _climb(sharp, state, level, prior, config, steps=5)
+        level = weighted(sharp, state, sharp.fitted(state.alone, Level.wide(sigma_px, contrast), rng))
+        state = climb(sharp, state, level, prior, config, steps=5)
+    day = _Day(sharp, prior, config, [o.drive for o in frames], int(rng.integers(2**32)))
+    found = _determined(day, state, level, rng)
     halves = [
-        _climb(sharp.of_frames(np.arange(k, len(used), 2)), state, level, prior, config, steps=4)
+        climb(
+            sharp.of_frames(np.arange(k, len(used), 2)), found.state, found.level, prior, config,
+            steps=4, held=found.held,
+        )
         for k in (0, 1)
-    ]
-    diagnostics = _diagnostics(sharp, level, state, ends, scores, halves)
-    return _conclude(sharp, state, level, prior, config, rng, frames, rejected, diagnostics)
+    ]  # fmt: skip
+    diagnostics = _diagnostics(sharp, found.level, found.state, ends, scores, halves)
+    return _conclude(found, config, len(frames), rejected, diagnostics)
 
 
 def camera_lidar_cost(
@@ -160,7 +145,7 @@ def camera_lidar_information(
     """
     gradient, information = terms.gradient(AlignmentState(T_camera_lidar, dt_s).alone, level or _VERDICT)
     g, I = -gradient.sum(0), information.sum(0)
-    focal = I[7, 7] + _FOCAL_SIGMA**-2
+    focal = I[7, 7] + FOCAL_SIGMA**-2
     return g[:7] - I[:7, 7] * g[7] / focal, I[:7, :7] - np.outer(I[:7, 7], I[7, :7]) / focal
 
 
@@ -202,103 +187,6 @@ def _basin(terms: Terms, prior: Prior, config: SolveConfig, rng: np.random.Gener
     return AlignmentState(poses(x[None])[0])
 
 
-def _prior_value(at: Alignments, prior: Prior, config: SolveConfig) -> Float[np.ndarray, " P"]:
-    """Log density of the prior, up to a constant."""
-    turn = log_so3(at.T_camera_lidar[:, :3, :3] @ prior.T_camera_lidar[:3, :3].T) / prior.rotation_sigma_rad
-    shift = (at.T_camera_lidar[:, :3, 3] - prior.T_camera_lidar[:3, 3]) / prior.translation_sigma_m
-    clock = (at.dt_s / config.time_offset_sigma_s) ** 2 + ((at.focal - 1) / _FOCAL_SIGMA) ** 2
-    return -0.5 * ((turn**2).sum(1) + (shift**2).sum(1) + clock)
-
-
-def _scales(terms: Terms, level: Level) -> Float[np.ndarray, " 8"]:
-    """Step per DoF that moves typical points by about one kernel width."""
-    angle = level.sigma_px / float(terms.camera[1])
-    shift = angle * _TYPICAL_RANGE_M
-    return np.array([angle] * 3 + [shift] * 3 + [shift / _TYPICAL_SPEED_MPS, _FOCAL_SIGMA])
-
-
-def _design() -> Float[np.ndarray, "P 8"]:
-    """Points of the response surface: centre and antithetic pairs in a ball, the same for every call."""
-    rng = np.random.default_rng(7)
-    x = rng.normal(size=(66, 8))
-    x *= (rng.random((66, 1)) ** (1 / 3)) / np.linalg.norm(x, axis=1, keepdims=True)
-    return np.concatenate([np.zeros((1, 8)), x, -x])
-
-
-_DESIGN = _design()
-_UPPER = np.triu_indices(8)
-
-
-_FIT = np.linalg.pinv(
-    np.column_stack([np.ones(len(_DESIGN)), _DESIGN, _DESIGN[:, _UPPER[0]] * _DESIGN[:, _UPPER[1]]])
-)
-
-
-def _quadratic(
-    value: Float[np.ndarray, "P F"],
-) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
-    """Gradient and Hessian of the least-squares quadratic through each frame's values on the design."""
-    c = (_FIT @ value).T
-    H = np.zeros((value.shape[1], 8, 8))
-    H[:, _UPPER[0], _UPPER[1]] = c[:, 9:]
-    return c[:, 1:9], H + H.transpose(0, 2, 1)
-
-
-def _climb(
-    terms: Terms, state: AlignmentState, level: Level, prior: Prior, config: SolveConfig, *, steps: int
-) -> AlignmentState:
-    """Maximise by response surfaces: the score is rough at the scale of a pixel, and a quadratic over a ball is not.
-
-    Newton steps, with at least half the curvature that the frames' gradients promise by their scatter
-    (Fisher scoring): a direction that the roughness makes flat or convex would send the step anywhere.
-    """
-    scale = 1.8 * _scales(terms, level)
-    for _ in range(steps):
-        at = state.moved(_DESIGN * scale)
-        gradient, H = _quadratic(terms.score(at, level))
-        (before,), (H_prior,) = _quadratic(_prior_value(at, prior, config)[:, None])
-        promised = gradient.T @ gradient - H_prior
-        curvature = _at_least(-H.sum(0) - H_prior, 0.5 * promised + 1e-9 * np.trace(promised) * np.eye(8))
-        step = np.linalg.solve(curvature, gradient.sum(0) + before)
-        length = float(np.linalg.norm(step))
-        state = state.stepped(step / max(length, 1.0) * scale)
-        if length < 1.0:
-            scale = scale * 0.75
-    return state
-
-
-def _at_least(
-    curvature: Float[np.ndarray, "8 8"], least: Float[np.ndarray, "8 8"]
-) -> Float[np.ndarray, "8 8"]:
-    """The larger of two symmetric matrices in every direction; `least` must be positive definite."""
-    return spread_to_covariance(0.5 * (curvature + curvature.T), least)
-
-
-def _derivatives(
-    terms: Terms, state: AlignmentState, level: Level, scale: Float[np.ndarray, " 8"]
-) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
-    """Gradient and Hessian of each frame's score over a ball of `scale`, in units of `scale`."""
-    return _quadratic(terms.score(state.moved(_DESIGN * scale), level))
-
-
-def _weighted(terms: Terms, state: AlignmentState, level: Level) -> Level:
-    """Scale each term so that its curvature equals the scatter of its gradient over frames.
-
-    Points of one frame err together (one mask boundary, one lane line), so a sum of log likelihood ratios
-    promises too much, and by another factor for each term.
-    """
-    scale = _scales(terms, level)
-    weights = []
-    for edges, markings in ((1.0, 0.0), (0.0, 1.0)):
-        gradient, H = _derivatives(
-            terms, state, replace(level, edge_weight=edges, marking_weight=markings), scale
-        )
-        scatter = float(((gradient - gradient.mean(0)) ** 2).sum())
-        curvature = -float(np.trace(H.sum(0)))
-        weights.append(float(np.clip(curvature / scatter, 0.02, 1.0)) if scatter > 1e-9 else 0.0)
-    return replace(level, edge_weight=weights[0], marking_weight=weights[1])
-
-
 def _diagnostics(
     terms: Terms,
     level: Level,
@@ -337,44 +225,112 @@ def _difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]
     return np.concatenate([log_so3(D[:3, :3]), shift, [a.dt_s - b.dt_s, a.focal - b.focal]])
 
 
-def _conclude(
-    terms: Terms,
+@dataclass(frozen=True, eq=False)
+class _Day:
+    """What every solution of one day shares."""
+
+    terms: Terms
+    prior: Prior
+    config: SolveConfig
+    drives: list[int]
+    seed: int  # of the bootstrap: solutions compare on the same resampled days
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A solution: what of it the day determined, and how surely (chart of `AlignmentState.changed`)."""
+
+    state: AlignmentState
+    level: Level
+    held: np.ndarray  # 8, bool
+    covariance: np.ndarray  # 8 8
+    observability: np.ndarray  # 6
+
+
+def _determined(day: _Day, state: AlignmentState, level: Level, rng: np.random.Generator) -> _Found:
+    """Solve again with what the day cannot determine held at the prior, until nothing more is to be held.
+
+    Left free, such a degree of freedom wanders as far as its prior lets it and drags others along: lane lines
+    pull tz, and with it dt, by decimetres.
+    """
+    found = _measured(day, state, level, NOTHING, np.ones(6))
+    for _ in range(_HOLD_ROUNDS):
+        held = found.held | np.append(found.observability < OBSERVABLE, [False, False])
+        if (held == found.held).all():
+            break
+        state = climb(day.terms, found.state, level, day.prior, day.config, steps=2, held=held)
+        level = weighted(day.terms, state, day.terms.fitted(state.alone, level, rng))
+        state = climb(day.terms, state, level, day.prior, day.config, steps=4, held=held)
+        found = _measured(day, state, level, held, found.observability)
+    return found
+
+
+def _measured(
+    day: _Day,
     state: AlignmentState,
     level: Level,
-    prior: Prior,
+    held: Bool[np.ndarray, " 8"],
+    observability: Float[np.ndarray, " 6"],
+) -> _Found:
+    """Covariance of a solution; what is held has the prior's, and the others follow it (and the bias along tz)."""
+    terms, prior = day.terms, day.prior
+    scale = scales(terms, level)
+    gradient = derivatives(terms, state, level, scale)[0] / scale
+    prior_variance = np.array(
+        [prior.rotation_sigma_rad**2] * 3
+        + [prior.translation_sigma_m**2] * 3
+        + [day.config.time_offset_sigma_s**2, FOCAL_SIGMA**2]
+    )
+    curvature = _smooth_curvature(terms, state, level) + np.diag(1 / prior_variance)
+    # After `weighted`, the scatter of the frames' gradients is the curvature, without its roughness
+    # (Bartlett's identity).
+    information = gradient[:, :, None] * gradient[:, None, :]
+    block = blocks_of(np.array(day.drives), day.config.bootstrap_blocks)
+    covariance = held_covariance(
+        information, -gradient, prior_variance, curvature, held, block, np.random.default_rng(day.seed)
+    )
+    floor = np.diag(np.where(held, 0.0, np.append(_BIAS_FLOOR, [_TIME_OFFSET_FLOOR_S, 0.0])) ** 2)
+    if not held[_TZ]:
+        along = response(curvature, np.arange(8) == _TZ, held)[:, 0] * _TZ_BIAS_M
+        floor += np.outer(along, along)
+    covariance = covariance + floor
+    shrunk = np.clip(1 - np.diag(covariance) / prior_variance, 0.0, 1.0)[:6]
+    return _Found(state, level, held, covariance, np.where(held[:6], observability, shrunk))
+
+
+def _smooth_curvature(terms: Terms, state: AlignmentState, level: Level) -> Float[np.ndarray, "8 8"]:
+    """Curvature of the cost without its roughness, in the chart of `changed`: Gauss-Newton, from the points' slopes.
+
+    For ratios only. Moving tz on real logs moves dt by -0.04 s/m: this says -0.03, response surfaces +0.1 to -0.1.
+    """
+    _, information = terms.gradient(state.alone, level)
+    to_left = np.eye(8)
+    to_left[:6, :6] = np.linalg.inv(change_jacobian(state.T_camera_lidar))
+    return to_left.T @ information.sum(0) @ to_left
+
+
+def _conclude(
+    found: _Found,
     config: SolveConfig,
-    rng: np.random.Generator,
-    frames: list[Observation],
+    frames: int,
     rejected: dict[str, int],
     diagnostics: dict[str, float],
 ) -> PairEstimate:
-    """Covariance from curvature and blocks, observability, notes."""
-    scale = _scales(terms, level)
-    gradient = _derivatives(terms, state, level, scale)[0] / scale
-    prior_information = np.diag(
-        [prior.rotation_sigma_rad**-2] * 3
-        + [prior.translation_sigma_m**-2] * 3
-        + [config.time_offset_sigma_s**-2, _FOCAL_SIGMA**-2]
-    )
-    # After `_weighted`, the scatter of the frames' gradients is the curvature, without its roughness
-    # (Bartlett's identity).
-    information = gradient[:, :, None] * gradient[:, None, :]
-    block = blocks_of(np.array([o.drive for o in frames]), config.bootstrap_blocks)
-    covariance = bootstrap_covariance(information, -gradient, prior_information, block, rng)
-    after = posterior(covariance[:6, :6], prior.covariance("camera_lidar"), _BIAS_FLOOR)
-    dt_sigma = float(np.sqrt(covariance[6, 6] + _TIME_OFFSET_FLOOR_S**2))
+    """The estimate, its covariance by left perturbation, notes."""
+    dt_sigma = float(np.sqrt(found.covariance[6, 6]))
     notes = []
     if dt_sigma > 0.7 * config.time_offset_sigma_s:
         notes.append("camera time offset: the day's speeds do not determine it")
+    to_left = np.linalg.inv(change_jacobian(found.state.T_camera_lidar))
     return PairEstimate(
         "camera_lidar",
-        state.T_camera_lidar,
-        after.covariance,
-        after.observability,
-        after.observable,
-        frames_used=len(frames),
+        found.state.T_camera_lidar,
+        to_left @ found.covariance[:6, :6] @ to_left.T,
+        found.observability,
+        ~found.held[:6],
+        frames_used=frames,
         frames_rejected=rejected,
-        time_offset_s=state.dt_s,
+        time_offset_s=found.state.dt_s,
         time_offset_sigma_s=dt_sigma,
         diagnostics=diagnostics,
         notes=notes,

@@ -15,10 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-__all__ = ["Posterior", "blocks_of", "bootstrap_covariance", "posterior", "spread_to_covariance"]
+__all__ = [
+    "OBSERVABLE",
+    "Posterior",
+    "blocks_of",
+    "bootstrap_covariance",
+    "held_covariance",
+    "posterior",
+    "response",
+    "spread_to_covariance",
+]
 
 _FEWEST_BLOCKS = 8  # with fewer, a bootstrap says nothing about its own tails
-_OBSERVABLE = 0.5  # the day at least halved the variance
+OBSERVABLE = 0.5  # the day at least halved the variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +97,51 @@ def bootstrap_covariance(
     return spread_to_covariance(spread + inverse @ prior_information @ inverse, inverse)
 
 
+def response(
+    curvature: Float[np.ndarray, "P P"], given: Bool[np.ndarray, " P"], held: Bool[np.ndarray, " P"]
+) -> Float[np.ndarray, "P G"]:
+    """How far the optimum follows when the `given` parameters are moved by one unit; `held` ones stay."""
+    out = np.zeros((len(given), int(given.sum())))
+    out[given] = np.eye(out.shape[1])
+    free = ~given & ~held
+    out[free] = -np.linalg.solve(curvature[np.ix_(free, free)], curvature[np.ix_(free, given)])
+    return out
+
+
+def held_covariance(
+    information: Float[np.ndarray, "F P P"],
+    score: Float[np.ndarray, "F P"],
+    prior_variance: Float[np.ndarray, " P"],
+    curvature: Float[np.ndarray, "P P"],
+    held: Bool[np.ndarray, " P"],
+    block: Int64[np.ndarray, " F"],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "P P"]:
+    """Covariance of a MAP estimate some parameters of which were held at the prior.
+
+    Args:
+        information: what each frame says, as for `bootstrap_covariance`.
+        score: gradient of each frame's cost.
+        prior_variance: of every parameter, independent.
+        curvature: of the whole cost, prior included: says how far the others follow a held parameter.
+        held: parameters that the frames had no say in.
+        block: frames with the same number are drawn together.
+        rng: draws the blocks.
+
+    Returns:
+        The free parameters' covariance given the held ones, plus what the prior leaves open in the held ones,
+        for them and for all that follow them.
+    """
+    at = np.ix_(~held, ~held)
+    out = np.zeros((len(held), len(held)))
+    prior_information = np.diag(1 / prior_variance[~held])
+    out[at] = bootstrap_covariance(
+        information[:, ~held][:, :, ~held], score[:, ~held], prior_information, block, rng
+    )
+    along = response(curvature, held, np.zeros_like(held))
+    return out + (along * prior_variance[held]) @ along.T
+
+
 def spread_to_covariance(
     spread: Float[np.ndarray, "P P"], least: Float[np.ndarray, "P P"]
 ) -> Float[np.ndarray, "P P"]:
@@ -118,7 +172,7 @@ def posterior(
     full = covariance + np.diag(bias_floor**2)
     variance, before = np.diag(full), np.diag(prior_covariance)
     observability = np.clip(1 - variance / before, 0.0, 1.0)
-    observable = observability >= _OBSERVABLE
+    observable = observability >= OBSERVABLE
     # An unobservable DoF keeps the prior's sigma: widen its row and column, correlations stay.
     scale = np.where(observable, 1.0, np.sqrt(np.maximum(before / variance, 1.0)))
     return Posterior(full * np.outer(scale, scale), observability, observable)

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config import SolveConfig
+from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import from_quaternion, inverse, log_so3, perturb_exactly, transform_points
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.objective.problem import Prior
@@ -68,14 +69,14 @@ def run(
     prior = Prior(
         perturb_exactly(T_cl, rotation, start[1], rng),
         perturb_exactly(T_lr, rotation, start[1], rng),
-        float(np.radians(2.0)),
-        0.05,
+        max(float(np.radians(2.0)), float(rotation)),
+        max(0.05, start[1]),
     )
     begun = time.process_time()
     e = estimate_camera_lidar(rows, prior, SolveConfig(), np.random.default_rng(100 + seed))
     cpu_s = time.process_time() - begun
     error = azimuth_elevation_deg(e.T, T_cl)
-    sigma = np.sqrt(np.diag(e.covariance))
+    sigma = np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
     off = np.concatenate([log_so3((e.T @ inverse(T_cl))[:3, :3]), e.T[:3, 3] - T_cl[:3, 3]])
     print(
         f"{label:6s} start {start[0]:.0f} deg {start[1]:.1f} m seed {seed} | az {error[0]:.3f} el {error[1]:.3f} deg"
