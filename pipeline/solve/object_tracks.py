@@ -36,6 +36,7 @@ _HEIGHT_M = {
 _CAR_HEIGHT_M = 1.55
 _BOX_RANGE_FRACTION, _BOX_BEARING_SIGMA_RAD = 0.2, np.radians(0.5)
 _BORDER_PX = 6.0  # a box that ends at the image's border ends there by accident
+_LEAST_HEIGHT_M = 1.45  # no road user is lower: where beams are sparse, the topmost one hits below the top
 _LARGEST_M, _SMALLEST_M = 12.0, 0.3
 _CLUSTER_SIGMA_M = 0.5  # which part of an object the beams meet changes from frame to frame
 _FAR_M = 80.0
@@ -152,7 +153,8 @@ def camera_tracks(observations: Sequence[Observation], motion: Sequence[Motion])
 def box_centres(track: Track, observations: Sequence[Observation]) -> Float[np.ndarray, "N 3"]:
     """Centre of the box about a lidar track's cluster at each sighting, let down to the ground where that is known.
 
-    An object's lowest part is cut off with the ground; a 3D detector's box stands on the ground.
+    An object's lowest part is cut off with the ground, its highest lies above the topmost beam that meets it; a 3D
+    detector's box stands on the ground and is as high as road users are.
     """
     centres = np.empty((track.sightings, 3))
     for k, (i, row) in enumerate(zip(track.frame, track.detection, strict=True)):
@@ -166,7 +168,7 @@ def box_centres(track: Track, observations: Sequence[Observation]) -> Float[np.n
             n, d = o.ground_plane[:3], o.ground_plane[3]
             ground = -(n[0] * middle[0] + n[1] * middle[1] + d) / n[2]
             if 0 < low[2] - ground < 1.0:
-                middle[2] = 0.5 * (ground + high[2])
+                middle[2] = 0.5 * (ground + max(high[2], ground + _LEAST_HEIGHT_M))
         centres[k] = middle
     return centres
 

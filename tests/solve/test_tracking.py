@@ -12,7 +12,7 @@ from pipeline.objective.problem import Prior
 from pipeline.solve.association import associate, shared_sightings
 from pipeline.solve.bearings import Bearings, align_bearings, consistency
 from pipeline.solve.methods import solver_of
-from pipeline.solve.object_tracks import lidar_tracks, motions, turn_between
+from pipeline.solve.object_tracks import box_centres, lidar_tracks, motions, turn_between
 from pipeline.solve.tracking import BIAS_FLOOR_RAD, PairTracks, calibrate_pair, solve_tracking
 from pipeline.solve.tracks import Motion, Scan, Track, follow
 from schemas.calibrations import PAIRS
@@ -330,3 +330,17 @@ def test_a_camera_that_sees_nobody_leaves_the_radar_calibrated(day):
     assert solution.pairs["camera_lidar"].frames_used == 0
     assert np.array_equal(solution.pairs["camera_lidar"].T, PRIOR.T_camera_lidar)
     assert solution.pairs["lidar_radar"].frames_used == 16
+
+
+def test_a_box_stands_on_the_ground_and_is_no_lower_than_a_car(day):
+    track = make_track(day[0].lidar_cluster_centre_m[:1].astype(float), np.zeros(3))
+    low = day[0].lidar_cluster_min_m.copy()
+    high = day[0].lidar_cluster_max_m.copy()
+    low[0, 2], high[0, 2] = -1.4, -0.9  # what two rings leave of a car, 0.3 m above the ground at -1.7 m
+    plane = np.array([0.0, 0.0, 1.0, 1.7])
+    seen = replace(day[0], lidar_cluster_min_m=low, lidar_cluster_max_m=high, ground_plane=plane)
+    assert box_centres(track, [seen])[0, 2] == pytest.approx(-1.7 + 1.45 / 2, abs=1e-6)
+    tall = replace(seen, lidar_cluster_max_m=high + np.float32([0, 0, 2.2]))
+    assert box_centres(track, [tall])[0, 2] == pytest.approx((-1.7 + 1.3) / 2, abs=1e-6)
+    unknown = replace(seen, ground_plane=None)
+    assert box_centres(track, [unknown])[0, 2] == pytest.approx(-1.15, abs=1e-6)
