@@ -1,0 +1,169 @@
+"""Corner reflectors found by themselves in a standing recording, near a guess: lidar by echo and shape, radar by power.
+
+A trihedral corner's phase centre is its apex, where its three plates meet: that is what a radar reports and what
+a person marks. No lidar beam meets the apex itself, so it is fitted from the ranges on the plates.
+Source: paper, section 2.1 (three trihedral reflectors, 150 frames, positions in each sensor's own coordinates).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from pipeline.geometry.se3 import exp_so3
+from pipeline.geometry.spherical import to_spherical
+
+__all__ = ["Found", "find_in_lidar", "find_in_radar", "robust_mean"]
+
+Echoes = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]  # points [m], intensity or power [dB]
+
+_CLIP_SIGMAS: Final = 3.5
+_FEWEST_FRAMES: Final = 8  # fewer give no standard error worth its name
+_BRIGHT: Final = 0.5  # of the brightest echo near the guess
+_OVER_MEDIAN: Final = (
+    4.0  # bare metal against the median echo of a lot, asphalt; a tripod reaches half of that
+)
+_CELL_RAD: Final = np.radians(0.1)  # returns of one beam of a standing sensor fall into one cell
+_RANGE_SIGMA_M: Final = 0.02  # of a beam's mean range on a plate: mixed returns, steps of the range counter
+_FACING_SIGMA_RAD: Final = np.radians(
+    2.0
+)  # how well a person turns a reflector to the car, and the lidar's own tilt
+_BLOCKS: Final = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """One reflector in one sensor's frame."""
+
+    position_m: np.ndarray  # 3
+    sigma_m: np.ndarray  # 3, standard error of the position, per axis
+    spread_m: np.ndarray  # 3, standard deviation of one frame's position
+    frames: int  # that the position rests on
+
+
+def robust_mean(
+    samples: Float[np.ndarray, "N 3"],
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], int]:
+    """Mean and standard deviation of the samples within 3.5 robust sigmas of the median on every axis, and their count.
+
+    Sigma is 1.4826 times the median absolute deviation; the samples are one frame's position each.
+    """
+    off = np.abs(samples - np.median(samples, axis=0))
+    sigma = 1.4826 * np.median(off, axis=0)
+    kept = samples[np.all(off <= _CLIP_SIGMAS * np.maximum(sigma, 1e-6), axis=1)]
+    if len(kept) < 2:
+        return np.median(samples, axis=0), np.std(samples, axis=0), len(samples)
+    return kept.mean(axis=0), kept.std(axis=0, ddof=1), len(kept)
+
+
+def find_in_radar(
+    frames: Sequence[Echoes], guess_m: Float[np.ndarray, " 3"], radius_m: float = 1.5
+) -> Found | None:
+    """Robust mean of the strongest detection of every frame that lies near the guess in top view.
+
+    Top view, because a radar's elevation is off by metres where the ground reflects too. At one range the
+    strongest echo is the largest radar cross-section. None where fewer than 8 frames hold one.
+    """
+    strongest = []
+    for points, power_db in frames:
+        near = np.flatnonzero(np.linalg.norm(points[:, :2] - guess_m[:2], axis=1) < radius_m)
+        if near.size:
+            strongest.append(points[near[np.argmax(power_db[near])]])
+    if len(strongest) < _FEWEST_FRAMES:
+        return None
+    mean, spread, count = robust_mean(np.array(strongest, np.float64))
+    return Found(mean, spread / np.sqrt(count), spread, count)
+
+
+def find_in_lidar(
+    frames: Sequence[Echoes],
+    guess_m: Float[np.ndarray, " 3"],
+    edge_m: float | None = None,
+    radius_m: float = 1.0,
+) -> Found | None:
+    """Apex of a trihedral from the bright echoes near the guess; their plain centre where its edge is unknown.
+
+    Args:
+        frames: points and intensities of each standing frame, lidar frame.
+        guess_m: where it stands, roughly.
+        edge_m: length of the edges that meet in the apex. The reflector opens towards the sensor with one edge
+            upright, to 2 deg per axis, and the fit may turn it within that.
+        radius_m: of the ball about the guess.
+
+    Returns:
+        None where fewer than 8 frames hold a bright echo, or where its beams leave the apex open by more than a
+        quarter of an edge (one sigma). sigma_m holds the scatter between frames and what the
+        few standing beams leave open; without edge_m, the apex lies deeper than the returned centre.
+    """
+    bright = [b for points, intensity in frames if len(b := _bright(points, intensity, guess_m, radius_m))]
+    if len(bright) < _FEWEST_FRAMES:
+        return None
+    centres = np.array([b.mean(axis=0) for b in bright])
+    mean, spread, count = robust_mean(centres)
+    if edge_m is None:
+        everything = np.concatenate(bright)
+        beams = max(len(everything) / len(bright), 1.0)
+        return Found(
+            mean, np.hypot(spread / np.sqrt(count), everything.std(axis=0) / np.sqrt(beams)), spread, count
+        )
+    apex, sigma = _fit_apex(np.concatenate(bright), edge_m)
+    if sigma.max() > edge_m / 4:
+        return None
+    parts = [np.concatenate(bright[i::_BLOCKS]) for i in range(_BLOCKS)]
+    between = np.std([_fit_apex(part, edge_m)[0] for part in parts], axis=0, ddof=1) / np.sqrt(_BLOCKS)
+    return Found(apex, np.hypot(sigma, between), spread, len(bright))
+
+
+def _bright(points: np.ndarray, intensity: np.ndarray, guess_m: np.ndarray, radius_m: float) -> np.ndarray:
+    near = np.linalg.norm(points - guess_m, axis=1) < radius_m
+    p, v = points[near].astype(np.float64), intensity[near]
+    return p[v > max(_BRIGHT * v.max(), _OVER_MEDIAN * np.median(intensity))] if len(p) else p
+
+
+def _fit_apex(points: np.ndarray, edge_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Apex and its sigma: where a ray leaves the corner of three planes through the apex is the range it measured."""
+    rays, range_m = _by_beam(points)
+    centre = (rays * range_m[:, None]).mean(axis=0)
+    # The centre of a plate lies 2/3 of an edge's depth in front of the apex: edge / sqrt(3) * 2/3.
+    start = centre * (1 + edge_m * 2 / np.sqrt(27) / np.linalg.norm(centre))
+    edges = _facing(start)
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        plates = edges @ exp_so3(x[3:]).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (plates @ (start + x[:3])) / (rays @ plates.T)
+        at = np.where(t > 0, t, np.inf).min(axis=1)
+        miss = np.where(np.isfinite(at), at - range_m, 10.0) / _RANGE_SIGMA_M
+        # The echoes' centre holds the apex where the beams are too few: half an edge across.
+        return np.concatenate([miss, x[:3] / (edge_m / 2), x[3:] / _FACING_SIGMA_RAD])
+
+    found = least_squares(residuals, np.zeros(6), loss="soft_l1", x_scale=0.05)
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    return start + found.x[:3], np.sqrt(np.diag(covariance)[:3])
+
+
+def _by_beam(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean direction and median range of each cell of directions that a good part of the returns fall into."""
+    spherical = to_spherical(points)
+    _, cell, counts = np.unique(
+        np.round(spherical[:, :2] / _CELL_RAD), axis=0, return_inverse=True, return_counts=True
+    )
+    often = np.flatnonzero(counts >= 0.2 * counts.max())
+    members = [np.flatnonzero(cell.ravel() == k) for k in often]
+    middle = np.array([np.median(points[m], axis=0) for m in members])
+    rays = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    return rays, np.array([np.median(spherical[m, 2]) for m in members])
+
+
+def _facing(apex: np.ndarray) -> np.ndarray:
+    """Unit edges (rows) of a trihedral that opens along the level line to the sensor, one edge in the upright plane."""
+    towards = -apex * [1, 1, 0] / np.linalg.norm(apex[:2])
+    side, up = np.array([-towards[1], towards[0], 0.0]), np.array([0.0, 0.0, 1.0])
+    turns = np.radians([90.0, 210.0, 330.0])
+    across = np.cos(turns)[:, None] * side + np.sin(turns)[:, None] * up
+    return towards / np.sqrt(3) + across * np.sqrt(2 / 3)
