@@ -1,4 +1,4 @@
-"""`boresight evaluate`: calibration records against a known truth or picked reflectors, as the paper's Table 1."""
+"""`boresight evaluate`: calibration records against a known truth or picked reflectors, as the paper's tables."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
 
-    from pipeline.verify.targets import Picks
+    from pipeline.verify.evaluation import Comparison
+    from pipeline.verify.recording import ReflectorFiles
     from schemas.calibrations import CalibrationRecord
 
 __all__ = ["evaluate"]
@@ -19,6 +22,8 @@ def evaluate(
     lake: str,
     truth: Path | None = None,
     reflectors: Path | None = None,
+    recording_lake: str | None = None,
+    recording_day: str | None = None,
     method: str | None = None,
     truth_sigma: str = "0,0",
     out: Path | None = None,
@@ -28,12 +33,17 @@ def evaluate(
     Args:
         lake: folder of the tables.
         truth: JSON with T_camera_lidar and T_lidar_radar (4x4), or a folder with VEHICLE/DAY.json.
-        reflectors: JSON of reflector positions as picked in each sensor's data, instead of a truth:
-            {"camera": {model, K, D, width_px, height_px}, "targets": [{"pixel": [u, v], "lidar_m": [x, y, z],
-            "radar_m": [x, y, z]}]}.
+        reflectors: instead of a truth, JSON of reflector positions as picked in each sensor's data (what `simulate
+            --reflectors` writes; {"camera": {...}, "targets": [{"pixel", "lidar_m", "radar_m", ...}]}, described in
+            pipeline/verify/picks.py), or a folder with VEHICLE/DAY.json. It judges the vehicle and day that it names.
+        recording_lake: lake that the reflector recording was ingested into: lidar and radar positions are then found
+            in its frames near the picks, camera pixels stay as picked. Default: --lake where --recording-day is given.
+        recording_day: day under which it was ingested; default: the day of the picks. A lake holds one partition of
+            frames per vehicle-day: give the recording another day or a lake of its own, or it replaces the drives.
         method: only this method's records.
-        truth_sigma: ROT_DEG,TRANS_M: how well the truth itself is known, for the errors in sigmas.
-        out: Markdown file to write; the table goes to stderr in any case.
+        truth_sigma: ROT_DEG,TRANS_M: how well a --truth itself is known, for the errors in sigmas.
+        out: FILE.md, FILE.parquet, or a folder for table_1.md, extended_table_1.md and table_1.parquet; the
+            tables go to stderr in any case.
     """
     import math
     import sys
@@ -43,36 +53,69 @@ def evaluate(
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake
     from pipeline.store.tables import read_records
-    from pipeline.verify.evaluation import compare, current_runs, table_1
+    from pipeline.verify.recording import ReflectorFiles
+    from pipeline.verify.table import as_markdown, table_rows
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
     if (truth is None) == (reflectors is None):
         raise ConfigError("command line", "truth", "give either --truth or --reflectors")
+    if truth is not None and (recording_lake or recording_day):
+        raise ConfigError("command line", "recording-lake", "a reflector recording needs --reflectors")
     records = [
         r for r in read_records(Lake.at(lake), CALIBRATIONS, CalibrationRecord) if method in (None, r.method)
     ]
-    picks = _read_picks(reflectors) if reflectors else None
-    known_deg, known_m = parse_pair(truth_sigma, "truth-sigma")
-    compared, refused, unknown = [], 0, 0
+    recording = (recording_lake or lake, recording_day) if recording_lake or recording_day else None
+    files = ReflectorFiles(reflectors, recording)
+    rotation_deg, translation_m = parse_pair(truth_sigma, "truth-sigma")
+    compared, counts = _compare_all(records, truth, files, (math.radians(rotation_deg), translation_m))
+    notes = files.notes()
+    sys.stderr.write("\n".join(as_markdown(table_rows(compared), compared, notes).values()))
+    if out is not None:
+        _write(out, compared, notes)
+    status = "done" if compared else "refused"
+    print_summary("evaluate", status, runs=len(compared), **counts, positions=notes, out=out)
+    return 0 if compared else 3
+
+
+def _compare_all(
+    records: Sequence[CalibrationRecord],
+    truth: Path | None,
+    files: ReflectorFiles,
+    truth_sigma: tuple[float, float],
+) -> tuple[list[Comparison], dict[str, int]]:
+    """Every current run that has a truth, and how many have none or no result."""
+    from pipeline.verify.evaluation import compare, current_runs
+
+    compared, counts = [], {"refused_runs": 0, "runs_without_truth": 0}
     for run in current_runs(records):
-        known = None if truth is None else _truth_of(truth, next(iter(run.values())))
-        if known is None and picks is None:
-            unknown += 1
+        first = next(iter(run.values()))
+        known = None if truth is None else _truth_of(truth, first)
+        file = files.of(first.vehicle, first.day)
+        if known is None and file is None:
+            counts["runs_without_truth"] += 1
             continue
-        comparison = compare(run, known, picks, (math.radians(known_deg), known_m))
+        comparison = compare(run, known, file.picks if file else None, truth_sigma)
         if comparison is None:
-            refused += 1
+            counts["refused_runs"] += 1
         else:
             compared.append(comparison)
-    text = table_1(compared)
-    sys.stderr.write(text)
-    if out is not None:
-        out.write_text(text)
-    status = "done" if compared else "refused"
-    print_summary(
-        "evaluate", status, runs=len(compared), refused_runs=refused, runs_without_truth=unknown, out=out
-    )
-    return 0 if compared else 3
+    return compared, counts
+
+
+def _write(out: Path, compared: Sequence[Comparison], notes: Sequence[str]) -> None:
+    from pipeline.verify.table import as_markdown, as_parquet, table_rows
+
+    rows = table_rows(compared)
+    texts = as_markdown(rows, compared, notes)
+    if out.suffix == ".parquet":
+        out.write_bytes(as_parquet(rows, notes))
+    elif out.suffix:
+        out.write_text("\n".join(texts.values()))
+    else:
+        out.mkdir(parents=True, exist_ok=True)
+        for title, text in texts.items():
+            (out / f"{title.lower().replace(' data', '').replace(' ', '_')}.md").write_text(text)
+        (out / "table_1.parquet").write_bytes(as_parquet(rows, notes))
 
 
 def _truth_of(truth: Path, record: CalibrationRecord) -> dict[str, np.ndarray] | None:
@@ -82,34 +125,3 @@ def _truth_of(truth: Path, record: CalibrationRecord) -> dict[str, np.ndarray] |
     if truth.is_dir() and not path.exists():
         return None
     return read_transforms(path)
-
-
-def _read_picks(path: Path) -> Picks:
-    import json
-
-    import numpy as np
-
-    from pipeline.errors import ConfigError
-    from pipeline.geometry.cameras import Camera
-    from pipeline.verify.targets import Picks
-
-    try:
-        content = json.loads(path.read_text())
-        c, targets = content["camera"], content["targets"]
-        camera = Camera(
-            c["model"],
-            np.array(c["K"], float),
-            np.array(c["D"], float),
-            int(c["width_px"]),
-            int(c["height_px"]),
-        )
-        pixels, lidar_m, radar_m = (
-            np.array([t[key] for t in targets], float) for key in ("pixel", "lidar_m", "radar_m")
-        )
-    except (OSError, ValueError, KeyError, TypeError) as err:
-        raise ConfigError(str(path), "", f"no readable reflector file: {err!r}") from err
-    if not targets or [a.shape[1:] for a in (pixels, lidar_m, radar_m)] != [(2,), (3,), (3,)]:
-        raise ConfigError(
-            str(path), "targets", "each needs pixel [u, v], lidar_m [x, y, z] and radar_m [x, y, z]"
-        )
-    return Picks(pixels, lidar_m, radar_m, camera)

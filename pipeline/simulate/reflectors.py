@@ -1,5 +1,8 @@
 """The paper's controlled recording: three trihedral corner reflectors on a level empty lot, seen standing still.
 
+The JSON beside the recording is the file that `boresight evaluate --reflectors` reads as it is: its format is
+described in pipeline/verify/picks.py. What is true stands in it under `truth`, which evaluate does not read.
+
 Source: paper, section 2.1 (150 frames, positions picked by hand in each sensor's data) and figure 2.
 """
 
@@ -31,6 +34,7 @@ __all__ = ["REFLECTORS_VEHICLE", "simulate_reflectors"]
 # Apexes in the vehicle frame [m]: three ranges, three bearings, at about the height of the sensors.
 REFLECTORS_VEHICLE: Final = np.array([[16.3, -2.6, 1.45], [26.0, 3.5, 1.30], [41.2, 0.6, 1.60]])
 _EDGE_M: Final = 0.35
+_LIDAR_PICK_SIGMA_M: Final = 0.015
 _RATE_HZ: Final = 10.0
 _SUN: Final = np.array([0.35, 0.55, 0.76]) / np.linalg.norm([0.35, 0.55, 0.76])
 
@@ -123,18 +127,30 @@ def _picks(
     lidar = transform_points(T_lidar_vehicle, REFLECTORS_VEHICLE)
     radar = transform_points(inverse(m.T_vehicle_radar), REFLECTORS_VEHICLE)
     step = m.camera.width_px / 1824  # half a pixel of the full camera
-    targets = [
-        {
-            "pixel": (pixels[i] + rng.normal(0, 0.5 * max(step, 0.5), 2)).tolist(),
-            "lidar_m": (lidar[i] + rng.normal(0, 0.015, 3)).tolist(),
-            "radar_m": _radar_pick(frames, radar[i]).tolist(),
-        }
-        for i in range(len(REFLECTORS_VEHICLE))
-    ]
+    pixel_sd, lidar_sd = 0.5 * max(step, 0.5), _LIDAR_PICK_SIGMA_M
+    targets = []
+    for i in range(len(REFLECTORS_VEHICLE)):
+        pixel, point = pixels[i] + rng.normal(0, pixel_sd, 2), lidar[i] + rng.normal(0, lidar_sd, 3)
+        detections = _radar_picks(frames, radar[i])
+        targets.append(
+            {
+                "pixel": pixel.tolist(),
+                "lidar_m": point.tolist(),
+                "radar_m": detections.mean(axis=0).tolist(),
+                # A person marks a standing scene once in image and cloud; the radar's detections dance.
+                "spread": {
+                    "pixel": [pixel_sd] * 2,
+                    "lidar_m": [lidar_sd] * 3,
+                    "radar_m": detections.std(axis=0).tolist(),
+                },
+                "frames": {"pixel": 1, "lidar_m": 1, "radar_m": len(detections)},
+            }
+        )
     return {
         "vehicle": vehicle,
         "day": day,
         "frames": len(frames),
+        "reflector": {"edge_m": _EDGE_M},
         "targets": targets,
         "camera": {
             "model": m.nominal_camera.model,
@@ -153,12 +169,12 @@ def _picks(
     }
 
 
-def _radar_pick(frames: list[SimulatedFrame], near_m: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """Mean of the strongest detection around a reflector over all frames."""
+def _radar_picks(frames: list[SimulatedFrame], near_m: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "N 3"]:
+    """The strongest detection around a reflector in every frame that has one."""
     found = []
     for frame in frames:
         offset = np.linalg.norm(frame.scan.xyz_m[:, :2] - near_m[:2], axis=1)
         close = np.flatnonzero(offset < 1.5)
         if close.size:
             found.append(frame.scan.xyz_m[close[np.argmax(frame.scan.power_db[close])]])
-    return np.mean(found, axis=0).astype(np.float64) if found else np.full(3, np.nan)
+    return np.array(found, np.float64) if found else np.full((1, 3), np.nan)

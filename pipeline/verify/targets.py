@@ -7,7 +7,7 @@ positions where it exists.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +17,30 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical, to_spherical, wrap_angle
 
-__all__ = ["DEFAULT_TARGETS", "Picks", "errors_at_targets", "errors_of_picks", "loop_errors"]
+__all__ = [
+    "DEFAULT_TARGETS",
+    "Doubt",
+    "Picks",
+    "doubt_of_loop",
+    "doubt_of_picks",
+    "errors_at_targets",
+    "errors_of_picks",
+    "loop_errors",
+]
 
 # Three reflectors inside the field of view that all three sensors share: azimuth, elevation [rad], range [m].
 DEFAULT_TARGETS = from_spherical(
     np.array([[np.radians(-10), 0, 15.0], [np.radians(8), 0, 25.0], [0.0, 0, 40.0]])
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Doubt:
+    """Standard deviation of picked positions, per coordinate."""
+
+    pixels: np.ndarray  # N 2
+    lidar_m: np.ndarray  # N 3
+    radar_m: np.ndarray  # N 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +51,8 @@ class Picks:
     lidar_m: np.ndarray  # N 3
     radar_m: np.ndarray  # N 3
     camera: Camera
+    spread: Doubt | None = None  # of one frame's pick
+    sigma: Doubt | None = None  # of the positions: standard errors
 
 
 def errors_at_targets(
@@ -60,6 +80,49 @@ def errors_of_picks(pair: str, T: Float[np.ndarray, "4 4"], picks: Picks) -> Flo
     points = transform_points(T, picks.lidar_m if pair == "camera_lidar" else picks.radar_m)
     error = _mean_error(pair, points, picks.camera.unproject(picks.pixels))
     return np.array([error[0], error[1], np.nan])
+
+
+def doubt_of_picks(
+    pair: str, T: Float[np.ndarray, "4 4"], picks: Picks, doubt: Doubt
+) -> Float[np.ndarray, " 3"]:
+    """One sigma that doubtful picks leave in a reflector's azimuth, elevation [rad] and range [m] error.
+
+    Root mean square over the reflectors, first order; range is NaN for camera pairs. T turns the child's axes into
+    the parent's, which any estimate does well enough.
+    """
+    radar = pair == "lidar_radar"
+    angles = to_spherical if radar else camera_direction_angles
+    child = (picks.lidar_m, doubt.lidar_m) if pair == "camera_lidar" else (picks.radar_m, doubt.radar_m)
+    square = _propagated(lambda p: angles(transform_points(T, p)), *child)
+    if radar:
+        square = square + _propagated(to_spherical, picks.lidar_m, doubt.lidar_m)
+        return np.sqrt(square.mean(axis=0))
+    square = square + _propagated(
+        lambda p: camera_direction_angles(picks.camera.unproject(p)), picks.pixels, doubt.pixels
+    )
+    return np.array([*np.sqrt(square.mean(axis=0)), np.nan])
+
+
+def doubt_of_loop(
+    transforms: Mapping[str, Float[np.ndarray, "4 4"]], picks: Picks, doubt: Doubt
+) -> Float[np.ndarray, " 3"]:
+    """The same for the loop: next to nothing, for it compares a lidar point with itself."""
+    loop = transforms["lidar_radar"] @ inverse(transforms["camera_radar"]) @ transforms["camera_lidar"]
+    return np.sqrt(
+        _propagated(
+            lambda p: to_spherical(transform_points(loop, p)) - to_spherical(p), picks.lidar_m, doubt.lidar_m
+        ).mean(axis=0)
+    )
+
+
+def _propagated(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Variance of function(at) per row, by central differences of one standard deviation."""
+    total = np.zeros(1)
+    for axis in range(at.shape[1]):
+        step = np.zeros_like(at)
+        step[:, axis] = sd[:, axis]
+        total = total + ((function(at + step) - function(at - step)) / 2) ** 2
+    return total
 
 
 def _mean_error(pair: str, points: np.ndarray, true: np.ndarray) -> np.ndarray:

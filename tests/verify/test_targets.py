@@ -3,6 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from pipeline.calibration_records import Inputs, record_of
@@ -10,8 +12,18 @@ from pipeline.geometry.se3 import exp_so3, inverse, transform_points
 from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.solve.select import Selection
 from pipeline.store.partitions import Partition
-from pipeline.verify.evaluation import compare, current_runs, table_1
-from pipeline.verify.targets import DEFAULT_TARGETS, Picks, errors_at_targets, errors_of_picks, loop_errors
+from pipeline.verify.evaluation import compare, current_runs
+from pipeline.verify.table import as_markdown, as_parquet, table_rows
+from pipeline.verify.targets import (
+    DEFAULT_TARGETS,
+    Doubt,
+    Picks,
+    doubt_of_loop,
+    doubt_of_picks,
+    errors_at_targets,
+    errors_of_picks,
+    loop_errors,
+)
 from pipeline.verify.verdict import Verdict
 from schemas.calibrations import PAIRS
 from tests.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
@@ -103,20 +115,97 @@ def make_run(method="joint", seed=0, key="k1", off_deg=0.2, speed=10.0):
     ]  # fmt: skip
 
 
-def test_table_holds_our_errors_and_the_papers_rows_as_other_data():
-    runs = current_runs(
-        [*make_run(), *make_run(method="joint-optimisation", key="k2", off_deg=0.5, speed=30.0)]
-    )
-    text = table_1([compare(run, TRUTH) for run in runs])
-    ours = next(line for line in text.splitlines() if line.startswith("| joint | all"))
+def compared_runs(picks=None):
+    records = [*make_run(), *make_run(method="joint-optimisation", key="k2", off_deg=0.5, speed=30.0)]
+    return [compare(run, None if picks else TRUTH, picks) for run in current_runs(records)]
+
+
+def test_tables_hold_our_errors_and_the_papers_rows_as_other_data():
+    comparisons = compared_runs()
+    texts = as_markdown(table_rows(comparisons), comparisons, ["positions: made up"])
+    first, extended = texts["Table 1"], texts["Extended data table 1"]
+    ours = next(line for line in first.splitlines() if line.startswith("| joint | all"))
     assert "| 1 | 0.20" in ours
     assert "3 of 3 pairs" in ours
-    assert "| joint-optimisation | highway | 1 | 0.50" in text
-    assert (
+    assert "| joint-optimisation | highway | 1 | 0.50" in extended
+    assert "highway" not in first
+    printed = (
         "| paper: joint optimization | all | other data | 0.22 / 0.27 | 0.20 / 0.45 | 0.36 / 0.72 / 0.14 |"
-        in text
     )
-    assert "| (prior) | all | 2 | 2.0" in text
+    lines = first.splitlines()
+    row = next(i for i, line in enumerate(lines) if line.startswith(printed))
+    assert lines[row - 1].startswith("| joint-optimisation | all | 1 |")
+    assert "| (prior) | all | 2 | 2.0" in first
+    assert "- positions: made up" in first
+
+
+def test_methods_without_records_keep_their_rows_with_dashes():
+    comparisons = compared_runs()
+    texts = as_markdown(table_rows(comparisons), comparisons)
+    assert "| joint-ssl | all | 0 | - | - | - | - |  |" in texts["Table 1"]
+    assert "| joint-ssl | urban | 0 | - | - | - | - |  |" in texts["Extended data table 1"]
+
+
+def test_the_parquet_table_says_the_same_as_the_markdown():
+    comparisons = compared_runs()
+    rows = table_rows(comparisons)
+    table = pq.read_table(pa.BufferReader(as_parquet(rows, ["a note"])))
+    assert table.schema.metadata[b"truth"] == b"a note"
+    content = table.to_pylist()
+    ours = next(r for r in content if (r["method"], r["environment"]) == ("joint", "all"))
+    assert ours["camera_lidar_azimuth_deg"] == pytest.approx(0.2, abs=0.01)
+    assert (ours["source"], ours["accepted_pairs"], ours["pairs"]) == ("ours", 3, 3)
+    tracking = [r for r in content if r["method"] == "paper: object tracking [60]"]
+    assert [(r["source"], r["runs"], r["loop_range_m"]) for r in tracking] == [
+        ("paper (other data)", None, None)
+    ]
+    assert {r["table"] for r in content if r["environment"] != "all"} == {"Extended data table 1"}
+
+
+def doubtful_picks(pixel=0.0, lidar=0.0, radar=0.0):
+    sizes = zip((2, 3, 3), (pixel, lidar, radar), strict=True)
+    doubt = Doubt(*(np.full((3, n), sd) for n, sd in sizes))
+    return replace(picks_of(), spread=doubt, sigma=doubt), doubt
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_truths_own_sigma_is_the_scatter_that_its_picks_make(pair):
+    picks, doubt = doubtful_picks(0.8, 0.03, 0.1)
+    rng = np.random.default_rng(4)
+    of_each = []
+    for k in range(3):
+        pixels, lidar, radar = (
+            at[k] + sd[k] * rng.standard_normal((20_000, len(at[k])))
+            for at, sd in (
+                (picks.pixels, doubt.pixels),
+                (picks.lidar_m, doubt.lidar_m),
+                (picks.radar_m, doubt.radar_m),
+            )
+        )
+        # The mean absolute value of a normal variable is sqrt(2 / pi) of its sigma.
+        of_each.append(
+            errors_of_picks(pair, TRUTH[pair], Picks(pixels, lidar, radar, CAMERA)) * np.sqrt(np.pi / 2)
+        )
+    expected = np.sqrt(np.mean(np.square(of_each), axis=0))
+    found = doubt_of_picks(pair, TRUTH[pair], picks, doubt)
+    wanted = slice(3 if pair == "lidar_radar" else 2)
+    np.testing.assert_allclose(found[wanted], expected[wanted], rtol=0.03)
+
+
+def test_a_loop_hardly_cares_where_its_points_were_picked():
+    picks, doubt = doubtful_picks(lidar=0.1)
+    opened = TRUTH | {"lidar_radar": turned(T_LIDAR_RADAR, 2, 0.3)}
+    assert np.degrees(doubt_of_loop(opened, picks, doubt)[:2]).max() < 0.01
+
+
+def test_a_table_from_picks_states_what_the_truth_is_worth():
+    comparisons = compared_runs(doubtful_picks(radar=0.1)[0])
+    text = as_markdown(table_rows(comparisons), comparisons)["Table 1"]
+    line = next(x for x in text.splitlines() if x.startswith("| (truth: 1 sigma"))
+    lidar_radar = [float(v) for v in line.split("|")[6].split("/")]
+    # 0.1 m across at 15, 25 and 40 m; 0.1 m along the beam
+    across = np.degrees(0.1 * np.sqrt(np.mean(1 / np.array([15, 25, 40]) ** 2)))
+    assert lidar_radar == pytest.approx([across, across, 0.1], rel=0.05)
 
 
 def test_normalised_errors_are_errors_in_sigmas():
