@@ -41,8 +41,8 @@ from schemas.observations import Observation
 __all__ = ["BIAS_FLOOR_RAD", "MIN_TRACKS", "PairTracks", "calibrate_pair", "solve_tracking"]
 
 MIN_TRACKS = 5  # pairs of tracks: fewer are no majority that could outvote a wrong one
-# What is common to all tracks: the accuracy that the authors claim. Simulated days err by 0.1-0.2 deg at the targets; on
-# the real logs (16 rings) camera elevation differs by 0.4 deg from the calibration given with them.
+# What is common to all tracks: the accuracy that the authors claim. Simulated days err by 0.1-0.2 deg at the
+# targets; on the real logs (16 rings) camera elevation differs by 0.4 deg from the calibration given with them.
 BIAS_FLOOR_RAD = np.radians([0.2, 0.2, 0.2])
 _ROUNDS = 6
 _LEAST_ROTATION_SIGMA_RAD = np.radians(0.5)  # gate of later rounds: box against cluster, object by object
