@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
+from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import inverse, log_so3, perturb_exactly
 from pipeline.objective.problem import Prior
 from pipeline.solve.camera_lidar import estimate_camera_lidar
@@ -36,6 +37,45 @@ def test_road_without_reflectivity_leaves_the_edges_to_do_it():
     e = estimate_camera_lidar(day, prior_off_by(3.0, 0.05, 1), SolveConfig(), np.random.default_rng(0))
     assert np.abs(np.degrees(log_so3((e.T @ inverse(T_TRUE))[:3, :3]))).max() < 0.3
     assert e.diagnostics["marking_weight"] == 0.0
+
+
+def prior_along_the_axis(sigma_m):
+    """A prior that is wrong only along the optical axis, where a few frames say little."""
+    T = T_TRUE.copy()
+    T[2, 3] += 0.04
+    return Prior(T, np.eye(4), float(np.radians(2.0)), sigma_m)
+
+
+def test_what_the_day_cannot_determine_stays_at_the_prior_with_its_sigma_and_the_clock_says_so():
+    day = traced_day(SPARSE, 12, seed=1, dt_s=0.03)
+    found = []
+    for sigma_m in (0.02, 0.1):
+        prior = prior_along_the_axis(sigma_m)
+        e = estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
+        change = change_between(prior.T_camera_lidar, e.T)
+        sigma = np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
+        assert not e.observable[5]
+        assert e.observability[5] < 0.5
+        assert change[5] == pytest.approx(0.0, abs=1e-9)
+        assert sigma[5] == pytest.approx(sigma_m, rel=0.05)
+        assert e.observable[:3].all()
+        assert np.abs(change[:3]).max() > 1e-6
+        assert np.linalg.eigvalsh(e.covariance).min() > 0
+        assert abs(e.time_offset_s - 0.03) < 3 * e.time_offset_sigma_s
+        found.append(e)
+    # The less is known about tz, the less about the clock: a car that stands dt later looks as if it stood further on.
+    assert found[1].time_offset_sigma_s > found[0].time_offset_sigma_s
+
+
+def test_what_the_day_knows_better_than_the_prior_is_left_to_the_day():
+    day = traced_day(SPARSE, 12, seed=1, dt_s=0.03)
+    prior = prior_along_the_axis(0.6)
+    e = estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
+    sigma = np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
+    assert e.observable.all()
+    assert 0.1 < sigma[5] < 0.4
+    assert abs(e.T[2, 3] - T_TRUE[2, 3]) < 3 * sigma[5]
+    assert e.T[2, 3] != prior.T_camera_lidar[2, 3]
 
 
 def test_same_seed_gives_the_same_estimate():

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from pipeline.solve.covariance import blocks_of, bootstrap_covariance, posterior, spread_to_covariance
+from pipeline.solve.covariance import (
+    blocks_of,
+    bootstrap_covariance,
+    held_covariance,
+    posterior,
+    response,
+    spread_to_covariance,
+)
 
 
 def linear_day(rng, frames=200, shared=0.0, sigma=1.0):
@@ -102,3 +109,31 @@ def test_the_bias_floor_is_never_undercut():
     floor = np.array([1, 2, 3, 4, 5, 6]) * 1e-3
     after = posterior(np.eye(6) * 1e-12, np.eye(6), floor)
     assert np.all(np.sqrt(np.diag(after.covariance)) >= floor)
+
+
+def test_parameters_that_follow_a_held_one_inherit_its_doubt_and_cover_the_truth():
+    held, prior_variance = np.array([False, True]), np.array([100.0, 0.04])
+    z, deaf = [], []
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        truth = np.array([0.0, 0.2 * rng.normal()])  # the prior of the second is 0 +- 0.2
+        x = rng.normal(size=200)
+        A = np.stack([np.ones(200) + 0.5 * x, np.ones(200)], -1)
+        y = A @ truth + rng.normal(size=200)
+        estimate = np.array([A[:, 0] @ y / (A[:, 0] @ A[:, 0]), 0.0])
+        H, g = A[:, :, None] * A[:, None, :], A * (A @ estimate - y)[:, None]
+        curvature = H.sum(0) + np.diag(1 / prior_variance)
+        covariance = held_covariance(H, g, prior_variance, curvature, held, np.arange(200) // 5, rng)
+        assert covariance[1, 1] == pytest.approx(prior_variance[1])
+        assert covariance[0, 1] < 0
+        z.append((estimate[0] - truth[0]) / np.sqrt(covariance[0, 0]))
+        deaf.append((estimate[0] - truth[0]) * np.sqrt(curvature[0, 0]))
+    assert np.std(deaf) > 2.0
+    assert 0.85 < np.std(z) < 1.15
+
+
+def test_the_optimum_follows_along_the_valley_and_leaves_alone_what_is_held():
+    curvature = np.array([[4.0, 2.0, 0.0], [2.0, 5.0, 1.0], [0.0, 1.0, 3.0]])
+    given, held = np.array([False, True, False]), np.array([False, False, True])
+    np.testing.assert_allclose(response(curvature, given, held), [[-0.5], [1.0], [0.0]])
+    np.testing.assert_allclose(response(curvature, given, np.zeros(3, bool)), [[-0.5], [1.0], [-1 / 3]])
