@@ -137,10 +137,10 @@ def test_association_follows_the_motion_not_the_nearest_position():
     assert np.all(wrong + 0.3 < right)
     found = associate(shared_sightings(lidar, radar), np.eye(4), np.radians(4.0))
     assert (found.reference.tolist(), found.other.tolist()) == ([0], [0])
-    # Where nothing tells them apart by motion, the nearer one is taken.
+    # Where motion does not tell them apart, the place does.
     alike = [
         lidar[0],
-        replace(lidar[1], position_m=lidar[0].position_m + [0, 2.4, 0], velocity_mps=lidar[0].velocity_mps),
+        replace(lidar[0], position_m=lidar[0].position_m @ (R @ exp_so3(np.array([0, 0, 0.01]))).T),
     ]
     assert associate(shared_sightings(alike, radar), np.eye(4), np.radians(4.0)).reference.tolist() == [1]
 
