@@ -14,11 +14,13 @@ import numpy as np
 
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
-from pipeline.geometry.se3 import compose_covariance, inverse, log_so3
+from pipeline.geometry.changes import change_covariance, change_jacobian
+from pipeline.geometry.se3 import adjoint, compose_covariance, inverse, log_so3
 from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.results import Progress, silent
 from pipeline.solve.camera_lidar import estimate_camera_lidar
 from pipeline.solve.camera_radar import estimate_camera_radar
+from pipeline.solve.covariance import OBSERVABLE
 from pipeline.solve.lidar_radar import estimate_lidar_radar
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
@@ -26,6 +28,7 @@ from schemas.observations import Observation
 __all__ = ["compose_pairs", "solve_joint"]
 
 _SIGMAS = 3.0
+_MOSTLY = 0.5  # of a variance: from there on it is called the prior's
 _RESTART_ROTATION_RAD, _RESTART_SHIFT_M = np.radians(0.15), 0.05
 
 
@@ -99,8 +102,7 @@ def compose_pairs(
     """
     T = camera_lidar.T @ lidar_radar.T
     covariance = compose_covariance(camera_lidar.T, camera_lidar.covariance, lidar_radar.covariance)
-    before = prior.covariance("camera_radar")
-    observability = np.clip(1 - np.diag(covariance) / np.diag(before), 0.0, 1.0)
+    observability, observable = _composed_observability(camera_lidar, lidar_radar, prior)
     difference = log_so3((T @ inverse(alone.T))[:3, :3])
     sigma = np.sqrt(np.diag(covariance)[:3] + np.diag(alone.covariance)[:3])
     known = alone.observable[:3]
@@ -120,7 +122,7 @@ def compose_pairs(
         T,
         covariance,
         observability,
-        observability >= 0.5,
+        observable,
         min(camera_lidar.frames_used, lidar_radar.frames_used),
         {},
         *_time_offset(camera_lidar, lidar_radar),
@@ -133,12 +135,37 @@ def compose_pairs(
     return estimate, loop_rad, doubts
 
 
+def _composed_observability(
+    camera_lidar: PairEstimate, lidar_radar: PairEstimate, prior: Prior
+) -> tuple[np.ndarray, np.ndarray]:
+    """Observability of the composed pair, and which of its unknowns do not rest on the prior.
+
+    Counted as the record shows them, turns about the radar and its position in the camera: an unknown rests on the
+    prior where the factors' unobservable unknowns make up half of its variance, or the factors' variance together is
+    no better than half of the prior's.
+    """
+    T = camera_lidar.T @ lidar_radar.T
+    to_change = change_jacobian(T)
+    variance, kept = np.zeros(6), np.zeros(6)
+    for estimate, lever in ((camera_lidar, np.eye(6)), (lidar_radar, adjoint(camera_lidar.T))):
+        # From the factor's own turn and position to its twist, to the composed twist, to the composed position.
+        A = to_change @ lever @ np.linalg.inv(change_jacobian(estimate.T))
+        own = change_covariance(estimate.T, estimate.covariance)
+        variance += np.diag(A @ own @ A.T)
+        unseen = A[:, ~estimate.observable]
+        kept += np.diag(unseen @ own[np.ix_(~estimate.observable, ~estimate.observable)] @ unseen.T)
+    observability = np.clip(1 - variance / np.diag(prior.covariance("camera_radar")), 0.0, 1.0)
+    return observability, (observability >= OBSERVABLE) & (kept < _MOSTLY * variance)
+
+
 def _time_offset(camera_lidar: PairEstimate, lidar_radar: PairEstimate) -> tuple[float | None, float | None]:
     """stamp_camera = stamp_lidar + dt_cl = stamp_radar + dt_lr + dt_cl."""
     a, b = camera_lidar.time_offset_s, lidar_radar.time_offset_s
     if a is None or b is None:
         return None, None
-    return a + b, float(np.hypot(camera_lidar.time_offset_sigma_s or 0.0, lidar_radar.time_offset_sigma_s or 0.0))
+    return a + b, float(
+        np.hypot(camera_lidar.time_offset_sigma_s or 0.0, lidar_radar.time_offset_sigma_s or 0.0)
+    )
 
 
 def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:
