@@ -34,6 +34,7 @@ class Comparison:
     prior_errors: dict[str, np.ndarray]
     statuses: dict[str, str]
     normalised: np.ndarray  # error / sigma of every observable DoF of every pair
+    independent_loop: tuple[float, float] | None = None  # [rad], [m], of three pairs estimated apart
     truth_spread: dict[str, np.ndarray] = field(
         default_factory=dict
     )  # like errors: spread of one frame's picks
@@ -103,9 +104,17 @@ def compare(
         np.concatenate([_normalised(run[pair], T[pair], truth[pair], truth_sigma) for pair in PAIRS])
         if truth
         else np.zeros(0),
+        _independent_loop(run),
         doubts(picks.spread if picks else None),
         doubts(picks.sigma if picks else None),
     )
+
+
+def _independent_loop(run: Mapping[str, CalibrationRecord]) -> tuple[float, float] | None:
+    for record in run.values():
+        if record.loop_rotation_rad is not None and record.loop_translation_m is not None:
+            return record.loop_rotation_rad, record.loop_translation_m
+    return None
 
 
 def _transform(record: CalibrationRecord, prefix: str) -> np.ndarray:

@@ -2,7 +2,8 @@
 
     {"vehicle": "vehicle-1", "day": "2026-03-02",        whose mounting it shows; left out: that of every record
      "frames": 150,                                      of the standing recording
-     "reflector": {"edge_m": 0.35},                      optional: trihedral, edges that meet in its apex
+     "reflector": {"edge_m": 0.35},                      optional: trihedral, edges that meet in its apex; it opens
+                                                         towards the lidar, one edge upright, to 2 deg
      "camera": {"model", "K", "D", "width_px", "height_px"},
      "targets": [{"pixel": [u, v], "lidar_m": [x, y, z], "radar_m": [x, y, z],
                   "spread": {"pixel": [su, sv], "lidar_m": [sx, sy, sz], "radar_m": [sx, sy, sz]},
@@ -103,7 +104,7 @@ def find_again(
     in_lidar = [find_in_lidar(lidar, at, edge) if lidar else None for at in picks.lidar_m]
     in_radar = [find_in_radar(radar, at) if radar else None for at in picks.radar_m]
     moved = _moved(_moved(picks, "lidar_m", in_lidar), "radar_m", in_radar)
-    how = f"apex of a {edge:g} m trihedral" if edge else "centre of the bright echoes"
+    how = f"apex of a {edge:g} m trihedral" if edge else "centre of the bright echoes, its apex lies deeper,"
     sources = (
         file.sources[0],
         _source(f"lidar: {how}", in_lidar, where, file.sources[1]),

@@ -32,6 +32,7 @@ COLUMNS = (
 )
 _TABLES = {"all": "Table 1", "highway": "Extended data table 1", "urban": "Extended data table 1"}
 _NAN = float("nan")
+_CLOSED = 1e-6  # degrees or metres: rounding of stored quaternions
 # Method, environment, the name that the paper prints, COLUMNS. Camera pairs have no range in the paper either.
 _PAPER: tuple[tuple[str, str, str, tuple[float, ...]], ...] = (
     ("tracking", "all", "object tracking [60]", (0.55, 2.01, 1.92, 3.13, 1.46, 1.87, 0.22, _NAN, _NAN, _NAN)),
@@ -78,6 +79,10 @@ class TableRow:
     values: tuple[float, ...]  # COLUMNS, NaN where there is none
     accepted_pairs: int | None = None
     pairs: int | None = None
+    independent_loop_deg: float | None = (
+        None  # of pairs estimated apart: a check, where a method closes the loop itself
+    )
+    independent_loop_m: float | None = None
 
 
 def table_rows(comparisons: Sequence[Comparison]) -> list[TableRow]:
@@ -114,7 +119,8 @@ def as_markdown(
     for title in dict.fromkeys(_TABLES.values()):
         lines = [f"## {title}", "", *_HEADER, *(_line(r) for r in rows if r.table == title), ""]
         if title == "Table 1":
-            lines += [*(f"- {note}" for note in notes), ""] if notes else []
+            remarks = [*notes, *_loop_remarks(rows)]
+            lines += [*(f"- {remark}" for remark in remarks), ""] if remarks else []
             lines += [*_honesty(comparisons), ""]
         texts[title] = "\n".join(lines).rstrip() + "\n"
     return texts
@@ -128,6 +134,8 @@ def as_parquet(rows: Sequence[TableRow], notes: Sequence[str] = ()) -> bytes:
         n: pa.array([getattr(r, n) for r in rows], pa.int64() if n in integers else pa.string())
         for n in names
     }
+    for column in ("independent_loop_deg", "independent_loop_m"):
+        arrays[column] = pa.array([getattr(r, column) for r in rows], pa.float64())
     for k, column in enumerate(COLUMNS):
         arrays[column] = pa.array([r.values[k] for r in rows], pa.float64(), from_pandas=True)
     sink = pa.BufferOutputStream()
@@ -166,10 +174,35 @@ def _our_row(table: str, method: str, environment: str, members: Sequence[Compar
     if not members:
         return TableRow(table, method, environment, "ours", 0, (_NAN,) * len(COLUMNS))
     accepted = sum(s == "accepted" for c in members for s in c.statuses.values())
-    values = _values([c.errors for c in members])
+    loops = [c.independent_loop for c in members if c.independent_loop is not None]
+    angle, shift = np.mean(loops, axis=0) if loops else (None, None)
     return TableRow(
-        table, method, environment, "ours", len(members), values, accepted, len(PAIRS) * len(members)
+        table,
+        method,
+        environment,
+        "ours",
+        len(members),
+        _values([c.errors for c in members]),
+        accepted,
+        len(PAIRS) * len(members),
+        None if angle is None else float(np.degrees(angle)),
+        None if shift is None else float(shift),
     )
+
+
+def _loop_remarks(rows: Sequence[TableRow]) -> list[str]:
+    """A loop that a method closes by construction says nothing; that of its independent pair estimates does."""
+    closed = [
+        r
+        for r in rows
+        if r.source == "ours" and r.pairs and r.environment == "all" and max(r.values[7:]) < _CLOSED
+    ]
+    remarks = []
+    for r in closed:
+        known = r.independent_loop_deg is not None and r.independent_loop_m is not None
+        apart = f"{r.independent_loop_deg:.3f} deg, {r.independent_loop_m:.3f} m" if known else "not known"
+        remarks.append(f"{r.method} closes the loop by construction; loop of its independent pairs: {apart}")
+    return remarks
 
 
 def _values(errors: Sequence[Mapping[str, np.ndarray]]) -> tuple[float, ...]:

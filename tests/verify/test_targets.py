@@ -146,6 +146,17 @@ def test_methods_without_records_keep_their_rows_with_dashes():
     assert "| joint-ssl | urban | 0 | - | - | - | - |  |" in texts["Extended data table 1"]
 
 
+def test_a_loop_closed_by_construction_is_called_so_and_the_independent_one_is_told():
+    run = {p: replace(r, loop_rotation_rad=np.radians(0.12), loop_translation_m=0.04) for p, r in
+           current_runs(make_run(off_deg=0.0))[0].items()}  # fmt: skip
+    comparisons = [compare(run, TRUTH)]
+    rows = table_rows(comparisons)
+    remark = "- joint closes the loop by construction; loop of its independent pairs: 0.120 deg, 0.040 m"
+    assert remark in as_markdown(rows, comparisons)["Table 1"]
+    opened = [compare(current_runs(make_run(off_deg=0.3))[0], TRUTH)]
+    assert "closes the loop" not in as_markdown(table_rows(opened), opened)["Table 1"]
+
+
 def test_the_parquet_table_says_the_same_as_the_markdown():
     comparisons = compared_runs()
     rows = table_rows(comparisons)
