@@ -180,7 +180,9 @@ def _settle(
         state, linear = finish(problem, state, held)
         information = _with_measured_curvature(problem, state, linear.information)
         curvature = information.sum(0) + linear.pull
-        full = held_covariance(information, linear.g, 1 / np.diag(linear.pull), curvature, held, block, rng)
+        variance = 1 / np.diag(linear.pull)
+        variance[: DT + 1] = np.where(held[: DT + 1], before, variance[: DT + 1])
+        full = held_covariance(information, linear.g, variance, curvature, held, block, rng)
         full[:2, :2] += _camera_share(problem, covariance_camera_lidar) * ~(held[:2, None] | held[:2])
         free = ~held[: DT + 1]
         bias = np.where(free, [*_BIAS_FLOOR**2, _DT_FLOOR_S**2 + _crawl(linear, held) ** 2], 0.0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import SolveConfig
+from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import adjoint, exp_se3, log_se3, perturb_exactly
 from pipeline.objective.problem import PairEstimate, Prior
 from pipeline.solve.joint import compose_pairs, solve_joint
@@ -50,6 +51,22 @@ def test_the_composed_covariance_is_that_of_composed_errors():
     first, second = exp_se3(np.swapaxes(rng.multivariate_normal(np.zeros(6), SMALL, (4000, 2)), 0, 1))
     errors = log_se3(first @ T_CAMERA_LIDAR @ second @ T_LIDAR_RADAR @ np.linalg.inv(found.T))
     assert np.allclose(np.std(errors, axis=0), np.sqrt(np.diag(found.covariance)), rtol=0.06)
+
+
+def test_what_one_factor_leaves_to_the_prior_rests_on_it_in_the_composed_pair_too():
+    # Radar height and roll are kept at the prior: lidar axes x ahead, y left, z up are camera axes z, -x, -y.
+    kept = np.diag([np.radians(2.0) ** 2, *[np.radians(0.1) ** 2] * 2, 0.02**2, 0.02**2, 0.05**2])
+    lever = np.linalg.inv(change_jacobian(T_LIDAR_RADAR))
+    radar = estimate(
+        "lidar_radar",
+        T_LIDAR_RADAR,
+        (False, True, True, True, True, False),
+        covariance=lever @ kept @ lever.T,
+    )
+    found, _, _ = compose_pairs(camera_lidar(), radar, alone(), PRIOR)
+    assert found.observable.tolist() == [True, True, False, True, False, True]
+    both, _, _ = compose_pairs(camera_lidar(), lidar_radar(), alone(), PRIOR)
+    assert both.observable.all()
 
 
 def test_only_rotations_that_camera_and_radar_alone_determine_are_compared():
