@@ -74,6 +74,9 @@ class AlignedBearings:
 
     T: Float[np.ndarray, "4 4"]
     covariance: Float[np.ndarray, "6 6"]  # without a bias floor; translation is the prior's
+    spread: Float[
+        np.ndarray, "3 3"
+    ]  # the part of the rotation's covariance that is known from resampling tracks
     weight: Float[np.ndarray, " N"]  # Geman-McClure, 0..1
     kept: Bool[np.ndarray, " K"]  # tracks that agree
     residual_rad: Float[np.ndarray, " A"]  # robust standard deviation of the kept sightings
@@ -130,10 +133,10 @@ def align_bearings(
     weight = _geman_mcclure(z, c)
     per_track = np.bincount(bearings.track, weight, minlength=bearings.tracks)
     kept = per_track > _OUTLIER_WEIGHT * np.bincount(bearings.track, minlength=bearings.tracks)
-    covariance = _covariance(bearings, z, J, share * weight, prior_covariance, rng)
+    covariance, resampled = _covariance(bearings, z, J, share * weight, prior_covariance, rng)
     inliers = weight > _OUTLIER_WEIGHT
     spread = _spread(bearings.residuals(T)[0][inliers]) if inliers.any() else np.full(len(scale), np.nan)
-    return AlignedBearings(T, covariance, weight, kept, spread)
+    return AlignedBearings(T, covariance, resampled, weight, kept, spread)
 
 
 def consistency(
@@ -150,19 +153,18 @@ def consistency(
         bias_floor_rad: sigma per axis of what is common to all tracks.
     """
     turned = log_so3(aligned.T[:3, :3] @ T_prior[:3, :3].T)
-    spread = aligned.covariance[:3, :3]
-    covariance = spread + np.diag(bias_floor_rad**2)
+    covariance = aligned.covariance[:3, :3] + np.diag(bias_floor_rad**2)
     n, p = int(aligned.kept.sum()), 3
     if n < 2:
         return Consistency(0.0, float("inf"))
-    # Along the turn itself: how much of its variance is known only from the spread of n tracks.
-    u = turned / max(float(np.linalg.norm(turned)), 1e-12)
-    share = float(u @ spread @ u) / max(float(u @ covariance @ u), 1e-300)
+    # Along the axis that tells most of the turn: how much of the variance is known only from the spread of n tracks.
+    u = np.linalg.solve(covariance, turned)
+    share = float(u @ aligned.spread @ u) / max(float(u @ covariance @ u), 1e-300)
     dof = (n - 1) / max(share, 1e-3) ** 2
     if dof <= p:
         return Consistency(0.0, float("inf"))
     threshold = p * dof / (dof - p + 1) * f_distribution.ppf(_CONFIDENCE, p, dof - p + 1)
-    return Consistency(float(turned @ np.linalg.solve(covariance, turned)), float(threshold))
+    return Consistency(float(turned @ u), float(threshold))
 
 
 def _whitened(bearings: Bearings, T: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -187,8 +189,8 @@ def _covariance(
     weight: np.ndarray,
     prior_covariance: np.ndarray,
     rng: np.random.Generator,
-) -> np.ndarray:
-    """Bootstrap over tracks of the rotation; what the fixed translation's own sigma does to it is added."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bootstrap over tracks of the rotation, with what the fixed translation's own sigma does to it, and without."""
     K = bearings.tracks
     H6, g6 = np.zeros((K, 6, 6)), np.zeros((K, 6))
     np.add.at(H6, bearings.track, np.einsum("n,nai,naj->nij", weight, J, J))
@@ -204,4 +206,4 @@ def _covariance(
     covariance[:3, :3] = rotation + slope @ translation @ slope.T
     covariance[:3, 3:] = slope @ translation
     covariance[3:, :3] = covariance[:3, 3:].T
-    return covariance
+    return covariance, rotation

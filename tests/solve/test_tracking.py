@@ -181,7 +181,7 @@ def test_few_tracks_raise_the_threshold_of_the_miscalibration_test():
         )  # fmt: skip
         bearings = replace(bearings, bearing_rad=bearings.residuals(T_LIDAR_RADAR)[0])
         aligned = align_bearings(bearings, T_LIDAR_RADAR, np.eye(6) * 1e-3, np.random.default_rng(0))
-        noisy = replace(aligned, covariance=np.eye(6) * 1e-4)
+        noisy = replace(aligned, covariance=np.eye(6) * 1e-4, spread=np.eye(3) * 1e-4)
         thresholds.append(consistency(noisy, turned_prior(), BIAS_FLOOR_RAD).threshold)
     assert thresholds[0] > 2 * thresholds[1] > 2 * 16.2  # chi^2 with 3 degrees of freedom, 99.9 %
 
