@@ -107,6 +107,7 @@ def _write(out: Path, compared: Sequence[Comparison], notes: Sequence[str]) -> N
 
     rows = table_rows(compared)
     texts = as_markdown(rows, compared, notes)
+    out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".parquet":
         out.write_bytes(as_parquet(rows, notes))
     elif out.suffix:
