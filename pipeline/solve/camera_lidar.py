@@ -4,7 +4,8 @@ A small differential evolution finds the basin (wide kernels, few points, restar
 surfaces find the optimum, and the frames' own curvatures and gradients say how sure it is. Weights of the
 terms come from the data: the share of matching edges, the contrast under markings, and how much a term's
 gradient scatters from frame to frame against what its curvature promises (composite likelihood: Varin,
-Reid, Firth 2011, section 2.3).
+Reid, Firth 2011, section 2.3). A degree of freedom that the day does not determine is then held at the prior and
+the others solved again; their covariance includes what the prior leaves open in it.
 """
 
 from __future__ import annotations
@@ -54,7 +55,6 @@ _BIAS_FLOOR = np.array([np.radians(0.03)] * 3 + [0.01, 0.01, 0.01])
 # tz ends 3-25 cm (RMS 18) from the reference on halves of a real day, where resampling promises 2-4 cm.
 _TZ, _TZ_BIAS_M = 5, 0.18
 _TIME_OFFSET_FLOOR_S = 0.004
-_HOLD_ROUNDS = 3  # to hold one degree of freedom can leave another undetermined
 
 
 def estimate_camera_lidar(
@@ -252,13 +252,12 @@ def _determined(day: _Day, state: AlignmentState, level: Level, rng: np.random.G
     """Solve again with what the day cannot determine held at the prior, until nothing more is to be held.
 
     Left free, such a degree of freedom wanders as far as its prior lets it and drags others along: lane lines
-    pull tz, and with it dt, by decimetres.
+    pull tz, and with it dt, by decimetres. To hold one can leave another undetermined, whose optimum follows it.
     """
     found = _measured(day, state, level, NOTHING, np.ones(6))
-    for _ in range(_HOLD_ROUNDS):
-        held = found.held | np.append(found.observability < OBSERVABLE, [False, False])
-        if (held == found.held).all():
-            break
+    while (
+        held := found.held | np.append(found.observability < OBSERVABLE, [False, False])
+    ).sum() > found.held.sum():
         state = climb(day.terms, found.state, level, day.prior, day.config, steps=2, held=held)
         level = weighted(day.terms, state, day.terms.fitted(state.alone, level, rng))
         state = climb(day.terms, state, level, day.prior, day.config, steps=4, held=held)
