@@ -92,17 +92,7 @@ def solve_tracking(
     frames = sorted(
         {o.frame_index: o for pair in PAIRS for o in observations[pair]}.values(), key=lambda o: o.stamp_ns
     )
-    motion = motions(frames, prior)
-    lidar = lidar_tracks(frames, motion)
-    sensors = {
-        "camera_lidar": PairTracks(
-            lidar, camera_tracks(frames, motion), [box_centres(t, frames) for t in lidar], _CAMERA_LEVEL, False, True
-        ),
-        "lidar_radar": PairTracks(
-            lidar, radar_tracks(frames), [t.position_m for t in lidar], np.eye(3), True,
-            any(o.radar_has_elevation for o in frames),
-        ),
-    }  # fmt: skip
+    sensors = _tracked(frames, prior)
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
     pairs: dict[str, PairEstimate] = {}
     doubts: dict[str, list[str]] = {pair: [] for pair in PAIRS}
@@ -166,13 +156,27 @@ def calibrate_pair(
         same = before is not None and np.array_equal(before.reference, found.reference)
         if same and before is not None and np.array_equal(before.other, found.other):
             break
-        worst = float(np.sqrt(np.diag(aligned.covariance)[1:3].max()))
+        worst = float(np.sqrt(np.diag(aligned.covariance)[_steering(tracks)].max()))
         sigma, before = min(sigma, max(2 * worst, _LEAST_ROTATION_SIGMA_RAD)), found
     if aligned.kept.sum() < MIN_TRACKS:
         raise SolveError(
             f"only {aligned.kept.sum()} of {len(aligned.kept)} pairs of tracks agree, needs {MIN_TRACKS}"
         )
     return _estimate(pair, tracks, prior, bearings, aligned, used)
+
+
+def _tracked(frames: Sequence[Observation], prior: Prior) -> dict[str, PairTracks]:
+    """Tracks of all three sensors: box centres for the camera, which sees boxes, points' centres for the radar."""
+    motion = motions(frames, prior)
+    lidar = lidar_tracks(frames, motion)
+    boxes = [box_centres(t, frames) for t in lidar]
+    elevation = any(o.radar_has_elevation for o in frames)
+    return {
+        "camera_lidar": PairTracks(lidar, camera_tracks(frames, motion), boxes, _CAMERA_LEVEL, False, True),
+        "lidar_radar": PairTracks(
+            lidar, radar_tracks(frames), [t.position_m for t in lidar], np.eye(3), True, elevation
+        ),
+    }
 
 
 def _level_transform(T: np.ndarray, tracks: PairTracks) -> Float[np.ndarray, "4 4"]:
@@ -182,6 +186,13 @@ def _level_transform(T: np.ndarray, tracks: PairTracks) -> Float[np.ndarray, "4 
     level = np.eye(4)
     level[:3, :3] = tracks.level
     return level @ T
+
+
+def _steering(tracks: PairTracks) -> list[int]:
+    """Axes of the parent frame about which a turn moves bearings ahead: not roll, and not pitch without elevation."""
+    if not tracks.inverted:
+        return [0, 1]  # optical axes
+    return [1, 2] if tracks.elevation else [2]
 
 
 def _bearings(
