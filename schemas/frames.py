@@ -88,8 +88,12 @@ FRAMES = TableSchema(
             "ego_yaw_rate_radps", "float64", "yaw rate from odometry, positive to the left", nullable=True
         ),
         *transform_columns("ego_", "T_odom_vehicle at stamp_ns from odometry", nullable=True),
-        *transform_columns("prior_camera_lidar_", "T_camera_lidar from tf_static or the prior file", nullable=True),
-        *transform_columns("prior_lidar_radar_", "T_lidar_radar from tf_static or the prior file", nullable=True),
+        *transform_columns(
+            "prior_camera_lidar_", "T_camera_lidar from tf_static or the prior file", nullable=True
+        ),
+        *transform_columns(
+            "prior_lidar_radar_", "T_lidar_radar from tf_static or the prior file", nullable=True
+        ),
     ),
     "One trio per row, in order of stamp. Camera: optical frame; lidar and radar: x forward, y left, z up.",
 )
