@@ -95,7 +95,10 @@ def run_once(
         return result | {"refused": err.reason}
     result["cpu_s"] = round(time.process_time() - began, 1)
     for record in records:
-        result["pairs"][record.pair] = _measure(record, given.of(record.pair))
+        if record.status == "refused":
+            result.setdefault("refused_pairs", {})[record.pair] = record.reason
+        else:
+            result["pairs"][record.pair] = _measure(record, given.of(record.pair))
     return result
 
 
@@ -144,7 +147,7 @@ def table(results: list[dict[str, Any]]) -> str:
 def _rows(members: list[dict[str, Any]]) -> Iterator[str]:
     parts = {p: [m for m in members if m["part"] == p and m["pairs"]] for p in PARTS}
     for pair in ("camera_lidar", "camera_radar", "lidar_radar"):
-        day = [m["pairs"][pair] for m in parts["day"]]
+        day = [m["pairs"][pair] for m in parts["day"] if pair in m["pairs"]]
         if not day:
             continue
         cells = []
@@ -152,18 +155,19 @@ def _rows(members: list[dict[str, Any]]) -> Iterator[str]:
             values = np.array([d[name] for d in day])
             cells.append(f"{values.mean():.3f} / {np.percentile(values, 95):.3f}")
         accepted = f"{sum(d['status'] == 'accepted' for d in day)}/{len(day)}"
-        offsets = [_median([m["pairs"][pair]["time_offset_ms"] for m in parts[p]]) for p in PARTS]
+        known = {p: [m["pairs"][pair] for m in parts[p] if pair in m["pairs"]] for p in PARTS}
+        offsets = [_median([r["time_offset_ms"] for r in known[p]]) for p in PARTS]
         halves = "; ".join(_apart(parts[a], parts[b], pair) for a, b in HALVES)
         yield " | ".join([str(len(day)), pair, *cells, accepted, halves, ", ".join(offsets)])
 
 
 def _apart(first: list[dict[str, Any]], second: list[dict[str, Any]], pair: str) -> str:
     """Mean distance between two halves' results from the same start, at the targets."""
-    other = {m["seed"]: m["pairs"][pair] for m in second}
+    other = {m["seed"]: m["pairs"][pair] for m in second if pair in m["pairs"]}
     gaps = [
         np.degrees(errors_at_targets(pair, np.array(m["pairs"][pair]["T"]), np.array(other[m["seed"]]["T"])))
         for m in first
-        if m["seed"] in other
+        if m["seed"] in other and pair in m["pairs"]
     ]
     return "{:.3f} / {:.3f}".format(*np.mean(gaps, axis=0)[:2]) if gaps else "-"
 
@@ -176,7 +180,7 @@ def _median(values: list[float | None]) -> str:
 def _line(result: dict[str, Any]) -> str:
     head = f"{result['method']} {result['start']} seed {result['seed']} {result['part']}"
     if not result["pairs"]:
-        return f"{head}: refused: {result['refused']}"
+        return f"{head}: refused: {result.get('refused') or result.get('refused_pairs')}"
     cells = [
         f"{pair} {p['az_deg']:.3f}/{p['el_deg']:.3f}/{p['range_m']:.3f} {p['status']}"
         for pair, p in result["pairs"].items()
