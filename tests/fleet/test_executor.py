@@ -62,7 +62,8 @@ def test_a_killed_worker_costs_its_own_item_only_and_is_retried_within_bounds(be
     assert {k for k, f in found.items() if f.error} == {"die-always", "raise-1"}
     assert found["die-once"].value[0] == "die-once done"
     assert "killed" in found["die-always"].error
-    assert tries(tmp_path, "die-always") == 3  # in company, and twice alone
+    # Twice alone; before that once in company, unless a neighbour's death came before it had begun.
+    assert 2 <= tries(tmp_path, "die-always") <= 3
     assert tries(tmp_path, "die-once") <= 3
     children = psutil.Process().children(recursive=True)
     assert not [c for c in children if "spawn_main" in " ".join(c.cmdline())]
