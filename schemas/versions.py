@@ -10,13 +10,14 @@ from schemas.columns import TableSchema
 from schemas.drift import DRIFT
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS
+from schemas.training import TRAINING
 
 __all__ = ["CODE_VERSION", "TABLES", "write_json_schemas"]
 
 # Enters every work key: raise it with every change that alters a number, so that stale partitions are made anew.
 CODE_VERSION = "0.1.0"
 
-TABLES: dict[str, TableSchema] = {t.name: t for t in (FRAMES, OBSERVATIONS, CALIBRATIONS, DRIFT)}
+TABLES: dict[str, TableSchema] = {t.name: t for t in (FRAMES, OBSERVATIONS, TRAINING, CALIBRATIONS, DRIFT)}
 
 
 def write_json_schemas(folder: Path) -> list[Path]:
