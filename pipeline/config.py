@@ -21,6 +21,7 @@ __all__ = [
     "LidarTopics",
     "OnnxSemantics",
     "PerceiveConfig",
+    "PrepareConfig",
     "PriorConfig",
     "RadarTopics",
     "Rig",
@@ -184,6 +185,48 @@ class SolveConfig(_Section):
     seed: int = 0
 
 
+class PrepareConfig(_Section):
+    """Training data: the camera's grid, how much of each cloud, and how frames are split."""
+
+    grid_step_deg: Literal[0.1, 0.2, 0.3, 0.4] = 0.4
+    # A lidar's 60 x 24 deg, 8 deg about it for the guess to be wrong, 6 deg to turn the camera by in training.
+    grid_width_deg: Annotated[float, Field(ge=20, le=160)] = 89.6
+    grid_height_deg: Annotated[float, Field(ge=10, le=90)] = 51.2
+    lidar_points: Annotated[int, Field(ge=256)] = 8192
+    cluster_points: Annotated[int, Field(ge=64)] = 1024
+    edge_points: Annotated[int, Field(ge=64)] = 768
+    max_frames: Annotated[int, Field(gt=0)] | None = None  # per vehicle-day, evenly spread; None = all
+    min_step_m: Annotated[float, Field(ge=0)] = (
+        0.5  # a frame that the vehicle hardly moved for says nothing new
+    )
+    split_by: tuple[Literal["vehicle", "day", "place"], ...] = ("vehicle", "day", "place")
+    val_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
+    test_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
+    positions: Literal["local", "map"] = "local"  # map: odometry of all logs is in one frame (GNSS, a map)
+    place_m: Positive = 100.0  # side of a place's cell
+    place_s: Positive = 20.0  # stretch of a drive that counts as a place where the log has no positions
+    guard_s: Annotated[float, Field(ge=0)] = (
+        3.0  # frames of one drive this near to another split are left out
+    )
+    duplicate_bits: Annotated[int, Field(ge=0, le=128)] = (
+        16  # of 256 fingerprint bits: fewer differ = same view
+    )
+    seed: int = 0
+
+    @model_validator(mode="after")
+    def _splits_make_sense(self) -> PrepareConfig:
+        if not self.split_by or len(set(self.split_by)) != len(self.split_by):
+            raise ValueError("split_by must name at least one of vehicle, day, place, each once")
+        return self
+
+    @property
+    def grid_shape(self) -> tuple[int, int]:
+        """(height, width) in cells, whole multiples of 16: networks halve them four times."""
+        sides = (self.grid_height_deg, self.grid_width_deg)
+        height, width = (16 * max(1, round(side / self.grid_step_deg / 16)) for side in sides)
+        return height, width
+
+
 class AuditConfig(_Section):
     """Control charts."""
 
@@ -210,6 +253,7 @@ class FleetConfig(_Section):
     select: SelectConfig = SelectConfig()
     trigger: TriggerConfig = TriggerConfig()
     solve: SolveConfig = SolveConfig()
+    prepare: PrepareConfig = PrepareConfig()
     audit: AuditConfig = AuditConfig()
 
     @model_validator(mode="after")
