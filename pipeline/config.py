@@ -188,7 +188,7 @@ class SolveConfig(_Section):
 class PrepareConfig(_Section):
     """Training data: the camera's grid, how much of each cloud, and how frames are split."""
 
-    grid_step_deg: Literal[0.1, 0.2, 0.3, 0.4] = 0.4
+    grid_step_deg: Annotated[float, Field(ge=0.1, le=0.5)] = 0.4
     # A lidar's 60 x 24 deg, 8 deg about it for the guess to be wrong, 6 deg to turn the camera by in training.
     grid_width_deg: Annotated[float, Field(ge=20, le=160)] = 89.6
     grid_height_deg: Annotated[float, Field(ge=10, le=90)] = 51.2
@@ -217,6 +217,8 @@ class PrepareConfig(_Section):
     def _splits_make_sense(self) -> PrepareConfig:
         if not self.split_by or len(set(self.split_by)) != len(self.split_by):
             raise ValueError("split_by must name at least one of vehicle, day, place, each once")
+        if abs(self.grid_step_deg * 10 - round(self.grid_step_deg * 10)) > 1e-9:
+            raise ValueError("grid_step_deg must be a multiple of 0.1: distances are stored in such steps")
         return self
 
     @property

@@ -26,36 +26,43 @@ __all__ = [
     "DISTANCE_GROUPS",
     "GRID_CLASSES",
     "NO_EDGE",
-    "OUTSIDE_IMAGE",
     "POINT_IS_EDGE",
     "POINT_IS_GROUND",
     "SPLITS",
     "TRAINING",
+    "UNKNOWN_CLASS",
     "TrainingRow",
 ]
 
 SPLITS = ("train", "val", "test")
-# Classes of the grid, few enough for a small network; the first six are those whose distances are kept.
-GRID_CLASSES = (
-    "vehicle", "person", "two_wheeler", "pole", "structure", "vegetation", "road", "ground", "sky", "void",
-)  # fmt: skip
-DISTANCE_GROUPS = GRID_CLASSES[:6]  # what the paper calls reflecting: their union is its mask
-OUTSIDE_IMAGE = 255  # in grid_class: the camera does not see this cell
-_GROUP_OF_LABELS = {
-    "vehicle": (13, 14, 15, 16),  # Cityscapes train ids
-    "person": (11,),
-    "two_wheeler": (12, 17, 18),  # riders sit on theirs
-    "pole": (5, 6, 7),  # poles, traffic lights, signs
-    "structure": (2, 3, 4),  # buildings, walls, fences
-    "vegetation": (8,),
+# Classes of the grid: Cityscapes train ids folded by what they look like to a lidar.
+_LABELS_OF_CLASS = {
     "road": (0,),
-    "ground": (1, 9),  # sidewalk, terrain
+    "verge": (1, 9),  # sidewalk and terrain: flat, beside the road
+    "building": (2, 3),  # and walls
+    "fence": (4,),
+    "pole": (5, 6, 7),  # poles, lights, signs: thin and upright
+    "vegetation": (8,),
     "sky": (10,),
+    "person": (11, 12),
+    "vehicle": (13, 14, 15, 16),
+    "two_wheeler": (17, 18),
 }
-# Lookup from Cityscapes train ids (255 and all others: void) to classes of the grid.
-CLASS_OF_LABEL = np.full(256, GRID_CLASSES.index("void"), np.uint8)
-for _name, _labels in _GROUP_OF_LABELS.items():
-    CLASS_OF_LABEL[list(_labels)] = GRID_CLASSES.index(_name)
+GRID_CLASSES = tuple(_LABELS_OF_CLASS)
+UNKNOWN_CLASS = 255  # in grid_class: void, or outside the image
+# Lookup from Cityscapes train ids to classes of the grid.
+CLASS_OF_LABEL = np.full(256, UNKNOWN_CLASS, np.uint8)
+for _index, _labels in enumerate(_LABELS_OF_CLASS.values()):
+    CLASS_OF_LABEL[list(_labels)] = _index
+# Groups whose distances are kept: what the paper calls reflecting. The nearest of them all is the paper's mask.
+DISTANCE_GROUPS: dict[str, tuple[str, ...]] = {
+    "vehicle": ("vehicle",),
+    "person": ("person",),
+    "two_wheeler": ("two_wheeler",),
+    "pole": ("pole",),
+    "structure": ("building", "fence"),
+    "vegetation": ("vegetation",),
+}
 POINT_IS_EDGE, POINT_IS_GROUND = 1, 2  # bits of lidar_flags
 NO_EDGE = -128  # in edge_offset: no boundary of this direction within reach
 
@@ -88,7 +95,8 @@ TRAINING = TableSchema(
             (3, "N"),
             "red, green, blue; each H W row by row, area-averaged; 0 outside the image",
         ),
-        array("grid_class", "|u1", ("N",), "H W: index into GRID_CLASSES, by majority; OUTSIDE_IMAGE"),
+        array("grid_class", "|u1", ("N",), "H W: index into GRID_CLASSES, by majority; UNKNOWN_CLASS"),
+        array("grid_seen", "|u1", ("N",), "H W: 1 where the image shows the whole cell"),
         array(
             "class_distance",
             "|u1",
@@ -207,6 +215,7 @@ class TrainingRow:
     grid_width: int
     image: np.ndarray
     grid_class: np.ndarray
+    grid_seen: np.ndarray
     class_distance: np.ndarray
     edge_offset: np.ndarray
     sky_depth: np.ndarray

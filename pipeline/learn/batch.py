@@ -29,7 +29,8 @@ class TrainingBatch:
     frame_index: Int32[Tensor, " B"]
     # camera, on the equirectangular grid of its optical frame
     image: UInt8[Tensor, "B 3 H W"]  # red, green, blue
-    grid_class: UInt8[Tensor, "B H W"]  # index into GRID_CLASSES, OUTSIDE_IMAGE
+    grid_class: UInt8[Tensor, "B H W"]  # index into GRID_CLASSES, UNKNOWN_CLASS
+    grid_seen: UInt8[Tensor, "B H W"]  # 1 where the image shows the whole cell
     class_distance: UInt8[Tensor, "B 6 H W"]  # 0.1 deg, by DISTANCE_GROUPS
     edge_offset: Int8[Tensor, "B 4 H W"]  # 0.05 deg, by EDGE_LEFT/RIGHT/ABOVE/BELOW, NO_EDGE
     sky_depth: UInt8[Tensor, "B H W"]  # 0.1 deg
