@@ -6,13 +6,14 @@ import hashlib
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipeline.errors import ConfigError
 
 __all__ = [
+    "TERMS",
     "AuditConfig",
     "CameraTopics",
     "EgoTopics",
@@ -36,6 +37,8 @@ __all__ = [
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Topic = Annotated[str, Field(pattern=r"^/\S+$")]
+Term = Literal["edges", "reflectivity", "static", "boxes", "moving", "time_offsets", "translation_prior"]
+TERMS: tuple[Term, ...] = get_args(Term)
 
 
 class _Section(BaseModel):
@@ -182,7 +185,20 @@ class SolveConfig(_Section):
     paper_generations: Annotated[int, Field(gt=0)] = 60
     bootstrap_blocks: Annotated[int, Field(gt=1)] = 24
     time_offset_sigma_s: Positive = 0.05
+    terms: tuple[Term, ...] = TERMS  # of method joint; leave some out to see what they are worth
     seed: int = 0
+
+    @model_validator(mode="after")
+    def _terms_differ_and_show_the_lidar(self) -> SolveConfig:
+        if len(set(self.terms)) < len(self.terms):
+            raise ValueError(f"terms names one twice: {', '.join(self.terms)}")
+        if not {"edges", "reflectivity"} & set(self.terms):
+            raise ValueError(
+                "terms needs edges or reflectivity: nothing else brings camera and lidar together"
+            )
+        if not {"static", "moving"} & set(self.terms):
+            raise ValueError("terms needs static or moving: nothing else brings lidar and radar together")
+        return self
 
 
 class PrepareConfig(_Section):

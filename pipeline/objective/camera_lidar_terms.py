@@ -101,6 +101,14 @@ class Terms:
         )
         return replace(self, edges=edges, markings=markings, classes=classes)
 
+    def of_kinds(self, *, edges: bool, markings: bool) -> Terms:
+        """With or without edges, and markings."""
+        kept = [
+            p if wanted else p.chosen(np.zeros(len(p.xyz_m), bool))
+            for p, wanted in ((self.edges, edges), (self.markings, markings))
+        ]
+        return replace(self, edges=kept[0], markings=kept[1])
+
     def sharp(self, max_gap_px: float) -> Terms:
         """Without the edges whose interval is wider than `max_gap_px`: those make the basin, not the accuracy."""
         narrow = self.edges.gap_rad * self.camera[1] <= max_gap_px

@@ -86,7 +86,8 @@ def estimate_camera_lidar(
     frames = [observations[i] for i in used]
     reach = np.radians(config.search_rotation_deg + 2.0)
     terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar[used], reach_rad=float(reach))
-    if len(terms.edges.xyz_m) < 20 * len(used):
+    terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
+    if "edges" in config.terms and len(terms.edges.xyz_m) < 20 * len(used):
         raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
 
     starts = [_basin(terms, prior, config, rng) for _ in range(_RESTARTS)]

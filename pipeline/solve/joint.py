@@ -9,6 +9,7 @@ camera-radar without the lidar, disjoint halves, restarts, and the registration'
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,6 +30,7 @@ __all__ = ["compose_pairs", "solve_joint"]
 
 _SIGMAS = 3.0
 _MOSTLY = 0.5  # of a variance: from there on it is called the prior's
+_NO_OFFSET_S, _ANYWHERE_M = 1e-4, 10.0
 _RESTART_ROTATION_RAD, _RESTART_SHIFT_M = np.radians(0.15), 0.05
 
 
@@ -54,6 +56,7 @@ def solve_joint(
     Returns:
         The solution; a pair that the day cannot determine keeps its prior, with a doubt that says why.
     """
+    prior, config = _without_terms(prior, config)
     doubts: dict[str, list[str]] = {pair: [] for pair in PAIRS}
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
     progress(0, 3, "camera-lidar")
@@ -197,6 +200,15 @@ def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:
                 f"the registration would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
             )
     return doubts
+
+
+def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfig]:
+    """Time offsets nailed to zero, and a prior that knows no position, where `terms` leaves those out."""
+    if "time_offsets" not in config.terms:
+        config = config.model_copy(update={"time_offset_sigma_s": _NO_OFFSET_S})
+    if "translation_prior" not in config.terms:
+        prior = replace(prior, translation_sigma_m=_ANYWHERE_M)
+    return prior, config
 
 
 def _kept(pair: str, prior: Prior) -> PairEstimate:

@@ -107,6 +107,8 @@ def estimate_lidar_radar(
         and np.diag(covariance_camera_lidar)[:3].max() > _CAMERA_SIGMA_RAD**2
     ):
         T_camera_lidar = None  # its own error would go into roll and pitch
+    if "boxes" not in config.terms:
+        T_camera_lidar = None
     problem = RadarProblem(
         observations,
         frames,
@@ -116,6 +118,7 @@ def estimate_lidar_radar(
         prior,
         config.time_offset_sigma_s,
         elevation_floor(observations),
+        config.terms,
     )
     ends = [anneal(problem, start) for start in scan(problem, config)]
     costs = [_sharp_cost(problem, end) for end in ends]

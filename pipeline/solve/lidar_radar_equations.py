@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.config import TERMS
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
 from pipeline.objective.boxes import (
@@ -111,6 +112,7 @@ class RadarProblem:
     prior: Prior
     dt_sigma_s: float
     floor: np.ndarray  # sigma of roll, pitch, z as the registration's elevations give them
+    terms: Sequence[str] = TERMS  # that take part
 
     def of_frames(self, index: np.ndarray) -> RadarProblem:
         """The same with part of the registration's frames (and of the observations behind them)."""
@@ -166,6 +168,10 @@ def linearise(
             state.range_bias_m,
         ),
     )
+    if "static" not in problem.terms:
+        equations = replace(
+            equations, H=0 * equations.H, g=0 * equations.g, information=0 * equations.information
+        )
     at = problem.frames.frame
     decide = np.ix_(at, AZIMUTH_RANGE_DOF, AZIMUTH_RANGE_DOF)
     block = np.ix_(np.arange(len(at)), AZIMUTH_RANGE_DOF, AZIMUTH_RANGE_DOF)
@@ -175,7 +181,7 @@ def linearise(
     registration_step = _add_elevations(problem, equations, stride, H, info, g)
     box_sigma = _add_boxes(problem, state, pairs, about_radar, H, info, g)
     mover_sigma = float("nan")
-    if widen == 1.0:  # partners are found only once the clusters lie near them
+    if widen == 1.0 and "moving" in problem.terms:  # partners are found only once the clusters lie near them
         Hm, gm, mover_sigma = azimuth_equations_lidar(problem.movers, state.T_lidar_radar, state.dt_s)
         Hm, gm = _turned(about_radar, Hm, gm)
         # As with static detections, azimuths say yaw, x and y; roll would come from heights that clusters lack.

@@ -53,7 +53,7 @@ def scan(problem: RadarProblem, config: SolveConfig) -> list[RadarState]:
     ]
     cost = [float(normal_equations(part, T, 0.0, sigma, 0.0, OUTLIER, stride=3).cost.mean()) for T in poses]
     bias = np.zeros(len(BOX_CLASSES))
-    best = int(np.argmin(cost))
+    best = int(np.argmin(cost if "static" in problem.terms else np.abs(turns)))
     chosen = [best] if abs(turns[best]) < 0.5 * _SCAN_STEP_RAD else [best, int(np.argmin(np.abs(turns)))]
     return [RadarState(poses[k], 0.0, 0.0, bias, SIGMA_START.copy(), BOUNCE_PRIOR) for k in chosen]
 
