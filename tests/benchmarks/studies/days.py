@@ -1,0 +1,173 @@
+"""Simulated vehicle-days for the studies: generated and perceived once, calibrated as often as a study likes.
+
+    python tests/benchmarks/studies/days.py generate --root /tmp/studies/days --sets table1 coverage verdict offsets
+
+Of a day only its truth, its fleet.toml and its observations stay on the disk; days that are there are not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.config import FleetConfig, load_fleet
+from pipeline.ingest.run import ingest_day
+from pipeline.perceive.run import perceive_day
+from pipeline.simulate.faults import parse_faults
+from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_rows
+from schemas.observations import OBSERVATIONS, Observation
+
+__all__ = ["SETS", "Day", "DaySpec", "generate_day", "load_day"]
+
+VEHICLE, DATE = "vehicle-1", "2026-03-02"
+_FINISHED = "done.json"
+
+
+@dataclass(frozen=True)
+class DaySpec:
+    """One simulated vehicle-day; `fault` is `sensor:kind:amount` as `boresight simulate --faults` has it."""
+
+    seed: int
+    environment: str
+    frames: int = 40
+    rig: str = "paper"
+    fault: str = ""
+
+    @property
+    def name(self) -> str:
+        """Folder of the day."""
+        fault = "_" + self.fault.replace(":", "-") if self.fault else ""
+        return f"{self.rig}_{self.environment}_{self.frames}_{self.seed}{fault}"
+
+
+@dataclass(frozen=True, eq=False)
+class Day:
+    """A day as a study needs it."""
+
+    spec: DaySpec
+    rows: list[Observation]
+    truth: dict[str, object]
+    fleet: FleetConfig
+
+    def T(self, pair: str) -> np.ndarray:
+        """True transform of a pair."""
+        return np.array(self.truth[f"T_{pair}"], np.float64)
+
+
+def generate_day(spec: DaySpec, root: Path) -> Path:
+    """Simulate, ingest and perceive a day unless it is there; returns its folder."""
+    folder = root / spec.name
+    if (folder / _FINISHED).exists():
+        return folder
+    shutil.rmtree(folder, ignore_errors=True)
+    began = time.process_time()
+    faults = f"{VEHICLE}:{DATE}:{spec.fault}" if spec.fault else ""
+    simulate_fleet(
+        FleetSpec(
+            vehicles=1, days=1, first_day=DATE, frames=spec.frames, rig=spec.rig,
+            environments=spec.environment, faults=parse_faults(faults, day_names(DATE, 1)), seed=spec.seed,
+        ),
+        folder,
+    )  # fmt: skip
+    fleet, lake, partition = folder / "fleet.toml", Lake.at(folder / "lake"), Partition(VEHICLE, DATE)
+    config = load_fleet(fleet)
+    logs = sorted((folder / "logs" / VEHICLE / DATE).iterdir())
+    ingest_day(logs, partition, config, lake, fleet_file=str(fleet))
+    result = perceive_day(partition, config, lake, fleet_file=fleet)
+    shutil.rmtree(folder / "logs")
+    shutil.rmtree(folder / "lake" / "frames")
+    note = asdict(spec) | {"kept_frames": result.rows, "cpu_s": round(time.process_time() - began, 1)}
+    (folder / _FINISHED).write_text(json.dumps(note) + "\n")
+    return folder
+
+
+def load_day(spec: DaySpec, root: Path) -> Day:
+    """Observations, truth and configuration of a generated day."""
+    folder = root / spec.name
+    if not (folder / _FINISHED).exists():
+        raise SystemExit(f"{folder} is not there: run `days.py generate --root {root}` first")
+    return Day(
+        spec,
+        read_rows(Lake.at(folder / "lake"), OBSERVATIONS, Partition(VEHICLE, DATE), Observation),
+        json.loads((folder / "truth" / VEHICLE / f"{DATE}.json").read_text()),
+        load_fleet(folder / "fleet.toml"),
+    )
+
+
+def _both(first: int, count: int, **fields: object) -> list[DaySpec]:
+    """Urban and highway in turn."""
+    return [
+        DaySpec(first + i, ("urban", "highway")[i % 2], **fields)  # type: ignore[arg-type]
+        for i in range(count)
+    ]
+
+
+def _turned(first: int) -> list[DaySpec]:
+    """A sensor that hangs 12 deg off in its bracket, twice the default search range."""
+    faults = [f"{sensor}:{axis}:12" for sensor in ("camera", "radar", "lidar") for axis in ("yaw", "pitch")]
+    return [
+        DaySpec(first + i, ("urban", "highway")[i % 2], fault=faults[i // 2]) for i in range(2 * len(faults))
+    ]
+
+
+# Seeds below 200 are for tuning; all others are looked at only with code that no longer changes.
+SETS: dict[str, list[DaySpec]] = {
+    "dev": _both(110, 16),
+    "dev-bad": [
+        DaySpec(130, "urban", fault="camera:labels:1"),
+        DaySpec(131, "highway", fault="camera:labels:1"),
+        DaySpec(132, "urban", fault="camera:night:1"),
+        DaySpec(133, "highway", fault="camera:night:1"),
+        DaySpec(134, "urban", fault="camera:time:0.08"),
+        DaySpec(135, "highway", fault="camera:time:0.08"),
+        DaySpec(136, "urban", fault="radar:time:0.08"),
+        DaySpec(137, "highway", fault="radar:time:0.08"),
+        DaySpec(138, "urban", fault="radar:yaw:12"),
+        DaySpec(139, "highway", fault="camera:pitch:12"),
+    ],
+    "table1": [DaySpec(200 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
+    "coverage": _both(300, 120),
+    "verdict": [
+        *_both(500, 16, fault="camera:labels:1"),
+        *_both(520, 16, fault="camera:night:1"),
+        *_both(540, 10, fault="camera:time:0.08"),
+        *_both(550, 10, fault="radar:time:0.08"),
+        *_turned(560),
+    ],
+    "offsets": [*_both(700, 6, fault="camera:time:0.04"), *_both(706, 6, fault="radar:time:0.04")],
+    "ablation": [
+        DaySpec(800, "urban", 100),
+        DaySpec(801, "highway", 100),
+        DaySpec(802, "urban", 100, "ring16"),
+        DaySpec(803, "urban", 100, "paper-flat"),
+        DaySpec(804, "urban", 100, "ring16-flat"),
+    ],
+}
+
+
+def main() -> None:
+    """Generate what is missing, in the order named."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("command", choices=["generate"])
+    parser.add_argument("--root", type=Path, required=True)
+    parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
+    args = parser.parse_args()
+    for name in args.sets:
+        for spec in SETS[name]:
+            began = time.time()
+            generate_day(spec, args.root)
+            print(f"{time.strftime('%H:%M:%S')} {name} {spec.name} ({time.time() - began:.0f} s)", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,253 @@
+"""The engine of all studies: runs that are not yet in the JSON Lines file, on days perceived before, one line each.
+
+A study is a list of `Run`s and a summary. A run names a day, how its prior is made, the method and changes of the
+configuration; its key is all of that, so a study that was stopped goes on where it stood.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.calibrate import calibrate_observations
+from pipeline.calibration_records import Inputs
+from pipeline.config import FleetConfig, SolveConfig
+from pipeline.errors import SolveError
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.objective.problem import Prior
+from pipeline.prior import perturbed
+from pipeline.store.partitions import Partition
+from schemas.calibrations import PAIRS
+from schemas.observations import Observation
+from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, load_day
+from tests.benchmarks.studies.metrics import measure
+
+__all__ = ["Run", "calibrate_once", "prior_of", "read_results", "run_study", "study_arguments"]
+
+# The default sigmas of `rigs.*.prior` in fleet.toml: what a user has who says nothing.
+ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M = 2.0, 0.05
+
+
+@dataclass(frozen=True)
+class Run:
+    """One calibration of a study.
+
+    `prior` is how the prior differs from truth: ("exact", deg, m) turns and shifts both transforms by exactly so much
+    in random directions; ("drawn", deg, m) draws every angle and shift from a normal distribution of that sigma, and
+    the prior's sigmas say so. `solve` and `select` replace fields of the configuration. `spoil` is what is done to the
+    observations on the way (see `spoiled`).
+    """
+
+    day: DaySpec
+    method: str = "joint"
+    prior: tuple[str, float, float] = ("drawn", ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M)
+    seed: int = 0
+    solve: dict[str, Any] = field(default_factory=dict)
+    select: dict[str, Any] = field(default_factory=dict)
+    spoil: str = ""
+
+    @property
+    def key(self) -> str:
+        """What tells this run from all others."""
+        return key_of(asdict(self))
+
+
+def key_of(result: dict[str, Any]) -> str:
+    """Key of the run that a result line stands for."""
+    return json.dumps({f.name: result[f.name] for f in fields(Run)}, sort_keys=True)
+
+
+def prior_of(
+    T_camera_lidar: np.ndarray, T_lidar_radar: np.ndarray, how: tuple[str, float, float], seed: int
+) -> Prior:
+    """A prior that is off from the truth as a run says, with sigmas that say how far."""
+    kind, deg, shift_m = how
+    sigma_rad = float(np.radians(deg))
+    if kind == "exact":
+        default = Prior(
+            T_camera_lidar, T_lidar_radar, float(np.radians(ROTATION_SIGMA_DEG)), TRANSLATION_SIGMA_M
+        )
+        return perturbed(default, (deg, shift_m), seed)
+    rng = np.random.default_rng([seed, 7])
+    moved = [
+        from_rotation_translation(
+            exp_so3(rng.normal(0, sigma_rad, 3)) @ T[:3, :3], T[:3, 3] + rng.normal(0, shift_m, 3)
+        )
+        for T in (T_camera_lidar, T_lidar_radar)
+    ]
+    return Prior(moved[0], moved[1], sigma_rad, shift_m)
+
+
+def search_range(how: tuple[str, float, float]) -> dict[str, float]:
+    """`solve.search_*` that contain the prior's error, as its user would set them: 4 sigmas, or 1.2 times an exact one.
+
+    Never less than the defaults.
+    """
+    factor = 4.0 if how[0] == "drawn" else 1.2
+    default = SolveConfig()
+    return {
+        "search_rotation_deg": max(default.search_rotation_deg, factor * how[1]),
+        "search_translation_m": max(default.search_translation_m, factor * how[2]),
+    }
+
+
+def spoiled(rows: Sequence[Observation], how: str) -> list[Observation]:
+    """Faults that can be put into observations exactly, because perceive hands these columns on as it finds them.
+
+    `focal:F` scales the camera's focal length by 1 + F as a wrong calibration file would; `centre:PX` shifts its
+    principal point; `few:N` leaves N frames, spread over the day.
+    """
+    if not how:
+        return list(rows)
+    kind, _, amount = how.partition(":")
+    if kind == "few":
+        kept = np.unique(np.linspace(0, len(rows) - 1, int(amount)).round().astype(int))
+        return [rows[i] for i in kept]
+    change = np.zeros((3, 3))
+    if kind == "focal":
+        factor = np.ones((3, 3))
+        factor[[0, 1], [0, 1]] += float(amount)
+        return [replace(o, camera_K=o.camera_K * factor) for o in rows]
+    if kind == "centre":
+        change[:2, 2] = float(amount)
+        return [replace(o, camera_K=o.camera_K + change) for o in rows]
+    raise ValueError(f"no such fault: {how}")
+
+
+def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
+    """Calibrate a day as a run says and measure every pair against truth."""
+    prior = prior_of(day.T("camera_lidar"), day.T("lidar_radar"), run.prior, run.seed)
+    rows = spoiled(day.rows, run.spoil)
+    fleet = _configured(day.fleet, run)
+    about = Inputs(Partition(VEHICLE, DATE), run.method, "study", run.seed, ())
+    began = time.process_time()
+    try:
+        records = calibrate_observations(rows, prior, fleet, about)
+    except SolveError as err:
+        return {"refused": err.reason, "pairs": {}}
+    measured = {
+        r.pair: measure(r, day.T(r.pair), prior, float(str(day.truth[f"dt_{r.pair}_s"]))) for r in records
+    }
+    assert set(measured) == set(PAIRS)
+    return {"cpu_s": round(time.process_time() - began, 1), "pairs": measured}
+
+
+def run_study(
+    runs: Sequence[Run],
+    args: argparse.Namespace,
+    summary: Callable[[list[dict[str, Any]]], str],
+    trim: Callable[[dict[str, Any]], dict[str, Any]] = lambda result: result,
+) -> None:
+    """Run what is missing, a line per run as it finishes; then print the summary and write it beside the lines.
+
+    Args:
+        runs: all runs of the study.
+        args: what `study_arguments` parsed.
+        summary: Markdown of the results of `runs`.
+        trim: leaves out of a result what the study has no use for.
+    """
+    done = {key_of(r) for r in read_results(args.out)}
+    todo = [r for r in runs if r.key not in done][: args.limit]
+    about = {"commit": _commit(), "date": time.strftime("%Y-%m-%d")}
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    print(f"{len(runs)} runs, {len(todo)} to do", flush=True)
+    with (
+        ProcessPoolExecutor(args.workers, mp_context=get_context("spawn"), initializer=_quiet) as pool,
+        args.out.open("a") as out,
+    ):
+        jobs = {pool.submit(_work, run, args.root): run for run in todo}
+        for number, job in enumerate(as_completed(jobs), 1):
+            run = jobs[job]
+            result = trim({**asdict(run), **about, **job.result()})
+            out.write(json.dumps(result) + "\n")
+            out.flush()
+            print(f"{number}/{len(todo)} {_line(result)}", flush=True)
+    wanted = {r.key for r in runs}
+    results = [r for r in read_results(args.out) if key_of(r) in wanted]
+    if not results:
+        return
+    commits = sorted({r["commit"] for r in results})
+    seeds = sorted({r["day"]["seed"] for r in results})
+    dates = sorted({r["date"] for r in results})
+    head = (
+        f"{len(results)} of {len(runs)} runs; commit {', '.join(commits)}; {', '.join(dates)}; "
+        f"days of seeds {seeds[0]}-{seeds[-1]}\n"
+    )
+    text = f"{head}\n{summary(results)}\n"
+    args.out.with_suffix(".md").write_text(text)
+    print(text)
+
+
+def study_arguments(description: str, name: str) -> argparse.ArgumentParser:
+    """Options that all studies share."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--root", type=Path, required=True, help="days that days.py generated")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--limit", type=int, default=None, help="at most so many new runs")
+    parser.add_argument(
+        "--tuning", action="store_true", help="tuning seeds (below 200) in place of test seeds"
+    )
+    parser.add_argument("--out", type=Path, default=Path(f"tests/benchmarks/results/{name}.jsonl"))
+    return parser
+
+
+def read_results(path: Path) -> list[dict[str, Any]]:
+    """The lines of a result file; none where there is no file."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def _configured(fleet: FleetConfig, run: Run) -> FleetConfig:
+    """The day's configuration with the run's changes, validated like a file's."""
+    plain = fleet.model_dump(mode="json")
+    plain["solve"] |= search_range(run.prior) | run.solve
+    plain["select"] |= run.select
+    return FleetConfig.model_validate(plain)
+
+
+def _work(run: Run, root: Path) -> dict[str, Any]:
+    return calibrate_once(run, _day(run.day, root))
+
+
+@lru_cache(maxsize=4)
+def _day(spec: DaySpec, root: Path) -> Day:
+    return load_day(spec, root)
+
+
+def _quiet() -> None:
+    os.nice(5)
+
+
+def _line(result: dict[str, Any]) -> str:
+    head = f"{result['method']} {DaySpec(**result['day']).name} seed {result['seed']} {result['spoil']}"
+    if not result["pairs"]:
+        return f"{head}: refused: {result['refused']}"
+    cells = [
+        f"{pair} {p['az_deg']:.3f}/{p['el_deg']:.3f}/{p['range_m']:.3f} {p['status']}"
+        if "az_deg" in p
+        else f"{pair} {p['status']}"
+        for pair, p in result["pairs"].items()
+    ]
+    return f"{head}: {'; '.join(cells)} ({result['cpu_s']} CPU s)"
+
+
+def _commit() -> str:
+    """The commit, with a + where the working tree differs from it in pipeline."""
+    head = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    )
+    changed = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", "pipeline", "schemas"], check=False)
+    return (head.stdout.strip() or "unknown") + ("+" if changed.returncode else "")

@@ -1,0 +1,130 @@
+"""What a study asks of one calibration record against known truth, and of many of them together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.geometry.se3 import from_quaternion
+from pipeline.objective.problem import Prior
+from pipeline.verify.targets import errors_at_targets
+from schemas.calibrations import CalibrationRecord
+
+__all__ = [
+    "LIMITS_DEG",
+    "claimed_error_deg",
+    "inside_share",
+    "measure",
+    "rms",
+    "share",
+    "transform_of",
+    "within",
+]
+
+# The issue's limits for an accepted result, and the axes of the parent frame that turn azimuth and elevation.
+LIMITS_DEG = {"camera_lidar": 0.2, "camera_radar": 0.4, "lidar_radar": 0.4}
+AZIMUTH_ELEVATION_DOF = {"camera_lidar": (1, 0), "camera_radar": (1, 0), "lidar_radar": (2, 1)}
+
+
+def measure(
+    record: CalibrationRecord, T_true: Float[np.ndarray, "4 4"], prior: Prior, dt_true_s: float | None
+) -> dict[str, Any]:
+    """One record against truth, small enough for a line of JSON.
+
+    `error` is the change (rotation vector about the child, its position; parent axes, rad and m) from truth to the
+    result and `sigma` what the record's covariance says of it; `*_deg`, `range_m` are the paper's errors at its three
+    targets; `prior_*` the same for the prior.
+    """
+    pair = record.pair
+    T_prior = prior.of(pair)
+    azimuth, elevation, range_m = errors_at_targets(pair, T_prior, T_true)
+    out: dict[str, Any] = {
+        "status": record.status,
+        "reason": record.reason,
+        "prior_error": _rounded(change_between(T_true, T_prior)),
+        "prior_az_deg": _number(np.degrees(azimuth)),
+        "prior_el_deg": _number(np.degrees(elevation)),
+        "prior_range_m": _number(range_m),
+        "frames_used": record.frames_used,
+    }
+    T = transform_of(record)
+    if T is None or record.covariance is None:
+        return out
+    azimuth, elevation, range_m = errors_at_targets(pair, T, T_true)
+    out |= {
+        "az_deg": _number(np.degrees(azimuth)),
+        "el_deg": _number(np.degrees(elevation)),
+        "range_m": _number(range_m),
+        "error": _rounded(change_between(T_true, T)),
+        "sigma": _rounded(np.sqrt(np.diag(change_covariance(T, record.covariance)))),
+        "observable": [int(v) for v in record.observable or []],
+        "loop_rotation_rad": record.loop_rotation_rad,
+        "diagnostics": {k: _number(v) for k, v in sorted(record.diagnostics.items())},
+    }
+    if record.time_offset_s is not None:
+        out |= {
+            "dt_s": _number(record.time_offset_s),
+            "dt_sigma_s": None if record.time_offset_sigma_s is None else _number(record.time_offset_sigma_s),
+            "dt_true_s": dt_true_s,
+        }
+    return out
+
+
+def transform_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
+    """T_parent_child of a record; None where it was refused."""
+    if record.qw is None:
+        return None
+    return from_quaternion(
+        np.array([record.qw, record.qx, record.qy, record.qz], np.float64),
+        np.array([record.tx_m, record.ty_m, record.tz_m], np.float64),
+    )
+
+
+def within(pair: str, measured: Mapping[str, Any], *, claimed: bool = False) -> bool:
+    """Azimuth and elevation at the targets are within the limit.
+
+    Args:
+        pair: camera_lidar, camera_radar or lidar_radar.
+        measured: what `measure` returned.
+        claimed: ask only of angles that the record calls determined by the day.
+    """
+    return claimed_error_deg(pair, measured, claimed=claimed) <= LIMITS_DEG[pair]
+
+
+def claimed_error_deg(pair: str, measured: Mapping[str, Any], *, claimed: bool) -> float:
+    """The larger of azimuth and elevation error at the targets [deg]; 0 where nothing is claimed."""
+    angles = [measured["az_deg"], measured["el_deg"]]
+    if claimed:
+        angles = [
+            a for a, k in zip(angles, AZIMUTH_ELEVATION_DOF[pair], strict=True) if measured["observable"][k]
+        ]
+    return max(angles, default=0.0)
+
+
+def inside_share(errors: Float[np.ndarray, " N"], sigmas: Float[np.ndarray, " N"], count: float) -> float:
+    """Share of errors inside `count` sigmas; NaN of none."""
+    return float(np.mean(np.abs(errors) <= count * sigmas)) if len(errors) else float("nan")
+
+
+def rms(values: Sequence[float] | Float[np.ndarray, " N"]) -> float:
+    """Root mean square; NaN of none."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+def share(hits: Iterable[bool]) -> str:
+    """`k/n (p %)`."""
+    found = list(hits)
+    return f"{sum(found)}/{len(found)} ({100 * np.mean(found):.1f} %)" if found else "none"
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [_number(v) for v in values]
+
+
+def _number(value: float) -> float:
+    """Five digits: study files are committed, and nobody reads more."""
+    return float(f"{float(value):.5g}")
