@@ -1,0 +1,142 @@
+"""The equirectangular grid that all networks see: directions of the camera's optical frame, in equal angles.
+
+A camera is resampled onto it once; lidar and radar are rendered onto it through the current guess, so that a
+rotation error is a shift of cells whatever the lens. Column 0 is the leftmost, row 0 the highest; the centre of
+cell (v, u) has azimuth `left - (u + 1/2) c` and elevation `top - (v + 1/2) c`, c the size of a cell.
+
+Azimuth is positive to the left, elevation upwards, as in `geometry.spherical.camera_direction_angles`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.geometry.cameras import Camera
+from schemas.training import UNKNOWN_CLASS
+
+__all__ = ["Grid", "grid_rays", "resample_camera", "resample_labels"]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What part of the camera's directions is looked at, and how finely.
+
+    Args:
+        cell_deg: size of a cell; 0.4 is the CPU budget's, 0.2 the GPU's.
+        left_deg: azimuth of the left border (the right one is its mirror image).
+        top_deg: elevation of the upper border.
+        bottom_deg: elevation of the lower border.
+
+    The default is the paper rig's lidar (60 x 24 deg) and 8 deg around it.
+    """
+
+    cell_deg: float = 0.4
+    left_deg: float = 38.4
+    top_deg: float = 16.0
+    bottom_deg: float = -22.4
+
+    def __post_init__(self) -> None:
+        for name, count in (("width", self._columns), ("height", self._rows)):
+            # Three halvings down and up again in the camera's encoder, and three levels of cells in the matcher.
+            if abs(count - round(count)) > 1e-6 or round(count) % 16:
+                raise ValueError(f"the grid's {name} of {count:g} cells is no multiple of 16")
+
+    @property
+    def _columns(self) -> float:
+        return 2 * self.left_deg / self.cell_deg
+
+    @property
+    def _rows(self) -> float:
+        return (self.top_deg - self.bottom_deg) / self.cell_deg
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return round(self._columns)
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return round(self._rows)
+
+    def coarser(self, factor: int) -> Grid:
+        """The same view in cells `factor` times as large."""
+        return _Level(self.cell_deg * factor, self.left_deg, self.top_deg, self.bottom_deg)
+
+    def finer(self, factor: int) -> Grid:
+        """The same view in cells 1/`factor` as large."""
+        return _Level(self.cell_deg / factor, self.left_deg, self.top_deg, self.bottom_deg)
+
+    def azimuth_rad(self) -> Float[np.ndarray, " W"]:
+        """Azimuth of the columns' centres."""
+        return np.radians(self.left_deg - (np.arange(self.width) + 0.5) * self.cell_deg)
+
+    def elevation_rad(self) -> Float[np.ndarray, " H"]:
+        """Elevation of the rows' centres."""
+        return np.radians(self.top_deg - (np.arange(self.height) + 0.5) * self.cell_deg)
+
+
+class _Level(Grid):
+    """A level of a pyramid: any whole number of cells."""
+
+    def __post_init__(self) -> None:
+        return
+
+
+def grid_rays(grid: Grid) -> Float[np.ndarray, "H W 3"]:
+    """Unit rays through the cells' centres, optical frame (x right, y down, z forward)."""
+    azimuth, elevation = np.meshgrid(grid.azimuth_rad(), grid.elevation_rad())
+    c = np.cos(elevation)
+    return np.stack([-c * np.sin(azimuth), -np.sin(elevation), c * np.cos(azimuth)], -1)
+
+
+def _maps(camera: Camera, grid: Grid, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel of each cell in an image `scale` times the camera's size (float32), and where there is one."""
+    rays = grid_rays(grid)
+    at = camera.scaled(scale)
+    uv, valid = at.project(rays)
+    return uv.astype(np.float32), valid & at.contains(uv)
+
+
+def resample_camera(
+    image: UInt8[np.ndarray, "Y X 3"], camera: Camera, grid: Grid
+) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
+    """The image in the grid's cells, and 1 where the camera sees the whole cell.
+
+    Colours are averaged over the cell: the image is first reduced to about half a cell per pixel, then sampled
+    twice per cell and axis. `camera` may belong to another size of the same image (pre-reduced images).
+    """
+    fine = grid.finer(2)
+    pitch_rad = 1.0 / max(camera.focal_px) * camera.width_px / image.shape[1]
+    scale = min(1.0, pitch_rad / np.radians(fine.cell_deg))
+    if scale < 1.0:
+        size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], 3)
+    uv, valid = _maps(camera, fine, image.shape[1] / camera.width_px)
+    sampled = cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    whole = valid.reshape(grid.height, 2, grid.width, 2).all(axis=(1, 3))
+    reduced = cv2.resize(sampled, (grid.width, grid.height), interpolation=cv2.INTER_AREA)
+    return np.where(whole[..., None], reduced, 0).astype(np.uint8), whole.astype(np.uint8)
+
+
+def resample_labels(
+    labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid, classes: int
+) -> UInt8[np.ndarray, "H W"]:
+    """The most frequent class of each cell, from 4 x 4 samples; UNKNOWN_CLASS outside the image.
+
+    `labels` are indices below `classes`, or UNKNOWN_CLASS; their image may have any size, `camera` belongs to the full one.
+    """
+    fine = grid.finer(4)
+    uv, valid = _maps(camera, fine, labels.shape[1] / camera.width_px)
+    # Pixel centres are integers, so rounding is the nearest pixel.
+    x = np.clip(np.rint(uv[..., 0]), 0, labels.shape[1] - 1).astype(np.int64)
+    y = np.clip(np.rint(uv[..., 1]), 0, labels.shape[0] - 1).astype(np.int64)
+    sampled = np.where(valid, labels[y, x], UNKNOWN_CLASS)
+    cells = sampled.reshape(grid.height, 4, grid.width, 4).transpose(0, 2, 1, 3).reshape(-1, 16)
+    counts = np.stack([(cells == k).sum(axis=1) for k in range(classes)], -1)
+    winner = np.where(counts.max(axis=1) >= 8, counts.argmax(axis=1), UNKNOWN_CLASS)  # half a cell or nothing
+    return winner.reshape(grid.height, grid.width).astype(np.uint8)
