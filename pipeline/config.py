@@ -30,6 +30,7 @@ __all__ = [
     "SolveConfig",
     "TopicSemantics",
     "TriggerConfig",
+    "VerifyConfig",
     "config_hash",
     "load_fleet",
 ]
@@ -245,6 +246,14 @@ class PrepareConfig(_Section):
         return height, width
 
 
+class VerifyConfig(_Section):
+    """What an accepted calibration must be good for: errors of azimuth and elevation at targets 15 to 40 m away."""
+
+    camera_lidar_limit_deg: Positive = 0.2
+    radar_limit_deg: Positive = 0.4
+    confidence_sigmas: Positive = 2.8  # 99.5 % of a normal deviate
+
+
 class AuditConfig(_Section):
     """Control charts."""
 
@@ -271,6 +280,7 @@ class FleetConfig(_Section):
     select: SelectConfig = SelectConfig()
     trigger: TriggerConfig = TriggerConfig()
     solve: SolveConfig = SolveConfig()
+    verify: VerifyConfig = VerifyConfig()
     prepare: PrepareConfig = PrepareConfig()
     audit: AuditConfig = AuditConfig()
 

@@ -60,6 +60,22 @@ CALIBRATIONS = TableSchema(
             "accepted (use it), held (computed, the prior stays current), refused (nothing computed)",
         ),
         scalar("reason", "string", "why, in words; empty where accepted without remark"),
+        scalar(
+            "score",
+            "float64",
+            "smallest margin over all checks of the verdict: 1 = far inside, 0 = at a limit, negative = beyond; ranks records",
+            nullable=True,
+        ),
+        scalar(
+            "determined",
+            "list<string>",
+            "what an accepted record vouches for, of azimuth and elevation at targets 15 to 40 m away: within limit_rad",
+        ),
+        scalar("limit_rad", "float64", "the largest error that the purpose bears", nullable=True),
+        scalar(
+            "azimuth_sigma_rad", "float64", "sigma of a target's azimuth, from the covariance", nullable=True
+        ),
+        scalar("elevation_sigma_rad", "float64", "sigma of its elevation", nullable=True),
         scalar("trigger_before", "map<string,float64>", "the paper's trigger metrics at the prior"),
         scalar("trigger_after", "map<string,float64>", "the same at the result"),
         scalar("triggered", "bool", "a trigger metric exceeded its threshold at the prior"),
@@ -80,6 +96,10 @@ CALIBRATIONS = TableSchema(
             nullable=True,
         ),
         scalar("loop_translation_m", "float64", "its translation", nullable=True),
+        scalar(
+            "loop_rotation_sigma_rad", "float64", "sigma that the pairs promise for the angle", nullable=True
+        ),
+        scalar("loop_translation_sigma_m", "float64", "and for the translation", nullable=True),
         scalar("environment", "string", "highway, urban, mixed or unknown"),
         scalar(
             "time_offset_s",
@@ -88,7 +108,9 @@ CALIBRATIONS = TableSchema(
             nullable=True,
         ),
         scalar("time_offset_sigma_s", "float64", "its sigma", nullable=True),
-        scalar("notes", "list<string>", "what was assumed, what the drive still lacks"),
+        scalar("notes", "list<string>", "what else a reader should know"),
+        scalar("assumptions", "list<string>", "what was taken as known, and what that is worth"),
+        scalar("drive_missing", "list<string>", "what the day did not show: what to drive next time"),
         scalar(
             "diagnostics",
             "map<string,float64>",
@@ -144,11 +166,20 @@ class CalibrationRecord:
     alignment_after: float | None = None
     loop_rotation_rad: float | None = None
     loop_translation_m: float | None = None
+    loop_rotation_sigma_rad: float | None = None
+    loop_translation_sigma_m: float | None = None
+    score: float | None = None
+    limit_rad: float | None = None
+    azimuth_sigma_rad: float | None = None
+    elevation_sigma_rad: float | None = None
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     trigger_before: dict[str, float] = field(default_factory=dict)
     trigger_after: dict[str, float] = field(default_factory=dict)
     frames_rejected: dict[str, int] = field(default_factory=dict)
+    determined: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    assumptions: list[str] = field(default_factory=list)
+    drive_missing: list[str] = field(default_factory=list)
     diagnostics: dict[str, float] = field(default_factory=dict)
     inputs: list[str] = field(default_factory=list)
