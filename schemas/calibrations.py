@@ -63,13 +63,13 @@ CALIBRATIONS = TableSchema(
         scalar(
             "score",
             "float64",
-            "smallest margin over all checks of the verdict: 1 = far inside, 0 = at a limit, negative = beyond; ranks records",
+            "smallest margin over the checks of the verdict: 1 = far inside, 0 = at a limit, below 0 = beyond",
             nullable=True,
         ),
         scalar(
             "determined",
             "list<string>",
-            "what an accepted record vouches for, of azimuth and elevation at targets 15 to 40 m away: within limit_rad",
+            "of azimuth and elevation at targets 15 to 40 m away: what lies within limit_rad, as sure as asked",
         ),
         scalar("limit_rad", "float64", "the largest error that the purpose bears", nullable=True),
         scalar(
