@@ -1,8 +1,11 @@
 """Simulated vehicle-days for the studies: generated and perceived once, calibrated as often as a study likes.
 
-    python tests/benchmarks/studies/days.py generate --root /tmp/studies/days --sets table1 coverage verdict offsets
+    python tests/benchmarks/studies/days.py generate --root DAYS --sets table1 coverage verdict offsets
+    python tests/benchmarks/studies/days.py adopt --root DAYS --fleet astyx.toml --lake LAKE --vehicle V --day D
 
 Of a day only its truth, its fleet.toml and its observations stay on the disk; days that are there are not made again.
+`adopt` puts a real day, ingested and perceived, beside them: its logged calibration stands in for the truth that nobody
+knows.
 """
 
 from __future__ import annotations
@@ -19,13 +22,15 @@ import numpy as np
 from pipeline.config import FleetConfig, load_fleet
 from pipeline.ingest.run import ingest_day
 from pipeline.perceive.run import perceive_day
+from pipeline.prior import read_prior
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
+from schemas.calibrations import PAIRS
 from schemas.observations import OBSERVATIONS, Observation
 
-__all__ = ["SETS", "Day", "DaySpec", "generate_day", "load_day"]
+__all__ = ["REAL", "SETS", "Day", "DaySpec", "adopt_day", "generate_day", "load_day"]
 
 VEHICLE, DATE = "vehicle-1", "2026-03-02"
 _FINISHED = "done.json"
@@ -57,7 +62,7 @@ class Day:
     truth: dict[str, object]
     fleet: FleetConfig
 
-    def T(self, pair: str) -> np.ndarray:
+    def true_of(self, pair: str) -> np.ndarray:
         """True transform of a pair."""
         return np.array(self.truth[f"T_{pair}"], np.float64)
 
@@ -89,15 +94,36 @@ def generate_day(spec: DaySpec, root: Path) -> Path:
     return folder
 
 
+def adopt_day(fleet_file: Path, lake: str, partition: Partition, root: Path) -> Path:
+    """Put a perceived real day among the generated ones; its logged calibration is the reference."""
+    rows = read_rows(Lake.at(lake), OBSERVATIONS, partition, Observation)
+    given = read_prior(rows, load_fleet(fleet_file).rig_of(partition.vehicle).prior, fleet_file)
+    folder = root / REAL.name
+    shutil.rmtree(folder, ignore_errors=True)
+    truth = folder / "truth" / partition.vehicle / f"{partition.day}.json"
+    truth.parent.mkdir(parents=True)
+    truth.write_text(json.dumps({f"T_{pair}": given.of(pair).tolist() for pair in PAIRS}))
+    shutil.copy(fleet_file, folder / "fleet.toml")
+    shutil.copytree(
+        Lake.at(lake).folder(OBSERVATIONS.name, partition),
+        Lake.at(folder / "lake").folder(OBSERVATIONS.name, partition),
+    )
+    note = asdict(REAL) | {"vehicle": partition.vehicle, "day": partition.day, "kept_frames": len(rows)}
+    (folder / _FINISHED).write_text(json.dumps(note) + "\n")
+    return folder
+
+
 def load_day(spec: DaySpec, root: Path) -> Day:
-    """Observations, truth and configuration of a generated day."""
+    """Observations, truth and configuration of a generated (or adopted) day."""
     folder = root / spec.name
     if not (folder / _FINISHED).exists():
         raise SystemExit(f"{folder} is not there: run `days.py generate --root {root}` first")
+    note = json.loads((folder / _FINISHED).read_text())
+    partition = Partition(note.get("vehicle", VEHICLE), note.get("day", DATE))
     return Day(
         spec,
-        read_rows(Lake.at(folder / "lake"), OBSERVATIONS, Partition(VEHICLE, DATE), Observation),
-        json.loads((folder / "truth" / VEHICLE / f"{DATE}.json").read_text()),
+        read_rows(Lake.at(folder / "lake"), OBSERVATIONS, partition, Observation),
+        json.loads((folder / "truth" / partition.vehicle / f"{partition.day}.json").read_text()),
         load_fleet(folder / "fleet.toml"),
     )
 
@@ -117,6 +143,8 @@ def _turned(first: int) -> list[DaySpec]:
         DaySpec(first + i, ("urban", "highway")[i % 2], fault=faults[i // 2]) for i in range(2 * len(faults))
     ]
 
+
+REAL = DaySpec(0, "real", 0, "real")
 
 # Seeds below 200 are for tuning; all others are looked at only with code that no longer changes.
 SETS: dict[str, list[DaySpec]] = {
@@ -158,10 +186,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("command", choices=["generate"])
+    parser.add_argument("command", choices=["generate", "adopt"])
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
+    parser.add_argument("--fleet", type=Path)
+    parser.add_argument("--lake")
+    parser.add_argument("--vehicle")
+    parser.add_argument("--day")
     args = parser.parse_args()
+    if args.command == "adopt":
+        print(adopt_day(args.fleet, args.lake, Partition(args.vehicle, args.day), args.root))
+        return
     for name in args.sets:
         for spec in SETS[name]:
             began = time.time()
