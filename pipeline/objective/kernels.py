@@ -28,7 +28,15 @@ from pipeline.objective.kernel_loops import (
     polynomial_gradients,
 )
 
-__all__ = ["FoldedFrames", "fold_frames", "fold_map", "frame_costs", "frame_gradients", "pack_quads"]
+__all__ = [
+    "FoldedFrames",
+    "fold_frames",
+    "fold_map",
+    "frame_costs",
+    "frame_gradients",
+    "pack_quads",
+    "without_tangential",
+]
 
 _DEGREE = 8  # fit error below 1e-3 px over 116 deg of view
 _f4 = np.float32
@@ -74,7 +82,7 @@ def pack_quads(bytes_map: UInt8[np.ndarray, "H W"]) -> UInt32[np.ndarray, "H W"]
 def fold_map(cost: Float[np.ndarray, "H W"], camera: Camera, penalty: float) -> Float32[np.ndarray, "H W"]:
     """The cost map as the kernel's camera sees it: tangential distortion, where there is any, moves the pixels."""
     cost = cost.astype(np.float32)
-    radial = _without_tangential(camera)
+    radial = without_tangential(camera)
     if radial is camera:
         return cost
     v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
@@ -108,7 +116,7 @@ def fold_frames(
         scale = max(float(folded.max()), 1e-6) / 255
         maps.append(pack_quads(np.round(folded / scale).astype(np.uint8)).ravel())
         coefficients, c_min = (
-            _polynomial(_without_tangential(camera)) if is_polynomial else (np.zeros(_DEGREE + 1), 0.0)
+            _polynomial(without_tangential(camera)) if is_polynomial else (np.zeros(_DEGREE + 1), 0.0)
         )
         parameters.append([*camera.focal_px, *camera.centre_px, c_min, scale, *coefficients])
     stacked = (
@@ -167,7 +175,8 @@ def frame_gradients(
     return terms[..., 0], terms[..., 1:7], H
 
 
-def _without_tangential(camera: Camera) -> Camera:
+def without_tangential(camera: Camera) -> Camera:
+    """The camera that folded maps belong to."""
     if camera.model == "equidistant" or len(camera.D) < 4 or not np.any(camera.D[2:4]):
         return camera
     D = camera.D.astype(np.float64).copy()

@@ -1,0 +1,202 @@
+"""The paper's three pairwise losses in torch: the same definition as the compiled ones, from the same preparation.
+
+Points, maps, weights and limits come from `camera_lidar`, `camera_radar` and `lidar_radar` of `pipeline.objective`;
+only the way from a pose to a loss is written again, so that autograd can follow it. Poses are `*batch #F 4 4`: one per
+frame, or a stack of poses that all frames share (`T[:, None]`).
+
+Source: paper section 4.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.geometry.cameras import Camera
+from pipeline.objective import camera_radar, lidar_radar
+from pipeline.objective.camera_lidar import CameraLidarLoss
+from pipeline.objective.camera_radar import CameraRadarLoss
+from pipeline.objective.differentiable.lookup import bilinear, masked_mean
+from pipeline.objective.differentiable.poses import inverse, transform_points
+from pipeline.objective.differentiable.projection import Projection, camera_projection
+from pipeline.objective.kernels import FoldedFrames, without_tangential
+from pipeline.objective.lidar_radar import LidarRadarLoss
+
+__all__ = [
+    "CameraRadarTensors",
+    "FoldedTensors",
+    "LidarRadarTensors",
+    "camera_lidar_tensors",
+    "camera_radar_tensors",
+    "distance_cost",
+    "folded_tensors",
+    "lidar_radar_tensors",
+    "padded",
+]
+
+
+def distance_cost(squared: Float[Tensor, "*shape"], scale: float | Tensor) -> Float[Tensor, "*shape"]:
+    """d^2 / (d^2 + s^2) of squared distances, as `pipeline.objective.semantics.distance_cost`."""
+    return squared / (squared + scale * scale)
+
+
+@dataclass(frozen=True, eq=False)
+class FoldedTensors:
+    """Points and folded cost maps of F frames, as `FoldedFrames` holds them."""
+
+    points: Float[Tensor, "F N 3"]
+    present: Bool[Tensor, "F N"]
+    maps: Float[Tensor, "F H W"]
+    projection: Projection
+    penalty: float
+
+    def frame_losses(self, T_camera_points: Float[Tensor, "*batch #F 4 4"]) -> Float[Tensor, "*batch F"]:
+        """Mean cost of each frame's points."""
+        uv, valid = self.projection.project(transform_points(T_camera_points, self.points))
+        return masked_mean(bilinear(self.maps, uv, valid, self.penalty), self.present)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraRadarTensors:
+    """Tracks, box centres, and detections with their sky maps."""
+
+    tracks: Float[Tensor, "F M 3"]
+    track_present: Bool[Tensor, "F M"]
+    centres_px: Float[Tensor, "F B 2"]
+    informative: Bool[Tensor, " F"]
+    projection: Projection
+    scale_px: float
+    detections: FoldedTensors
+
+    def frame_losses(self, T_camera_radar: Float[Tensor, "*batch #F 4 4"]) -> Float[Tensor, "*batch F"]:
+        """Loss of each frame; 0 where it has no track or no road user."""
+        uv, valid = self.projection.project(transform_points(T_camera_radar, self.tracks))
+        squared = (uv[..., :, None, :] - self.centres_px[:, None]).square().sum(-1).amin(-1)
+        cost = torch.where(valid, distance_cost(squared, self.scale_px), torch.ones_like(squared))
+        total = masked_mean(cost, self.track_present) + self.detections.frame_losses(T_camera_radar)
+        return total * self.informative
+
+
+@dataclass(frozen=True, eq=False)
+class LidarRadarTensors:
+    """Drivable cells and maps, tracks and cluster centres."""
+
+    drivable: Float[Tensor, "F N 3"]
+    drivable_present: Bool[Tensor, "F N"]
+    lidar_area_m2: Float[Tensor, " F"]
+    radar_maps: Float[Tensor, "F ahead across"]
+    radar_area_m2: Float[Tensor, " F"]
+    tracks: Float[Tensor, "F M 3"]
+    track_present: Bool[Tensor, "F M"]
+    centres: Float[Tensor, "F K 3"]
+    centre_present: Bool[Tensor, "F K"]
+    flat: Bool[Tensor, " F"]
+
+    def frame_losses(self, T_lidar_radar: Float[Tensor, "*batch #F 4 4"]) -> Float[Tensor, "*batch F"]:
+        """Loss of each frame."""
+        has_areas = (self.radar_area_m2 > 0) & (self.lidar_area_m2 > 0)
+        has_tracks = self.track_present.any(-1) & self.centre_present.any(-1)
+        nearest = masked_mean(self._nearest_costs(T_lidar_radar), self.track_present)
+        return (1 - self.drivable_iou(T_lidar_radar)) * has_areas + nearest * has_tracks
+
+    def drivable_iou(self, T_lidar_radar: Float[Tensor, "*batch #F 4 4"]) -> Float[Tensor, "*batch F"]:
+        """Smooth IoU of the two drivable areas, 0..1; 0 where a frame lacks one of them."""
+        seen = transform_points(inverse(T_lidar_radar), self.drivable)
+        return smooth_iou(
+            seen, self.drivable_present, self.lidar_area_m2, self.radar_maps, self.radar_area_m2
+        )
+
+    def _nearest_costs(self, T_lidar_radar: Tensor) -> Tensor:
+        delta = transform_points(T_lidar_radar, self.tracks)[..., :, None, :] - self.centres[:, None]
+        height = torch.where(self.flat[:, None, None], torch.zeros_like(delta[..., 2]), delta[..., 2])
+        squared = delta[..., :2].square().sum(-1) + height.square()
+        squared = squared.masked_fill(~self.centre_present[:, None], 1e12)
+        return distance_cost(squared.amin(-1), lidar_radar.SCALE_M)
+
+
+def smooth_iou(
+    drivable_radar: Float[Tensor, "*batch F N 3"],
+    present: Bool[Tensor, "F N"],
+    lidar_area_m2: Float[Tensor, " F"],
+    radar_maps: Float[Tensor, "F ahead across"],
+    radar_area_m2: Float[Tensor, " F"],
+) -> Float[Tensor, "*batch F"]:
+    """IoU of the lidar's drivable cells, in radar axes, with the radar's soft drivable map."""
+    cell = lidar_radar.CELL_M
+    row = drivable_radar[..., 0] / cell - 0.5
+    column = drivable_radar[..., 1] / cell - 0.5 + radar_maps.shape[2] // 2
+    uv = torch.stack([column, row], -1)
+    share = masked_mean(bilinear(radar_maps, uv, torch.ones_like(row, dtype=torch.bool), 0.0), present)
+    overlap = share * lidar_area_m2
+    return overlap / (lidar_area_m2 + radar_area_m2 - overlap).clamp_min(1e-9)
+
+
+def camera_lidar_tensors(
+    loss: CameraLidarLoss, cameras: Sequence[Camera], dtype: torch.dtype = torch.float32
+) -> FoldedTensors:
+    """The prepared camera-lidar loss as tensors; cameras at label size, as they were when it was prepared."""
+    return folded_tensors(loss.frames, cameras, dtype)
+
+
+def camera_radar_tensors(loss: CameraRadarLoss, dtype: torch.dtype = torch.float32) -> CameraRadarTensors:
+    """The prepared camera-radar loss as tensors."""
+    frames = range(len(loss.cameras))
+    tracks, present = padded([loss.tracks_radar[loss.track_frame == f] for f in frames], dtype)
+    return CameraRadarTensors(
+        tracks,
+        present,
+        torch.tensor(loss.centres_px, dtype=dtype),
+        torch.tensor(loss.informative),
+        camera_projection(loss.cameras, dtype),
+        camera_radar.SCALE_RAD * loss.cameras[0].focal_px[0],  # the day's one camera, as there
+        folded_tensors(loss.detections, loss.cameras, dtype),
+    )
+
+
+def lidar_radar_tensors(loss: LidarRadarLoss, dtype: torch.dtype = torch.float32) -> LidarRadarTensors:
+    """The prepared lidar-radar loss as tensors."""
+    return LidarRadarTensors(
+        *padded(np.split(loss.drivable_lidar, loss.drivable_first[1:-1]), dtype),
+        torch.tensor(loss.lidar_area_m2, dtype=dtype),
+        torch.tensor(loss.radar_maps, dtype=dtype),
+        torch.tensor(loss.radar_area_m2, dtype=dtype),
+        *padded(np.split(loss.tracks_radar, loss.track_first[1:-1]), dtype),
+        *padded(np.split(loss.centres_lidar, loss.centre_first[1:-1]), dtype),
+        torch.tensor(loss.flat),
+    )
+
+
+def padded(arrays: Sequence[np.ndarray], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Frames' points one under the other, filled with zeros, and which of them are points."""
+    longest = max([1, *(len(a) for a in arrays)])
+    points = np.zeros((len(arrays), longest, 3))
+    present = np.zeros((len(arrays), longest), bool)
+    for f, a in enumerate(arrays):
+        points[f, : len(a)], present[f, : len(a)] = a, True
+    return torch.tensor(points, dtype=dtype), torch.tensor(present)
+
+
+def folded_tensors(frames: FoldedFrames, cameras: Sequence[Camera], dtype: torch.dtype) -> FoldedTensors:
+    """Points and byte maps of the kernel as tensors; cameras as they were given to `fold_frames`, all of one size.
+
+    Raises:
+        ValueError: the cameras differ in size or kind of model.
+    """
+    xyz = np.stack([frames.x_m, frames.y_m, frames.z_m], -1)
+    sizes = {(c.height_px, c.width_px) for c in cameras}
+    if len(sizes) != 1:
+        raise ValueError(f"the maps of a batch must have one size, not {sorted(sizes)}")
+    # The lowest byte of a quad is the pixel's own cost.
+    bytes_ = (frames.quads & np.uint32(255)).reshape(len(cameras), *sizes.pop())
+    maps = bytes_.astype(np.float64) * frames.camera[:, 5, None, None].astype(np.float64)
+    return FoldedTensors(
+        *padded(np.split(xyz, frames.first[1:-1]), dtype),
+        torch.tensor(maps, dtype=dtype),
+        camera_projection([without_tangential(c) for c in cameras], dtype),
+        frames.penalty,
+    )

@@ -1,0 +1,222 @@
+"""Terms of self-supervision on the equirectangular grid: what `joint` uses, as smooth costs of one frame each.
+
+Angles in degrees, distances in metres, per-frame means over what is valid, so that terms and frames compare. Every
+function takes the poses of its own pair, `*batch #F 4 4`, and tensors of F frames.
+
+Source: the project's evidence on self-supervision, section 3 (which terms have their minimum at the truth).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int8, Int64, UInt8
+from torch import Tensor
+
+from pipeline.objective.camera_lidar import SCALE_RAD as CLASS_SCALE_RAD
+from pipeline.objective.differentiable.edges import edge_residuals_px
+from pipeline.objective.differentiable.lookup import bilinear_groups, masked_mean, nearest_pixel
+from pipeline.objective.differentiable.poses import transform_points
+from pipeline.objective.differentiable.projection import GridProjection
+
+__all__ = [
+    "GridMaps",
+    "cluster_class_cost",
+    "edge_cost",
+    "sky_cost",
+    "track_cluster_cost",
+    "track_detection_cost",
+]
+
+DEG = 180.0 / torch.pi
+CLASS_SCALE_DEG = CLASS_SCALE_RAD * DEG  # the paper loss's robust scale
+_CLASS_TAU = 0.05  # of the soft choice of a cluster's class, in units of the robust cost
+EDGE_CLAMP_DEG = 4.0  # evidence: convex to +-4 deg
+DETECTION_TAU_DEG, DETECTION_CLAMP_DEG = 0.5, 8.0
+CLUSTER_TAU_M, CLUSTER_CLAMP_M = 0.3, 5.0
+DISTANCE_STEP_DEG, OFFSET_STEP_DEG = 0.1, 0.05  # of the stored maps
+
+
+@dataclass(frozen=True, eq=False)
+class GridMaps:
+    """Maps of F frames on one equirectangular grid in the optical frame; steps as in `schemas.training`."""
+
+    class_distance: UInt8[Tensor, "F G H W"]
+    edge_offset: Int8[Tensor, "F 4 H W"]
+    sky_depth: UInt8[Tensor, "F H W"]
+    seen: Bool[Tensor, "F H W"]  # the camera sees this cell
+    projection: GridProjection
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.seen.shape[1], self.seen.shape[2]
+
+    def pixels(
+        self, T_camera_points: Float[Tensor, "*batch #F 4 4"], points: Float[Tensor, "F N 3"]
+    ) -> tuple[Float[Tensor, "*batch F N 2"], Bool[Tensor, "*batch F N"]]:
+        """Cells of points, and which of them the camera sees."""
+        uv, valid = self.projection.project(transform_points(T_camera_points, points))
+        row, column, inside = nearest_pixel(self.size, uv, valid)
+        frame = torch.arange(len(self.seen), device=uv.device)[:, None]
+        return uv, inside & self.seen[frame, row, column]
+
+
+def cluster_class_cost(
+    maps: GridMaps,
+    T_camera_lidar: Float[Tensor, "*batch #F 4 4"],
+    points: Float[Tensor, "F N 3"],
+    cluster: Int64[Tensor, "F N"],
+    present: Bool[Tensor, "F N"],
+    clusters: int,
+) -> Float[Tensor, "*batch F"]:
+    """Each lidar cluster lies on objects of ONE reflecting class, whichever suits it best at this pose [deg].
+
+    Twice as steep as the union of the classes where neighbours differ, and needs no semantics of the lidar. The robust
+    distance is the paper loss's, times its scale; a point out of view costs the scale, as far from any object.
+
+    Args:
+        maps: of the frames.
+        T_camera_lidar: poses.
+        points: points of object clusters, lidar frame.
+        cluster: which cluster, below `clusters`; -1 counts as a cluster of its own kind.
+        present: which rows are points.
+        clusters: most clusters of a frame.
+    """
+    uv, seen = maps.pixels(T_camera_lidar, points)
+    distance = bilinear_groups(maps.class_distance, uv, seen) * DISTANCE_STEP_DEG
+    squared = distance.square()
+    cost = (
+        torch.where(seen[..., None], squared / (squared + CLASS_SCALE_DEG**2), torch.ones_like(squared))
+        * present.to(squared.dtype)[..., None]
+    )
+    index = torch.where(cluster < 0, torch.full_like(cluster, clusters), cluster)
+    batch = cost.shape[:-2]
+    by_cluster = cost.new_zeros(*batch, clusters + 1, cost.shape[-1])
+    by_cluster = by_cluster.scatter_add(-2, index[..., None].expand_as(cost), cost)
+    count = present.to(cost.dtype).new_zeros(len(points), clusters + 1)
+    count = count.scatter_add(-1, index, present.to(cost.dtype))
+    mean = by_cluster / count.clamp_min(1)[..., None]
+    best = soft_minimum(mean, _CLASS_TAU)
+    return CLASS_SCALE_DEG * (best * count).sum(-1) / count.sum(-1).clamp_min(1)
+
+
+def edge_cost(
+    maps: GridMaps,
+    T_camera_lidar: Float[Tensor, "*batch #F 4 4"],
+    points: Float[Tensor, "F N 3"],
+    side: Int64[Tensor, "F N"],
+    present: Bool[Tensor, "F N"],
+) -> Float[Tensor, "*batch F"]:
+    """Depth jumps lie on mask boundaries of their own direction: distance along that direction's axis [deg], clamped.
+
+    As `pipeline.objective.edges`: the boundary is looked up at the nearest cell, the distance is taken from the point.
+    """
+    uv, seen = maps.pixels(T_camera_lidar, points)
+    step_deg = maps.projection.step_rad * DEG
+    residual, _, found = edge_residuals_px(
+        maps.edge_offset, uv, seen, side, step_px=OFFSET_STEP_DEG / step_deg, shift_px=0.0
+    )
+    none = torch.full_like(residual, EDGE_CLAMP_DEG)
+    cost = torch.where(found, soft_clamp((residual * step_deg).abs(), EDGE_CLAMP_DEG), none)
+    return masked_mean(cost, present)
+
+
+def sky_cost(
+    maps: GridMaps,
+    T_camera_points: Float[Tensor, "*batch #F 4 4"],
+    points: Float[Tensor, "F N 3"],
+    present: Bool[Tensor, "F N"],
+    free_deg: float = 0.0,
+) -> Float[Tensor, "*batch F"]:
+    """Nothing that returned an echo lies in the sky: depth inside the sky's mask beyond `free_deg`, 0 outside [deg].
+
+    A guard, not an alignment term: it pushes down only.
+    """
+    uv, seen = maps.pixels(T_camera_points, points)
+    depth = bilinear_groups(maps.sky_depth[:, None], uv, seen)[..., 0] * DISTANCE_STEP_DEG
+    return masked_mean(torch.where(seen, (depth - free_deg).clamp_min(0), torch.zeros_like(depth)), present)
+
+
+def track_detection_cost(
+    T_camera_radar: Float[Tensor, "*batch #F 4 4"],
+    tracks: Float[Tensor, "F M 3"],
+    track_present: Bool[Tensor, "F M"],
+    centres_rad: Float[Tensor, "F G 2"],
+    centre_present: Bool[Tensor, "F G"],
+    has_elevation: Bool[Tensor, " F"],
+) -> Float[Tensor, "*batch F"]:
+    """Tracked clusters lie at road users' box centres: soft smallest angle, clamped [deg].
+
+    Azimuth alone counts where the radar measures no elevation.
+
+    Args:
+        T_camera_radar: poses.
+        tracks: tracked clusters, radar frame.
+        track_present: which rows are tracks.
+        centres_rad: azimuth to the left and elevation upwards of box centres, camera frame.
+        centre_present: which rows are boxes.
+        has_elevation: whether the radar measures it.
+    """
+    p = transform_points(T_camera_radar, tracks)
+    azimuth, elevation = directions(p)
+    da = (azimuth[..., :, None] - centres_rad[:, None, :, 0]) * DEG
+    de = (elevation[..., :, None] - centres_rad[:, None, :, 1]) * DEG
+    de = torch.where(has_elevation[:, None, None], de, torch.zeros_like(de))
+    angle = safe_sqrt(da.square() + de.square())
+    return _nearest_cost(angle, track_present, centre_present, DETECTION_TAU_DEG, DETECTION_CLAMP_DEG)
+
+
+def track_cluster_cost(
+    T_lidar_radar: Float[Tensor, "*batch #F 4 4"],
+    tracks: Float[Tensor, "F M 3"],
+    track_present: Bool[Tensor, "F M"],
+    centres: Float[Tensor, "F K 3"],
+    centre_present: Bool[Tensor, "F K"],
+    has_elevation: Bool[Tensor, " F"],
+) -> Float[Tensor, "*batch F"]:
+    """Tracked clusters lie at lidar clusters' centres: soft smallest distance, clamped [m].
+
+    In the plane where the radar measures no elevation.
+    """
+    delta = transform_points(T_lidar_radar, tracks)[..., :, None, :] - centres[:, None]
+    height = torch.where(has_elevation[:, None, None], delta[..., 2], torch.zeros_like(delta[..., 2]))
+    distance = safe_sqrt(delta[..., :2].square().sum(-1) + height.square())
+    return _nearest_cost(distance, track_present, centre_present, CLUSTER_TAU_M, CLUSTER_CLAMP_M)
+
+
+def directions(
+    points_camera: Float[Tensor, "*batch 3"],
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Azimuth to the left and elevation upwards [rad], as `camera_direction_angles`; (0, 0) for the origin."""
+    x, y, z = points_camera.unbind(-1)
+    h2 = x * x + z * z
+    off = h2 > 1e-6
+    azimuth = torch.where(off, torch.atan2(-x, torch.where(off, z, torch.ones_like(z))), torch.zeros_like(x))
+    return azimuth, torch.where(
+        off, torch.atan2(-y, torch.where(off, h2, torch.ones_like(h2)).sqrt()), torch.zeros_like(y)
+    )
+
+
+def soft_minimum(values: Float[Tensor, "*batch N"], tau: float) -> Float[Tensor, "*batch"]:
+    """Smooth lower bound of the smallest value, equal to it for a single finite one."""
+    return -tau * torch.logsumexp(-values / tau, -1)
+
+
+def soft_clamp(values: Float[Tensor, "*shape"], limit: float) -> Float[Tensor, "*shape"]:
+    """The value itself where it is small, saturating smoothly at `limit`; for values >= 0."""
+    return limit * torch.tanh(values / limit)
+
+
+def safe_sqrt(squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Square root with a finite slope at 0."""
+    return (squared + 1e-8).sqrt()
+
+
+def _nearest_cost(
+    distance: Tensor, present: Tensor, target_present: Tensor, tau: float, clamp: float
+) -> Tensor:
+    """Mean over the present rows of the soft smallest clamped distance; 0 where a frame lacks either side."""
+    clamped = soft_clamp(distance, clamp).masked_fill(~target_present[:, None], 2 * clamp)
+    return masked_mean(soft_minimum(clamped, tau), present) * target_present.any(-1)

@@ -1,0 +1,231 @@
+"""The torch losses against the compiled ones, value and gradient, on perceived rows; poses and loop against NumPy."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.geometry import se3
+from pipeline.objective import loop
+from pipeline.objective.camera_lidar import camera_lidar_loss
+from pipeline.objective.camera_lidar_terms import Alignments, Level, prepare_terms
+from pipeline.objective.camera_radar import camera_radar_loss
+from pipeline.objective.differentiable.edges import edge_residuals_px, edge_scores
+from pipeline.objective.differentiable.lookup import bilinear
+from pipeline.objective.differentiable.paper import (
+    camera_lidar_tensors,
+    camera_radar_tensors,
+    folded_tensors,
+    lidar_radar_tensors,
+    padded,
+)
+from pipeline.objective.differentiable.poses import (
+    euler_angles,
+    exp_se3,
+    inverse,
+    loop_loss,
+    pose_of_euler_angles,
+    transform_points,
+)
+from pipeline.objective.differentiable.projection import GridProjection, camera_projection
+from pipeline.objective.kernels import fold_frames, frame_gradients
+from pipeline.objective.lidar_radar import lidar_radar_loss
+from pipeline.objective.semantics import camera_at_label_size, labels_of
+from pipeline.prior import read_prior
+from pipeline.store.partitions import Lake, Partition
+from tests.objective.test_kernels import CAMERAS, PENALTY, cloud, poses, smooth_cost
+from tests.simulated_days import perceived, simulated_day
+
+PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
+MARGIN_RAD = np.radians(3.0)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """Six frames of the demo rig, and poses near the true ones."""
+    day = simulated_day(tmp_path_factory.mktemp("day"), frames=6)
+    return day.observations, day.truth
+
+
+@pytest.fixture(scope="module")
+def real(real_logs, tmp_path_factory):
+    """Six frames of the real day, and poses near the logs' own calibration."""
+    folder = tmp_path_factory.mktemp("real")
+    log = real_logs / "astyx-1_2019-01-14_00.mcap"
+    fleet = folder / "fleet.toml"
+    text = (Path(__file__).parent.parent / "end_to_end" / "astyx.toml").read_text()
+    fleet.write_text(f"{text}\n[ingest]\nmax_frames = 6\n")
+    day = perceived(fleet, Lake.at(folder / "lake"), Partition("astyx-1", "2019-01-14"), [log], folder)
+    prior = read_prior(day.observations, day.fleet.rig_of("astyx-1").prior, fleet)
+    return day.observations, {pair: prior.of(pair) for pair in PAIRS}
+
+
+def test_parity_on_a_simulated_day(simulated):
+    check_paper_losses(*simulated)
+    check_edges(*simulated)
+
+
+@pytest.mark.real_logs
+def test_parity_on_the_real_day(real):
+    check_paper_losses(*real)
+    check_edges(*real)
+
+
+def near(T, count, seed):
+    """Poses about T: a degree and some centimetres away."""
+    rng = np.random.default_rng(seed)
+    return se3.exp_se3(rng.normal(size=(count, 6)) * np.array([0.02] * 3 + [0.08] * 3)) @ T
+
+
+def value_and_gradient(loss, T):
+    """Loss of each pose and frame, and d(sum over frames)/d(left twist) of each pose, by autograd in float64."""
+    twist = torch.zeros(len(T), 6, dtype=torch.float64, requires_grad=True)
+    values = loss(exp_se3(twist)[:, None] @ torch.tensor(T)[:, None])
+    values.sum().backward()
+    return values.detach().numpy(), twist.grad.numpy()
+
+
+def by_differences(function, T, h=2e-5):
+    """d(sum of function over frames)/d(left twist) by central differences."""
+    steps = se3.exp_se3(np.concatenate([np.eye(6), -np.eye(6)]) * h)
+    values = np.stack([function(steps @ t).sum(1) for t in T])
+    return (values[:, :6] - values[:, 6:]) / (2 * h)
+
+
+def assert_close(ours, kernel, relative=1e-3):
+    assert np.abs(kernel).max() > 1e-3  # it compares something
+    np.testing.assert_allclose(ours, kernel, rtol=0, atol=relative * np.abs(kernel).max())
+
+
+def check_paper_losses(rows, truth):
+    cameras = [camera_at_label_size(o, labels_of(o)) for o in rows]
+    T = {pair: near(truth[pair], 4, seed) for seed, pair in enumerate(PAIRS)}
+
+    loss = camera_lidar_loss(rows, truth["camera_lidar"], MARGIN_RAD)
+    ours = camera_lidar_tensors(loss, cameras, torch.float64)
+    value, gradient = value_and_gradient(ours.frame_losses, T["camera_lidar"])
+    assert_close(value, loss.frame_losses(T["camera_lidar"]))
+    _, slopes, _ = frame_gradients(loss.frames, T["camera_lidar"])
+    assert_close(gradient, (slopes / loss.frames.counts[:, None]).sum(1))
+
+    loss = camera_radar_loss(rows, truth["camera_radar"], MARGIN_RAD)
+    ours = camera_radar_tensors(loss, torch.float64)
+    value, gradient = value_and_gradient(ours.frame_losses, T["camera_radar"])
+    assert_close(value, loss.frame_losses(T["camera_radar"]))
+    _, slopes, _ = frame_gradients(loss.detections, T["camera_radar"])
+    slopes = slopes * loss.informative[:, None] / np.maximum(loss.detections.counts, 1)[:, None]
+    without_sky = replace(loss, detections=replace(loss.detections, quads=loss.detections.quads * 0))
+    tracks = by_differences(without_sky.frame_losses, T["camera_radar"])
+    assert_close(gradient, slopes.sum(1) + tracks)
+
+    loss = lidar_radar_loss(rows)
+    ours = lidar_radar_tensors(loss, torch.float64)
+    value, gradient = value_and_gradient(ours.frame_losses, T["lidar_radar"])
+    assert_close(value, loss.frame_losses(T["lidar_radar"]))
+    # The kernel adds in float32: differences need a wide step, which rounds the corners of the bilinear map.
+    assert_close(gradient, by_differences(loss.frame_losses, T["lidar_radar"], 1e-4))
+
+
+def check_edges(rows, truth):
+    terms = prepare_terms(rows, truth["camera_lidar"], np.zeros((len(rows), 3)), reach_rad=0.1)
+    level = terms.fitted(
+        Alignments.of_poses(truth["camera_lidar"][None]), Level.wide(4.0, 0), np.random.default_rng(0)
+    )
+    e, T = terms.edges, near(truth["camera_lidar"], 3, 7)
+    points, present = padded(np.split(e.xyz_m, e.start[1:-1]), torch.float64)
+
+    def spread(values):
+        out = torch.zeros(*present.shape, *values.shape[1:], dtype=torch.float64)
+        out[present] = torch.tensor(values.astype(np.float64))
+        return out
+
+    side = spread(e.side).long()
+    projection = camera_projection([terms.maps.camera] * len(rows), torch.float64)
+    sigma = spread(np.hypot(level.sigma_px, e.gap_rad * terms.maps.camera.focal_px[0] / np.sqrt(12)))
+    match, chance = spread(level.match[e.kind]), spread(level.chance[e.kind])
+
+    def scores(T_camera_lidar):
+        uv, valid = projection.project(transform_points(T_camera_lidar, points))
+        residual = edge_residuals_px(torch.tensor(terms.maps.offsets), uv, valid & present, side)
+        return edge_scores(*residual, sigma, match, chance).sum(-1)
+
+    value, gradient = value_and_gradient(scores, T)
+    assert_close(value, terms.edge_score(Alignments.of_poses(T), level))
+    kernel = [terms.gradient(Alignments.of_poses(t[None]), replace(level, marking_weight=0.0))[0] for t in T]
+    assert_close(gradient, np.stack(kernel)[:, :, :6].sum(1))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_folded_maps_agree_with_the_kernel_for_every_camera_model(name):
+    camera = CAMERAS[name]
+    frames = fold_frames([cloud(1), cloud(2, 700)], [smooth_cost(3), smooth_cost(4)], [camera] * 2, PENALTY)
+    ours = folded_tensors(frames, [camera] * 2, torch.float64)
+    T = poses(4, 3, 0.01, 0.1)
+    value, gradient = value_and_gradient(ours.frame_losses, T)
+    cost, slopes, _ = frame_gradients(frames, T)
+    assert_close(value, cost / frames.counts)
+    assert_close(gradient, (slopes / frames.counts[:, None]).sum(1))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_projection_equals_the_camera_and_its_jacobian(name):
+    camera = CAMERAS[name]
+    points = np.concatenate([cloud(5), [[0.0, 0, 9.0], [0, 0, -9.0], [30.0, 0, 0.1]]])
+    uv, valid = camera.project(points)
+    ours, ok = camera_projection([camera], torch.float64).project(torch.tensor(points)[None])
+    keep = valid & (points[:, 2] > 0.5)
+    np.testing.assert_array_equal(ok[0].numpy()[points[:, 2] > 0.5], valid[points[:, 2] > 0.5])
+    np.testing.assert_allclose(ours[0].numpy()[keep], uv[keep], atol=1e-9)
+    at = torch.tensor(points[keep][None], requires_grad=True)
+    camera_projection([camera], torch.float64).project(at)[0].sum().backward()
+    assert torch.isfinite(at.grad).all()
+    np.testing.assert_allclose(at.grad[0], camera.projection_jacobian(points[keep]).sum(1), atol=1e-6)
+
+
+def test_on_the_grid_a_turn_of_the_camera_is_a_shift():
+    grid = GridProjection(-0.8, -0.4, np.radians(0.4), 1)
+    points = torch.tensor(cloud(3)[:, [0, 1, 2]][None])
+    points = points[:, points[0, :, 2] > 0.5]
+    turned = (
+        points @ torch.tensor(se3.exp_so3(np.array([0, 0.05, 0]))).T
+    )  # about the downward axis: to the right
+    shift = grid.project(turned)[0] - grid.project(points)[0]
+    np.testing.assert_allclose(shift[..., 0], 0.05 / np.radians(0.4), atol=1e-9)
+    np.testing.assert_allclose(shift[..., 1], 0, atol=1e-9)
+
+
+def test_bilinear_is_exact_on_a_plane_and_tells_what_is_outside():
+    v, u = np.mgrid[0:6, 0:9].astype(float)
+    plane = torch.tensor((2 * u - 3 * v)[None])
+    uv = torch.tensor([[[0.0, 0.0], [8.0, 5.0], [3.25, 1.5], [8.01, 2.0], [-0.01, 2.0]]], dtype=torch.float64)
+    got = bilinear(plane, uv, torch.ones(1, 5, dtype=torch.bool), 99.0)
+    np.testing.assert_allclose(got[0], [0, 1, 2, 99, 99])
+
+
+def test_poses_equal_their_numpy_versions():
+    rng = np.random.default_rng(1)
+    xi = rng.normal(size=(50, 6)) * np.array([[1.0], [1e-3], [1e-5], [0.0], [0.3]]).repeat(10, 0)
+    T = exp_se3(torch.tensor(xi))
+    np.testing.assert_allclose(T, se3.exp_se3(xi), atol=1e-12)
+    np.testing.assert_allclose(inverse(T), se3.inverse(se3.exp_se3(xi)), atol=1e-12)
+    np.testing.assert_allclose(euler_angles(T), loop.euler_angles(se3.exp_se3(xi)), atol=1e-12)
+    back = pose_of_euler_angles(euler_angles(T), T[:, :3, 3])
+    np.testing.assert_allclose(back, T, atol=1e-12)
+
+
+def test_the_exponential_has_the_right_gradient_at_zero():
+    xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    point = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    T = exp_se3(xi)
+    (T[:3, :3] @ point + T[:3, 3]).sum().backward()
+    np.testing.assert_allclose(xi.grad, [2 - 3, 3 - 1, 1 - 2, 1, 1, 1])
+
+
+def test_the_loop_loss_is_the_numpy_one_and_zero_where_the_three_agree():
+    T = [se3.exp_se3(x) for x in np.random.default_rng(2).normal(size=(3, 7, 6)) * 0.3]
+    ours = loop_loss(*(torch.tensor(t) for t in T))
+    np.testing.assert_allclose(ours, loop.loop_loss(loop.loop_transform(*T)), atol=1e-12)
+    closed = loop_loss(torch.tensor(T[0]), torch.tensor(T[1]), torch.tensor(T[0] @ T[1]))
+    np.testing.assert_allclose(closed, 0, atol=1e-12)
