@@ -23,11 +23,11 @@ import numpy as np
 
 from pipeline.calibrate import calibrate_observations
 from pipeline.calibration_records import Inputs
-from pipeline.config import FleetConfig, SolveConfig
+from pipeline.config import FleetConfig, PriorConfig, SolveConfig
 from pipeline.errors import SolveError
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.objective.problem import Prior
-from pipeline.prior import perturbed
+from pipeline.prior import perturbed, read_prior
 from pipeline.store.partitions import Partition
 from pipeline.verify.targets import loop_errors
 from schemas.calibrations import PAIRS
@@ -46,8 +46,9 @@ class Run:
     """One calibration of a study.
 
     `prior` is how the prior differs from truth: ("exact", deg, m) turns and shifts both transforms by exactly so much
-    in random directions; ("drawn", deg, m) draws every angle and shift from a normal distribution of that sigma, and
-    the prior's sigmas say so. `solve` and `select` replace fields of the configuration. `spoil` is what is done to the
+    in random directions, and its sigmas allow for it; ("hidden", deg, m) does the same and its sigmas know nothing of
+    it; ("drawn", deg, m) draws every angle and shift from the normal distribution that its sigmas state; ("logged",
+    deg, m) is tf_static with these sigmas. `solve` and `select` replace fields of the configuration. `spoil` is what is done to the
     observations on the way (see `spoiled`).
     """
 
@@ -70,33 +71,34 @@ def key_of(result: dict[str, Any]) -> str:
     return json.dumps({f.name: result[f.name] for f in fields(Run)}, sort_keys=True)
 
 
-def prior_of(
-    T_camera_lidar: np.ndarray, T_lidar_radar: np.ndarray, how: tuple[str, float, float], seed: int
-) -> Prior:
-    """A prior that is off from the truth as a run says, with sigmas that say how far."""
+def prior_of(day: Day, how: tuple[str, float, float], seed: int) -> Prior:
+    """The prior of a run (see `Run`)."""
     kind, deg, shift_m = how
-    sigma_rad = float(np.radians(deg))
-    if kind == "exact":
-        default = Prior(
-            T_camera_lidar, T_lidar_radar, float(np.radians(ROTATION_SIGMA_DEG)), TRANSLATION_SIGMA_M
-        )
-        return perturbed(default, (deg, shift_m), seed)
+    default = (float(np.radians(ROTATION_SIGMA_DEG)), TRANSLATION_SIGMA_M)
+    stated = (float(np.radians(deg)), shift_m)
+    true = Prior(day.true_of("camera_lidar"), day.true_of("lidar_radar"), *default)
+    if kind in {"exact", "hidden"}:
+        moved = perturbed(true, (deg, shift_m), seed)
+        return moved if kind == "exact" else Prior(moved.T_camera_lidar, moved.T_lidar_radar, *default)
+    if kind == "logged":
+        logged = read_prior(day.rows, PriorConfig(), Path("fleet.toml"))
+        return Prior(logged.T_camera_lidar, logged.T_lidar_radar, *stated)
     rng = np.random.default_rng([seed, 7])
-    moved = [
+    drawn = [
         from_rotation_translation(
-            exp_so3(rng.normal(0, sigma_rad, 3)) @ T[:3, :3], T[:3, 3] + rng.normal(0, shift_m, 3)
+            exp_so3(rng.normal(0, stated[0], 3)) @ T[:3, :3], T[:3, 3] + rng.normal(0, shift_m, 3)
         )
-        for T in (T_camera_lidar, T_lidar_radar)
+        for T in (true.T_camera_lidar, true.T_lidar_radar)
     ]
-    return Prior(moved[0], moved[1], sigma_rad, shift_m)
+    return Prior(drawn[0], drawn[1], *stated)
 
 
 def search_range(how: tuple[str, float, float]) -> dict[str, float]:
     """`solve.search_*` that contain the prior's error, as its user would set them: 4 sigmas, or 1.2 times an exact one.
 
-    Never less than the defaults.
+    Never less than the defaults, and these where nobody knows that the prior is off.
     """
-    factor = 4.0 if how[0] == "drawn" else 1.2
+    factor = {"drawn": 4.0, "exact": 1.2}.get(how[0], 0.0)
     default = SolveConfig()
     return {
         "search_rotation_deg": max(default.search_rotation_deg, factor * how[1]),
@@ -129,7 +131,7 @@ def spoiled(rows: Sequence[Observation], how: str) -> list[Observation]:
 
 def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
     """Calibrate a day as a run says and measure every pair against truth."""
-    prior = prior_of(day.true_of("camera_lidar"), day.true_of("lidar_radar"), run.prior, run.seed)
+    prior = prior_of(day, run.prior, run.seed)
     rows = spoiled(day.rows, run.spoil)
     fleet = _configured(day.fleet, run)
     about = Inputs(Partition(VEHICLE, DATE), run.method, "study", run.seed, ())
