@@ -48,8 +48,8 @@ class Run:
     `prior` is how the prior differs from truth: ("exact", deg, m) turns and shifts both transforms by exactly so much
     in random directions, and its sigmas allow for it; ("hidden", deg, m) does the same and its sigmas know nothing of
     it; ("drawn", deg, m) draws every angle and shift from the normal distribution that its sigmas state; ("logged",
-    deg, m) is tf_static with these sigmas. `solve` and `select` replace fields of the configuration. `spoil` is what is done to the
-    observations on the way (see `spoiled`).
+    deg, m) is tf_static with these sigmas. `solve` and `select` replace fields of the configuration. `spoil` is what is
+    done to the observations on the way (see `spoiled`).
     """
 
     day: DaySpec
