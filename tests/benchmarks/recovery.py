@@ -5,10 +5,12 @@ A resumable command: every finished run is one line of the JSON Lines file, and 
     boresight ingest --fleet astyx.toml --lake LAKE --vehicle astyx-1 --day 2019-01-14 LOG...
     boresight perceive --fleet astyx.toml --lake LAKE --vehicle astyx-1 --day 2019-01-14
     python tests/benchmarks/recovery.py --fleet astyx.toml --lake LAKE --vehicle astyx-1 --day 2019-01-14 \
-        --methods joint,joint-optimisation --starts 2,0.1 5,0.2 --seeds 10 --out recovery.jsonl
+        --methods joint,joint-optimisation --starts 2,0.1 5,0.2 10,0.5 --seeds 10 --out recovery.jsonl
 
 The given calibration is the logs' own tf_static. It is no truth: the distance to it says how well methods agree with
-whoever calibrated the car, the halves of the day say how well a method agrees with itself.
+whoever calibrated the car, the halves of the day say how well a method agrees with itself, and injected changes of the
+radar's own data (turned by 0.3 deg of yaw, shifted by 5 cm of y) say how small a change is found. The search range
+follows the start (1.2 times its size, never less than the default). A summary is printed and written beside the lines.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -28,19 +31,22 @@ import numpy as np
 
 from pipeline.calibrate import calibrate_observations
 from pipeline.calibration_records import Inputs
-from pipeline.config import load_fleet
+from pipeline.config import FleetConfig, load_fleet
 from pipeline.errors import SolveError
-from pipeline.geometry.se3 import from_quaternion, inverse, log_se3
+from pipeline.geometry.se3 import exp_so3, from_quaternion, inverse, log_se3
 from pipeline.prior import perturbed, read_prior
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
 from pipeline.verify.targets import errors_at_targets
 from schemas.calibrations import CalibrationRecord
 from schemas.observations import OBSERVATIONS, Observation
+from tests.benchmarks.studies.engine import search_range
 
 # Disjoint halves: every other frame sees the same streets, first and second half see different ones.
 HALVES = (("even_frames", "odd_frames"), ("first_half", "second_half"))
-PARTS = ("day", *HALVES[0], *HALVES[1])
+# Known changes of the radar's data, in radar axes: yaw [deg], y [m].
+INJECTED = {"injected_yaw": (0.3, 0.0), "injected_y": (0.0, 0.05)}
+PARTS = ("day", *HALVES[0], *HALVES[1], *INJECTED)
 
 
 def main() -> None:
@@ -51,7 +57,7 @@ def main() -> None:
         (method, start, seed, part)
         for method in args.methods.split(",")
         for start in args.starts
-        for part in PARTS
+        for part in args.parts
         for seed in range(args.seeds if part == "day" else min(args.seeds, args.half_seeds))
     ]
     todo = [run for run in wanted if run not in {_key(r) for r in done}]
@@ -66,7 +72,10 @@ def main() -> None:
             out.write(json.dumps(result) + "\n")
             out.flush()
             print(_line(result), flush=True)
-    print(table(_read(args.out)))
+    results = _read(args.out)
+    text = "\n\n".join([table(results), injections(results)])
+    args.out.with_suffix(".md").write_text(f"commits {_commits(results)}\n\n{text}\n")
+    print(text)
 
 
 def run_once(
@@ -79,14 +88,10 @@ def run_once(
     given = read_prior(rows, fleet.rig_of(vehicle).prior, fleet_file)
     rotation_deg, translation_m = (float(v) for v in start.split(","))
     prior = perturbed(given, (rotation_deg, translation_m), seed)
-    half = len(rows) // 2
-    chosen = {
-        "day": rows,
-        "even_frames": rows[::2],
-        "odd_frames": rows[1::2],
-        "first_half": rows[:half],
-        "second_half": rows[half:],
-    }[part]
+    plain = fleet.model_dump(mode="json")
+    plain["solve"] |= search_range(("exact", rotation_deg, translation_m))
+    fleet = FleetConfig.model_validate(plain)
+    chosen = _part(rows, part)
     began = time.process_time()
     result: dict[str, Any] = {"method": method, "start": start, "seed": seed, "part": part, "pairs": {}}
     try:
@@ -100,6 +105,46 @@ def run_once(
         else:
             result["pairs"][record.pair] = _measure(record, given.of(record.pair))
     return result
+
+
+def _part(rows: list[Observation], part: str) -> list[Observation]:
+    """A part of the day, or all of it with the radar's data changed."""
+    if part in INJECTED:
+        yaw_deg, y_m = INJECTED[part]
+        return [changed_radar(o, np.radians(yaw_deg), y_m) for o in rows]
+    half = len(rows) // 2
+    return {
+        "day": rows,
+        "even_frames": rows[::2],
+        "odd_frames": rows[1::2],
+        "first_half": rows[:half],
+        "second_half": rows[half:],
+    }[part]
+
+
+def changed_radar(row: Observation, yaw_rad: float, y_m: float) -> Observation:
+    """What the radar would have delivered with axes turned by -yaw about its z and an origin y to the right.
+
+    Every point is turned by +yaw and shifted by +y, velocities are turned: T_lidar_radar becomes T_lidar_radar D^-1.
+    """
+    R = exp_so3(np.array([0.0, 0.0, yaw_rad]))
+    shift = np.array([0.0, y_m, 0.0])
+
+    def point(xyz: np.ndarray) -> np.ndarray:
+        return (xyz @ R.T + shift).astype(xyz.dtype)
+
+    velocity, covariance = row.radar_velocity_mps, row.radar_velocity_cov
+    return replace(
+        row,
+        radar_xyz_m=point(row.radar_xyz_m),
+        radar_track_xyz_m=point(row.radar_track_xyz_m),
+        radar_track_velocity_mps=(row.radar_track_velocity_mps @ R.T).astype(
+            row.radar_track_velocity_mps.dtype
+        ),
+        radar_velocity_mps=None if velocity is None else R @ velocity,
+        radar_velocity_cov=None if covariance is None else R @ covariance @ R.T,
+        radar_drivable_azimuth_rad=row.radar_drivable_azimuth_rad + np.float32(yaw_rad),
+    )
 
 
 def _measure(record: CalibrationRecord, T_given: np.ndarray) -> dict[str, Any]:
@@ -141,6 +186,30 @@ def table(results: list[dict[str, Any]]) -> str:
         groups[result["method"], result["start"]].append(result)
     for (method, start), members in groups.items():
         lines += [f"| {method} | {start} | {row} |" for row in _rows(members)]
+    return "\n".join(lines)
+
+
+def injections(results: list[dict[str, Any]]) -> str:
+    """What each method finds of a known change: its result on the changed day against that on the day as it is."""
+    lines = [
+        "| method | start | runs | injected | pair | found yaw [deg] | found y [m] |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    known = {_key(r): r["pairs"] for r in results if r["pairs"]}
+    for part, (yaw_deg, y_m) in INJECTED.items():
+        groups: dict[tuple[str, str, str], list[np.ndarray]] = defaultdict(list)
+        for (method, start, seed, name), pairs in known.items():
+            before = known.get((method, start, seed, "day"), {})
+            if name == part and "lidar_radar" in pairs and "lidar_radar" in before:
+                T, T_before = (np.array(p["lidar_radar"]["T"]) for p in (pairs, before))
+                groups[method, start, "lidar_radar"].append(inverse(T) @ T_before)
+        for (method, start, pair), found in groups.items():
+            yaw = np.degrees([log_se3(D)[2] for D in found])
+            y = np.array([D[1, 3] for D in found])
+            lines.append(
+                f"| {method} | {start} | {len(found)} | yaw {yaw_deg:g} deg, y {y_m:g} m | {pair} "
+                f"| {yaw.mean():+.3f} +- {yaw.std():.3f} | {y.mean():+.4f} +- {y.std():.4f} |"
+            )
     return "\n".join(lines)
 
 
@@ -196,6 +265,10 @@ def _read(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
+def _commits(results: list[dict[str, Any]]) -> str:
+    return ", ".join(sorted({f"{r['commit']} ({r['date']})" for r in results}))
+
+
 def _commit() -> str:
     run = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     return run.stdout.strip() or "unknown"
@@ -210,7 +283,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--vehicle", required=True)
     parser.add_argument("--day", required=True)
     parser.add_argument("--methods", default="joint,joint-optimisation")
-    parser.add_argument("--starts", nargs="+", default=["2,0.1", "5,0.2"])
+    parser.add_argument("--starts", nargs="+", default=["2,0.1", "5,0.2", "10,0.5"])
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--half-seeds", type=int, default=3)
     parser.add_argument("--workers", type=int, default=1)
