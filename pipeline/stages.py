@@ -16,8 +16,9 @@ from schemas.columns import TableSchema
 from schemas.drift import DRIFT
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS
+from schemas.training import TRAINING
 
-__all__ = ["AUDIT", "CALIBRATE", "INGEST", "PERCEIVE", "REPORT", "STAGES", "Stage"]
+__all__ = ["AUDIT", "CALIBRATE", "INGEST", "PERCEIVE", "PREPARE", "REPORT", "STAGES", "Stage"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Stage:
 
 INGEST = Stage("ingest", (), (FRAMES,), "pipeline.ingest.run:ingest_day")
 PERCEIVE = Stage("perceive", (FRAMES,), (OBSERVATIONS,), "pipeline.perceive.run:perceive_day")
+PREPARE = Stage("prepare", (FRAMES, OBSERVATIONS), (TRAINING,), "pipeline.learn.prepare:prepare_day")
 CALIBRATE = Stage("calibrate", (OBSERVATIONS,), (CALIBRATIONS,), "pipeline.calibrate:calibrate_day")
 AUDIT = Stage("audit", (CALIBRATIONS,), (DRIFT,), "pipeline.audit.run:audit_fleet", per_vehicle_day=False)
 REPORT = Stage(
@@ -49,4 +51,4 @@ REPORT = Stage(
     per_vehicle_day=False,
 )
 
-STAGES = (INGEST, PERCEIVE, CALIBRATE, AUDIT, REPORT)
+STAGES = (INGEST, PERCEIVE, PREPARE, CALIBRATE, AUDIT, REPORT)

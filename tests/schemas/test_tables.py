@@ -11,11 +11,13 @@ from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
+from schemas.training import TRAINING, TrainingRow
 from schemas.versions import TABLES, write_json_schemas
 
 ROW_TYPES = {
     FRAMES.name: Frame,
     OBSERVATIONS.name: Observation,
+    TRAINING.name: TrainingRow,
     CALIBRATIONS.name: CalibrationRecord,
     DRIFT.name: DriftFinding,
 }

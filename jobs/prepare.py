@@ -1,0 +1,186 @@
+"""`boresight prepare`: frames and observations of many vehicle-days to training data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.config import FleetConfig
+    from pipeline.learn.inventory import Inventory
+    from pipeline.learn.prepare_fleet import PrepareWork
+    from pipeline.results import StageResult
+    from pipeline.store.partitions import Lake, Partition
+
+__all__ = ["prepare"]
+
+
+def prepare(
+    *,
+    fleet: Path,
+    lake: str,
+    from_day: Annotated[str | None, Parameter(name="--from")] = None,
+    to_day: Annotated[str | None, Parameter(name="--to")] = None,
+    vehicles: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    executor: Literal["process", "inline"] = "process",
+    workers: int | None = None,
+) -> int:
+    """Make table training: what a network learns from, split so that no vehicle, day or place is on two sides.
+
+    Args:
+        fleet: fleet.toml; its section prepare says how finely and how the frames are split.
+        lake: folder of the tables, with frames and observations.
+        from_day: first day, YYYY-MM-DD.
+        to_day: last day.
+        vehicles: only these; default: all of fleet.toml that the lake has.
+        executor: process (a pool) or inline (one after the other in this process).
+        workers: processes at a time; default: one per CPU that this process may use.
+    """
+    from jobs.summary import exit_code, print_summary, progress_reporter
+    from pipeline.config import load_fleet
+    from pipeline.learn.inventory import take_inventory, write_inventory
+    from pipeline.store.partitions import Lake
+
+    config, tables = load_fleet(fleet), Lake.at(lake)
+    days = _days(config, tables, fleet, from_day, to_day, vehicles)
+    results = _run(_plan(config, tables, fleet, days), executor, workers)
+    with progress_reporter("inventory") as progress:
+        progress(0, 0, "compare views")
+        inventory = take_inventory(tables, config.prepare.duplicate_bits)
+    path = write_inventory(tables, inventory, _about(config))
+    statuses = [r.status for r in results] + (["held"] if _empty_sides(config, inventory) else [])
+    code = exit_code(statuses)
+    print_summary(
+        "prepare",
+        {0: "done", 1: "failed", 3: "held"}[code],
+        vehicle_days=len(results),
+        **{s: sum(r.status == s for r in results) for s in ("done", "cached", "refused", "failed")},
+        frames=inventory.frames,
+        environments=inventory.environments,
+        rejected=inventory.rejected,
+        leaks=len(inventory.leaks),
+        problems=_problems(config, results, inventory),
+        manifest=path,
+    )
+    return code
+
+
+def _days(
+    config: FleetConfig,
+    lake: Lake,
+    fleet: Path,
+    from_day: str | None,
+    to_day: str | None,
+    vehicles: Sequence[str] | None,
+) -> list[Partition]:
+    """Vehicle-days with observations, as wanted."""
+    from pipeline.errors import ConfigError
+    from pipeline.fleet.pattern import check_day
+    from schemas.observations import OBSERVATIONS
+
+    for name, day in (("--from", from_day), ("--to", to_day)):
+        check_day(name, day)
+    for vehicle in vehicles or ():
+        config.rig_of(vehicle, file=str(fleet))
+    wanted = set(vehicles or config.vehicles)
+    days = [
+        p
+        for p in lake.partitions(OBSERVATIONS.name)
+        if p.vehicle in wanted and (from_day or "") <= p.day <= (to_day or "9999")
+    ]
+    if not days:
+        raise ConfigError(
+            "command line", "--lake", f"{lake.root} has no observations of these vehicles and days"
+        )
+    return days
+
+
+def _plan(config: FleetConfig, lake: Lake, fleet: Path, days: Sequence[Partition]) -> list[PrepareWork]:
+    """Look over all days and divide them; each worker gets the keys of its own day."""
+    from jobs.summary import progress_reporter
+    from pipeline.learn.prepare import decided_sides
+    from pipeline.learn.prepare_fleet import PrepareWork
+    from pipeline.learn.split import SplitPlan, Unit
+    from pipeline.learn.survey import plan_days, survey_day
+
+    surveys = []
+    with progress_reporter("survey") as progress:
+        for done, day in enumerate(days):
+            progress(done, len(days), f"{day.vehicle} {day.day}")
+            surveys.append(survey_day(day, lake, config.prepare))
+    plan = plan_days(surveys, config.prepare, decided_sides(lake, config.prepare))
+    work = []
+    for survey in surveys:
+        day = survey.partition
+        keys = {k for place in set(survey.place) for k in Unit(day.vehicle, day.day, place).keys(plan.by)}
+        own = SplitPlan(plan.by, {k: plan.sides[k] for k in keys & plan.sides.keys()})
+        work.append(PrepareWork(day, config, fleet, lake, own))
+    return work
+
+
+def _run(work: Sequence[PrepareWork], executor: str, workers: int | None) -> list[StageResult]:
+    """All days, in view of whoever watches."""
+    from contextlib import closing
+
+    from jobs.nightly import usable_cpus
+    from jobs.summary import progress_reporter
+    from pipeline.errors import ConfigError
+    from pipeline.fleet.executor import EXECUTORS
+    from pipeline.learn.prepare_fleet import run_prepare
+    from pipeline.results import StageResult
+
+    if workers is not None and workers < 1:
+        raise ConfigError("command line", "--workers", f"{workers} is less than one")
+    results: list[StageResult] = []
+    with progress_reporter("prepare") as progress:
+
+        def watch(index: int, done: int, total: int, what: str) -> None:
+            day = work[index].partition
+            progress(len(results), len(work), f"{day.vehicle} {day.day}: {what} {done}/{total}")
+
+        with closing(EXECUTORS[executor](run_prepare, work, workers or usable_cpus(), watch)) as finished:
+            for end in finished:
+                day = end.item.partition
+                lost = StageResult("prepare", day.vehicle, day.day, "failed", "", reason=end.error)
+                results.append(end.value or lost)
+    return results
+
+
+def _about(config: FleetConfig) -> dict[str, Any]:
+    from schemas.training import TRAINING
+    from schemas.versions import CODE_VERSION
+
+    return {
+        "table": TRAINING.name,
+        "version": TRAINING.version,
+        "code_version": CODE_VERSION,
+        "settings": config.prepare.model_dump(mode="json"),
+    }
+
+
+def _empty_sides(config: FleetConfig, inventory: Inventory) -> list[str]:
+    wanted = {"train": 1.0, "val": config.prepare.val_fraction, "test": config.prepare.test_fraction}
+    return [side for side, share in wanted.items() if share > 0 and not inventory.frames[side]]
+
+
+def _problems(
+    config: FleetConfig, results: Sequence[StageResult], inventory: Inventory
+) -> list[dict[str, str]]:
+    found = [
+        {"vehicle": r.vehicle, "day": r.day, "status": r.status, "reason": r.reason}
+        for r in results
+        if r.status not in ("done", "cached")
+    ]
+    by = ", ".join(config.prepare.split_by)
+    return found + [
+        {
+            "side": side,
+            "status": "held",
+            "reason": f"no frames: too few to tell apart by {by} (prepare.split_by)",
+        }
+        for side in _empty_sides(config, inventory)
+    ]

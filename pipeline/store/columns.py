@@ -1,0 +1,74 @@
+"""Single columns and single row groups of partitions: for plans over many days, and for shuffled reading."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pyarrow.parquet as pq
+
+from pipeline.errors import ContractError
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.rows import from_table
+from pipeline.store.tables import read_manifest
+from schemas.columns import TableSchema
+
+__all__ = ["RowGroup", "read_columns", "read_group", "row_groups"]
+
+Row = TypeVar("Row")
+_PARTITION_FILE = "part-0.parquet"
+
+
+@dataclass(frozen=True, order=True)
+class RowGroup:
+    """One row group of one partition."""
+
+    partition: Partition
+    index: int
+    rows: int
+
+
+def read_columns(
+    lake: Lake, schema: TableSchema, partition: Partition, names: Sequence[str]
+) -> dict[str, list[Any]]:
+    """Plain columns of a whole partition; nothing else of it is read. Arrays come as bytes.
+
+    Raises:
+        ContractError: there is no such partition, or it was written with another schema version.
+    """
+    with pq.ParquetFile(_checked(lake, schema, partition)) as file:
+        table = file.read(columns=list(names))
+    return {name: table.column(name).to_pylist() for name in names}
+
+
+def row_groups(lake: Lake, schema: TableSchema, partition: Partition) -> list[RowGroup]:
+    """The row groups of a partition, in order.
+
+    Raises:
+        ContractError: there is no such partition, or it was written with another schema version.
+    """
+    metadata = pq.read_metadata(_checked(lake, schema, partition))
+    return [RowGroup(partition, i, metadata.row_group(i).num_rows) for i in range(metadata.num_row_groups)]
+
+
+def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[Row]) -> list[Row]:
+    """All rows of a group; arrays are views into one buffer.
+
+    Raises:
+        ContractError: the partition is gone, or not of this schema.
+    """
+    path = lake.folder(schema.name, group.partition) / _PARTITION_FILE
+    try:
+        with pq.ParquetFile(path) as file:
+            return from_table(file.read_row_group(group.index), schema, row_type)
+    except FileNotFoundError as err:
+        raise ContractError(str(path), "the partition went away while it was read") from err
+
+
+def _checked(lake: Lake, schema: TableSchema, partition: Partition) -> Path:
+    path = lake.folder(schema.name, partition) / _PARTITION_FILE
+    if read_manifest(lake, schema, partition) is None:
+        raise ContractError(str(path), f"table {schema.name} has no such partition")
+    return path
