@@ -1,0 +1,175 @@
+"""Studies go on where they stopped, from the priors that they promise, on days spoiled as they say."""
+
+import json
+from argparse import Namespace
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from pipeline.config import SolveConfig, load_fleet
+from pipeline.geometry.se3 import exp_so3, inverse, log_so3, transform_points
+from tests.benchmarks.recovery import changed_radar
+from tests.benchmarks.studies import engine
+from tests.benchmarks.studies.ablation import _settings, setting_of
+from tests.benchmarks.studies.days import SETS, Day, DaySpec
+from tests.benchmarks.studies.engine import Run, key_of, prior_of, read_results, run_study, spoiled
+from tests.benchmarks.studies.verdict import _derived, _simulated, fault_of
+from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+
+SPEC = DaySpec(7, "urban")
+TRUTH = {
+    "T_camera_lidar": T_CAMERA_LIDAR.tolist(),
+    "T_lidar_radar": T_LIDAR_RADAR.tolist(),
+    "T_camera_radar": (T_CAMERA_LIDAR @ T_LIDAR_RADAR).tolist(),
+    "dt_camera_lidar_s": 0.0,
+    "dt_lidar_radar_s": 0.0,
+    "dt_camera_radar_s": 0.0,
+}
+FLEET = """
+[fleet]
+name = "f"
+[rigs.default.camera]
+image = "/i"
+info = "/c"
+semantics = { source = "topics", labels = "/l", detections = "/d" }
+[rigs.default.lidar]
+points = "/p"
+[rigs.default.radar]
+points = "/r"
+[vehicles.vehicle-1]
+"""
+
+
+@pytest.fixture
+def day(tmp_path) -> Day:
+    (tmp_path / "fleet.toml").write_text(FLEET)
+    return Day(SPEC, make_day(frames=10), TRUTH, load_fleet(tmp_path / "fleet.toml"))
+
+
+def off_by(day: Day, how) -> tuple[float, float]:
+    """Angle [deg] and shift [m] of the camera-lidar prior."""
+    prior = prior_of(day, how, 3)
+    turn = log_so3(prior.T_camera_lidar[:3, :3] @ T_CAMERA_LIDAR[:3, :3].T)
+    return np.degrees(np.linalg.norm(turn)), np.linalg.norm(
+        prior.T_camera_lidar[:3, 3] - T_CAMERA_LIDAR[:3, 3]
+    )
+
+
+def test_an_exact_prior_is_off_by_exactly_so_much_and_says_so(day):
+    assert off_by(day, ("exact", 5.0, 0.3)) == pytest.approx((5.0, 0.3))
+    prior = prior_of(day, ("exact", 5.0, 0.3), 3)
+    assert (np.degrees(prior.rotation_sigma_rad), prior.translation_sigma_m) == pytest.approx((5.0, 0.3))
+
+
+def test_a_hidden_error_is_the_same_but_the_prior_knows_nothing_of_it(day):
+    assert off_by(day, ("hidden", 12.0, 0.05)) == pytest.approx((12.0, 0.05))
+    assert np.degrees(prior_of(day, ("hidden", 12.0, 0.05), 3).rotation_sigma_rad) == pytest.approx(2.0)
+    assert (
+        engine.search_range(("hidden", 12.0, 0.05))["search_rotation_deg"]
+        == SolveConfig().search_rotation_deg
+    )
+
+
+def test_drawn_priors_scatter_by_their_sigmas(day):
+    turns, shifts = [], []
+    for seed in range(300):
+        prior = prior_of(day, ("drawn", 2.0, 0.05), seed)
+        turns.append(log_so3(prior.T_lidar_radar[:3, :3] @ T_LIDAR_RADAR[:3, :3].T))
+        shifts.append(prior.T_lidar_radar[:3, 3] - T_LIDAR_RADAR[:3, 3])
+    assert np.degrees(np.std(turns)) == pytest.approx(2.0, rel=0.08)
+    assert np.std(shifts) == pytest.approx(0.05, rel=0.08)
+
+
+def test_a_logged_prior_is_tf_static(day):
+    assert off_by(day, ("logged", 2.0, 0.05)) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+def test_the_search_range_contains_a_prior_error_that_is_known():
+    assert engine.search_range(("exact", 10.0, 0.5)) == pytest.approx(
+        {"search_rotation_deg": 12.0, "search_translation_m": 0.6}
+    )
+
+
+@pytest.mark.parametrize(("how", "K"), [("focal:0.03", (515.0, 319.5)), ("centre:20", (500.0, 339.5))])
+def test_wrong_intrinsics_are_in_every_row_and_nothing_else_changes(day, how, K):
+    rows = spoiled(day.rows, how)
+    assert all((o.camera_K[0, 0], o.camera_K[0, 2]) == pytest.approx(K) for o in rows)
+    assert replace(rows[3], camera_K=day.rows[3].camera_K).labels_png == day.rows[3].labels_png
+
+
+def test_few_frames_are_spread_over_the_day(day):
+    assert [o.frame_index for o in spoiled(day.rows, "few:3")] == [0, 4, 9]
+    with pytest.raises(ValueError, match="no such fault"):
+        spoiled(day.rows, "rain")
+
+
+def test_a_study_goes_on_where_it_stopped(tmp_path, monkeypatch, capsys):
+    class Inline:
+        def __init__(self, *_args, **_kwargs): ...
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_error): ...
+        def submit(self, work, *args):
+            from concurrent.futures import Future
+
+            future = Future()
+            future.set_result(work(*args))
+            return future
+
+    calls = []
+
+    def work(run, _root):
+        calls.append(run)
+        return {"cpu_s": 0.1, "pairs": {}, "refused": "nothing"}
+
+    monkeypatch.setattr(engine, "ProcessPoolExecutor", Inline)
+    monkeypatch.setattr(engine, "_work", work)
+    runs = [Run(SPEC, seed=k, solve={"terms": ["edges", "static"]}) for k in range(3)]
+    args = Namespace(out=tmp_path / "r.jsonl", limit=2, workers=1, root=tmp_path)
+    run_study(runs, args, lambda results: f"{len(results)} lines")
+    assert len(calls) == 2
+    args.limit = None
+    run_study(runs, args, lambda results: f"{len(results)} lines")
+    assert [c.seed for c in calls] == [0, 1, 2]
+    lines = read_results(args.out)
+    assert {key_of(line) for line in lines} == {run.key for run in runs}
+    assert all(line["commit"] and line["date"] for line in lines)
+    assert "3 of 3 runs" in args.out.with_suffix(".md").read_text()
+    assert "3 lines" in capsys.readouterr().out
+
+
+def test_a_calibration_is_measured_against_truth_pair_by_pair(day):
+    result = engine.calibrate_once(Run(SPEC, method="tracking", seed=1), day)
+    assert set(json.loads(json.dumps(result))["pairs"]) == {"camera_lidar", "camera_radar", "lidar_radar"}
+
+
+def test_seeds_of_tuning_and_test_sets_never_meet():
+    tuning = {d.seed for name in ("dev", "dev-bad") for d in SETS[name]}
+    test = [d.seed for name, days in SETS.items() if not name.startswith("dev") for d in days]
+    assert max(tuning) < 200 <= min(test)
+    assert len(set(test)) == len(test)
+
+
+def test_an_ablation_changes_one_thing_at_a_time():
+    settings = [setting_of(asdict(run)) for run in _settings(SPEC, 1)]
+    assert len(set(settings)) == len(settings) == 13
+    assert settings[0] == "all"
+
+
+def test_every_bad_day_of_the_verdict_study_has_a_name_and_good_days_have_none():
+    bad = [*(_simulated(d) for d in SETS["verdict"]), *_derived(SETS["coverage"], 3)]
+    assert all(fault_of(asdict(run)) for run in bad)
+    assert not any(fault_of(asdict(Run(d))) for d in SETS["coverage"])
+
+
+def test_a_change_of_the_radars_data_is_a_change_of_its_pose():
+    row = make_day(frames=1)[0]
+    changed = changed_radar(row, np.radians(0.3), 0.05)
+    D = np.eye(4)
+    D[:3, :3] = exp_so3(np.array([0, 0, np.radians(0.3)]))
+    D[1, 3] = 0.05
+    seen = transform_points(T_LIDAR_RADAR, row.radar_xyz_m.astype(float))
+    again = transform_points(T_LIDAR_RADAR @ inverse(D), changed.radar_xyz_m.astype(float))
+    assert again == pytest.approx(seen, abs=1e-4)
