@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.geometry.cameras import Camera
-from schemas.training import UNKNOWN_CLASS
 
-__all__ = ["Grid", "grid_rays", "resample_camera", "resample_labels"]
+__all__ = ["Grid", "grid_rays", "resample_camera"]
 
 
 @dataclass(frozen=True)
@@ -121,22 +120,3 @@ def resample_camera(
     whole = valid.reshape(grid.height, 2, grid.width, 2).all(axis=(1, 3))
     reduced = cv2.resize(sampled, (grid.width, grid.height), interpolation=cv2.INTER_AREA)
     return np.where(whole[..., None], reduced, 0).astype(np.uint8), whole.astype(np.uint8)
-
-
-def resample_labels(
-    labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid, classes: int
-) -> UInt8[np.ndarray, "H W"]:
-    """The most frequent class of each cell, from 4 x 4 samples; UNKNOWN_CLASS outside the image.
-
-    `labels` are indices below `classes`, or UNKNOWN_CLASS; their image may have any size, `camera` belongs to the full one.
-    """
-    fine = grid.finer(4)
-    uv, valid = _maps(camera, fine, labels.shape[1] / camera.width_px)
-    # Pixel centres are integers, so rounding is the nearest pixel.
-    x = np.clip(np.rint(uv[..., 0]), 0, labels.shape[1] - 1).astype(np.int64)
-    y = np.clip(np.rint(uv[..., 1]), 0, labels.shape[0] - 1).astype(np.int64)
-    sampled = np.where(valid, labels[y, x], UNKNOWN_CLASS)
-    cells = sampled.reshape(grid.height, 4, grid.width, 4).transpose(0, 2, 1, 3).reshape(-1, 16)
-    counts = np.stack([(cells == k).sum(axis=1) for k in range(classes)], -1)
-    winner = np.where(counts.max(axis=1) >= 8, counts.argmax(axis=1), UNKNOWN_CLASS)  # half a cell or nothing
-    return winner.reshape(grid.height, grid.width).astype(np.uint8)

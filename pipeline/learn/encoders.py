@@ -1,0 +1,101 @@
+"""Small convolutional encoders: camera and rendered lidar to class logits per cell, radar points to class logits."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+__all__ = ["CameraEncoder", "LidarEncoder", "PointEncoder"]
+
+
+class CameraEncoder(nn.Module):
+    """A mini U-net: 1/2 to 1/16 of the grid and back to 1/2, then logits for every cell by pixel shuffle."""
+
+    def __init__(self, classes: int, width: int) -> None:
+        super().__init__()
+        w = (width, 2 * width, 3 * width, 4 * width)
+        self.down = nn.ModuleList(
+            [_block(4, w[0], 2), _block(w[0], w[1], 2), _block(w[1], w[2], 2), _block(w[2], w[3], 2)]
+        )
+        self.up = nn.ModuleList(
+            [_block(w[3] + w[2], w[2], 1), _block(w[2] + w[1], w[1], 1), _block(w[1] + w[0], w[0], 1)]
+        )
+        self.logits = nn.Conv2d(w[0], 4 * classes, 1)
+
+    def forward(self, camera: Float[Tensor, "B 4 H W"]) -> Float[Tensor, "B K H W"]:
+        """Logits per cell of the grid, whose sides are multiples of 16.
+
+        Colours are standardised over the part of the grid that the image shows, so that exposure, gain and
+        another camera's black level do not matter.
+        """
+        x = standardised(camera)
+        skips = []
+        for block in self.down:
+            x = block(x)
+            skips.append(x)
+        for block, skip in zip(self.up, reversed(skips[:-1]), strict=True):
+            x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
+        return F.pixel_shuffle(self.logits(x), 2)
+
+
+class LidarEncoder(nn.Module):
+    """Convolutions on the rendered sweep; logits for every cell by pixel shuffle."""
+
+    def __init__(self, channels: int, classes: int, width: int) -> None:
+        super().__init__()
+        w = (width, 2 * width, 3 * width)
+        self.down = nn.ModuleList([_block(channels, w[0], 2), _block(w[0], w[1], 2), _block(w[1], w[2], 2)])
+        self.up = nn.ModuleList([_block(w[2] + w[1], w[1], 1), _block(w[1] + w[0], w[0], 1)])
+        self.logits = nn.Conv2d(w[0], 4 * classes, 1)
+        # What a point is depends first of all on itself: its own height, echo and range, cell by cell.
+        self.own = nn.Sequential(
+            nn.Conv2d(channels, 2 * width, 1), nn.ReLU(), nn.Conv2d(2 * width, classes, 1)
+        )
+
+    def forward(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B K H W"]:
+        """Logits per cell; meaningful where a point was rendered."""
+        x, skips = rendered, []
+        for block in self.down:
+            x = block(x)
+            skips.append(x)
+        for block, skip in zip(self.up, reversed(skips[:-1]), strict=True):
+            x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
+        return F.pixel_shuffle(self.logits(x), 2) + self.own(rendered)
+
+
+class PointEncoder(nn.Module):
+    """Class logits of single points, for radar detections: range, Doppler, power."""
+
+    def __init__(self, features: int, classes: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(features + 1, 32), nn.ReLU(), nn.Linear(32, classes))
+
+    def forward(
+        self, features: Float[Tensor, "B N F"], range_m: Float[Tensor, "B N"]
+    ) -> Float[Tensor, "B N K"]:
+        """Logits of each point."""
+        return self.layers(torch.cat([features, range_m[..., None] / 40.0], -1))
+
+
+def standardised(camera: Float[Tensor, "B 4 H W"]) -> Float[Tensor, "B 4 H W"]:
+    """Colours less their mean over their standard deviation, 0 where the camera sees nothing; the mask stays."""
+    colours, seen = camera[:, :3], camera[:, 3:]
+    count = seen.sum((2, 3), keepdim=True).clamp(min=1.0)
+    mean = (colours * seen).sum((2, 3), keepdim=True) / count
+    centred = (colours - mean) * seen
+    variance = (centred * centred).sum((1, 2, 3), keepdim=True) / (3 * count)
+    return torch.cat([centred / torch.sqrt(variance + 1e-4), seen], 1)
+
+
+def _block(inputs: int, outputs: int, stride: int) -> nn.Sequential:
+    """Two 3 x 3 convolutions; group norm works at batch 1 and at any rig's statistics."""
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False),
+        nn.GroupNorm(max(1, outputs // 8), outputs),
+        nn.ReLU(),
+        nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False),
+        nn.GroupNorm(max(1, outputs // 8), outputs),
+        nn.ReLU(),
+    )

@@ -1,0 +1,73 @@
+"""Small damped least squares inside a network: differentiable, batched, and made of operations that ONNX has."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+__all__ = ["angular_jacobian", "inverse_spd", "small_rotation_vector", "spherical_jacobian"]
+
+
+def inverse_spd(H: Float[Tensor, "B P P"]) -> Float[Tensor, "B P P"]:
+    """Inverse of symmetric positive definite matrices by Gauss-Jordan elimination, which needs no pivoting there."""
+    size = H.shape[-1]
+    identity = torch.eye(size, dtype=H.dtype, device=H.device).expand_as(H)
+    rows = torch.cat([H, identity], -1)
+    for k in range(size):
+        pivot = rows[:, k : k + 1] / rows[:, k : k + 1, k : k + 1]
+        below = rows - rows[:, :, k : k + 1] * pivot
+        rows = torch.cat([below[:, :k], pivot, below[:, k + 1 :]], 1)
+    return rows[:, :, size:]
+
+
+def angular_jacobian(
+    directions: Float[Tensor, "B N 3"], inverse_range: Float[Tensor, "B N"]
+) -> Float[Tensor, "B N 2 6"]:
+    """d(azimuth, elevation) of points in the optical frame by a twist (rotation vector, translation) on the left.
+
+    Args:
+        directions: unit vectors, optical frame; not on the axis of the poles.
+        inverse_range: 1/range [1/m].
+    """
+    x, y, z = directions.unbind(-1)
+    h = torch.sqrt(x * x + z * z)
+    o = torch.zeros_like(x)
+    # azimuth = atan2(-x, z), elevation = atan2(-y, h)
+    d_azimuth = torch.stack([-z / (h * h), o, x / (h * h)], -1)
+    d_elevation = torch.stack([x * y / h, -h, z * y / h], -1)
+    return _with_rotation(torch.stack([d_azimuth, d_elevation], -2), directions, inverse_range)
+
+
+def spherical_jacobian(
+    directions: Float[Tensor, "B N 3"], range_m: Float[Tensor, "B N"]
+) -> Float[Tensor, "B N 3 6"]:
+    """d(azimuth, elevation, range) of points in a frame with x forward, z up by a twist on the left."""
+    x, y, z = directions.unbind(-1)
+    h = torch.sqrt((x * x + y * y).clamp(min=1e-6))
+    o = torch.zeros_like(x)
+    inverse = 1 / range_m.clamp(min=0.5)
+    d_azimuth = torch.stack([-y / (h * h), x / (h * h), o], -1)
+    d_elevation = torch.stack([-x * z / h, -y * z / h, h], -1)
+    angles = _with_rotation(torch.stack([d_azimuth, d_elevation], -2), directions, inverse)
+    no_turn = torch.zeros_like(directions)
+    d_range = torch.cat([no_turn, directions], -1)
+    return torch.cat([angles, d_range[..., None, :]], -2)
+
+
+def _with_rotation(by_direction: Tensor, directions: Tensor, inverse_range: Tensor) -> Tensor:
+    """Rows by direction (B N R 3) to rows by twist: a rotation w moves d by w x d, a translation t by t/range."""
+    # row . (w x d) = w . (d x row), written out: cross products of broadcast tensors trouble some exporters
+    d = directions[..., None, :]
+    a, b, c = by_direction.unbind(-1)
+    dx, dy, dz = d.unbind(-1)
+    turn = torch.stack([dy * c - dz * b, dz * a - dx * c, dx * b - dy * a], -1)
+    return torch.cat([turn, by_direction * inverse_range[..., None, None]], -1)
+
+
+def small_rotation_vector(R: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3"]:
+    """Rotation vector of rotations well below 90 deg, where the sine tells all."""
+    skew = torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], -1) / 2
+    square = (skew * skew).sum(-1, keepdim=True).clamp(max=0.998)
+    # asin(s)/s by its series to s^7: below 1e-8 up to 12 deg, 1e-5 up to 30 deg, and smooth at zero.
+    return skew * (1 + square * (1 / 6 + square * (3 / 40 + square * (15 / 336 + square * 105 / 3456))))

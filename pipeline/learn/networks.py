@@ -1,0 +1,142 @@
+"""The networks: sensor data and a guess in, better extrinsics and their doubt out.
+
+`matching` computes correspondences explicitly and learns what classes look like, how sharp evidence is, and residuals;
+`concat` is the paper's: encode, concatenate, fuse, regress. Both come for all pairs at once (joint) or for one alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+
+from pipeline.learn.concat import ConcatCore
+from pipeline.learn.grid import Grid
+from pipeline.learn.inputs import NetworkInputs
+from pipeline.learn.matching_network import MatchingCore
+from pipeline.learn.outputs import PAIRS, CoreOutputs, Predictions
+from pipeline.learn.views import render
+
+__all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "refine"]
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """What is built.
+
+    Args:
+        architecture: explicit matching, or the paper's concatenation.
+        pairs: all three pairs in one network, or one pair.
+        grid: part of the camera's directions that is looked at.
+        width: channels of the encoders' first stage.
+        hidden: features per pair before fusion (matching), fused features (concat).
+    """
+
+    architecture: Literal["matching", "concat"] = "matching"
+    pairs: Literal["joint", "camera_lidar", "camera_radar", "lidar_radar"] = "joint"
+    grid: Grid = Grid()
+    width: int = 16
+    hidden: int = 192
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """The pairs that the network corrects."""
+        return PAIRS if self.pairs == "joint" else (self.pairs,)
+
+
+class CalibrationNetwork(nn.Module):
+    """One network of either architecture: renders at the guess, computes, applies the corrections."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.core: MatchingCore | ConcatCore
+        if config.architecture == "matching":
+            self.core = MatchingCore(config.grid, config.estimated, config.width, config.hidden)
+        else:
+            self.core = ConcatCore(config.estimated, config.width, config.hidden)
+
+    def forward(self, inputs: NetworkInputs) -> Predictions:
+        """One pass."""
+        view, index = render(inputs, self.config.grid)
+        return self._predictions(inputs, self.core(view), index)
+
+    def refine(self, inputs: NetworkInputs, iterations: int) -> list[Predictions]:
+        """Several passes with the same weights, each rendered at the last one's answer; the camera is encoded once.
+
+        Gradients do not flow from one pass into the one before.
+        """
+        found: list[Predictions] = []
+        likelihood: Tensor | None = None
+        logits: Tensor | None = None
+        for _ in range(iterations):
+            view, index = render(inputs, self.config.grid)
+            if isinstance(self.core, MatchingCore) and found:
+                outputs = self.core.match(view, likelihood, logits)
+            else:
+                outputs = self.core(view)
+                likelihood, logits = outputs.camera_log_likelihood, outputs.camera_logits
+            last = self._predictions(inputs, outputs, index)
+            found.append(last)
+            inputs = replace(
+                inputs,
+                T_camera_lidar=last.T_camera_lidar.detach(),
+                T_camera_radar=last.T_camera_radar.detach(),
+                T_lidar_radar=last.T_lidar_radar.detach(),
+            )
+        return found
+
+    def _predictions(
+        self, inputs: NetworkInputs, outputs: CoreOutputs, index: Int64[Tensor, "B HW"]
+    ) -> Predictions:
+        T_camera_lidar, T_camera_radar, T_lidar_radar = compose(
+            outputs.corrections, inputs.T_camera_lidar, inputs.T_camera_radar, inputs.T_lidar_radar,
+            composed=self.core.composed,
+        )  # fmt: skip
+        return Predictions(
+            T_camera_lidar,
+            T_camera_radar,
+            T_lidar_radar,
+            outputs.log_variance,
+            outputs.camera_logits,
+            outputs.lidar_logits,
+            outputs.radar_logits,
+            index,
+        )
+
+
+def compose(
+    corrections: Float[Tensor, "B 3 4 4"],
+    T_camera_lidar: Float[Tensor, "B 4 4"],
+    T_camera_radar: Float[Tensor, "B 4 4"],
+    T_lidar_radar: Float[Tensor, "B 4 4"],
+    *,
+    composed: bool,
+) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 4 4"], Float[Tensor, "B 4 4"]]:
+    """Corrected transforms (camera-lidar, camera-radar, lidar-radar).
+
+    With `composed` the camera-radar correction stands on the other two's product instead of on the guess: radar is
+    matched to the lidar six times better than to the image.
+    """
+    camera_lidar = corrections[:, 0] @ T_camera_lidar
+    lidar_radar = corrections[:, 2] @ T_lidar_radar
+    base = camera_lidar @ lidar_radar if composed else T_camera_radar
+    return camera_lidar, corrections[:, 1] @ base, lidar_radar
+
+
+def build_network(config: NetworkConfig, seed: int = 0) -> CalibrationNetwork:
+    """A fresh network; the same seed gives the same weights, whatever else used torch's generator."""
+    state = torch.random.get_rng_state()
+    torch.manual_seed(seed)
+    try:
+        return CalibrationNetwork(config)
+    finally:
+        torch.random.set_rng_state(state)
+
+
+def refine(network: CalibrationNetwork, inputs: NetworkInputs, iterations: int = 3) -> list[Predictions]:
+    """`network.refine`, for callers that hold the network as a value."""
+    return network.refine(inputs, iterations)
