@@ -1,4 +1,4 @@
-"""Study: does the truth lie where `joint` says? One calibration on each of 120 simulated vehicle-days.
+"""Study: does the truth lie where `joint` says? One calibration on each of 100 simulated vehicle-days.
 
     python tests/benchmarks/studies/days.py generate --root DAYS --sets coverage
     python tests/benchmarks/studies/coverage.py --root DAYS --workers 2
