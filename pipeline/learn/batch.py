@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int8, Int16, Int32, UInt8
+from jaxtyping import Bool, Float, Int8, Int16, Int32, Int64, UInt8
 
 __all__ = ["TrainingBatch"]
 
@@ -100,6 +100,14 @@ class TrainingBatch:
             part, vehicle=self.vehicle[rows], day=self.day[rows], environment=self.environment[rows]
         )
 
+    def take(self, rows: Int64[Tensor, " K"]) -> TrainingBatch:
+        """Frames by number, in any order; `rows` on the batch's device."""
+        part = self._map(lambda t: t[rows])
+        picked, words = rows.tolist(), ("vehicle", "day", "environment")
+        names: dict[str, Any] = {n: tuple(getattr(self, n)[i] for i in picked) for n in words}
+        return replace(part, **names)
+
     def _map(self, function: Callable[[Tensor], Tensor]) -> TrainingBatch:
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{n: function(v) for n, v in values.items() if isinstance(v, torch.Tensor)})
+        mapped: dict[str, Any] = {n: function(v) for n, v in values.items() if isinstance(v, torch.Tensor)}
+        return replace(self, **mapped)
