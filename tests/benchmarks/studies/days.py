@@ -187,6 +187,9 @@ def main() -> None:
     parser.add_argument("command", choices=["generate", "adopt"])
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
+    parser.add_argument(
+        "--shard", default="0/1", help="I/N: every N-th day from the I-th, for N commands at once"
+    )
     parser.add_argument("--fleet", type=Path)
     parser.add_argument("--lake")
     parser.add_argument("--vehicle")
@@ -195,8 +198,9 @@ def main() -> None:
     if args.command == "adopt":
         print(adopt_day(args.fleet, args.lake, Partition(args.vehicle, args.day), args.root))
         return
+    shard, shards = (int(v) for v in args.shard.split("/"))
     for name in args.sets:
-        for spec in SETS[name]:
+        for spec in SETS[name][shard::shards]:
             began = time.time()
             generate_day(spec, args.root)
             print(f"{time.strftime('%H:%M:%S')} {name} {spec.name} ({time.time() - began:.0f} s)", flush=True)
