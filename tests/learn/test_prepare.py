@@ -1,0 +1,227 @@
+"""`boresight prepare`: sides stay apart in what is written, runs repeat, resume and grow, and say what they did."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jobs.cli import main
+from pipeline.config import load_fleet
+from pipeline.errors import ContractError
+from pipeline.learn.inventory import alike, read_leaks, take_inventory, write_inventory
+from pipeline.learn.survey import survey_day
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_manifest, read_rows, write_partition
+from schemas.observations import OBSERVATIONS, Observation
+from schemas.training import SPLITS, TRAINING, TrainingRow
+from tests import training_lakes
+
+VEHICLES = ("a", "b", "c", "d", "e")
+
+
+def rows_of(lake):
+    return [r for p in lake.partitions(TRAINING.name) for r in read_rows(lake, TRAINING, p, TrainingRow)]
+
+
+def assert_sides_apart(rows, kinds=("vehicle", "day", "place")):
+    for kind in kinds:
+        side = {}
+        for row in rows:
+            assert side.setdefault(getattr(row, kind), row.split) == row.split, kind
+
+
+def test_no_vehicle_day_or_place_is_on_two_sides(tmp_path):
+    lake = Lake.at(tmp_path)
+    for number, vehicle in enumerate(VEHICLES):  # each its own day
+        training_lakes.fill(lake, vehicle, f"2026-01-0{number + 1}", frames=5)
+    results = training_lakes.prepare_all(lake, training_lakes.fleet_of(VEHICLES))
+    rows = rows_of(lake)
+    assert {r.split for r in rows} == set(SPLITS)
+    assert_sides_apart(rows)
+    assert sum(r.rows for r in results.values()) == len(rows) == 25
+    assert all(r.status == "done" for r in results.values())
+
+
+def test_a_fleet_that_shares_days_loses_frames_not_the_separation(tmp_path):
+    days = [f"2026-01-0{d}" for d in range(1, 4)]
+    lake = training_lakes.fleet_lake(tmp_path, ("a", "b", "c"), days, frames=2)
+    results = training_lakes.prepare_all(lake, training_lakes.fleet_of(("a", "b", "c")))
+    rows = rows_of(lake)
+    assert {r.split for r in rows} == set(SPLITS)
+    assert_sides_apart(rows)
+    lost = sum(r.rejected.get("split_conflict", 0) for r in results.values())
+    assert lost == 18 - len(rows) > 0
+
+
+def test_one_day_is_split_by_stretches_with_a_guard_between_them(tmp_path):
+    lake = Lake.at(tmp_path)
+    training_lakes.fill(lake, "a", "2026-01-01", frames=40)  # 1 s apart, drives of 8 frames 30 s apart
+    fleet = training_lakes.fleet_of(
+        ["a"], split_by=["place"], place_s=4, guard_s=2.5, val_fraction=0.2, test_fraction=0.2
+    )
+    result = training_lakes.prepare_all(lake, fleet)[Partition("a", "2026-01-01")]
+    rows = rows_of(lake)
+    assert {r.split for r in rows} == set(SPLITS)
+    assert_sides_apart(rows, ("place",))
+    assert result.rejected["next_to_other_split"] > 0
+    for row in rows:
+        other = [abs(row.stamp_ns - r.stamp_ns) for r in rows if r.split != row.split]
+        assert min(other) >= 2.5e9
+
+
+def test_cells_of_the_map_keep_vehicles_apart_that_drive_the_same_street(tmp_path):
+    lake = Lake.at(tmp_path)
+    for vehicle in VEHICLES:
+        for day in ("2026-01-01", "2026-01-02"):
+            east = 1000.0 * "aabbe".index(vehicle[0]) if vehicle in "abe" else 50.0
+            training_lakes.fill(lake, vehicle, day, 3, ego_tx_m=east, ego_ty_m=0.0)
+    fleet = training_lakes.fleet_of(VEHICLES, positions="map", split_by=["place"])
+    training_lakes.prepare_all(lake, fleet)
+    rows = rows_of(lake)
+    assert_sides_apart(rows, ("place",))
+    assert len({r.split for r in rows if r.vehicle in "acd"}) == 1  # a, c and d meet in one cell
+
+
+def test_the_same_work_is_done_once_and_what_is_lost_comes_back_the_same(tmp_path):
+    lake = training_lakes.fleet_lake(tmp_path, VEHICLES[:3], frames=3)
+    fleet = training_lakes.fleet_of(VEHICLES, split_by=["vehicle"])
+    training_lakes.prepare_all(lake, fleet)
+    before = {r.vehicle: r for r in rows_of(lake)}
+    assert {r.status for r in training_lakes.prepare_all(lake, fleet).values()} == {"cached"}
+    gone = Partition("b", "2026-01-01")
+    (lake.folder(TRAINING.name, gone) / "part-0.parquet").unlink()
+    again = training_lakes.prepare_all(lake, fleet)
+    assert {p.vehicle: r.status for p, r in again.items()} == {"a": "cached", "b": "done", "c": "cached"}
+    for row in (r for r in rows_of(lake) if r.frame_index == before[r.vehicle].frame_index):
+        old = before[row.vehicle]
+        assert all(np.array_equal(getattr(row, n), getattr(old, n)) for n in row.__dataclass_fields__)
+
+
+def test_a_growing_fleet_moves_no_frame_to_another_side(tmp_path):
+    lake = training_lakes.fleet_lake(tmp_path, VEHICLES[:3], frames=2)
+    fleet = training_lakes.fleet_of([*VEHICLES, "f", "g", "h"], split_by=["vehicle"])
+    training_lakes.prepare_all(lake, fleet)
+    before = {r.vehicle: r.split for r in rows_of(lake)}
+    training_lakes.fleet_lake(tmp_path, [*VEHICLES[3:], "f", "g", "h"], frames=4)
+    results = training_lakes.prepare_all(lake, fleet)
+    assert {p.vehicle for p, r in results.items() if r.status == "cached"} == set(before)
+    after = {r.vehicle: r.split for r in rows_of(lake)}
+    assert {v: after[v] for v in before} == before
+
+
+def test_frames_without_way_between_them_are_one_sample(tmp_path):
+    lake = Lake.at(tmp_path)
+    training_lakes.fill(lake, "a", "2026-01-01", 6, ego_speed_mps=0.3)  # 0.3 m between frames
+    fleet = training_lakes.fleet_of(["a"], split_by=["vehicle"], min_step_m=0.5)
+    result = training_lakes.prepare_all(lake, fleet)[Partition("a", "2026-01-01")]
+    assert (result.rows, result.rejected) == (3, {"hardly_moved": 3})
+
+
+def test_frames_that_perception_refused_or_that_changed_their_prior_are_counted(tmp_path):
+    lake = Lake.at(tmp_path)
+    training_lakes.fill(lake, "a", "2026-01-01", 6)
+    partition = Partition("a", "2026-01-01")
+    observations = read_rows(lake, OBSERVATIONS, partition, Observation)
+    observations[4] = replace(observations[4], prior_camera_lidar_tx_m=9.0)
+    with write_partition(lake, OBSERVATIONS, partition, "other", "test") as writer:
+        writer.append([o for o in observations if o.frame_index != 2])
+    result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], split_by=["vehicle"]))[partition]
+    assert (result.rows, result.rejected) == (4, {"not_perceived": 1, "prior_changed": 1})
+
+
+def test_a_day_without_prior_is_refused_with_its_reason(tmp_path):
+    lake = Lake.at(tmp_path)
+    training_lakes.fill(lake, "a", "2026-01-01", 3)
+    partition = Partition("a", "2026-01-01")
+    rows = [
+        replace(o, prior_camera_lidar_qw=None) for o in read_rows(lake, OBSERVATIONS, partition, Observation)
+    ]
+    with write_partition(lake, OBSERVATIONS, partition, "other", "test") as writer:
+        writer.append(rows)
+    result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], split_by=["vehicle"]))[partition]
+    assert result.status == "refused"
+    assert result.reason == "no sample: 3 no_prior"
+
+
+def test_views_that_come_back_on_another_side_are_found_and_barred(tmp_path):
+    lake = Lake.at(tmp_path)
+    for number, vehicle in enumerate(VEHICLES):
+        seed = 77 if vehicle in "ab" else None  # a and b show the same scenes under two names
+        training_lakes.fill(lake, vehicle, f"2026-01-0{number + 1}", 3, seed=seed)
+    fleet = training_lakes.fleet_of(VEHICLES, split_by=["vehicle"], val_fraction=0.3, test_fraction=0.3)
+    training_lakes.prepare_all(lake, fleet)
+    split = {r.vehicle: r.split for r in rows_of(lake)}
+    inventory = take_inventory(lake, 16)
+    twins = {split["a"], split["b"]}
+    assert len(twins) == 2, "the seed puts both on one side: the test proves nothing"
+    assert {v for v, _, _ in inventory.leaks} <= {"a", "b"}
+    assert len(inventory.leaks) == 3
+    assert take_inventory(lake, 0).leaks == []
+    write_inventory(lake, inventory, {"settings": {}})
+    barred = read_leaks(lake)
+    assert {p.vehicle for p in barred} < {"a", "b"}
+    assert set.union(*barred.values()) == {0, 1, 2}
+
+
+def test_alike_is_the_number_of_differing_bits():
+    rng = np.random.default_rng(0)
+    views, others = rng.integers(0, 256, (2, 40, 32)).astype(np.uint8)
+    others[5] = views[7]
+    others[5, :2] ^= 0b10110001  # 8 bits
+    expected = (np.unpackbits(views[:, None] ^ others[None], axis=-1).sum(-1) < 9).any(1)
+    assert np.array_equal(alike(views, others, 9), expected)
+    assert expected.sum() == 1
+    assert not alike(views, others, 8).any()
+
+
+def test_prepare_without_perception_says_what_to_run(tmp_path):
+    lake = Lake.at(tmp_path)
+    with pytest.raises(ContractError, match="no such partition"):
+        survey_day(Partition("a", "2026-01-01"), lake, training_lakes.fleet_of(["a"]).prepare)
+
+
+FLEET = """
+[fleet]
+name = "tests"
+[rigs.default.camera]
+image = "/image"
+info = "/info"
+semantics = { source = "topics", labels = "/labels", detections = "/detections" }
+[rigs.default.lidar]
+points = "/lidar"
+[rigs.default.radar]
+points = "/radar"
+[prepare]
+lidar_points = 512
+cluster_points = 64
+edge_points = 64
+split_by = ["vehicle"]
+"""
+
+
+def test_the_job_tells_counts_and_exit_codes(tmp_path, capsys):
+    lake = training_lakes.fleet_lake(tmp_path / "lake", VEHICLES[:3], frames=2)
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text(FLEET + "".join(f'[vehicles.{v}]\nrig = "default"\n' for v in VEHICLES))
+    arguments = ["prepare", "--fleet", str(fleet), "--lake", str(lake.root), "--executor", "inline"]
+
+    def run(*more):
+        code = main([*arguments, *more])
+        return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+
+    code, told = run("--vehicles", "a", "--vehicles", "b")
+    assert (code, told["status"]) == (3, "held")  # two vehicles fill two sides
+    assert [p["side"] for p in told["problems"]] == ["test"]
+    code, told = run()
+    assert (code, told["status"], told["done"], told["cached"]) == (0, "done", 1, 2)
+    assert told["frames"] == {"train": 2, "val": 2, "test": 2}
+    assert sum(told["environments"]["train"].values()) == 2
+    manifest = json.loads((lake.root / "training" / "manifest.json").read_text())
+    assert manifest["frames"] == told["frames"]
+    assert manifest["settings"]["lidar_points"] == 512 == load_fleet(fleet).prepare.lidar_points
+    first = lake.partitions(TRAINING.name)[0]
+    assert read_manifest(lake, TRAINING, first).kept["frames"] == 2
+    assert run("--from", "2027-01-01")[0] == 2
+    assert run("--vehicles", "nobody")[0] == 2
+    assert run("--workers", "0")[0] == 2
