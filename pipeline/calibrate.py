@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.calibration_records import Inputs, record_of, refused_records
+from pipeline.calibration_records import Inputs, Judged, record_of, refused_records
 from pipeline.config import FleetConfig, config_hash
 from pipeline.errors import SolveError
-from pipeline.objective.problem import Prior, Solution
+from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.prior import perturbed, prior_key, read_prior
 from pipeline.results import Progress, StageResult, silent
 from pipeline.solve.alignment import alignment_of
@@ -24,8 +24,10 @@ from pipeline.solve.select import Selection, select_frames
 from pipeline.solve.trigger import exceeded, trigger_metrics
 from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.tables import read_manifest, read_records, read_rows, write_records
+from pipeline.verify.claims import Claim, claims_of
 from pipeline.verify.holdout import HeldOutTest, paired_test
-from pipeline.verify.verdict import Limits, Verdict, judge, loop_doubts
+from pipeline.verify.opinion import second_opinion
+from pipeline.verify.verdict import Limits, judge, loop_doubts
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.versions import CODE_VERSION
@@ -77,7 +79,7 @@ def calibrate_day(
         "seed": seed,
         "prior_file": prior_key(rig.prior, fleet_file),
     }
-    resolved = config_hash(fleet.select, fleet.trigger, fleet.solve, rig.prior, settings)
+    resolved = config_hash(fleet.select, fleet.trigger, fleet.solve, fleet.verify, rig.prior, settings)
     key = work_key("calibrate", CODE_VERSION, resolved, inputs)
     about = Inputs(partition, method, key, seed, tuple(inputs))
     recorded = _recorded(lake, partition, key)
@@ -125,15 +127,14 @@ def calibrate_observations(
     )
     progress(2, 4, "judge on held-out frames")
     after = trigger_metrics(sample, {pair: solution.pairs[pair].T for pair in PAIRS})
-    verdicts, tests = _judge_all(observations, selection, prior, solution, fleet, active)
+    judged = _judge_all(observations, selection, prior, solution, fleet, active)
     records = [
         record_of(
             about,
             pair,
             solution,
             prior,
-            verdicts[pair],
-            tests[pair],
+            judged[pair],
             selection,
             observations,
             before=before[pair],
@@ -159,39 +160,54 @@ def _judge_all(
     solution: Solution,
     fleet: FleetConfig,
     active: Sequence[str],
-) -> tuple[dict[str, Verdict], dict[str, HeldOutTest | None]]:
-    """Verdict and held-out test of each pair; pairs that a method composes come after their factors."""
+) -> dict[str, Judged]:
+    """Verdict and evidence of each pair; pairs that a method composes come after their factors."""
     doubts = loop_doubts(solution)
     limits = Limits(np.radians(fleet.solve.search_rotation_deg), fleet.solve.search_translation_m)
     composed = COMPOSED.get(solution.method, ())
-    verdicts: dict[str, Verdict] = {}
-    tests: dict[str, HeldOutTest | None] = {}
+    found: dict[str, Judged] = {}
     for pair in sorted(PAIRS, key=lambda p: p in composed):
-        held = [observations[i] for i in selection.holdout[pair]]
-        tests[pair] = _held_out_test(pair, held, prior, solution)
-        verdicts[pair] = judge(
-            solution.pairs[pair],
+        estimate = solution.pairs[pair]
+        held = [observations[i] for i in selection.holdout[pair]] if pair in active else []
+        test, claims = _heard(estimate, held, prior, fleet)
+        verdict = judge(
+            estimate,
             prior.of(pair),
             prior.covariance(pair),
-            tests[pair],
+            test,
+            claims,
             [*solution.doubts.get(pair, []), *doubts],
             limits,
             calibrated=pair in active,
-            factors=tuple(verdicts.values()) if pair in composed else (),
+            factors=tuple(f.verdict for f in found.values()) if pair in composed else (),
         )
-    return verdicts, tests
+        found[pair] = Judged(verdict, test, claims)
+    return found
 
 
-def _held_out_test(
-    pair: str, held: Sequence[Observation], prior: Prior, solution: Solution
-) -> HeldOutTest | None:
-    """Alignment of held-out frames at prior and result, the result's time offset at both: poses are compared."""
-    if not held:
-        return None
-    estimate = solution.pairs[pair]
-    cost = alignment_of(pair, held, prior)
-    dt_s = estimate.time_offset_s or 0.0
-    return paired_test(cost(prior.of(pair), dt_s), cost(estimate.T, dt_s), blocks_of(held))
+def _heard(
+    estimate: PairEstimate, held: Sequence[Observation], prior: Prior, fleet: FleetConfig
+) -> tuple[HeldOutTest | None, dict[str, Claim]]:
+    """What held-out frames say: prior against result (with the result's time offset at both), and their own optimum."""
+    pair, verify = estimate.pair, fleet.verify
+    limit_deg = verify.camera_lidar_limit_deg if pair == "camera_lidar" else verify.radar_limit_deg
+    test = opinion = None
+    if held:
+        ask = alignment_of(estimate, held, prior, fleet.solve)
+        blocks, dt_s = blocks_of(held), estimate.time_offset_s or 0.0
+        test = paired_test(ask.cost(prior.of(pair), dt_s), ask.cost(estimate.T, dt_s), blocks)
+        covariance = np.diag([*np.zeros(6), *ask.extra_variance])
+        covariance[:6, :6] = estimate.covariance
+        opinion = second_opinion(ask.slopes, covariance, ask.bias, blocks)
+    claims = claims_of(
+        pair,
+        estimate.T,
+        estimate.covariance,
+        opinion,
+        float(np.radians(limit_deg)),
+        verify.confidence,
+    )
+    return test, claims
 
 
 def _recorded(lake: Lake, partition: Partition, key: str) -> list[CalibrationRecord]:

@@ -12,13 +12,14 @@ from pipeline.geometry.se3 import to_quaternion
 from pipeline.objective.problem import Prior, Solution
 from pipeline.solve.select import Selection
 from pipeline.store.partitions import Partition
+from pipeline.verify.claims import Claim, target_sigmas
 from pipeline.verify.holdout import HeldOutTest
-from pipeline.verify.verdict import Verdict
+from pipeline.verify.verdict import Verdict, loop_sigmas
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.observations import Observation
 from schemas.versions import CODE_VERSION
 
-__all__ = ["Inputs", "environment_of", "record_of", "refused_records"]
+__all__ = ["Inputs", "Judged", "environment_of", "record_of", "refused_records"]
 
 # Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
 _FAST_MPS = 20.0
@@ -36,13 +37,21 @@ class Inputs:
     inputs: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Judged:
+    """The verdict on one pair and the evidence behind it."""
+
+    verdict: Verdict
+    test: HeldOutTest | None
+    claims: Mapping[str, Claim]
+
+
 def record_of(
     about: Inputs,
     pair: str,
     solution: Solution,
     prior: Prior,
-    verdict: Verdict,
-    test: HeldOutTest | None,
+    judged: Judged,
     selection: Selection,
     observations: Sequence[Observation],
     *,
@@ -51,12 +60,16 @@ def record_of(
     triggered: bool,
 ) -> CalibrationRecord:
     """The record of one pair that was computed."""
-    estimate = solution.pairs[pair]
+    estimate, verdict, test = solution.pairs[pair], judged.verdict, judged.test
+    loop_sigma = _loop_sigmas(solution)
+    sigma = target_sigmas(pair, estimate.T, estimate.covariance)
     refused = verdict.status == "refused"
     computed: dict[str, Any] = {
         "covariance": estimate.covariance,
         "observability": [float(v) for v in estimate.observability],
         "observable": [bool(v) for v in estimate.observable],
+        "azimuth_sigma_rad": float(sigma[0]),
+        "elevation_sigma_rad": float(sigma[1]),
         **_transform_fields("", estimate.T),
     }
     return CalibrationRecord(
@@ -64,6 +77,9 @@ def record_of(
         **({} if refused else computed),
         status=verdict.status,
         reason=verdict.reason,
+        score=verdict.score,
+        determined=list(verdict.determined),
+        limit_rad=judged.claims["azimuth"].limit,
         frames_used=estimate.frames_used,
         frames_rejected=_add(selection.rejected[pair], estimate.frames_rejected),
         environment=environment_of(observations),
@@ -74,11 +90,16 @@ def record_of(
         alignment_after=test.after if test else None,
         loop_rotation_rad=solution.loop_rotation_rad,
         loop_translation_m=solution.loop_translation_m,
+        loop_rotation_sigma_rad=loop_sigma[0],
+        loop_translation_sigma_m=loop_sigma[1],
         time_offset_s=estimate.time_offset_s,
         time_offset_sigma_s=estimate.time_offset_sigma_s,
-        notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable), *estimate.notes],
+        notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable)],
+        assumptions=list(estimate.notes),
+        drive_missing=selection.missing.get(pair, []),
         diagnostics=dict(estimate.diagnostics)
         | _test_numbers(test)
+        | _claim_numbers(judged)
         | {"paper_frames": float(selection.passed[pair])},
     )
 
@@ -144,6 +165,32 @@ def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
         "holdout_blocks": float(test.blocks),
         "holdout_z": test.z,
     }
+
+
+def _claim_numbers(judged: Judged) -> dict[str, float]:
+    """Score, what is vouched for, what held-out frames would change and what is left unknown with them."""
+    vouched = judged.verdict.determined
+    return {
+        "confidence": judged.verdict.score,
+        "vouched_az": float("azimuth" in vouched),
+        "vouched_el": float("elevation" in vouched),
+    } | {
+        f"holdout_{name}_{what}_rad": value
+        for name, claim in judged.claims.items()
+        for what, value in (
+            ("shift", claim.shift),
+            ("shift_sigma", claim.shift_sigma),
+            ("remaining_sigma", claim.remaining),
+        )
+    }
+
+
+def _loop_sigmas(solution: Solution) -> tuple[float | None, float | None]:
+    """Sigma of the loop's angle and translation, from three pairs estimated apart or from the method's own check."""
+    apart = loop_sigmas(solution)
+    if apart is not None:
+        return apart
+    return solution.pairs["camera_radar"].diagnostics.get("loop_rotation_sigma_rad"), None
 
 
 def _add(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:

@@ -251,7 +251,8 @@ class VerifyConfig(_Section):
 
     camera_lidar_limit_deg: Positive = 0.2
     radar_limit_deg: Positive = 0.4
-    confidence_sigmas: Positive = 2.8  # 99.5 % of a normal deviate
+    # Probability that an error stays within the limit, before a direction is vouched for.
+    confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.995
 
 
 class AuditConfig(_Section):

@@ -61,7 +61,10 @@ class PairView:
     rejected: list[tuple[str, int]]
     time_offset: str
     loop: str
+    vouched: str
     notes: list[str]
+    assumptions: list[str]
+    missing: list[str]
     diagnostics: list[tuple[str, str]]
 
 
@@ -106,9 +109,20 @@ def pair_view(record: CalibrationRecord) -> PairView:
         rejected=sorted(record.frames_rejected.items(), key=lambda kv: -kv[1]),
         time_offset=_time_offset(record),
         loop=_loop(record),
+        vouched=_vouched(record),
         notes=list(record.notes),
+        assumptions=list(record.assumptions),
+        missing=list(record.drive_missing),
         diagnostics=[(name, f"{value:.4g}") for name, value in sorted(record.diagnostics.items())],
     )
+
+
+def _vouched(record: CalibrationRecord) -> str:
+    """What an accepted record vouches for, and its score; empty where it was never judged."""
+    if record.score is None or record.limit_rad is None:
+        return ""
+    what = f"{' and '.join(record.determined)} within {np.degrees(record.limit_rad):.2g} deg at 15 to 40 m"
+    return f"{what if record.determined else 'nothing'}; score {record.score:.2f}"
 
 
 def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFinding]) -> tuple[str, str]:

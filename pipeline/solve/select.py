@@ -47,6 +47,7 @@ class Selection:
     passed: dict[str, int]  # frames that meet the paper's conditions
     rejected: dict[str, dict[str, int]]  # frames not used for the fit, by reason
     notes: dict[str, list[str]] = field(default_factory=dict)
+    missing: dict[str, list[str]] = field(default_factory=dict)  # what the day did not show, in words
 
 
 def select_frames(
@@ -68,7 +69,7 @@ def select_frames(
         SolveError: fewer than MIN_FRAMES frames are left for a pair.
     """
     held = hold_out(observations, config.holdout_fraction)
-    fit, holdout, passed, rejected, notes = {}, {}, {}, {}, {}
+    fit, holdout, passed, rejected, notes, missing = {}, {}, {}, {}, {}, {}
     for pair in PAIRS:
         reasons = [unmet_conditions(o, pair, config, sync_gate_s) for o in observations]
         usable = [i for i, r in enumerate(reasons) if "sync" not in r and "empty" not in r]
@@ -87,8 +88,8 @@ def select_frames(
         passed[pair] = sum(1 for r in reasons if not r)
         rejected[pair] = _count_rejected(reasons, held, chosen, paper=paper)
         notes[pair] = _notes(pair, passed[pair], [i for i in chosen if reasons[i]], len(chosen), paper=paper)
-        notes[pair] += missing_content([observations[i] for i in chosen], pair)
-    return Selection(fit, holdout, passed, rejected, notes)
+        missing[pair] = missing_content([observations[i] for i in chosen], pair)
+    return Selection(fit, holdout, passed, rejected, notes, missing)
 
 
 def unmet_conditions(

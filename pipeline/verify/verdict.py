@@ -1,22 +1,32 @@
-"""Accept, hold or refuse: held-out frames decide, doubts hold, and nothing worse than the prior passes.
+"""Accept, hold or refuse: every check has a margin, the smallest is the score, and one below zero holds the record.
 
-Held means: computed and recorded, but the prior stays current.
+Held means: computed and recorded, but the prior stays current. Accepted means that the record vouches for what it
+names in `determined`: azimuth, and elevation where the day tells it, of targets 15 to 40 m away, within a stated limit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.se3 import adjoint, inverse, log_so3
 from pipeline.objective.problem import PairEstimate, Solution
+from pipeline.verify.claims import Claim
 from pipeline.verify.holdout import HeldOutTest
 from schemas.calibrations import DOF_NAMES
 
-__all__ = ["Limits", "Verdict", "judge", "loop_doubts", "moved"]
+__all__ = ["Limits", "Verdict", "judge", "loop_doubts", "loop_sigmas", "moved"]
+
+# What a pair is good for: without it there is nothing to accept. A radar without elevation is still worth its azimuth.
+_NEEDED = {
+    "camera_lidar": ("azimuth", "elevation"),
+    "camera_radar": ("azimuth",),
+    "lidar_radar": ("azimuth",),
+}
+_BAD = -1.0  # margin of what is wrong without being measured
 
 
 @dataclass(frozen=True)
@@ -26,7 +36,7 @@ class Limits:
     search_rotation_rad: float
     search_translation_m: float
     prior_sigmas: float = 4.0  # a move this large happens once in 16,000 days if the prior's sigma is right
-    worse_z: float = 1.64  # one-sided 5 %: a right result is held by chance once in 20 days at most
+    worse_z: float = 2.33  # one-sided 1 %: a right result near a good prior aligns worse by chance
     # One-sided 16 %: short days hold out some ten frames, and 5 % would hold right results that moved by 10 cm.
     better_z: float = 1.0
     agree_sigmas: float = 3.0
@@ -36,9 +46,19 @@ class Limits:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Status of a record and the reason in words."""
+    """Status of a record, the reason in words, the smallest margin, and what an accepted record vouches for."""
 
     status: str
+    reason: str
+    score: float = 0.0
+    determined: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class _Check:
+    """One thing that must hold: margin 1 = far inside, 0 = at the limit; the reason is said where it is negative."""
+
+    margin: float
     reason: str
 
 
@@ -47,6 +67,7 @@ def judge(
     T_prior: Float[np.ndarray, "4 4"],
     prior_covariance: Float[np.ndarray, "6 6"],
     test: HeldOutTest | None,
+    claims: Mapping[str, Claim],
     doubts: Sequence[str],
     limits: Limits,
     *,
@@ -60,33 +81,38 @@ def judge(
         T_prior: what stands without it.
         prior_covariance: of the prior, order as the estimate's.
         test: held-out frames at prior and result; None where no frame could tell.
+        claims: what can be said of azimuth and elevation at the targets.
         doubts: reasons found while solving for not trusting the pair.
         limits: thresholds.
         calibrated: False where no trigger asked for this pair.
         factors: verdicts of the pairs that this one is composed of; empty where it was estimated. A composed pair is as
-            good as its factors: it need not align better on its own held-out frames, but it may not align worse.
+            good as its factors: how far it moved is theirs to answer for, and it need not align better on its own
+            held-out frames, but it may not align worse, nor may they contradict it.
     """
     if not calibrated:
-        return Verdict("held", "not triggered: the prior stays")
+        return Verdict("held", "not triggered: the prior stays", _BAD)
     if estimate.frames_used < limits.min_frames:
         few = f"too few frames: {estimate.frames_used}, needs {limits.min_frames}"
-        return Verdict("refused", "; ".join([*doubts, few]))
-    reasons = [*doubts, *_range_reasons(estimate, T_prior, prior_covariance, limits)]
-    if not estimate.observable.any():
-        reasons.append("the day determines no degree of freedom")
+        return Verdict("refused", "; ".join([*doubts, few]), _BAD)
+    checks = [_Check(_BAD, doubt) for doubt in doubts]
     if factors:
-        reasons += (
-            []
-            if all(f.status == "accepted" for f in factors)
-            else ["composed of a pair that is not accepted"]
+        good = all(f.status == "accepted" for f in factors)
+        checks.append(
+            _Check(min(f.score for f in factors) if good else _BAD, "composed of a pair that is not accepted")
         )
-        reasons += _worse(test, limits)
+        checks += _not_worse(test, limits)
     else:
-        reasons += _holdout_reasons(estimate, T_prior, test, limits)
+        checks += _moves(estimate, T_prior, prior_covariance, limits)
+        checks += _held_out(estimate, T_prior, test, limits)
+    checks += _claims(estimate, claims)
+    if not estimate.observable.any():
+        checks.append(_Check(_BAD, "the day determines no degree of freedom"))
+    score = min(1.0, *(c.margin for c in checks))
+    reasons = [c.reason for c in checks if c.margin < 0]
     if reasons:
-        return Verdict("held", "; ".join(reasons))
-    kept = [name for name, seen in zip(DOF_NAMES, estimate.observable, strict=True) if not seen]
-    return Verdict("accepted", f"not determined by the day: {', '.join(kept)}" if kept else "")
+        return Verdict("held", "; ".join(reasons), score)
+    vouched = tuple(name for name, claim in claims.items() if claim.margin >= 0)
+    return Verdict("accepted", _remark(estimate, claims), score, vouched)
 
 
 def moved(T: Float[np.ndarray, "4 4"], T_prior: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 6"]:
@@ -96,11 +122,10 @@ def moved(T: Float[np.ndarray, "4 4"], T_prior: Float[np.ndarray, "4 4"]) -> Flo
 
 def loop_doubts(solution: Solution, sigmas: float = 3.0) -> list[str]:
     """A loop of independent estimates that does not close within its sigma is a doubt about every pair."""
-    if solution.loop_rotation_rad is None or solution.loop_translation_m is None:
+    found = loop_sigmas(solution)
+    if found is None or solution.loop_rotation_rad is None or solution.loop_translation_m is None:
         return []
-    covariance = _loop_covariance(solution)
-    rotation = float(np.sqrt(np.trace(covariance[:3, :3])))
-    translation = float(np.sqrt(np.trace(covariance[3:, 3:])))
+    rotation, translation = found
     doubts = []
     if solution.loop_rotation_rad > sigmas * rotation:
         open_deg, sigma_deg = np.degrees(solution.loop_rotation_rad), np.degrees(rotation)
@@ -112,6 +137,14 @@ def loop_doubts(solution: Solution, sigmas: float = 3.0) -> list[str]:
     return doubts
 
 
+def loop_sigmas(solution: Solution) -> tuple[float, float] | None:
+    """Sigma of the loop's angle [rad] and translation [m] where all three pairs were estimated apart."""
+    if solution.loop_rotation_rad is None or solution.loop_translation_m is None:
+        return None
+    covariance = _loop_covariance(solution)
+    return float(np.sqrt(np.trace(covariance[:3, :3]))), float(np.sqrt(np.trace(covariance[3:, 3:])))
+
+
 def _loop_covariance(solution: Solution) -> np.ndarray:
     """Of T_camera_lidar T_lidar_radar T_radar_camera, with independent factors (first order)."""
     cl, lr, cr = (solution.pairs[p] for p in ("camera_lidar", "lidar_radar", "camera_radar"))
@@ -120,45 +153,90 @@ def _loop_covariance(solution: Solution) -> np.ndarray:
     return cl.covariance + A @ lr.covariance @ A.T + B @ cr.covariance @ B.T
 
 
-def _range_reasons(
+def _moves(
     estimate: PairEstimate, T_prior: np.ndarray, prior_covariance: np.ndarray, limits: Limits
-) -> list[str]:
+) -> list[_Check]:
+    """Within what was searched, and within what the prior allows."""
     step = moved(estimate.T, T_prior)
-    reasons = []
-    rotation, translation = np.linalg.norm(step[:3]), np.abs(step[3:]).max()
+    rotation, translation = float(np.linalg.norm(step[:3])), float(np.abs(step[3:]).max())
     # The searched box has half-widths per axis: its corners lie sqrt(3) further out.
-    if rotation > np.sqrt(3) * limits.search_rotation_rad:
-        reasons.append(f"moved {np.degrees(rotation):.1f} deg, beyond the search range")
-    if translation > limits.search_translation_m:
-        reasons.append(f"moved {translation:.2f} m, beyond the search range")
+    reach = np.sqrt(3) * limits.search_rotation_rad
     ratio = np.abs(step) / np.sqrt(np.diag(prior_covariance))
     worst = int(np.argmax(ratio))
-    if ratio[worst] > limits.prior_sigmas:
-        reasons.append(f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} prior sigmas")
-    return reasons
+    return [
+        _Check(1 - rotation / reach, f"moved {np.degrees(rotation):.1f} deg, beyond the search range"),
+        _Check(
+            1 - translation / limits.search_translation_m,
+            f"moved {translation:.2f} m, beyond the search range",
+        ),
+        _Check(
+            1 - ratio[worst] / limits.prior_sigmas,
+            f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} prior sigmas",
+        ),
+    ]
 
 
-def _holdout_reasons(
+def _held_out(
     estimate: PairEstimate, T_prior: np.ndarray, test: HeldOutTest | None, limits: Limits
-) -> list[str]:
+) -> list[_Check]:
+    """Held-out frames align better than at the prior, or as well where the result says the same as the prior."""
     if test is None or test.frames < limits.min_holdout:
-        return [
-            f"too few held-out frames to judge: {0 if test is None else test.frames}, needs {limits.min_holdout}"
-        ]
-    if test.z > limits.worse_z or test.z < -limits.better_z:
-        return _worse(test, limits)
-    # Neither better nor worse: fine as long as the result says the same as the prior.
+        found = 0 if test is None else test.frames
+        return [_Check(_BAD, f"too few held-out frames to judge: {found}, needs {limits.min_holdout}")]
     sigma = np.sqrt(np.diag(estimate.covariance))
     ratio = np.where(estimate.observable, np.abs(moved(estimate.T, T_prior)) / sigma, 0.0)
     worst = int(np.argmax(ratio))
-    if ratio[worst] > limits.agree_sigmas:
-        claim = f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} of its sigmas"
-        return [f"{claim}, and held-out frames align no better (z = {test.z:.1f})"]
-    return []
+    same = 1 - ratio[worst] / limits.agree_sigmas
+    better = (-test.z - limits.better_z) / limits.better_z
+    claim = f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} of its sigmas"
+    no_better = _Check(
+        min(1.0, max(same, better)), f"{claim}, and held-out frames align no better (z = {test.z:.1f})"
+    )
+    worse = _not_worse(test, limits)
+    return worse if worse[0].margin < 0 else [*worse, no_better]
 
 
-def _worse(test: HeldOutTest | None, limits: Limits) -> list[str]:
-    if test is None or test.z <= limits.worse_z:
+def _not_worse(test: HeldOutTest | None, limits: Limits) -> list[_Check]:
+    if test is None:
         return []
     change = f"{test.after:.4g} after {test.before:.4g}, z = {test.z:.1f}"
-    return [f"held-out frames align worse than at the prior ({change})"]
+    return [
+        _Check(
+            min(1.0, 1 - test.z / limits.worse_z), f"held-out frames align worse than at the prior ({change})"
+        )
+    ]
+
+
+def _claims(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[_Check]:
+    """Held-out frames must not contradict the result, and what the pair is good for must be known well enough."""
+    checks = []
+    for name, claim in claims.items():
+        checks.append(
+            _Check(
+                claim.agreement,
+                f"held-out frames would move the {name} by {_deg(claim.shift)},"
+                f" sigma of that {_deg(claim.shift_sigma)}",
+            )
+        )
+        if name in _NEEDED[estimate.pair]:
+            checks.append(_Check(claim.margin, f"{name} is {_known(claim)}"))
+    return checks
+
+
+def _known(claim: Claim) -> str:
+    off = f"{_deg(claim.shift)} off by held-out frames and " if claim.shift > claim.remaining else ""
+    share = f"{100 * claim.confidence:.3g} %"
+    return f"{off}known to {_deg(claim.remaining)} (1 sigma), not within {_deg(claim.limit)} at {share}"
+
+
+def _remark(estimate: PairEstimate, claims: Mapping[str, Claim]) -> str:
+    """What an accepted record does not vouch for."""
+    remarks = [
+        f"{name} not vouched for: {_known(claim)}" for name, claim in claims.items() if claim.margin < 0
+    ]
+    kept = [name for name, seen in zip(DOF_NAMES, estimate.observable, strict=True) if not seen]
+    return "; ".join([*remarks, *([f"not determined by the day: {', '.join(kept)}"] if kept else [])])
+
+
+def _deg(angle_rad: float) -> str:
+    return f"{np.degrees(angle_rad):.2f} deg"

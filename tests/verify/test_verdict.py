@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation
 from pipeline.objective.problem import PairEstimate, Prior, Solution
+from pipeline.verify.claims import DIRECTIONS, Claim
 from pipeline.verify.holdout import HeldOutTest, paired_test
 from pipeline.verify.verdict import Limits, judge, loop_doubts, moved
 
@@ -26,8 +27,12 @@ def estimate(rotation_deg=0.0, shift_m=0.0, pair="camera_lidar", observable=None
     return PairEstimate(pair, T, np.diag(SIGMA**2), np.where(seen, 0.9, 0.1), seen, 50)
 
 
-def verdict(result, test, doubts=(), **changes):
-    return judge(result, np.eye(4), PRIOR.covariance("camera_lidar"), test, doubts, LIMITS, **changes)
+SURE = {name: Claim(0.001, 0.0, 0.001, 0.001, np.radians(0.2), 0.995) for name in DIRECTIONS}
+
+
+def verdict(result, test, doubts=(), claims=SURE, **changes):
+    prior = PRIOR.covariance("camera_lidar")
+    return judge(result, np.eye(4), prior, test, claims, doubts, LIMITS, **changes)
 
 
 def test_a_better_alignment_is_accepted_without_remark():
@@ -87,6 +92,14 @@ def test_a_day_that_determines_nothing_is_held():
     assert "no degree of freedom" in verdict(estimate(0.0, observable=[0] * 6), SAME).reason
 
 
+def test_a_composed_pair_moves_as_far_as_its_factors_do():
+    """Two turns within the search range, or one shift of a lever arm, may add up to more than one range."""
+    good = verdict(estimate(1.5), BETTER)
+    far = estimate(12.0, 0.4)
+    assert verdict(far, BETTER).status == "held"
+    assert verdict(far, BETTER, factors=[good, good]).status == "accepted"
+
+
 def test_a_composed_pair_is_as_good_as_its_factors():
     good, bad = verdict(estimate(1.5), BETTER), verdict(estimate(1.5), WORSE)
     assert verdict(estimate(1.0), SAME, factors=[good, good]).status == "accepted"
@@ -95,6 +108,46 @@ def test_a_composed_pair_is_as_good_as_its_factors():
         == "composed of a pair that is not accepted"
     )
     assert "align worse" in verdict(estimate(1.0), WORSE, factors=[good, good]).reason
+
+
+def claim(sigma_deg, shift_deg=0.0, shift_sigma_deg=0.1):
+    sigma, shift, shift_sigma = np.radians([sigma_deg, shift_deg, shift_sigma_deg])
+    return Claim(sigma, shift, shift_sigma, sigma, np.radians(0.2), 0.995)
+
+
+def test_what_the_purpose_needs_more_exactly_than_it_is_known_is_held():
+    found = verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(0.3)})
+    assert found.status == "held"
+    assert found.reason == "azimuth is known to 0.30 deg (1 sigma), not within 0.20 deg at 99.5 %"
+
+
+def test_a_radar_is_accepted_for_its_azimuth_and_says_that_elevation_is_not_vouched_for():
+    claims = SURE | {"elevation": claim(0.5)}
+    assert verdict(estimate(1.5), BETTER, claims=claims).status == "held"
+    found = verdict(estimate(1.5, pair="lidar_radar"), BETTER, claims=claims)
+    assert (found.status, found.determined) == ("accepted", ("azimuth",))
+    assert "elevation not vouched for: known to 0.50 deg" in found.reason
+
+
+def test_held_out_frames_that_lie_elsewhere_by_more_than_their_sigma_hold():
+    off = SURE | {"elevation": claim(0.01, shift_deg=0.15, shift_sigma_deg=0.04)}
+    found = verdict(estimate(1.5, pair="lidar_radar"), BETTER, claims=off)
+    assert found.status == "held"
+    assert "would move the elevation by 0.15 deg, sigma of that 0.04 deg" in found.reason
+    near = SURE | {"elevation": claim(0.01, shift_deg=0.05, shift_sigma_deg=0.04)}
+    assert verdict(estimate(1.5), BETTER, claims=near).status == "accepted"
+
+
+def test_the_score_is_the_smallest_margin_and_ranks():
+    scores = [
+        verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(s)}).score for s in (0.01, 0.04, 0.3)
+    ]
+    assert scores == sorted(scores, reverse=True)
+    assert scores[1] > 0 > scores[2]
+    assert verdict(estimate(1.5), BETTER, doubts=["x"]).score < 0
+    weak = verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(0.06)})
+    strong = verdict(estimate(1.0), BETTER)
+    assert verdict(estimate(1.0), BETTER, factors=[weak, strong]).score == weak.score
 
 
 def test_too_few_frames_are_refused():
