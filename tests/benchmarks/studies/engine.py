@@ -177,6 +177,11 @@ def run_study(
         jobs = {pool.submit(_work, run, args.root): run for run in todo}
         for number, job in enumerate(as_completed(jobs), 1):
             run = jobs[job]
+            if (
+                job.exception() is not None
+            ):  # the others need not wait; this one is missing until it is run again
+                print(f"{number}/{len(todo)} FAILED {run.day.name}: {job.exception()!r}", flush=True)
+                continue
             result = trim({**asdict(run), **about, **job.result()})
             out.write(json.dumps(result) + "\n")
             out.flush()

@@ -31,7 +31,7 @@ def main() -> None:
     args = parser.parse_args()
     days = SETS["table1"]
     if args.tuning:
-        days = [DaySpec(101 + i, ("urban", "highway")[i % 2], 100) for i in range(4)]
+        days = [DaySpec(101 + i, ("urban", "highway")[i % 2], 100) for i in range(3)]
     runs = [Run(day, method, PRIOR, day.seed) for method in args.methods for day in days]
     run_study(runs, args, summary)
 
