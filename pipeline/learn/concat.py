@@ -5,12 +5,16 @@ Source: paper, figure 6 and "SSL-based method"; layer sizes are not given there 
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import nn
 
 from pipeline.learn.encoders import standardised
-from pipeline.learn.outputs import PAIRS, CoreOutputs, Heads
-from pipeline.learn.views import LIDAR_CHANNELS, RADAR_CHANNELS, RenderedView
+from pipeline.learn.grid import Grid
+from pipeline.learn.layout import LIDAR_CHANNELS, PAIRS, RADAR_CHANNELS
+from pipeline.learn.outputs import CoreOutputs, Heads
+from pipeline.learn.views import RenderedView
 
 __all__ = ["ConcatCore"]
 
@@ -21,10 +25,9 @@ _STD = 1e-2  # heads start near no correction
 class ConcatCore(nn.Module):
     """What is computed from one rendered view, for those sensors that the pairs need."""
 
-    def __init__(self, pairs: tuple[str, ...], width: int, hidden: int) -> None:
+    def __init__(self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int) -> None:
         super().__init__()
         self.pairs = pairs
-        self.composed = False
         channels = {name: _CHANNELS[name] for name in _CHANNELS if any(name in pair for pair in pairs)}
         self.encoders = nn.ModuleDict({name: _encoder(c, width) for name, c in channels.items()})
         self.fusion = nn.Sequential(
@@ -32,13 +35,13 @@ class ConcatCore(nn.Module):
             nn.ReLU(),
             nn.Conv2d(6 * width, 6 * width, 3, 2, 1),
             nn.ReLU(),
-            # Where something is must survive: a small grid, not a mean.
-            nn.AdaptiveAvgPool2d((2, 4)),
-            nn.Flatten(),
-            nn.Linear(6 * width * 8, hidden),
-            nn.ReLU(),
         )
-
+        # Where something is must survive: averages over 2 x 4 regions, as a product that every exporter knows.
+        rows, columns = -(-grid.height // 64), -(-grid.width // 64)
+        one_hot = torch.eye(rows * columns).reshape(-1, 1, rows, columns)
+        regions = nn.functional.adaptive_avg_pool2d(one_hot, (2, 4)).flatten(1)
+        self.register_buffer("regions", regions, persistent=False)
+        self.last = nn.Sequential(nn.Linear(6 * width * 8, hidden), nn.ReLU())
         self.heads = Heads(hidden, pairs, _STD)
 
     def forward(self, view: RenderedView) -> CoreOutputs:
@@ -48,7 +51,8 @@ class ConcatCore(nn.Module):
             "lidar": view.lidar_grid,
             "radar": view.radar_grid,
         }
-        fused = self.fusion(torch.cat([encoder(grids[name]) for name, encoder in self.encoders.items()], 1))
+        maps = self.fusion(torch.cat([encoder(grids[name]) for name, encoder in self.encoders.items()], 1))
+        fused = self.last((maps.flatten(2) @ self.regions).flatten(1))
         found = self.heads(fused)
         identity = torch.eye(4, device=fused.device).expand(len(fused), 4, 4)
         start = self.heads.start.expand(len(fused), 6)
@@ -60,7 +64,7 @@ class ConcatCore(nn.Module):
 def _encoder(channels: int, width: int) -> nn.Sequential:
     layers: list[nn.Module] = []
     sizes = (channels, width, 2 * width, 3 * width, 4 * width)
-    for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+    for inputs, outputs in pairwise(sizes):
         layers += [
             nn.Conv2d(inputs, outputs, 3, 2, 1, bias=False),
             nn.GroupNorm(max(1, outputs // 8), outputs),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
-from torch.nn import functional as F
+from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
 from pipeline.learn.grid import Grid
 from pipeline.learn.outputs import Predictions

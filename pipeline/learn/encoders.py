@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
 __all__ = ["CameraEncoder", "LidarEncoder", "PointEncoder"]
 

@@ -70,6 +70,23 @@ class Grid:
         """The same view in cells 1/`factor` as large."""
         return _Level(self.cell_deg / factor, self.left_deg, self.top_deg, self.bottom_deg)
 
+    def window(self, stored: tuple[int, int], step_deg: float) -> tuple[slice, slice]:
+        """Rows and columns of this view in maps of (height, width) cells about the optical axis.
+
+        Raises:
+            ValueError: cells of another size, or maps that do not contain this view.
+        """
+        if abs(step_deg - self.cell_deg) > 1e-9:
+            raise ValueError(f"the data has cells of {step_deg} deg, the network wants {self.cell_deg} deg")
+        rows, columns = stored
+        top, left = rows / 2 - self.top_deg / step_deg, columns / 2 - self.left_deg / step_deg
+        row, column = round(top), round(left)
+        if max(abs(top - row), abs(left - column)) > 1e-6:
+            raise ValueError("the network's grid lies between the cells of the data's")
+        if min(row, column) < 0 or row + self.height > rows or column + self.width > columns:
+            raise ValueError(f"the data's grid of {rows} x {columns} cells does not contain the network's")
+        return slice(row, row + self.height), slice(column, column + self.width)
+
     def azimuth_rad(self) -> Float[np.ndarray, " W"]:
         """Azimuth of the columns' centres."""
         return np.radians(self.left_deg - (np.arange(self.width) + 0.5) * self.cell_deg)

@@ -11,13 +11,10 @@ from torch import Tensor
 
 from pipeline.learn.batch import TrainingBatch
 from pipeline.learn.grid import Grid
+from pipeline.learn.layout import FEATURE_UNITS
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND
 
-__all__ = ["LIDAR_FEATURES", "RADAR_FEATURES", "NetworkInputs", "SensorInputs", "crop", "sensor_inputs"]
-
-LIDAR_FEATURES = ("intensity", "height", "edge", "ground")
-RADAR_FEATURES = ("speed", "power", "moving")
-_HEIGHT_UNIT_M, _SPEED_UNIT_MPS, _POWER_UNIT_DB = 3.0, 5.0, 20.0  # bring features to the order of one
+__all__ = ["NetworkInputs", "SensorInputs", "crop", "sensor_inputs"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +57,7 @@ def sensor_inputs(batch: TrainingBatch, grid: Grid) -> SensorInputs:
     lidar_features = torch.stack(
         [
             batch.lidar_intensity / 255.0,
-            heights(batch.lidar_xyz_m, batch.lidar_valid, batch.ground_plane) / _HEIGHT_UNIT_M,
+            heights(batch.lidar_xyz_m, batch.lidar_valid, batch.ground_plane) / FEATURE_UNITS["height"],
             ((flags & POINT_IS_EDGE) > 0).float(),
             ((flags & POINT_IS_GROUND) > 0).float(),
         ],
@@ -82,8 +79,8 @@ def radar_features(
     residual_mps: Float[Tensor, "B M"], power_db: Float[Tensor, "B M"], moving: Bool[Tensor, "B M"]
 ) -> Float32[Tensor, "B M 3"]:
     """RADAR_FEATURES from Doppler residuals, power over the scan's median, and what perception says moves."""
-    speed = (residual_mps.abs() / _SPEED_UNIT_MPS).clamp(max=2.0)
-    power = (power_db / _POWER_UNIT_DB).clamp(-2.0, 2.0)
+    speed = (residual_mps.abs() / FEATURE_UNITS["speed"]).clamp(max=2.0)
+    power = (power_db / FEATURE_UNITS["power"]).clamp(-2.0, 2.0)
     return torch.stack([speed, power, moving.to(speed.dtype)], -1).float()
 
 
@@ -108,15 +105,5 @@ def crop(
     Raises:
         ValueError: cells of another size, or a stored grid that does not contain the network's.
     """
-    if abs(step_deg - grid.cell_deg) > 1e-9:
-        raise ValueError(f"the data has cells of {step_deg} deg, the network wants {grid.cell_deg} deg")
-    rows, columns = stored.shape[-2:]
-    top = rows / 2 - grid.top_deg / step_deg
-    left = columns / 2 - grid.left_deg / step_deg
-    first_row, first_column = round(top), round(left)
-    if max(abs(top - first_row), abs(left - first_column)) > 1e-6:
-        raise ValueError("the network's grid lies between the cells of the data's")
-    last_row, last_column = first_row + grid.height, first_column + grid.width
-    if min(first_row, first_column) < 0 or last_row > rows or last_column > columns:
-        raise ValueError(f"the data's grid of {rows} x {columns} cells does not contain the network's")
-    return stored[..., first_row:last_row, first_column:last_column]
+    rows, columns = grid.window((stored.shape[-2], stored.shape[-1]), step_deg)
+    return stored[..., rows, columns]

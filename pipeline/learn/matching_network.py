@@ -5,15 +5,16 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
 from pipeline.learn.encoders import CameraEncoder, LidarEncoder, PointEncoder
 from pipeline.learn.grid import Grid
-from pipeline.learn.inputs import RADAR_FEATURES
+from pipeline.learn.layout import LIDAR_CHANNELS, PAIRS, RADAR_FEATURES
 from pipeline.learn.matching import FLOOR, NEUTRAL, ClassMatcher, Match
 from pipeline.learn.occupancy import OccupancyMatch, OccupancyMatcher
-from pipeline.learn.outputs import PAIRS, CoreOutputs, Heads, pose_of_twist
+from pipeline.learn.outputs import CoreOutputs, Heads, pose_of_twist
 from pipeline.learn.rendering import grid_cells, sphere
-from pipeline.learn.views import LIDAR_CHANNELS, RenderedView
+from pipeline.learn.views import RenderedView
 from schemas.training import GRID_CLASSES
 
 __all__ = ["MatchingCore"]
@@ -33,7 +34,6 @@ class MatchingCore(nn.Module):
     def __init__(self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int) -> None:
         super().__init__()
         self.grid, self.pairs = grid, pairs
-        self.composed = "camera_lidar" in pairs and "lidar_radar" in pairs
         uses_camera = pairs != ("lidar_radar",)
         self.camera_encoder = CameraEncoder(_CLASSES, width) if uses_camera else None
         sizes = []
@@ -108,13 +108,13 @@ class MatchingCore(nn.Module):
         row, column = grid_cells(sphere(points_camera), self.grid)
         height, width = self.grid.height, self.grid.width
         index = row.long().clamp(0, height - 1) * width + column.long().clamp(0, width - 1)
-        flat = maps.flatten(2).transpose(1, 2)
-        return flat.gather(1, index[..., None].expand(-1, -1, maps.shape[1]))
+        frame = torch.arange(len(maps), device=maps.device)[:, None] * (height * width)
+        return F.embedding(index + frame, maps.permute(0, 2, 3, 1).reshape(-1, maps.shape[1]))
 
     def _combine(self, bases: dict[str, Match | OccupancyMatch], fused: Tensor) -> tuple[Tensor, Tensor]:
         residuals = self.heads(fused)
         variances = {pair: base.variance for pair, base in bases.items()}
-        if self.composed:
+        if "camera_radar" not in bases and "camera_radar" in self.pairs:
             lidar_radar = variances["lidar_radar"]
             turned = [lidar_radar[:, [a + o for a in _AXES_CAMERA_OF_LIDAR]] for o in (0, 3)]
             variances["camera_radar"] = variances["camera_lidar"] + torch.cat(turned, -1)

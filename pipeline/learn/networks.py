@@ -6,45 +6,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from pipeline.learn.concat import ConcatCore
-from pipeline.learn.grid import Grid
 from pipeline.learn.inputs import NetworkInputs
+from pipeline.learn.layout import NetworkConfig
 from pipeline.learn.matching_network import MatchingCore
-from pipeline.learn.outputs import PAIRS, CoreOutputs, Predictions
+from pipeline.learn.outputs import CoreOutputs, Predictions
 from pipeline.learn.views import render
 
 __all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "refine"]
-
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """What is built.
-
-    Args:
-        architecture: explicit matching, or the paper's concatenation.
-        pairs: all three pairs in one network, or one pair.
-        grid: part of the camera's directions that is looked at.
-        width: channels of the encoders' first stage.
-        hidden: features per pair before fusion (matching), fused features (concat).
-    """
-
-    architecture: Literal["matching", "concat"] = "matching"
-    pairs: Literal["joint", "camera_lidar", "camera_radar", "lidar_radar"] = "joint"
-    grid: Grid = Grid()
-    width: int = 16
-    hidden: int = 192
-
-    @property
-    def estimated(self) -> tuple[str, ...]:
-        """The pairs that the network corrects."""
-        return PAIRS if self.pairs == "joint" else (self.pairs,)
 
 
 class CalibrationNetwork(nn.Module):
@@ -57,7 +32,7 @@ class CalibrationNetwork(nn.Module):
         if config.architecture == "matching":
             self.core = MatchingCore(config.grid, config.estimated, config.width, config.hidden)
         else:
-            self.core = ConcatCore(config.estimated, config.width, config.hidden)
+            self.core = ConcatCore(config.grid, config.estimated, config.width, config.hidden)
 
     def forward(self, inputs: NetworkInputs) -> Predictions:
         """One pass."""
@@ -94,7 +69,7 @@ class CalibrationNetwork(nn.Module):
     ) -> Predictions:
         T_camera_lidar, T_camera_radar, T_lidar_radar = compose(
             outputs.corrections, inputs.T_camera_lidar, inputs.T_camera_radar, inputs.T_lidar_radar,
-            composed=self.core.composed,
+            composed=self.config.composed,
         )  # fmt: skip
         return Predictions(
             T_camera_lidar,

@@ -19,7 +19,9 @@ from pipeline.objective.differentiable.poses import exp_so3
 
 __all__ = ["OccupancyMatch", "OccupancyMatcher"]
 
-_REACH_DEG, _YAW_STEP_DEG, _PITCH_STEP_DEG = 8.0, 0.25, 0.5
+# Steps stay well below the kernels' widths, between which densities are interpolated.
+_REACH_DEG, _YAW_STEP_DEG, _PITCH_STEP_DEG = 8.0, 0.4, 0.5
+_FIELD_DEG = (48.0, 28.0)  # azimuth and elevation to each side: what lidar and radar share ahead
 _SECTORS = 3
 _ROLLS_DEG = 1.5 * np.arange(-4, 5)
 
@@ -50,11 +52,11 @@ class OccupancyMatcher(nn.Module):
         self.weigh = nn.Linear(radar_features, 1)
         nn.init.zeros_(self.weigh.weight)
         nn.init.zeros_(self.weigh.bias)
-        reach = round(_REACH_DEG / _YAW_STEP_DEG)
-        self.register_buffer("yaws", torch.arange(-reach, reach + 1) * _YAW_STEP_DEG * degree, False)
-        reach = round(_REACH_DEG / _PITCH_STEP_DEG)
-        self.register_buffer("pitches", torch.arange(-reach, reach + 1) * _PITCH_STEP_DEG * degree, False)
-        self.register_buffer("rolls", torch.tensor(_ROLLS_DEG * degree, dtype=torch.float32), False)
+        self.register_buffer("yaws", _steps(_YAW_STEP_DEG), persistent=False)
+        self.register_buffer("pitches", _steps(_PITCH_STEP_DEG), persistent=False)
+        self.register_buffer(
+            "rolls", torch.tensor(_ROLLS_DEG * degree, dtype=torch.float32), persistent=False
+        )
 
     @property
     def profile_size(self) -> int:
@@ -91,7 +93,7 @@ class OccupancyMatcher(nn.Module):
         elevation_gap = (lidar[:, None, :, 1] - radar[:, :, None, 1]) * tall[..., None]
         loose = torch.sqrt(width[1] ** 2 + (2.0 * np.pi / 180) ** 2)
         yaw_logits = self._profile(
-            kernel_range * _kernel(elevation_gap, loose), lidar[..., 0], radar[..., 0], self.yaws, width[0]
+            kernel_range * _kernel(elevation_gap, loose), lidar[..., 0], radar[..., 0], self.yaws, 0
         )
         yaw_surface = (yaw_logits * weight[..., None]).sum(1) / total * torch.exp(self.log_sharpness[0])
         yaw_posterior = torch.softmax(yaw_surface, -1)
@@ -99,7 +101,7 @@ class OccupancyMatcher(nn.Module):
         azimuth = radar[..., 0] + yaw[:, None]
         kernel_azimuth = _kernel(lidar[:, None, :, 0] - azimuth[..., None], width[0])
         pitch_logits = self._profile(
-            kernel_range * kernel_azimuth, lidar[..., 1], radar[..., 1], self.pitches, width[1]
+            kernel_range * kernel_azimuth, lidar[..., 1], radar[..., 1], self.pitches, 1
         )
         pitch_surface, up, roll = self._tilt(pitch_logits, azimuth, weight, total)
         # Elevation ahead grows by a turn about -y, elevation to the left by one about x.
@@ -111,17 +113,17 @@ class OccupancyMatcher(nn.Module):
         return OccupancyMatch(twist, variance, profiles)
 
     def _profile(
-        self, kernel: Tensor, lidar_angle: Tensor, radar_angle: Tensor, shifts: Tensor, width: Tensor
+        self, kernel: Tensor, lidar_angle: Tensor, radar_angle: Tensor, shifts: Tensor, axis: int
     ) -> Tensor:
         """B M S: log-likelihood of each detection at each shift of one angle.
 
         The density is tabulated over absolute angles once (a matrix product) and looked up per detection.
         """
-        step = shifts[1] - shifts[0]
-        lowest = -1.2  # [rad]: 69 deg to the side, beyond any pair of fields of view that overlap ahead
-        bins = int(round(2.4 / float(step)))
+        step = float(np.radians((_YAW_STEP_DEG, _PITCH_STEP_DEG)[axis]))
+        bins = round(2 * _FIELD_DEG[axis] / (_YAW_STEP_DEG, _PITCH_STEP_DEG)[axis])
+        lowest = -bins / 2 * step
         centres = lowest + step * torch.arange(bins + 1, device=kernel.device)
-        table = kernel @ _kernel(centres - lidar_angle[..., None], width)
+        table = kernel @ _kernel(centres - lidar_angle[..., None], torch.exp(self.log_width[axis]))
         at = ((radar_angle[..., None] + shifts - lowest) / step).clamp(0, bins - 1e-3)
         low = torch.floor(at)
         part = at - low
@@ -143,7 +145,7 @@ class OccupancyMatcher(nn.Module):
         )
         sectors = (member @ logits) / total[..., None]
         side = (member @ torch.sin(azimuth)[..., None])[..., 0] / member.sum(-1).clamp(min=1e-3)
-        step = self.pitches[1] - self.pitches[0]
+        step = float(np.radians(_PITCH_STEP_DEG))
         place = torch.arange(len(self.pitches), device=logits.device, dtype=logits.dtype)
         at = place + (self.rolls[None, :, None] * side[:, None, :] / step)[..., None]
         blend = (1 - (at.clamp(0, len(self.pitches) - 1)[..., None] - place).abs()).clamp(min=0)
@@ -159,31 +161,28 @@ class OccupancyMatcher(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """One step of damped least squares towards the softly associated lidar points."""
         radar = _spherical(radar_lidar)
-        gap = lidar[:, None] - radar[:, :, None]
-        scale = torch.stack(
-            [
-                width[0] * torch.ones_like(tall),
-                width[1] / tall.clamp(min=1e-3),
-                width[2] * torch.ones_like(tall),
-            ],
-            -1,
+        away = [lidar[:, None, :, axis] - radar[:, :, None, axis] for axis in range(3)]
+        near = (
+            (away[0] / width[0]) ** 2
+            + (away[1] / width[1]) ** 2 * tall[..., None]
+            + (away[2] / width[2]) ** 2
         )
-        kernel = torch.exp(-((gap / scale[:, :, None]) ** 2).sum(-1) / 2) * density[:, None]
+        kernel = torch.exp(-near / 2) * density[:, None]
         mass = kernel.sum(-1)
-        mean = (kernel[..., None] * gap).sum(2) / mass.clamp(min=1e-6)[..., None]
+        # The mean gap is the mean place less the own one: a product, not another array of all pairs.
+        mean = (kernel @ lidar) / mass.clamp(min=1e-6)[..., None] - radar
+        mean = mean * (mass > 1e-6)[..., None].to(mean.dtype)
         inlier = mass / (mass + torch.exp(self.log_floor)) * weight
-        precision = torch.exp(-2 * self.log_noise) * torch.cat(
-            [torch.ones_like(tall), tall, torch.ones_like(tall)], -1
-        )
+        one = torch.ones_like(tall)
+        precision = torch.exp(-2 * self.log_noise) * torch.cat([one, tall, one], -1)
         distance = radar[..., 2].clamp(min=0.5)
         J = spherical_jacobian(radar_lidar / distance[..., None], distance)
         information = inlier[..., None] * precision[:, None]
-        H = torch.einsum("bnij,bni,bnik->bjk", J, information, J) + torch.diag(
-            torch.exp(-2 * self.log_prior_sigma)
-        )
+        H = torch.einsum("bnij,bni,bnik->bjk", J, information, J)
+        H = H + torch.eye(6, device=J.device) * torch.exp(-2 * self.log_prior_sigma)
         covariance = inverse_spd(H)
         step = (covariance @ torch.einsum("bnij,bni->bj", J, information * mean)[..., None])[..., 0]
-        return step, torch.diagonal(covariance, dim1=1, dim2=2)
+        return step, (covariance * torch.eye(6, device=J.device)).sum(-1)
 
 
 def _kernel(difference: Tensor, width: Tensor) -> Tensor:
@@ -196,3 +195,9 @@ def _spherical(points: Tensor) -> Tensor:
     ahead = x.clamp(min=0.1)
     flat = torch.sqrt(ahead * ahead + y * y)
     return torch.stack([torch.atan(y / ahead), torch.atan(z / flat), torch.sqrt(flat * flat + z * z)], -1)
+
+
+def _steps(step_deg: float) -> Tensor:
+    """Shifts to both sides [rad]."""
+    reach = round(_REACH_DEG / step_deg)
+    return torch.arange(-reach, reach + 1) * float(np.radians(step_deg))

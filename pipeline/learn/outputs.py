@@ -10,9 +10,8 @@ from torch import Tensor, nn
 
 from pipeline.objective.differentiable.poses import exp_so3, pose, pose_of_euler_angles
 
-__all__ = ["PAIRS", "CoreOutputs", "Heads", "Predictions", "pose_of_twist"]
+__all__ = ["CoreOutputs", "Heads", "Predictions", "pose_of_twist"]
 
-PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
 _ANGLE_UNIT_RAD, _SHIFT_UNIT_M = 0.0175, 0.05  # heads put out numbers of the order of one
 # Doubt of an untrained network: 0.3 deg and 5 cm.
 _LOG_VARIANCE = (-10.5, -10.5, -10.5, -6.0, -6.0, -6.0)
@@ -61,8 +60,8 @@ class Heads(nn.Module):
             nn.init.normal_(layer.weight, std=std)
             nn.init.zeros_(layer.bias)
         unit = [_ANGLE_UNIT_RAD] * 3 + [_SHIFT_UNIT_M] * 3
-        self.register_buffer("unit", torch.tensor(unit), False)
-        self.register_buffer("start", torch.tensor(_LOG_VARIANCE), False)
+        self.register_buffer("unit", torch.tensor(unit), persistent=False)
+        self.register_buffer("start", torch.tensor(_LOG_VARIANCE), persistent=False)
 
     def forward(
         self, features: Float[Tensor, "B F"]

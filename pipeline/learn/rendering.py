@@ -1,26 +1,20 @@
-"""Lidar and radar points on the camera's grid, seen through a guess: torch for training, numba for inference.
+"""Lidar and radar points on the camera's grid, seen through a guess: for training; inference has compiled_rendering.
 
 Per cell the nearest point wins. Both versions decide by the same integer key, so they agree wherever the cell of a
-point is the same, which float32 and float64 leave open only for points within 1e-5 cells of a border.
+point is the same; rounding leaves that open only for points within 1e-5 cells of a border.
 """
 
 from __future__ import annotations
 
-from typing import no_type_check
-
-import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int32, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from pipeline.learn.grid import Grid
+from pipeline.learn.layout import INDEX_BITS, MILLIMETRES, NEAR_M
 
-__all__ = ["grid_cells", "nearest_points", "nearest_points_numba", "paint", "sphere"]
-
-_NEAR_M = 0.5
-_MM = 1000.0  # ranges are compared in millimetres
-_INDEX_BITS = 20  # up to a million points share a key with their range
+__all__ = ["grid_cells", "nearest_points", "paint", "sphere"]
 
 
 def sphere(points_camera: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3"]:
@@ -52,15 +46,15 @@ def nearest_points(
     height, width = grid.height, grid.width
     angles = sphere(points_camera)
     row, column = grid_cells(angles, grid)
-    inside = valid & (points_camera[..., 2] > _NEAR_M) & (row >= 0) & (column >= 0)
+    inside = valid & (points_camera[..., 2] > NEAR_M) & (row >= 0) & (column >= 0)
     inside = inside & (row < height) & (column < width)
     cell = torch.where(inside, row.long() * width + column.long(), height * width)
     number = torch.arange(points_camera.shape[1], device=cell.device)
-    key = ((angles[..., 2] * _MM).long() << _INDEX_BITS) | number
+    key = ((angles[..., 2] * MILLIMETRES).long() << INDEX_BITS) | number
     empty = torch.iinfo(torch.int64).max
     cells = torch.full((len(cell), height * width + 1), empty, dtype=torch.int64, device=points_camera.device)
     nearest = cells.scatter_reduce(1, cell, key, "amin")[:, :-1]
-    return torch.where(nearest == empty, -1, nearest & ((1 << _INDEX_BITS) - 1))
+    return torch.where(nearest == empty, -1, nearest & ((1 << INDEX_BITS) - 1))
 
 
 def paint(
@@ -70,35 +64,3 @@ def paint(
     picked = values.gather(1, index.clamp(min=0)[..., None].expand(-1, -1, values.shape[-1]))
     painted = picked * (index >= 0)[..., None].to(values.dtype)
     return painted.transpose(1, 2).reshape(len(values), values.shape[-1], grid.height, grid.width)
-
-
-def nearest_points_numba(
-    points_camera: Float[np.ndarray, "N 3"], valid: Bool[np.ndarray, " N"], grid: Grid
-) -> Int32[np.ndarray, " HW"]:
-    """As `nearest_points` for one frame, without torch."""
-    out = np.full(grid.height * grid.width, -1, np.int32)
-    limits = np.radians([grid.top_deg, grid.left_deg, grid.cell_deg]).astype(np.float32)
-    points = np.ascontiguousarray(points_camera, dtype=np.float32)
-    _nearest(points, np.ascontiguousarray(valid), limits, grid.height, grid.width, out)
-    return out
-
-
-@no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, nogil=True)
-def _nearest(points, valid, limits, height, width, out):  # noqa: ANN001, ANN202 - compiled
-    best = np.full(height * width, np.iinfo(np.int64).max, np.int64)
-    for n in range(len(points)):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        if not valid[n] or z <= _NEAR_M:
-            continue
-        flat = np.sqrt(x * x + z * z)
-        row = (limits[0] - np.arctan(-y / flat)) / limits[2]
-        column = (limits[1] - np.arctan(-x / z)) / limits[2]
-        if row < 0 or column < 0 or row >= height or column >= width:
-            continue
-        cell = np.int64(row) * width + np.int64(column)
-        millimetres = np.int64(np.sqrt(flat * flat + y * y) * np.float32(_MM))
-        key = (millimetres << _INDEX_BITS) | n
-        if key < best[cell]:
-            best[cell] = key
-            out[cell] = n

@@ -10,27 +10,24 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from pipeline.learn.grid import Grid
-from pipeline.learn.inputs import LIDAR_FEATURES, RADAR_FEATURES, NetworkInputs
+from pipeline.learn.inputs import NetworkInputs
+from pipeline.learn.layout import (
+    EDGE_BONUS,
+    GROUND_WEIGHT,
+    LIDAR_FEATURES,
+    MARGIN_DEG,
+    MATCHED_POINTS,
+    NEAR_M,
+    NEARNESS_M,
+    OBJECT_BONUS,
+    OBJECT_POINTS,
+)
 from pipeline.learn.rendering import nearest_points, paint
 from pipeline.objective.differentiable.poses import transform_points
 
-__all__ = [
-    "LIDAR_CHANNELS",
-    "MATCHED_POINTS",
-    "OBJECT_POINTS",
-    "RADAR_CHANNELS",
-    "RenderedView",
-    "importance",
-    "render",
-]
+__all__ = ["RenderedView", "render"]
 
-LIDAR_CHANNELS = 2 + len(LIDAR_FEATURES)  # occupied, nearness, features
-RADAR_CHANNELS = 2 + len(RADAR_FEATURES)
-MATCHED_POINTS = 1536  # lidar points whose classes are matched with the camera's
-OBJECT_POINTS = 1024  # lidar points off the ground that radar detections are matched with
-_NEARNESS_M = 8.0
-_GROUND_WEIGHT = 0.3  # ground is most of the points and its classes are the least sharp
-_MARGIN_RAD = float(np.radians(8.0))  # beyond the grid's border, for guesses that are wrong
+_MARGIN = float(np.radians(MARGIN_DEG))
 _EDGE, _GROUND = LIDAR_FEATURES.index("edge"), LIDAR_FEATURES.index("ground")
 
 
@@ -61,10 +58,10 @@ def render(inputs: NetworkInputs, grid: Grid) -> tuple[RenderedView, Int64[Tenso
     radar_index = nearest_points(radar_camera, sensors.radar_valid, grid)
     edge, ground = sensors.lidar_features[..., _EDGE], sensors.lidar_features[..., _GROUND]
     in_view = sensors.lidar_valid & _in_view(lidar_camera, grid)
-    rank = importance(lidar_camera.shape[1], edge.device)
-    matched = _best(rank + edge + 0.5 * (1 - ground), in_view, MATCHED_POINTS)
-    solid = _best(rank + 0 * ground, in_view & (ground < 0.5), OBJECT_POINTS)
-    weight = torch.where(ground > 0.5, _GROUND_WEIGHT, 1.0) * in_view
+    rank = _importance(lidar_camera.shape[1], edge.device)
+    matched = _best(rank + EDGE_BONUS * edge + OBJECT_BONUS * (1 - ground), in_view, MATCHED_POINTS)
+    solid = _best(rank.expand_as(ground), in_view & (ground < 0.5), OBJECT_POINTS)
+    weight = torch.where(ground > 0.5, GROUND_WEIGHT, 1.0) * in_view
     view = RenderedView(
         sensors.camera,
         paint(index, _channels(lidar_camera, sensors.lidar_features), grid),
@@ -82,15 +79,15 @@ def render(inputs: NetworkInputs, grid: Grid) -> tuple[RenderedView, Int64[Tenso
     return view, index
 
 
-def importance(count: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:
+def _importance(count: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:
     """A fixed irregular number in 0..1 per row: picks points evenly, and the same ones on every machine."""
     number = torch.arange(count, device=device, dtype=torch.int64)
     return ((number * 2654435761) % 65536).float() / 65536  # Knuth's multiplicative hash
 
 
 def _channels(points_camera: Tensor, features: Tensor) -> Tensor:
-    distance = points_camera.norm(dim=-1, keepdim=True).clamp(min=0.5)
-    nearness = (_NEARNESS_M / distance).clamp(max=2.0)
+    distance = points_camera.norm(dim=-1, keepdim=True).clamp(min=NEAR_M)
+    nearness = (NEARNESS_M / distance).clamp(max=2.0)
     return torch.cat([torch.ones_like(distance), nearness, features], -1)
 
 
@@ -98,12 +95,11 @@ def _in_view(points_camera: Tensor, grid: Grid) -> Tensor:
     """True inside the grid and a margin; a plain angular box, by tangents."""
     x, y, z = points_camera.unbind(-1)
     flat = torch.sqrt(x * x + z * z)
-    side = float(np.tan(np.radians(grid.left_deg) + _MARGIN_RAD))
+    side = float(np.tan(np.radians(grid.left_deg) + _MARGIN))
     up, down = (
-        float(np.tan(np.radians(e) + m))
-        for e, m in ((grid.top_deg, _MARGIN_RAD), (grid.bottom_deg, -_MARGIN_RAD))
+        float(np.tan(np.radians(e) + m)) for e, m in ((grid.top_deg, _MARGIN), (grid.bottom_deg, -_MARGIN))
     )
-    return (z > 0.5) & (x.abs() < side * z) & (-y < up * flat) & (-y > down * flat)
+    return (z > NEAR_M) & (x.abs() < side * z) & (-y < up * flat) & (-y > down * flat)
 
 
 def _best(score: Tensor, allowed: Tensor, count: int) -> Tensor:
