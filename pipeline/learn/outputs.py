@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
+from pipeline.learn.layout import PAIRS
 from pipeline.objective.differentiable.poses import exp_so3, pose, pose_of_euler_angles
 
-__all__ = ["CoreOutputs", "Heads", "Predictions", "pose_of_twist"]
+__all__ = ["PAIRS", "CoreOutputs", "Heads", "Predictions", "pose_of_twist"]
 
 _ANGLE_UNIT_RAD, _SHIFT_UNIT_M = 0.0175, 0.05  # heads put out numbers of the order of one
 # Doubt of an untrained network: 0.3 deg and 5 cm.
