@@ -34,7 +34,6 @@ class CameraFeatures:
     """Columns of table `training` that labels give, as maps of the grid."""
 
     grid_class: UInt8[np.ndarray, "H W"]
-    grid_seen: UInt8[np.ndarray, "H W"]
     class_distance: UInt8[np.ndarray, "6 H W"]
     edge_offset: Int8[np.ndarray, "4 H W"]
     sky_depth: UInt8[np.ndarray, "H W"]
@@ -52,13 +51,11 @@ def camera_features(labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid
     per_cell = round(grid.cell_deg / FINE_DEG)
     classes = CLASS_OF_LABEL[fine.labels]
     distance = np.stack([_group_distance(classes, names, per_cell) for names in DISTANCE_GROUPS.values()])
-    seen = fine.seen.reshape(grid.height, per_cell, grid.width, per_cell).all(axis=(1, 3))
     return CameraFeatures(
         _majority(classes, per_cell, len(GRID_CLASSES)),
-        seen.astype(np.uint8),
         distance,
         _edge_offsets(fine.labels, per_cell),
-        np.asarray(_sky_depth(classes, fine.seen, per_cell) * seen, np.uint8),
+        _sky_depth(classes, fine.seen, per_cell),
     )
 
 
@@ -105,8 +102,11 @@ def _sky_depth(classes: np.ndarray, seen: np.ndarray, per_cell: int) -> np.ndarr
     inside = ((classes == GRID_CLASSES.index("sky")) | ~seen).astype(np.uint8)
     if inside.all():
         height, width = classes.shape
-        return np.full((height // per_cell, width // per_cell), _FARTHEST, np.uint8)
-    return _at_centres(_distance(inside), per_cell)
+        depth = np.full((height // per_cell, width // per_cell), _FARTHEST, np.uint8)
+    else:
+        depth = _at_centres(_distance(inside), per_cell)
+    shown = seen.reshape(depth.shape[0], per_cell, depth.shape[1], per_cell).all(axis=(1, 3))
+    return np.asarray(depth * shown, np.uint8)
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -22,9 +22,17 @@ from pipeline.objective.problem import Prior
 from pipeline.objective.semantics import labels_of
 from schemas.frames import Frame
 from schemas.observations import Observation
-from schemas.training import GRID_CLASSES, TrainingRow
+from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, TrainingRow
 
-__all__ = ["About", "SampleReason", "SampleRejectedError", "decode_small", "fingerprint", "make_row"]
+__all__ = [
+    "About",
+    "SampleReason",
+    "SampleRejectedError",
+    "decode_small",
+    "fingerprint",
+    "make_row",
+    "sensor_row",
+]
 
 _DETECTIONS = 24
 _MARGIN_RAD = np.radians(6.0)  # beyond the grid: what a guess wrong by so much still brings into view
@@ -78,20 +86,46 @@ def make_row(
     Raises:
         SampleRejectedError: the frame shows too little.
     """
+    sensors = sensor_row(frame, observation, prior, about, config)
+    grid = stored_grid(config.grid_shape, config.grid_step_deg)
+    camera = camera_of(observation)
+    features = camera_features(labels_of(observation), camera, grid)
+    return replace(
+        sensors,
+        grid_class=features.grid_class.ravel(),
+        class_distance=features.class_distance.reshape(len(features.class_distance), -1),
+        edge_offset=features.edge_offset.reshape(4, -1),
+        sky_depth=features.sky_depth.ravel(),
+        **_detection_columns(observation, camera),
+    )
+
+
+def sensor_row(
+    frame: Frame, observation: Observation, prior: Prior, about: About, config: PrepareConfig
+) -> TrainingRow:
+    """A row whose columns from the camera's semantics are all 0: what a network needs to be asked, not taught.
+
+    Args:
+        frame: image and sweep.
+        observation: what geometry alone says of lidar and radar: ground, clusters, motion.
+        prior: decides which lidar points are in view, and is the row's reference.
+        about: whose frame it is.
+        config: the grid and the counts.
+
+    Raises:
+        SampleRejectedError: the frame shows too little.
+    """
     # One generator per frame: the row does not depend on which frames came before.
     rng = np.random.default_rng([frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index, config.seed])
     height, width = config.grid_shape
     grid = stored_grid((height, width), config.grid_step_deg)
-    camera = camera_of(observation)
-    image = decode_small(frame, config.grid_step_deg)
-    small, _ = resample_camera(image, camera, grid)
-    features = camera_features(labels_of(observation), camera, grid)
-    if features.grid_seen.mean() < _MIN_SEEN:
+    small, seen = resample_camera(decode_small(frame, config.grid_step_deg), camera_of(observation), grid)
+    if seen.mean() < _MIN_SEEN:
         raise SampleRejectedError(SampleReason.NARROW_VIEW)
-    view = _view(prior, grid)
-    lidar = lidar_columns(frame, observation, view, config, rng)
+    lidar = lidar_columns(frame, observation, _view(prior, grid), config, rng)
     if lidar["lidar_count"] < _MIN_POINTS:
         raise SampleRejectedError(SampleReason.FEW_LIDAR_POINTS)
+    cells = height * width
     return TrainingRow(
         frame_index=frame.frame_index,
         **about.__dict__,
@@ -102,12 +136,15 @@ def make_row(
         grid_height=height,
         grid_width=width,
         image=small[..., ::-1].transpose(2, 0, 1).reshape(3, -1),  # OpenCV decodes blue first
-        grid_class=features.grid_class.ravel(),
-        grid_seen=features.grid_seen.ravel(),
-        class_distance=features.class_distance.reshape(len(features.class_distance), -1),
-        edge_offset=features.edge_offset.reshape(4, -1),
-        sky_depth=features.sky_depth.ravel(),
-        **_detection_columns(observation, camera),
+        grid_seen=seen.ravel(),
+        grid_class=np.zeros(cells, np.uint8),
+        class_distance=np.zeros((len(DISTANCE_GROUPS), cells), np.uint8),
+        edge_offset=np.zeros((4, cells), np.int8),
+        sky_depth=np.zeros(cells, np.uint8),
+        detection_box_rad=np.zeros((_DETECTIONS, 4), np.float32),
+        detection_class=np.zeros(_DETECTIONS, np.uint8),
+        detection_score=np.zeros(_DETECTIONS, np.float32),
+        detection_count=0,
         **lidar,
         **radar_columns(observation, rng),
         **_reference_columns(observation, prior),

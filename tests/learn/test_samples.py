@@ -12,8 +12,8 @@ from pipeline.geometry.se3 import transform_points
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.learn.camera_maps import camera_features, stored_grid
 from pipeline.learn.clouds import range_edges
-from pipeline.learn.grid import grid_rays
-from pipeline.learn.samples import About, SampleReason, SampleRejectedError, fingerprint, make_row
+from pipeline.learn.grid import grid_rays, resample_camera
+from pipeline.learn.samples import About, SampleReason, SampleRejectedError, fingerprint, make_row, sensor_row
 from pipeline.objective.problem import Prior
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, POINT_IS_EDGE, POINT_IS_GROUND
@@ -85,7 +85,7 @@ def test_cells_have_the_class_of_most_of_them_and_none_outside_the_image():
     labels = labels_by_angle(lambda _, e: np.where(e > 1.1, BUILDING, ROAD))
     found = camera_features(labels, FTHETA, grid)
     azimuth, elevation = angles(grid)
-    inside = found.grid_seen == 1
+    inside = resample_camera(np.zeros((*labels.shape, 3), np.uint8), FTHETA, grid)[1] == 1
     expected = np.where(elevation > 1.1, GRID_CLASSES.index("building"), GRID_CLASSES.index("road"))
     clear = inside & (np.abs(elevation - 1.1) > 0.2)
     assert (found.grid_class == expected)[clear].all()
@@ -163,6 +163,19 @@ def test_no_semantics_of_the_camera_reach_the_lidar_points_of_the_input():
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
     flags = a.lidar_flags[: a.lidar_count]
     assert set(np.unique(flags & POINT_IS_GROUND)) == {0, POINT_IS_GROUND}
+
+
+def test_a_network_is_asked_with_the_same_numbers_that_it_was_taught_with():
+    frame, observation = scene()
+    taught = row_of(frame, observation)
+    config = training_lakes.fleet_of(["v"]).prepare
+    asked = sensor_row(frame, observation, PRIOR, ABOUT, config)
+    semantic = {"grid_class", "class_distance", "edge_offset", "sky_depth"}
+    for name in taught.__dataclass_fields__:
+        same = np.array_equal(getattr(asked, name), getattr(taught, name))
+        assert same is not (name in semantic or name.startswith("detection_")), name
+        if not same:
+            assert not np.any(getattr(asked, name)), name
 
 
 def test_range_edges_are_the_near_ends_of_jumps():
