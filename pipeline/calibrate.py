@@ -19,7 +19,7 @@ from pipeline.prior import perturbed, prior_key, read_prior
 from pipeline.results import Progress, StageResult, silent
 from pipeline.solve.alignment import alignment_of
 from pipeline.solve.curvature import blocks_of
-from pipeline.solve.methods import COMPOSED, PAPER_METHODS, solver_of
+from pipeline.solve.methods import COMPOSED, PAPER_METHODS, UNTHINNED, solver_of
 from pipeline.solve.select import Selection, select_frames
 from pipeline.solve.trigger import exceeded, trigger_metrics
 from pipeline.store.partitions import Lake, Partition, work_key
@@ -110,7 +110,10 @@ def calibrate_observations(
         SolveError: the day cannot be calibrated.
     """
     progress(0, 4, "select frames")
-    selection = select_frames(observations, fleet.select, paper=about.method in PAPER_METHODS)
+    select = fleet.select
+    if about.method in UNTHINNED:
+        select = select.model_copy(update={"frames": max(len(observations), 1)})
+    selection = select_frames(observations, select, paper=about.method in PAPER_METHODS)
     frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in PAIRS}
     sample = _spread(observations, selection)
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in PAIRS})

@@ -2,7 +2,8 @@
 
 Range and range rate over ground do not depend on how a sensor is turned; nor does the course of the bearing, up to a
 constant. The constant itself, the mean difference of the bearings, may be as large as the prior is uncertain. All are
-compared over the frames that both tracks share, and tracks are paired one to one.
+compared over the frames that both tracks share. No sighting belongs to two pairs; but a track may continue another
+sensor's track after that one broke off, so one track may have several partners, one after the other.
 
 Source: Persic et al. 2021, "calibration-agnostic track to track association"; the measure is our reading of it.
 """
@@ -14,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.optimize import linear_sum_assignment
 
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import to_spherical, wrap_angle
@@ -64,7 +64,7 @@ def associate(
     *,
     elevation: bool = True,
 ) -> Association:
-    """Pair tracks one to one so that the sum of scores is largest; pairs outside the gates are not made.
+    """Pair tracks, best scores first, none with a sighting that a better pair has; nothing outside the gates.
 
     Args:
         shared: what reference and other sensor saw in the same frames, level axes.
@@ -74,14 +74,9 @@ def associate(
     """
     if not len(shared.first):
         return Association(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-    score = np.zeros((shared.reference.max() + 1, shared.other.max() + 1))
-    found = _scores(shared, T_other_reference, rotation_sigma_rad, elevation=elevation)
-    score[shared.reference, shared.other] = found
-    rows, columns = linear_sum_assignment(score, maximize=True)
-    kept = score[rows, columns] > 0
-    return Association(
-        rows[kept].astype(np.int64), columns[kept].astype(np.int64), score[rows, columns][kept]
-    )
+    score = _scores(shared, T_other_reference, rotation_sigma_rad, elevation=elevation)
+    kept = _without_conflict(shared, score)
+    return Association(shared.reference[kept], shared.other[kept], score[kept])
 
 
 def shared_sightings(reference: Sequence[Track], other: Sequence[Track]) -> Shared:
@@ -118,6 +113,25 @@ def shared_rows(a: Track, b: Track) -> tuple[Int64[np.ndarray, " S"], Int64[np.n
 def bearing_sigma_rad(range_m: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     """How far apart two sensors' bearings of one object may lie: half a metre on it, and half a degree."""
     return np.hypot(_ANGLE_SIGMA_RAD, _CENTRE_SIGMA_M / np.maximum(range_m, 1.0))
+
+
+def _without_conflict(shared: Shared, score: Float[np.ndarray, " P"]) -> Int64[np.ndarray, " K"]:
+    """The best pairs first; another pair with a track of theirs only where it claims none of its sightings again."""
+    taken: set[tuple[int, int, int]] = set()
+    kept = []
+    for k in np.argsort(-score, kind="stable"):
+        if score[k] <= 0:
+            break
+        rows = slice(shared.first[k], shared.first[k] + shared.count[k])
+        claims = {
+            (side, int(track), int(f))
+            for side, track in enumerate((shared.reference[k], shared.other[k]))
+            for f in shared.of_reference.frame[rows]
+        }
+        if taken.isdisjoint(claims):
+            taken |= claims
+            kept.append(int(k))
+    return np.array(sorted(kept), np.int64)
 
 
 def _scores(

@@ -13,7 +13,7 @@ from pipeline.results import Progress
 from schemas.calibrations import METHODS
 from schemas.observations import Observation
 
-__all__ = ["COMPOSED", "METHOD", "PAPER_METHODS", "Solver", "solver_of"]
+__all__ = ["COMPOSED", "METHOD", "PAPER_METHODS", "UNTHINNED", "Solver", "solver_of"]
 
 METHOD: dict[str, str] = {
     "joint": "pipeline.solve.joint:solve_joint",
@@ -28,6 +28,10 @@ COMPOSED: dict[str, tuple[str, ...]] = {
 }
 # Methods that take the paper's frame conditions and judge by the paper's losses.
 PAPER_METHODS = ("pairwise-optimisation", "joint-optimisation")
+
+
+# Methods that follow objects from frame to frame: they take all frames that are not held out.
+UNTHINNED = ("tracking",)
 
 
 @runtime_checkable

@@ -1,8 +1,9 @@
-"""Moving objects as radar, lidar and camera see them: tracks in each sensor's own level axes.
+"""Road users as radar, lidar and camera see them: tracks in each sensor's own level axes.
 
-Radar: the tracked moving clusters of perception. Lidar: object clusters no larger than a lorry, followed here,
-kept where they move over ground. Camera: boxes of road users, their range by the usual height of their class, as
-a monocular 3D detector would guess it (about 20 %); whether they move only the other sensors tell.
+Radar: the tracked moving clusters of perception. Lidar: clusters of a road user's size and height above the
+ground, followed here; against the radar only those that move over ground. Camera: boxes of road users, their range
+by the usual height of their class, as a monocular 3D detector would guess it (about 20 %); parked ones are boxes too,
+and pass by the sensors like any other.
 
 Source: Persic et al. 2021, whose lidar and camera detections come from 3D networks; clusters and sized boxes
 stand for these here.
@@ -13,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 from scipy.spatial import cKDTree
 
 from pipeline.geometry.cameras import Camera
@@ -22,7 +23,16 @@ from pipeline.objective.problem import Prior
 from pipeline.solve.tracks import Motion, Scan, Track, follow, take_sightings
 from schemas.observations import Observation
 
-__all__ = ["box_centres", "camera_tracks", "lidar_tracks", "motions", "radar_tracks", "turn_between"]
+__all__ = [
+    "box_centres",
+    "camera_tracks",
+    "lidar_tracks",
+    "motions",
+    "moves_over_ground",
+    "passes_by",
+    "radar_tracks",
+    "turn_between",
+]
 
 _HEIGHT_M = {
     "person": 1.7,
@@ -38,8 +48,11 @@ _BOX_RANGE_FRACTION, _BOX_BEARING_SIGMA_RAD = 0.2, np.radians(0.5)
 _BORDER_PX = 6.0  # a box that ends at the image's border ends there by accident
 _LEAST_HEIGHT_M = 1.45  # no road user is lower: where beams are sparse, the topmost one hits below the top
 _LARGEST_M, _SMALLEST_M = 12.0, 0.3
+_LOWEST_M, _HIGHEST_M = 0.5, 4.2  # of a road user's top above the ground
+_STANDS_M = 0.8  # its underside is no higher: ground removal takes the lowest part
 _CLUSTER_SIGMA_M = 0.5  # which part of an object the beams meet changes from frame to frame
 _FAR_M = 80.0
+_LEAST_WAY_M = 2.0
 _LEAST_SPEED_MPS, _SPEED_SIGMAS = 2.0, 3.0
 _RADAR_AGE, _RADAR_POINTS = 2, 2
 _RADAR_RATE_SIGMA_MPS, _RADAR_RANGE_SIGMA_M = 0.6, 0.7
@@ -62,7 +75,7 @@ def motions(observations: Sequence[Observation], prior: Prior) -> list[Motion]:
         a, b = speeds[i - 1], speeds[i]
         turn = None
         if last is not None and last.drive == o.drive and 0 < dt < 2.5 and a is not None and b is not None:
-            turn = turn_between(_objects(last)[0], _objects(o)[0], 0.5 * (a + b) * dt, dt)
+            turn = turn_between(_objects(last), _objects(o), 0.5 * (a + b) * dt, dt)
         found.append(Motion(velocity) if turn is None else Motion(velocity, turn / dt, 0.02))
     return found
 
@@ -122,15 +135,28 @@ def radar_tracks(observations: Sequence[Observation]) -> list[Track]:
 
 
 def lidar_tracks(observations: Sequence[Observation], motion: Sequence[Motion]) -> list[Track]:
-    """Object clusters that move over ground. Sightings are those of the clusters' points' centres."""
-    scans = []
+    """Clusters that can be road users. Sightings are those of the clusters' points' centres."""
+    scans, kept = [], []
     for i, o in enumerate(observations):
-        centres = _objects(o)[0]
+        rows = _road_users(o)
+        kept.append(rows)
+        centres = o.lidar_cluster_centre_m[rows].astype(np.float64)
         covariance = np.tile(_CLUSTER_SIGMA_M**2 * np.eye(2), (len(centres), 1, 1))
         scans.append(Scan(i, o.drive, o.stamp_ns * 1e-9, motion[i], centres, covariance))
-    followed = [t for t in follow(scans) if _moves(t)]
-    kept = [_objects(o)[1] for o in observations]
-    return [_renumbered(t, kept) for t in followed]
+    return [_renumbered(t, kept) for t in follow(scans)]
+
+
+def moves_over_ground(track: Track) -> bool:
+    """Faster over ground than 2 m/s and than its sigma explains, over the later half of its sightings."""
+    later = take_sightings(track, np.arange(track.sightings // 2, track.sightings))
+    speed = np.median(np.linalg.norm(later.velocity_mps[:, :2], axis=1))
+    return bool(speed > max(_LEAST_SPEED_MPS, _SPEED_SIGMAS * float(np.median(later.rate_sigma_mps))))
+
+
+def passes_by(track: Track) -> bool:
+    """Seen in places more than 2 m apart: what stands before a standing car could be any other thing there."""
+    way_m = np.linalg.norm(track.position_m - track.position_m[0], axis=1)
+    return bool(way_m.max() > _LEAST_WAY_M)
 
 
 def camera_tracks(observations: Sequence[Observation], motion: Sequence[Motion]) -> list[Track]:
@@ -181,12 +207,27 @@ def _speed(o: Observation, prior: Prior) -> float | None:
     return float((prior.T_lidar_radar[:3, :3] @ o.radar_velocity_mps)[0])
 
 
-def _objects(o: Observation) -> tuple[np.ndarray, np.ndarray]:
-    """Centres of clusters that can be road users, and their rows."""
+def _objects(o: Observation) -> Float[np.ndarray, "K 3"]:
+    """Centres of all clusters no larger than a lorry."""
+    return o.lidar_cluster_centre_m[_no_larger_than_a_lorry(o)].astype(np.float64)
+
+
+def _no_larger_than_a_lorry(o: Observation) -> Bool[np.ndarray, " K"]:
     size = np.max(o.lidar_cluster_max_m[:, :2] - o.lidar_cluster_min_m[:, :2], axis=1, initial=0.0)
     near = np.linalg.norm(o.lidar_cluster_centre_m[:, :2], axis=1) < _FAR_M
-    rows = np.flatnonzero((size <= _LARGEST_M) & (size >= _SMALLEST_M) & near)
-    return o.lidar_cluster_centre_m[rows].astype(np.float64), rows
+    return np.asarray((size <= _LARGEST_M) & (size >= _SMALLEST_M) & near)
+
+
+def _road_users(o: Observation) -> Int64[np.ndarray, " K"]:
+    """Rows of the clusters that can be road users: of their size, standing on the ground where that is known."""
+    possible = _no_larger_than_a_lorry(o)
+    if o.ground_plane is not None:
+        n, d = o.ground_plane[:3], o.ground_plane[3]
+        x, y, _ = o.lidar_cluster_centre_m.astype(np.float64).T
+        ground = -(n[0] * x + n[1] * y + d) / n[2]
+        top, bottom = o.lidar_cluster_max_m[:, 2] - ground, o.lidar_cluster_min_m[:, 2] - ground
+        possible &= (bottom < _STANDS_M) & (top > _LOWEST_M) & (top < _HIGHEST_M)
+    return np.flatnonzero(possible).astype(np.int64)
 
 
 def _renumbered(track: Track, kept: Sequence[np.ndarray]) -> Track:
@@ -196,13 +237,6 @@ def _renumbered(track: Track, kept: Sequence[np.ndarray]) -> Track:
         track.drive, track.frame, rows, track.stamp_s, track.position_m, track.velocity_mps,
         track.rate_sigma_mps, track.range_sigma_m,
     )  # fmt: skip
-
-
-def _moves(track: Track) -> bool:
-    """Faster over ground than 2 m/s and than its sigma explains, over the later half of its sightings."""
-    later = take_sightings(track, np.arange(track.sightings // 2, track.sightings))
-    speed = np.median(np.linalg.norm(later.velocity_mps[:, :2], axis=1))
-    return bool(speed > max(_LEAST_SPEED_MPS, _SPEED_SIGMAS * float(np.median(later.rate_sigma_mps))))
 
 
 def _boxes(o: Observation) -> tuple[np.ndarray, np.ndarray]:

@@ -33,7 +33,15 @@ from pipeline.solve.association import (
 )
 from pipeline.solve.bearings import AlignedBearings, Bearings, align_bearings, consistency
 from pipeline.solve.covariance import posterior
-from pipeline.solve.object_tracks import box_centres, camera_tracks, lidar_tracks, motions, radar_tracks
+from pipeline.solve.object_tracks import (
+    box_centres,
+    camera_tracks,
+    lidar_tracks,
+    motions,
+    moves_over_ground,
+    passes_by,
+    radar_tracks,
+)
 from pipeline.solve.tracks import Track
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
@@ -166,15 +174,19 @@ def calibrate_pair(
 
 
 def _tracked(frames: Sequence[Observation], prior: Prior) -> dict[str, PairTracks]:
-    """Tracks of all three sensors: box centres for the camera, which sees boxes, points' centres for the radar."""
+    """Tracks of all three sensors: box centres for the camera, which sees boxes, points' centres for the radar.
+
+    The radar's tracks all move, so of the lidar's only those that move can be theirs; the camera sees parked cars too.
+    """
     motion = motions(frames, prior)
-    lidar = lidar_tracks(frames, motion)
+    lidar = [t for t in lidar_tracks(frames, motion) if passes_by(t)]
     boxes = [box_centres(t, frames) for t in lidar]
+    moving = [t for t in lidar if moves_over_ground(t)]
     elevation = any(o.radar_has_elevation for o in frames)
     return {
         "camera_lidar": PairTracks(lidar, camera_tracks(frames, motion), boxes, _CAMERA_LEVEL, False, True),
         "lidar_radar": PairTracks(
-            lidar, radar_tracks(frames), [t.position_m for t in lidar], np.eye(3), True, elevation
+            moving, radar_tracks(frames), [t.position_m for t in moving], np.eye(3), True, elevation
         ),
     }
 

@@ -12,7 +12,14 @@ from pipeline.objective.problem import Prior
 from pipeline.solve.association import associate, shared_sightings
 from pipeline.solve.bearings import Bearings, align_bearings, consistency
 from pipeline.solve.methods import solver_of
-from pipeline.solve.object_tracks import box_centres, lidar_tracks, motions, turn_between
+from pipeline.solve.object_tracks import (
+    box_centres,
+    lidar_tracks,
+    motions,
+    moves_over_ground,
+    passes_by,
+    turn_between,
+)
 from pipeline.solve.tracking import BIAS_FLOOR_RAD, PairTracks, calibrate_pair, solve_tracking
 from pipeline.solve.tracks import Motion, Scan, Track, follow
 from schemas.calibrations import PAIRS
@@ -143,6 +150,29 @@ def test_association_follows_the_motion_not_the_nearest_position():
         replace(lidar[0], position_m=lidar[0].position_m @ (R @ exp_so3(np.array([0, 0, 0.01]))).T),
     ]
     assert associate(shared_sightings(alike, radar), np.eye(4), np.radians(4.0)).reference.tolist() == [1]
+
+
+def test_a_track_that_broke_off_and_began_again_keeps_both_parts_and_no_sighting_counts_twice():
+    velocity = np.array([5.0, 0, 0])
+    path = np.array([30.0, 2, 0]) + velocity * STEP_S * np.arange(8)[:, None]
+    whole = [make_track(path, velocity)]
+    parts = [make_track(path[:4], velocity), make_track(path[4:], velocity, first_frame=4)]
+    twice = make_track(path[2:6] + [0.4, 0, 0], velocity, first_frame=2)  # a ghost of the same car
+    found = associate(shared_sightings(whole, [*parts, twice]), np.eye(4), np.radians(1))
+    assert sorted(found.other.tolist()) == [0, 1]
+
+
+def test_a_cluster_as_high_as_a_house_or_off_the_ground_is_no_road_user(day):
+    low, high = day[0].lidar_cluster_min_m.copy(), day[0].lidar_cluster_max_m.copy()
+    assert len(low) >= 3
+    low[:, 2], high[:, 2] = -1.5, -0.1
+    high[0, 2] = 4.0
+    low[1, 2], high[1, 2] = 0.0, 0.5
+    plane = np.array([0.0, 0.0, 1.0, 1.7])
+    first = replace(day[0], lidar_cluster_min_m=low, lidar_cluster_max_m=high, ground_plane=plane)
+    second = replace(first, stamp_ns=first.stamp_ns + 10**8)
+    tracks = lidar_tracks([first, second], [Motion((0.0, 0.0))] * 2)
+    assert {int(k) for t in tracks for k in t.detection} == set(range(2, len(low)))
 
 
 def test_tracks_that_contradict_each_other_are_not_paired():
@@ -322,7 +352,8 @@ def test_a_day_on_which_nothing_moves_is_refused_and_says_so():
     still = [replace(o, lidar_cluster_centre_m=day[0].lidar_cluster_centre_m,
                      lidar_cluster_min_m=day[0].lidar_cluster_min_m, lidar_cluster_max_m=day[0].lidar_cluster_max_m,
                      drive=0, ego_speed_mps=0.0, ego_yaw_rate_radps=0.0) for o in day]  # fmt: skip
-    assert lidar_tracks(still, motions(still, PRIOR)) == []
+    tracks = lidar_tracks(still, motions(still, PRIOR))
+    assert tracks and not any(passes_by(t) or moves_over_ground(t) for t in tracks)
     with pytest.raises(SolveError, match="no moving objects in the lidar"):
         solve(still, PRIOR)
 
