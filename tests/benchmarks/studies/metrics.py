@@ -90,7 +90,8 @@ def within(pair: str, measured: Mapping[str, Any], *, claimed: bool = False) -> 
     Args:
         pair: camera_lidar, camera_radar or lidar_radar.
         measured: what `measure` returned.
-        claimed: ask only of angles that the record calls determined by the day.
+        claimed: ask only of angles that the record vouches for (`diagnostics["vouched_az"]`, `vouched_el`); where it
+            does not say, of those whose axis it calls determined by the day.
     """
     return claimed_error_deg(pair, measured, claimed=claimed) <= LIMITS_DEG[pair]
 
