@@ -6,8 +6,8 @@ dynamic clusters; all need stamps within 5 ms. Where they leave fewer frames tha
 frames that come nearest to them fill up, and the selection says so: a narrow camera may never see 20 % of
 sky.
 
-Method `joint` does not need the paper's conditions; there they are only counted, and frames are chosen by
-content.
+Method `joint` does not need the paper's conditions; there they are only counted, and frames are chosen for what
+they add to the view that the others cover (image, azimuth, elevation, range).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 
 from pipeline.config import SelectConfig
 from pipeline.errors import SolveError
+from pipeline.solve.coverage import choose_for_information, contents_of, missing_in_view
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS
 from schemas.observations import Observation
 
@@ -29,12 +30,6 @@ MIN_FRAMES = 8  # fewer carry no calibration: 10 frames already scatter by 0.1 d
 _SCARCE, _BRISK_MPS = 0.1, 5.0
 _BLOCKS_S = (10.0, 7.0, 5.0, 4.0, 3.0, 20.0)
 _JUDGING_BLOCKS = 4
-# What makes a frame worth having, by pair.
-_CONTENT = {
-    "camera_lidar": ("lidar_edge_xyz_m", "marking_xyz_m", "lidar_cluster_centre_m"),
-    "camera_radar": ("radar_track_xyz_m", "road_user_boxes_px", "radar_xyz_m"),
-    "lidar_radar": ("radar_xyz_m", "lidar_cluster_centre_m", "radar_track_xyz_m"),
-}
 _GUARD_S = 1.0  # frames nearer in time than this show the same scene
 
 
@@ -75,12 +70,13 @@ def select_frames(
         usable = [i for i, r in enumerate(reasons) if "sync" not in r and "empty" not in r]
         candidates = [i for i in usable if held[i] is False]
         ideal = [i for i in candidates if not reasons[i]]
-        scores = _scores(observations, pair)
-        chosen = _choose(ideal if paper else candidates, scores, config.frames)
+        contents = contents_of(observations, pair)
+        chosen = choose_for_information(ideal if paper else candidates, contents, config.frames)
         if paper and len(chosen) < config.frames:
             rest = sorted(set(candidates) - set(chosen), key=lambda i: (len(reasons[i]), i))
             fewest = rest[: max(0, 2 * (config.frames - len(chosen)))]
-            chosen = sorted(chosen + _choose(sorted(fewest), scores, config.frames - len(chosen)))
+            chosen += choose_for_information(fewest, contents, config.frames - len(chosen))
+            chosen = sorted(chosen)
         if len(chosen) < MIN_FRAMES:
             raise SolveError(_too_few(pair, chosen, reasons))
         fit[pair] = chosen
@@ -132,7 +128,7 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
         and np.mean([len(o.road_user_boxes_px) > 0 for o in observations]) < _SCARCE
     ):
         missing.append("hardly any road users in the images")
-    return missing
+    return missing + missing_in_view(observations, pair)
 
 
 def hold_out(observations: Sequence[Observation], fraction: float) -> list[bool | None]:
@@ -172,21 +168,6 @@ def _near(stamps: np.ndarray, others: np.ndarray) -> np.ndarray:
     k = np.searchsorted(others, stamps)
     before, after = others[np.maximum(k - 1, 0)], others[np.minimum(k, len(others) - 1)]
     return np.minimum(np.abs(stamps - before), np.abs(stamps - after)) < _GUARD_S
-
-
-def _scores(observations: Sequence[Observation], pair: str) -> np.ndarray:
-    """How much a frame offers a pair: logarithms, for the hundredth edge says less than the first."""
-    return np.array(
-        [np.log1p([len(getattr(o, name)) for name in _CONTENT[pair]]).sum() for o in observations]
-    )
-
-
-def _choose(candidates: list[int], scores: np.ndarray, count: int) -> list[int]:
-    """The best frame of each of `count` equal stretches of the candidates: spread over the day, then by content."""
-    if len(candidates) <= count:
-        return sorted(candidates)
-    stretches = np.array_split(np.array(sorted(candidates)), count)
-    return [int(s[np.argmax(scores[s])]) for s in stretches]
 
 
 def _count_rejected(

@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.config import SelectConfig
 from pipeline.errors import SolveError
+from pipeline.solve.coverage import choose_for_information, contents_of
 from pipeline.solve.select import MIN_FRAMES, hold_out, missing_content, select_frames, unmet_conditions
 from schemas.calibrations import PAIRS
 from tests.solve_scenes import make_day
@@ -60,17 +61,36 @@ def test_a_short_day_still_holds_a_block_out():
     assert any(h is True for h in hold_out(make_day(12, per_drive=12), 0.2))
 
 
-def test_frames_are_spread_over_the_day_and_the_richest_of_each_stretch_is_taken(day):
-    rich = {
-        i: make_changed(o, lidar_edge_xyz_m=np.zeros((500, 3), np.float32))
+def edges_at(azimuth_deg, range_m, count=30):
+    angle = np.radians(np.full(count, azimuth_deg) + np.linspace(-2, 2, count))
+    return (range_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], -1)).astype(np.float32)
+
+
+def test_frames_are_spread_over_the_day_and_of_each_stretch_the_one_that_adds_most_is_taken(day):
+    """Every third frame shows what no other shows: it is taken, however many edges of the usual kind others have."""
+    usual = [make_changed(o, lidar_edge_xyz_m=edges_at(0, 15, 300)) for o in day]
+    rare = {
+        i: make_changed(o, lidar_edge_xyz_m=edges_at((-25, 25, 15)[i % 9 // 3], 8))
         for i, o in enumerate(day)
         if i % 3 == 1
     }
-    mixed = [rich.get(i, o) for i, o in enumerate(day)]
-    chosen = select_frames(mixed, SelectConfig(frames=15), paper=False).fit["camera_lidar"]
-    assert len(chosen) == 15
-    assert np.diff(chosen).max() < 15
-    assert np.mean([i in rich for i in chosen]) > 0.9
+    chosen = select_frames(
+        [rare.get(i, o) for i, o in enumerate(usual)], SelectConfig(frames=15), paper=False
+    )
+    picked = chosen.fit["camera_lidar"]
+    assert len(picked) == 15
+    assert np.diff(picked).max() < 15
+    assert np.mean([i in rare for i in picked]) > 0.6  # by chance a third
+    assert any(i not in rare for i in picked)  # and one of the usual kind
+
+
+def test_chosen_frames_cover_more_of_the_view_than_evenly_spaced_ones():
+    day = make_day(200, seed=4, per_drive=50)
+    contents = contents_of(day, "camera_lidar")
+    chosen = choose_for_information(range(len(day)), contents, 20)
+    covered, even = (np.log1p(contents[list(rows)].sum(axis=0)).sum() for rows in (chosen, range(0, 200, 10)))
+    assert covered > even
+    assert len(set(chosen)) == 20
 
 
 def test_the_same_day_gives_the_same_frames(day):
@@ -96,12 +116,33 @@ def test_where_the_paper_leaves_too_few_frames_the_nearest_fill_up_and_the_recor
 
 
 def test_what_the_drive_lacks_is_said_per_pair(day):
-    assert all(missing_content(day, pair) == [] for pair in PAIRS)
+    for pair in PAIRS:
+        assert not any("time offsets" in m or "road users in" in m for m in missing_content(day, pair))
     slow = [make_changed(o, ego_speed_mps=1.0, radar_has_elevation=False) for o in day]
     assert "time offsets" in missing_content(slow, "camera_lidar")[0]
     assert "no elevation" in missing_content(slow, "lidar_radar")[1]
     empty = [make_changed(o, radar_track_xyz_m=np.zeros((0, 3), np.float32)) for o in day]
-    assert missing_content(empty, "lidar_radar") == ["hardly any moving road users for the radar"]
+    assert "hardly any moving road users for the radar" in missing_content(empty, "lidar_radar")
+
+
+def test_parts_of_the_view_without_content_are_named(day):
+    right_and_near = [
+        make_changed(o, lidar_edge_xyz_m=np.concatenate([edges_at(-20, 15), edges_at(0, 8)])) for o in day
+    ]
+    assert "hardly any depth edges left of 15 deg or beyond 40 m" in missing_content(
+        right_and_near, "camera_lidar"
+    )
+    everywhere = [
+        make_changed(o, lidar_edge_xyz_m=np.concatenate([edges_at(a, r) for a in (-25, 25) for r in (8, 50)]))
+        for o in day
+    ]
+    assert not any("depth edges" in m for m in missing_content(everywhere, "camera_lidar"))
+    blank = [make_changed(o, marking_xyz_m=np.zeros((0, 3), np.float32)) for o in everywhere]
+    assert "no road markings" in missing_content(blank, "camera_lidar")
+    chosen = select_frames(right_and_near, CONFIG, paper=False)
+    assert chosen.missing["camera_lidar"] == missing_content(
+        [right_and_near[i] for i in chosen.fit["camera_lidar"]], "camera_lidar"
+    )
 
 
 def test_too_few_frames_are_an_error_that_names_the_pair_and_the_reasons():
