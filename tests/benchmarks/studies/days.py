@@ -138,7 +138,8 @@ def _both(first: int, count: int, **fields: object) -> list[DaySpec]:
 
 def _turned(first: int) -> list[DaySpec]:
     """A sensor that hangs 12 deg off in its bracket, twice the default search range."""
-    faults = [f"{sensor}:{axis}:12" for sensor in ("camera", "radar", "lidar") for axis in ("yaw", "pitch")]
+    faults = [f"camera:yaw:{sign}12" for sign in ("", "-")]
+    faults += [f"{sensor}:{axis}:12" for sensor in ("radar", "lidar") for axis in ("yaw", "pitch")]
     return [DaySpec(first + i, ("urban", "highway")[i % 2], fault=fault) for i, fault in enumerate(faults)]
 
 
@@ -157,7 +158,7 @@ SETS: dict[str, list[DaySpec]] = {
         DaySpec(136, "urban", fault="radar:time:0.08"),
         DaySpec(137, "highway", fault="radar:time:0.08"),
         DaySpec(138, "urban", fault="radar:yaw:12"),
-        DaySpec(139, "highway", fault="camera:pitch:12"),
+        DaySpec(139, "highway", fault="camera:yaw:12"),
     ],
     "table1": [DaySpec(200 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
     "coverage": _both(300, 100),

@@ -100,9 +100,11 @@ def claimed_error_deg(pair: str, measured: Mapping[str, Any], *, claimed: bool) 
     """The larger of azimuth and elevation error at the targets [deg]; 0 where nothing is claimed."""
     angles = [measured["az_deg"], measured["el_deg"]]
     if claimed:
-        angles = [
-            a for a, k in zip(angles, AZIMUTH_ELEVATION_DOF[pair], strict=True) if measured["observable"][k]
+        flags = [
+            measured.get("diagnostics", {}).get(f"vouched_{name}", measured["observable"][k])
+            for name, k in zip(("az", "el"), AZIMUTH_ELEVATION_DOF[pair], strict=True)
         ]
+        angles = [a for a, flag in zip(angles, flags, strict=True) if flag]
     return max(angles, default=0.0)
 
 
