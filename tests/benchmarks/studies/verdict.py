@@ -37,7 +37,7 @@ def main() -> None:
     args = parser.parse_args()
     good = SETS["dev" if args.tuning else "coverage"]
     bad = SETS["dev-bad" if args.tuning else "verdict"]
-    runs = [*(_simulated(day) for day in bad), *_derived(good, 4 if args.tuning else 15)]
+    runs = [*(_simulated(day) for day in bad), *_derived(good, 2 if args.tuning else 15)]
     known = args.coverage or args.out.with_name("dev_coverage.jsonl" if args.tuning else "coverage.jsonl")
     run_study(
         runs, args, lambda results: summary([*read_results(known), *results], args.out.with_suffix(".csv"))
