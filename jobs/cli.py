@@ -34,6 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "perceive": ("jobs.perceive:perceive", "Frames of one vehicle-day to the table observations."),
     "calibrate": ("jobs.calibrate:calibrate", "Observations of one vehicle-day to calibration records."),
     "prepare": ("jobs.prepare:prepare", "Frames and observations of many vehicle-days to training data."),
+    "train": ("jobs.train:train", "A network from training data, without any ground truth."),
     "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
     "report": ("jobs.report:report", "HTML pages of vehicle-days and of the fleet."),
     "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),

@@ -37,6 +37,7 @@ __all__ = [
     "folded_tensors",
     "lidar_radar_tensors",
     "padded",
+    "smooth_iou",
 ]
 
 
@@ -125,11 +126,11 @@ def smooth_iou(
     lidar_area_m2: Float[Tensor, " F"],
     radar_maps: Float[Tensor, "F ahead across"],
     radar_area_m2: Float[Tensor, " F"],
+    cell_m: float = lidar_radar.CELL_M,
 ) -> Float[Tensor, "*batch F"]:
-    """IoU of the lidar's drivable cells, in radar axes, with the radar's soft drivable map."""
-    cell = lidar_radar.CELL_M
-    row = drivable_radar[..., 0] / cell - 0.5
-    column = drivable_radar[..., 1] / cell - 0.5 + radar_maps.shape[2] // 2
+    """IoU of the lidar's drivable cells, in radar axes, with the radar's soft drivable map of cells `cell_m` wide."""
+    row = drivable_radar[..., 0] / cell_m - 0.5
+    column = drivable_radar[..., 1] / cell_m - 0.5 + radar_maps.shape[2] // 2
     uv = torch.stack([column, row], -1)
     share = masked_mean(bilinear(radar_maps, uv, torch.ones_like(row, dtype=torch.bool), 0.0), present)
     overlap = share * lidar_area_m2

@@ -19,6 +19,7 @@ from pipeline.objective.differentiable.edges import edge_residuals_px
 from pipeline.objective.differentiable.lookup import bilinear_groups, masked_mean, nearest_pixel
 from pipeline.objective.differentiable.poses import transform_points
 from pipeline.objective.differentiable.projection import GridProjection
+from pipeline.objective.registration import SIGMA_START
 
 __all__ = [
     "GridMaps",
@@ -30,11 +31,15 @@ __all__ = [
 ]
 
 DEG = 180.0 / torch.pi
-CLASS_SCALE_DEG = CLASS_SCALE_RAD * DEG  # the paper loss's robust scale
-_CLASS_TAU = 0.05  # of the soft choice of a cluster's class, in units of the robust cost
+CLASS_CLAMP_DEG = (
+    2 * CLASS_SCALE_RAD * DEG
+)  # the paper loss's robust scale: there its cost is four fifths of all
+_CLASS_TAU_DEG = 0.1  # of the soft choice of a cluster's class
 EDGE_CLAMP_DEG = 4.0  # evidence: convex to +-4 deg
 DETECTION_TAU_DEG, DETECTION_CLAMP_DEG = 0.5, 8.0
 CLUSTER_TAU_M, CLUSTER_CLAMP_M = 0.3, 5.0
+# Elevation counts by what a radar's is worth beside its azimuth; ground bounce biases it as well.
+_ELEVATION_WORTH = float(SIGMA_START[0] / SIGMA_START[1])
 DISTANCE_STEP_DEG, OFFSET_STEP_DEG = 0.1, 0.05  # of the stored maps
 
 
@@ -73,8 +78,8 @@ def cluster_class_cost(
 ) -> Float[Tensor, "*batch F"]:
     """Each lidar cluster lies on objects of ONE reflecting class, whichever suits it best at this pose [deg].
 
-    Twice as steep as the union of the classes where neighbours differ, and needs no semantics of the lidar. The robust
-    distance is the paper loss's, times its scale; a point out of view costs the scale, as far from any object.
+    Steeper than the union of the classes where neighbours differ, and needs no semantics of the lidar. A point out of
+    view costs as much as one far from any object.
 
     Args:
         maps: of the frames.
@@ -86,11 +91,9 @@ def cluster_class_cost(
     """
     uv, seen = maps.pixels(T_camera_lidar, points)
     distance = bilinear_groups(maps.class_distance, uv, seen) * DISTANCE_STEP_DEG
-    squared = distance.square()
-    cost = (
-        torch.where(seen[..., None], squared / (squared + CLASS_SCALE_DEG**2), torch.ones_like(squared))
-        * present.to(squared.dtype)[..., None]
-    )
+    far = torch.full_like(distance, CLASS_CLAMP_DEG)
+    cost = torch.where(seen[..., None], soft_clamp(distance, CLASS_CLAMP_DEG), far)
+    cost = cost * present.to(cost.dtype)[..., None]
     index = torch.where(cluster < 0, torch.full_like(cluster, clusters), cluster)
     batch = cost.shape[:-2]
     by_cluster = cost.new_zeros(*batch, clusters + 1, cost.shape[-1])
@@ -98,8 +101,8 @@ def cluster_class_cost(
     count = present.to(cost.dtype).new_zeros(len(points), clusters + 1)
     count = count.scatter_add(-1, index, present.to(cost.dtype))
     mean = by_cluster / count.clamp_min(1)[..., None]
-    best = soft_minimum(mean, _CLASS_TAU)
-    return CLASS_SCALE_DEG * (best * count).sum(-1) / count.sum(-1).clamp_min(1)
+    best = soft_minimum(mean, _CLASS_TAU_DEG)
+    return (best * count).sum(-1) / count.sum(-1).clamp_min(1)
 
 
 def edge_cost(
@@ -163,8 +166,8 @@ def track_detection_cost(
     azimuth, elevation = directions(p)
     da = (azimuth[..., :, None] - centres_rad[:, None, :, 0]) * DEG
     de = (elevation[..., :, None] - centres_rad[:, None, :, 1]) * DEG
-    de = torch.where(has_elevation[:, None, None], de, torch.zeros_like(de))
-    angle = safe_sqrt(da.square() + de.square())
+    worth = _ELEVATION_WORTH * has_elevation.to(de.dtype)[:, None, None]
+    angle = safe_sqrt(da.square() + (worth * de).square())
     return _nearest_cost(angle, track_present, centre_present, DETECTION_TAU_DEG, DETECTION_CLAMP_DEG)
 
 
@@ -181,7 +184,7 @@ def track_cluster_cost(
     In the plane where the radar measures no elevation.
     """
     delta = transform_points(T_lidar_radar, tracks)[..., :, None, :] - centres[:, None]
-    height = torch.where(has_elevation[:, None, None], delta[..., 2], torch.zeros_like(delta[..., 2]))
+    height = _ELEVATION_WORTH * has_elevation.to(delta.dtype)[:, None, None] * delta[..., 2]
     distance = safe_sqrt(delta[..., :2].square().sum(-1) + height.square())
     return _nearest_cost(distance, track_present, centre_present, CLUSTER_TAU_M, CLUSTER_CLAMP_M)
 

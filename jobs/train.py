@@ -1,0 +1,96 @@
+"""`boresight train`: a network from training data, without any ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+__all__ = ["parse_duration", "train"]
+
+_UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+def train(
+    *,
+    data: str,
+    out: Path,
+    config: Path | None = None,
+    architecture: Literal["matching", "concat"] | None = None,
+    pairs: Literal["joint", "camera_lidar", "camera_radar", "lidar_radar"] | None = None,
+    steps: int | None = None,
+    batch_size: int | None = None,
+    budget: str | None = None,
+    seed: int | None = None,
+    time_limit: str | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    compiled: bool = False,
+    resident: bool = False,
+    ray_workers: int | None = None,
+) -> int:
+    """Train on the table that `boresight prepare` made, or go on with the run in OUT.
+
+    Several processes: `torchrun --nproc-per-node N $(which boresight) train ...`, or --ray-workers N.
+
+    Args:
+        data: folder of the tables, with table training.
+        out: folder of the run: last.pt, best.pt, metrics.jsonl, events, train.json.
+        config: train.toml; options here win over it.
+        architecture: explicit matching, or the paper's concatenation.
+        pairs: one network for all three pairs, or for one of them.
+        steps: steps in all, in place of the configuration's epochs.
+        batch_size: frames per process and step.
+        budget: time of the whole run, as in 25m; the learning rate falls over it.
+        seed: of everything random.
+        time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
+        device: cpu, cuda, or whatever is there.
+        compiled: compile the encoders (minutes at first, faster afterwards).
+        resident: hold all training data on the device.
+        ray_workers: train on a Ray cluster with so many workers; needs the extra [ray].
+    """
+    from dataclasses import asdict
+
+    from jobs.summary import print_summary, progress_reporter
+    from pipeline.learn.settings import load_train_config
+    from pipeline.learn.training import TrainRequest
+    from pipeline.learn.training import train as run
+
+    minutes = None if budget is None else parse_duration(budget, "budget") / 60
+    options = {
+        "architecture": architecture,
+        "pairs": pairs,
+        "steps": steps,
+        "batch_size": batch_size,
+        "budget_minutes": minutes,
+        "seed": seed,
+    }
+    settings = load_train_config(config, options)
+    limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
+    request = TrainRequest(data, out, device, limit, compiled, resident)
+    if ray_workers is not None:
+        from pipeline.learn.ray_training import train_on_ray
+
+        result = train_on_ray(request, settings, ray_workers)
+    else:
+        with progress_reporter(f"train {out.name}") as progress:
+            result = run(request, settings, progress)
+    fields = asdict(result)
+    print_summary("train", fields.pop("status"), out=out, **fields)
+    return 128 + result.signal if result.signal else 0
+
+
+def parse_duration(text: str, option: str) -> float:
+    """Seconds of "90s", "25m", "1.5h", or of plain seconds.
+
+    Raises:
+        ConfigError: no such duration, or none above 0.
+    """
+    from pipeline.errors import ConfigError
+
+    number, unit = (text[:-1], text[-1]) if text and text[-1] in _UNIT_S else (text, "s")
+    try:
+        seconds = float(number) * _UNIT_S[unit]
+    except ValueError as err:
+        raise ConfigError("command line", option, f"{text!r} is no duration, as in 90s, 25m or 1h") from err
+    if not 0 < seconds < float("inf"):
+        raise ConfigError("command line", option, f"{text!r}: must be above 0")
+    return seconds

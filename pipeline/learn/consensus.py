@@ -1,0 +1,85 @@
+"""Each vehicle-day's mean answer so far: what a single frame's doubt is measured against, no truth needed.
+
+The scatter of single frames about their day's mean is what their variance should say. A constant bias of the network
+is not in it, and cannot be without truth.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.objective.differentiable.poses import exp_se3, inverse
+
+__all__ = ["Consensus", "doubt_loss", "twist_between"]
+
+_LOG_VARIANCE = (-18.0, 2.0)  # sigmas of 0.1 mrad to 3 m: what lies beyond has no gradient
+_LEAST_SHARE = 0.02  # of the newest frame in the mean: networks change while they learn
+
+
+def twist_between(
+    T_a: Float[Tensor, "*batch 4 4"], T_b: Float[Tensor, "*batch 4 4"]
+) -> Float[Tensor, "*batch 6"]:
+    """Twist xi with T_a = exp(xi) T_b to first order in the angle's square: rotation vector [rad], translation [m]."""
+    delta = T_a @ inverse(T_b)
+    R = delta[..., :3, :3]
+    skew = torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
+    return torch.cat([skew / 2, delta[..., :3, 3]], -1)
+
+
+class Consensus:
+    """Running mean, by vehicle, day and pair, of how far answers lie from the day's reference."""
+
+    def __init__(self) -> None:
+        self._mean: dict[str, Tensor] = {}
+        self._count: dict[str, int] = {}
+
+    def scatter(
+        self,
+        days: list[str],
+        answers: Float[Tensor, "B 3 4 4"],
+        references: Float[Tensor, "B 3 4 4"],
+    ) -> Float[Tensor, "B 3 6"]:
+        """Twist from each day's mean to each frame's answer, without gradient; then the answers join the mean."""
+        twist = twist_between(answers.detach(), references).cpu()
+        out = torch.zeros_like(twist)
+        for row, (day, value) in enumerate(zip(days, twist, strict=True)):
+            mean = exp_se3(self._mean.get(day, value))
+            out[row] = twist_between(exp_se3(value), mean)
+        for day, value in zip(days, twist, strict=True):
+            count = self._count.get(day, 0) + 1
+            share = max(1.0 / count, _LEAST_SHARE)
+            self._mean[day] = value if count == 1 else self._mean[day] + share * (value - self._mean[day])
+            self._count[day] = count
+        return out.to(answers.device)
+
+    def known(self, days: list[str], least: int = 8) -> list[bool]:
+        """Whether each day's mean is worth anything yet."""
+        return [self._count.get(day, 0) >= least for day in days]
+
+    def pose(self, days: list[str], pair: int, references: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
+        """Each day's mean answer for a pair; its reference where no answer is known."""
+        none = torch.zeros(3, 6)
+        twist = torch.stack([self._mean.get(day, none)[pair] for day in days])
+        return exp_se3(twist.to(references)) @ references
+
+    def state_dict(self) -> dict[str, dict[str, Tensor] | dict[str, int]]:
+        """For checkpoints."""
+        return {"mean": dict(self._mean), "count": dict(self._count)}
+
+    def load_state_dict(self, state: dict[str, dict[str, Tensor] | dict[str, int]]) -> None:
+        """From checkpoints."""
+        self._mean = {day: torch.as_tensor(mean) for day, mean in state["mean"].items()}
+        self._count = {day: int(count) for day, count in state["count"].items()}
+
+
+def doubt_loss(
+    log_variance: Float[Tensor, "B 3 6"], scatter: Float[Tensor, "B 3 6"], known: Float[Tensor, " B"]
+) -> Float[Tensor, ""]:
+    """Negative log likelihood of the scatter: teaches the variances only, for the scatter has no gradient."""
+    bounded = log_variance.clamp(*_LOG_VARIANCE)
+    per_frame = 0.5 * (scatter.square() * torch.exp(-bounded) + bounded).mean((1, 2))
+    return (per_frame * known).sum() / known.sum().clamp_min(1)

@@ -1,0 +1,158 @@
+"""What training minimises for a batch: terms of the three pairs and the loop, as in the estimator's objective.
+
+Angles in degrees, translations in metres, per-frame means over what is valid. No term knows a true transform: the
+reference only says which points the camera surely sees.
+
+Source: paper section 4.4 (SSL minimises L_P + L_G); the project's evidence on self-supervision, section 3, for the
+weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.learn.batch import TrainingBatch
+from pipeline.learn.settings import LossConfig
+from pipeline.objective.differentiable.lookup import nearest_pixel
+from pipeline.objective.differentiable.paper import smooth_iou
+from pipeline.objective.differentiable.poses import inverse, loop_loss, transform_points
+from pipeline.objective.differentiable.projection import GridProjection
+from pipeline.objective.differentiable.static import static_cost
+from pipeline.objective.differentiable.terms import (
+    DEG,
+    GridMaps,
+    cluster_class_cost,
+    edge_cost,
+    sky_cost,
+    track_cluster_cost,
+    track_detection_cost,
+)
+
+__all__ = ["PAIR_OF_TERM", "FrameObjective", "frame_objective"]
+
+PAIR_OF_TERM = {
+    "classes": "camera_lidar",
+    "edges": "camera_lidar",
+    "sky": "camera_lidar",
+    "tracks_camera": "camera_radar",
+    "radar_sky": "camera_radar",
+    "static": "lidar_radar",
+    "tracks_lidar": "lidar_radar",
+    "drivable": "lidar_radar",
+    "loop": "joint",
+}
+_MARGIN_DEG = 3.0  # what the reference may be wrong by, for points that are asked to lie in view
+_RADAR_SKY_FREE_DEG = 2.0  # a radar's elevation is noisy: only what is deep in the sky is wrong
+_RADAR_CELL_M = 1.0  # of the stored drivable map
+
+
+@dataclass(frozen=True, eq=False)
+class FrameObjective:
+    """The objective of B frames, ready for any poses."""
+
+    batch: TrainingBatch
+    maps: GridMaps
+    cluster_in_view: Bool[Tensor, "B C"]
+    edge_in_view: Bool[Tensor, "B E"]
+    radar_in_view: Bool[Tensor, "B R"]
+    centres_rad: Float[Tensor, "B G 2"]
+
+    def terms(
+        self,
+        T_camera_lidar: Float[Tensor, "*batch B 4 4"],
+        T_camera_radar: Float[Tensor, "*batch B 4 4"],
+        T_lidar_radar: Float[Tensor, "*batch B 4 4"],
+    ) -> dict[str, Float[Tensor, "*batch B"]]:
+        """Every term of every frame, unweighted, by the names of PAIR_OF_TERM."""
+        b = self.batch
+        cluster, edge, radar = b.cluster_xyz_m, b.edge_xyz_m, b.radar_xyz_m
+        tracks, valid, elevation = b.track_xyz_m, b.track_valid, b.radar_has_elevation
+        return {
+            "classes": cluster_class_cost(
+                self.maps,
+                T_camera_lidar,
+                cluster,
+                b.cluster_id.long(),
+                self.cluster_in_view,
+                b.cluster_centre_m.shape[1],
+            ),
+            "edges": edge_cost(self.maps, T_camera_lidar, edge, b.edge_side.long(), self.edge_in_view),
+            "sky": sky_cost(self.maps, T_camera_lidar, cluster, self.cluster_in_view),
+            "tracks_camera": track_detection_cost(
+                T_camera_radar, tracks, valid, self.centres_rad, b.detection_valid, elevation
+            ),
+            "radar_sky": sky_cost(self.maps, T_camera_radar, radar, self.radar_in_view, _RADAR_SKY_FREE_DEG),
+            "static": static_cost(
+                T_lidar_radar,
+                radar,
+                b.radar_valid & (b.radar_motion == 0),
+                b.lidar_xyz_m,
+                b.lidar_valid,
+                b.ground_plane,
+                elevation,
+            ),
+            "tracks_lidar": track_cluster_cost(
+                T_lidar_radar, tracks, valid, b.cluster_centre_m, b.cluster_valid, elevation
+            ),
+            "drivable": self._drivable(T_lidar_radar),
+            "loop": loop_loss(T_camera_lidar, T_lidar_radar, T_camera_radar, angle_unit=DEG, metre_unit=5.0),
+        }
+
+    def _drivable(self, T_lidar_radar: Tensor) -> Tensor:
+        """1 - IoU; 0 where a frame lacks one of the areas."""
+        b = self.batch
+        soft = b.radar_drivable.float() / 255
+        area = soft.sum((1, 2)) * _RADAR_CELL_M**2
+        seen = transform_points(inverse(T_lidar_radar), b.drivable_xyz_m)
+        lidar_area = b.drivable_area_m2.to(soft.dtype)
+        iou = smooth_iou(seen, b.drivable_valid, lidar_area, soft, area, _RADAR_CELL_M)
+        return (1 - iou) * ((area > 0) & (lidar_area > 0))
+
+
+def frame_objective(batch: TrainingBatch) -> FrameObjective:
+    """Prepare the objective of a batch, on the batch's device."""
+    step_rad = batch.grid_step_deg / DEG
+    height, width = batch.sky_depth.shape[1:]
+    projection = GridProjection(
+        -(width - 1) / 2 * step_rad, -(height - 1) / 2 * step_rad, step_rad, len(batch)
+    )
+    maps = GridMaps(
+        batch.class_distance, batch.edge_offset, batch.sky_depth, batch.grid_seen.bool(), projection
+    )
+    box = batch.detection_box_rad
+    return FrameObjective(
+        batch,
+        maps,
+        batch.cluster_point_valid & _surely_in_view(maps, batch.T_camera_lidar, batch.cluster_xyz_m),
+        batch.edge_valid & _surely_in_view(maps, batch.T_camera_lidar, batch.edge_xyz_m),
+        batch.radar_valid & _surely_in_view(maps, batch.T_camera_radar, batch.radar_xyz_m),
+        torch.stack([(box[..., 0] + box[..., 2]) / 2, (box[..., 1] + box[..., 3]) / 2], -1),
+    )
+
+
+def weighted(
+    terms: dict[str, Float[Tensor, "*batch"]], weights: LossConfig, pairs: tuple[str, ...]
+) -> Float[Tensor, "*batch"]:
+    """Weighted sum of the terms of some pairs, and of the loop where all three are there."""
+    chosen = [
+        getattr(weights, name) * value
+        for name, value in terms.items()
+        if PAIR_OF_TERM[name] in pairs and getattr(weights, name) > 0
+    ]
+    return torch.stack(chosen).sum(0)
+
+
+def _surely_in_view(maps: GridMaps, T: Tensor, points: Tensor) -> Tensor:
+    """Points that the camera sees at this pose, and when it is turned by the margin to any side."""
+    uv, valid = maps.projection.project(transform_points(T.to(points.dtype), points))
+    margin = _MARGIN_DEG / DEG / maps.projection.step_rad
+    frame = torch.arange(len(points), device=points.device)[:, None]
+    out = valid
+    for du, dv in ((margin, 0.0), (-margin, 0.0), (0.0, margin), (0.0, -margin)):
+        row, column, inside = nearest_pixel(maps.size, uv + uv.new_tensor([du, dv]), valid)
+        out = out & inside & maps.seen[frame, row, column]
+    return out

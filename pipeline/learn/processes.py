@@ -1,0 +1,89 @@
+"""One process or many: who am I, on which device, and what all must decide together."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import distributed
+
+from pipeline.errors import ConfigError
+
+__all__ = ["Processes", "joined"]
+
+
+@dataclass(frozen=True)
+class Processes:
+    """This process among those that train together."""
+
+    rank: int
+    count: int
+    device: torch.device
+
+    @property
+    def leads(self) -> bool:
+        """True for the one that writes."""
+        return self.rank == 0
+
+    def any(self, flags: list[bool]) -> list[bool]:
+        """Each flag: true on all as soon as it is true on one, so that all stop after the same step."""
+        if self.count == 1:
+            return flags
+        told = torch.tensor([float(f) for f in flags], device=self.device)
+        distributed.all_reduce(told, op=distributed.ReduceOp.MAX)
+        return [value > 0 for value in told.tolist()]
+
+    def gather(self, value: Any) -> list[Any]:
+        """Everyone's value, by rank; every process must call."""
+        if self.count == 1:
+            return [value]
+        everyone: list[Any] = [None] * self.count
+        distributed.all_gather_object(everyone, value)
+        return everyone
+
+    def mean(self, values: torch.Tensor) -> torch.Tensor:
+        """Mean over the processes."""
+        if self.count > 1:
+            distributed.all_reduce(values)
+            values = values / self.count
+        return values
+
+
+@contextmanager
+def joined(device: str) -> Iterator[Processes]:
+    """Join the process group that torchrun (or Ray) has described in the environment, or train alone.
+
+    Args:
+        device: cpu, cuda (this process's own GPU) or auto.
+
+    Raises:
+        ConfigError: no such device here.
+    """
+    rank, count = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+    chosen = _device(device, int(os.environ.get("LOCAL_RANK", "0")))
+    already = distributed.is_available() and distributed.is_initialized()
+    if count > 1 and not already:
+        distributed.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
+    try:
+        yield Processes(rank, count, chosen)
+    finally:
+        if count > 1 and not already:
+            distributed.destroy_process_group()
+
+
+def _device(name: str, local_rank: int) -> torch.device:
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name not in ("cpu", "cuda"):
+        raise ConfigError("train", "device", f"{name!r} is none of auto, cpu, cuda")
+    if name == "cpu":
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        raise ConfigError("train", "device", "no CUDA device here; use cpu")
+    device = torch.device("cuda", local_rank)
+    torch.cuda.set_device(device)
+    return device
