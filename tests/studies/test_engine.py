@@ -127,7 +127,7 @@ def test_a_study_goes_on_where_it_stopped(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(engine, "ProcessPoolExecutor", Inline)
     monkeypatch.setattr(engine, "_work", work)
     runs = [Run(SPEC, seed=k, solve={"terms": ["edges", "static"]}) for k in range(3)]
-    args = Namespace(out=tmp_path / "r.jsonl", limit=2, workers=1, root=tmp_path)
+    args = Namespace(out=tmp_path / "r.jsonl", limit=2, workers=1, root=tmp_path, tuning=False)
     run_study(runs, args, lambda results: f"{len(results)} lines")
     assert len(calls) == 2
     args.limit = None

@@ -39,6 +39,14 @@ __all__ = ["Run", "calibrate_once", "prior_of", "read_results", "run_study", "st
 
 # The default sigmas of `rigs.*.prior` in fleet.toml: what a user has who says nothing.
 ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M = 2.0, 0.05
+_DIAGNOSTICS = {
+    "confidence",
+    "vouched_az",
+    "vouched_el",
+    "holdout_z",
+    "loop_rotation_sigma_rad",
+    "focal_scale",
+}
 
 
 @dataclass(frozen=True)
@@ -147,7 +155,7 @@ def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
     found = {r.pair: T for r in records if (T := transform_of(r)) is not None}
     if set(found) == set(PAIRS):
         azimuth, elevation, range_m = loop_errors(found)
-        out["loop"] = [float(np.degrees(azimuth)), float(np.degrees(elevation)), float(range_m)]
+        out["loop"] = [round(float(v), 5) for v in (np.degrees(azimuth), np.degrees(elevation), range_m)]
     return out
 
 
@@ -155,7 +163,6 @@ def run_study(
     runs: Sequence[Run],
     args: argparse.Namespace,
     summary: Callable[[list[dict[str, Any]]], str],
-    trim: Callable[[dict[str, Any]], dict[str, Any]] = lambda result: result,
 ) -> None:
     """Run what is missing, a line per run as it finishes; then print the summary and write it beside the lines.
 
@@ -163,7 +170,6 @@ def run_study(
         runs: all runs of the study.
         args: what `study_arguments` parsed.
         summary: Markdown of the results of `runs`.
-        trim: leaves out of a result what the study has no use for.
     """
     done = {key_of(r) for r in read_results(args.out)}
     todo = [r for r in runs if r.key not in done][: args.limit]
@@ -182,7 +188,9 @@ def run_study(
             ):  # the others need not wait; this one is missing until it is run again
                 print(f"{number}/{len(todo)} FAILED {run.day.name}: {job.exception()!r}", flush=True)
                 continue
-            result = trim({**asdict(run), **about, **job.result()})
+            result = {**asdict(run), **about, **job.result()}
+            if not args.tuning:
+                result = _small(result)
             out.write(json.dumps(result) + "\n")
             out.flush()
             print(f"{number}/{len(todo)} {_line(result)}", flush=True)
@@ -237,6 +245,17 @@ def _work(run: Run, root: Path) -> dict[str, Any]:
 @lru_cache(maxsize=4)
 def _day(spec: DaySpec, root: Path) -> Day:
     return load_day(spec, root)
+
+
+def _small(result: dict[str, Any]) -> dict[str, Any]:
+    """The result with only those diagnostics that a summary asks for: result files are committed."""
+    pairs = {
+        pair: p | {"diagnostics": {k: v for k, v in p["diagnostics"].items() if k in _DIAGNOSTICS}}
+        if "diagnostics" in p
+        else p
+        for pair, p in result["pairs"].items()
+    }
+    return result | {"pairs": pairs}
 
 
 def _quiet() -> None:

@@ -62,14 +62,14 @@ def measure(
         "error": _rounded(change_between(T_true, T)),
         "sigma": _rounded(np.sqrt(np.diag(change_covariance(T, record.covariance)))),
         "observable": [int(v) for v in record.observable or []],
-        "loop_rotation_rad": record.loop_rotation_rad,
+        "loop_rotation_rad": None if record.loop_rotation_rad is None else _number(record.loop_rotation_rad),
         "diagnostics": {k: _number(v) for k, v in sorted(record.diagnostics.items())},
     }
     if record.time_offset_s is not None:
         out |= {
             "dt_s": _number(record.time_offset_s),
             "dt_sigma_s": None if record.time_offset_sigma_s is None else _number(record.time_offset_sigma_s),
-            "dt_true_s": dt_true_s,
+            "dt_true_s": None if dt_true_s is None else _number(dt_true_s),
         }
     return out
 
