@@ -19,6 +19,7 @@ __all__ = [
     "EgoTopics",
     "FleetConfig",
     "IngestConfig",
+    "LearnConfig",
     "LidarTopics",
     "OnnxSemantics",
     "PerceiveConfig",
@@ -187,6 +188,7 @@ class SolveConfig(_Section):
     bootstrap_blocks: Annotated[int, Field(gt=1)] = 24
     time_offset_sigma_s: Positive = 0.05
     terms: tuple[Term, ...] = TERMS  # of method joint; leave some out to see what they are worth
+    polish: bool = False  # of the SSL methods: let method joint finish from the network's answer
     seed: int = 0
 
     @model_validator(mode="after")
@@ -255,6 +257,15 @@ class VerifyConfig(_Section):
     confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.995
 
 
+class LearnConfig(_Section):
+    """Networks of the methods `joint-ssl` and `pairwise-ssl`; left out: those that come with Boresight."""
+
+    model: str | None = None  # ONNX file of the joint network, relative to fleet.toml
+    pairwise_models: dict[Literal["camera_lidar", "camera_radar", "lidar_radar"], str] = {}
+    iterations: Annotated[int, Field(ge=1, le=5)] = 3  # passes per frame, each rendered at the one before
+    threads: Annotated[int, Field(ge=1)] = 1
+
+
 class AuditConfig(_Section):
     """Control charts."""
 
@@ -283,6 +294,7 @@ class FleetConfig(_Section):
     solve: SolveConfig = SolveConfig()
     verify: VerifyConfig = VerifyConfig()
     prepare: PrepareConfig = PrepareConfig()
+    learn: LearnConfig = LearnConfig()
     audit: AuditConfig = AuditConfig()
 
     @model_validator(mode="after")
