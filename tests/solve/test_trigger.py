@@ -13,7 +13,12 @@ from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 @pytest.fixture(scope="module")
 def day():
-    return make_day(10)
+    return [with_ages(o, 3) for o in make_day(10)]
+
+
+def with_ages(observation, age):
+    n = len(observation.radar_track_xyz_m)
+    return replace(observation, radar_track_age=np.full(n, age, np.int32))
 
 
 def transforms(camera_lidar=T_CAMERA_LIDAR, lidar_radar=T_LIDAR_RADAR):
@@ -58,8 +63,22 @@ def test_counts_are_per_frame_whatever_the_number_of_frames(day):
 
 
 def test_a_metric_that_no_frame_can_show_is_left_out(day):
-    empty = [replace(o, radar_track_xyz_m=np.zeros((0, 3), np.float32)) for o in day]
-    metrics = trigger_metrics(empty, transforms())
-    assert metrics["camera_radar"] == {}
-    assert list(metrics["lidar_radar"]) == ["drivable_outside_fraction"]
-    assert exceeded(metrics["camera_radar"], TriggerConfig()) == []
+    empty = [with_ages(replace(o, radar_track_xyz_m=np.zeros((0, 3), np.float32)), 3) for o in day]
+    for quiet in (empty, [with_ages(o, 1) for o in day]):  # clusters of one scan are not tracked yet
+        metrics = trigger_metrics(quiet, transforms())
+        assert metrics["camera_radar"] == {}
+        assert list(metrics["lidar_radar"]) == ["drivable_outside_fraction"]
+        assert exceeded(metrics["camera_radar"], TriggerConfig()) == []
+
+
+def test_a_lidar_that_sees_all_around_is_measured_by_what_lies_in_the_image(day):
+    behind = [
+        replace(
+            o,
+            lidar_map_xyz_m=np.concatenate([o.lidar_map_xyz_m, o.lidar_map_xyz_m * np.float32(-1)]),
+            lidar_map_cluster=np.concatenate([o.lidar_map_cluster, o.lidar_map_cluster]),
+        )
+        for o in day
+    ]
+    moved = transforms(camera_lidar=turned(T_CAMERA_LIDAR, 1, 5))
+    assert trigger_metrics(behind, moved)["camera_lidar"] == trigger_metrics(day, moved)["camera_lidar"]
