@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from pipeline.prior import perturbed, prior_key, read_prior
 from pipeline.results import Progress, StageResult, silent
 from pipeline.solve.alignment import alignment_of
 from pipeline.solve.curvature import blocks_of
-from pipeline.solve.methods import COMPOSED, PAPER_METHODS, UNTHINNED, solver_of
+from pipeline.solve.methods import COMPOSED, PAPER_METHODS, UNTHINNED, Solver, solver_of
 from pipeline.solve.select import Selection, select_frames
 from pipeline.solve.trigger import exceeded, trigger_metrics
 from pipeline.store.partitions import Lake, Partition, work_key
@@ -32,8 +33,9 @@ from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.versions import CODE_VERSION
 
-__all__ = ["calibrate_day", "calibrate_observations"]
+__all__ = ["SSL_METHODS", "calibrate_day", "calibrate_observations"]
 
+SSL_METHODS = ("pairwise-ssl", "joint-ssl")
 _TRIGGER_FRAMES = 40  # metrics are means over frames: more of them only cost time
 
 
@@ -54,7 +56,7 @@ def calibrate_day(
         partition: vehicle and day.
         fleet: configuration.
         lake: where observations lie and records go.
-        method: one of `pipeline.solve.methods.METHOD`.
+        method: one of `pipeline.solve.methods.METHOD`, or of SSL_METHODS.
         perturb: exact angle [deg] and shift [m] by which the prior is moved on purpose, for tests:
             T_camera_lidar and T_lidar_radar independently, about a random axis and in a random direction. The
             prior's sigmas are then no smaller than these two numbers.
@@ -68,17 +70,22 @@ def calibrate_day(
     Raises:
         ConfigError: no such vehicle or method, or an impossible prior file.
     """
-    solver_of(method)
+    solver = solver_of(method) if method not in SSL_METHODS else None
     seed = fleet.solve.seed if seed is None else seed
     rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
     observations = read_manifest(lake, OBSERVATIONS, partition)
     inputs = [observations.work_key] if observations else []
-    settings = {
+    settings: dict[str, Any] = {
         "method": method,
         "perturb": perturb,
         "seed": seed,
         "prior_file": prior_key(rig.prior, fleet_file),
     }
+    if solver is None:
+        from pipeline.calibrate_ssl import ssl_key, ssl_solver  # noqa: PLC0415 - brings onnxruntime
+
+        settings |= ssl_key(method, partition, fleet, lake, fleet_file)
+        solver = ssl_solver(method, partition, fleet, lake, fleet_file)
     resolved = config_hash(fleet.select, fleet.trigger, fleet.solve, fleet.verify, rig.prior, settings)
     key = work_key("calibrate", CODE_VERSION, resolved, inputs)
     about = Inputs(partition, method, key, seed, tuple(inputs))
@@ -90,7 +97,7 @@ def calibrate_day(
     try:
         rows = _observations(lake, partition)
         prior = perturbed(read_prior(rows, rig.prior, fleet_file), perturb, seed)
-        records = calibrate_observations(rows, prior, fleet, about, progress)
+        records = calibrate_observations(rows, prior, fleet, about, progress, solver)
     except SolveError as err:
         records = refused_records(about, err.reason, len(rows), prior)
     write_records(lake, CALIBRATIONS, partition, records, key, CODE_VERSION, inputs)
@@ -103,8 +110,11 @@ def calibrate_observations(
     fleet: FleetConfig,
     about: Inputs,
     progress: Progress = silent,
+    solver: Solver | None = None,
 ) -> list[CalibrationRecord]:
-    """Select, trigger, solve, judge: the records of one day, without reading or writing anything.
+    """Select, trigger, solve, judge: the records of one day, without writing anything.
+
+    `solver` is for methods that need more than observations (`pipeline.calibrate_ssl`); None = the method's own.
 
     Raises:
         SolveError: the day cannot be calibrated.
@@ -120,7 +130,7 @@ def calibrate_observations(
     fired = {pair: exceeded(before[pair], fleet.trigger) for pair in PAIRS}
     active = [p for p in PAIRS if fired[p] or fleet.trigger.when == "always"]
     progress(1, 4, f"solve by {about.method}")
-    solution = solver_of(about.method)(
+    solution = (solver or solver_of(about.method))(
         frames,
         prior,
         fleet.solve,

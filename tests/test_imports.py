@@ -18,7 +18,7 @@ FOUNDATIONS = {"config", "errors", "results", "geometry", "store", "objective", 
 # Stage folders. solve and verify are two halves of one stage that pipeline/calibrate.py joins.
 ROOMS = {"ingest", "perceive", "solve", "verify", "audit", "report", "fleet", "simulate", "learn"}
 # Beside the rooms: modules that bring several of them together.
-JOINTS = {"stages", "calibrate", "calibration_records"}
+JOINTS = {"stages", "calibrate", "calibrate_ssl", "calibration_records"}
 
 
 def modules():
