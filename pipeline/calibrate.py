@@ -201,14 +201,14 @@ def _judge_all(
 def _heard(
     estimate: PairEstimate, held: Sequence[Observation], prior: Prior, fleet: FleetConfig
 ) -> tuple[HeldOutTest | None, dict[str, Claim]]:
-    """What held-out frames say: prior against result (with the result's time offset at both), and their own optimum."""
+    """What held-out frames say: prior against result, and where their own optimum lies."""
     pair, verify = estimate.pair, fleet.verify
     limit_deg = verify.camera_lidar_limit_deg if pair == "camera_lidar" else verify.radar_limit_deg
     test = opinion = None
     if held:
         ask = alignment_of(estimate, held, prior, fleet.solve)
-        blocks, dt_s = blocks_of(held), estimate.time_offset_s or 0.0
-        test = paired_test(ask.cost(prior.of(pair), dt_s), ask.cost(estimate.T, dt_s), blocks)
+        blocks = blocks_of(held)
+        test = paired_test(ask.cost(prior.of(pair)), ask.cost(estimate.T), blocks)
         covariance = np.diag([*np.zeros(6), *ask.extra_variance])
         covariance[:6, :6] = estimate.covariance
         opinion = second_opinion(ask.slopes, covariance, ask.bias, blocks)

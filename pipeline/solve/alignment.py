@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from pipeline.config import SolveConfig
 from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import exp_se3, rotation_angle_rad
+from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3, rotation_angle_rad
 from pipeline.objective.camera_lidar_terms import Alignments, Level, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.moving import azimuth_equations_camera, moving_clusters
 from pipeline.objective.problem import PairEstimate, Prior
@@ -51,8 +51,9 @@ _BIAS = {
 class Alignment:
     """Questions that the held-out frames of one pair answer."""
 
-    # (T of the pair, time offset of the pair [s]) -> cost per frame, NaN where a frame cannot tell; lower is better.
-    cost: Callable[[np.ndarray, float], np.ndarray]
+    # T of the pair -> cost per frame, NaN where a frame cannot tell; lower is better. Time offset and nuisance are the
+    # result's at every pose, and so are unknowns of the pose that the judge cannot tell: the others are compared.
+    cost: Callable[[np.ndarray], np.ndarray]
     # (step from the result: left perturbation, time offset, nuisance; kernel width, 1 = sharp) -> each frame's
     # gradient of its log likelihood and information.
     slopes: Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray]]
@@ -81,7 +82,7 @@ def alignment_of(
 
 
 Judge = tuple[
-    Callable[[np.ndarray, float], np.ndarray],
+    Callable[[np.ndarray], np.ndarray],
     Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray]],
     float,
 ]
@@ -92,11 +93,11 @@ def _camera_lidar(estimate: PairEstimate, observations: Sequence[Observation], p
     velocity = lidar_velocities(observations, prior.T_lidar_radar)
     reach = float(apart) + _REACH_RAD
     terms = prepare_terms(observations, estimate.T, velocity, reach_rad=reach).sharp(_MAX_GAP_PX)
-    focal = estimate.diagnostics.get("focal_scale", 1.0)
+    focal, dt_s = estimate.diagnostics.get("focal_scale", 1.0), estimate.time_offset_s or 0.0
     told = np.array([len(o.lidar_edge_xyz_m) + len(o.marking_xyz_m) > 0 for o in observations])
     sharp = Level.wide(_SHARP_PX, _SHARP_CONTRAST)
 
-    def cost(T: np.ndarray, dt_s: float) -> np.ndarray:
+    def cost(T: np.ndarray) -> np.ndarray:
         at = Alignments(T[None], np.array([dt_s]), np.array([focal]))
         score = (terms.edge_excess(at, sharp) + terms.marking_score(at, sharp))[0]
         return np.where(told, -score, np.nan)
@@ -104,9 +105,7 @@ def _camera_lidar(estimate: PairEstimate, observations: Sequence[Observation], p
     def slopes(step: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
         scale = _camera_lidar_scale(terms, width)
         x = step + DESIGN * scale
-        at = Alignments(
-            exp_se3(x[:, :6]) @ estimate.T, (estimate.time_offset_s or 0.0) + x[:, 6], focal + x[:, 7]
-        )
+        at = Alignments(exp_se3(x[:, :6]) @ estimate.T, dt_s + x[:, 6], focal + x[:, 7])
         contrast = _SHARP_CONTRAST if width < 2 else _WIDE_CONTRAST
         gradient, H = fit_quadratics(terms.score(at, Level.wide(width * _SHARP_PX, contrast)))
         return gradient / scale, -H / np.outer(scale, scale)
@@ -125,12 +124,15 @@ def _lidar_radar(estimate: PairEstimate, observations: Sequence[Observation], pr
     del prior
     # The detections are picked alike at every pose.
     frames = registration_frames(observations, estimate.T, np.random.default_rng(0))
-    range_bias_m = estimate.diagnostics.get("range_bias_m", 0.0)
+    range_bias_m, dt_s = estimate.diagnostics.get("range_bias_m", 0.0), estimate.time_offset_s or 0.0
 
-    def cost(T: np.ndarray, dt_s: float) -> np.ndarray:
+    def cost(T: np.ndarray) -> np.ndarray:
         out = np.full(len(observations), np.nan)
         if frames.count:
-            found = normal_equations(frames, T, dt_s, _REGISTRATION_SIGMA, 0.0, _OUTLIER)
+            planar = _with_planar(estimate.T, T)
+            found = normal_equations(
+                frames, planar, dt_s, _REGISTRATION_SIGMA, 0.0, _OUTLIER, range_bias_m=range_bias_m
+            )
             out[frames.frame] = found.cost
         return out
 
@@ -143,6 +145,13 @@ def _lidar_radar(estimate: PairEstimate, observations: Sequence[Observation], pr
         return g, H
 
     return cost, slopes, _RANGE_BIAS_SIGMA_M
+
+
+def _with_planar(T: np.ndarray, T_planar: np.ndarray) -> np.ndarray:
+    """A pose of the radar with another one's yaw, x and y."""
+    turn = log_so3(T_planar[:3, :3] @ T[:3, :3].T)
+    R = exp_so3(np.array([0.0, 0.0, turn[2]])) @ T[:3, :3]
+    return from_rotation_translation(R, np.append(T_planar[:2, 3], T[2, 3]))
 
 
 def _registration_slopes(
@@ -169,7 +178,7 @@ def _camera_radar(estimate: PairEstimate, observations: Sequence[Observation], p
     del prior
     clusters = moving_clusters(observations)
 
-    def cost(T: np.ndarray, _dt_s: float) -> np.ndarray:
+    def cost(T: np.ndarray) -> np.ndarray:
         return camera_radar_cost(observations, T)
 
     def slopes(step: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:

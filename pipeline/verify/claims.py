@@ -39,15 +39,13 @@ class Claim:
 
     @property
     def reach(self) -> float:
-        """The error is smaller than this with the probability asked for [rad]."""
-        if self.remaining == 0:
-            return self.shift
-        m, tail = self.shift / self.remaining, 1 - self.confidence
-        # Between one tail (all of the doubt lies on the side that the shift shows) and two (no shift at all).
-        low, high = m + float(ndtri(1 - tail)), m + float(ndtri(1 - tail / 2))
-        return self.remaining * float(
-            brentq(lambda x: ndtr(m - x) + ndtr(-m - x) - tail, low - 1e-9, high + 1e-9)
-        )
+        """The error is smaller than this with the probability asked for [rad].
+
+        By the estimate's own sigma, where held-out frames do not contradict it, or by both together, shift and all:
+        whichever says more.
+        """
+        own = _quantile(0.0, self.sigma, self.confidence) if self.agreement >= 0 else np.inf
+        return min(own, _quantile(self.shift, self.remaining, self.confidence))
 
     @property
     def margin(self) -> float:
@@ -58,6 +56,16 @@ class Claim:
     def agreement(self) -> float:
         """1 = held-out frames agree, 0 = they would move the estimate by three of that shift's sigmas."""
         return 1 - self.shift / (3 * self.shift_sigma) if self.shift_sigma > 0 else 1.0
+
+
+def _quantile(shift: float, sigma: float, probability: float) -> float:
+    """Of the absolute value of a normal deviate about `shift`."""
+    if sigma == 0:
+        return shift
+    m, tail = shift / sigma, 1 - probability
+    # Between one tail (all of the doubt lies on the side that the shift shows) and two (no shift at all).
+    low, high = m + float(ndtri(1 - tail)), m + float(ndtri(1 - tail / 2))
+    return sigma * float(brentq(lambda x: ndtr(m - x) + ndtr(-m - x) - tail, low - 1e-9, high + 1e-9))
 
 
 def target_jacobian(

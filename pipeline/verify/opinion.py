@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import ndtr, stdtrit
 
 __all__ = ["SecondOpinion", "Slopes", "second_opinion"]
 
@@ -22,6 +23,7 @@ __all__ = ["SecondOpinion", "Slopes", "second_opinion"]
 # frame's log likelihood, and its information, both by the step.
 Slopes = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray]]
 _FEWEST_BLOCKS = 3
+_SIGMAS = 3.0  # where contradiction begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,5 +101,6 @@ def _inflation(g: np.ndarray, information: np.ndarray, blocks: np.ndarray) -> fl
     scatter = (sums**2).sum(axis=0) * B / (B - 1)
     promised = np.diag(information)
     some = promised > 0
-    # Few blocks scatter less than they should half of the time: variance of Student's t with B - 1 degrees, nearly.
-    return max(1.0, float(np.mean(scatter[some] / promised[some]))) * (B + 1) / (B - 1)
+    # Few blocks often scatter less than they should: three sigmas then reach as far as Student's t does.
+    few = float(stdtrit(B - 1, ndtr(_SIGMAS))) / _SIGMAS
+    return max(1.0, float(np.mean(scatter[some] / promised[some]))) * few**2

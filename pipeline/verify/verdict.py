@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import adjoint, inverse, log_so3
 from pipeline.objective.problem import PairEstimate, Solution
 from pipeline.verify.claims import Claim
@@ -25,6 +26,12 @@ _NEEDED = {
     "camera_lidar": ("azimuth", "elevation"),
     "camera_radar": ("azimuth",),
     "lidar_radar": ("azimuth",),
+}
+# What held-out frames can tell apart: registration and boxes say nothing of the radar's elevation.
+_JUDGED = {
+    "camera_lidar": np.ones(6, bool),
+    "camera_radar": np.array([False, True, False, False, False, False]),
+    "lidar_radar": np.array([False, False, True, True, True, False]),
 }
 _BAD = -1.0  # margin of what is wrong without being measured
 
@@ -100,7 +107,7 @@ def judge(
         checks.append(
             _Check(min(f.score for f in factors) if good else _BAD, "composed of a pair that is not accepted")
         )
-        checks += _not_worse(test, limits)
+        checks += _not_worse(estimate, T_prior, test, limits)
     else:
         checks += _moves(estimate, T_prior, prior_covariance, limits)
         checks += _held_out(estimate, T_prior, test, limits)
@@ -183,28 +190,41 @@ def _held_out(
     if test is None or test.frames < limits.min_holdout:
         found = 0 if test is None else test.frames
         return [_Check(_BAD, f"too few held-out frames to judge: {found}, needs {limits.min_holdout}")]
-    sigma = np.sqrt(np.diag(estimate.covariance))
-    ratio = np.where(estimate.observable, np.abs(moved(estimate.T, T_prior)) / sigma, 0.0)
-    worst = int(np.argmax(ratio))
-    same = 1 - ratio[worst] / limits.agree_sigmas
-    better = (-test.z - limits.better_z) / limits.better_z
-    claim = f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} of its sigmas"
-    no_better = _Check(
-        min(1.0, max(same, better)), f"{claim}, and held-out frames align no better (z = {test.z:.1f})"
-    )
-    worse = _not_worse(test, limits)
-    return worse if worse[0].margin < 0 else [*worse, no_better]
-
-
-def _not_worse(test: HeldOutTest | None, limits: Limits) -> list[_Check]:
-    if test is None:
-        return []
-    change = f"{test.after:.4g} after {test.before:.4g}, z = {test.z:.1f}"
+    name, ratio = _largest_move(estimate, T_prior)
+    same, better = 1 - ratio / limits.agree_sigmas, (-test.z - limits.better_z) / limits.better_z
+    if test.z > limits.worse_z:
+        return [_Check(1 - test.z / limits.worse_z, _worse(test))]
+    claim = f"{name} moved {ratio:.1f} of its sigmas"
     return [
         _Check(
-            min(1.0, 1 - test.z / limits.worse_z), f"held-out frames align worse than at the prior ({change})"
+            min(1.0, max(same, better)),
+            f"{claim}, and held-out frames align no better (z = {test.z:.1f})",
         )
     ]
+
+
+def _not_worse(
+    estimate: PairEstimate, T_prior: np.ndarray, test: HeldOutTest | None, limits: Limits
+) -> list[_Check]:
+    """Of a composed pair: no worse than a prior that the result, by its own sigma, contradicts."""
+    if test is None:
+        return []
+    _, ratio = _largest_move(estimate, T_prior)
+    return [_Check(min(1.0, max(1 - ratio / limits.agree_sigmas, 1 - test.z / limits.worse_z)), _worse(test))]
+
+
+def _largest_move(estimate: PairEstimate, T_prior: np.ndarray) -> tuple[str, float]:
+    """The degree of freedom that moved most of those that held-out frames can tell, in sigmas of the result."""
+    sigma = np.sqrt(np.diag(change_covariance(estimate.T, estimate.covariance)))
+    told = estimate.observable & _JUDGED[estimate.pair]
+    ratio = np.where(told, np.abs(moved(estimate.T, T_prior)) / sigma, 0.0)
+    worst = int(np.argmax(ratio))
+    return DOF_NAMES[worst], float(ratio[worst])
+
+
+def _worse(test: HeldOutTest) -> str:
+    change = f"{test.after:.4g} after {test.before:.4g}, z = {test.z:.1f}"
+    return f"held-out frames align worse than at the prior ({change})"
 
 
 def _claims(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[_Check]:

@@ -41,9 +41,17 @@ def test_the_reach_is_the_quantile_of_the_absolute_error():
         (1.0, 0.1, 0.995),
         (0.02, 0.1, 0.9),
     ):
-        reach = Claim(sigma, shift, sigma, sigma, 0.2, confidence).reach
+        reach = Claim(9.0, shift, 9.0, sigma, 0.2, confidence).reach
         inside = norm.cdf(reach, shift, sigma) - norm.cdf(-reach, shift, sigma)
         assert inside == pytest.approx(confidence, abs=1e-9)
+
+
+def test_the_own_sigma_is_enough_until_held_out_frames_contradict_it():
+    agreed = Claim(0.05, 0.1, 0.05, 0.045, 0.2, 0.995)
+    assert agreed.reach == pytest.approx(0.05 * norm.ppf(0.9975))
+    contradicted = Claim(0.05, 0.1, 0.03, 0.045, 0.2, 0.995)
+    assert contradicted.agreement < 0
+    assert contradicted.reach > 0.2 > agreed.reach
 
 
 def quadratic_frames(truth, blocks, rng, scatter=1.0, information=400.0):

@@ -108,6 +108,15 @@ def test_a_composed_pair_is_as_good_as_its_factors():
         == "composed of a pair that is not accepted"
     )
     assert "align worse" in verdict(estimate(1.0), WORSE, factors=[good, good]).reason
+    # The composed prior may by chance be better; within the result's sigma that contradicts nothing.
+    assert verdict(estimate(0.2), WORSE, factors=[good, good]).status == "accepted"
+
+
+def test_a_radar_answers_only_for_the_moves_that_held_out_frames_can_tell():
+    tilted = estimate(1.0, pair="lidar_radar")  # pitch
+    assert verdict(tilted, SAME).status == "accepted"
+    turned = replace(tilted, T=from_rotation_translation(exp_so3(np.array([0, 0, 0.02])), np.zeros(3)))
+    assert "rz moved" in verdict(turned, SAME).reason
 
 
 def claim(sigma_deg, shift_deg=0.0, shift_sigma_deg=0.1):
