@@ -110,12 +110,13 @@ def grid_rays(grid: Grid) -> Float[np.ndarray, "H W 3"]:
     return np.stack([-c * np.sin(azimuth), -np.sin(elevation), c * np.cos(azimuth)], -1)
 
 
-def _maps(camera: Camera, grid: Grid, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel of each cell in an image `scale` times the camera's size (float32), and where there is one."""
-    rays = grid_rays(grid)
-    at = camera.scaled(scale)
-    uv, valid = at.project(rays)
-    return uv.astype(np.float32), valid & at.contains(uv)
+def _pixels(camera: Camera, grid: Grid, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel (float32) of each cell in an image of (height, width) that shows what the camera's does, and if any."""
+    uv, valid = camera.project(grid_rays(grid))
+    seen = valid & camera.contains(uv)
+    # By axis: sides are rounded to whole pixels, and 0.07 cells of elevation were lost to one factor for both.
+    scale = np.array([size[1] / camera.width_px, size[0] / camera.height_px])
+    return ((uv + 0.5) * scale - 0.5).astype(np.float32), seen
 
 
 def resample_camera(
@@ -132,7 +133,7 @@ def resample_camera(
     if scale < 1.0:
         size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], 3)
-    uv, valid = _maps(camera, fine, image.shape[1] / camera.width_px)
+    uv, valid = _pixels(camera, fine, (image.shape[0], image.shape[1]))
     sampled = cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     whole = valid.reshape(grid.height, 2, grid.width, 2).all(axis=(1, 3))
     reduced = cv2.resize(sampled, (grid.width, grid.height), interpolation=cv2.INTER_AREA)

@@ -1,0 +1,172 @@
+"""The exported file computes what the network computes, says what it is, and needs neither torch nor semantics."""
+
+import json
+import subprocess
+import sys
+from functools import lru_cache
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from pipeline.errors import ModelError
+from pipeline.geometry.se3 import exp_so3
+from pipeline.learn.collate import collate
+from pipeline.learn.compiled_rendering import frame_sensors, render_frame
+from pipeline.learn.grid import Grid
+from pipeline.learn.inference import SingleFrameCalibrator
+from pipeline.learn.inputs import NetworkInputs, sensor_inputs
+from pipeline.learn.layout import LIKELIHOOD, NetworkConfig
+from pipeline.learn.networks import build_network
+from pipeline.learn.onnx_export import export_onnx
+from pipeline.learn.samples import About, make_row
+from pipeline.learn.views import render
+from pipeline.objective.problem import Prior
+from schemas.training import GRID_CLASSES
+from schemas.versions import CODE_VERSION
+from tests import solve_scenes, training_lakes
+
+GRID = Grid(0.4, 25.6, 12.8, -12.8)
+CARD = {"data": "two frames", "seeds": [0], "results": {"azimuth_deg": 0.1}}
+KINDS = [
+    "matching-joint",
+    "matching-camera_lidar",
+    "matching-camera_radar",
+    "matching-lidar_radar",
+    "concat-joint",
+]
+
+
+@lru_cache
+def row():
+    rng = np.random.default_rng(0)
+    observation = solve_scenes.make_observation(rng, 0, 0, 0.0)
+    prior = Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05)
+    about = About("v", "2026-01-01", "default", "train", "p", "urban")
+    config = training_lakes.fleet_of(["v"], lidar_points=4096).prepare
+    return make_row(training_lakes.frame_of(observation, rng), observation, prior, about, config)
+
+
+def guess():
+    wrong = np.eye(4)
+    wrong[:3, :3] = exp_so3(np.radians([1.0, -1.5, 0.5]))
+    T_camera_lidar, T_lidar_radar = wrong @ solve_scenes.T_CAMERA_LIDAR, wrong @ solve_scenes.T_LIDAR_RADAR
+    return T_camera_lidar, T_lidar_radar, T_camera_lidar @ T_lidar_radar
+
+
+def inputs():
+    T_camera_lidar, T_lidar_radar, T_camera_radar = (
+        torch.tensor(T, dtype=torch.float32)[None] for T in guess()
+    )
+    return NetworkInputs(sensor_inputs(collate([row()]), GRID), T_camera_lidar, T_camera_radar, T_lidar_radar)
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def exported(request, tmp_path_factory):
+    """A network with weights as large as trained ones, and its file."""
+    architecture, pairs = request.param.split("-")
+    network = build_network(NetworkConfig(architecture, pairs, GRID, width=8, hidden=32))
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for layer in network.core.heads.layers.values():
+            size = 0.01 if architecture == "matching" else 0.05  # half a degree of residuals
+            layer.weight += size * torch.randn(layer.weight.shape, generator=generator)
+    return network, export_onnx(network, tmp_path_factory.mktemp("model") / "model.onnx", CARD)
+
+
+def test_the_file_computes_what_the_network_computes(exported):
+    network, path = exported
+    calibrator = SingleFrameCalibrator(path)
+    sensors = frame_sensors(row(), GRID)
+    T_camera_lidar, T_lidar_radar, _ = guess()
+    ours = calibrator.estimate(sensors, T_camera_lidar, T_lidar_radar, iterations=1)[0]
+    with torch.no_grad():
+        theirs = network(inputs())
+    moved = (
+        np.abs(ours.T_camera_lidar - T_camera_lidar).max() + np.abs(ours.T_lidar_radar - T_lidar_radar).max()
+    )
+    moved += np.abs(ours.T_camera_radar - T_camera_lidar @ T_lidar_radar).max()
+    assert moved > 1e-3  # parity of nothing would prove nothing
+    for pair in ("camera_lidar", "camera_radar", "lidar_radar"):
+        assert ours.of(pair) == pytest.approx(getattr(theirs, f"T_{pair}")[0].numpy(), abs=1e-5)
+    assert ours.log_variance == pytest.approx(theirs.log_variance[0].numpy(), abs=1e-4)
+    assert ours.estimated == network.config.estimated
+
+
+def test_three_passes_agree_too(exported):
+    network, path = exported
+    T_camera_lidar, T_lidar_radar, _ = guess()
+    ours = SingleFrameCalibrator(path).estimate(frame_sensors(row(), GRID), T_camera_lidar, T_lidar_radar)
+    with torch.no_grad():
+        theirs = network.refine(inputs(), 3)
+    assert len(ours) == 3
+    for pair in ("camera_lidar", "camera_radar", "lidar_radar"):
+        # A point on a cell's border may fall to another side after rounding: a hundredth of a degree at most.
+        assert ours[-1].of(pair) == pytest.approx(getattr(theirs[-1], f"T_{pair}")[0].numpy(), abs=2e-4)
+        R = ours[-1].of(pair)[:3, :3]
+        assert pytest.approx(np.eye(3), abs=1e-12) == R @ R.T
+
+
+def test_the_file_is_a_checked_graph_of_a_recent_opset_and_carries_its_card(exported):
+    network, path = exported
+    model = onnx.load(path)
+    onnx.checker.check_model(model, full_check=True)
+    assert {o.version for o in model.opset_import if o.domain == ""} == {18}
+    metadata = {m.key: m.value for m in model.metadata_props}
+    assert json.loads(metadata["classes"]) == list(GRID_CLASSES)
+    assert json.loads(metadata["grid"])["cell_deg"] == GRID.cell_deg
+    assert metadata["architecture"] == network.config.architecture
+    assert metadata["code_version"] == CODE_VERSION
+    assert json.loads(metadata["card"]) == CARD
+    card = json.loads(path.with_suffix(".json").read_text())
+    assert card["results"] == CARD["results"]
+    assert card["bytes"] == path.stat().st_size
+    assert "azimuth_deg: 0.1" in path.with_suffix(".md").read_text()
+
+
+def test_the_default_network_fits_into_two_and_a_half_megabytes(tmp_path):
+    for architecture in ("matching", "concat"):
+        path = export_onnx(build_network(NetworkConfig(architecture)), tmp_path / f"{architecture}.onnx")
+        assert path.stat().st_size <= 2_500_000
+        outputs = {o.name for o in onnx.load(path).graph.output}
+        assert (LIKELIHOOD in outputs) == (architecture == "matching")
+
+
+def test_inference_sees_what_training_saw():
+    T_camera_lidar, T_lidar_radar, T_camera_radar = guess()
+    ours = render_frame(frame_sensors(row(), GRID), T_camera_lidar, T_camera_radar, T_lidar_radar, GRID)
+    theirs, _ = render(inputs(), GRID)
+    for name in ("camera", "radar_valid", "radar_has_elevation"):
+        assert np.array_equal(ours[name], getattr(theirs, name).numpy())
+    for name in ("radar_lidar", "radar_camera", "radar_features"):
+        valid = ours["radar_valid"]
+        assert ours[name][valid] == pytest.approx(getattr(theirs, name).numpy()[valid], abs=2e-5)
+    for name, weight in (("points_camera", "point_weight"), ("objects", "object_weight")):
+        present = ours[weight][0] > 0
+        count = present.sum()
+        assert count > 300
+        assert (getattr(theirs, weight)[0] > 0).sum() == count
+        assert ours[name][0, :count] == pytest.approx(getattr(theirs, name).numpy()[0, :count], abs=2e-5)
+    for name in ("lidar_grid", "radar_grid"):
+        differ = np.abs(ours[name] - getattr(theirs, name).numpy()).max(axis=1) > 1e-4
+        assert differ.sum() <= 4  # points on a border between cells
+
+
+def test_inference_loads_no_torch():
+    code = "import sys; import pipeline.learn.inference; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_a_file_that_is_no_such_model_is_refused_by_name(tmp_path):
+    path = tmp_path / "model.onnx"
+    with pytest.raises(ModelError, match=r"model\.onnx"):
+        SingleFrameCalibrator(path)
+    path.write_bytes(b"nonsense")
+    with pytest.raises(ModelError, match="ONNX"):
+        SingleFrameCalibrator(path)
+    graph = onnx.helper.make_graph([], "empty", [], [])
+    onnx.save(onnx.helper.make_model(graph), path)
+    with pytest.raises(ModelError, match="boresight export"):
+        SingleFrameCalibrator(path)

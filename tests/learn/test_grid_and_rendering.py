@@ -1,0 +1,128 @@
+"""The grid's angles, what is rendered onto it through a guess, and that inference renders what training rendered."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import exp_so3
+from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.learn.compiled_rendering import compiled_nearest_points
+from pipeline.learn.grid import Grid, grid_rays, resample_camera
+from pipeline.learn.rendering import nearest_points, paint
+
+GRID = Grid()
+WIDE = np.array([[900.0, 0, 911.5], [0, 920, 469.5], [0, 0, 1]])
+NARROW = np.array([[700.0, 0, 639.5], [0, 700, 359.5], [0, 0, 1]])
+CAMERAS = {
+    "f-theta": Camera("equidistant", WIDE, np.zeros(4), 1824, 940),
+    "pinhole": Camera("plumb_bob", NARROW, np.array([-0.05, 0.01, 0.001, 0, 0]), 1280, 720),
+}
+
+
+def torch_points(points):
+    return torch.tensor(np.asarray(points), dtype=torch.float32)[None]
+
+
+def everywhere(points):
+    return torch.ones((1, points.shape[1]), dtype=torch.bool)
+
+
+def test_cells_look_where_their_row_and_column_say():
+    angles = np.degrees(camera_direction_angles(grid_rays(GRID)))
+    assert angles[0, 0] == pytest.approx([38.2, 15.8])
+    assert angles[-1, -1] == pytest.approx([-38.2, -22.2])
+    assert np.diff(angles[50, :, 0]) == pytest.approx(-0.4)
+
+
+def test_a_point_on_the_ray_of_each_cell_is_rendered_into_that_cell():
+    rays = grid_rays(GRID).reshape(-1, 3)
+    points = torch_points(rays * np.linspace(3, 90, len(rays))[:, None])
+    index = nearest_points(points, everywhere(points), GRID)
+    assert torch.equal(index[0], torch.arange(len(rays)))
+    ranges = paint(index, points.norm(dim=-1, keepdim=True), GRID)
+    assert ranges.flatten().numpy() == pytest.approx(np.linspace(3, 90, len(rays)), rel=1e-5)
+
+
+def test_of_several_points_in_a_cell_the_nearest_wins_and_absent_ones_never():
+    ray = grid_rays(GRID)[40, 100]
+    points = torch_points([ray * 30, ray * 12, ray * 5, ray * 20])
+    valid = torch.tensor([[True, True, False, True]])
+    index = nearest_points(points, valid, GRID)[0]
+    assert index[40 * GRID.width + 100] == 1
+    assert (index >= 0).sum() == 1
+
+
+def test_what_is_behind_or_outside_is_not_rendered():
+    points = torch_points([[0, 0, -10], [30, 0, 10], [0, -10, 10], [0, 10, 10], [0, 0, 0.2]])
+    assert (nearest_points(points, everywhere(points), GRID) == -1).all()
+
+
+def test_a_turn_about_the_upright_axis_is_a_shift_of_columns():
+    rays = grid_rays(GRID)[:, 60:120].reshape(-1, 3) * 20
+    turned = rays @ exp_so3(np.radians([0, 5 * GRID.cell_deg, 0])).T  # y points down: to the right
+    first, second = (
+        nearest_points(torch_points(p), everywhere(torch_points(p)), GRID).reshape(GRID.height, GRID.width)
+        for p in (rays, turned)
+    )
+    assert torch.equal(second[:, 65:125], first[:, 60:120])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_inference_renders_what_training_rendered(seed):
+    rng = np.random.default_rng(seed)
+    points = (rng.normal(0, [12, 3, 12], (6000, 3)) + [0, 0, 15]).astype(np.float32)
+    valid = rng.random(6000) < 0.9
+    ours = compiled_nearest_points(points, valid, GRID)
+    theirs = nearest_points(torch_points(points), torch.tensor(valid)[None], GRID)[0].numpy()
+    assert (ours >= 0).sum() > 1000
+    # A point within rounding of a border may fall into the neighbour: its own cell and the other's differ.
+    assert (ours != theirs).sum() <= 4
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_cameras_of_any_lens_show_each_direction_in_its_cell(model):
+    camera = CAMERAS[model]
+    v, u = np.mgrid[: camera.height_px, : camera.width_px].astype(float)
+    angles = np.degrees(camera_direction_angles(camera.unproject(np.stack([u, v], -1))))
+    cells = np.degrees(np.stack(np.meshgrid(GRID.azimuth_rad(), GRID.elevation_rad()), -1))
+    for axis in (0, 1):
+        # Three levels per degree, and the mirror image: together they cancel what rounding to whole levels adds.
+        colours = np.stack([angles[..., axis], -angles[..., axis], np.zeros_like(u)], -1) * 3 + 127
+        image = np.rint(np.clip(np.nan_to_num(colours), 0, 255)).astype(np.uint8)
+        resampled, seen = resample_camera(image, camera, GRID)
+        inside = seen == 1
+        assert inside.mean() > 0.9
+        one, other = np.moveaxis((resampled[..., :2].astype(float) - 127) / 3, -1, 0)
+        assert np.abs(one - cells[..., axis])[inside].max() < 0.5  # three roundings
+        assert abs(((one - other) / 2 - cells[..., axis])[inside].mean()) < 0.01
+
+
+def test_a_smaller_copy_of_the_image_gives_the_same_grid():
+    camera = CAMERAS["f-theta"]
+    rng = np.random.default_rng(0)
+    image = cv2.resize(
+        rng.integers(0, 255, (24, 40, 3), np.uint8), (1824, 940), interpolation=cv2.INTER_CUBIC
+    )
+    small = cv2.resize(image, (912, 470), interpolation=cv2.INTER_AREA)
+    full, _ = resample_camera(image, camera, GRID)
+    half, _ = resample_camera(small, camera, GRID)
+    assert np.abs(full.astype(float) - half).mean() < 1.0
+
+
+def test_the_networks_view_is_cut_out_of_larger_maps_and_refused_from_others():
+    rows, columns = GRID.window((128, 224), 0.4)
+    assert (rows.start, rows.stop, columns.start, columns.stop) == (24, 120, 16, 208)
+    for shape, step, words in (
+        ((128, 224), 0.2, "deg"),
+        ((90, 224), 0.4, "contain"),
+        ((129, 224), 0.4, "between"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            GRID.window(shape, step)
+
+
+def test_a_grid_that_cannot_be_halved_is_refused():
+    with pytest.raises(ValueError, match="multiple of 16"):
+        Grid(cell_deg=0.4, left_deg=38.0)

@@ -1,0 +1,199 @@
+"""The oracle: true classes and no training must find known turns, and nothing where there is nothing to find."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.geometry.se3 import exp_se3, exp_so3
+from pipeline.geometry.spherical import camera_direction_angles, to_spherical
+from pipeline.learn.grid import Grid, grid_rays
+from pipeline.learn.least_squares import (
+    angular_jacobian,
+    inverse_spd,
+    small_rotation_vector,
+    spherical_jacobian,
+)
+from pipeline.learn.matching import NEUTRAL, ClassMatcher
+from pipeline.learn.occupancy import OccupancyMatcher
+from pipeline.learn.outputs import pose_of_twist
+
+GRID = Grid()
+
+
+@lru_cache
+def street(seed=0):
+    """Directions of a fine grid, their range and class: objects of ten classes before a far wall of one class."""
+    rng = np.random.default_rng(seed)
+    rays = grid_rays(GRID.finer(2))
+    azimuth, elevation = np.moveaxis(np.degrees(camera_direction_angles(rays)), -1, 0)
+    kind, distance = np.full(azimuth.shape, 2), np.full(azimuth.shape, 45.0)
+    kind[elevation < -3], distance[elevation < -3] = 0, 25.0
+    for _ in range(30):
+        a, e = rng.uniform(-36, 36), rng.uniform(-8, 5)
+        w, h = rng.uniform(1, 4, 2)
+        inside = (np.abs(azimuth - a) < w) & (np.abs(elevation - e) < h)
+        nearer = inside & (distance > (d := rng.uniform(6, 40)))
+        kind[nearer], distance[nearer] = rng.integers(3, 10), d
+    return rays, kind, distance
+
+
+@lru_cache
+def observed():
+    """Likelihood maps of the camera, and 1500 lidar points in the optical frame with one-hot classes."""
+    rays, kind, distance = street()
+    cells = (
+        kind.reshape(GRID.height, 2, GRID.width, 2).transpose(0, 2, 1, 3).reshape(GRID.height, GRID.width, 4)
+    )
+    share = np.stack([(cells == k).mean(-1) for k in range(10)])
+    likelihood = torch.log(torch.tensor(share * 0.9 + 0.01, dtype=torch.float32))[None]
+    rng = np.random.default_rng(1)
+    picked = rng.choice(kind.size, 1500, replace=False)
+    points = (rays * distance[..., None]).reshape(-1, 3)[picked]
+    classes = torch.nn.functional.one_hot(torch.tensor(kind.ravel()[picked]), 10).float()[None]
+    return likelihood, torch.tensor(points, dtype=torch.float32)[None], classes
+
+
+def matched(T, passes=3, grid_matcher=None):
+    """Twists in degrees and metres that are left after some passes from points moved by T."""
+    likelihood, points, classes = observed()
+    matcher = grid_matcher or ClassMatcher(GRID)
+    T = torch.tensor(T, dtype=torch.float32)[None]
+    with torch.no_grad():
+        for _ in range(passes):
+            moved = points @ T[0, :3, :3].T + T[0, :3, 3]
+            found = matcher(likelihood, moved, classes, torch.ones(1, points.shape[1]))
+            T = pose_of_twist(found.twist) @ T
+    return np.degrees(small_rotation_vector(T[:, :3, :3])[0].numpy()), T[0, :3, 3].numpy(), found
+
+
+def test_perfect_semantics_at_the_right_place_ask_for_no_turn():
+    # Half a cell would be 0.2 deg: the error that looks like slow learning.
+    turn, shift, _ = matched(np.eye(4), passes=1)
+    assert np.abs(turn).max() < 0.05
+    assert np.abs(shift).max() < 0.02
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("angle_deg", [-3.0, 0.7, 5.0])
+def test_a_known_turn_about_each_axis_is_undone(axis, angle_deg):
+    omega = np.zeros(3)
+    omega[axis] = np.radians(angle_deg)
+    T = np.eye(4)
+    T[:3, :3] = exp_so3(omega)
+    turn, _, _ = matched(T)
+    assert np.abs(turn).max() < 0.12
+
+
+def test_random_turns_of_three_degrees_and_shifts_are_undone_to_a_tenth():
+    rng = np.random.default_rng(3)
+    left = []
+    for _ in range(8):
+        T = np.eye(4)
+        T[:3, :3] = exp_so3(np.radians(rng.uniform(-3, 3, 3)))
+        T[:3, 3] = rng.uniform(-0.03, 0.03, 3)
+        turn, _, _ = matched(T)
+        left.append(np.abs(turn))
+    assert np.mean(left, axis=0).max() < 0.15  # a 3 cm shift alone looks like 0.1 deg at 17 m
+
+
+def test_parallax_tells_a_sideways_shift_from_a_turn():
+    matcher = ClassMatcher(GRID)
+    with torch.no_grad():
+        matcher.log_prior_sigma[3:] = np.log(0.3)  # let translations move
+    T = np.eye(4)
+    T[0, 3] = 0.25
+    _, shift, _ = matched(T, passes=4, grid_matcher=matcher)
+    assert abs(shift[0]) < 0.12
+
+
+def test_blind_cameras_move_nothing_and_leave_the_prior_s_variance():
+    likelihood, points, classes = observed()
+    matcher = ClassMatcher(GRID)
+    with torch.no_grad():
+        found = matcher(torch.full_like(likelihood, NEUTRAL), points, classes, torch.ones(1, points.shape[1]))
+        none = matcher(likelihood, points, classes, torch.zeros(1, points.shape[1]))
+    for match in (found, none):
+        assert match.twist.abs().max() < 1e-4
+        assert match.variance[0].numpy() == pytest.approx(
+            np.exp(2 * matcher.log_prior_sigma.detach().numpy()), rel=0.02
+        )
+
+
+def radar_scene(seed=0, elevation_deg=1.0):
+    """Boxes of lidar points and radar detections on them, with noise and clutter; lidar frame."""
+    rng = np.random.default_rng(seed)
+    centres = np.stack([rng.uniform(8, 50, 25), rng.uniform(-0.5, 0.5, 25), rng.uniform(-1.5, 1, 25)], -1)
+    centres[:, 1] *= centres[:, 0]
+    objects = (centres[:, None] + rng.uniform(-0.5, 0.5, (25, 40, 3)) * [0.3, 1.5, 1.2]).reshape(-1, 3)
+    polar = to_spherical(centres[rng.integers(0, 25, 120)])
+    polar += rng.normal(0, 1, (120, 3)) * [np.radians(0.4), np.radians(elevation_deg), 0.1]
+    clutter = np.stack([rng.uniform(-0.5, 0.5, 40), rng.uniform(-0.2, 0.2, 40), rng.uniform(5, 60, 40)], -1)
+    a, e, r = np.concatenate([polar, clutter]).T
+    radar = np.stack([r * np.cos(e) * np.cos(a), r * np.cos(e) * np.sin(a), r * np.sin(e)], -1)
+    return torch.tensor(objects, dtype=torch.float32)[None], radar
+
+
+def radar_left(xi, seed=0, *, elevation=True, passes=3):
+    objects, radar = radar_scene(seed)
+    T = torch.tensor(exp_se3(np.asarray(xi, float)), dtype=torch.float32)[None]
+    radar = torch.tensor(radar, dtype=torch.float32)[None]
+    matcher = OccupancyMatcher(3)
+    real = torch.ones(1, radar.shape[1], dtype=torch.bool)
+    with torch.no_grad():
+        for _ in range(passes):
+            moved = radar @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]
+            found = matcher(
+                moved,
+                torch.zeros_like(moved),
+                real,
+                torch.tensor([elevation]),
+                objects,
+                torch.ones(1, objects.shape[1]),
+            )
+            T = pose_of_twist(found.twist) @ T
+    return np.degrees(small_rotation_vector(T[:, :3, :3])[0].numpy()), T[0, :3, 3].numpy(), found
+
+
+@pytest.mark.parametrize("turn_deg", [(0, 0, 0), (0, 0, 4), (0, -3, 0), (2, 2, -3), (0, 3, 5)])
+def test_radar_finds_the_lidar_s_objects_again(turn_deg):
+    left, shift, _ = radar_left([*np.radians(turn_deg), 0.03, -0.03, 0.0])
+    assert abs(left[2]) < 0.3
+    assert abs(left[1]) < 0.6
+    assert np.abs(shift).max() < 0.15
+
+
+def test_a_radar_without_elevation_turns_about_the_upright_axis_alone():
+    left, _, found = radar_left(np.radians([1.0, 2.0, 3.0, 0, 0, 0]), elevation=False, passes=1)
+    assert abs(left[2]) < 0.4
+    assert left[:2] == pytest.approx([1.0, 2.0], abs=0.2)
+    # Nothing was learned of roll and pitch: their variance is the prior's.
+    assert found.variance[0, :2].sqrt().numpy() == pytest.approx(0.02, rel=0.1)
+
+
+def test_elimination_inverts_what_numpy_inverts():
+    A = np.random.default_rng(0).normal(size=(5, 6, 6))
+    H = A @ A.transpose(0, 2, 1) + np.eye(6)
+    assert inverse_spd(torch.tensor(H)).numpy() == pytest.approx(np.linalg.inv(H), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("jacobian", "angles", "scale"),
+    [(angular_jacobian, camera_direction_angles, "inverse"), (spherical_jacobian, to_spherical, "range")],
+)
+def test_jacobians_agree_with_differences(jacobian, angles, scale):
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-2, 2, (7, 3)) + [[12, 0, 0], [0, 0, 12]][scale == "inverse"]
+    distance = np.linalg.norm(points, axis=1)
+    J = jacobian(
+        torch.tensor(points / distance[:, None])[None],
+        torch.tensor(1 / distance if scale == "inverse" else distance)[None],
+    )[0].numpy()
+    h = 1e-6
+    for k in range(6):
+        xi = np.zeros(6)
+        xi[k] = h
+        up, down = exp_se3(xi), exp_se3(-xi)
+        difference = angles(points @ up[:3, :3].T + up[:3, 3]) - angles(points @ down[:3, :3].T + down[:3, 3])
+        assert J[..., k] == pytest.approx(difference / (2 * h), abs=1e-6)

@@ -1,0 +1,209 @@
+"""Networks of both architectures: what they correct, what teaches them, and what they must not care about."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.learn.batch import TrainingBatch
+from pipeline.learn.collate import collate
+from pipeline.learn.distillation import class_of_points, semantics_loss
+from pipeline.learn.grid import Grid
+from pipeline.learn.inputs import NetworkInputs, crop, sensor_inputs
+from pipeline.learn.layout import GRAPH_INPUTS, PAIRS, NetworkConfig
+from pipeline.learn.networks import build_network, refine
+from pipeline.learn.samples import About, make_row
+from pipeline.learn.views import render
+from pipeline.objective.differentiable.poses import transform_points
+from pipeline.objective.problem import Prior
+from schemas.training import UNKNOWN_CLASS
+from tests import solve_scenes, training_lakes
+
+GRID = Grid(0.4, 25.6, 12.8, -12.8)
+KINDS = [(a, p) for a in ("matching", "concat") for p in ("joint", *PAIRS)]
+
+
+@lru_cache
+def batch(frames=2) -> TrainingBatch:
+    config = training_lakes.fleet_of(["v"]).prepare
+    prior = Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05)
+    about = About("v", "2026-01-01", "default", "train", "p", "urban")
+    rows = []
+    for seed in range(frames):
+        rng = np.random.default_rng(seed)
+        observation = solve_scenes.make_observation(rng, seed, 0, float(seed))
+        rows.append(make_row(training_lakes.frame_of(observation, rng), observation, prior, about, config))
+    return collate(rows)
+
+
+def inputs_of(data, **changes) -> NetworkInputs:
+    T = {"T_camera_lidar": data.T_camera_lidar, "T_lidar_radar": data.T_lidar_radar}
+    T |= {"T_camera_radar": data.T_camera_radar}
+    return NetworkInputs(sensor_inputs(data, GRID), **{k: v.float() for k, v in (T | changes).items()})
+
+
+def small(architecture="matching", pairs="joint", seed=0):
+    return build_network(NetworkConfig(architecture, pairs, GRID, width=8, hidden=32), seed)
+
+
+def names_of(pair):
+    return f"T_{pair}"
+
+
+@pytest.mark.parametrize(("architecture", "pairs"), KINDS)
+def test_a_network_corrects_its_pairs_rigidly_and_leaves_the_others(architecture, pairs):
+    inputs = inputs_of(batch())
+    network = small(architecture, pairs)
+    with torch.no_grad():
+        answer = network(inputs)
+    for pair in PAIRS:
+        T = getattr(answer, names_of(pair))
+        assert torch.allclose(
+            T[:, :3, :3] @ T[:, :3, :3].transpose(1, 2), torch.eye(3).expand(2, 3, 3), atol=1e-5
+        )
+        moved = (T - getattr(inputs, names_of(pair))).abs().max() > 1e-7
+        assert bool(moved) == (pairs in ("joint", pair))
+    assert answer.log_variance.shape == (2, 3, 6)
+    assert torch.isfinite(answer.log_variance).all()
+
+
+def test_a_fresh_matching_network_is_its_geometry():
+    # Residual heads start near nothing: the radar's matcher works untrained.
+    inputs = inputs_of(batch())
+    network = small()
+    with torch.no_grad():
+        answer = network(inputs)
+        view, _ = render(inputs, GRID)
+        alone = network.core.radar_matcher(
+            view.radar_lidar, view.radar_features, view.radar_valid, view.radar_has_elevation,
+            view.objects, view.object_weight,
+        )  # fmt: skip
+    turn = answer.T_lidar_radar @ torch.linalg.inv(inputs.T_lidar_radar)
+    skew = (turn[:, 1, 0] - turn[:, 0, 1]) / 2
+    assert skew.numpy() == pytest.approx(alone.twist[:, 2].numpy(), abs=2e-4)
+
+
+def test_a_joint_matching_network_composes_the_camera_radar_pair():
+    answer = small()(inputs_of(batch()))
+    composed = answer.T_camera_lidar @ answer.T_lidar_radar
+    assert (
+        composed - answer.T_camera_radar
+    ).abs().max() < 5e-3  # all but a residual that has not learned yet
+
+
+def test_refinement_renders_at_the_last_answer_and_encodes_the_camera_once():
+    network, inputs = small(), inputs_of(batch())
+    calls = []
+    network.core.camera_encoder.register_forward_hook(lambda *_: calls.append(1))
+    with torch.no_grad():
+        answers = refine(network, inputs, 3)
+        by_hand = inputs
+        for answer in answers:
+            again = network(by_hand)
+            for pair in PAIRS:
+                assert torch.allclose(
+                    getattr(again, names_of(pair)), getattr(answer, names_of(pair)), atol=1e-6
+                )
+            by_hand = replace(by_hand, **{names_of(p): getattr(again, names_of(p)) for p in PAIRS})
+    assert len(calls) == 1 + 3  # once in refine, once in each pass by hand
+
+
+def test_the_same_seed_gives_the_same_weights_and_leaves_torch_s_generator_alone():
+    torch.manual_seed(5)
+    before = torch.random.get_rng_state()
+    first, second, other = small(seed=1), small(seed=1), small(seed=2)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    pairs = list(zip(first.parameters(), second.parameters(), other.parameters(), strict=True))
+    assert all(torch.equal(a, b) for a, b, _ in pairs)
+    assert any(not torch.equal(a, c) for a, _, c in pairs)
+
+
+def test_alignment_teaches_heads_and_temperatures_and_classes_teach_encoders():
+    network, inputs = small(), inputs_of(batch())
+    answer = network(inputs)
+    loss = sum(getattr(answer, names_of(p)).pow(2).sum() for p in PAIRS) + answer.log_variance.sum()
+    loss.backward(retain_graph=True)
+    untaught = {n for n, p in network.named_parameters() if p.grad is None}
+    assert untaught == {n for n, _ in network.named_parameters() if "_encoder" in n}
+    data = batch()
+    classes = crop(data.grid_class, data.grid_step_deg, GRID)
+    semantics_loss(
+        answer, classes, data.lidar_xyz_m, data.lidar_valid, inputs.T_camera_lidar, GRID
+    ).backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.parameters())
+
+
+@pytest.mark.parametrize("pairs", ["joint", "camera_lidar", "camera_radar"])
+def test_a_dozen_steps_on_two_frames_teach_classes(pairs):
+    network, data = small(pairs=pairs), batch()
+    inputs = inputs_of(data)
+    classes = crop(data.grid_class, data.grid_step_deg, GRID)
+    radar = transform_points(inputs.T_camera_radar, inputs.sensors.radar_xyz_m)
+    optimiser = torch.optim.Adam(network.parameters(), 1e-2)
+    losses = []
+    for _ in range(12):
+        optimiser.zero_grad()
+        loss = semantics_loss(
+            network(inputs), classes, data.lidar_xyz_m, data.lidar_valid, inputs.T_camera_lidar, GRID,
+            radar, data.radar_valid,
+        )  # fmt: skip
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.75 * losses[0]
+
+
+def test_points_take_the_class_of_their_cell_and_none_outside():
+    classes = torch.full((1, GRID.height, GRID.width), 4, dtype=torch.uint8)
+    classes[:, :, : GRID.width // 2] = 7
+    classes[:, 0, 0] = UNKNOWN_CLASS
+    points = torch.tensor([[[-1.0, 0, 10], [1.0, 0, 10], [30.0, 0, 10], [0, 0, -10], [1.0, 0, 10]]])
+    valid = torch.tensor([[True, True, True, True, False]])
+    found = class_of_points(classes, points, valid, GRID)
+    assert found[0].tolist() == [7, 4, UNKNOWN_CLASS, UNKNOWN_CLASS, UNKNOWN_CLASS]
+
+
+@pytest.mark.parametrize("architecture", ["matching", "concat"])
+def test_exposure_and_contrast_do_not_matter(architecture):
+    network, inputs = small(architecture), inputs_of(batch())
+    camera = inputs.sensors.camera
+    seen = camera[:, 3:]
+    darker = torch.cat([(camera[:, :3] * 0.5 + 0.1) * seen, seen], 1)
+    other = replace(inputs, sensors=replace(inputs.sensors, camera=darker))
+    with torch.no_grad():
+        first, second = network(inputs), network(other)
+    assert torch.allclose(first.T_camera_lidar, second.T_camera_lidar, atol=2e-4)
+
+
+def test_frames_of_a_batch_do_not_know_of_each_other():
+    data, network = batch(), small()
+    with torch.no_grad():
+        both, alone = network(inputs_of(data)), network(inputs_of(data[1:]))
+    assert torch.allclose(both.T_camera_lidar[1:], alone.T_camera_lidar, atol=1e-5)
+    assert torch.allclose(both.log_variance[1:], alone.log_variance, atol=1e-3)
+
+
+def test_padding_does_not_matter():
+    inputs, network = inputs_of(batch()), small()
+    s = inputs.sensors
+
+    def padded(values, amount=50):
+        return torch.cat([values, torch.zeros_like(values[:, :1]).expand(-1, amount, *values.shape[2:])], 1)
+
+    more = replace(
+        s,
+        radar_xyz_m=padded(s.radar_xyz_m),
+        radar_features=padded(s.radar_features),
+        radar_valid=padded(s.radar_valid),
+    )
+    with torch.no_grad():
+        first, second = network(inputs), network(replace(inputs, sensors=more))
+    assert torch.allclose(first.T_lidar_radar, second.T_lidar_radar, atol=1e-6)
+
+
+def test_the_exported_graph_s_inputs_are_the_fields_of_a_view():
+    view, index = render(inputs_of(batch()), GRID)
+    assert tuple(vars(view)) == GRAPH_INPUTS
+    assert view.lidar_grid[:, 0].sum() == (index >= 0).sum()
