@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.config import FleetConfig
+    from pipeline.store.partitions import Lake, Partition
 
 __all__ = ["calibrate", "parse_pair", "parse_perturb"]
 
@@ -16,6 +21,8 @@ def calibrate(
     method: str = "joint",
     perturb: str | None = None,
     seed: int | None = None,
+    frame: int | None = None,
+    polish: bool = False,
 ) -> int:
     """Find out how the vehicle's sensors sat relative to each other on that day, and how sure that is.
 
@@ -24,9 +31,12 @@ def calibrate(
         lake: folder of the tables.
         vehicle: vehicle id, as in fleet.toml.
         day: YYYY-MM-DD.
-        method: joint, pairwise-optimisation or joint-optimisation.
+        method: joint; tracking, pairwise-optimisation, joint-optimisation; or by networks: pairwise-ssl, joint-ssl.
         perturb: ROT_DEG,TRANS_M: move the prior on purpose by exactly this much, for tests.
         seed: of everything random; the configuration's where left out.
+        frame: frame_index or stamp_ns: calibrate from this frame alone, by a network (joint-ssl where no SSL method
+            is named). Nothing is recorded; the summary holds the transforms.
+        polish: let the optimiser finish from the networks' answer, as solve.polish in fleet.toml.
     """
     from jobs.summary import exit_code, print_summary, progress_reporter
     from pipeline.calibrate import calibrate_day
@@ -34,6 +44,11 @@ def calibrate(
     from pipeline.store.partitions import Lake, Partition
 
     config = load_fleet(fleet)
+    if polish:
+        config = config.model_copy(update={"solve": config.solve.model_copy(update={"polish": True})})
+    if frame is not None:
+        partition, tables = Partition(vehicle, day), Lake.at(lake)
+        return _calibrate_frame(config, fleet, tables, partition, frame, method, parse_perturb(perturb), seed)
     with progress_reporter(f"calibrate {vehicle} {day}") as progress:
         result = calibrate_day(
             Partition(vehicle, day),
@@ -57,6 +72,48 @@ def calibrate(
         outputs=result.outputs,
     )
     return exit_code([result.status, *(status for status, pairs in result.kept.items() if pairs)])
+
+
+def _calibrate_frame(
+    config: FleetConfig,
+    fleet: Path,
+    lake: Lake,
+    partition: Partition,
+    frame: int,
+    method: str,
+    perturb: tuple[float, float] | None,
+    seed: int | None,
+) -> int:
+    """One frame's transforms in the summary."""
+    from jobs.summary import print_summary
+    from pipeline.calibrate_ssl import calibrate_frame
+
+    method = "joint-ssl" if method == "joint" else method
+    found = calibrate_frame(
+        partition, config, lake, frame, method=method, perturb=perturb, seed=seed, fleet_file=fleet
+    )
+    estimates = {
+        pair: {
+            "T": estimate.T,
+            "T_prior": found.prior.of(pair),
+            "covariance": estimate.covariance,
+            "observable": estimate.observable,
+            "diagnostics": estimate.diagnostics,
+        }
+        for pair, estimate in found.solution.pairs.items()
+    }
+    print_summary(
+        "calibrate",
+        "done",
+        vehicle=partition.vehicle,
+        day=partition.day,
+        method=method,
+        frame_index=found.frame_index,
+        stamp_ns=found.stamp_ns,
+        estimates=estimates,
+        reason="one frame: nothing judges it and nothing is recorded",
+    )
+    return 0
 
 
 def parse_perturb(text: str | None) -> tuple[float, float] | None:
