@@ -87,7 +87,7 @@ def make_observation(
         "radar_has_elevation": True,
         "radar_velocity_mps": np.array([10.0, 0, 0]), "radar_velocity_cov": np.eye(3) * 0.01,
         "radar_track_xyz_m": tracks.astype(np.float32), "radar_track_velocity_mps": np.ones((n, 3), np.float32),
-        "radar_track_id": np.arange(n, dtype=np.int32), "radar_track_age": np.ones(n, np.int32),
+        "radar_track_id": np.arange(n, dtype=np.int32), "radar_track_age": np.full(n, 3, np.int32),
         "radar_track_points": np.full(n, 3, np.int32),
         "radar_drivable_azimuth_rad": azimuth.astype(np.float32), "radar_drivable_range_m": reach.astype(np.float32),
     }  # fmt: skip
