@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import SolveConfig, load_fleet
+from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3, inverse, log_so3, transform_points
 from tests.benchmarks.recovery import changed_radar
 from tests.benchmarks.studies import engine
@@ -15,7 +16,7 @@ from tests.benchmarks.studies.ablation import _settings, setting_of
 from tests.benchmarks.studies.days import SETS, Day, DaySpec
 from tests.benchmarks.studies.engine import Run, key_of, prior_of, read_results, run_study, spoiled
 from tests.benchmarks.studies.verdict import _derived, _simulated, fault_of
-from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 SPEC = DaySpec(7, "urban")
 TRUTH = {
@@ -96,6 +97,17 @@ def test_wrong_intrinsics_are_in_every_row_and_nothing_else_changes(day, how, K)
     rows = spoiled(day.rows, how)
     assert all((o.camera_K[0, 0], o.camera_K[0, 2]) == pytest.approx(K) for o in rows)
     assert replace(rows[3], camera_K=day.rows[3].camera_K).labels_png == day.rows[3].labels_png
+
+
+def test_a_wrong_principal_point_is_a_turned_camera_and_pixels_fall_into_place(day):
+    T = engine.reference(day, "camera_lidar", "centre:20")
+    point = np.array([[20.0, 0.3, -0.4]])
+    seen = CAMERA.project(transform_points(T_CAMERA_LIDAR, point))[0]
+    K = CAMERA.K + np.array([[0, 0, 20], [0, 0, 20], [0, 0, 0]])
+    wrong = Camera(CAMERA.model, K, CAMERA.D, CAMERA.width_px, CAMERA.height_px)
+    again = wrong.project(transform_points(T, point))[0]
+    assert np.abs(again - seen).max() < 0.5
+    assert engine.reference(day, "lidar_radar", "centre:20") == pytest.approx(T_LIDAR_RADAR)
 
 
 def test_few_frames_are_spread_over_the_day(day):

@@ -7,7 +7,8 @@ Good days are those of the coverage study (same days, priors and keys: its resul
 days: simulated with permuted label classes, night perception, a camera or radar clock 80 ms late, and a sensor hanging
 12 deg off in its bracket, of which tf_static knows nothing; and made of good days at observation level, exactly, since
 perceive copies these columns: focal length wrong by 3 %, principal point wrong by 20 px, 2 % of the frames (1 of 40);
-and good days with a prior that is 12 deg off unbeknown, twice the search range.
+and good days with a prior that is 12 deg off unbeknown, twice the search range. A wrong principal point is a turned
+camera to any alignment: those days are measured against the truth turned likewise (`engine.reference`).
 
 The score of the precision-recall curve is the record's `diagnostics["confidence"]` where it carries one; else
 minus the largest of the 6 sigmas' angles [deg] among the determined ones, so that surer records come first.
