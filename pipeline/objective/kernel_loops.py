@@ -17,11 +17,12 @@ import numpy as np
 
 __all__ = ["pinhole_costs", "pinhole_gradients", "polynomial_costs", "polynomial_gradients"]
 
-_TILE = 512  # points; 64 to 4096 measured the same within noise
+_TILE = 2048  # points, 24 kB; 512 costs 4 % more
 _NEAR_M = 0.5  # nothing outside the car is nearer
 _f4 = np.float32
 # 32-bit constants: plain ones would make numba compute in 64 bits and halve the width of its vectors.
 _BYTE, _8, _16, _24 = np.uint32(255), np.uint32(8), np.uint32(16), np.uint32(24)
+_31 = np.uint32(0x7FFFFFFF)  # says that an index is not negative: gathers of 32-bit offsets, 16 at a time
 
 _jit = numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 
@@ -38,21 +39,22 @@ def pinhole_costs(poses, xs, ys, zs, first, quads, map_first, size_px, camera, p
         outside = penalty / scale
         for t0 in range(first[f], first[f + 1], _TILE):
             t1 = min(t0 + _TILE, first[f + 1])
+            xt, yt, zt = xs[t0:t1], ys[t0:t1], zs[t0:t1]
             for p in range(len(poses)):
                 r0, r1, r2, tx = poses[p, 0], poses[p, 1], poses[p, 2], poses[p, 3]
                 r3, r4, r5, ty = poses[p, 4], poses[p, 5], poses[p, 6], poses[p, 7]
                 r6, r7, r8, tz = poses[p, 8], poses[p, 9], poses[p, 10], poses[p, 11]
                 total = zero
-                for i in range(t0, t1):
-                    z = r6 * xs[i] + r7 * ys[i] + r8 * zs[i] + tz
+                for i in range(len(xt)):
+                    z = r6 * xt[i] + r7 * yt[i] + r8 * zt[i] + tz
                     iz = one / max(z, near)
-                    u = (r0 * xs[i] + r1 * ys[i] + r2 * zs[i] + tx) * iz * fx + cx
-                    v = (r3 * xs[i] + r4 * ys[i] + r5 * zs[i] + ty) * iz * fy + cy
+                    u = (r0 * xt[i] + r1 * yt[i] + r2 * zt[i] + tx) * iz * fx + cx
+                    v = (r3 * xt[i] + r4 * yt[i] + r5 * zt[i] + ty) * iz * fy + cy
                     uc = min(max(u, zero), w_max)
                     vc = min(max(v, zero), h_max)
                     iu, iv = np.int32(uc), np.int32(vc)
                     a, b = uc - _f4(iu), vc - _f4(iv)
-                    w = quad[np.uint32(iv * width + iu)]
+                    w = quad[np.uint32(np.uint32(iv * width + iu) & _31)]
                     m0, m1 = _f4(np.int32(w & _BYTE)), _f4(np.int32((w >> _8) & _BYTE))
                     m2, m3 = _f4(np.int32((w >> _16) & _BYTE)), _f4(np.int32(w >> _24))
                     top = m0 + a * (m1 - m0)
@@ -83,15 +85,16 @@ def polynomial_costs(poses, xs, ys, zs, first, quads, map_first, size_px, camera
         outside = penalty / scale
         for t0 in range(first[f], first[f + 1], _TILE):
             t1 = min(t0 + _TILE, first[f + 1])
+            xt, yt, zt = xs[t0:t1], ys[t0:t1], zs[t0:t1]
             for p in range(len(poses)):
                 r0, r1, r2, tx = poses[p, 0], poses[p, 1], poses[p, 2], poses[p, 3]
                 r3, r4, r5, ty = poses[p, 4], poses[p, 5], poses[p, 6], poses[p, 7]
                 r6, r7, r8, tz = poses[p, 8], poses[p, 9], poses[p, 10], poses[p, 11]
                 total = zero
-                for i in range(t0, t1):
-                    x = r0 * xs[i] + r1 * ys[i] + r2 * zs[i] + tx
-                    y = r3 * xs[i] + r4 * ys[i] + r5 * zs[i] + ty
-                    z = r6 * xs[i] + r7 * ys[i] + r8 * zs[i] + tz
+                for i in range(len(xt)):
+                    x = r0 * xt[i] + r1 * yt[i] + r2 * zt[i] + tx
+                    y = r3 * xt[i] + r4 * yt[i] + r5 * zt[i] + ty
+                    z = r6 * xt[i] + r7 * yt[i] + r8 * zt[i] + tz
                     inv = one / np.sqrt(x * x + y * y + z * z + tiny)
                     c = z * inv
                     q = one - max(c, c_min)
@@ -104,7 +107,7 @@ def polynomial_costs(poses, xs, ys, zs, first, quads, map_first, size_px, camera
                     vc = min(max(v, zero), h_max)
                     iu, iv = np.int32(uc), np.int32(vc)
                     a, b = uc - _f4(iu), vc - _f4(iv)
-                    w = quad[np.uint32(iv * width + iu)]
+                    w = quad[np.uint32(np.uint32(iv * width + iu) & _31)]
                     m0, m1 = _f4(np.int32(w & _BYTE)), _f4(np.int32((w >> _8) & _BYTE))
                     m2, m3 = _f4(np.int32((w >> _16) & _BYTE)), _f4(np.int32(w >> _24))
                     top = m0 + a * (m1 - m0)
@@ -125,6 +128,7 @@ def pinhole_gradients(poses, xs, ys, zs, first, quads, map_first, size_px, camer
         fx, fy, cx, cy, scale = camera[f, 0], camera[f, 1], camera[f, 2], camera[f, 3], camera[f, 5]
         for t0 in range(first[f], first[f + 1], _TILE):
             t1 = min(t0 + _TILE, first[f + 1])
+            xt, yt, zt = xs[t0:t1], ys[t0:t1], zs[t0:t1]
             for p in range(len(poses)):
                 r0, r1, r2, tx = poses[p, 0], poses[p, 1], poses[p, 2], poses[p, 3]
                 r3, r4, r5, ty = poses[p, 4], poses[p, 5], poses[p, 6], poses[p, 7]
@@ -132,10 +136,10 @@ def pinhole_gradients(poses, xs, ys, zs, first, quads, map_first, size_px, camer
                 s = g0 = g1 = g2 = g3 = g4 = g5 = zero
                 h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = zero
                 h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = zero
-                for i in range(t0, t1):
-                    x = r0 * xs[i] + r1 * ys[i] + r2 * zs[i] + tx
-                    y = r3 * xs[i] + r4 * ys[i] + r5 * zs[i] + ty
-                    z = r6 * xs[i] + r7 * ys[i] + r8 * zs[i] + tz
+                for i in range(len(xt)):
+                    x = r0 * xt[i] + r1 * yt[i] + r2 * zt[i] + tx
+                    y = r3 * xt[i] + r4 * yt[i] + r5 * zt[i] + ty
+                    z = r6 * xt[i] + r7 * yt[i] + r8 * zt[i] + tz
                     iz = one / max(z, near)
                     xn, yn = x * iz, y * iz
                     u, v = xn * fx + cx, yn * fy + cy
@@ -143,7 +147,7 @@ def pinhole_gradients(poses, xs, ys, zs, first, quads, map_first, size_px, camer
                     vc = min(max(v, zero), h_max)
                     iu, iv = np.int32(uc), np.int32(vc)
                     a, b = uc - _f4(iu), vc - _f4(iv)
-                    w = quad[np.uint32(iv * width + iu)]
+                    w = quad[np.uint32(np.uint32(iv * width + iu) & _31)]
                     m0, m1 = _f4(np.int32(w & _BYTE)), _f4(np.int32((w >> _8) & _BYTE))
                     m2, m3 = _f4(np.int32((w >> _16) & _BYTE)), _f4(np.int32(w >> _24))
                     top = m0 + a * (m1 - m0)
@@ -245,6 +249,7 @@ def polynomial_gradients(poses, xs, ys, zs, first, quads, map_first, size_px, ca
         k5, k6, k7, k8 = camera[f, 11], camera[f, 12], camera[f, 13], camera[f, 14]
         for t0 in range(first[f], first[f + 1], _TILE):
             t1 = min(t0 + _TILE, first[f + 1])
+            xt, yt, zt = xs[t0:t1], ys[t0:t1], zs[t0:t1]
             for p in range(len(poses)):
                 r0, r1, r2, tx = poses[p, 0], poses[p, 1], poses[p, 2], poses[p, 3]
                 r3, r4, r5, ty = poses[p, 4], poses[p, 5], poses[p, 6], poses[p, 7]
@@ -252,10 +257,10 @@ def polynomial_gradients(poses, xs, ys, zs, first, quads, map_first, size_px, ca
                 s = g0 = g1 = g2 = g3 = g4 = g5 = zero
                 h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = zero
                 h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = zero
-                for i in range(t0, t1):
-                    x = r0 * xs[i] + r1 * ys[i] + r2 * zs[i] + tx
-                    y = r3 * xs[i] + r4 * ys[i] + r5 * zs[i] + ty
-                    z = r6 * xs[i] + r7 * ys[i] + r8 * zs[i] + tz
+                for i in range(len(xt)):
+                    x = r0 * xt[i] + r1 * yt[i] + r2 * zt[i] + tx
+                    y = r3 * xt[i] + r4 * yt[i] + r5 * zt[i] + ty
+                    z = r6 * xt[i] + r7 * yt[i] + r8 * zt[i] + tz
                     inv = one / np.sqrt(x * x + y * y + z * z + tiny)
                     xn, yn, c = x * inv, y * inv, z * inv
                     q = one - max(c, c_min)
@@ -282,7 +287,7 @@ def polynomial_gradients(poses, xs, ys, zs, first, quads, map_first, size_px, ca
                     vc = min(max(v, zero), h_max)
                     iu, iv = np.int32(uc), np.int32(vc)
                     a, b = uc - _f4(iu), vc - _f4(iv)
-                    w = quad[np.uint32(iv * width + iu)]
+                    w = quad[np.uint32(np.uint32(iv * width + iu) & _31)]
                     m0, m1 = _f4(np.int32(w & _BYTE)), _f4(np.int32((w >> _8) & _BYTE))
                     m2, m3 = _f4(np.int32((w >> _16) & _BYTE)), _f4(np.int32(w >> _24))
                     top = m0 + a * (m1 - m0)
