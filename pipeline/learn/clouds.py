@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Integer, UInt8
 from scipy.spatial import cKDTree
 
 from pipeline.config import PrepareConfig
@@ -91,7 +91,7 @@ def input_points(
 
 
 def range_edges(
-    xyz_m: Float[np.ndarray, "N 3"], ring: Int[np.ndarray, " N"] | None
+    xyz_m: Float[np.ndarray, "N 3"], ring: Integer[np.ndarray, " N"] | None
 ) -> Bool[np.ndarray, " N"]:
     """True for points that stand in front of their neighbour along the ring by a jump in range.
 
