@@ -178,6 +178,7 @@ def _judge_all(
     doubts = loop_doubts(solution)
     limits = Limits(np.radians(fleet.solve.search_rotation_deg), fleet.solve.search_translation_m)
     composed = COMPOSED.get(solution.method, ())
+    against = _contradictions(solution, composed)
     found: dict[str, Judged] = {}
     for pair in sorted(PAIRS, key=lambda p: p in composed):
         estimate = solution.pairs[pair]
@@ -189,13 +190,24 @@ def _judge_all(
             prior.covariance(pair),
             test,
             claims,
-            [*solution.doubts.get(pair, []), *doubts],
+            [*solution.doubts.get(pair, []), *against.get(pair, []), *doubts],
             limits,
             calibrated=pair in active,
             factors=tuple(f.verdict for f in found.values()) if pair in composed else (),
         )
         found[pair] = Judged(verdict, test, claims)
     return found
+
+
+def _contradictions(solution: Solution, composed: Sequence[str]) -> dict[str, list[str]]:
+    """Doubts that only a composed pair has are about its factors: two sensors contradict the third one's registration.
+
+    Camera and lidar know their pose ten times better than either knows the radar's, so the radar's pair is doubted.
+    """
+    factors = [p for p in PAIRS if p not in composed]
+    known = {doubt for p in factors for doubt in solution.doubts.get(p, [])}
+    own = [doubt for p in composed for doubt in solution.doubts.get(p, []) if doubt not in known]
+    return {"lidar_radar": own} if own else {}
 
 
 def _heard(

@@ -1,0 +1,92 @@
+"""Through the whole stage: what sensors contradict is not accepted, and what no trigger asked for keeps the prior."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate import calibrate_observations
+from pipeline.calibration_records import Inputs
+from pipeline.config import FleetConfig
+from pipeline.geometry.se3 import exp_so3, perturb_exactly
+from pipeline.objective.problem import Prior
+from pipeline.store.partitions import Partition
+from tests.radar_scenes import T_LIDAR_RADAR, street_day
+from tests.solve_scenes import T_CAMERA_LIDAR, make_day
+
+PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
+RIG = {
+    "camera": {
+        "image": "/i",
+        "info": "/c",
+        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
+    },
+    "lidar": {"points": "/p"},
+    "radar": {"points": "/r"},
+}
+
+
+def records_of(day, prior=PRIOR, method="joint", **sections):
+    fleet = FleetConfig.model_validate(
+        {"fleet": {"name": "f"}, "rigs": {"default": RIG}, "vehicles": {"v": {}}} | sections
+    )
+    about = Inputs(Partition("v", "2024-05-06"), method, "k", 1, ())
+    return {r.pair: r for r in calibrate_observations(day, prior, fleet, about)}
+
+
+@pytest.fixture(scope="module")
+def street():
+    return street_day(48, seed=3)
+
+
+def with_turned_statics(day, yaw_deg):
+    """What stands turns about the radar, what moves does not: the lidar's registration against the camera's boxes."""
+    R = exp_so3(np.array([0, 0, np.radians(yaw_deg)]))
+    out = []
+    for o in day:
+        xyz = o.radar_xyz_m.astype(np.float64)
+        standing = o.radar_motion == 0
+        xyz[standing] = xyz[standing] @ R.T
+        out.append(
+            replace(o, radar_xyz_m=xyz.astype(np.float32), radar_velocity_mps=R @ o.radar_velocity_mps)
+        )
+    return out
+
+
+def test_a_registration_that_the_camera_contradicts_is_not_accepted(street):
+    fine = records_of(street)["lidar_radar"]
+    assert "without the lidar" not in fine.reason
+    assert fine.status == "accepted"
+    turned = records_of(with_turned_statics(street, 3.0))
+    for pair in ("lidar_radar", "camera_radar"):
+        assert turned[pair].status == "held"
+        assert "without the lidar yaw turns by" in turned[pair].reason
+        assert turned[pair].score < 0
+        assert turned[pair].determined == []
+
+
+def test_pairs_that_no_trigger_asked_for_keep_the_prior_beside_one_that_is_calibrated():
+    start = perturb_exactly(T_CAMERA_LIDAR, np.radians(1.0), 0.02, np.random.default_rng(0))
+    found = records_of(
+        make_day(40),
+        replace(PRIOR, T_camera_lidar=start),
+        "pairwise-optimisation",
+        trigger={
+            "when": "triggered",
+            "radar_outside_image": 99,
+            "radar_outside_lidar": 99,
+            "drivable_outside_fraction": 1.0,
+        },
+        solve={"paper_population": 10, "paper_generations": 5},
+        select={"frames": 12},
+    )
+    assert found["camera_lidar"].triggered
+    assert found["camera_lidar"].frames_used == 12
+    assert "not triggered" not in found["camera_lidar"].reason
+    for pair in ("camera_radar", "lidar_radar"):
+        r = found[pair]
+        assert (r.status, r.reason, r.triggered) == ("held", "not triggered: the prior stays", False)
+        assert (r.tx_m, r.ty_m, r.tz_m) == (r.prior_tx_m, r.prior_ty_m, r.prior_tz_m)
+        np.testing.assert_allclose(r.covariance, r.prior_covariance)
+        assert not any(r.observable)
+        assert r.determined == []
