@@ -21,11 +21,12 @@ from jaxtyping import Bool, Float, Int
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.objective.problem import PairEstimate
 
-__all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "twists_about"]
+__all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "twists_about"]
 
 OBSERVABLE = 0.5  # the day at least halved the variance, as in all methods
 _RESAMPLES = 200
 _ROUNDS = 12  # of re-weighting
+_FARTHEST_SIGMAS = 3.0
 _NOTHING = 1e6  # variance of an answer that means nothing
 _TUKEY = 4.7  # robust sigmas from which on an answer does not count
 # Gains before any frame is seen are 0 give or take 1, where a radian counts as much as a shift of a usual distance.
@@ -102,6 +103,16 @@ def day_estimate(
         answers.frames,
         diagnostics=_diagnostics(fit, gain, answers),
     )
+
+
+def mean_answer(
+    answers: Answers, T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"]
+) -> Float[np.ndarray, "4 4"]:
+    """Where the answers point on the whole, whatever they owe to their guesses; 3 prior sigmas from it at most."""
+    fit = _robust_regression(answers)
+    from_prior = log_se3(exp_se3(fit.coefficients[0]) @ answers.T_centre @ inverse(T_prior))
+    limit = _FARTHEST_SIGMAS * np.sqrt(np.diag(prior_covariance))
+    return exp_se3(np.clip(from_prior, -limit, limit)) @ T_prior
 
 
 def _spread(

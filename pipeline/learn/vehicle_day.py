@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.errors import SolveError
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
-from pipeline.learn.aggregate import Answers, day_estimate, twists_about
+from pipeline.learn.aggregate import Answers, day_estimate, mean_answer, twists_about
 from pipeline.learn.samples import SampleRejectedError
 from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.results import Progress, silent
@@ -49,6 +49,7 @@ class FrameAnswer:
     variance: Mapping[str, np.ndarray]  # of a twist on the left: rad^2, m^2
 
 
+@runtime_checkable
 class FrameNetwork(Protocol):
     """A network as the day sees it."""
 
@@ -181,12 +182,13 @@ def _chosen(observations: Mapping[str, Sequence[Observation]]) -> list[Observati
 def _scouted(asked: _Asked, centre: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Go where a few frames point, until they point here: answers are best when asked near the truth."""
     count = len(asked.sensors)
-    rows = list(np.unique(np.linspace(0, count - 1, min(count, _SCOUTS)).astype(int)))
+    rows: list[int] = np.unique(np.linspace(0, count - 1, min(count, _SCOUTS)).astype(int)).tolist()
     while len(rows) < _GUESSES_OF_ONE_FRAME:
         rows = [*rows, *rows]
     for _ in range(_SCOUT_ROUNDS):
         found = _ask(asked, rows, centre, rng, lambda _: None)
-        moved = {pair: _estimate(pair, found[pair], asked, rng).T for pair in PAIRS}
+        prior = asked.prior
+        moved = {p: mean_answer(found[p], prior.of(p), prior.covariance(p)) for p in PAIRS}
         way = max(float(rotation_angle_rad(moved[p] @ inverse(centre[p]))) for p in PAIRS)
         centre = moved
         if way < _SETTLED_RAD:
