@@ -47,6 +47,7 @@ def train(
         resident: hold all training data on the device.
         ray_workers: train on a Ray cluster with so many workers; needs the extra [ray].
     """
+    import os
     from dataclasses import asdict
 
     from jobs.summary import print_summary, progress_reporter
@@ -70,6 +71,9 @@ def train(
         from pipeline.learn.ray_training import train_on_ray
 
         result = train_on_ray(request, settings, ray_workers)
+    elif os.environ.get("RANK", "0") != "0":  # one of torchrun's: the first one speaks for all
+        result = run(request, settings)
+        return 128 + result.signal if result.signal else 0
     else:
         with progress_reporter(f"train {out.name}") as progress:
             result = run(request, settings, progress)

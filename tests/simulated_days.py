@@ -27,6 +27,7 @@ class SimulatedDay:
     fleet_file: Path
     observations: list[Observation]
     truth: dict[str, np.ndarray]
+    told: dict[str, float]  # all that the simulator's truth file says
 
 
 def simulated_day(
@@ -64,4 +65,4 @@ def perceived(
         if f"T_{p}" in told
     }
     rows = read_rows(lake, OBSERVATIONS, partition, Observation)
-    return SimulatedDay(lake, partition, config, fleet_file, rows, truth)
+    return SimulatedDay(lake, partition, config, fleet_file, rows, truth, told)

@@ -69,7 +69,8 @@ class FrameObjective:
     ) -> dict[str, Float[Tensor, "*batch B"]]:
         """Every term of every frame, unweighted, by the names of PAIR_OF_TERM."""
         b = self.batch
-        cluster, edge, radar = b.cluster_xyz_m, b.edge_xyz_m, b.radar_xyz_m
+        cluster, edge = (_at_lag(b, points, b.camera_lag_s) for points in (b.cluster_xyz_m, b.edge_xyz_m))
+        radar = b.radar_xyz_m
         tracks, valid, elevation = b.track_xyz_m, b.track_valid, b.radar_has_elevation
         return {
             "classes": cluster_class_cost(
@@ -90,7 +91,7 @@ class FrameObjective:
                 T_lidar_radar,
                 radar,
                 b.radar_valid & (b.radar_motion == 0),
-                b.lidar_xyz_m,
+                _at_lag(b, b.lidar_xyz_m, b.radar_lag_s),
                 b.lidar_valid,
                 b.ground_plane,
                 elevation,
@@ -144,6 +145,15 @@ def weighted(
         if PAIR_OF_TERM[name] in pairs and getattr(weights, name) > 0
     ]
     return torch.stack(chosen).sum(0)
+
+
+def _at_lag(batch: TrainingBatch, points: Float[Tensor, "B N 3"], lag_s: Float[Tensor, " B"]) -> Tensor:
+    """Where standing points are, lidar frame, when another sensor looks `lag_s` later: the car has driven towards them.
+
+    What the clocks do not know, a constant offset between them, stays in the answer as a shift along the way driven.
+    """
+    ahead = (batch.ego_speed_mps * lag_s)[:, None]
+    return torch.stack([points[..., 0] - ahead, points[..., 1], points[..., 2]], -1)
 
 
 def _surely_in_view(maps: GridMaps, T: Tensor, points: Tensor) -> Tensor:

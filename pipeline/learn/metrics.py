@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, TextIO
+from typing import Any, TextIO
 
 __all__ = ["MetricsLog", "read_metrics"]
 
@@ -36,12 +35,8 @@ class MetricsLog:
             for name, value in values.items():
                 self._events.add_scalar(name, value, step)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Finish both files; `contextlib.closing` calls it."""
         self._file.close()
         if self._events is not None:
             self._events.close()

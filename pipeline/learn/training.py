@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -95,7 +95,7 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
             (request.out / "train.json").write_text(
                 json.dumps(config.model_dump(mode="json"), indent=1) + "\n"
             )
-            log = stack.enter_context(MetricsLog(request.out, run.step))
+            log = stack.enter_context(closing(MetricsLog(request.out, run.step)))
         return _loop(request, run, processes, log, told, progress)
 
 

@@ -33,6 +33,7 @@ def static_cost(
     *,
     widen: float = 1.0,
     outlier: float = 1.0,
+    points: int = _POINTS,
 ) -> Float[Tensor, "*batch F"]:
     """Minus the mean log likelihood of a frame's static detections, each drawn from a lidar point or its mirror image.
 
@@ -46,9 +47,10 @@ def static_cost(
         has_elevation: whether the radar measures it.
         widen: factor of the sigmas; wider ones make a wider basin.
         outlier: weight of "no lidar point", in units of one lidar point at distance 0.
+        points: most lidar points of a frame; more are strided.
     """
     # Rows are in no order that matters once they are strided: each stands for its neighbours.
-    thin, sparse = -(-radar.shape[1] // _DETECTIONS), -(-lidar.shape[1] // _POINTS)
+    thin, sparse = -(-radar.shape[1] // _DETECTIONS), -(-lidar.shape[1] // points)
     radar, radar_present = radar[:, ::thin], radar_present[:, ::thin]
     lidar, lidar_present = lidar[:, ::sparse], lidar_present[:, ::sparse]
     sigma = torch.tensor(SIGMA_START * widen, dtype=radar.dtype, device=radar.device)
