@@ -1,0 +1,265 @@
+"""The vehicle-day by networks: exact with an oracle, the prior with an echo, from frames in the lake to records."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from jobs.cli import main
+from pipeline.calibrate import calibrate_day
+from pipeline.errors import ConfigError, ModelError, SolveError
+from pipeline.geometry.se3 import exp_se3, inverse, log_se3
+from pipeline.learn.layout import NetworkConfig
+from pipeline.learn.networks import build_network
+from pipeline.learn.onnx_export import export_onnx
+from pipeline.learn.onnx_networks import model_files, models_key, open_networks
+from pipeline.learn.samples import SampleReason, SampleRejectedError
+from pipeline.learn.vehicle_day import FrameAnswer, single_frame_solution, solve_by_networks
+from pipeline.objective.problem import Prior
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_records
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from tests import training_lakes
+from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+
+TRUTH = {
+    "camera_lidar": T_CAMERA_LIDAR,
+    "camera_radar": T_CAMERA_LIDAR @ T_LIDAR_RADAR,
+    "lidar_radar": T_LIDAR_RADAR,
+}
+NOISE = np.array([*np.radians([0.2] * 3), *[0.02] * 3])
+DAY = Partition("a", "2026-01-01")
+
+
+class Oracle:
+    """A network that repeats `gain` of its guess's error, and adds noise."""
+
+    def __init__(self, pairs=PAIRS, gain=0.1, noise=1.0, composed=False, reach_rad=np.inf, blind_frames=()):
+        self.pairs, self.gain, self.noise, self.composed = pairs, gain, noise, composed
+        self.reach_rad, self.blind_frames = reach_rad, blind_frames
+        self.rng = np.random.default_rng(3)
+
+    def sensors(self, frame, observation, _prior):
+        if frame.frame_index in self.blind_frames:
+            raise SampleRejectedError(SampleReason.FEW_LIDAR_POINTS)
+        assert frame.frame_index == observation.frame_index
+        return frame.frame_index
+
+    def answer(self, _sensors, guess):
+        T = {}
+        for pair in self.pairs:
+            error = log_se3(guess[pair] @ inverse(TRUTH[pair]))
+            known = min(1.0, self.reach_rad / max(np.linalg.norm(error[:3]), 1e-9))
+            step = error * (1 - (1 - self.gain) * known)
+            T[pair] = exp_se3(step + self.rng.normal(size=6) * NOISE * self.noise) @ TRUTH[pair]
+        return FrameAnswer(T, dict.fromkeys(self.pairs, NOISE**2))
+
+
+def prior_off(angle_rad, shift_m=0.03):
+    turn = np.array([1, -1, 1]) * angle_rad / np.sqrt(3)
+    shift = np.array([1, -1, 1]) * shift_m
+    T_camera_lidar = exp_se3(np.r_[turn, shift]) @ T_CAMERA_LIDAR
+    T_lidar_radar = exp_se3(np.r_[-turn, shift]) @ T_LIDAR_RADAR
+    return Prior(T_camera_lidar, T_lidar_radar, np.radians(2.0), 0.05)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    observations = make_day(40, seed=5)
+    return observations, [training_lakes.frame_of(o, np.random.default_rng(0)) for o in observations]
+
+
+def solve(frames, networks, prior, triggered=PAIRS, seed=0):
+    observations, images = frames
+    return solve_by_networks(
+        dict.fromkeys(PAIRS, observations),
+        prior,
+        networks=networks,
+        frames=lambda indices: iter([images[i] for i in indices]),
+        method="joint-ssl",
+        seed=seed,
+        triggered=triggered,
+    )
+
+
+def errors_deg(solution):
+    return {p: np.degrees(log_se3(e.T @ inverse(TRUTH[p]))[:3]) for p, e in solution.pairs.items()}
+
+
+def test_an_oracle_is_followed_to_the_truth_within_its_sigmas(frames):
+    solution = solve(frames, [Oracle()], prior_off(np.radians(1.5)))
+    for pair, estimate in solution.pairs.items():
+        error = log_se3(estimate.T @ inverse(TRUTH[pair]))
+        assert np.abs(error / np.sqrt(np.diag(estimate.covariance))).max() < 3.5, pair
+        assert estimate.frames_used == 40
+        assert estimate.observable[:3].all()
+    assert np.abs(errors_deg(solution)["camera_lidar"]).max() < 0.12
+    assert np.degrees(solution.loop_rotation_rad) < 0.4
+    assert solution.doubts == {pair: [] for pair in PAIRS}
+
+
+def test_scouts_walk_until_the_network_is_within_reach(frames):
+    """A network that corrects at most 2 deg at once, 5 deg away."""
+    far = replace(prior_off(np.radians(5)), rotation_sigma_rad=np.radians(5))
+    solution = solve(frames, [Oracle(reach_rad=np.radians(2))], far)
+    assert np.abs(errors_deg(solution)["camera_lidar"]).max() < 0.2
+
+
+def test_networks_that_only_repeat_their_guess_leave_every_prior(frames):
+    prior = prior_off(np.radians(1.0))
+    for composed in (False, True):
+        solution = solve(frames, [Oracle(gain=1.0, noise=1e-3, composed=composed)], prior)
+        for pair, estimate in solution.pairs.items():
+            assert not estimate.observable.any(), pair
+            assert pytest.approx(prior.of(pair), abs=1e-9) == estimate.T
+
+
+def test_three_pairwise_networks_make_one_solution_whose_loop_is_a_check(frames):
+    networks = [Oracle((pair,)) for pair in PAIRS]
+    solution = solve(frames, networks, prior_off(np.radians(1.0)))
+    assert solution.loop_rotation_rad > 0
+    assert solve(frames, [Oracle(composed=True)], prior_off(np.radians(1.0))).loop_rotation_rad is None
+
+
+def test_pairs_that_nothing_triggered_keep_the_prior_to_the_last_digit(frames):
+    prior = prior_off(np.radians(1.0))
+    solution = solve(frames, [Oracle()], prior, triggered=["camera_lidar"])
+    assert np.array_equal(solution.pairs["lidar_radar"].T, prior.T_lidar_radar)
+    assert solution.pairs["lidar_radar"].frames_used == 0
+    assert np.abs(errors_deg(solution)["camera_lidar"]).max() < 0.15
+
+
+def test_frames_that_show_too_little_are_counted_and_too_few_refuse_the_day(frames):
+    solution = solve(frames, [Oracle(blind_frames=range(10))], prior_off(0.01))
+    assert solution.pairs["camera_lidar"].frames_rejected == {"few_lidar_points_in_view": 10}
+    assert solution.pairs["camera_lidar"].frames_used == 30
+    with pytest.raises(SolveError, match="5 of 40 \\(35 few_lidar_points_in_view\\)"):
+        solve(frames, [Oracle(blind_frames=range(35))], prior_off(0.01))
+
+
+def test_a_day_whose_halves_differ_is_doubted(frames):
+    class Moved(Oracle):
+        def answer(self, sensors, guess):
+            said = super().answer(sensors, guess)
+            step = exp_se3(np.array([0.02, 0, 0, 0, 0, 0]) * (sensors // 5 % 2))
+            return replace(said, T={pair: step @ T for pair, T in said.T.items()})
+
+    solution = solve(frames, [Moved()], prior_off(0.01))
+    assert "halves" in solution.doubts["camera_lidar"][0]
+
+
+def test_a_flat_radar_keeps_its_elevations(frames):
+    observations, images = frames
+    flat = [replace(o, radar_has_elevation=False) for o in observations]
+    prior = prior_off(np.radians(1.0))
+    solution = solve((flat, images), [Oracle()], prior)
+    assert solution.pairs["lidar_radar"].observable.tolist()[:3] == [False, False, True]
+    assert solution.pairs["camera_lidar"].observable[:3].all()
+
+
+def test_one_frame_is_a_calibration_with_the_sigma_of_one_frame(frames):
+    observations, images = frames
+    prior = replace(prior_off(np.radians(5)), rotation_sigma_rad=np.radians(5))
+    network = Oracle(noise=0.02)  # one frame errs the same way at every guess: its noise is no scatter
+    found = single_frame_solution(
+        images[3], observations[3], prior, networks=[network], method="joint-ssl", seed=0
+    )
+    estimate = found.pairs["camera_lidar"]
+    assert np.abs(errors_deg(found)["camera_lidar"]).max() < 0.1
+    assert estimate.frames_used == 1
+    assert np.sqrt(estimate.covariance[0, 0]) > 0.8 * NOISE[0]
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory):
+    """One day of 24 frames, a fleet.toml, and untrained networks of every kind."""
+    root = tmp_path_factory.mktemp("day")
+    training_lakes.fill(Lake.at(root / "lake"), *("a", "2026-01-01"), 24)
+    torch.manual_seed(0)
+    for pairs in ("joint", *PAIRS):
+        export_onnx(build_network(NetworkConfig(pairs=pairs, width=8, hidden=32)), root / f"{pairs}.onnx", {})
+    topics = """
+[rigs.default.camera]
+image = "/image"
+info = "/info"
+semantics = { source = "topics", labels = "/labels", detections = "/detections" }
+[rigs.default.lidar]
+points = "/lidar"
+[rigs.default.radar]
+points = "/radar"
+"""
+    names = ", ".join(f'{pair} = "{pair}.onnx"' for pair in PAIRS)
+    learn = f'[learn]\nmodel = "joint.onnx"\npairwise_models = {{ {names} }}\niterations = 1\n'
+    vehicles = '[vehicles.a]\nrig = "default"\n'
+    (root / "fleet.toml").write_text(f'[fleet]\nname = "t"\n{topics}{learn}{vehicles}')
+    return root
+
+
+def run(lake, capsys, *more):
+    arguments = ["calibrate", "--fleet", str(lake / "fleet.toml"), "--lake", str(lake / "lake")]
+    code = main([*arguments, "--vehicle", "a", "--day", "2026-01-01", *more])
+    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+@pytest.mark.parametrize("method", ["joint-ssl", "pairwise-ssl"])
+def test_untrained_networks_make_records_that_nobody_would_drive_by(lake, capsys, method):
+    code, told = run(lake, capsys, "--method", method)
+    records = [
+        r for r in read_records(Lake.at(lake / "lake"), CALIBRATIONS, CalibrationRecord) if r.method == method
+    ]
+    assert {r.pair for r in records} == set(PAIRS)
+    assert code == 3
+    camera_lidar = next(r for r in records if r.pair == "camera_lidar")
+    assert camera_lidar.status == "held"
+    assert camera_lidar.diagnostics["answers"] > 0
+    assert run(lake, capsys, "--method", method)[1]["status"] == "cached"
+    assert told["work_key"] == records[0].work_key
+
+
+def test_one_frame_on_the_command_line_prints_transforms_and_records_nothing(lake, capsys):
+    before = len(read_records(Lake.at(lake / "lake"), CALIBRATIONS, CalibrationRecord))
+    code, told = run(lake, capsys, "--frame", "7", "--perturb", "2,0.05")
+    assert (code, told["method"], told["frame_index"]) == (0, "joint-ssl", 7)
+    assert set(told["estimates"]) == set(PAIRS)
+    T = np.array(told["estimates"]["camera_lidar"]["T"])
+    assert T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3), abs=1e-9)
+    by_stamp = run(lake, capsys, "--frame", str(told["stamp_ns"]), "--perturb", "2,0.05")[1]
+    assert by_stamp == told
+    assert run(lake, capsys, "--frame", "99")[0] == 2
+    assert run(lake, capsys, "--frame", "7", "--method", "tracking")[0] == 2
+    assert len(read_records(Lake.at(lake / "lake"), CALIBRATIONS, CalibrationRecord)) == before
+
+
+def test_another_model_is_other_work(lake, tmp_path):
+    from pipeline.config import load_fleet
+
+    fleet = load_fleet(lake / "fleet.toml")
+    files = model_files("joint-ssl", fleet.learn, lake / "fleet.toml")
+    assert files == {"joint": lake / "joint.onnx"}
+    other = tmp_path / "joint.onnx"
+    other.write_bytes((lake / "camera_lidar.onnx").read_bytes())
+    assert models_key(files) != models_key({"joint": other})
+    with pytest.raises(ModelError, match="estimates camera_lidar, not"):
+        open_networks({"joint": other}, fleet.learn, fleet.prepare)
+
+
+def test_a_missing_model_names_its_key(lake, tmp_path):
+    fleet = training_lakes.fleet_of(["a"])
+    broken = fleet.model_copy(update={"learn": fleet.learn.model_copy(update={"model": "nowhere.onnx"})})
+    with pytest.raises(ConfigError, match=r"learn\.model: .*nowhere.onnx does not exist"):
+        calibrate_day(DAY, broken, Lake.at(tmp_path), method="joint-ssl", fleet_file=lake / "fleet.toml")
+
+
+def test_a_day_without_frames_is_refused_not_crashed(lake, tmp_path):
+    from pipeline.config import load_fleet
+
+    training_lakes.fill(Lake.at(tmp_path), "a", "2026-01-01", 24)
+    (Lake.at(tmp_path).folder("frames", DAY) / "part-0.parquet").unlink()
+    result = calibrate_day(
+        DAY, load_fleet(lake / "fleet.toml"), Lake.at(tmp_path), method="joint-ssl",
+        fleet_file=lake / "fleet.toml",
+    )  # fmt: skip
+    assert result.status == "refused"
+    assert "no frames of this day" in result.reason
