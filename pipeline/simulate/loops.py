@@ -211,7 +211,8 @@ def shade(
             bu = (tx * px + ty * py + tz * pz) * inv
             qx, qy, qz = ty * e1z - tz * e1y, tz * e1x - tx * e1z, tx * e1y - ty * e1x
             bv = (dx * qx + dy * qy + dz * qz) * inv
-            t = (e2x * qx + e2y * qy + e2z * qz) * inv
+            # At the horizon a neighbour's triangle can be edge on, and its plane lie behind: no haze there.
+            t = max((e2x * qx + e2y * qy + e2z * qz) * inv, 0.0)
             bw = 1.0 - bu - bv
             su = bw * uv[k, 0, 0] + bu * uv[k, 1, 0] + bv * uv[k, 2, 0]
             sv = bw * uv[k, 0, 1] + bu * uv[k, 1, 1] + bv * uv[k, 2, 1]
@@ -293,7 +294,7 @@ def developed(linear, exposure, grain, noise, curve):
             x = 2.0 * j / (w - 1) - 1.0
             gain = exposure * (1.0 - 0.22 * (x * x + 0.35 * y * y)) * 4096.0
             for c in range(3):
-                value = curve[int(min(linear[i, j, c] * gain, 4096.0))]
+                value = curve[int(min(max(linear[i, j, c] * gain, 0.0), 4096.0))]
                 # Shot noise is largest in the shadows after the gamma.
                 value += grain[i, j, c] * noise * (1.35 - value / 255.0)
                 out[i, j, 2 - c] = min(max(value, 0.0), 255.0)
