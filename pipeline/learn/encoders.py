@@ -86,7 +86,7 @@ def standardised(camera: Float[Tensor, "B 4 H W"]) -> Float[Tensor, "B 4 H W"]:
     mean = (colours * seen).sum((2, 3), keepdim=True) / count
     centred = (colours - mean) * seen
     variance = (centred * centred).sum((1, 2, 3), keepdim=True) / (3 * count)
-    return torch.cat([centred / torch.sqrt(variance + 1e-4), seen], 1)
+    return torch.cat([centred / torch.sqrt(variance + 1e-6), seen], 1)
 
 
 def _block(inputs: int, outputs: int, stride: int) -> nn.Sequential:

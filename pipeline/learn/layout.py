@@ -43,7 +43,7 @@ NEAR_M = 0.5  # nothing outside the car is nearer
 MILLIMETRES = 1000.0  # ranges are compared in millimetres
 INDEX_BITS = 20  # up to a million points share a key with their range
 MATCHED_POINTS = 1536  # lidar points whose classes are matched with the camera's
-OBJECT_POINTS = 1024  # lidar points off the ground that radar detections are matched with
+OBJECT_POINTS = 512  # lidar points off the ground that radar detections are matched with
 RADAR_POINTS = 384  # as table training holds them
 # Added to a rank in 0..1 to choose points: edges first, then objects. Unequal fractions of a rank's step, so that no
 # two scores are the same and all machines pick the same points.

@@ -41,9 +41,10 @@ class OccupancyMatcher(nn.Module):
     def __init__(self, radar_features: int) -> None:
         super().__init__()
         degree = float(np.pi / 180)
-        # Azimuth, elevation [rad], range [m]: the radar's noise and the lidar's gaps.
-        self.log_width = nn.Parameter(torch.log(torch.tensor([0.7 * degree, 1.8 * degree, 0.5])))
-        self.log_floor = nn.Parameter(torch.tensor(float(np.log(0.3))))
+        # Azimuth, elevation [rad], range [m]: the radar's noise and the lidar's gaps. Where training starts was tuned
+        # on simulated days (tests/benchmarks/ssl_oracle.py).
+        self.log_width = nn.Parameter(torch.log(torch.tensor([0.5 * degree, 1.2 * degree, 0.35])))
+        self.log_floor = nn.Parameter(torch.tensor(0.0))
         # exp: how many independent detections a frame's mean log-likelihood is worth.
         self.log_sharpness = nn.Parameter(torch.log(torch.tensor([100.0, 60.0])))
         self.log_prior_sigma = nn.Parameter(torch.log(torch.tensor([0.02, 0.02, 0.02, 0.03, 0.03, 0.03])))

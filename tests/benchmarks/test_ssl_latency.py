@@ -1,0 +1,51 @@
+"""How long one frame takes, and how large the file is: the default networks, three passes with rendering, two threads."""
+
+import time
+
+import numpy as np
+import pytest
+
+from pipeline.learn.compiled_rendering import FrameSensors
+from pipeline.learn.inference import SingleFrameCalibrator
+from pipeline.learn.layout import NetworkConfig
+from pipeline.learn.networks import build_network
+from pipeline.learn.onnx_export import export_onnx
+
+GOAL_MS = 60.0
+BUSY = 4.0  # a shared machine: the goal is for idle cores, and the best of many runs comes near it
+T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.2], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def full_frame():
+    """As many points as table training holds."""
+    rng = np.random.default_rng(0)
+    azimuth, elevation = rng.uniform(-0.6, 0.6, 8192), rng.uniform(-0.27, 0.16, 8192)
+    distance = rng.uniform(5, 70, 8192)
+    xyz = distance * np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
+    features = np.stack(
+        [rng.random(8192), rng.normal(0, 1, 8192), rng.random(8192) < 0.1, elevation < -0.05], -1
+    )
+    lidar = xyz.T.astype(np.float32)
+    radar = lidar[rng.integers(0, 8192, 384)]
+    camera = rng.random((4, 96, 192)).astype(np.float32)
+    return FrameSensors(
+        camera, lidar, features.astype(np.float32), radar, rng.random((384, 3)).astype(np.float32), True
+    )
+
+
+@pytest.mark.parametrize("architecture", ["matching", "concat"])
+def test_three_passes_over_one_frame_stay_in_their_budget(architecture, tmp_path, capsys):
+    path = export_onnx(build_network(NetworkConfig(architecture)), tmp_path / "model.onnx")
+    calibrator, sensors = SingleFrameCalibrator(path, threads=2), full_frame()
+    calibrator.estimate(sensors, T_CAMERA_LIDAR, np.eye(4))  # compiles
+    wall, cpu = [], []
+    for _ in range(10):
+        began, busy = time.perf_counter(), time.process_time()
+        calibrator.estimate(sensors, T_CAMERA_LIDAR, np.eye(4), iterations=3)
+        wall.append(1e3 * (time.perf_counter() - began))
+        cpu.append(1e3 * (time.process_time() - busy))
+    with capsys.disabled():
+        print(f"\n{architecture}: 3 passes {min(wall):.0f} ms at best, {np.median(wall):.0f} ms median, "
+              f"{min(cpu):.0f} ms of CPU; {path.stat().st_size / 1e6:.2f} MB")  # fmt: skip
+    assert min(wall) < GOAL_MS * BUSY
+    assert path.stat().st_size <= 2_500_000
