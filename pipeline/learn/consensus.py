@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.objective.differentiable.poses import exp_se3, inverse
+from pipeline.objective.differentiable.poses import exp_so3, inverse, pose
 
 __all__ = ["Consensus", "doubt_loss", "twist_between"]
 
@@ -21,13 +21,24 @@ _LEAST_SHARE = 0.02  # of the newest frame in the mean: networks change while th
 def twist_between(
     T_a: Float[Tensor, "*batch 4 4"], T_b: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch 6"]:
-    """Twist xi with T_a = exp(xi) T_b to first order in the angle's square: rotation vector [rad], translation [m]."""
+    """Rotation vector [rad] and translation [m] of T_a T_b^-1, for angles well below pi; inverse of `_moved`."""
     delta = T_a @ inverse(T_b)
     R = delta[..., :3, :3]
-    skew = torch.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    skew = (
+        torch.stack(
+            [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+        )
+        / 2
     )
-    return torch.cat([skew / 2, delta[..., :3, 3]], -1)
+    sine = skew.norm(dim=-1, keepdim=True)
+    cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
+    small = sine < 1e-6
+    scale = torch.where(small, torch.ones_like(sine), torch.atan2(sine, cosine) / sine.clamp_min(1e-6))
+    return torch.cat([scale * skew, delta[..., :3, 3]], -1)
+
+
+def _moved(twist: Float[Tensor, "*batch 6"], T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    return pose(exp_so3(twist[..., :3]), twist[..., 3:]) @ T
 
 
 class Consensus:
@@ -45,10 +56,10 @@ class Consensus:
     ) -> Float[Tensor, "B 3 6"]:
         """Twist from each day's mean to each frame's answer, without gradient; then the answers join the mean."""
         twist = twist_between(answers.detach(), references).cpu()
-        out = torch.zeros_like(twist)
+        out, origin = torch.zeros_like(twist), torch.eye(4, dtype=twist.dtype)
         for row, (day, value) in enumerate(zip(days, twist, strict=True)):
-            mean = exp_se3(self._mean.get(day, value))
-            out[row] = twist_between(exp_se3(value), mean)
+            mean = self._mean.get(day, value)
+            out[row] = twist_between(_moved(value, origin), _moved(mean, origin))
         for day, value in zip(days, twist, strict=True):
             count = self._count.get(day, 0) + 1
             share = max(1.0 / count, _LEAST_SHARE)
@@ -64,7 +75,7 @@ class Consensus:
         """Each day's mean answer for a pair; its reference where no answer is known."""
         none = torch.zeros(3, 6)
         twist = torch.stack([self._mean.get(day, none)[pair] for day in days])
-        return exp_se3(twist.to(references)) @ references
+        return _moved(twist.to(references), references)
 
     def state_dict(self) -> dict[str, dict[str, Tensor] | dict[str, int]]:
         """For checkpoints."""

@@ -134,7 +134,11 @@ def _curves(
     parts: dict[str, list[torch.Tensor]] = {}
     with torch.no_grad():
         for part in objective:
-            by_pose = [part.terms(*(poses[pair][None, i] for pair in PAIRS)) for i in range(len(offsets))]
+            count = len(part.centres_rad)
+            by_pose = [
+                part.terms(*(poses[pair][i].expand(count, 4, 4) for pair in PAIRS))
+                for i in range(len(offsets))
+            ]
             for name in by_pose[0]:
                 if name != "loop":
                     parts.setdefault(name, []).append(torch.stack([t[name] for t in by_pose]))

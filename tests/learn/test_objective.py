@@ -1,0 +1,211 @@
+"""What training minimises: lowest at the truth, moved only along what is wrong, the same through a turned camera."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.geometry import se3
+from pipeline.learn.augment import random_guess, turned_view
+from pipeline.learn.consensus import Consensus, doubt_loss, twist_between
+from pipeline.learn.losses import PAIR_OF_TERM, frame_objective, weighted
+from pipeline.learn.settings import PAIRS_OF, AugmentConfig, LossConfig
+from pipeline.objective.differentiable.poses import exp_se3, exp_so3, pose, transform_points
+from pipeline.objective.differentiable.static import static_cost
+from pipeline.objective.differentiable.terms import soft_clamp, soft_minimum
+from pipeline.objective.registration import SIGMA_START, normal_equations, registration_frames
+from schemas.training import UNKNOWN_CLASS
+from tests.benchmarks.ssl_landscape import PAIRS, TOLERANCE, day_batch, minima, with_true_clocks
+from tests.simulated_days import simulated_day
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory):
+    return simulated_day(tmp_path_factory.mktemp("fleet"), frames=40, environment="mixed")
+
+
+@pytest.fixture(scope="module")
+def batch(day):
+    return with_true_clocks(day_batch(day.lake, day.partition, day.fleet_file), day.told)
+
+
+@pytest.fixture(scope="module")
+def few(batch):
+    return batch[slice(0, 4)]
+
+
+def test_the_minimum_over_a_fleet_is_at_the_truth_in_all_that_it_determines(batch, day):
+    found = minima(batch, day.truth, LossConfig())
+    determined = {
+        (pair, dof): found[pair][dof].offset
+        for pair in PAIRS
+        for dof in range(6)
+        if found[pair][dof].determined(TOLERANCE[dof])
+    }
+    assert {("camera_lidar", 1), ("camera_lidar", 2), ("camera_radar", 2), ("lidar_radar", 2)} <= set(
+        determined
+    )
+    far = {key: offset for key, offset in determined.items() if abs(offset) > TOLERANCE[key[1]]}
+    assert far == {}
+    assert len(determined) >= 8
+
+
+def test_together_the_terms_pull_wrong_poses_back(few, day):
+    """Descending from a degree and 5 cm away brings the camera-lidar pose most of the way back."""
+    truth = torch.tensor(day.truth["camera_lidar"], dtype=torch.float32)
+    objective = frame_objective(few)
+    xi = torch.tensor([0.012, -0.01, 0.008, 0.0, 0.03, -0.03], requires_grad=True)
+    optimiser = torch.optim.Adam([xi], lr=1e-3)
+    lidar_radar = torch.tensor(day.truth["lidar_radar"], dtype=torch.float32)
+    for _ in range(60):
+        T = (exp_se3(xi) @ truth).expand(len(few), 4, 4)
+        terms = objective.terms(T, T @ lidar_radar, lidar_radar.expand(len(few), 4, 4))
+        loss = weighted(terms, LossConfig(), ("camera_lidar",)).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    assert np.degrees(xi.detach()[:2].norm().item()) < 0.3  # from 0.9: pitch and yaw
+
+
+def test_every_term_is_finite_with_a_finite_gradient_even_at_absurd_poses(few):
+    objective = frame_objective(few)
+    for size in (0.0, 0.1, 3.0):
+        xi = (size * torch.randn(3, len(few), 6, generator=torch.Generator().manual_seed(0))).requires_grad_()
+        T = [
+            exp_se3(x) @ t
+            for x, t in zip(xi, (few.T_camera_lidar, few.T_camera_radar, few.T_lidar_radar), strict=True)
+        ]
+        terms = objective.terms(*T)
+        assert set(terms) == set(PAIR_OF_TERM)
+        total = weighted(terms, LossConfig(), PAIRS_OF["joint"])
+        assert total.shape == (len(few),)
+        total.sum().backward()
+        assert torch.isfinite(total).all()
+        assert torch.isfinite(xi.grad).all()
+
+
+def test_a_pair_of_its_own_is_moved_by_its_own_terms_alone(few):
+    xi = torch.zeros(3, 6, requires_grad=True)
+    T = [
+        exp_se3(x) @ t
+        for x, t in zip(xi, (few.T_camera_lidar, few.T_camera_radar, few.T_lidar_radar), strict=True)
+    ]
+    weighted(frame_objective(few).terms(*T), LossConfig(), PAIRS_OF["lidar_radar"]).sum().backward()
+    assert (xi.grad[:2] == 0).all()
+    assert (xi.grad[2] != 0).any()
+
+
+def test_the_loop_counts_degrees_and_fifths_of_a_metre(few):
+    T_lidar_radar = few.T_lidar_radar
+    T_turned = exp_se3(torch.tensor([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])) @ few.T_camera_radar
+    loop = frame_objective(few).terms(few.T_camera_lidar, T_turned, T_lidar_radar)["loop"]
+    turn, lever = np.degrees(0.01), 5 * 0.01 * few.T_camera_radar[:, :2, 3].abs().sum(-1)
+    np.testing.assert_allclose(loop, turn + lever, rtol=0.05)
+
+
+def test_static_cost_is_the_registrations_likelihood(day):
+    """Where both see all neighbours: the compiled loop cuts at three sigmas and takes every static detection."""
+    rows = [o for o in day.observations if o.ground_plane is not None][:3]
+    T = day.truth["lidar_radar"]
+    frames = registration_frames(rows, T, np.random.default_rng(0), radar_points=60)
+    for f in range(frames.count):
+        # All elevations told: the torch term has no limits of the lidar's view.
+        one = replace(frames.subset(np.array([f])), lidar_elevation_rad=np.array([-1.5, 1.5]))
+        wanted = normal_equations(one, T, -float(frames.stamp_gap_s[f]), SIGMA_START).cost[0]
+        lidar, radar = (torch.tensor(p, dtype=torch.float64)[None] for p in (one.lidar_m, one.radar_m))
+        got = static_cost(
+            torch.tensor(T)[None],
+            radar,
+            torch.ones(radar.shape[:2], dtype=torch.bool),
+            lidar,
+            torch.ones(lidar.shape[:2], dtype=torch.bool),
+            torch.tensor(one.plane),
+            torch.tensor(one.has_elevation),
+            points=lidar.shape[1],
+        )
+        np.testing.assert_allclose(got.item(), wanted, rtol=0.02)
+
+
+def test_random_guesses_close_the_loop_and_stay_in_their_limits(few):
+    config = AugmentConfig(rotation_deg=3.0, translation_m=0.1, small_share=0.5, view_deg=4.0)
+    guess = random_guess(few, config, torch.Generator().manual_seed(1))
+    np.testing.assert_allclose(guess.T_camera_lidar @ guess.T_lidar_radar, guess.T_camera_radar, atol=1e-5)
+    moved = twist_between(guess.unturned(guess.T_camera_lidar), few.T_camera_lidar)
+    largest_deg = np.degrees(moved[:, :3].norm(dim=1).max().item())
+    assert 0.2 < largest_deg <= 3.01 * np.sqrt(3)
+    again = random_guess(few, config, torch.Generator().manual_seed(1))
+    assert torch.equal(again.T_lidar_radar, guess.T_lidar_radar)
+    none = AugmentConfig(rotation_deg=0, translation_m=0, view_deg=0)
+    still = random_guess(few, none, torch.Generator().manual_seed(1))
+    np.testing.assert_allclose(still.T_camera_lidar, few.T_camera_lidar, atol=1e-6)
+
+
+def test_a_turned_view_shows_the_same_things_in_the_turned_directions(few):
+    """The class under a lidar point is the same, seen by the camera or by the turned one through the turned pose."""
+    R = torch.tensor(se3.exp_so3(np.radians([[2.0, -1.0, 3.0]] * len(few))), dtype=torch.float32)
+    view = turned_view(few, R)
+    T_turned = few.T_camera_lidar.clone()
+    T_turned[:, :3] = R @ few.T_camera_lidar[:, :3]
+    same = []
+    for b in range(len(few)):
+        points = few.lidar_xyz_m[b][few.lidar_valid[b]]
+        before = class_under(few, b, transform_points(few.T_camera_lidar[b], points))
+        after = class_under(view, b, transform_points(T_turned[b], points))
+        both = (before != UNKNOWN_CLASS) & (after != UNKNOWN_CLASS)
+        assert both.sum() > 300
+        same.append((before == after)[both].float().mean().item())
+        brightness = view.image[b].float().mean() / few.image[b].float().mean()
+        assert 0.7 < brightness < 1.1
+    assert min(same) > 0.9  # the nearest of cells that were cut anew
+    untouched = turned_view(few, torch.eye(3).expand(len(few), 3, 3))
+    assert torch.equal(untouched.image[:, :, 1:-1, 1:-1], few.image[:, :, 1:-1, 1:-1])
+
+
+def class_under(batch, b, points_camera):
+    height, width = batch.sky_depth.shape[1:]
+    x, y, z = points_camera.unbind(-1)
+    azimuth, elevation = torch.atan2(-x, z), torch.atan2(-y, torch.hypot(x, z))
+    step = np.radians(batch.grid_step_deg)
+    column, row = width / 2 - azimuth / step, height / 2 - elevation / step
+    inside = (z > 0.5) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    column, row = (torch.where(inside, q, torch.zeros_like(q)).long() for q in (column, row))
+    found = batch.grid_class[b, row, column].long()
+    return torch.where(inside, found, torch.full_like(found, UNKNOWN_CLASS))
+
+
+def test_doubt_is_least_where_it_says_what_the_scatter_is():
+    scatter = 0.01 * torch.randn(4000, 3, 6, generator=torch.Generator().manual_seed(0))
+    losses = [
+        doubt_loss(torch.full((4000, 3, 6), 2 * np.log(s)), scatter, torch.ones(4000))
+        for s in (0.005, 0.01, 0.02)
+    ]
+    assert losses[1] < min(losses[0], losses[2])
+
+
+def test_scatter_is_about_the_days_mean_not_about_the_reference():
+    """A day whose answers all lie 0.02 rad off its reference has no scatter; two days do not mix."""
+    consensus, generator = Consensus(), torch.Generator().manual_seed(0)
+    reference = torch.eye(4).expand(2, 3, 4, 4)
+    bias = torch.tensor([[0.02, 0, 0, 0, 0, 0], [0, -0.03, 0, 0, 0, 0.1]])[:, None].expand(2, 3, 6)
+    for _ in range(50):
+        noise = 1e-3 * torch.randn(2, 3, 6, generator=generator)
+        scatter = consensus.scatter(
+            ["a", "b"], pose(exp_so3((bias + noise)[..., :3]), (bias + noise)[..., 3:]), reference
+        )
+    assert consensus.known(["a", "b", "c"]) == [True, True, False]
+    assert scatter.abs().max() < 6e-3
+    mean = consensus.pose(["a", "b"], 0, reference[:, 0])
+    np.testing.assert_allclose(mean, pose(exp_so3(bias[:, 0, :3]), bias[:, 0, 3:]), atol=1e-3)
+    back = Consensus()
+    back.load_state_dict(consensus.state_dict())
+    assert torch.equal(back.pose(["b"], 1, reference[:1, 0]), consensus.pose(["b"], 1, reference[:1, 0]))
+
+
+def test_soft_minimum_and_clamp_are_what_they_say():
+    values = torch.tensor([[3.0, 1.0, 7.0], [2.0, 9.0, 9.0]])
+    np.testing.assert_allclose(soft_minimum(values, 0.01), [1.0, 2.0], atol=1e-6)
+    assert (soft_minimum(values, 1.0) <= values.min(1).values).all()
+    x = torch.linspace(0, 100, 500)
+    assert soft_clamp(x, 4.0).max() <= 4.0
+    np.testing.assert_allclose(soft_clamp(x[:2], 4.0), x[:2], atol=1e-3)

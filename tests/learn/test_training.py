@@ -1,0 +1,250 @@
+"""Runs: that they resume to the bit, stop when told, refuse what cannot be right, and work in several processes."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+import torch
+
+from jobs.train import parse_duration
+from pipeline.errors import ConfigError, ContractError
+from pipeline.learn.checkpoints import load_checkpoint, save_checkpoint
+from pipeline.learn.metrics import MetricsLog, read_metrics
+from pipeline.learn.run_state import network_of_run
+from pipeline.learn.samples import About, make_row
+from pipeline.learn.schedule import DivergedError, DivergenceGuard, cosine_rate
+from pipeline.learn.settings import TrainConfig, load_train_config
+from pipeline.learn.training import TrainRequest, train
+from pipeline.prior import read_prior
+from pipeline.store.partitions import Partition
+from pipeline.store.tables import read_rows, write_partition
+from schemas.frames import FRAMES, Frame
+from schemas.training import TRAINING
+from tests.simulated_days import simulated_day
+
+SMALL = {"width": 4, "hidden": 16, "batch_size": 2, "validate_every": 10, "validation_frames": 4}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """What bit-exact means needs one order of additions."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Table training of eight frames to train on, in four row groups, and two held out."""
+    folder = tmp_path_factory.mktemp("data")
+    day = simulated_day(folder, frames=10)
+    frames = {f.frame_index: f for f in read_rows(day.lake, FRAMES, day.partition, Frame)}
+    prior = read_prior(day.observations, day.fleet.rig_of("vehicle-1").prior, day.fleet_file)
+    about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
+    rows = [make_row(frames[o.frame_index], o, prior, about, day.fleet.prepare) for o in day.observations]
+    rows = [replace(row, split="train" if i < len(rows) - 2 else "val") for i, row in enumerate(rows)]
+    with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key", "0") as writer:
+        for first in range(0, len(rows), 2):
+            writer.append(rows[first : first + 2])
+        writer.describe(kept={}, rejected={})
+    return str(folder / "lake")
+
+
+def config(**changes):
+    return TrainConfig.model_validate(SMALL | {"steps": 20, "log_every": 5} | changes)
+
+
+def reports(folder):
+    """All reports, without what the clock decides."""
+    return [{k: v for k, v in r.items() if k != "samples_per_s"} for r in read_metrics(folder)]
+
+
+def stop_at(step):
+    """Progress that sends this process SIGTERM when so many steps are done."""
+
+    def report(done, _total, _what):
+        if done == step:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    return report
+
+
+def test_a_run_that_was_stopped_goes_on_to_the_same_bits(data, tmp_path):
+    whole = train(TrainRequest(data, tmp_path / "whole", "cpu"), config())
+    assert (whole.status, whole.step) == ("done", 20)
+    half = train(TrainRequest(data, tmp_path / "parts", "cpu"), config(), stop_at(10))
+    assert (half.status, half.step, half.signal) == ("stopped", 10, signal.SIGTERM)
+    rest = train(TrainRequest(data, tmp_path / "parts", "cpu"), config())
+    assert (rest.status, rest.step) == ("done", 20)
+    assert reports(tmp_path / "parts") == reports(tmp_path / "whole")
+    a, b = (load_checkpoint(tmp_path / name / "last.pt") for name in ("whole", "parts"))
+    for name, weight in a["network"].items():
+        assert torch.equal(weight, b["network"][name]), name
+    for key, values in a["optimiser"]["state"].items():
+        assert all(torch.equal(v, b["optimiser"]["state"][key][n]) for n, v in values.items())
+    assert a["processes"][0]["stream"] == b["processes"][0]["stream"]
+
+
+def test_a_finished_run_reports_falls_validates_and_gives_its_network(data, tmp_path):
+    out = tmp_path / "run"
+    train(TrainRequest(data, out, "cpu"), config(steps=30, learning_rate=1e-2))
+    lines = reports(out)
+    trained = [r for r in lines if "loss" in r]
+    assert [r["step"] for r in trained] == [5, 10, 15, 20, 25, 30]
+    assert all(math.isfinite(v) for r in trained for v in r.values())
+    assert trained[-1]["semantics"] < 0.9 * trained[0]["semantics"]  # the encoders learn what is easy
+    assert trained[-1]["learning_rate"] < 0.02 * 1e-2  # the cosine has come down
+    assert [r["step"] for r in lines if "validation/alignment" in r] == [10, 20, 30]
+    assert (out / "best.pt").exists()
+    assert any((out / "events").iterdir())
+    network = network_of_run(out)
+    assert network.config.width == SMALL["width"]
+    assert not network.training
+    again = train(TrainRequest(data, out, "cpu"), config(steps=30, learning_rate=1e-2))
+    assert (again.status, again.samples) == ("done", 0)
+
+
+def test_time_limit_leaves_a_checkpoint_to_go_on_from(data, tmp_path):
+    result = train(TrainRequest(data, tmp_path, "cpu", time_limit_s=0.5), config(steps=100_000))
+    assert result.status == "time_limit"
+    assert load_checkpoint(tmp_path / "last.pt")["step"] == result.step
+
+
+def test_a_budget_of_time_brings_the_rate_down_whatever_the_speed(data, tmp_path):
+    result = train(TrainRequest(data, tmp_path, "cpu"), config(steps=None, budget_minutes=0.05, log_every=1))
+    assert result.status == "done"
+    rates = [r["learning_rate"] for r in reports(tmp_path) if "loss" in r]
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] < 0.6 * rates[0]
+
+
+def test_sigterm_ends_the_command_with_143_and_a_whole_checkpoint(data, tmp_path):
+    (tmp_path / "train.toml").write_text(
+        "\n".join(f"{k} = {v}" for k, v in (SMALL | {"log_every": 1}).items())
+    )
+    command = [sys.executable, "-m", "jobs.cli", "train", "--data", data, "--out", str(tmp_path / "run")]
+    command += ["--config", str(tmp_path / "train.toml"), "--device", "cpu", "--steps", "100000"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not read_metrics(tmp_path / "run") and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.2)
+    process.terminate()
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 143, err
+    summary = json.loads(out.splitlines()[-1])
+    assert summary["status"] == "stopped"
+    state = load_checkpoint(tmp_path / "run" / "last.pt")
+    assert state["step"] == summary["step"] > 0
+
+
+def test_a_diverging_run_stops_with_its_reason_and_keeps_the_last_good_checkpoint(data, tmp_path):
+    settings = config(learning_rate=1e6, steps=200, gradient_norm=1e9, checkpoint_minutes=1e-6)
+    with pytest.raises(DivergedError, match="diverged at step") as caught:
+        train(TrainRequest(data, tmp_path, "cpu"), settings)
+    assert caught.value.exit_code == 1
+    state = load_checkpoint(tmp_path / "last.pt")
+    assert state["step"] <= caught.value.step
+    assert all(torch.isfinite(v).all() for v in state["network"].values() if v.is_floating_point())
+
+
+def test_the_guard_knows_no_number_and_growth_but_not_noise():
+    guard = DivergenceGuard(10.0)
+    for step in range(200):
+        guard.check(step, 5.0 + 3.0 * math.sin(step), 1.0)
+    with pytest.raises(DivergedError, match="nan"):
+        guard.check(200, math.nan, 1.0)
+    with pytest.raises(DivergedError, match="norm"):
+        guard.check(200, 1.0, math.inf)
+    with pytest.raises(DivergedError, match="10 times"):
+        for step in range(200, 300):
+            guard.check(step, 500.0, 1.0)
+
+
+def test_two_processes_train_one_network(data, tmp_path):
+    (tmp_path / "train.toml").write_text("\n".join(f"{k} = {v}" for k, v in SMALL.items()))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command += ["-m", "jobs.cli", "train", "--data", data, "--out", str(tmp_path / "run"), "--steps", "3"]
+    command += ["--config", str(tmp_path / "train.toml"), "--device", "cpu"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    state = load_checkpoint(tmp_path / "run" / "last.pt")
+    assert state["step"] == 3
+    first, second = (p["stream"] for p in state["processes"])
+    assert first["order"] != second["order"]  # other frames
+    assert len(reports(tmp_path / "run")) == 2  # one of them writes: the last step's report, and validation's
+    with pytest.raises(ConfigError, match="begun by 2"):
+        train(TrainRequest(data, tmp_path / "run", "cpu"), TrainConfig.model_validate(SMALL | {"steps": 3}))
+
+
+def test_a_folder_takes_one_configuration(data, tmp_path):
+    train(TrainRequest(data, tmp_path, "cpu"), config(steps=1))
+    with pytest.raises(ConfigError, match="seed"):
+        train(TrainRequest(data, tmp_path, "cpu"), config(steps=1, seed=5))
+
+
+def test_what_cannot_be_right_is_named(tmp_path):
+    path = tmp_path / "train.toml"
+    for text, key in (
+        ("learning_rat = 1", "learning_rat"),
+        ("learning_rate = -1", "learning_rate"),
+        ("[loss]\nedge = 1", "loss.edge"),
+        ("final_learning_rate = 1", "final_learning_rate"),
+        ("cell_deg = 0.5", "cell_deg"),
+        ("= 3", "not a TOML file"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=key):
+            load_train_config(path, {})
+    assert load_train_config(None, {"seed": 3, "steps": None}).seed == 3
+    with pytest.raises(ContractError, match="prepare"):
+        train(TrainRequest(str(tmp_path), tmp_path / "run", "cpu"), config())
+    for text in ("", "m", "-3m", "2x", "0", "inf"):
+        with pytest.raises(ConfigError):
+            parse_duration(text, "time-limit")
+    assert parse_duration("1.5h", "budget") == 5400
+
+
+def test_defaults_are_the_papers_recipe():
+    c = TrainConfig()
+    assert (c.batch_size, c.adam_betas, c.learning_rate, c.final_learning_rate) == (
+        4,
+        (0.9, 0.999),
+        3e-4,
+        3e-7,
+    )
+    assert cosine_rate(0.0, 3e-4, 3e-7) == pytest.approx(3e-4)
+    assert cosine_rate(0.5, 3e-4, 3e-7) == pytest.approx(1.5015e-4)
+    assert cosine_rate(2.0, 3e-4, 3e-7) == pytest.approx(3e-7)
+
+
+def test_checkpoints_are_whole_or_not_there(tmp_path):
+    path = tmp_path / "last.pt"
+    save_checkpoint(path, {"step": 1, "weights": torch.ones(3)})
+    path.with_suffix(".part").write_bytes(b"killed while writing")
+    assert load_checkpoint(path)["step"] == 1
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ContractError, match="no checkpoint"):
+        load_checkpoint(path)
+
+
+def test_metrics_after_a_resume_hold_no_step_twice(tmp_path):
+    with closing(MetricsLog(tmp_path, 0, events=False)) as log:
+        for step in (1, 2, 3):
+            log.report(step, {"loss": float(step)})
+    with (tmp_path / "metrics.jsonl").open("a") as stream:
+        stream.write('{"step": 4, "lo')  # killed in the middle of a line
+    with closing(MetricsLog(tmp_path, 2, events=False)) as log:
+        log.report(3, {"loss": math.nan})
+    assert read_metrics(tmp_path) == [
+        {"step": 1, "loss": 1.0},
+        {"step": 2, "loss": 2.0},
+        {"step": 3, "loss": None},
+    ]
