@@ -113,7 +113,7 @@ def grid_rays(grid: Grid) -> Float[np.ndarray, "H W 3"]:
 def _pixels(camera: Camera, grid: Grid, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Pixel (float32) of each cell in an image of (height, width) that shows what the camera's does, and if any."""
     uv, valid = camera.project(grid_rays(grid))
-    seen = valid & camera.contains(uv)
+    seen = np.asarray(valid & camera.contains(uv))
     # By axis: sides are rounded to whole pixels, and 0.07 cells of elevation were lost to one factor for both.
     scale = np.array([size[1] / camera.width_px, size[0] / camera.height_px])
     return ((uv + 0.5) * scale - 0.5).astype(np.float32), seen
@@ -135,6 +135,6 @@ def resample_camera(
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], 3)
     uv, valid = _pixels(camera, fine, (image.shape[0], image.shape[1]))
     sampled = cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    whole = valid.reshape(grid.height, 2, grid.width, 2).all(axis=(1, 3))
+    whole = np.asarray(valid.reshape(grid.height, 2, grid.width, 2).all(axis=(1, 3)))
     reduced = cv2.resize(sampled, (grid.width, grid.height), interpolation=cv2.INTER_AREA)
     return np.where(whole[..., None], reduced, 0).astype(np.uint8), whole.astype(np.uint8)

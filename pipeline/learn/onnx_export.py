@@ -16,6 +16,7 @@ from typing import Any
 import onnx
 import torch
 from torch import Tensor, nn
+from torch.jit._trace import TracerWarning
 
 from pipeline.learn.grid import Grid
 from pipeline.learn.layout import (
@@ -74,7 +75,7 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
     with warnings.catch_warnings():
         # The tracing exporter is all that these graphs need; the newer one wants onnxscript, one more dependency.
         warnings.filterwarnings("ignore", category=DeprecationWarning)
-        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)
+        warnings.filterwarnings("ignore", category=TracerWarning)
         warnings.filterwarnings("ignore", message=".*Constant folding.*")
         torch.onnx.export(
             graph, examples, str(aside), dynamo=False, opset_version=OPSET,

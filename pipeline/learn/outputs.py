@@ -52,6 +52,9 @@ class Predictions:
 class Heads(nn.Module):
     """One head per pair: 3 Euler angles and 3 translations, and the logarithm of their variances."""
 
+    unit: Tensor
+    start: Tensor
+
     def __init__(self, features: int, pairs: tuple[str, ...], std: float) -> None:
         super().__init__()
         self.pairs = pairs

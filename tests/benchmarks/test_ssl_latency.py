@@ -1,4 +1,4 @@
-"""How long one frame takes, and how large the file is: the default networks, three passes with rendering, two threads."""
+"""How long one frame takes and how large the file is: three passes with rendering, on two threads."""
 
 import time
 
