@@ -26,6 +26,9 @@ __all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "twists_about
 OBSERVABLE = 0.5  # the day at least halved the variance, as in all methods
 _RESAMPLES = 200
 _ROUNDS = 12  # of re-weighting
+# Who repeats four fifths of a guess, or drives it further off, is not listened to: what is left, divided by a fifth and
+# less, would be an opinion made of how the guess was repeated.
+_LEAST_GAIN = 0.2
 _FARTHEST_SIGMAS = 3.0
 _NOTHING = 1e6  # variance of an answer that means nothing
 _TUKEY = 4.7  # robust sigmas from which on an answer does not count
@@ -83,7 +86,8 @@ def day_estimate(
     mean, gain = fit.coefficients[0], fit.coefficients[1:].T
     m0 = log_se3(T_prior @ inverse(answers.T_centre))
     H = np.eye(6) - gain
-    spread = _spread(pair, answers, draws, blind)
+    deaf = np.diag(H) < _LEAST_GAIN
+    spread = _spread(pair, answers, draws, deaf if blind is None else deaf | blind)
     gain_variance = draws[:, 1:].transpose(0, 2, 1).var(axis=0)
     x, covariance, R = m0, prior_covariance, spread
     for _ in range(3):
@@ -115,16 +119,12 @@ def mean_answer(
     return exp_se3(np.clip(from_prior, -limit, limit)) @ T_prior
 
 
-def _spread(
-    pair: str, answers: Answers, draws: np.ndarray, blind: np.ndarray | None
-) -> Float[np.ndarray, "6 6"]:
+def _spread(pair: str, answers: Answers, draws: np.ndarray, blind: np.ndarray) -> Float[np.ndarray, "6 6"]:
     """Covariance of the mean answer: what blocks say, no less than the network says itself, and the bias."""
     spread = np.cov(draws[:, 0].T)
     claimed = np.median(answers.variance, axis=0) / answers.frames
     spread += np.diag(np.maximum(claimed - np.diag(spread), 0.0) + np.square(BIAS_SIGMA[pair]))
-    if blind is not None:
-        spread += np.diag(np.where(blind, _NOTHING, 0.0))
-    return spread
+    return np.asarray(spread + np.diag(np.where(blind, _NOTHING, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)

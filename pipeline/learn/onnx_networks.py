@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 
 from pipeline.config import LearnConfig, PrepareConfig
 from pipeline.errors import ConfigError, ModelError
@@ -79,7 +80,7 @@ class OnnxNetwork:
     """One file as a `FrameNetwork`."""
 
     def __init__(self, path: Path, config: LearnConfig, prepare: PrepareConfig, rows: _LastRow) -> None:
-        self._calibrator = SingleFrameCalibrator(path, config.threads)
+        self._path, self._calibrator = path, SingleFrameCalibrator(path, config.threads)
         self._iterations, self._rows = config.iterations, rows
         self._prepare = _prepare_for(self._calibrator.grid, prepare)
 
@@ -103,14 +104,16 @@ class OnnxNetwork:
         return frame_sensors(row, self._calibrator.grid)
 
     def answer(self, sensors: FrameSensors, guess: Mapping[str, np.ndarray]) -> FrameAnswer:
-        """The last pass's transforms."""
-        last = self._calibrator.estimate(
-            sensors,
-            guess["camera_lidar"],
-            guess["lidar_radar"],
-            guess["camera_radar"],
-            self._iterations,
-        )[-1]
+        """The last pass's transforms.
+
+        Raises:
+            ModelError: the file wants other inputs than this version renders.
+        """
+        three = (guess["camera_lidar"], guess["lidar_radar"], guess["camera_radar"])
+        try:
+            last = self._calibrator.estimate(sensors, *three, self._iterations)[-1]
+        except InvalidArgument as err:
+            raise ModelError(str(self._path), f"was exported by another version: {err}") from err
         variance = np.exp(np.clip(last.log_variance, -20.0, 5.0))
         return FrameAnswer(
             {pair: last.of(pair) for pair in self.pairs},

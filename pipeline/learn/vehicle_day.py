@@ -28,7 +28,7 @@ _SCOUTS = 24  # frames that find out where to ask all of them
 _SCOUT_ROUNDS, _SETTLED_RAD = 3, np.radians(0.3)
 _MIN_FRAMES, _MAX_FRAMES = 8, 160
 _BLOCKS = 8
-_GUESSES_OF_ONE_FRAME = 16
+_GUESSES_OF_ONE_FRAME, _FEWEST_GUESSES = 16, 8
 _HALVES_SIGMAS = 4.0
 # Degrees of freedom that only elevations tell: of a radar that measures none nothing is known about them.
 _ELEVATION = {
@@ -183,8 +183,7 @@ def _scouted(asked: _Asked, centre: dict[str, np.ndarray], rng: np.random.Genera
     """Go where a few frames point, until they point here: answers are best when asked near the truth."""
     count = len(asked.sensors)
     rows: list[int] = np.unique(np.linspace(0, count - 1, min(count, _SCOUTS)).astype(int)).tolist()
-    while len(rows) < _GUESSES_OF_ONE_FRAME:
-        rows = [*rows, *rows]
+    rows *= -(-_FEWEST_GUESSES // len(rows))
     for _ in range(_SCOUT_ROUNDS):
         found = _ask(asked, rows, centre, rng, lambda _: None)
         prior = asked.prior

@@ -57,6 +57,19 @@ def test_a_network_that_repeats_its_guess_leaves_the_prior_as_it_was():
     assert found.diagnostics["repeated_rotation"] > 0.95
 
 
+def test_a_network_that_drives_guesses_apart_is_not_listened_to():
+    """Seen on an untrained network: 1.35 of a guess's error came back, and dividing by 1 - 1.35 turned it round."""
+    rng = np.random.default_rng(11)
+    gain = np.diag([1.35, 1.2, 0.9, 1.0, 1.0, 1.0])
+    answers = day(rng, gain, np.zeros(6), noise=NOISE * 0.05)
+    shifted = Answers(
+        answers.T_centre, answers.guess, answers.answer + PRIOR_SD, *list(vars(answers).values())[3:]
+    )
+    found = estimate(shifted, rng, x_prior=np.zeros(6))
+    assert not found.observable.any()
+    assert np.abs(found.T - T_CAMERA_LIDAR).max() < 1e-12
+
+
 def test_what_is_repeated_stays_and_what_is_known_is_taken():
     rng = np.random.default_rng(2)
     gain = np.diag([0.0, 0.05, 0.1, 1.0, 1.0, 1.0])  # translations are not learned
