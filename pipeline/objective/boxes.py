@@ -25,6 +25,7 @@ __all__ = [
     "box_equations",
     "box_pairs",
     "elevation_residuals",
+    "select_frames",
     "vehicle_boxes",
 ]
 
@@ -51,6 +52,19 @@ class VehicleBoxes:
     expected_m: Float[np.ndarray, " B"]  # range that the height suggests
     frame: Int64[np.ndarray, " B"]  # index into the observations given
 
+    def of_frames(self, frames: Int64[np.ndarray, " S"]) -> VehicleBoxes:
+        """Those of some observations, which are numbered anew in the order given."""
+        index, number = select_frames(self.frame, frames)
+        return VehicleBoxes(
+            self.kind[index],
+            self.azimuth_rad[index],
+            self.elevation_rad[index],
+            self.left_rad[index],
+            self.right_rad[index],
+            self.expected_m[index],
+            number,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class BoxPairs:
@@ -67,6 +81,16 @@ class BoxPairs:
     def count(self) -> int:
         """Number of boxes."""
         return len(self.kind)
+
+
+def select_frames(
+    frame: Int64[np.ndarray, " B"], frames: Int64[np.ndarray, " S"]
+) -> tuple[Int64[np.ndarray, " C"], Int64[np.ndarray, " C"]]:
+    """Rows that belong to the given frames, and the place of their frame among these."""
+    place = np.full(int(max(frame.max(initial=-1), frames.max(initial=-1))) + 1, -1, np.int64)
+    place[frames] = np.arange(len(frames))
+    index = np.flatnonzero(place[frame] >= 0)
+    return index.astype(np.int64), place[frame[index]]
 
 
 def vehicle_boxes(observations: Sequence[Observation]) -> VehicleBoxes:

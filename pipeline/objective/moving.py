@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int64
+from scipy.spatial import cKDTree
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, wrap_angle
+from pipeline.objective.boxes import select_frames
 from schemas.observations import Observation
 
 __all__ = [
@@ -27,6 +30,7 @@ __all__ = [
 ]
 
 _GATE_M = 2.5  # lidar cluster centre to radar cluster centre: half a car, twice
+_APART_M = 1e3
 _LARGEST_M = 12.0  # lidar clusters longer than a lorry are walls
 _RANGE_FACTOR = 1.8
 _HEIGHT_M = {
@@ -62,13 +66,34 @@ class MovingClusters:
         """Number of observations that they were taken from."""
         return len(self.box_azimuths)
 
+    @cached_property
+    def centres(self) -> cKDTree:
+        """All lidar clusters in the plane; those of different observations lie far apart in the third coordinate."""
+        frame = np.repeat(np.arange(len(self.lidar_centres_m)), [len(c) for c in self.lidar_centres_m])
+        flat = np.concatenate([*self.lidar_centres_m, np.zeros((0, 3))])[:, :2]
+        return cKDTree(np.column_stack([flat, _APART_M * frame]))
+
+    def of_frames(self, frames: Int64[np.ndarray, " S"]) -> MovingClusters:
+        """Those of some observations, which are numbered anew in the order given."""
+        index, number = select_frames(self.frame, frames)
+        return MovingClusters(
+            self.point_radar_m[index],
+            self.relative_mps[index],
+            self.stamp_gap_s[index],
+            number,
+            [self.lidar_centres_m[f] for f in frames],
+            [self.box_azimuths[f] for f in frames],
+        )
+
     def at_lidar_time(self, dt_s: float) -> Float[np.ndarray, "B 3"]:
         """Where they were at the lidar's stamp, radar axes; stamp_lidar = stamp_radar + dt."""
         return self.point_radar_m - self.relative_mps * (self.stamp_gap_s + dt_s)[:, None]
 
 
-def moving_clusters(observations: Sequence[Observation], least_detections: int = 2) -> MovingClusters:
-    """Moving clusters between 3 and 60 m; elevation is left out where the radar has none."""
+def moving_clusters(
+    observations: Sequence[Observation], least_detections: int = 2, with_boxes: bool = True
+) -> MovingClusters:
+    """Moving clusters between 3 and 60 m; without boxes it is cheaper, and enough against the lidar."""
     points, speeds, gaps, frames = [], [], [], []
     for index, o in enumerate(observations):
         for label in range(int(o.radar_cluster.max(initial=-1)) + 1):
@@ -92,7 +117,7 @@ def moving_clusters(observations: Sequence[Observation], least_detections: int =
         np.array(gaps, np.float64),
         np.array(frames, np.int64),
         [_object_centres(o) for o in observations],
-        [_box_azimuths(o) for o in observations],
+        [_box_azimuths(o) if with_boxes else (np.zeros(0), np.zeros(0)) for o in observations],
     )
 
 
@@ -110,18 +135,12 @@ def lidar_azimuth_residuals(
     """
     points = clusters.at_lidar_time(dt_s)
     in_lidar = transform_points(T_lidar_radar, points)
-    chosen: list[int] = []
-    partners: list[np.ndarray] = []
-    for b in range(clusters.count):
-        centres = clusters.lidar_centres_m[clusters.frame[b]]
-        if not len(centres):
-            continue
-        square = (centres[:, 0] - in_lidar[b, 0]) ** 2 + (centres[:, 1] - in_lidar[b, 1]) ** 2
-        n = int(np.argmin(square))
-        if square[n] <= gate_m**2:
-            chosen.append(b)
-            partners.append(centres[n])
-    p = np.array(partners).reshape(-1, 3)
+    if not clusters.count or clusters.centres.n == 0:
+        return np.zeros(0), np.zeros((0, 6)), np.zeros(0, np.int64)
+    where = np.column_stack([in_lidar[:, :2], _APART_M * clusters.frame])
+    _, partner = clusters.centres.query(where, distance_upper_bound=gate_m)
+    chosen = np.flatnonzero(partner < clusters.centres.n)
+    p = np.concatenate(clusters.lidar_centres_m)[partner[chosen]]
     q = transform_points(inverse(T_lidar_radar), p)
     h2 = q[:, 0] ** 2 + q[:, 1] ** 2
     residual = wrap_angle(np.arctan2(q[:, 1], q[:, 0]) - np.arctan2(points[chosen, 1], points[chosen, 0]))

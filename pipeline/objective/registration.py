@@ -15,7 +15,7 @@ Source: Granger & Pennec 2002, "Multi-scale EM-ICP"; Louis 1982 for the informat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -41,6 +41,7 @@ _BOUNCE_MOST = 0.3
 _RANGE_M = (3.0, 60.0)  # nearer is the car's own clutter; farther the lidar has too few points
 _RADAR_POINTS = 500  # per frame; more say the same again
 _SIDE_RAD = 1.25
+_VIEW_MARGIN_RAD = np.radians(1.0)  # half a wide radar's cell, less what its detections prefer
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,8 @@ class RegistrationFrames:
     stamp_gap_s: Float[np.ndarray, " F"]  # radar stamp minus lidar stamp
     block: Int64[np.ndarray, " F"]  # drive, for resampling
     frame: Int64[np.ndarray, " F"]  # index into the observations given
+    # Lowest and highest that the lidar ever showed, lidar axes.
+    lidar_elevation_rad: Float[np.ndarray, " 2"] = field(default_factory=lambda: np.array([-1.5, 1.5]))
 
     @property
     def count(self) -> int:
@@ -84,7 +87,10 @@ class RegistrationFrames:
                 self.frame,
             )
         )
-        return RegistrationFrames(radar, r_first, lidar, l_first, *rest)
+        return replace(
+            RegistrationFrames(radar, r_first, lidar, l_first, *rest),
+            lidar_elevation_rad=self.lidar_elevation_rad,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +162,7 @@ def registration_frames(
         np.array(columns[5], np.float64),
         np.array(columns[6], np.int64),
         np.array(columns[7], np.int64),
+        _elevation_limits(observations),
     )
 
 
@@ -197,6 +204,7 @@ def normal_equations(
         frames.plane,
         frames.has_plane,
         frames.has_elevation,
+        _told_elevations(frames.lidar_elevation_rad, float(sigma[1])),
         np.asarray(sigma, np.float64),
         outlier,
         bounce_prior,
@@ -225,9 +233,33 @@ def updated_sigma(
     equations: NormalEquations, sigma: Float[np.ndarray, " 3"], bounce_prior: float
 ) -> tuple[Float[np.ndarray, " 3"], float]:
     """Sigmas and bounce probability that the assigned residuals show, within what radars do (one EM step)."""
-    shown = sigma * np.sqrt(np.maximum(equations.second_moment, 1e-6))
+    # EM shrinks slowly what began wide (every lidar point within reach is a partner): twice its step, in logarithms.
+    shown = sigma * np.maximum(equations.second_moment, 1e-6)
     bounce = float(np.clip(equations.bounced, 0.01, _BOUNCE_MOST)) if bounce_prior > 0 else 0.0
     return np.clip(shown, _SIGMA_LEAST, _SIGMA_MOST), bounce
+
+
+def _elevation_limits(observations: Sequence[Observation]) -> np.ndarray:
+    """Lowest and highest elevation [rad] of lidar maps, a few stray points aside."""
+    low, high = [], []
+    for o in observations:
+        p = o.lidar_map_xyz_m
+        if len(p) >= 100:
+            angle = np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))
+            few = np.partition(angle, (len(p) // 200, len(p) - 1 - len(p) // 200))
+            low.append(few[len(p) // 200])
+            high.append(few[-1 - len(p) // 200])
+    # No single street shows all of the field of view.
+    return np.array([min(low), max(high)], np.float64) if low else np.array([-1.5, 1.5])
+
+
+def _told_elevations(limits_rad: np.ndarray, sigma_rad: float) -> np.ndarray:
+    """Tangents of the elevations between which a detection's elevation can be compared with the lidar's.
+
+    What stands out of the lidar's view would be matched to its edge, always from the same side.
+    """
+    margin = _VIEW_MARGIN_RAD + min(2 * sigma_rad, 0.25 * float(limits_rad[1] - limits_rad[0]))
+    return np.tan(np.clip(limits_rad + np.array([margin, -margin]), -1.5, 1.5))
 
 
 def _static_detections(o: Observation, most: int, rng: np.random.Generator) -> np.ndarray:

@@ -32,13 +32,13 @@ def _spherical(x, y, z):
 
 @no_type_check
 @_jit
-def _lidar_in_radar(p0, p1, R, t, xyz, plane, motion, has_plane, sph, bounce_el):
+def _lidar_in_radar(p0, p1, R, t, xyz, plane, motion, mirrors, sph, bounce_el):
     """Spherical radar coordinates of lidar points, and the elevation of their mirror image below the ground."""
     h0 = plane[0] * t[0] + plane[1] * t[1] + plane[2] * t[2] + plane[3]
     for k in range(p0, p1):
         dx, dy, dz = xyz[k, 0] - t[0], xyz[k, 1] - t[1], xyz[k, 2] - t[2]
         height = 0.0
-        if has_plane:
+        if mirrors:
             height = plane[0] * dx + plane[1] * dy + plane[2] * dz + h0
         for mirror in range(2):
             if mirror == 1:
@@ -126,12 +126,13 @@ def _jacobian(J, x, y, z, R, t, v, w, tau):
 @_jit
 def accumulate_frames(
     T, tau, range_bias, velocity, yaw_rate, radar, radar_first, lidar, lidar_first, plane, has_plane,
-    use_elevation, sigma,
+    use_elevation, limits, sigma,
     outlier, bounce_prior, stride, max_range, H, g, info, stats,
 ) -> None:  # fmt: skip
     """Normal equations of each frame: H (2, F, 8, 8) and g (2, F, 8) for (azimuth and range, elevation), information.
 
-    `info` is H less what the uncertain assignment takes away (Louis 1982), row by row.
+    `info` is H less what the uncertain assignment takes away (Louis 1982), row by row. A detection whose elevation in
+    lidar axes is not inside `limits` (tangents, low and high) is assigned by azimuth and range alone.
     """
     R, t = T[:3, :3], T[:3, 3]
     most = 1
@@ -151,13 +152,20 @@ def accumulate_frames(
         p0, p1 = lidar_first[f], lidar_first[f + 1]
         motion[:3] = velocity[f] * tau[f]
         motion[3] = yaw_rate[f] * tau[f]
-        _lidar_in_radar(p0, p1, R, t, lidar, plane[f], motion, has_plane[f], sph, bounce_el)
+        _lidar_in_radar(
+            p0, p1, R, t, lidar, plane[f], motion, has_plane[f] and bounce_prior > 0, sph, bounce_el
+        )
         for n in range(p1 - p0):
             sph[n, 2] += range_bias
         _sort_into_cells(p1 - p0, sph, -reach_a, 0.0, cell_a, cell_r, n_a, n_r, start, order, cell_of)
         for k in range(radar_first[f], radar_first[f + 1], stride):
             x, y, z = radar[k, 0], radar[k, 1], radar[k, 2]
             a, e, r = _spherical(x, y, z)
+            up = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+            flat = np.hypot(
+                R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0], R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
+            )
+            tells = use_elevation[f] and limits[0] * flat < up and up < limits[1] * flat
             i0, j0 = int(np.floor((a + reach_a) / cell_a)), int(np.floor(r / cell_r))
             direct, bounced = 0.0, 0.0
             m0, m1, m2, q0, q1, q2, b0, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -172,11 +180,11 @@ def accumulate_frames(
                     if d2 > _CUT:
                         continue
                     de, db = 0.0, 0.0
-                    if use_elevation[f]:
+                    if tells:
                         de = (sph[n, 1] - e) / sigma[1]
                         db = (bounce_el[n] - e) / sigma[1]
                     wd = (1 - bounce_prior) * np.exp(-0.5 * (d2 + de * de))
-                    wb = bounce_prior * np.exp(-0.5 * (d2 + db * db)) if use_elevation[f] else 0.0
+                    wb = bounce_prior * np.exp(-0.5 * (d2 + db * db)) if tells else 0.0
                     direct += wd
                     bounced += wb
                     m0 += wd * da
@@ -201,12 +209,13 @@ def accumulate_frames(
             m0, m2, q0, q2 = (m0 + b0) / total, (m2 + b2) / total, (q0 + bq0) / total, (q2 + bq2) / total
             m1, q1 = m1 / max(direct, 1e-12), q1 / max(direct, 1e-12)
             stats[f, 4] += gamma * q0
-            stats[f, 5] += gamma * share * q1
+            if tells:
+                stats[f, 5] += gamma * share * q1
+                stats[f, 7] += gamma * share
             stats[f, 6] += gamma * q2
-            stats[f, 7] += gamma * share
             _jacobian(J, x, y, z, R, t, velocity[f], yaw_rate[f], tau[f])
             for row in range(3):
-                if row == 1 and not use_elevation[f]:
+                if row == 1 and not tells:
                     continue
                 part = 1 if row == 1 else 0
                 weight = gamma * share if row == 1 else gamma

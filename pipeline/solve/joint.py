@@ -177,12 +177,16 @@ def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:
     doubts: list[str] = []
     if not d:
         return doubts
-    if abs(d["restarts_rz_rad"]) > _RESTART_ROTATION_RAD or d["restarts_xy_m"] > _RESTART_SHIFT_M:
-        doubts.append(
-            f"restarts disagree by {np.degrees(d['restarts_rz_rad']):+.2f} deg of yaw and {d['restarts_xy_m']:.2f} m"
-        )
-    # Two halves differ by twice the error of the whole, if their errors are independent.
     sigma = np.sqrt(np.diag(estimate.covariance))
+    # Restarts end where finishing begins: only what would be another basin counts, and only in what is claimed.
+    for k, name, key, least in (
+        (2, "yaw", "restarts_rz_rad", _RESTART_ROTATION_RAD),
+        (3, "x", "restarts_tx_m", _RESTART_SHIFT_M),
+        (4, "y", "restarts_ty_m", _RESTART_SHIFT_M),
+    ):
+        if estimate.observable[k] and abs(d[key]) > max(least, _SIGMAS * sigma[k]):
+            doubts.append(f"restarts disagree in {name} by {_size(k, d[key])}")
+    # Two halves differ by twice the error of the whole, if their errors are independent.
     for k, (name, key) in enumerate(
         zip(
             ("roll", "pitch", "yaw", "x", "y", "z"),
@@ -191,8 +195,7 @@ def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:
         )
     ):
         if estimate.observable[k] and abs(d[f"halves_{key}"]) > _SIGMAS * 2 * sigma[k]:
-            size = f"{np.degrees(d[f'halves_{key}']):+.2f} deg" if k < 3 else f"{d[f'halves_{key}']:+.3f} m"
-            doubts.append(f"disjoint halves disagree in {name} by {size}")
+            doubts.append(f"disjoint halves disagree in {name} by {_size(k, d[f'halves_{key}'])}")
     for k, name in ((0, "roll"), (1, "pitch")):
         offset, floor = d[f"registration_{name}_offset_rad"], d[f"registration_{name}_sigma_rad"]
         if estimate.observable[k] and abs(offset) > _SIGMAS * np.hypot(floor, sigma[k]):
@@ -209,6 +212,10 @@ def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfi
     if "translation_prior" not in config.terms:
         prior = replace(prior, translation_sigma_m=_ANYWHERE_M)
     return prior, config
+
+
+def _size(k: int, value: float) -> str:
+    return f"{np.degrees(value):+.2f} deg" if k < 3 else f"{value:+.3f} m"
 
 
 def _kept(pair: str, prior: Prior) -> PairEstimate:

@@ -27,12 +27,14 @@ from pipeline.solve.lidar_radar_equations import (
     DT,
     OUTLIER,
     RANGE,
+    RANGE_BIAS_SIGMA_M,
     STEP_LIMIT,
     UNKNOWNS,
     Linear,
     RadarProblem,
     RadarState,
-    elevation_floor,
+    beam_spacing,
+    elevation_spread,
     linearise,
 )
 from pipeline.solve.lidar_radar_search import FREE, anneal, finish, last_step, scan
@@ -41,13 +43,16 @@ from schemas.observations import Observation
 __all__ = ["estimate_lidar_radar", "lidar_radar_cost"]
 
 _FEWEST_FRAMES = 5
+_MANY_FRAMES = 60  # from here on half of them find the basin
 _VERDICT_SIGMA = np.array(
     [np.radians(0.5), np.radians(6.0), 0.2]
 )  # wide in elevation: that is not what decides
-# What resampling can't show, sigma per DoF: unobserved roll tilts azimuths, radars see into objects, box constants.
-# Roll: which detections of a box are taken moved it by 0.5 deg on real logs.
-_BIAS_FLOOR = np.array([np.radians(0.5), np.radians(0.3), np.radians(0.10), 0.02, 0.02, 0.05])
+# What resampling can't show, sigma per DoF: a radar's own constant elevation error looks like pitch and is taken as
+# 0 +- 0.15 deg (a fortieth of a car radar's resolution cell), unobserved roll tilts azimuths, radars see into objects.
+_ELEVATION_BIAS_RAD = np.radians(0.15)
+_BIAS_FLOOR = np.array([np.radians(0.1), _ELEVATION_BIAS_RAD, np.radians(0.05), 0.02, 0.02, 0.02])
 _DT_FLOOR_S = 0.002  # halves of a real day differed by 3 ms where resampling said 1
+_DT_TOLD_S = 0.005  # a time offset known no better than this is called so
 _MOVING_MPS = 3.0
 _SIDEWAYS_MPS = (
     0.3  # of a radar 3 m ahead of the axle: 6 deg/s, 0.1 deg in 20 ms; Doppler's own noise is 0.05 m/s
@@ -112,15 +117,17 @@ def estimate_lidar_radar(
     problem = RadarProblem(
         observations,
         frames,
-        moving_clusters(observations),
+        moving_clusters(observations, with_boxes=False),
         vehicle_boxes(observations),
         T_camera_lidar,
         prior,
         config.time_offset_sigma_s,
-        elevation_floor(observations),
+        beam_spacing(observations),
+        elevation_spread(frames),
         config.terms,
     )
-    ends = [anneal(problem, start) for start in scan(problem, config)]
+    some = problem if frames.count < _MANY_FRAMES else problem.of_frames(np.arange(0, frames.count, 2))
+    ends = [anneal(some, start) for start in scan(problem, config)]
     costs = [_sharp_cost(problem, end) for end in ends]
     settled = _settle(problem, ends[int(np.argmin(costs))], covariance_camera_lidar, config, rng)
     parts = [problem.of_frames(np.arange(k, frames.count, 2)) for k in (0, 1)]
@@ -180,7 +187,8 @@ def _settle(
     before = np.append(np.diag(problem.prior.covariance("lidar_radar")), problem.dt_sigma_s**2)
     held, observability = FREE.copy(), np.ones(DT + 1)
     while True:
-        state, linear = finish(problem, state, held)
+        # Once the radar's sigmas are known, comparing solutions asks that they stay.
+        state, linear = finish(problem, state, held, sharpen=not held.any())
         information = _with_measured_curvature(problem, state, linear.information)
         curvature = information.sum(0) + linear.pull
         variance = 1 / np.diag(linear.pull)
@@ -188,7 +196,7 @@ def _settle(
         full = held_covariance(information, linear.g, variance, curvature, held, block, rng)
         full[:2, :2] += _camera_share(problem, covariance_camera_lidar) * ~(held[:2, None] | held[:2])
         free = ~held[: DT + 1]
-        bias = np.where(free, [*_BIAS_FLOOR**2, _DT_FLOOR_S**2 + _crawl(linear, held) ** 2], 0.0)
+        bias = np.where(free, [*_BIAS_FLOOR**2, _DT_FLOOR_S**2 + _crawl(linear, state, held) ** 2], 0.0)
         told = _observability(np.diag(full)[: DT + 1], bias, before)
         observability[free] = told[free]
         if np.all(told[free] >= OBSERVABLE):
@@ -218,18 +226,8 @@ def _conclude(
     halves: list[RadarState],
     rejected: dict[str, int],
 ) -> PairEstimate:
-    state, linear, held = settled.state, settled.linear, settled.held
-    notes = []
-    if held[:6].any():
-        notes.append(f"not determined by this day, kept at the prior: {', '.join(_NAMES[held[:6]])}")
-    if held[DT]:
-        notes.append("time offset not determined by this day, kept at the prior")
-    if linear.boxes < 5:
-        notes.append(
-            "no vehicle boxes with radar elevations: roll and pitch rest on the registration and the prior"
-        )
-    else:
-        notes.append("radar pitch assumes that returns lie at a constant angle (0 +- 1 deg) from box centres")
+    state, held = settled.state, settled.held
+    notes = _notes(settled)
     # The record's covariance is of a left perturbation: a turn about the lidar carries the radar along.
     J = np.linalg.inv(change_jacobian(state.T_lidar_radar))
     return PairEstimate(
@@ -242,14 +240,40 @@ def _conclude(
         {reason: count for reason, count in rejected.items() if count},
         state.dt_s,
         float(np.sqrt(settled.covariance[DT, DT])),
-        _diagnostics(problem, settled, ends, halves),
+        _diagnostics(settled, ends, halves),
         notes,
     )
 
 
-def _diagnostics(
-    problem: RadarProblem, settled: _Settled, ends: list[RadarState], halves: list[RadarState]
-) -> dict[str, float]:
+def _notes(settled: _Settled) -> list[str]:
+    """What was not determined, and what was assumed."""
+    held, linear = settled.held, settled.linear
+    notes = []
+    if held[:6].any():
+        notes.append(f"not determined by this day, kept at the prior: {', '.join(_NAMES[held[:6]])}")
+    dt_sigma_s = float(np.sqrt(settled.covariance[DT, DT]))
+    if held[DT]:
+        notes.append("time offset not determined by this day, kept at the prior")
+    elif dt_sigma_s > _DT_TOLD_S:
+        notes.append(
+            f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: where the car keeps one speed, x looks the same"
+        )
+    if linear.boxes < _FEWEST_FRAMES:
+        notes.append(
+            "no vehicle boxes with radar elevations: roll and pitch rest on the registration and the prior"
+        )
+    else:
+        notes.append("radar pitch assumes that returns lie at a constant angle (0 +- 1 deg) from box centres")
+    bias_sigma_m = float(np.sqrt(settled.covariance[RANGE, RANGE]))
+    pitch_deg = float(np.degrees(_ELEVATION_BIAS_RAD))
+    notes += [
+        f"assumes a constant elevation error of the radar of 0 +- {pitch_deg:.2f} deg: it looks like pitch",
+        f"range bias {settled.state.range_bias_m:+.3f} +- {bias_sigma_m:.3f} m (prior 0 +- {RANGE_BIAS_SIGMA_M:.2f})",
+    ]
+    return notes
+
+
+def _diagnostics(settled: _Settled, ends: list[RadarState], halves: list[RadarState]) -> dict[str, float]:
     state, linear = settled.state, settled.linear
     half = change_between(halves[1].T_lidar_radar, halves[0].T_lidar_radar)
     apart = change_between(ends[-1].T_lidar_radar, ends[0].T_lidar_radar)
@@ -267,12 +291,13 @@ def _diagnostics(
         "moving_azimuth_sigma_rad": linear.mover_sigma_rad,
         "registration_roll_offset_rad": float(linear.registration_step[0]),
         "registration_pitch_offset_rad": float(linear.registration_step[1]),
-        "registration_roll_sigma_rad": float(problem.floor[0]),
-        "registration_pitch_sigma_rad": float(problem.floor[1]),
+        "registration_roll_sigma_rad": float(linear.floor[0]),
+        "registration_pitch_sigma_rad": float(linear.floor[1]),
         **{f"halves_{n}": float(v) for n, v in zip(_DOF_UNITS, half, strict=True)},
         "halves_dt_s": halves[0].dt_s - halves[1].dt_s,
         "restarts_rz_rad": float(apart[2]),
-        "restarts_xy_m": float(np.hypot(apart[3], apart[4])),
+        "restarts_tx_m": float(apart[3]),
+        "restarts_ty_m": float(apart[4]),
     }  # fmt: skip
     return {k: v for k, v in diagnostics.items() if np.isfinite(v)}
 
@@ -307,9 +332,9 @@ def _gradient(problem: RadarProblem, state: RadarState) -> np.ndarray:
     return g.sum(0)[AZIMUTH_RANGE_DOF]
 
 
-def _crawl(linear: Linear, held: np.ndarray) -> float:
+def _crawl(linear: Linear, state: RadarState, held: np.ndarray) -> float:
     """Ten of the steps of dt that were still to come [s], for the valley is flat."""
-    return float(10 * last_step(linear, held)[DT])
+    return float(10 * last_step(linear, state, held)[DT])
 
 
 def _camera_share(problem: RadarProblem, covariance: np.ndarray | None) -> np.ndarray:

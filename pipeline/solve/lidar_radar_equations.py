@@ -21,15 +21,15 @@ from jaxtyping import Bool, Float
 from pipeline.config import TERMS
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
+from pipeline.geometry.spherical import to_spherical
 from pipeline.objective.boxes import (
     BIAS_SIGMA_RAD,
     BOX_CLASSES,
     BoxPairs,
     VehicleBoxes,
     box_equations,
-    vehicle_boxes,
 )
-from pipeline.objective.moving import MovingClusters, azimuth_equations_lidar, moving_clusters
+from pipeline.objective.moving import MovingClusters, azimuth_equations_lidar
 from pipeline.objective.problem import Prior
 from pipeline.objective.registration import NormalEquations, RegistrationFrames, normal_equations
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, Observation
@@ -39,13 +39,17 @@ __all__ = [
     "DT",
     "OUTLIER",
     "RANGE",
+    "RANGE_BIAS_SIGMA_M",
     "STEP_LIMIT",
     "UNKNOWNS",
+    "ElevationSpread",
     "Linear",
     "RadarProblem",
     "RadarState",
-    "elevation_floor",
+    "beam_spacing",
+    "elevation_spread",
     "linearise",
+    "tempered",
 ]
 
 OUTLIER = 0.2  # in lidar points at distance 0: assigns about 40 % of a real radar's static detections
@@ -54,13 +58,18 @@ UNKNOWNS = 8 + len(BOX_CLASSES)
 STEP_LIMIT = np.array([0.05] * 3 + [0.15] * 3 + [0.03, 0.1] + [0.05] * len(BOX_CLASSES))
 AZIMUTH_RANGE_DOF = np.array([2, 3, 4, 6, 7])
 _ELEVATION_DOF = np.array([0, 1, 5])
-# How far a lidar's rings mislead the registration's elevations, in beam spacings: real logs (2 deg) showed 4-5 deg
-# of roll and 1-2 deg of pitch; simulation with 0.4 deg showed 0.3 deg. z by the same angle at 10 m, at least 0.25 m:
-# elevation errors that change with range (bounces, the horizon) look like z, in simulation up to 0.4 m.
-_ROLL_SPACINGS, _PITCH_SPACINGS, _Z_DISTANCE_M = 2.5, 0.8, 10.0
-_Z_FLOOR_M = 0.25
+# How far elevations that are matched to the nearest lidar points mislead roll, pitch [rad] and z [m]. Noise takes a
+# part `noise^2 / spread^2` of every mismatch away as if it were truth (regression dilution), and a mismatch is as
+# large as the spread of the elevations: the angle noise^2 / spread. Real logs (3.2 deg of noise, spread 3.9): 2.6 deg
+# where 1-2 deg of pitch and 4-5 deg of roll were seen; simulation (.65 deg, spread 3-6): .07-.16 deg where .01-.12 was
+# seen. A coarse lidar adds a share of its beam spacing, for points collapse onto the rings. z is wrong by the same
+# angle at 10 m.
+_RING_SHARE, _Z_DISTANCE_M, _Z_FLOOR_M = 0.05, 10.0, 0.03
+_ROLL_FACTOR = 0.7  # of pitch's at an azimuth of one radian: both sides seldom err in opposite directions
 _DEFAULT_SPACING_RAD = np.radians(1.0)
-_RANGE_BIAS_SIGMA_M = 0.05  # radars' own, and what lies behind the surface that the lidar sees
+RANGE_BIAS_SIGMA_M = 0.05  # radars' own, and what lies behind the surface that the lidar sees
+# Roll of the boxes: which detections of a box are taken moved it by 0.5 deg on real logs. Pitch has its own unknowns.
+_BOX_FLOOR = np.radians(np.array([1.0, 0.0] + [0.0] * len(BOX_CLASSES)))
 _CONTRADICTED = 2.5  # prior sigmas from which data that say otherwise are believed
 
 
@@ -101,6 +110,20 @@ class RadarState:
 
 
 @dataclass(frozen=True, eq=False)
+class ElevationSpread:
+    """How the static detections lie: standard deviation of their elevations, RMS of their azimuths [rad]."""
+
+    elevation_rad: float
+    azimuth_rad: float
+
+    def floor(self, noise_rad: float, spacing_rad: float) -> np.ndarray:
+        """Sigma of roll, pitch [rad] and z [m] that such elevation noise leaves to the registration."""
+        angle = np.hypot(noise_rad**2 / self.elevation_rad, _RING_SHARE * spacing_rad)
+        roll, z_m = _ROLL_FACTOR * angle / self.azimuth_rad, np.hypot(_Z_DISTANCE_M * angle, _Z_FLOOR_M)
+        return np.array([roll, angle, z_m])
+
+
+@dataclass(frozen=True, eq=False)
 class RadarProblem:
     """All that stays the same while the state moves."""
 
@@ -111,7 +134,8 @@ class RadarProblem:
     T_camera_lidar: np.ndarray | None
     prior: Prior
     dt_sigma_s: float
-    floor: np.ndarray  # sigma of roll, pitch, z as the registration's elevations give them
+    spacing_rad: float  # of the lidar's beams, vertically
+    spread: ElevationSpread
     terms: Sequence[str] = TERMS  # that take part
 
     def of_frames(self, index: np.ndarray) -> RadarProblem:
@@ -120,7 +144,11 @@ class RadarProblem:
         part = [self.observations[i] for i in chosen]
         frames = replace(self.frames.subset(index), frame=np.arange(len(index), dtype=np.int64))
         return replace(
-            self, observations=part, frames=frames, movers=moving_clusters(part), boxes=vehicle_boxes(part)
+            self,
+            observations=part,
+            frames=frames,
+            movers=self.movers.of_frames(chosen),
+            boxes=self.boxes.of_frames(chosen),
         )
 
 
@@ -138,6 +166,7 @@ class Linear:
     boxes: int
     mover_sigma_rad: float
     registration_step: np.ndarray  # where elevations of the registration alone would put roll, pitch, z
+    floor: np.ndarray  # sigma of roll, pitch, z as the registration's elevations give them
 
 
 def linearise(
@@ -178,7 +207,8 @@ def linearise(
     H[decide] += stride * equations.H[0][block]
     info[decide] += stride * equations.information[0][block]
     g[np.ix_(at, AZIMUTH_RANGE_DOF)] += stride * equations.g[0][:, AZIMUTH_RANGE_DOF]
-    registration_step = _add_elevations(problem, equations, stride, H, info, g)
+    floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
+    registration_step = _add_elevations(problem, equations, stride, floor, H, info, g)
     box_sigma = _add_boxes(problem, state, pairs, about_radar, H, info, g)
     mover_sigma = float("nan")
     if widen == 1.0 and "moving" in problem.terms:  # partners are found only once the clusters lie near them
@@ -191,7 +221,9 @@ def linearise(
         g[:, flat] += gm[:, flat]
     prior_H, prior_g = _prior_equations(problem, state)
     boxes = 0 if pairs is None else pairs.count
-    return Linear(H, info, g, prior_H, prior_g, equations, box_sigma, boxes, mover_sigma, registration_step)
+    return Linear(
+        H, info, g, prior_H, prior_g, equations, box_sigma, boxes, mover_sigma, registration_step, floor
+    )
 
 
 def _about_radar(about_radar: np.ndarray, equations: NormalEquations) -> NormalEquations:
@@ -227,9 +259,10 @@ def _add_boxes(
     # were chosen by the pose.
     columns = np.array([0, 1, *range(RANGE + 1, UNKNOWNS)])
     own = np.array([0, 1, *range(6, 6 + len(BOX_CLASSES))])
+    Hb, gb = tempered(Hb[:, own[:, None], own], gb[:, own], _BOX_FLOOR)
     for array in (H, info):
-        array[np.ix_(np.arange(F), columns, columns)] += Hb[:, own[:, None], own]
-    g[:, columns] += gb[:, own]
+        array[np.ix_(np.arange(F), columns, columns)] += Hb
+    g[:, columns] += gb
     return sigma
 
 
@@ -237,6 +270,7 @@ def _add_elevations(
     problem: RadarProblem,
     equations: NormalEquations,
     stride: int,
+    floor: np.ndarray,
     H: np.ndarray,
     info: np.ndarray,
     g: np.ndarray,
@@ -248,17 +282,23 @@ def _add_elevations(
     block = np.ix_(np.arange(len(problem.frames.frame)), _ELEVATION_DOF, _ELEVATION_DOF)
     He, Ie = stride * equations.H[1][block], stride * equations.information[1][block]
     ge = stride * equations.g[1][:, _ELEVATION_DOF]
-    total = He.sum(0)
-    # (H^-1 + F)^-1 = (1 + H F)^-1 H, which also holds where H is singular (a radar without elevation).
-    temper = np.linalg.inv(np.eye(3) + total @ np.diag(problem.floor**2))
-    temper_info = np.linalg.inv(np.eye(3) + Ie.sum(0) @ np.diag(problem.floor**2))
     at = problem.frames.frame
     where = np.ix_(at, _ELEVATION_DOF, _ELEVATION_DOF)
-    for array, per_frame, W in ((H, He, temper), (info, Ie, temper_info)):
-        product = W @ per_frame
-        array[where] += 0.5 * (product + np.swapaxes(product, 1, 2))
-    g[np.ix_(at, _ELEVATION_DOF)] += ge @ temper.T
-    return -np.linalg.pinv(total, rcond=1e-6) @ ge.sum(0)
+    He_t, ge_t = tempered(He, ge, floor)
+    H[where] += He_t
+    info[where] += tempered(Ie, ge, floor)[0]
+    g[np.ix_(at, _ELEVATION_DOF)] += ge_t
+    return -np.linalg.pinv(He.sum(0), rcond=1e-6) @ ge.sum(0)
+
+
+def tempered(
+    H: Float[np.ndarray, "F P P"], g: Float[np.ndarray, "F P"], floor: Float[np.ndarray, " P"]
+) -> tuple[Float[np.ndarray, "F P P"], Float[np.ndarray, "F P"]]:
+    """Equations of all frames as one measurement with covariance `H^-1 + floor^2`, shared out among the frames."""
+    # (H^-1 + F)^-1 = (1 + H F)^-1 H, which also holds where H is singular (a radar without elevation).
+    W = np.linalg.inv(np.eye(len(floor)) + H.sum(0) @ np.diag(floor**2))
+    product = W @ H
+    return 0.5 * (product + np.swapaxes(product, 1, 2)), g @ W.T
 
 
 def _prior_equations(problem: RadarProblem, state: RadarState) -> tuple[np.ndarray, np.ndarray]:
@@ -279,19 +319,26 @@ def _prior_equations(problem: RadarProblem, state: RadarState) -> tuple[np.ndarr
     shifted = (x[3:6] / prior.translation_sigma_m) ** 2
     weight[3:6] = 1 / prior.translation_sigma_m**2 / (1 + shifted / _CONTRADICTED**2)
     weight[DT] = 1 / problem.dt_sigma_s**2
-    weight[RANGE] = 1 / _RANGE_BIAS_SIGMA_M**2
+    weight[RANGE] = 1 / RANGE_BIAS_SIGMA_M**2
     weight[RANGE + 1 :] = 1 / BIAS_SIGMA_RAD**2
     return np.diag(weight), weight * x
 
 
-def elevation_floor(observations: Sequence[Observation]) -> np.ndarray:
-    """Sigma of roll, pitch [rad] and z [m] that the lidar's beam spacing leaves to the registration."""
+def beam_spacing(observations: Sequence[Observation]) -> float:
+    """Vertical spacing of the lidar's beams [rad], as its depth jumps between rings show it."""
     gaps = [
         o.lidar_edge_gap_rad[(o.lidar_edge_side == EDGE_ABOVE) | (o.lidar_edge_side == EDGE_BELOW)]
         for o in observations
     ]
     every = np.concatenate(gaps) if gaps else np.zeros(0)
-    spacing = float(np.median(every)) if len(every) else _DEFAULT_SPACING_RAD
-    return np.array(
-        [_ROLL_SPACINGS * spacing, _PITCH_SPACINGS * spacing, max(_Z_DISTANCE_M * spacing, _Z_FLOOR_M)]
+    return float(np.median(every)) if len(every) else float(_DEFAULT_SPACING_RAD)
+
+
+def elevation_spread(frames: RegistrationFrames) -> ElevationSpread:
+    """How the static detections of these frames lie."""
+    azimuth, elevation, _ = to_spherical(frames.radar_m).T
+    # One degree: below it, noise alone would make as much.
+    return ElevationSpread(
+        max(float(np.std(elevation)), np.radians(1.0)),
+        max(float(np.sqrt(np.mean(azimuth**2))), np.radians(3.0)),
     )

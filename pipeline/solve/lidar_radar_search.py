@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -27,16 +27,17 @@ __all__ = ["FREE", "anneal", "finish", "last_step", "scan"]
 FREE = np.zeros(UNKNOWNS, bool)  # no unknown held
 _WIDEST = 4.0  # anneal from this many sigmas
 _COOLING = 0.75
-_STEPS = 16
+_STEPS = 14
+_DT_SCANS = {4: 1.5, 8: 0.8, 11: 0.5}  # after so many steps, with so many times the starting sigmas
 _FINAL_STEPS = 20
 _STILL = 0.003  # of the step limit: 0.1 ms, 0.5 mm, 0.01 deg
-_MEMORY = 4
-_MOST_GAIN = 4.0  # of an accelerated step
-_CAUTION = (
-    0.15  # share of EM in the last steps: EM alone leaves 5 ms of dt after 20 steps, none of it oscillates
-)
+_CAUTION = 0.15  # share of EM in the last steps
+_NO_DT = np.arange(UNKNOWNS) == DT
+_DT_STEP_S, _LEAST_DT_S = 0.01, 2e-5  # longest step, and shortest from which a slope is believed
+_DT_SCAN_M, _DT_SCAN_MPS = 0.25, 8.0  # step in metres; slower cars need no finer steps of time
+_FLATNESS = (0.03, 1.5)
 _SCAN_STEP_RAD = np.radians(1.5)
-_SCAN_FRAMES = 24
+_SCAN_FRAMES = 24  # are enough to tell basins apart
 _BOX_GATE_RAD = (np.radians(12.0), np.radians(7.0))  # at the start, and once pitch and roll are about right
 
 
@@ -59,82 +60,131 @@ def scan(problem: RadarProblem, config: SolveConfig) -> list[RadarState]:
 
 
 def anneal(problem: RadarProblem, state: RadarState) -> RadarState:
-    """Newton steps with re-association at every step, from wide sigmas to the radar's own."""
-    pairs = None
+    """Newton steps with re-association at every step, from wide sigmas to the radar's own.
+
+    `problem` may be a part of the day: this finds the basin, `finish` its floor.
+    """
+    pairs, valley = None, _Valley()
     for k in range(_STEPS):
         widen = max(1.0, _WIDEST * _COOLING**k)
-        if k % 4 == 0:
-            pairs = _boxes(problem, state, _BOX_GATE_RAD[0 if k < _STEPS // 2 else 1])
+        if k in (0, _STEPS // 2):
+            pairs = _boxes(problem, state, _BOX_GATE_RAD[min(k, 1)])
         linear = linearise(problem, state, widen, pairs, stride=3)
-        state = state.moved(_next_step(linear))
+        if k in _DT_SCANS:
+            state, valley = _scan_dt(problem, state, _DT_SCANS[k]), _Valley()
+        # Where sigmas are wide, dt would only wander: what it shifts, x can shift as well.
+        held = _NO_DT if widen > 1.0 else FREE
+        step, valley = _next_step(linear, state, valley, 1.0 if widen > 1.0 else 0.5, held)
+        state = state.moved(step)
         if widen == 1.0:
-            sigma, bounce = updated_sigma(linear.registration, state.sigma, state.bounce)
-            state = replace(state, sigma=sigma, bounce=bounce)
+            state, valley = _sharpened(linear, state), valley.forgetting()
     return state
 
 
+def _scan_dt(problem: RadarProblem, state: RadarState, widen: float) -> RadarState:
+    """The time offset under which most detections meet the lidar, by the medium cost of some frames.
+
+    At 30 m/s 25 ms are 0.75 m: posts and signs are then out of reach of sharp sigmas, and guard rails meet themselves.
+    """
+    frames = problem.frames
+    speed = float(np.sqrt(np.mean(np.sum(frames.velocity_mps**2, axis=1))))
+    step_s = _DT_SCAN_M / max(speed, _DT_SCAN_MPS)
+    count = int(np.ceil(2 * problem.dt_sigma_s / step_s))
+    part = frames.subset(np.arange(0, frames.count, 1 + (frames.count > _SCAN_FRAMES)))
+    offsets = state.dt_s + step_s * np.arange(-count, count + 1)
+
+    def cost(dt_s: float) -> float:
+        T, sigma = state.T_lidar_radar, widen * SIGMA_START
+        fit = normal_equations(part, T, dt_s, sigma, 0.0, OUTLIER, 3, state.range_bias_m).cost.sum()
+        detections = max(len(part.radar_m) / 3 / max(part.count, 1), 1.0)
+        return float(fit * detections) + 0.5 * (dt_s / problem.dt_sigma_s) ** 2
+
+    return replace(state, dt_s=float(offsets[int(np.argmin([cost(float(dt_s)) for dt_s in offsets]))]))
+
+
 def finish(
-    problem: RadarProblem, state: RadarState, held: Bool[np.ndarray, " P"] = FREE
+    problem: RadarProblem, state: RadarState, held: Bool[np.ndarray, " P"] = FREE, sharpen: bool = False
 ) -> tuple[RadarState, Linear]:
-    """All detections, sigmas held: steps until nothing moves, and the equations there.
+    """All detections: steps until nothing moves, and the equations there.
 
     Args:
         problem: the day.
         state: start.
         held: unknowns of the pose and dt that keep the prior's value.
+        sharpen: let the radar's sigmas follow the residuals; else they stay.
     """
     state = state.kept(problem.prior, held)
     pairs = _boxes(problem, state, _BOX_GATE_RAD[1])
-    past: list[tuple[np.ndarray, np.ndarray]] = []  # where the state was, counted from here, and its step
-    x = np.zeros(UNKNOWNS)
-    for _ in range(_FINAL_STEPS):
-        step = _next_step(linearise(problem, state, 1.0, pairs), _CAUTION, held)
-        past = [*past[-_MEMORY:], (x, step)]
-        move = _accelerated(past)
-        x, state = x + move, state.moved(move).kept(problem.prior, held)
-        if np.max(np.abs(move) / STEP_LIMIT) < _STILL:
+    valley = _Valley()
+    for k in range(_FINAL_STEPS):
+        linear = linearise(problem, state, 1.0, pairs)
+        step, valley = _next_step(linear, state, valley, _CAUTION, held)
+        state = state.moved(step).kept(problem.prior, held)
+        still = np.max(np.abs(step) / STEP_LIMIT) < _STILL
+        if sharpen and k < _FINAL_STEPS // 2 and (still or k % 3 == 2):
+            before = state.sigma
+            state, valley = _sharpened(linear, state), valley.forgetting()
+            still = still and np.max(np.abs(state.sigma / before - 1)) < 0.02
+        if still:
             break
     return state, linearise(problem, state, 1.0, pairs)
 
 
-def _accelerated(past: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """The next move by Anderson's rule: dt, x and the range bias share a valley along which plain steps crawl.
+def _sharpened(linear: Linear, state: RadarState) -> RadarState:
+    sigma, bounce = updated_sigma(linear.registration, state.sigma, state.bounce)
+    return replace(state, sigma=sigma, bounce=bounce)
 
-    Source: Walker & Ni 2011, "Anderson acceleration for fixed-point iterations", in units of `STEP_LIMIT`.
-    """
-    step = past[-1][1]
-    if len(past) < 3:
-        return step
-    X = np.diff([x for x, _ in past], axis=0) / STEP_LIMIT
-    F = np.diff([f for _, f in past], axis=0) / STEP_LIMIT
-    # A little damping keeps directions that only noise tells apart from blowing up.
-    A = F @ F.T
-    share = np.linalg.solve(A + 1e-3 * np.trace(A) / len(A) * np.eye(len(A)), F @ (step / STEP_LIMIT))
-    move = step - share @ (X + F) * STEP_LIMIT
-    # Re-association is noisy: go along the valley only where the gradient points.
-    if move[DT] * step[DT] < 0:
-        move = 2 * step
-    gain = float(np.linalg.norm(move / STEP_LIMIT)) / max(float(np.linalg.norm(step / STEP_LIMIT)), 1e-12)
-    move = step + (move - step) * min(1.0, _MOST_GAIN / gain)
-    return move / max(1.0, float(np.max(np.abs(move) / (0.3 * STEP_LIMIT))))
+
+@dataclass(frozen=True)
+class _Valley:
+    """What past steps showed of the cost along dt, all other unknowns following."""
+
+    dt_s: float | None = None
+    gradient: float = 0.0
+    flatness: float = 1.0  # curvature seen, as a share of what soft assignment promises
+
+    def forgetting(self) -> _Valley:
+        """Only the shape: the gradient belonged to other sigmas."""
+        return replace(self, dt_s=None)
+
+    def seen(self, dt_s: float, gradient: float, promised: float) -> _Valley:
+        """With one more point."""
+        flatness = self.flatness
+        if self.dt_s is not None and abs(dt_s - self.dt_s) > _LEAST_DT_S:
+            flatness = float(np.clip((gradient - self.gradient) / (dt_s - self.dt_s) / promised, *_FLATNESS))
+        return _Valley(dt_s, gradient, flatness)
 
 
 def _next_step(
-    linear: Linear, caution: float = 1.0, held: Bool[np.ndarray, " P"] = FREE
-) -> Float[np.ndarray, " P"]:
-    """EM step (caution 1), or nearly Newton's with the information that assignment leaves (caution near 0)."""
+    linear: Linear,
+    state: RadarState,
+    valley: _Valley,
+    caution: float,
+    held: Bool[np.ndarray, " P"],
+) -> tuple[Float[np.ndarray, " P"], _Valley]:
+    """EM step (caution 1), or nearly Newton's with the information that assignment leaves (caution near 0).
+
+    On days of one speed dt, x and the range bias share a valley that is far flatter than any of these promises: along
+    dt, with the others following, the step is the secant's.
+    """
     H = caution * linear.H.sum(0) + (1 - caution) * linear.information.sum(0) + linear.pull
-    free = ~held
-    step = np.zeros(UNKNOWNS)
-    step[free] = -(1 + 0.5 * caution) * np.linalg.solve(
-        H[np.ix_(free, free)], (linear.g.sum(0) + linear.pull_g)[free]
-    )
-    return step / max(1.0, float(np.max(np.abs(step) / STEP_LIMIT)))
+    g = linear.g.sum(0) + linear.pull_g
+    step, others = np.zeros(UNKNOWNS), ~held
+    others[DT] = False
+    solved = np.linalg.solve(H[np.ix_(others, others)], np.stack([g[others], H[others, DT]], 1))
+    if not held[DT]:
+        promised = float(H[DT, DT] - H[DT, others] @ solved[:, 1])
+        gradient = float(g[DT] - H[DT, others] @ solved[:, 0])
+        valley = valley.seen(state.dt_s, gradient, promised)
+        move = -gradient / (promised * valley.flatness)
+        step[DT] = np.clip(move, -_DT_STEP_S, _DT_STEP_S)
+    step[others] = -(1 + 0.5 * caution) * solved[:, 0] - solved[:, 1] * step[DT]
+    return step / max(1.0, float(np.max(np.abs(step) / STEP_LIMIT))), valley
 
 
-def last_step(linear: Linear, held: Bool[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
-    """The step that `finish` would still take."""
-    return _next_step(linear, _CAUTION, held)
+def last_step(linear: Linear, state: RadarState, held: Bool[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+    """The step that soft assignment would still take."""
+    return _next_step(linear, state, _Valley(), _CAUTION, held)[0]
 
 
 def _boxes(problem: RadarProblem, state: RadarState, gate: float) -> BoxPairs | None:

@@ -9,6 +9,7 @@ from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import exp_se3, log_se3, perturb_exactly
+from pipeline.geometry.spherical import from_spherical, to_spherical
 from pipeline.objective.problem import Prior
 from pipeline.solve.camera_radar import camera_radar_cost, estimate_camera_radar
 from pipeline.solve.lidar_radar import estimate_lidar_radar, lidar_radar_cost
@@ -132,13 +133,26 @@ def test_boxes_make_roll_surer(day):
     assert without.diagnostics["boxes"] == 0
 
 
-def test_a_coarse_lidar_is_not_trusted_with_roll(day):
-    coarse = [
-        replace(o, lidar_edge_gap_rad=np.full_like(o.lidar_edge_gap_rad, np.radians(2.0))) for o in day[:20]
-    ]
-    found = solve(coarse, prior_off_by(1, 0.02), None)
-    assert not found.observable[0]
-    assert found.diagnostics["registration_roll_sigma_rad"] > np.radians(4.0)
+def test_a_radar_of_poor_elevation_is_not_trusted_with_roll(day):
+    rng = np.random.default_rng(5)
+
+    def blurred(o):
+        aer = to_spherical(o.radar_xyz_m.astype(np.float64))
+        aer[:, 1] += np.radians(4.0) * rng.standard_normal(len(aer))
+        return replace(o, radar_xyz_m=from_spherical(aer).astype(np.float32))
+
+    sharp = solve(day[:20], prior_off_by(1, 0.02), None)
+    poor = solve([blurred(o) for o in day[:20]], prior_off_by(1, 0.02), None)
+    sigma = [np.sqrt(found.covariance[0, 0]) for found in (sharp, poor)]
+    assert sigma[1] > 2 * sigma[0]
+    for found, s in zip((sharp, poor), sigma, strict=True):
+        assert abs(error_of(found)[0]) < 3 * s
+
+
+def test_constant_elevation_and_range_errors_are_named_as_assumptions(day):
+    notes = "\n".join(solve(day[:20], prior_off_by(1, 0.02)).notes)
+    assert "constant elevation error of the radar of 0 +- 0.15 deg" in notes
+    assert "range bias" in notes
 
 
 def test_a_standing_car_does_not_determine_the_time_offset():
