@@ -22,6 +22,7 @@ def calibrate(
     perturb: str | None = None,
     seed: int | None = None,
     frame: int | None = None,
+    page: Path | None = None,
     polish: bool = False,
 ) -> int:
     """Find out how the vehicle's sensors sat relative to each other on that day, and how sure that is.
@@ -36,6 +37,7 @@ def calibrate(
         seed: of everything random; the configuration's where left out.
         frame: frame_index or stamp_ns: calibrate from this frame alone, by a network (joint-ssl where no SSL method
             is named). Nothing is recorded; the summary holds the transforms.
+        page: HTML page of that frame, before and after.
         polish: let the optimiser finish from the networks' answer, as solve.polish in fleet.toml.
     """
     from jobs.summary import exit_code, print_summary, progress_reporter
@@ -48,7 +50,10 @@ def calibrate(
         config = config.model_copy(update={"solve": config.solve.model_copy(update={"polish": True})})
     if frame is not None:
         partition, tables = Partition(vehicle, day), Lake.at(lake)
-        return _calibrate_frame(config, fleet, tables, partition, frame, method, parse_perturb(perturb), seed)
+        ssl = "joint-ssl" if method == "joint" else method
+        return _calibrate_frame(
+            config, fleet, tables, partition, frame, ssl, parse_perturb(perturb), seed, page
+        )
     with progress_reporter(f"calibrate {vehicle} {day}") as progress:
         result = calibrate_day(
             Partition(vehicle, day),
@@ -83,15 +88,20 @@ def _calibrate_frame(
     method: str,
     perturb: tuple[float, float] | None,
     seed: int | None,
+    page: Path | None,
 ) -> int:
-    """One frame's transforms in the summary."""
+    """One frame's transforms in the summary, and its page where one is wanted."""
     from jobs.summary import print_summary
     from pipeline.calibrate_ssl import calibrate_frame
 
-    method = "joint-ssl" if method == "joint" else method
     found = calibrate_frame(
         partition, config, lake, frame, method=method, perturb=perturb, seed=seed, fleet_file=fleet
     )
+    if page is not None:
+        from pipeline.report.frame import write_frame_page
+
+        title = f"{partition.vehicle}, {partition.day}, frame {found.frame.frame_index}"
+        write_frame_page(page, found.frame, found.observation, found.prior, found.solution, title)
     estimates = {
         pair: {
             "T": estimate.T,
@@ -108,8 +118,9 @@ def _calibrate_frame(
         vehicle=partition.vehicle,
         day=partition.day,
         method=method,
-        frame_index=found.frame_index,
-        stamp_ns=found.stamp_ns,
+        frame_index=found.frame.frame_index,
+        stamp_ns=found.frame.stamp_ns,
+        page=page,
         estimates=estimates,
         reason="one frame: nothing judges it and nothing is recorded",
     )

@@ -30,10 +30,10 @@ __all__ = ["SSL_METHODS", "FrameCalibration", "calibrate_frame", "ssl_key", "ssl
 
 @dataclass(frozen=True, eq=False)
 class FrameCalibration:
-    """What one frame says: the prior that it started from, and the solution."""
+    """One frame, the prior that its calibration started from, and the solution."""
 
-    frame_index: int
-    stamp_ns: int
+    frame: Frame
+    observation: Observation
     prior: Prior
     solution: Solution
 
@@ -125,7 +125,7 @@ def calibrate_frame(
     networks = open_networks(model_files(method, fleet.learn, fleet_file), fleet.learn, fleet.prepare)
     shown = next(_frames_of(lake, partition)([row]))
     solution = single_frame_solution(shown, observation, prior, networks=networks, method=method, seed=seed)
-    return FrameCalibration(shown.frame_index, shown.stamp_ns, prior, solution)
+    return FrameCalibration(shown, observation, prior, solution)
 
 
 def _frames_of(lake: Lake, partition: Partition) -> Callable[[Sequence[int]], Iterator[Frame]]:

@@ -225,6 +225,12 @@ def test_one_frame_on_the_command_line_prints_transforms_and_records_nothing(lak
     assert set(told["estimates"]) == set(PAIRS)
     T = np.array(told["estimates"]["camera_lidar"]["T"])
     assert T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3), abs=1e-9)
+    page = lake / "frame.html"
+    assert run(lake, capsys, "--frame", "7", "--perturb", "2,0.05", "--page", str(page))[0] == 0
+    html = page.read_text()
+    assert html.count("data:image/jpeg") >= 1
+    assert "from this frame" in html
+    assert "http" not in html.replace("http://www.w3.org", "")
     by_stamp = run(lake, capsys, "--frame", str(told["stamp_ns"]), "--perturb", "2,0.05")[1]
     assert by_stamp == told
     assert run(lake, capsys, "--frame", "99")[0] == 2

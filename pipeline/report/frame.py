@@ -1,0 +1,64 @@
+"""A page about one frame: what a network makes of an abrupt change, as the paper's figure 4."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.objective.problem import Prior, Solution
+from pipeline.report.overlays import Extrinsics, Scene
+from pipeline.report.page import render, write_page
+from pipeline.report.pictures import scene_pictures
+from schemas.calibrations import PAIRS
+from schemas.frames import Frame
+from schemas.observations import Observation
+
+__all__ = ["write_frame_page"]
+
+_LABELS = ("before", "from this frame")
+
+
+def write_frame_page(
+    path: Path, frame: Frame, observation: Observation, prior: Prior, solution: Solution, title: str
+) -> Path:
+    """Write pictures at the prior and at the solution, and how sure one frame is of each pair.
+
+    Args:
+        path: the HTML file.
+        frame: what was calibrated from.
+        observation: what perception found in it; only drawn.
+        prior: start.
+        solution: result.
+        title: vehicle, day and frame.
+    """
+    before = Extrinsics(*(prior.of(pair) for pair in PAIRS))
+    after = Extrinsics(*(solution.pairs[pair].T for pair in PAIRS))
+    pictures = scene_pictures([Scene(frame, observation)], before, after, _LABELS)
+    html = render(
+        "frame.html",
+        title=title,
+        method=solution.method,
+        labels=_LABELS,
+        scene=pictures[0],
+        pairs=[_told(pair, prior, solution) for pair in PAIRS],
+    )
+    return write_page(path, html)
+
+
+def _told(pair: str, prior: Prior, solution: Solution) -> dict[str, str]:
+    """What the page says of a pair, in words."""
+    estimate, T = solution.pairs[pair], prior.of(pair)
+    R = estimate.T[:3, :3] @ T[:3, :3].T
+    turned_deg = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1.0, 1.0)))
+    shifted_m = float(np.linalg.norm(estimate.T[:3, 3] - T[:3, 3]))
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    known = [
+        f"{np.degrees(s):.2f} deg" for s, seen in zip(sigma[:3], estimate.observable[:3], strict=True) if seen
+    ]
+    return {
+        "title": pair.replace("_", "-"),
+        "moved": f"{turned_deg:.2f} deg and {shifted_m:.3f} m from before",
+        "known": ", ".join(known) if known else "nothing: the prior stays",
+        "matrix": "\n".join("  ".join(f"{v: .6f}" for v in row) for row in estimate.T),
+    }
