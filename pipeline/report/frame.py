@@ -10,7 +10,7 @@ from pipeline.objective.problem import Prior, Solution
 from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.page import render, write_page
 from pipeline.report.pictures import scene_pictures
-from schemas.calibrations import PAIRS
+from schemas.calibrations import DOF_NAMES, PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation
 
@@ -53,9 +53,8 @@ def _told(pair: str, prior: Prior, solution: Solution) -> dict[str, str]:
     turned_deg = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1.0, 1.0)))
     shifted_m = float(np.linalg.norm(estimate.T[:3, 3] - T[:3, 3]))
     sigma = np.sqrt(np.diag(estimate.covariance))
-    known = [
-        f"{np.degrees(s):.2f} deg" for s, seen in zip(sigma[:3], estimate.observable[:3], strict=True) if seen
-    ]
+    seen = zip(DOF_NAMES[:3], sigma[:3], estimate.observable[:3], strict=True)
+    known = [f"{name} {np.degrees(s):.2f} deg" for name, s, observable in seen if observable]
     return {
         "title": pair.replace("_", "-"),
         "moved": f"{turned_deg:.2f} deg and {shifted_m:.3f} m from before",

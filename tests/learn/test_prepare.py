@@ -181,6 +181,20 @@ def test_prepare_without_perception_says_what_to_run(tmp_path):
         survey_day(Partition("a", "2026-01-01"), lake, training_lakes.fleet_of(["a"]).prepare)
 
 
+def test_any_number_of_workers_writes_the_same_rows(tmp_path, capsys):
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text(FLEET + "".join(f'[vehicles.{v}]\nrig = "default"\n' for v in "abc"))
+    written = []
+    for name, options in (("one", ["--executor", "inline"]), ("two", ["--workers", "2"])):
+        lake = training_lakes.fleet_lake(tmp_path / name, "abc", frames=2)
+        assert main(["prepare", "--fleet", str(fleet), "--lake", str(lake.root), *options]) == 0
+        written.append(rows_of(lake))
+    capsys.readouterr()
+    assert len(written[0]) == len(written[1]) == 6
+    for a, b in zip(*written, strict=True):
+        assert all(np.array_equal(getattr(a, n), getattr(b, n)) for n in a.__dataclass_fields__)
+
+
 FLEET = """
 [fleet]
 name = "tests"
