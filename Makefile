@@ -28,10 +28,13 @@ lint: setup ## style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: setup ## speed, memory and accuracy, measured as ratios
+bench: setup ## speed and memory, measured as ratios against the committed baseline
 	$(BIN)/python -m pytest tests/benchmarks -p no:xdist -s
+
+bench-accept: setup ## the same, and writes what it measures into the baseline
+	$(BIN)/python -m pytest tests/benchmarks -p no:xdist -s --accept-baseline
 
 clean: ## remove what the other targets made
 	rm -rf .venv demo .pytest_cache .mypy_cache .ruff_cache
 
-.PHONY: help setup demo test lint bench clean
+.PHONY: help setup demo test lint bench bench-accept clean

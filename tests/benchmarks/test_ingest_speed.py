@@ -64,7 +64,7 @@ def cpu_s(work):
 
 
 @pytest.mark.slow
-def test_ingest_costs_at_most_four_times_the_iteration_over_the_log(tmp_path):
+def test_ingest_costs_at_most_four_times_the_iteration_over_the_log(tmp_path, gate):
     log, fleet = full_size_log(tmp_path / "a.mcap", 100), fleet_config()
     bare, whole = [], []
     for i in range(4):
@@ -74,6 +74,7 @@ def test_ingest_costs_at_most_four_times_the_iteration_over_the_log(tmp_path):
     ratio = min(whole) / min(bare)
     print(f"\ningest / raw iteration = {ratio:.2f} (goal {GOAL:g}); {min(whole) * 10:.2f} ms a frame")
     assert ratio < LIMIT
+    gate("ingest_vs_iteration", ratio)
 
 
 @pytest.mark.slow
