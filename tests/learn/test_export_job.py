@@ -1,0 +1,75 @@
+"""`boresight export onnx`: a run's best weights become a file that runs, with a card that says where they come from."""
+
+import json
+from dataclasses import asdict
+
+import pytest
+import torch
+
+from jobs.cli import main
+from pipeline.learn.checkpoints import BEST, LAST, save_checkpoint
+from pipeline.learn.grid import Grid
+from pipeline.learn.inference import SingleFrameCalibrator
+from pipeline.learn.layout import NetworkConfig
+from pipeline.learn.networks import build_network
+from pipeline.learn.settings import TrainConfig
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """What training leaves, in little."""
+    folder = tmp_path_factory.mktemp("run")
+    config = TrainConfig(architecture="concat", width=8, hidden=16, seed=7)
+    network = build_network(NetworkConfig("concat", "joint", Grid(), 8, 16))
+    with torch.no_grad():
+        network.core.heads.layers["lidar_radar"].bias[2] = 1.0
+    state = {
+        "config": config.model_dump(mode="json"),
+        "grid": asdict(Grid()),
+        "network": network.state_dict(),
+    }
+    save_checkpoint(folder / BEST, state | {"step": 40, "alignment": 1.0})
+    save_checkpoint(folder / LAST, state | {"step": 60, "trained_s": 120.0})
+    reports = [
+        {"step": 20, "validation/loss": 3.0},
+        {"step": 40, "validation/loss": 2.0},
+        {"step": 60, "validation/loss": 9},
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in reports))
+    return folder
+
+
+def test_a_run_becomes_a_file_with_its_card(run, tmp_path, capsys):
+    notes = tmp_path / "notes.json"
+    notes.write_text('{"held_out_days": {"azimuth_deg": 0.1}}')
+    out = tmp_path / "model.onnx"
+    assert main(["export", "onnx", "--run", str(run), "--out", str(out), "--notes", str(notes)]) == 0
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert summary["outputs"] == [str(out), str(tmp_path / "model.json"), str(tmp_path / "model.md")]
+    calibrator = SingleFrameCalibrator(out)
+    assert calibrator.config.architecture == "concat"
+    card = json.loads(calibrator.metadata["card"])
+    assert card["weights"].startswith("of step 40, the best")
+    assert card["results"] == {"loss": 2.0}  # of the step whose weights these are
+    assert card["seeds"] == [7]
+    assert card["time"] == {"steps": 60, "minutes": 2.0}
+    assert card["held_out_days"] == {"azimuth_deg": 0.1}
+    assert card["limits"]
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--out", "m.onnx"], "run"),
+        (["--out", "m.onnx", "--run", "nowhere"], "run"),
+        (["--out", "m.bin", "--run", "{run}"], "out"),
+        (["--out", "m.onnx", "--run", "{run}", "--notes", "missing.json"], "missing.json"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_with_the_reason(
+    run, tmp_path, monkeypatch, capsys, options, word
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", "onnx", *(o.format(run=run) for o in options)]) == 2
+    assert word in json.loads(capsys.readouterr().out.splitlines()[-1])["reason"]
+    assert not list(tmp_path.iterdir())
