@@ -296,5 +296,6 @@ def _commit() -> str:
     head = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
     )
-    changed = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", "pipeline", "schemas"], check=False)
+    diff = ["git", "diff", "--quiet", "HEAD", "--", "pipeline", "schemas"]
+    changed = subprocess.run(diff, capture_output=True, check=False)
     return (head.stdout.strip() or "unknown") + ("+" if changed.returncode else "")
