@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import to_quaternion
-from pipeline.objective.problem import Prior, Solution
+from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.solve.select import Selection
 from pipeline.store.partitions import Partition
 from pipeline.verify.claims import Claim, target_sigmas
@@ -24,6 +26,7 @@ __all__ = ["Inputs", "Judged", "environment_of", "record_of", "refused_records"]
 # Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
 _FAST_MPS = 20.0
 _MOVING_MPS = 1.0
+_DOUBTFUL_FOCAL = 0.009  # three sigmas of what intrinsics are known to
 
 
 @dataclass(frozen=True)
@@ -94,8 +97,8 @@ def record_of(
         loop_translation_sigma_m=loop_sigma[1],
         time_offset_s=estimate.time_offset_s,
         time_offset_sigma_s=estimate.time_offset_sigma_s,
-        notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable)],
-        assumptions=list(estimate.notes),
+        notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable), *_focal(estimate)],
+        assumptions=[*_assumed(pair, observations), *estimate.notes],
         drive_missing=selection.missing.get(pair, []),
         diagnostics=dict(estimate.diagnostics)
         | _test_numbers(test)
@@ -155,6 +158,39 @@ def _transform_fields(prefix: str, T: np.ndarray) -> dict[str, float]:
 def _unobservable(observable: np.ndarray) -> list[str]:
     names = [name for name, seen in zip(DOF_NAMES, observable, strict=True) if not seen]
     return [f"not determined by the day: {', '.join(names)}"] if names else []
+
+
+def _assumed(pair: str, observations: Sequence[Observation]) -> list[str]:
+    """What every method takes as known, and what an error of it is worth."""
+    assumed = ["sensors are rigid, clocks keep their offsets and scales over the day"]
+    if "camera" not in FRAMES_OF_PAIR[pair] or not observations:
+        return assumed
+    o = observations[0]
+    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+    wrong = Camera(
+        o.camera_model, _scaled(o.camera_K, 1.001), o.camera_D, o.image_width_px, o.image_height_px
+    )
+    edge = np.array([[0.0, o.image_height_px / 2], [o.image_width_px - 1.0, o.image_height_px / 2]])
+    angles = camera_direction_angles(camera.unproject(edge)) - camera_direction_angles(wrong.unproject(edge))
+    worth = float(np.degrees(np.abs(angles[:, 0]).max()))
+    return [
+        *assumed,
+        f"camera intrinsics as logged: a focal length wrong by 0.1 % puts the image's edge {worth:.2f} deg off",
+    ]
+
+
+def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
+    out = np.array(K, np.float64)
+    out[[0, 1], [0, 1]] *= factor
+    return out
+
+
+def _focal(estimate: PairEstimate) -> list[str]:
+    """A focal length that the images contradict is worth a sentence: the pose allows for it, its users may not."""
+    scale = estimate.diagnostics.get("focal_scale", 1.0)
+    if abs(scale - 1) < _DOUBTFUL_FOCAL:
+        return []
+    return [f"the images look as if the focal length were {100 * (scale - 1):+.1f} % off the logged one"]
 
 
 def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:

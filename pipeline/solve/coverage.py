@@ -34,12 +34,13 @@ class _Kind:
     name: str
     words: str
     camera_axes: bool = False  # seen from the camera by the prior; else from the sensor that measured them
+    far: bool = True  # worth having beyond _FAR_M
 
 
 _KINDS = {
     "camera_lidar": (
         _Kind("lidar_edge_xyz_m", "depth edges", camera_axes=True),
-        _Kind("marking_xyz_m", "road markings", camera_axes=True),
+        _Kind("marking_xyz_m", "road markings", camera_axes=True, far=False),
     ),
     "camera_radar": (_Kind("radar_track_xyz_m", "moving road users"),),
     "lidar_radar": (
@@ -80,7 +81,7 @@ def missing_in_view(observations: Sequence[Observation], pair: str) -> list[str]
         parts = {
             f"left of {_SIDE_DEG:.0f} deg": azimuth > np.radians(_SIDE_DEG),
             f"right of -{_SIDE_DEG:.0f} deg": azimuth < -np.radians(_SIDE_DEG),
-            f"beyond {_FAR_M:.0f} m": distance > _FAR_M,
+            f"beyond {_FAR_M:.0f} m": (distance > _FAR_M) | (not kind.far),
             f"nearer than {_NEAR_M:.0f} m": distance < _NEAR_M,
         }
         empty = [where for where, there in parts.items() if there.mean() < _SCARCE]

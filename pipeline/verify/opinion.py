@@ -23,6 +23,7 @@ __all__ = ["SecondOpinion", "Slopes", "second_opinion"]
 # frame's log likelihood, and its information, both by the step.
 Slopes = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray]]
 _FEWEST_BLOCKS = 3
+_STEP_SIGMAS = 2.0  # of the result: a quadratic is good near by only
 _SIGMAS = 3.0  # where contradiction begins
 
 
@@ -71,7 +72,8 @@ def second_opinion(
         # Information of a measurement whose own errors are J^-1 plus a common bias.
         less = np.linalg.inv(np.eye(len(x)) + J * bias**2)
         J, own = less @ J, less @ (towards + J @ x)
-        x = np.linalg.solve(prior + J, own)
+        step = np.linalg.solve(prior + J, own) - x
+        x = x + step * min(1.0, _STEP_SIGMAS / max(float(np.sqrt(step @ prior @ step)), 1e-12))
     both = np.linalg.inv(prior + J)
     at = np.ix_(range(6), range(6))
     shift_covariance = covariance - both

@@ -54,9 +54,14 @@ def with_turned_statics(day, yaw_deg):
 
 
 def test_a_registration_that_the_camera_contradicts_is_not_accepted(street):
-    fine = records_of(street)["lidar_radar"]
+    records = records_of(street)
+    fine = records["lidar_radar"]
     assert "without the lidar" not in fine.reason
     assert fine.status == "accepted"
+    assert fine.determined == ["azimuth"]
+    assert any("intrinsics as logged" in a and "0.1 %" in a for a in records["camera_radar"].assumptions)
+    assert not any("intrinsics" in a for a in fine.assumptions)
+    assert records["camera_lidar"].loop_rotation_sigma_rad > 0
     turned = records_of(with_turned_statics(street, 3.0))
     for pair in ("lidar_radar", "camera_radar"):
         assert turned[pair].status == "held"
