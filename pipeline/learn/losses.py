@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.learn.batch import TrainingBatch
-from pipeline.learn.settings import LossConfig
+from pipeline.learn.settings import PAIRS_OF, LossConfig
 from pipeline.objective.differentiable.lookup import nearest_pixel
 from pipeline.objective.differentiable.paper import smooth_iou
 from pipeline.objective.differentiable.poses import inverse, loop_loss, transform_points
@@ -47,6 +47,7 @@ PAIR_OF_TERM = {
 }
 _MARGIN_DEG = 3.0  # what the reference may be wrong by, for points that are asked to lie in view
 _RADAR_SKY_FREE_DEG = 2.0  # a radar's elevation is noisy: only what is deep in the sky is wrong
+_LOOP_METRE = 5.0  # a fifth of a metre counts as a degree: what it moves at 11 m
 _RADAR_CELL_M = 1.0  # of the stored drivable map
 
 
@@ -66,41 +67,53 @@ class FrameObjective:
         T_camera_lidar: Float[Tensor, "*batch B 4 4"],
         T_camera_radar: Float[Tensor, "*batch B 4 4"],
         T_lidar_radar: Float[Tensor, "*batch B 4 4"],
+        pairs: tuple[str, ...] = PAIRS_OF["joint"],
     ) -> dict[str, Float[Tensor, "*batch B"]]:
-        """Every term of every frame, unweighted, by the names of PAIR_OF_TERM."""
+        """Every term of the pairs (`joint`: the loop) and frames, unweighted, by the names of PAIR_OF_TERM."""
+        found: dict[str, Tensor] = {}
+        if "camera_lidar" in pairs:
+            found |= self._camera_lidar(T_camera_lidar)
+        if "camera_radar" in pairs:
+            found |= self._camera_radar(T_camera_radar)
+        if "lidar_radar" in pairs:
+            found |= self._lidar_radar(T_lidar_radar)
+        if "joint" in pairs:
+            found["loop"] = loop_loss(
+                T_camera_lidar, T_lidar_radar, T_camera_radar, angle_unit=DEG, metre_unit=_LOOP_METRE
+            )
+        return found
+
+    def _camera_lidar(self, T: Tensor) -> dict[str, Tensor]:
         b = self.batch
         cluster, edge = (_at_lag(b, points, b.camera_lag_s) for points in (b.cluster_xyz_m, b.edge_xyz_m))
-        radar = b.radar_xyz_m
-        tracks, valid, elevation = b.track_xyz_m, b.track_valid, b.radar_has_elevation
+        most = b.cluster_centre_m.shape[1]
         return {
             "classes": cluster_class_cost(
-                self.maps,
-                T_camera_lidar,
-                cluster,
-                b.cluster_id.long(),
-                self.cluster_in_view,
-                b.cluster_centre_m.shape[1],
+                self.maps, T, cluster, b.cluster_id.long(), self.cluster_in_view, most
             ),
-            "edges": edge_cost(self.maps, T_camera_lidar, edge, b.edge_side.long(), self.edge_in_view),
-            "sky": sky_cost(self.maps, T_camera_lidar, cluster, self.cluster_in_view),
+            "edges": edge_cost(self.maps, T, edge, b.edge_side.long(), self.edge_in_view),
+            "sky": sky_cost(self.maps, T, cluster, self.cluster_in_view),
+        }
+
+    def _camera_radar(self, T: Tensor) -> dict[str, Tensor]:
+        b = self.batch
+        return {
             "tracks_camera": track_detection_cost(
-                T_camera_radar, tracks, valid, self.centres_rad, b.detection_valid, elevation
+                T, b.track_xyz_m, b.track_valid, self.centres_rad, b.detection_valid, b.radar_has_elevation
             ),
-            "radar_sky": sky_cost(self.maps, T_camera_radar, radar, self.radar_in_view, _RADAR_SKY_FREE_DEG),
-            "static": static_cost(
-                T_lidar_radar,
-                radar,
-                b.radar_valid & (b.radar_motion == 0),
-                _at_lag(b, b.lidar_xyz_m, b.radar_lag_s),
-                b.lidar_valid,
-                b.ground_plane,
-                elevation,
-            ),
+            "radar_sky": sky_cost(self.maps, T, b.radar_xyz_m, self.radar_in_view, _RADAR_SKY_FREE_DEG),
+        }
+
+    def _lidar_radar(self, T: Tensor) -> dict[str, Tensor]:
+        b = self.batch
+        lidar, still = _at_lag(b, b.lidar_xyz_m, b.radar_lag_s), b.radar_valid & (b.radar_motion == 0)
+        elevation = b.radar_has_elevation
+        return {
+            "static": static_cost(T, b.radar_xyz_m, still, lidar, b.lidar_valid, b.ground_plane, elevation),
             "tracks_lidar": track_cluster_cost(
-                T_lidar_radar, tracks, valid, b.cluster_centre_m, b.cluster_valid, elevation
+                T, b.track_xyz_m, b.track_valid, b.cluster_centre_m, b.cluster_valid, elevation
             ),
-            "drivable": self._drivable(T_lidar_radar),
-            "loop": loop_loss(T_camera_lidar, T_lidar_radar, T_camera_radar, angle_unit=DEG, metre_unit=5.0),
+            "drivable": self._drivable(T),
         }
 
     def _drivable(self, T_lidar_radar: Tensor) -> Tensor:

@@ -75,7 +75,10 @@ def batch_loss(
     terms: dict[str, Tensor] = {}
     for answer in answers:
         terms = objective.terms(
-            guess.unturned(answer.T_camera_lidar), guess.unturned(answer.T_camera_radar), answer.T_lidar_radar
+            guess.unturned(answer.T_camera_lidar),
+            guess.unturned(answer.T_camera_radar),
+            answer.T_lidar_radar,
+            pairs,
         )
         total = total + weighted(terms, config.loss, pairs).mean() / len(answers)
     semantics = _semantics(answers, view, guess, batch, consensus, network)

@@ -39,7 +39,7 @@ PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
 DOFS = ("roll", "pitch", "yaw", "tx", "ty", "tz")
 TOLERANCE = np.array([0.15] * 3 + [0.05] * 3)  # deg, m
 # Offsets of one degree of freedom, in tolerances.
-STEPS = np.array([-8.0, -4, -2, -1, -0.5, 0, 0.5, 1, 2, 4, 8])
+STEPS = np.array([-8.0, -4, -2, -1, 0, 1, 2, 4, 8])
 _CAMERA_AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # of vehicle axes
 
 

@@ -22,7 +22,7 @@ from tests.simulated_days import simulated_day
 
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
-    return simulated_day(tmp_path_factory.mktemp("fleet"), frames=40, environment="mixed")
+    return simulated_day(tmp_path_factory.mktemp("fleet"), frames=32, environment="mixed")
 
 
 @pytest.fixture(scope="module")
@@ -43,29 +43,35 @@ def test_the_minimum_over_a_fleet_is_at_the_truth_in_all_that_it_determines(batc
         for dof in range(6)
         if found[pair][dof].determined(TOLERANCE[dof])
     }
-    assert {("camera_lidar", 1), ("camera_lidar", 2), ("camera_radar", 2), ("lidar_radar", 2)} <= set(
-        determined
-    )
+    # Pitch, yaw and all shifts of the camera, yaw and sideways shift of the radar; the rest needs more frames.
+    assert {("camera_lidar", dof) for dof in (1, 2, 3, 4, 5)} <= set(determined)
+    assert {("lidar_radar", 2), ("lidar_radar", 4)} <= set(determined)
     far = {key: offset for key, offset in determined.items() if abs(offset) > TOLERANCE[key[1]]}
     assert far == {}
-    assert len(determined) >= 8
+    yaw = found["camera_radar"][2]
+    assert abs(yaw.offset) < 3 * yaw.error
 
 
-def test_together_the_terms_pull_wrong_poses_back(few, day):
-    """Descending from a degree and 5 cm away brings the camera-lidar pose most of the way back."""
+def test_all_six_together_come_back_to_the_truth(batch, day):
+    """Descending from a degree and 5 cm away, on all six of camera-lidar at once."""
+    half = batch[slice(0, len(batch), 2)]
     truth = torch.tensor(day.truth["camera_lidar"], dtype=torch.float32)
-    objective = frame_objective(few)
+    objective = frame_objective(half)
     xi = torch.tensor([0.012, -0.01, 0.008, 0.0, 0.03, -0.03], requires_grad=True)
-    optimiser = torch.optim.Adam([xi], lr=1e-3)
-    lidar_radar = torch.tensor(day.truth["lidar_radar"], dtype=torch.float32)
-    for _ in range(60):
-        T = (exp_se3(xi) @ truth).expand(len(few), 4, 4)
-        terms = objective.terms(T, T @ lidar_radar, lidar_radar.expand(len(few), 4, 4))
-        loss = weighted(terms, LossConfig(), ("camera_lidar",)).mean()
+    optimiser = torch.optim.Adam([xi], lr=2e-3)
+    others = half.T_camera_radar, half.T_lidar_radar
+    for step in range(80):
+        optimiser.param_groups[0]["lr"] = 2e-3 * (1 - step / 80)
+        T = (exp_se3(xi) @ truth).expand(len(half), 4, 4)
+        loss = weighted(
+            objective.terms(T, *others, ("camera_lidar",)), LossConfig(), ("camera_lidar",)
+        ).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    assert np.degrees(xi.detach()[:2].norm().item()) < 0.3  # from 0.9: pitch and yaw
+    turn_deg, shift_m = np.degrees(xi.detach()[:3].numpy()), xi.detach()[3:].numpy()
+    assert np.abs(turn_deg[:2]).max() < 0.15  # pitch and yaw, about the camera's x and y
+    assert np.abs(shift_m[:2]).max() < 0.05  # sideways and upwards
 
 
 def test_every_term_is_finite_with_a_finite_gradient_even_at_absurd_poses(few):

@@ -18,7 +18,7 @@ from pipeline.objective.registration import BOUNCE_PRIOR, SIGMA_START
 __all__ = ["static_cost"]
 
 _RANGE_M = (3.0, 60.0)
-_DETECTIONS, _POINTS = 128, 1024  # of a frame at most: every pair of them is weighed
+_DETECTIONS, _POINTS = 96, 768  # of a frame at most: every pair of them is weighed
 _LEAST_HEIGHT_M = 0.3  # what is lower mirrors onto itself
 
 
