@@ -40,7 +40,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),
     "export": ("jobs.export:export", "Write the tables' contracts as JSON Schema, or a trained network as ONNX."),
     "simulate": ("jobs.simulate:simulate", "Logs of a synthetic fleet, its truth in a file of its own."),
-    "evaluate": ("jobs.evaluate:evaluate", "Compare calibration records with a known truth."),
+    "evaluate": ("jobs.evaluate:evaluate", "Compare calibration records with a known truth or a reflector recording, as the paper does."),
 }
 
 

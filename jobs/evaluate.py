@@ -1,4 +1,4 @@
-"""`boresight evaluate`: calibration records against a known truth or picked reflectors, as the paper's tables."""
+"""`boresight evaluate`: calibration records against a known truth or picked reflectors, as the paper reports them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from pipeline.verify.evaluation import Comparison
+    from jobs.evaluation_page import Compared
+    from pipeline.store.partitions import Lake
     from pipeline.verify.recording import ReflectorFiles
     from schemas.calibrations import CalibrationRecord
 
@@ -28,7 +29,9 @@ def evaluate(
     truth_sigma: str = "0,0",
     out: Path | None = None,
 ) -> int:
-    """Measure records by the paper's metric: azimuth, elevation and range errors at three reflectors.
+    """Measure records against a known truth or a corner-reflector recording, as the paper's tables 1 and figures 1-4.
+
+    Errors are azimuth, elevation and range at three reflectors; the paper's printed numbers stand beside them.
 
     Args:
         lake: folder of the tables.
@@ -42,8 +45,8 @@ def evaluate(
             frames per vehicle-day: give the recording another day or a lake of its own, or it replaces the drives.
         method: only this method's records.
         truth_sigma: ROT_DEG,TRANS_M: how well a --truth itself is known, for the errors in sigmas.
-        out: FILE.md, FILE.parquet, or a folder for table_1.md, extended_table_1.md and table_1.parquet; the
-            tables go to stderr in any case.
+        out: FILE.md, FILE.parquet, FILE.html (a page with the paper's figures of these days), or a folder for all of
+            them as table_1.*; the tables go to stderr in any case.
     """
     import math
     import sys
@@ -61,17 +64,17 @@ def evaluate(
         raise ConfigError("command line", "truth", "give either --truth or --reflectors")
     if truth is not None and (recording_lake or recording_day):
         raise ConfigError("command line", "recording-lake", "a reflector recording needs --reflectors")
-    records = [
-        r for r in read_records(Lake.at(lake), CALIBRATIONS, CalibrationRecord) if method in (None, r.method)
-    ]
+    tables = Lake.at(lake)
+    records = [r for r in read_records(tables, CALIBRATIONS, CalibrationRecord) if method in (None, r.method)]
     recording = (recording_lake or lake, recording_day) if recording_lake or recording_day else None
     files = ReflectorFiles(reflectors, recording)
     rotation_deg, translation_m = parse_pair(truth_sigma, "truth-sigma")
     compared, counts = _compare_all(records, truth, files, (math.radians(rotation_deg), translation_m))
     notes = files.notes()
-    sys.stderr.write("\n".join(as_markdown(table_rows(compared), compared, notes).values()))
+    comparisons = [c.comparison for c in compared]
+    sys.stderr.write("\n".join(as_markdown(table_rows(comparisons), comparisons, notes).values()))
     if out is not None:
-        _write(out, compared, notes)
+        _write(out, compared, notes, tables)
     status = "done" if compared else "refused"
     print_summary("evaluate", status, runs=len(compared), **counts, positions=notes, out=out)
     return 0 if compared else 3
@@ -82,8 +85,9 @@ def _compare_all(
     truth: Path | None,
     files: ReflectorFiles,
     truth_sigma: tuple[float, float],
-) -> tuple[list[Comparison], dict[str, int]]:
+) -> tuple[list[Compared], dict[str, int]]:
     """Every current run that has a truth, and how many have none or no result."""
+    from jobs.evaluation_page import Compared
     from pipeline.verify.evaluation import compare, current_runs
 
     compared, counts = [], {"refused_runs": 0, "runs_without_truth": 0}
@@ -94,22 +98,28 @@ def _compare_all(
         if known is None and file is None:
             counts["runs_without_truth"] += 1
             continue
-        comparison = compare(run, known, file.picks if file else None, truth_sigma)
+        picks = file.picks if file else None
+        comparison = compare(run, known, picks, truth_sigma)
         if comparison is None:
             counts["refused_runs"] += 1
         else:
-            compared.append(comparison)
+            compared.append(Compared(run, known, picks, comparison))
     return compared, counts
 
 
-def _write(out: Path, compared: Sequence[Comparison], notes: Sequence[str]) -> None:
+def _write(out: Path, compared: Sequence[Compared], notes: Sequence[str], lake: Lake) -> None:
+    from jobs.evaluation_page import page_of
+    from pipeline.report.page import write_page
     from pipeline.verify.table import as_markdown, as_parquet, table_rows
 
-    rows = table_rows(compared)
-    texts = as_markdown(rows, compared, notes)
+    comparisons = [c.comparison for c in compared]
+    rows = table_rows(comparisons)
+    texts = as_markdown(rows, comparisons, notes)
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".parquet":
         out.write_bytes(as_parquet(rows, notes))
+    elif out.suffix == ".html":
+        write_page(out, page_of(lake, compared, texts))
     elif out.suffix:
         out.write_text("\n".join(texts.values()))
     else:
@@ -117,6 +127,7 @@ def _write(out: Path, compared: Sequence[Comparison], notes: Sequence[str]) -> N
         for title, text in texts.items():
             (out / f"{title.lower().replace(' data', '').replace(' ', '_')}.md").write_text(text)
         (out / "table_1.parquet").write_bytes(as_parquet(rows, notes))
+        write_page(out / "table_1.html", page_of(lake, compared, texts))
 
 
 def _truth_of(truth: Path, record: CalibrationRecord) -> dict[str, np.ndarray] | None:

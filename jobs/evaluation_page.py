@@ -1,0 +1,156 @@
+"""The page of `boresight evaluate`: what was compared, as plain values for the report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import numpy as np
+
+    from pipeline.report.evaluation import EvaluatedRun, TableView, View
+    from pipeline.report.overlays import Extrinsics, Scene
+    from pipeline.store.partitions import Lake
+    from pipeline.verify.evaluation import Comparison
+    from pipeline.verify.targets import Picks
+    from schemas.calibrations import CalibrationRecord
+
+__all__ = ["Compared", "page_of"]
+
+_FAVOURITES = ("joint", "joint-ssl", "joint-optimisation")  # whose pictures are worth a look, best first
+
+
+class Compared(NamedTuple):
+    """One run, what it was compared with, and the result."""
+
+    run: Mapping[str, CalibrationRecord]
+    truth: Mapping[str, np.ndarray] | None
+    picks: Picks | None
+    comparison: Comparison
+
+
+def page_of(lake: Lake, compared: Sequence[Compared], texts: Mapping[str, str]) -> str:
+    """HTML of the tables (Markdown by title), the runs, and a frame per environment where the lake has frames."""
+    import numpy as np
+
+    from pipeline.report.evaluation import evaluation_page
+
+    by_method: dict[str, list[np.ndarray]] = {}
+    for c in compared:
+        if len(c.comparison.normalised):
+            by_method.setdefault(c.comparison.method, []).append(c.comparison.normalised)
+    views = _views(lake, compared)
+    return evaluation_page(
+        [_table(title, text) for title, text in texts.items()],
+        [_evaluated(c) for c in compared],
+        views,
+        {method: np.concatenate(parts) for method, parts in by_method.items()},
+        [line[2:] for text in texts.values() for line in text.splitlines() if line.startswith("- ")],
+        no_views="the lake no longer has the days' frames and observations",
+    )
+
+
+def _table(title: str, text: str) -> TableView:
+    """The lines of a Markdown table."""
+    from pipeline.report.evaluation import TableView
+
+    block = text.split("\n\n")[1].splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in block if line.startswith("|")]
+    return TableView(title, cells[0], [(row[0].startswith("paper:"), row) for row in cells[2:]])
+
+
+def _evaluated(compared: Compared) -> EvaluatedRun:
+    import numpy as np
+
+    from pipeline.geometry.se3 import transform_points
+    from pipeline.report.evaluation import EvaluatedRun
+    from pipeline.store.current import prior_of, transform_of
+    from pipeline.verify.targets import DEFAULT_TARGETS
+    from schemas.calibrations import PAIRS
+
+    def degrees(errors: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {pair: np.array([*np.degrees(errors[pair][:2]), errors[pair][2]]) for pair in PAIRS}
+
+    first = compared.run["lidar_radar"]
+    T, T_prior = transform_of(first), prior_of(first)
+    assert T is not None, "compared runs have a result"
+    if compared.picks is not None:
+        radar, lidar = compared.picks.radar_m, compared.picks.lidar_m
+    else:
+        assert compared.truth is not None, "either truth or picks"
+        radar = DEFAULT_TARGETS
+        lidar = transform_points(compared.truth["lidar_radar"], radar)
+    return EvaluatedRun(
+        f"{first.vehicle} {first.day}",
+        first.method,
+        degrees(compared.comparison.errors),
+        degrees(compared.comparison.prior_errors),
+        lidar,
+        transform_points(T if T_prior is None else T_prior, radar),
+        transform_points(T, radar),
+    )
+
+
+def _views(lake: Lake, compared: Sequence[Compared]) -> list[View]:
+    """A day of each environment, split into both states; and the run that started furthest off, state by state."""
+    import numpy as np
+
+    from pipeline.report.evaluation import View
+
+    def rank(c: Compared) -> int:
+        method = c.comparison.method
+        return _FAVOURITES.index(method) if method in _FAVOURITES else len(_FAVOURITES)
+
+    def start_deg(c: Compared) -> float:
+        return float(np.degrees(max(e[:2].max() for e in c.comparison.prior_errors.values())))
+
+    best = [c for c in compared if rank(c) == min(map(rank, compared))] if compared else []
+    wanted = {
+        c.comparison.environment: (c, f"{c.comparison.environment}: alignment", True) for c in reversed(best)
+    }
+    chosen = list(wanted.values())
+    if best:
+        worst = max(best, key=start_deg)
+        chosen.append((worst, f"Abrupt change: a start {start_deg(worst):.1f} deg off", False))
+    views = []
+    for c, title, split in chosen:
+        drawn = _scene(lake, c.run, another=not split)
+        if drawn is not None:
+            first = c.run["camera_lidar"]
+            views.append(View(title, *drawn, split, f"{first.vehicle} {first.day}, {first.method}."))
+    return views
+
+
+def _scene(
+    lake: Lake, run: Mapping[str, CalibrationRecord], *, another: bool
+) -> tuple[Scene, Extrinsics, Extrinsics] | None:
+    """A frame with much to see, and the run's two states; None where the lake has no frames of the day."""
+    from pipeline.report.overlays import Extrinsics, Scene
+    from pipeline.report.scenes import choose_frames
+    from pipeline.store.current import prior_of, transform_of
+    from pipeline.store.partitions import Partition
+    from pipeline.store.tables import iterate_rows, read_manifest
+    from schemas.calibrations import PAIRS
+    from schemas.frames import FRAMES, Frame
+    from schemas.observations import OBSERVATIONS, Observation
+
+    first = run["camera_lidar"]
+    partition = Partition(first.vehicle, first.day)
+    if any(read_manifest(lake, table, partition) is None for table in (FRAMES, OBSERVATIONS)):
+        return None
+    states = []
+    for of in (prior_of, transform_of):
+        known = [
+            T for pair in ("camera_lidar", "camera_radar", "lidar_radar") if (T := of(run[pair])) is not None
+        ]
+        if len(known) < len(PAIRS):
+            return None
+        states.append(Extrinsics(*known))
+    rows = [o for chunk in iterate_rows(lake, OBSERVATIONS, partition, Observation) for o in chunk]
+    if not rows:
+        return None
+    picked = [rows[i] for i in choose_frames(rows, states[1].T_camera_lidar, 2)]
+    o = picked[-1 if another else 0]
+    frames = [f for chunk in iterate_rows(lake, FRAMES, partition, Frame, [o.frame_index]) for f in chunk]
+    return (Scene(frames[0], o), states[0], states[1]) if frames else None
