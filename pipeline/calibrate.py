@@ -28,7 +28,7 @@ from pipeline.store.tables import read_manifest, read_records, read_rows, write_
 from pipeline.verify.claims import Claim, claims_of
 from pipeline.verify.holdout import HeldOutTest, paired_test
 from pipeline.verify.opinion import second_opinion
-from pipeline.verify.verdict import Limits, judge, loop_doubts
+from pipeline.verify.verdict import Limits, heading_doubts, judge, loop_doubts
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.versions import CODE_VERSION
@@ -179,6 +179,8 @@ def _judge_all(
     limits = Limits(np.radians(fleet.solve.search_rotation_deg), fleet.solve.search_translation_m)
     composed = COMPOSED.get(solution.method, ())
     against = _contradictions(solution, composed)
+    limit_rad = float(np.radians(fleet.verify.camera_lidar_limit_deg))
+    against["camera_lidar"] = heading_doubts(solution, prior, observations, limit_rad)
     found: dict[str, Judged] = {}
     for pair in sorted(PAIRS, key=lambda p: p in composed):
         estimate = solution.pairs[pair]

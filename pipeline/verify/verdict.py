@@ -14,12 +14,14 @@ from jaxtyping import Float
 
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import adjoint, inverse, log_so3
-from pipeline.objective.problem import PairEstimate, Solution
+from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.verify.claims import Claim
 from pipeline.verify.holdout import HeldOutTest
+from pipeline.verify.targets import DEFAULT_TARGETS
 from schemas.calibrations import DOF_NAMES
+from schemas.observations import Observation
 
-__all__ = ["Limits", "Verdict", "judge", "loop_doubts", "loop_sigmas", "moved"]
+__all__ = ["Limits", "Verdict", "heading_doubts", "judge", "loop_doubts", "loop_sigmas", "moved"]
 
 # What a pair is good for: without it there is nothing to accept. A radar without elevation is still worth its azimuth.
 _NEEDED = {
@@ -33,6 +35,7 @@ _JUDGED = {
     "camera_radar": np.array([False, True, False, False, False, False]),
     "lidar_radar": np.array([False, False, True, True, True, False]),
 }
+_ASIDE = 0.25  # share of the limit that a wrong heading may take
 _BAD = -1.0  # margin of what is wrong without being measured
 
 
@@ -142,6 +145,31 @@ def loop_doubts(solution: Solution, sigmas: float = 3.0) -> list[str]:
             f"the loop is open by {solution.loop_translation_m:.3f} m, its sigma is {translation:.3f} m"
         )
     return doubts
+
+
+def heading_doubts(
+    solution: Solution,
+    prior: Prior,
+    observations: Sequence[Observation],
+    limit_rad: float,
+    sigmas: float = 3.0,
+) -> list[str]:
+    """A camera's time offset moves the cloud along the car's heading, which the radar's prior tells.
+
+    Where lidar-radar finds the radar turned by many of the prior's sigmas, camera-lidar was solved along a wrong
+    heading: time offset times speed times that turn is how far aside.
+    """
+    dt_s = solution.pairs["camera_lidar"].time_offset_s or 0.0
+    turn = abs(float(moved(solution.pairs["lidar_radar"].T, prior.T_lidar_radar)[2]))
+    speeds = [abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None]
+    if not speeds or turn < sigmas * prior.rotation_sigma_rad:
+        return []
+    aside_m = turn * abs(dt_s) * float(np.mean(speeds))
+    nearness = float(np.sqrt(np.mean(1 / np.sum(DEFAULT_TARGETS**2, axis=1))))
+    if aside_m * nearness < _ASIDE * limit_rad:
+        return []
+    turned = f"solved along a heading that lidar-radar turns by {np.degrees(turn):.1f} deg"
+    return [f"{turned}: {aside_m:.2f} m aside in the camera's time offset"]
 
 
 def loop_sigmas(solution: Solution) -> tuple[float, float] | None:

@@ -9,7 +9,8 @@ from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation
 from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.verify.claims import DIRECTIONS, Claim
 from pipeline.verify.holdout import HeldOutTest, paired_test
-from pipeline.verify.verdict import Limits, judge, loop_doubts, moved
+from pipeline.verify.verdict import Limits, heading_doubts, judge, loop_doubts, moved
+from tests.solve_scenes import make_day
 
 PRIOR = Prior(np.eye(4), np.eye(4), np.radians(2), 0.05)
 SIGMA = np.array([np.radians(0.1)] * 3 + [0.02] * 3)
@@ -247,3 +248,21 @@ def test_two_blocks_are_no_proof_however_well_they_agree():
 
 def test_nothing_changed_is_neither_better_nor_worse():
     assert paired_test(np.ones(5), np.ones(5), np.arange(5)).z == 0
+
+
+def test_a_radar_that_turned_beyond_its_prior_casts_doubt_on_what_was_solved_along_its_heading():
+    day = make_day(5, ego_speed_mps=30.0)
+    limit = np.radians(0.2)
+
+    def doubts(turn_deg, dt_s):
+        T = from_rotation_translation(exp_so3(np.array([0, 0, np.radians(turn_deg)])), np.zeros(3))
+        pairs = {
+            "camera_lidar": replace(estimate(), time_offset_s=dt_s),
+            "lidar_radar": replace(estimate(pair="lidar_radar"), T=T),
+        }
+        return heading_doubts(Solution("joint", pairs), PRIOR, day, limit)
+
+    assert "turns by 9.0 deg: 0.09 m aside" in doubts(9.0, 0.02)[0]
+    assert doubts(9.0, 0.0) == []  # nothing was moved
+    assert doubts(9.0, None) == []
+    assert doubts(2.0, 0.02) == []  # within the prior's sigma: the covariance's business
