@@ -56,7 +56,7 @@ class Consensus:
     ) -> Float[Tensor, "B 3 6"]:
         """Twist from each day's mean to each frame's answer, without gradient; then the answers join the mean."""
         twist = twist_between(answers.detach(), references).cpu()
-        out, origin = torch.zeros_like(twist), torch.eye(4, dtype=twist.dtype)
+        out, origin = torch.zeros_like(twist), torch.eye(4, dtype=twist.dtype).expand(3, 4, 4)
         for row, (day, value) in enumerate(zip(days, twist, strict=True)):
             mean = self._mean.get(day, value)
             out[row] = twist_between(_moved(value, origin), _moved(mean, origin))
