@@ -78,7 +78,7 @@ class MatchingCore(nn.Module):
         features = []
         if "camera_lidar" in self.pairs:
             assert likelihood is not None
-            lidar_logits = self.lidar_encoder(view.lidar_grid)
+            lidar_logits = self.encode_lidar(view.lidar_grid)
             probability = torch.softmax(self._at_points(lidar_logits.detach(), view.points_camera), -1)
             found = self.lidar_matcher(likelihood, view.points_camera, probability, view.point_weight)
             bases["camera_lidar"] = found
@@ -102,6 +102,18 @@ class MatchingCore(nn.Module):
         fused = self.fusion(torch.cat([s(f) for s, f in zip(self.summaries, features, strict=True)], -1))
         corrections, log_variance = self._combine(bases, fused)
         return CoreOutputs(corrections, log_variance, likelihood, camera_logits, lidar_logits, radar_logits)
+
+    def encode_lidar(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B K H W"]:
+        """Class logits of a rendered sweep; in training every other frame is seen in a mirror.
+
+        Classes reach the lidar through guesses that are wrong by some angle. An encoder that learns where classes
+        end would learn that angle with them; for mirrored frames it is the opposite one.
+        """
+        if not self.training:
+            return self.lidar_encoder(rendered)
+        mirrored = (torch.arange(len(rendered), device=rendered.device) % 2 == 1)[:, None, None, None]
+        logits = self.lidar_encoder(torch.where(mirrored, rendered.flip(-1), rendered))
+        return torch.where(mirrored, logits.flip(-1), logits)
 
     def _at_points(self, maps: Tensor, points_camera: Tensor) -> Tensor:
         """B N K: values of the cells that points fall into."""

@@ -155,6 +155,18 @@ def test_a_dozen_steps_on_two_frames_teach_classes(pairs):
     assert losses[-1] < 0.75 * losses[0]
 
 
+def test_training_sees_every_other_sweep_in_a_mirror_and_inference_none():
+    core, generator = small().core, torch.Generator().manual_seed(0)
+    rendered = torch.rand(3, 6, GRID.height, GRID.width, generator=generator)
+    with torch.no_grad():
+        plain, mirrored = core.lidar_encoder(rendered), core.lidar_encoder(rendered.flip(-1)).flip(-1)
+        learning, judging = core.train().encode_lidar(rendered), core.eval().encode_lidar(rendered)
+    assert torch.equal(judging, plain)
+    assert torch.allclose(learning[0::2], plain[0::2], atol=1e-6)
+    assert torch.allclose(learning[1], mirrored[1], atol=1e-6)
+    assert (learning[1] - plain[1]).abs().max() > 1e-3
+
+
 def test_points_take_the_class_of_their_cell_and_none_outside():
     classes = torch.full((1, GRID.height, GRID.width), 4, dtype=torch.uint8)
     classes[:, :, : GRID.width // 2] = 7
@@ -178,7 +190,7 @@ def test_exposure_and_contrast_do_not_matter(architecture):
 
 
 def test_frames_of_a_batch_do_not_know_of_each_other():
-    data, network = batch(), small()
+    data, network = batch(), small().eval()
     with torch.no_grad():
         both, alone = network(inputs_of(data)), network(inputs_of(data[1:]))
     assert torch.allclose(both.T_camera_lidar[1:], alone.T_camera_lidar, atol=1e-5)
