@@ -6,12 +6,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipeline.geometry.cameras import Camera
 from schemas.observations import Observation
 
-__all__ = ["CLASSES", "EDGE_KINDS", "Points", "gather_classes", "gather_edges", "gather_markings"]
+__all__ = [
+    "CLASSES",
+    "EDGE_KINDS",
+    "Points",
+    "gather_classes",
+    "gather_edges",
+    "gather_markings",
+    "is_near_view",
+    "view_bounds",
+]
 
 # Markings brighter than this stand out of their ring (lane paint, patches) [robust sd].
 _MARKING_Z = 2.5
@@ -100,6 +109,35 @@ def gather_classes(
     return _gather([_height_classes(o) for o in observations], T_camera_lidar, camera, reach_rad)
 
 
+def view_bounds(camera: Camera) -> Float[np.ndarray, " 4"]:
+    """Smallest and largest azimuth, smallest and largest elevation [rad] along the image's border."""
+    border = np.array(
+        [
+            [u, v]
+            for u in (0.0, camera.width_px / 2, camera.width_px)
+            for v in (0.0, camera.height_px / 2, camera.height_px)
+        ]
+    )
+    rays = camera.unproject(border)
+    rays = rays[np.isfinite(rays).all(1)]
+    azimuth = np.arctan2(rays[:, 0], rays[:, 2])
+    elevation = np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
+    return np.array([azimuth.min(), azimuth.max(), elevation.min(), elevation.max()])
+
+
+def is_near_view(
+    xyz_m: np.ndarray,
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    bounds: Float[np.ndarray, " 4"],
+    reach_rad: float,
+) -> Bool[np.ndarray, " N"]:
+    """Whether points [N, 3] lie within `reach_rad` of the view bounds."""
+    q = xyz_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+    a, e = np.arctan2(q[:, 0], q[:, 2]), np.arctan2(q[:, 1], np.hypot(q[:, 0], q[:, 2]))
+    inside = (a > bounds[0] - reach_rad) & (a < bounds[1] + reach_rad)
+    return inside & (e > bounds[2] - reach_rad) & (e < bounds[3] + reach_rad)
+
+
 def _kinds(observations: Sequence[Observation]) -> list[np.ndarray]:
     """Kind of each edge: direction, height and size class."""
     sizes = np.concatenate([o.lidar_edge_points for o in observations])
@@ -131,25 +169,10 @@ def _gather(
     reach_rad: float,
 ) -> Points:
     """Points of all frames in or near the camera's field of view."""
-    border = np.array(
-        [
-            [u, v]
-            for u in (0.0, camera.width_px / 2, camera.width_px)
-            for v in (0.0, camera.height_px / 2, camera.height_px)
-        ]
-    )
-    rays = camera.unproject(border)
-    rays = rays[np.isfinite(rays).all(1)]
-    azimuth, elevation = (
-        np.arctan2(rays[:, 0], rays[:, 2]),
-        np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2])),
-    )
+    bounds = view_bounds(camera)
     kept, counts = [], [0]
     for xyz, side, kind, gap in frames:
-        q = xyz @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-        a, e = np.arctan2(q[:, 0], q[:, 2]), np.arctan2(q[:, 1], np.hypot(q[:, 0], q[:, 2]))
-        near = (a > azimuth.min() - reach_rad) & (a < azimuth.max() + reach_rad)
-        near &= (e > elevation.min() - reach_rad) & (e < elevation.max() + reach_rad)
+        near = is_near_view(xyz, T_camera_lidar, bounds, reach_rad)
         kept.append((xyz[near], side[near], kind[near], gap[near]))
         counts.append(counts[-1] + int(near.sum()))
     columns = [np.concatenate(c) for c in zip(*kept, strict=True)]

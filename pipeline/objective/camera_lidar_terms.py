@@ -21,6 +21,8 @@ from pipeline.objective.camera_lidar_points import (
     gather_classes,
     gather_edges,
     gather_markings,
+    is_near_view,
+    view_bounds,
 )
 from pipeline.objective.class_information import class_information
 from pipeline.objective.edges import (
@@ -114,6 +116,15 @@ class Terms:
         narrow = self.edges.gap_rad * self.camera[1] <= max_gap_px
         return replace(self, edges=self.edges.chosen(narrow))
 
+    def in_view(self, T_camera_lidar: Float[np.ndarray, "4 4"], margin_rad: float) -> Terms:
+        """With the edges and markings that a pose puts into the image, or within a margin of it."""
+        bounds = view_bounds(self.maps.camera)
+        edges, markings = (
+            p.chosen(is_near_view(p.xyz_m, T_camera_lidar, bounds, margin_rad))
+            for p in (self.edges, self.markings)
+        )
+        return replace(self, edges=edges, markings=markings)
+
     def at_most(self, points: int, rng: np.random.Generator) -> Terms:
         """With at most about so many edges, and markings, drawn at random."""
         share = [min(1.0, points / max(len(p.xyz_m), 1)) for p in (self.edges, self.markings)]
@@ -199,8 +210,12 @@ class Terms:
 
     def score(self, at: Alignments, level: Level) -> Float[np.ndarray, "P F"]:
         """Score of each frame at each alignment; higher is better."""
-        score = level.edge_weight * self.edge_score(at, level).astype(np.float64)
-        return score + level.marking_weight * self.marking_score(at, level)
+        score = np.zeros((len(at.dt_s), self.frames))
+        if level.edge_weight > 0:
+            score += level.edge_weight * self.edge_score(at, level)
+        if level.marking_weight > 0:
+            score += level.marking_weight * self.marking_score(at, level)
+        return score
 
     def gradient(
         self, at: Alignments, level: Level

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from pipeline.objective.projection_loops import project_point
+from pipeline.objective.projection_loops import most_points, project_points
 
 __all__ = ["LABEL_CLASSES", "class_information"]
 
@@ -22,7 +22,7 @@ LABEL_CLASSES = 20  # 19 Cityscapes classes and void
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def class_information(
     camera: Float32[np.ndarray, " 18"],
     labels: UInt8[np.ndarray, "F H W"],
@@ -40,16 +40,14 @@ def class_information(
     u_max, v_max = f4(width - 1), f4(height - 1)
     # Frames outside, poses inside: one frame's labels stay in the cache.
     table = np.zeros((count, kinds, 20))
+    xyz = np.ascontiguousarray(points.T)
+    us, vs = np.empty(most_points(start), np.float32), np.empty(most_points(start), np.float32)
     for f in range(frames):
         for p in range(count):
-            m = poses[p, f]
+            project_points(camera, xyz, start[f], start[f + 1], poses[p, f], f4(1), us, vs)
             for i in range(start[f], start[f + 1]):
-                x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
-                x = m[0] * x0 + m[1] * y0 + m[2] * z0 + m[3]
-                y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
-                z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
-                u, v, valid = project_point(camera, x, y, z)
-                if valid and u >= f4(0) and v >= f4(0) and u <= u_max and v <= v_max:
+                u, v = us[i - start[f]], vs[i - start[f]]
+                if u >= f4(0) and v >= f4(0) and u <= u_max and v <= v_max:
                     table[p, kind[i], min(labels[f, int(v + f4(0.5)), int(u + f4(0.5))], 19)] += 1.0
     for p in range(count):
         out[p] = _information(table[p]) / points.shape[0]

@@ -15,7 +15,12 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Int8, Int64, UInt8
 
-from pipeline.objective.projection_loops import project_point, project_with_jacobian
+from pipeline.objective.projection_loops import (
+    most_points,
+    project_point,
+    project_points,
+    project_with_jacobian,
+)
 
 __all__ = ["CHANCE_BINS", "chance_of", "edge_gradients", "edge_residuals", "edge_scores", "fit_match_share"]
 
@@ -57,15 +62,27 @@ def edge_scores(
     width_px = np.hypot(np.float32(sigma_px), gap_rad * camera[1] * np.float32(1 / np.sqrt(12)))
     # 2/pi makes (1 + x^2)^-2 a density
     gain = match[:, None] * np.float32(2 / np.pi) / chance
-    return _edge_loop(camera, offsets, points, side, kind, 1 / width_px, start, poses, focal, 1 - match, gain)
+    return _edge_loop(
+        camera,
+        offsets,
+        np.ascontiguousarray(points.T),
+        side,
+        kind,
+        1 / width_px,
+        start,
+        poses,
+        focal,
+        1 - match,
+        gain,
+    )
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def _edge_loop(
     camera: np.ndarray,
     offsets: np.ndarray,
-    points: np.ndarray,
+    xyz: np.ndarray,
     side: np.ndarray,
     kind: np.ndarray,
     sharpness: np.ndarray,
@@ -82,18 +99,14 @@ def _edge_loop(
     f4, i4 = np.float32, np.int32
     half, one = f4(0.5), f4(1.0)
     u_max, v_max = f4(width - 1), f4(height - 1)
+    us, vs = np.empty(most_points(start), np.float32), np.empty(most_points(start), np.float32)
     for f in range(frames):
         for p in range(count):
-            m, s = poses[p, f], focal[p]
+            project_points(camera, xyz, start[f], start[f + 1], poses[p, f], focal[p], us, vs)
             total, product, factors = f4(0.0), one, 0
             for i in range(start[f], start[f + 1]):
-                x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
-                x = m[0] * x0 + m[1] * y0 + m[2] * z0 + m[3]
-                y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
-                z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
-                u, v, valid = project_point(camera, x, y, z)
-                u, v = camera[3] + s * (u - camera[3]), camera[4] + s * (v - camera[4])
-                if not valid or u < f4(0) or v < f4(0) or u > u_max or v > v_max:
+                u, v = us[i - start[f]], vs[i - start[f]]
+                if u < f4(0) or v < f4(0) or u > u_max or v > v_max:
                     continue
                 c, n = side[i], kind[i]
                 iu, iv = i4(u + half), i4(v + half)

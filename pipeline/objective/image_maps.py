@@ -70,67 +70,83 @@ def camera_of(observation: Observation) -> Camera:
     )
 
 
-@no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, nogil=True)
-def _boundary_sides(order: np.ndarray, a: int, b: int) -> tuple[bool, bool]:
-    """Whether the boundary between labels a (left or above) and b has its foreground at a, at b (or may have both)."""
-    near_a, near_b = order[a], order[b]
-    if a == b or _UNKNOWN in (near_a, near_b):
-        return False, False
-    if near_a == near_b:  # two backdrops, or two kinds of ground: the labels say nothing of which is nearer
-        return near_a == _OBJECT, near_a == _OBJECT
-    return near_a > near_b, near_b > near_a
+def _foreground_table() -> UInt8[np.ndarray, "256 256"]:
+    """What lies nearer at a boundary between labels a (left or above) and b: bit 0 says a, bit 1 says b.
+
+    Two objects may both. Two backdrops, or two kinds of ground, say nothing, and unknown labels neither.
+    """
+    a, b = _DEPTH_ORDER[:, None].astype(np.int64), _DEPTH_ORDER[None].astype(np.int64)
+    objects = (a == b) & (a == _OBJECT)
+    known = (a != _UNKNOWN) & (b != _UNKNOWN) & ~np.eye(256, dtype=bool)
+    return ((known & (objects | (a > b))) + 2 * (known & (objects | (b > a)))).astype(np.uint8)
+
+
+_FOREGROUND = _foreground_table()
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
-def _scan(order: np.ndarray, labels: np.ndarray, out: np.ndarray) -> None:
+def _scan(foreground: np.ndarray, labels: np.ndarray, out: np.ndarray) -> None:
     """Fill out[4, H, W] with offsets to the nearest boundary of each direction class along its axis.
 
-    One sweep down-right carries the last boundary behind, one sweep up-left the next one ahead; both run along rows.
+    Sides of objects stretch by stretch along each row; their tops and feet by one sweep down and one up, row by row.
     """
-    out[:] = NO_BOUNDARY
     height, width = labels.shape
-    last = np.full((2, width), -10000)
+    last = np.full((2, width), -10000, np.int32)
     for i in range(height):
-        across = np.full(2, -10000)
-        for j in range(width):
-            for side in range(2):
-                _nearer(out, side, i, j, across[side] - j)
-                _nearer(out, 2 + side, i, j, last[side, j] - i)
-            _note_boundaries(order, labels, i, j, across, last)
-    following = np.full((2, width), 10000)
+        _along_row(foreground, labels[i], out[:2, i])
+        for side in range(2):
+            o, above = out[2 + side, i], last[side]
+            for j in range(width):
+                n = above[j] - i
+                o[j] = n if n >= -REACH_PX else NO_BOUNDARY
+        if i + 1 < height:
+            _note_below(foreground, labels, i, last)
+    following = np.full((2, width), 10000, np.int32)
     for i in range(height - 1, -1, -1):
-        across = np.full(2, 10000)
-        for j in range(width - 1, -1, -1):
-            _note_boundaries(order, labels, i, j, across, following)
-            for side in range(2):
-                _nearer(out, side, i, j, across[side] - j)
-                _nearer(out, 2 + side, i, j, following[side, j] - i)
+        if i + 1 < height:
+            _note_below(foreground, labels, i, following)
+        for side in range(2):
+            o, below = out[2 + side, i], following[side]
+            for j in range(width):
+                n = below[j] - i
+                # k + 1/2 ahead is nearer than -1/2 - k behind
+                if n <= REACH_PX and (o[j] == NO_BOUNDARY or 2 * n + 1 < -2 * o[j] - 1):
+                    o[j] = n
 
 
 @no_type_check
 @numba.njit(cache=True, nogil=True, inline="always")
-def _note_boundaries(
-    order: np.ndarray, labels: np.ndarray, i: int, j: int, across: np.ndarray, along: np.ndarray
-) -> None:
-    """Note the boundaries right of and below a pixel, by the side of their foreground."""
-    if j + 1 < labels.shape[1]:
-        here, there = _boundary_sides(order, labels[i, j], labels[i, j + 1])
-        across[0], across[1] = (j if here else across[0]), (j if there else across[1])
-    if i + 1 < labels.shape[0]:
-        here, there = _boundary_sides(order, labels[i, j], labels[i + 1, j])
-        along[0, j], along[1, j] = (i if here else along[0, j]), (i if there else along[1, j])
+def _note_below(foreground: np.ndarray, labels: np.ndarray, i: int, along: np.ndarray) -> None:
+    """Note the boundaries below the pixels of row i, by the side of their foreground."""
+    for j in range(labels.shape[1]):
+        if labels[i, j] != labels[i + 1, j]:
+            near = foreground[labels[i, j], labels[i + 1, j]]
+            if near & 1:
+                along[0, j] = i
+            if near & 2:
+                along[1, j] = i
 
 
 @no_type_check
-@numba.njit(cache=True, nogil=True, inline="always")
-def _nearer(out: np.ndarray, side: int, i: int, j: int, offset: int) -> None:
-    """Keep the nearer of two boundaries; offset k stands for k + 1/2: k ahead is as far as -1 - k behind."""
-    if -REACH_PX <= offset <= REACH_PX:
-        held = out[side, i, j]
-        if held == NO_BOUNDARY or abs(2 * offset + 1) < abs(2 * held + 1):
-            out[side, i, j] = offset
+@numba.njit(cache=True, nogil=True)
+def _along_row(foreground: np.ndarray, row: np.ndarray, out: np.ndarray) -> None:
+    """Offsets along one row [2, W]: every stretch between two boundaries of a class knows both its ends."""
+    width = row.shape[0]
+    for side in range(2):
+        begin, behind = 0, -10000
+        for j in range(width):
+            at_end = j == width - 1
+            ends = not at_end and row[j] != row[j + 1] and foreground[row[j], row[j + 1]] & (1 << side) > 0
+            if not (ends or at_end):
+                continue
+            ahead = j if ends else 10000
+            for k in range(begin, j + 1):
+                n = behind - k
+                if n < -REACH_PX or 2 * (ahead - k) + 1 < -2 * n - 1:
+                    n = ahead - k
+                out[side, k] = n if n <= REACH_PX else NO_BOUNDARY
+            begin, behind = j + 1, j
 
 
 def boundary_offsets(labels: UInt8[np.ndarray, "H W"]) -> Int8[np.ndarray, "4 H W"]:
@@ -139,7 +155,7 @@ def boundary_offsets(labels: UInt8[np.ndarray, "H W"]) -> Int8[np.ndarray, "4 H 
     The boundary lies at pixel + offset + 1/2; NO_BOUNDARY where none is in reach.
     """
     out = np.empty((4, *labels.shape), np.int8)
-    _scan(_DEPTH_ORDER, labels, out)
+    _scan(_FOREGROUND, labels, out)
     return out
 
 
@@ -189,7 +205,7 @@ def prepare_maps(observations: Sequence[Observation], blurs_px: tuple[float, ...
     offsets = np.empty((count, 4, *size), np.int8)
     contrast = np.zeros((len(blurs_px), count, *size), np.int8)
     for f, o in enumerate(observations):
-        _scan(_DEPTH_ORDER, labels[f], offsets[f])
+        _scan(_FOREGROUND, labels[f], offsets[f])
         if o.road_contrast_png is not None:
             contrast[:, f] = contrast_levels(_decoded(o.road_contrast_png), labels[f] == _ROAD, blurs_px)
     return CameraMaps(camera_of(first).scaled(first.label_scale), offsets, contrast, labels)

@@ -15,13 +15,13 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Int8, Int64
 
-from pipeline.objective.projection_loops import project_point, project_with_jacobian
+from pipeline.objective.projection_loops import most_points, project_points, project_with_jacobian
 
 __all__ = ["marking_gradients", "marking_scores"]
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def marking_scores(
     camera: Float32[np.ndarray, " 18"],
     contrast: Int8[np.ndarray, "F H W"],
@@ -37,18 +37,15 @@ def marking_scores(
     out = np.zeros((count, frames), np.float32)
     f4 = np.float32
     u_max, v_max = f4(width - 1.01), f4(height - 1.01)
+    xyz = np.ascontiguousarray(points.T)
+    us, vs = np.empty(most_points(start), np.float32), np.empty(most_points(start), np.float32)
     for f in range(frames):
         for p in range(count):
-            m, s = poses[p, f], focal[p]
+            project_points(camera, xyz, start[f], start[f + 1], poses[p, f], focal[p], us, vs)
             total = f4(0.0)
             for i in range(start[f], start[f + 1]):
-                x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
-                x = m[0] * x0 + m[1] * y0 + m[2] * z0 + m[3]
-                y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
-                z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
-                u, v, valid = project_point(camera, x, y, z)
-                u, v = camera[3] + s * (u - camera[3]), camera[4] + s * (v - camera[4])
-                if not valid or u < f4(0) or v < f4(0) or u > u_max or v > v_max:
+                u, v = us[i - start[f]], vs[i - start[f]]
+                if u < f4(0) or v < f4(0) or u > u_max or v > v_max:
                     continue
                 iu, iv = int(u), int(v)
                 a, b = u - f4(iu), v - f4(iv)

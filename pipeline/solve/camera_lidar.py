@@ -11,7 +11,7 @@ the others solved again; their covariance includes what the prior leaves open in
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,8 +19,7 @@ from jaxtyping import Bool, Float
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3
-from pipeline.objective.camera_lidar_terms import Alignments, Level, Terms, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar_terms import Level, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.problem import PairEstimate, Prior
 from pipeline.solve.camera_lidar_ascent import (
     FOCAL_SIGMA,
@@ -31,29 +30,28 @@ from pipeline.solve.camera_lidar_ascent import (
     scales,
     weighted,
 )
+from pipeline.solve.camera_lidar_motion import motion_biases, sweep_s_per_rad
+from pipeline.solve.camera_lidar_profile import TZ, Profile, profile_tz, with_tz
+from pipeline.solve.camera_lidar_search import Basin, difference, find_basin
 from pipeline.solve.covariance import OBSERVABLE, blocks_of, held_covariance, response
-from pipeline.solve.globalise import evolve
+from pipeline.solve.search_range import search_range
 from schemas.observations import Observation
 
 __all__ = ["AlignmentState", "camera_lidar_cost", "camera_lidar_information", "estimate_camera_lidar"]
 
 _FEWEST_FRAMES = 5
-_RESTARTS = 2
-_COARSE_POINTS = 9000  # per restart: a basin needs no more
-_FINE_POINTS = 24000  # of edges, and of markings; more say the same again
+_THIN_POINTS, _FINE_POINTS = 8000, 18000  # of edges, and of markings; more say the same again
+_MARGIN_RAD = np.radians(2.0)  # points further out of view than this stay out of it
 # Kernel widths [label px] and contrast levels, from wide to sharp.
-_COARSE = Level.wide(10.0, 0, match=0.1)
-# Nats per point of class information against log likelihood ratios: over the search box both then vary alike.
-_CLASS_WEIGHT_PER_POINT = 0.12
 _LADDER = ((4.0, 0), (2.5, 1), (1.5, 2))
 _VERDICT = Level.wide(1.5, 2)
 _MAX_GAP_PX = 5.0  # edges whose interval is wider (16 rings: 30 px) are for the basin only
 # What no resampling shows: mask dilation, focal length off by 0.1-0.5 %, rolling shutter
 # (evidence/method.md, section 4).
 _BIAS_FLOOR = np.array([np.radians(0.03)] * 3 + [0.01, 0.01, 0.01])
-# Along the optical axis more: lane lines pull tz without resisting it, and dt and the others follow. Left to itself
-# tz ends 3-25 cm (RMS 18) from the reference on halves of a real day, where resampling promises 2-4 cm.
-_TZ, _TZ_BIAS_M = 5, 0.18
+_NEAR_PRIOR_M = 0.25
+_HEADING_SIGMA_RAD = np.radians(0.3)  # of velocities that a caller knows
+_IS_TZ = np.arange(8) == TZ
 _TIME_OFFSET_FLOOR_S = 0.004
 
 
@@ -79,38 +77,51 @@ def estimate_camera_lidar(
         SolveError: too few frames, or nothing to align in them.
     """
     used, rejected = _usable(observations)
+    heading_sigma = _HEADING_SIGMA_RAD
     if velocity_lidar is None:
         velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar)
+        heading_sigma = float(np.hypot(heading_sigma, prior.rotation_sigma_rad))
     if len(used) < _FEWEST_FRAMES:
         raise SolveError(f"camera-lidar needs {_FEWEST_FRAMES} frames of one camera, the day has {len(used)}")
     frames = [observations[i] for i in used]
-    reach = np.radians(config.search_rotation_deg + 2.0)
-    terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar[used], reach_rad=float(reach))
+    reach = search_range(prior, config)[0] + _MARGIN_RAD
+    terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar[used], reach_rad=reach)
     terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
     if "edges" in config.terms and len(terms.edges.xyz_m) < 20 * len(used):
         raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
 
-    starts = [_basin(terms, prior, config, rng) for _ in range(_RESTARTS)]
-    sharp = terms.sharp(_MAX_GAP_PX).at_most(_FINE_POINTS, rng)
-    thin = sharp.thinned(0.35, rng)
     first = Level.wide(*_LADDER[0])
-    ends = [climb(thin, s, first, prior, config, steps=5) for s in starts]
-    scores = [float(sharp.score(e.alone, first).sum()) for e in ends]
-    best = int(np.argmax(scores))
-    state, level = ends[best], first
+    sharp = terms.sharp(_MAX_GAP_PX)
+    thin = sharp.at_most(_THIN_POINTS, rng)
+    basin = find_basin(terms, thin, first, prior, config, rng)
+    sharp = sharp.in_view(basin.state.T_camera_lidar, _MARGIN_RAD).at_most(_FINE_POINTS, rng)
+    # Wide kernels are biased along the optical axis: where the prior is better than that, enter the valley there.
+    near = prior.translation_sigma_m <= _NEAR_PRIOR_M
+    held = _IS_TZ if near else NOTHING
+    state = replace(basin.state, dt_s=0.0) if near else basin.state
+    state = climb(thin, state, first, prior, config, steps=8, held=held)
     for sigma_px, contrast in _LADDER[1:]:
         level = weighted(sharp, state, sharp.fitted(state.alone, Level.wide(sigma_px, contrast), rng))
-        state = climb(sharp, state, level, prior, config, steps=5)
-    day = _Day(sharp, prior, config, [o.drive for o in frames], int(rng.integers(2**32)))
+        state = climb(sharp, state, level, prior, config, steps=5, held=held)
+    day = _Day(
+        sharp,
+        prior,
+        config,
+        [o.drive for o in frames],
+        int(rng.integers(2**32)),
+        prior.translation_sigma_m**2,
+        heading_sigma,
+        sweep_s_per_rad(frames),
+    )
     found = _determined(day, state, level, rng)
     halves = [
         climb(
-            sharp.of_frames(np.arange(k, len(used), 2)), found.state, found.level, prior, config,
-            steps=4, held=found.held,
+            sharp.of_frames(np.arange(k, len(used), 2)), found.state, found.level, found.prior, config,
+            steps=3, held=found.held,
         )
         for k in (0, 1)
     ]  # fmt: skip
-    diagnostics = _diagnostics(sharp, found.level, found.state, ends, scores, halves)
+    diagnostics = _diagnostics(sharp, found, basin, halves)
     return _conclude(found, config, len(frames), rejected, diagnostics)
 
 
@@ -167,43 +178,20 @@ def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, i
     return used, {"another camera": others} if others else {}
 
 
-def _basin(terms: Terms, prior: Prior, config: SolveConfig, rng: np.random.Generator) -> AlignmentState:
-    """Differential evolution in the search box, wide kernels, a random share of the points."""
-    thin = terms.thinned(
-        min(1.0, _COARSE_POINTS / max(len(terms.edges.xyz_m) + len(terms.markings.xyz_m), 1)), rng
-    )
-    weight = _CLASS_WEIGHT_PER_POINT * (len(thin.edges.xyz_m) + len(thin.markings.xyz_m))
-    T_0 = prior.T_camera_lidar
-    box = np.array([np.radians(config.search_rotation_deg)] * 3 + [config.search_translation_m] * 3)
-    sigma = np.array([config.search_translation_m / 2] * 3)
-
-    def poses(x: np.ndarray) -> np.ndarray:
-        return from_rotation_translation(exp_so3(x[:, :3]) @ T_0[:3, :3], T_0[:3, 3] + x[:, 3:])
-
-    def cost(x: np.ndarray) -> np.ndarray:
-        at = Alignments.of_poses(poses(x))
-        score = thin.score(at, _COARSE).sum(1) + weight * thin.class_information(at)
-        return -score + 0.5 * ((x[:, 3:] / sigma) ** 2).sum(1)
-
-    x, _ = evolve(cost, -box, box, rng, population=48, generations=36, start=np.zeros((1, 6)))
-    return AlignmentState(poses(x[None])[0])
-
-
 def _diagnostics(
     terms: Terms,
-    level: Level,
-    state: AlignmentState,
-    ends: list[AlignmentState],
-    scores: list[float],
+    found: _Found,
+    basin: Basin,
     halves: list[AlignmentState],
 ) -> dict[str, float]:
     """Numbers behind the verdict."""
-    apart = _difference(halves[0], halves[1])
-    spread = [_difference(e, ends[int(np.argmax(scores))]) for e in ends]
+    apart = difference(halves[0], halves[1])
+    level, profile = found.level, found.profile
     return {
-        "restart_rotation_spread_deg": max(float(np.degrees(np.linalg.norm(d[:3]))) for d in spread),
-        "restart_translation_spread_m": max(float(np.linalg.norm(d[3:6])) for d in spread),
-        "restart_score_spread": float(max(scores) - min(scores)),
+        "restarts": float(basin.restarts),
+        "restart_rotation_spread_deg": float(np.degrees(basin.rotation_spread_rad)),
+        "restart_translation_spread_m": basin.translation_spread_m,
+        "restart_score_spread": basin.score_spread,
         **{f"halves_{n}_deg": float(np.degrees(abs(apart[i]))) for i, n in enumerate(("rx", "ry", "rz"))},
         **{f"halves_{n}_m": float(abs(apart[3 + i])) for i, n in enumerate(("tx", "ty", "tz"))},
         "halves_dt_s": float(abs(apart[6])),
@@ -211,20 +199,16 @@ def _diagnostics(
             f"edge_match_share_{n}": float(terms.mean_match(level)[i])
             for i, n in enumerate(("left", "right", "above", "below"))
         },
-        "focal_scale": state.focal,
+        "tz_bias_m": profile.bias_m,
+        "tz_kinds_apart_m": profile.kinds_apart_m,
+        "tz_kinds_sigma_m": profile.kinds_sigma_m,
+        "focal_scale": found.state.focal,
         "edge_weight": level.edge_weight,
         "marking_contrast_sd": level.delta,
         "marking_weight": level.marking_weight,
         "edges_per_frame": len(terms.edges.xyz_m) / terms.frames,
         "markings_per_frame": len(terms.markings.xyz_m) / terms.frames,
     }
-
-
-def _difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]:
-    """Rotation vector, translation and dt from b to a."""
-    D = a.T_camera_lidar @ inverse(b.T_camera_lidar)
-    shift = a.T_camera_lidar[:3, 3] - b.T_camera_lidar[:3, 3]
-    return np.concatenate([log_so3(D[:3, :3]), shift, [a.dt_s - b.dt_s, a.focal - b.focal]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,78 +220,96 @@ class _Day:
     config: SolveConfig
     drives: list[int]
     seed: int  # of the bootstrap: solutions compare on the same resampled days
+    tz_variance: float  # [m2]
+    heading_sigma_rad: float
+    sweep_s_per_rad: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
     """A solution: what of it the day determined, and how surely (chart of `AlignmentState.changed`)."""
 
+    prior: Prior  # with the tz that was found
     state: AlignmentState
     level: Level
     held: np.ndarray  # 8, bool
     covariance: np.ndarray  # 8 8
     observability: np.ndarray  # 6
+    profile: Profile
 
 
 def _determined(day: _Day, state: AlignmentState, level: Level, rng: np.random.Generator) -> _Found:
-    """Solve again with what the day cannot determine held at the prior, until nothing more is to be held.
+    """Fix tz by its profile, then solve again with what the day cannot determine held at the prior.
 
     Left free, such a degree of freedom wanders as far as its prior lets it and drags others along: lane lines
     pull tz, and with it dt, by decimetres. To hold one can leave another undetermined, whose optimum follows it.
     """
-    found = _measured(day, state, level, NOTHING, np.ones(6))
-    while (
-        held := found.held | np.append(found.observability < OBSERVABLE, [False, False])
-    ).sum() > found.held.sum():
-        state = climb(day.terms, found.state, level, day.prior, day.config, steps=2, held=held)
+    follow = response(_curvature(day, state, level), _IS_TZ, NOTHING)[:, 0]
+    profile = profile_tz(day.terms, state, level, day.prior, day.config, follow)
+    before = float(day.prior.T_camera_lidar[2, 3]), day.prior.translation_sigma_m
+    tz_m, variance = profile.with_prior(*before)
+    seen = 1 - variance / before[1] ** 2
+    if seen < OBSERVABLE:
+        tz_m, variance = before[0], before[1] ** 2
+    day = replace(day, prior=with_tz(day.prior, tz_m), tz_variance=variance)
+    state = state.stepped(follow * (tz_m - state.T_camera_lidar[2, 3]))
+    held, observability = _IS_TZ, np.ones(6)
+    while True:
+        state = climb(day.terms, state, level, day.prior, day.config, steps=2, held=held)
         level = weighted(day.terms, state, day.terms.fitted(state.alone, level, rng))
         state = climb(day.terms, state, level, day.prior, day.config, steps=4, held=held)
-        found = _measured(day, state, level, held, found.observability)
-    return found
+        covariance, shrunk = _measured(day, state, level, held)
+        observability = np.where(held[:6], observability, shrunk)
+        held_too = held | np.append(observability < OBSERVABLE, [False, False])
+        if held_too.sum() == held.sum():
+            break
+        held = held_too
+    observability[TZ] = max(seen, 0.0)
+    return _Found(day.prior, state, level, held, covariance, observability, profile)
 
 
 def _measured(
-    day: _Day,
-    state: AlignmentState,
-    level: Level,
-    held: Bool[np.ndarray, " 8"],
-    observability: Float[np.ndarray, " 6"],
-) -> _Found:
-    """Covariance of a solution; what is held has the prior's, and the others follow it (and the bias along tz)."""
-    terms, prior = day.terms, day.prior
-    scale = scales(terms, level)
+    day: _Day, state: AlignmentState, level: Level, held: Bool[np.ndarray, " 8"]
+) -> tuple[Float[np.ndarray, "8 8"], Float[np.ndarray, " 6"]]:
+    """Covariance of a solution and observability; what is held has its own variance, and the others follow it."""
+    terms, prior_variance = day.terms, _prior_variance(day)
+    scale, curvature = scales(terms, level), _curvature(day, state, level)
     gradient = derivatives(terms, state, level, scale)[0] / scale
-    prior_variance = np.array(
-        [prior.rotation_sigma_rad**2] * 3
-        + [prior.translation_sigma_m**2] * 3
-        + [day.config.time_offset_sigma_s**2, FOCAL_SIGMA**2]
-    )
-    curvature = _smooth_curvature(terms, state, level) + np.diag(1 / prior_variance)
     # After `weighted`, the scatter of the frames' gradients is the curvature, without its roughness
     # (Bartlett's identity).
     information = gradient[:, :, None] * gradient[:, None, :]
     block = blocks_of(np.array(day.drives), day.config.bootstrap_blocks)
     covariance = held_covariance(
-        information, -gradient, prior_variance, curvature, held, block, np.random.default_rng(day.seed)
+        information,
+        -gradient,
+        prior_variance,
+        curvature,
+        held,
+        block,
+        np.random.default_rng(day.seed),
     )
-    floor = np.diag(np.where(held, 0.0, np.append(_BIAS_FLOOR, [_TIME_OFFSET_FLOOR_S, 0.0])) ** 2)
-    if not held[_TZ]:
-        along = response(curvature, np.arange(8) == _TZ, held)[:, 0] * _TZ_BIAS_M
-        floor += np.outer(along, along)
-    covariance = covariance + floor
-    shrunk = np.clip(1 - np.diag(covariance) / prior_variance, 0.0, 1.0)[:6]
-    return _Found(state, level, held, covariance, np.where(held[:6], observability, shrunk))
+    floor = np.where(held, 0.0, np.append(_BIAS_FLOOR, [_TIME_OFFSET_FLOOR_S, 0.0]))
+    motion = motion_biases(terms, state, level, curvature, held, day.heading_sigma_rad, day.sweep_s_per_rad)
+    covariance = covariance + np.diag(floor**2) + motion.T @ motion
+    return covariance, np.clip(1 - np.diag(covariance) / prior_variance, 0.0, 1.0)[:6]
 
 
-def _smooth_curvature(terms: Terms, state: AlignmentState, level: Level) -> Float[np.ndarray, "8 8"]:
+def _prior_variance(day: _Day) -> Float[np.ndarray, " 8"]:
+    """Of every unknown before the frames' gradients are asked: of tz what its profile left."""
+    rotation, translation = day.prior.rotation_sigma_rad, day.prior.translation_sigma_m
+    sigma = np.array([rotation] * 3 + [translation] * 3 + [day.config.time_offset_sigma_s, FOCAL_SIGMA])
+    return np.where(_IS_TZ, day.tz_variance, sigma**2)
+
+
+def _curvature(day: _Day, state: AlignmentState, level: Level) -> Float[np.ndarray, "8 8"]:
     """Curvature of the cost without its roughness, in the chart of `changed`: Gauss-Newton, from the points' slopes.
 
     For ratios only. Moving tz on real logs moves dt by -0.04 s/m: this says -0.03, response surfaces +0.1 to -0.1.
     """
-    _, information = terms.gradient(state.alone, level)
+    _, information = day.terms.gradient(state.alone, level)
     to_left = np.eye(8)
     to_left[:6, :6] = np.linalg.inv(change_jacobian(state.T_camera_lidar))
-    return to_left.T @ information.sum(0) @ to_left
+    return to_left.T @ information.sum(0) @ to_left + np.diag(1 / _prior_variance(day))
 
 
 def _conclude(
@@ -328,7 +330,7 @@ def _conclude(
         found.state.T_camera_lidar,
         to_left @ found.covariance[:6, :6] @ to_left.T,
         found.observability,
-        ~found.held[:6],
+        found.observability >= OBSERVABLE,
         frames_used=frames,
         frames_rejected=rejected,
         time_offset_s=found.state.dt_s,

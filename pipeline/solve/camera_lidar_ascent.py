@@ -19,6 +19,7 @@ __all__ = [
     "AlignmentState",
     "climb",
     "derivatives",
+    "prior_value",
     "scales",
     "weighted",
 ]
@@ -29,6 +30,7 @@ _TYPICAL_SPEED_MPS = 8.0
 # Intrinsics are known to about this; free within it, so that the pose along the optical axis is not surer
 # than they are.
 FOCAL_SIGMA = 0.003
+_ARRIVED = 0.05  # a step of this share of the ball changes nothing that matters
 NOTHING = np.zeros(8, bool)  # held
 
 
@@ -73,7 +75,7 @@ class AlignmentState:
         return self.moved(np.zeros((1, 8)))
 
 
-def _prior_value(at: Alignments, prior: Prior, config: SolveConfig) -> Float[np.ndarray, " P"]:
+def prior_value(at: Alignments, prior: Prior, config: SolveConfig) -> Float[np.ndarray, " P"]:
     """Log density of the prior, up to a constant."""
     turn = log_so3(at.T_camera_lidar[:, :3, :3] @ prior.T_camera_lidar[:3, :3].T) / prior.rotation_sigma_rad
     shift = (at.T_camera_lidar[:, :3, 3] - prior.T_camera_lidar[:3, 3]) / prior.translation_sigma_m
@@ -100,6 +102,8 @@ def climb(
 ) -> AlignmentState:
     """Maximise by response surfaces: the score is rough at the scale of a pixel, and a quadratic over a ball is not.
 
+    At most `steps`, for valleys are long: fast cars hardly tell tz from the clock.
+
     What is `held` stays at the prior.
     """
     scale = 1.8 * scales(terms, level)
@@ -111,6 +115,8 @@ def climb(
         step[free] = np.linalg.solve(curvature[np.ix_(free, free)], slope[free])
         length = float(np.linalg.norm(step))
         state = state.stepped(step / max(length, 1.0) * scale).held(prior, held)
+        if length < _ARRIVED:
+            break
         if length < 1.0:
             scale = scale * 0.75
     return state
@@ -131,7 +137,7 @@ def _surface(
     """
     at = state.changed(DESIGN * scale)
     gradient, H = fit_quadratics(terms.score(at, level))
-    (before,), (H_prior,) = fit_quadratics(_prior_value(at, prior, config)[:, None])
+    (before,), (H_prior,) = fit_quadratics(prior_value(at, prior, config)[:, None])
     promised = gradient.T @ gradient - H_prior
     least = 0.5 * promised + 1e-9 * np.trace(promised) * np.eye(8)
     return gradient.sum(0) + before, at_least(-H.sum(0) - H_prior, least)

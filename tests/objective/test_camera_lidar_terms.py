@@ -9,7 +9,7 @@ from pipeline.objective.camera_lidar_points import Points
 from pipeline.objective.camera_lidar_terms import Alignments, Level, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.edges import chance_of, fit_match_share
 from pipeline.objective.image_maps import NO_BOUNDARY, CameraMaps, boundary_offsets, contrast_levels
-from pipeline.objective.projection_loops import camera_parameters
+from pipeline.objective.projection_loops import camera_parameters, project_point, project_points
 from pipeline.solve.camera_lidar import AlignmentState, camera_lidar_cost
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from tests.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
@@ -94,6 +94,19 @@ def test_gradients_agree_with_differences_of_the_score(camera):
     h = np.array([1e-3] * 3 + [1e-2] * 3 + [2e-3, 2e-3])
     value = terms.score(state.moved(np.concatenate([np.diag(h), -np.diag(h)])), level).sum(1)
     np.testing.assert_allclose(analytic, (value[:8] - value[8:]) / (2 * h), rtol=0.02, atol=2.0)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+def test_vector_projection_agrees_with_the_point_by_point_one_and_marks_what_cannot_be_seen(camera):
+    c = camera_parameters(camera)
+    xyz = np.random.default_rng(0).normal(0, 10, (3, 500)).astype(np.float32)
+    u, v = np.empty(500, np.float32), np.empty(500, np.float32)
+    pose = np.eye(4)[:3].reshape(-1).astype(np.float32)
+    project_points(c, xyz, 0, 500, pose, np.float32(1.0), u, v)
+    alone = [project_point(c, *p) for p in xyz.T]
+    seen = np.array([a[2] for a in alone])
+    np.testing.assert_array_equal(u == -1, ~seen)
+    np.testing.assert_allclose(np.stack([u, v], -1)[seen], [a[:2] for a in alone if a[2]], atol=0.02)
 
 
 def test_information_is_positive_semidefinite(terms):

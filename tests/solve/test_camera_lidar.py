@@ -10,6 +10,7 @@ from pipeline.geometry.se3 import inverse, log_so3, perturb_exactly
 from pipeline.objective.problem import Prior
 from pipeline.solve.camera_lidar import estimate_camera_lidar
 from pipeline.solve.globalise import evolve
+from pipeline.solve.search_range import search_range
 from tests.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
 
 
@@ -68,14 +69,27 @@ def test_what_the_day_cannot_determine_stays_at_the_prior_with_its_sigma_and_the
 
 
 def test_what_the_day_knows_better_than_the_prior_is_left_to_the_day():
-    day = traced_day(SPARSE, 12, seed=1, dt_s=0.03)
+    day = traced_day(DENSE, 10, seed=1, dt_s=0.03)
     prior = prior_along_the_axis(0.6)
     e = estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
     sigma = np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
     assert e.observable.all()
-    assert 0.1 < sigma[5] < 0.4
+    assert 0.03 < sigma[5] < 0.3
     assert abs(e.T[2, 3] - T_TRUE[2, 3]) < 3 * sigma[5]
     assert e.T[2, 3] != prior.T_camera_lidar[2, 3]
+
+
+def test_the_search_follows_a_prior_that_says_it_may_be_far_off():
+    day = traced_day(DENSE, 10, seed=1, dt_s=0.03)
+    T = perturb_exactly(T_TRUE, np.radians(14.0), 0.5, np.random.default_rng(3))
+    prior = Prior(T, np.eye(4), float(np.radians(14.0)), 0.5)
+    rotation, shift = search_range(prior, SolveConfig())
+    assert np.degrees(rotation) > 14
+    assert shift > 0.5
+    e = estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
+    assert np.abs(np.degrees(log_so3((e.T @ inverse(T_TRUE))[:3, :3]))).max() < 0.4
+    near = Prior(T, np.eye(4), 0.01, 0.01)
+    assert search_range(near, SolveConfig()) == (np.radians(6.0), 0.3)
 
 
 def test_same_seed_gives_the_same_estimate():
