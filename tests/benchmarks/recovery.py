@@ -225,7 +225,7 @@ def _rows(members: list[dict[str, Any]]) -> Iterator[str]:
             cells.append(f"{values.mean():.3f} / {np.percentile(values, 95):.3f}")
         accepted = f"{sum(d['status'] == 'accepted' for d in day)}/{len(day)}"
         known = {p: [m["pairs"][pair] for m in parts[p] if pair in m["pairs"]] for p in PARTS}
-        offsets = [_median([r["time_offset_ms"] for r in known[p]]) for p in PARTS]
+        offsets = [_median([r["time_offset_ms"] for r in known[p]]) for p in PARTS if p not in INJECTED]
         halves = "; ".join(_apart(parts[a], parts[b], pair) for a, b in HALVES)
         yield " | ".join([str(len(day)), pair, *cells, accepted, halves, ", ".join(offsets)])
 
