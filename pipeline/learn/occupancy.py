@@ -38,6 +38,10 @@ class OccupancyMatch:
 class OccupancyMatcher(nn.Module):
     """Widths of the kernels, floor and temperatures are learned; everything else is geometry."""
 
+    yaws: Tensor
+    pitches: Tensor
+    rolls: Tensor
+
     def __init__(self, radar_features: int) -> None:
         super().__init__()
         degree = float(np.pi / 180)
