@@ -21,6 +21,7 @@ from pipeline.results import Progress, StageResult, silent
 from pipeline.solve.alignment import alignment_of
 from pipeline.solve.curvature import blocks_of
 from pipeline.solve.methods import COMPOSED, PAPER_METHODS, UNTHINNED, Solver, solver_of
+from pipeline.solve.search_range import search_range
 from pipeline.solve.select import Selection, select_frames
 from pipeline.solve.trigger import exceeded, trigger_metrics
 from pipeline.store.partitions import Lake, Partition, work_key
@@ -176,7 +177,7 @@ def _judge_all(
 ) -> dict[str, Judged]:
     """Verdict and evidence of each pair; pairs that a method composes come after their factors."""
     doubts = loop_doubts(solution)
-    limits = Limits(np.radians(fleet.solve.search_rotation_deg), fleet.solve.search_translation_m)
+    limits = Limits(*search_range(prior, fleet.solve))
     composed = COMPOSED.get(solution.method, ())
     against = _contradictions(solution, composed)
     limit_rad = float(np.radians(fleet.verify.camera_lidar_limit_deg))
