@@ -2,6 +2,9 @@
 
 Held means: computed and recorded, but the prior stays current. Accepted means that the record vouches for what it
 names in `determined`: azimuth, and elevation where the day tells it, of targets 15 to 40 m away, within a stated limit.
+
+Thresholds were chosen on simulated days of seeds 140 to 145 (demo and paper rig, 40 frames, 24 good days and 28 with
+faults), and on the real day for the question what methods that are .3 to .8 deg off look like.
 """
 
 from __future__ import annotations
@@ -49,7 +52,7 @@ class Limits:
     worse_z: float = 2.33  # one-sided 1 %: a right result near a good prior aligns worse by chance
     # One-sided 16 %: short days hold out some ten frames, and 5 % would hold right results that moved by 10 cm.
     better_z: float = 1.0
-    agree_sigmas: float = 3.0
+    agree_sigmas: float = 4.0  # the largest of six, where held-out frames are too few to tell
     min_frames: int = 8
     min_holdout: int = 3
 
