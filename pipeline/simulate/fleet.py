@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -110,15 +113,22 @@ def simulate_fleet(
             logs += simulate_vehicle_day(spec, v, d, out, report)
             done += spec.frames
     else:
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            jobs = {pool.submit(simulate_vehicle_day, spec, v, d, out): (v, d) for v, d in work}
+        others = set(active_children())
+        context = get_context("spawn")
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=_stop_on_sigterm) as pool:
+            jobs = {pool.submit(_work, spec, v, d, out): (v, d) for v, d in work}
             try:
                 for job in as_completed(jobs):
                     v, d = jobs[job]
                     logs, done = logs + job.result(), done + spec.frames
                     progress(done, total, f"{vehicles[v]} {days[d]}")
-            finally:  # stopped or failed: days not begun yet need not be
+            except (
+                BaseException
+            ):  # stopped or failed: days not begun yet need not be, nor those that were begun
                 pool.shutdown(wait=False, cancel_futures=True)
+                for worker in set(active_children()) - others:
+                    worker.terminate()
+                raise
     return {
         "vehicles": vehicles,
         "days": days,
@@ -127,6 +137,24 @@ def simulate_fleet(
         "fleet": str(out / "fleet.toml"),
         "truth": str(out / "truth"),
     }
+
+
+def _stop_on_sigterm() -> None:
+    """A worker told to stop unwinds, so that no log is left in halves; ^C reaches it through its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
+
+
+def _work(spec: FleetSpec, vehicle: int, day: int, out: Path) -> int:
+    try:
+        return simulate_vehicle_day(spec, vehicle, day, out)
+    except SystemExit as err:  # told to stop, and unwound: the pool would hand this worker the next day
+        os._exit(int(err.code or 0))
+
+
+def _leave(signum: int, _frame: Any) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.exit(128 + signum)
 
 
 def simulate_vehicle_day(

@@ -1,4 +1,8 @@
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
@@ -44,3 +48,30 @@ def test_the_job_refuses_what_cannot_be_before_it_writes_anything(wrong, tmp_pat
     with pytest.raises(ConfigError):
         simulate(out=tmp_path / "out", **wrong)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_simulation_in_several_processes_stops_at_once_and_leaves_no_half_log(tmp_path):
+    command = [f"{sys.prefix}/bin/boresight", "simulate", "--out", tmp_path, "--vehicles", "2", "--days", "2"]
+    command += ["--frames", "90", "--workers", "2"]
+    running = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    try:
+        _wait_until(lambda: len(list(tmp_path.glob("logs/*/*/.partial-*"))) == 2, 120)
+        began = time.monotonic()
+        running.send_signal(signal.SIGTERM)
+        stdout, _ = running.communicate(timeout=60)
+    except BaseException:
+        running.terminate()
+        running.communicate()
+        raise
+    assert running.returncode == 128 + signal.SIGTERM
+    assert json.loads(stdout.splitlines()[-1])["status"] == "stopped"
+    assert time.monotonic() - began < 30  # two days take minutes
+    assert not [p for p in tmp_path.glob("logs/*/*/*") if p.name.startswith(".partial") or p.is_file()]
+
+
+def _wait_until(true, seconds):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.1)
