@@ -2,7 +2,9 @@
 
 L_P sums the losses of the triggered pairs; the others stay at the prior and still close the loop.
 
-Source: section 4.5.3, equations 1 and 2, the row "joint optimization" of Table 1.
+Source: section 4.5.3, equations 1 and 2, the row "joint optimization" of Table 1. Differences are those of `pairwise`,
+and one more: in L_P each pair's loss is divided by the value of its pairwise minimum. Unscaled, two simulated days gave
+camera-lidar .09/.44, camera-radar .09/.53, lidar-radar .10/.81 deg; scaled .10/.17, .22/.46, .29/.59.
 """
 
 from __future__ import annotations
