@@ -48,11 +48,12 @@ _VERDICT_SIGMA = np.array(
     [np.radians(0.5), np.radians(6.0), 0.2]
 )  # wide in elevation: that is not what decides
 # What resampling can't show, sigma per DoF: a radar's own constant elevation error looks like pitch and is taken as
-# 0 +- 0.15 deg (a fortieth of a car radar's resolution cell), unobserved roll tilts azimuths, radars see into objects.
-_ELEVATION_BIAS_RAD = np.radians(0.15)
-_BIAS_FLOOR = np.array([np.radians(0.1), _ELEVATION_BIAS_RAD, np.radians(0.05), 0.02, 0.02, 0.02])
+# 0 +- 0.2 deg (a thirtieth of a car radar's resolution cell), unobserved roll tilts azimuths, radars see into objects.
+_ELEVATION_BIAS_RAD = np.radians(0.2)
+_BIAS_FLOOR = np.array([np.radians(0.1), _ELEVATION_BIAS_RAD, np.radians(0.03), 0.02, 0.02, 0.02])
 _DT_FLOOR_S = 0.002  # halves of a real day differed by 3 ms where resampling said 1
 _DT_TOLD_S = 0.005  # a time offset known no better than this is called so
+_CLEARLY = 4.0  # standard errors by which frames reject the end of another start
 _MOVING_MPS = 3.0
 _SIDEWAYS_MPS = (
     0.3  # of a radar 3 m ahead of the axle: 6 deg/s, 0.1 deg in 20 ms; Doppler's own noise is 0.05 m/s
@@ -129,10 +130,11 @@ def estimate_lidar_radar(
     some = problem if frames.count < _MANY_FRAMES else problem.of_frames(np.arange(0, frames.count, 2))
     ends = [anneal(some, start) for start in scan(problem, config)]
     costs = [_sharp_cost(problem, end) for end in ends]
-    settled = _settle(problem, ends[int(np.argmin(costs))], covariance_camera_lidar, config, rng)
+    best = ends[int(np.argmin([c.mean() for c in costs]))]
+    settled = _settle(problem, best, covariance_camera_lidar, config, rng)
     parts = [problem.of_frames(np.arange(k, frames.count, 2)) for k in (0, 1)]
     halves = [finish(part, settled.state, settled.held)[0] for part in parts]
-    return _conclude(problem, settled, ends, halves, rejected)
+    return _conclude(problem, settled, [best, _rival(ends, costs)], halves, rejected)
 
 
 def lidar_radar_cost(
@@ -167,12 +169,20 @@ def _turns_unmeasured(observations: Sequence[Observation], frames: RegistrationF
     return unmeasured & (np.abs(sideways) > _SIDEWAYS_MPS)
 
 
-def _sharp_cost(problem: RadarProblem, state: RadarState) -> float:
-    """Cost that compares ends of different starts: same sigmas for all."""
+def _sharp_cost(problem: RadarProblem, state: RadarState) -> np.ndarray:
+    """Cost of each frame that compares ends of different starts: same sigmas for all."""
     T, dt_s = state.T_lidar_radar, state.dt_s
-    return float(
-        normal_equations(problem.frames, T, dt_s, _VERDICT_SIGMA, 0.0, OUTLIER, stride=2).cost.mean()
-    )
+    return normal_equations(problem.frames, T, dt_s, _VERDICT_SIGMA, 0.0, OUTLIER, stride=2).cost
+
+
+def _rival(ends: list[RadarState], costs: list[np.ndarray]) -> RadarState:
+    """The end of another start that the frames do not clearly rate below the best one; else the best one itself."""
+    best = int(np.argmin([c.mean() for c in costs]))
+    for end, cost in zip(ends, costs, strict=True):
+        worse = cost - costs[best]
+        if end is not ends[best] and worse.mean() < _CLEARLY * worse.std() / np.sqrt(len(worse)):
+            return end
+    return ends[best]
 
 
 def _settle(

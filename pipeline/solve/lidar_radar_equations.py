@@ -63,8 +63,8 @@ _ELEVATION_DOF = np.array([0, 1, 5])
 # large as the spread of the elevations: the angle noise^2 / spread. Real logs (3.2 deg of noise, spread 3.9): 2.6 deg
 # where 1-2 deg of pitch and 4-5 deg of roll were seen; simulation (.65 deg, spread 3-6): .07-.16 deg where .01-.12 was
 # seen. A coarse lidar adds a share of its beam spacing, for points collapse onto the rings. z is wrong by the same
-# angle at 10 m.
-_RING_SHARE, _Z_DISTANCE_M, _Z_FLOOR_M = 0.05, 10.0, 0.03
+# angle at 15 m.
+_RING_SHARE, _Z_DISTANCE_M, _Z_FLOOR_M = 0.05, 15.0, 0.03
 _ROLL_FACTOR = 0.7  # of pitch's at an azimuth of one radian: both sides seldom err in opposite directions
 _DEFAULT_SPACING_RAD = np.radians(1.0)
 RANGE_BIAS_SIGMA_M = 0.05  # radars' own, and what lies behind the surface that the lidar sees
