@@ -38,9 +38,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
     "report": ("jobs.report:report", "HTML pages of vehicle-days and of the fleet."),
     "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),
-    "export": ("jobs.export:export", "Write the tables' contracts as JSON Schema, or a trained network as ONNX."),
+    "export": (
+        "jobs.export:export",
+        "Write the tables' contracts as JSON Schema, or a trained network as ONNX.",
+    ),
     "simulate": ("jobs.simulate:simulate", "Logs of a synthetic fleet, its truth in a file of its own."),
-    "evaluate": ("jobs.evaluate:evaluate", "Compare calibration records with a known truth or a reflector recording, as the paper does."),
+    "evaluate": ("jobs.evaluate:evaluate", "Compare records with a known truth or a reflector recording."),
 }
 
 
