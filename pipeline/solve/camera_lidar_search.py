@@ -17,11 +17,10 @@ from pipeline.solve.search_range import search_range
 
 __all__ = ["Basin", "difference", "find_basin"]
 
-_RESTARTS, _MOST_RESTARTS = 2, 4
-_COARSE_POINTS = 6000  # per restart: a basin needs no more
+_RESTARTS, _MOST_RESTARTS = 2, 6
 _SAME_ROTATION_RAD, _SAME_SHIFT_M = np.radians(0.4), 0.15  # ends nearer than this are one optimum
-# Population and generations: of a box of 6 deg about the prior, and of one of 30.
-_NARROW, _WIDE, _WIDE_RAD = (48, 36), (64, 50), np.radians(9.0)
+# Population, generations, points: of a box of 6 deg about the prior, and of one of 20 or 30.
+_NARROW, _WIDE, _WIDE_RAD = (48, 36, 6000), (64, 70, 9000), np.radians(9.0)
 _SIGMAS_OF_CLOCK = 2.0
 _STEPS = 10
 _COARSE = Level.wide(10.0, 0, match=0.1)
@@ -43,7 +42,7 @@ class Basin:
 def find_basin(
     terms: Terms, thin: Terms, first: Level, prior: Prior, config: SolveConfig, rng: np.random.Generator
 ) -> Basin:
-    """Restart until another end vouches for the best one, at most four times.
+    """Restart until another end vouches for the best one, at most six times.
 
     Args:
         terms: all points, for the evolution.
@@ -77,10 +76,11 @@ def difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]:
 
 def _evolved(terms: Terms, prior: Prior, config: SolveConfig, rng: np.random.Generator) -> AlignmentState:
     """Differential evolution in the search box, wide kernels, a random share of the points."""
-    points = len(terms.edges.xyz_m) + len(terms.markings.xyz_m)
-    thin = terms.thinned(min(1.0, _COARSE_POINTS / max(points, 1)), rng)
-    weight = _CLASS_WEIGHT_PER_POINT * (len(thin.edges.xyz_m) + len(thin.markings.xyz_m))
     rotation, shift = search_range(prior, config)
+    population, generations, most = _WIDE if rotation > _WIDE_RAD else _NARROW
+    points = len(terms.edges.xyz_m) + len(terms.markings.xyz_m)
+    thin = terms.thinned(min(1.0, most / max(points, 1)), rng)
+    weight = _CLASS_WEIGHT_PER_POINT * (len(thin.edges.xyz_m) + len(thin.markings.xyz_m))
     T_0 = prior.T_camera_lidar
     clock = config.time_offset_sigma_s
     box = np.array([rotation] * 3 + [shift] * 3 + [_SIGMAS_OF_CLOCK * clock])
@@ -94,7 +94,6 @@ def _evolved(terms: Terms, prior: Prior, config: SolveConfig, rng: np.random.Gen
         score = thin.score(at, _COARSE).sum(1) + weight * thin.class_information(at)
         return -score + 0.5 * ((x / sigma) ** 2).sum(1)
 
-    population, generations = _WIDE if rotation > _WIDE_RAD else _NARROW
     x, _ = evolve(
         cost, -box, box, rng, population=population, generations=generations, start=np.zeros((1, 7))
     )
