@@ -65,7 +65,11 @@ def test_what_we_import_we_declare():
 
     project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *extras["ray"], *extras["train"]]  # what people, not developers, install
+    wanted = [
+        *project["dependencies"],
+        *extras["ray"],
+        *extras["train"],
+    ]  # what people, not developers, install
     declared = {d.split("=")[0].split("[")[0].lower().replace("-", "_") for d in wanted}
     called = {"cv2": "opencv_python_headless"}  # import name -> distribution
     imported = set()

@@ -95,7 +95,12 @@ def test_the_picks_that_simulate_wrote_are_read_as_they_are(folder):
     assert "| joint-ssl | highway | 0 | - | - | - | - |  |" in extended.read_text()
     assert "Extended data table 1" in stderr
     page = (out / "table_1.html").read_text()
-    for words in ("paper: joint SSL", "Extended data table 1", "Every run", "No pictures: the lake no longer has"):
+    for words in (
+        "paper: joint SSL",
+        "Extended data table 1",
+        "Every run",
+        "No pictures: the lake no longer has",
+    ):
         assert words in page
     assert "Are the sigmas honest?" not in page  # positions are no truth for each axis
     one_file = folder / "one.md"
