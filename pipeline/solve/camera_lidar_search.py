@@ -15,10 +15,10 @@ from pipeline.solve.camera_lidar_ascent import AlignmentState, climb
 from pipeline.solve.globalise import evolve
 from pipeline.solve.search_range import search_range
 
-__all__ = ["Basin", "difference", "find_basin"]
+__all__ = ["SAME_ROTATION_RAD", "Basin", "difference", "find_basin"]
 
 _RESTARTS, _MOST_RESTARTS = 2, 6
-_SAME_ROTATION_RAD, _SAME_SHIFT_M = np.radians(0.4), 0.15  # ends nearer than this are one optimum
+SAME_ROTATION_RAD, _SAME_SHIFT_M = float(np.radians(0.4)), 0.15  # ends nearer than this are one optimum
 # Population, generations, points: of a box of 6 deg about the prior, and of one of 20 or 30.
 _NARROW, _WIDE, _WIDE_RAD = (48, 36, 6000), (64, 70, 9000), np.radians(9.0)
 _SIGMAS_OF_CLOCK = 2.0
@@ -60,7 +60,7 @@ def find_basin(
         best = int(np.argmax(scores))
         others = [difference(e, ends[best]) for i, e in enumerate(ends) if i != best]
         apart = [(float(np.linalg.norm(d[:3])), float(np.linalg.norm(d[3:6]))) for d in others]
-        agree = any(a < _SAME_ROTATION_RAD and s < _SAME_SHIFT_M for a, s in apart)
+        agree = any(a < SAME_ROTATION_RAD and s < _SAME_SHIFT_M for a, s in apart)
         if len(ends) >= _RESTARTS and agree:
             break
     rotation, shift = min(apart)

@@ -20,6 +20,7 @@ from pipeline.geometry.se3 import adjoint, compose_covariance, inverse, log_so3
 from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.results import Progress, silent
 from pipeline.solve.camera_lidar import estimate_camera_lidar
+from pipeline.solve.camera_lidar_search import SAME_ROTATION_RAD
 from pipeline.solve.camera_radar import estimate_camera_radar
 from pipeline.solve.covariance import OBSERVABLE
 from pipeline.solve.lidar_radar import estimate_lidar_radar
@@ -87,6 +88,7 @@ def solve_joint(
         observations["camera_radar"], prior, config, np.random.default_rng([seed, 2])
     )
     camera_radar, loop_rad, open_loop = compose_pairs(camera_lidar, lidar_radar, alone, prior)
+    doubts["camera_lidar"] += _camera_lidar_doubts(camera_lidar)
     doubts["lidar_radar"] += _lidar_radar_doubts(lidar_radar)
     doubts["camera_radar"] += [*doubts["camera_lidar"], *doubts["lidar_radar"], *open_loop]
     pairs = {"camera_lidar": camera_lidar, "camera_radar": camera_radar, "lidar_radar": lidar_radar}
@@ -169,6 +171,14 @@ def _time_offset(camera_lidar: PairEstimate, lidar_radar: PairEstimate) -> tuple
     return a + b, float(
         np.hypot(camera_lidar.time_offset_sigma_s or 0.0, lidar_radar.time_offset_sigma_s or 0.0)
     )
+
+
+def _camera_lidar_doubts(estimate: PairEstimate) -> list[str]:
+    """A best end that no other restart came near may be one of several optima: its sigma knows only its own."""
+    apart_deg = estimate.diagnostics.get("restart_rotation_spread_deg", 0.0)
+    if apart_deg <= np.degrees(SAME_ROTATION_RAD):
+        return []
+    return [f"no restart vouches for the optimum: the nearest other end is {apart_deg:.1f} deg away"]
 
 
 def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:

@@ -79,6 +79,13 @@ def test_what_the_day_knows_better_than_the_prior_is_left_to_the_day():
     assert e.T[2, 3] != prior.T_camera_lidar[2, 3]
 
 
+def test_what_sparse_rings_leave_open_of_a_vague_prior_is_said_with_a_sigma_that_covers_it():
+    day = traced_day(SPARSE, 12, seed=1, dt_s=0.03)
+    e = estimate_camera_lidar(day, prior_along_the_axis(0.6), SolveConfig(), np.random.default_rng(0))
+    sigma = np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
+    assert abs(e.T[2, 3] - T_TRUE[2, 3]) < 3 * sigma[5]
+
+
 def test_the_search_follows_a_prior_that_says_it_may_be_far_off():
     day = traced_day(DENSE, 10, seed=1, dt_s=0.03)
     T = perturb_exactly(T_TRUE, np.radians(14.0), 0.5, np.random.default_rng(3))

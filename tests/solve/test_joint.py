@@ -103,6 +103,16 @@ def test_pairs_that_cannot_be_solved_keep_the_prior_with_a_doubt():
     assert len(solution.doubts["camera_radar"]) >= 2
 
 
+def test_a_camera_lidar_end_that_no_restart_came_near_is_a_doubt_about_both_camera_pairs(monkeypatch):
+    for apart_deg, doubted in ((0.1, False), (2.6, True)):
+        found = replace(camera_lidar(), diagnostics={"restart_rotation_spread_deg": apart_deg})
+        monkeypatch.setattr("pipeline.solve.joint.estimate_camera_lidar", lambda *_, found=found: found)
+        solution = solve_joint(dict.fromkeys(PAIRS, street_day(3)), PRIOR, SolveConfig(), seed=0)
+        for pair in ("camera_lidar", "camera_radar"):
+            assert any("no restart" in why for why in solution.doubts.get(pair, [])) == doubted
+        assert not any("no restart" in why for why in solution.doubts["lidar_radar"])
+
+
 def test_an_untriggered_camera_lidar_stays_at_the_prior_and_its_boxes_are_not_trusted():
     day = street_day(24)
     start = perturb_exactly(T_LIDAR_RADAR, np.radians(2.0), 0.05, np.random.default_rng(0))
