@@ -223,6 +223,7 @@ class _Day:
     tz_variance: float  # [m2]
     heading_sigma_rad: float
     sweep_s_per_rad: float
+    clock_bias_s: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +252,10 @@ def _determined(day: _Day, state: AlignmentState, level: Level, rng: np.random.G
     seen = 1 - variance / before[1] ** 2
     if seen < OBSERVABLE:
         tz_m, variance = before[0], before[1] ** 2
-    day = replace(day, prior=with_tz(day.prior, tz_m), tz_variance=variance)
+    # Seen from a moving car, a shift of the evidence along the axis is one in time.
+    speed_mps = max(float(np.sqrt(np.mean(day.terms.velocity_lidar**2) * 3)), 1.0)
+    clock_bias_s = profile.bias_m / speed_mps
+    day = replace(day, prior=with_tz(day.prior, tz_m), tz_variance=variance, clock_bias_s=clock_bias_s)
     state = state.stepped(follow * (tz_m - state.T_camera_lidar[2, 3]))
     held, observability = _IS_TZ, np.ones(6)
     while True:
@@ -288,7 +292,8 @@ def _measured(
         block,
         np.random.default_rng(day.seed),
     )
-    floor = np.where(held, 0.0, np.append(_BIAS_FLOOR, [_TIME_OFFSET_FLOOR_S, 0.0]))
+    clock_floor_s = np.hypot(_TIME_OFFSET_FLOOR_S, day.clock_bias_s)
+    floor = np.where(held, 0.0, np.append(_BIAS_FLOOR, [clock_floor_s, 0.0]))
     motion = motion_biases(terms, state, level, curvature, held, day.heading_sigma_rad, day.sweep_s_per_rad)
     covariance = covariance + np.diag(floor**2) + motion.T @ motion
     return covariance, np.clip(1 - np.diag(covariance) / prior_variance, 0.0, 1.0)[:6]
