@@ -2,9 +2,9 @@
 
 import ast
 import importlib
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -116,11 +116,10 @@ def test_help_comes_within_a_second_and_loads_nothing_heavy():
         "heavy = {'torch', 'open3d', 'numpy', 'pyarrow', 'scipy', 'numba', 'cv2', 'matplotlib', 'pydantic'};"
         "print('loaded:', sorted(heavy & set(sys.modules)))"
     )
-    seconds = []
-    for _ in range(3):  # the best of three: another process may be busy on this machine
-        began = time.monotonic()
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        seconds.append(time.monotonic() - began)
-        assert done.stdout.splitlines()[-1] == "loaded: []"
-    assert min(seconds) < 1.0
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert done.stdout.splitlines()[-1] == "loaded: []"
+    # Of the processor, not of the clock: another process may be busy on this machine.
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.0
     assert all(command in done.stdout for command in COMMANDS)

@@ -7,11 +7,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.calibration_records import Inputs, record_of
+from pipeline.calibration_records import Inputs, Judged, record_of
 from pipeline.geometry.se3 import exp_so3, inverse, transform_points
 from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.solve.select import Selection
 from pipeline.store.partitions import Partition
+from pipeline.verify.claims import Claim
 from pipeline.verify.evaluation import compare, current_runs
 from pipeline.verify.table import as_markdown, as_parquet, table_rows
 from pipeline.verify.targets import (
@@ -106,9 +107,10 @@ def make_run(method="joint", seed=0, key="k1", off_deg=0.2, speed=10.0):
     selection = Selection(empty, empty, dict.fromkeys(PAIRS, 0), {p: {} for p in PAIRS})
     day = [replace(o, ego_speed_mps=speed) for o in make_day(1)]
     about = Inputs(Partition("v", "2024-01-01"), method, key, seed, ())
+    claims = dict.fromkeys(("azimuth", "elevation"), Claim(0.003, 0.0, 0.003, 0.002, 0.007, 0.995))
     return [
         record_of(
-            about, p, Solution(method, pairs), prior, Verdict("accepted", ""), None, selection, day,
+            about, p, Solution(method, pairs), prior, Judged(Verdict("accepted", ""), None, claims), selection, day,
             before={}, after={}, triggered=True,
         )
         for p in PAIRS
