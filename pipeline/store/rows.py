@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -33,14 +33,22 @@ def to_table(rows: Sequence[Any], schema: TableSchema) -> pa.Table:
 def from_table(table: pa.Table, schema: TableSchema, row_type: type[Row]) -> list[Row]:
     """Row dataclasses of a table; array fields are decoded without a copy.
 
+    Records are kept for good: a column that an older release did not write yet takes the field's default.
+
     Raises:
-        ContractError: the table lacks a column of the schema.
+        ContractError: the table lacks a column of the schema that has no default.
     """
-    missing = [c.name for c in schema.columns if c.name not in table.column_names]
+    known = {f.name: f for f in fields(row_type)}  # type: ignore[arg-type]
+    absent = [c.name for c in schema.columns if c.name not in table.column_names]
+    optional = {name for name, f in known.items() if (f.default, f.default_factory) != (MISSING, MISSING)}
+    missing = [name for name in absent if name not in optional]
     if missing:
         raise ContractError(schema.name, f"columns missing: {', '.join(missing)}")
-    names = {f.name for f in fields(row_type)}  # type: ignore[arg-type]
-    values = {c.name: _decode_column(table.column(c.name), c) for c in schema.columns if c.name in names}
+    values = {
+        c.name: _decode_column(table.column(c.name), c)
+        for c in schema.columns
+        if c.name in known and c.name not in absent
+    }
     return [row_type(**{name: values[name][i] for name in values}) for i in range(table.num_rows)]
 
 

@@ -146,6 +146,21 @@ def test_records_are_appended_and_the_same_work_gives_the_same_file(lake, rng):
     assert read_records(lake, CALIBRATIONS, CalibrationRecord, day="2026-03-03") == []
 
 
+def test_records_of_a_release_that_knew_fewer_columns_stay_readable(lake, rng):
+    row = make_row("calibrations", rng, vehicle="car", score=0.5, drive_missing=["nothing left"])
+    path = write_records(lake, CALIBRATIONS, DAY, [row], "k1", "0.1")
+    footer = pq.read_metadata(path).metadata
+    whole = pq.read_table(path, partitioning=None).replace_schema_metadata(footer)
+    for gone, readable in ((["score", "drive_missing"], True), (["pair"], False)):
+        pq.write_table(whole.drop_columns(gone), path)
+        if readable:
+            (found,) = read_records(lake, CALIBRATIONS, CalibrationRecord)
+            assert (found.score, found.drive_missing, found.pair) == (None, [], row.pair)
+        else:
+            with pytest.raises(ContractError, match="columns missing: pair"):
+                read_records(lake, CALIBRATIONS, CalibrationRecord)
+
+
 def test_the_newest_record_file_comes_last(lake, rng):
     for age, key in ((100, "a"), (300, "b"), (200, "c")):
         path = write_records(lake, CALIBRATIONS, DAY, [make_row("calibrations", rng, seed=age)], key, "0.1")
