@@ -35,6 +35,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("jobs.calibrate:calibrate", "Observations of one vehicle-day to calibration records."),
     "prepare": ("jobs.prepare:prepare", "Frames and observations of many vehicle-days to training data."),
     "train": ("jobs.train:train", "A network from training data, without any ground truth."),
+    "train-radar-drivable": (
+        "jobs.train_radar_drivable:train_radar_drivable",
+        "A small network for the radar's drivable area, taught by the lidar.",
+    ),
     "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
     "report": ("jobs.report:report", "HTML pages of vehicle-days and of the fleet."),
     "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),

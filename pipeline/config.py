@@ -21,6 +21,7 @@ __all__ = [
     "IngestConfig",
     "LearnConfig",
     "LidarTopics",
+    "OnnxDrivable",
     "OnnxSemantics",
     "PerceiveConfig",
     "PrepareConfig",
@@ -78,6 +79,13 @@ class LidarTopics(_Section):
     points: Topic
 
 
+class OnnxDrivable(_Section):
+    """The radar's drivable area computed here by a network; path of its manifest, relative to fleet.toml."""
+
+    source: Literal["onnx"]
+    model: str
+
+
 class RadarTopics(_Section):
     """The radar's topic and what its Doppler means."""
 
@@ -86,6 +94,8 @@ class RadarTopics(_Section):
     doppler_positive: Literal["approaching", "receding"] = "receding"
     doppler_period_mps: Positive | None = None
     azimuth_positive: Literal["left", "right"] = "left"  # RadarScan drivers differ; PointCloud2 has x y z
+    # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
+    drivable: OnnxDrivable | None = Field(default=None, exclude=True)
 
 
 class EgoTopics(_Section):

@@ -35,7 +35,7 @@ from pipeline.learn.views import RenderedView
 from schemas.training import GRID_CLASSES
 from schemas.versions import CODE_VERSION
 
-__all__ = ["OPSET", "export_onnx"]
+__all__ = ["OPSET", "card_markdown", "export_onnx"]
 
 OPSET = 18
 
@@ -166,10 +166,11 @@ def _write_card(
         **card,
     }
     out.with_suffix(".json").write_text(json.dumps(plain, indent=2, default=str) + "\n")
-    out.with_suffix(".md").write_text(_markdown(plain))
+    out.with_suffix(".md").write_text(card_markdown(plain))
 
 
-def _markdown(plain: dict[str, Any]) -> str:
+def card_markdown(plain: dict[str, Any]) -> str:
+    """A card for people."""
     lines = [f"# Model card of {plain['file']}", ""]
     for key, value in plain.items():
         if isinstance(value, dict):

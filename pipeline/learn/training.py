@@ -35,7 +35,7 @@ from pipeline.learn.step import Passes, batch_loss
 from pipeline.results import Progress, silent
 from pipeline.store.partitions import Lake
 
-__all__ = ["TrainRequest", "TrainResult", "train"]
+__all__ = ["TrainRequest", "TrainResult", "told_to_stop", "train"]
 
 _VALIDATION_SEED = 977  # the guesses of validation are the same every time
 
@@ -85,7 +85,7 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
     request.out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         processes = stack.enter_context(joined(request.device))
-        told = stack.enter_context(_told_to_stop())
+        told = stack.enter_context(told_to_stop())
         run = begin_run(
             request.data, request.out, config, processes, compiled=request.compiled, resident=request.resident
         )
@@ -203,7 +203,7 @@ def _generator(seed: int, step: int, rank: int) -> torch.Generator:
 
 
 @contextmanager
-def _told_to_stop() -> Iterator[list[int]]:
+def told_to_stop() -> Iterator[list[int]]:
     """A list that SIGTERM and SIGINT add their number to, instead of ending the process in the middle of a step."""
     told: list[int] = []
     if threading.current_thread() is not threading.main_thread():  # Ray's workers: signals are not theirs

@@ -1,8 +1,8 @@
 """How far the road is free in each direction, seen by the radar.
 
 The static returns of a road scene lie on kerbs, rails, walls and parked cars; the asphalt itself scatters
-away. The free sector of a direction ends at its nearest static return that is no loner. Geometry, instead of
-the paper's weakly supervised network.
+away. The free sector of a direction ends at its nearest static return that is no loner. Geometry, where no
+model of the paper's weakly supervised network is given.
 
 Source: paper, section 4.2 (radar drivable area), as the geometric fallback of the design.
 """
@@ -10,12 +10,15 @@ Source: paper, section 4.2 (radar drivable area), as the geometric fallback of t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 from scipy.spatial import cKDTree
 
-__all__ = ["FreeSector", "free_sector"]
+from pipeline.geometry.radar_grid import Scan
+
+__all__ = ["DrivableSource", "FreeSector", "free_sector"]
 
 _BIN_RAD = np.deg2rad(2.0)
 _HALF_SECTOR_RAD = np.deg2rad(70.0)
@@ -37,6 +40,17 @@ class FreeSector:
 
     azimuth_rad: Float32[np.ndarray, " B"]
     range_m: Float32[np.ndarray, " B"]
+
+
+@runtime_checkable
+class DrivableSource(Protocol):
+    """Who tells the radar's drivable area in place of geometry, scan by scan of a vehicle-day."""
+
+    provenance: dict[str, Any]  # what of it belongs into the work key
+
+    def free_sector(self, scan: Scan) -> FreeSector:
+        """Free ranges by direction."""
+        ...
 
 
 def free_sector(

@@ -9,11 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config import FleetConfig, OnnxSemantics, PerceiveConfig, TopicSemantics, config_hash
+from pipeline.config import (
+    FleetConfig,
+    OnnxSemantics,
+    PerceiveConfig,
+    RadarTopics,
+    TopicSemantics,
+    config_hash,
+)
 from pipeline.errors import ContractError
 from pipeline.geometry.cameras import Camera
+from pipeline.geometry.radar_grid import Scan
 from pipeline.perceive.camera import SemanticsSource, TopicSource, decode_grey, encode_png
-from pipeline.perceive.drivable import free_sector
+from pipeline.perceive.drivable import DrivableSource, free_sector
 from pipeline.perceive.edges import lidar_edges
 from pipeline.perceive.ground import find_ground
 from pipeline.perceive.labels import ROAD_ID
@@ -62,12 +70,15 @@ def perceive_day(
         ContractError: the day has no frames yet.
         ModelError: a model does not do what its manifest says.
     """
-    semantics = fleet.rig_of(partition.vehicle, file=str(fleet_file)).camera.semantics
+    rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
     frames = read_manifest(lake, FRAMES, partition)
     if frames is None:
         folder = lake.folder(FRAMES.name, partition)
         raise ContractError(str(folder), "no frames of this vehicle and day: run `boresight ingest` first")
-    source, semantics_key = _source(semantics, fleet.perceive, fleet_file)
+    source, semantics_key = _source(rig.camera.semantics, fleet.perceive, fleet_file)
+    drivable = _drivable(rig.radar, fleet_file)
+    if drivable is not None:
+        semantics_key |= drivable.provenance
     key = work_key("perceive", CODE_VERSION, config_hash(fleet.perceive, semantics_key), [frames.work_key])
     done = read_manifest(lake, OBSERVATIONS, partition)
     if done is not None and done.work_key == key:
@@ -78,7 +89,7 @@ def perceive_day(
         for group in iterate_rows(lake, FRAMES, partition, Frame):
             for frame in group:
                 try:
-                    observation, state = perceive_frame(frame, source, fleet.perceive, state)
+                    observation, state = perceive_frame(frame, source, fleet.perceive, state, drivable)
                     rows.append(observation)
                 except FrameRejectedError as rejection:
                     rejected[rejection.reason.value] += 1
@@ -95,9 +106,20 @@ def perceive_day(
 
 
 def perceive_frame(
-    frame: Frame, source: SemanticsSource, config: PerceiveConfig, tracks: TrackState
+    frame: Frame,
+    source: SemanticsSource,
+    config: PerceiveConfig,
+    tracks: TrackState,
+    drivable: DrivableSource | None = None,
 ) -> tuple[Observation, TrackState]:
     """Everything that one frame shows, and the radar tracks carried on.
+
+    Args:
+        frame: the next of the day.
+        source: of the camera's semantics.
+        config: gates and sizes.
+        tracks: from the frame before.
+        drivable: network for the radar's drivable area, which remembers the scans before; None = geometry.
 
     Raises:
         FrameRejectedError: the frame cannot be used; `tracks` stay as they were.
@@ -109,7 +131,7 @@ def perceive_frame(
     # One generator per frame: the result does not depend on which frames came before.
     rng = np.random.default_rng([frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index])
     lidar = _perceive_lidar(frame, config, rng)
-    radar, motion, state = _perceive_radar(frame, config, tracks, rng)
+    radar, motion, state = _perceive_radar(frame, config, tracks, rng, drivable)
     copied = {name: getattr(frame, name) for name in _COPIED_FIELDS}
     users = semantics.detections
     observation = Observation(
@@ -195,7 +217,11 @@ def _perceive_lidar(frame: Frame, config: PerceiveConfig, rng: np.random.Generat
 
 
 def _perceive_radar(
-    frame: Frame, config: PerceiveConfig, tracks: TrackState, rng: np.random.Generator
+    frame: Frame,
+    config: PerceiveConfig,
+    tracks: TrackState,
+    rng: np.random.Generator,
+    drivable: DrivableSource | None,
 ) -> tuple[dict[str, Any], RadarMotion, TrackState]:
     """The radar_* columns but those copied from the frame."""
     xyz = frame.radar_xyz_m
@@ -208,7 +234,11 @@ def _perceive_radar(
         tracks, frame.radar_stamp_ns, frame.drive, _ego_motion(frame, motion), returns,
         frame.doppler_period_mps,
     )  # fmt: skip
-    sector = free_sector(xyz, motion.motion, frame.radar_has_elevation)
+    sector = (
+        free_sector(xyz, motion.motion, frame.radar_has_elevation)
+        if drivable is None
+        else drivable.free_sector(_scan(frame, motion))
+    )
     columns = {
         "radar_xyz_m": xyz,
         "radar_residual_mps": motion.residual_mps,
@@ -221,6 +251,29 @@ def _perceive_radar(
         "radar_drivable_range_m": sector.range_m,
     }
     return columns, motion, state
+
+
+def _drivable(radar: RadarTopics, fleet_file: Path) -> DrivableSource | None:
+    if radar.drivable is None:
+        return None
+    from pipeline.perceive.models.radar_drivable import RadarDrivable  # noqa: PLC0415 - as in _source
+
+    return RadarDrivable.load(radar.drivable, fleet_file)
+
+
+def _scan(frame: Frame, motion: RadarMotion) -> Scan:
+    ego = _ego_motion(frame, motion)
+    return Scan(
+        frame.radar_stamp_ns,
+        frame.drive,
+        frame.radar_xyz_m,
+        frame.radar_power_db,
+        motion.residual_mps,
+        motion.motion,
+        frame.radar_has_elevation,
+        ego.velocity_mps,
+        ego.yaw_rate_radps,
+    )
 
 
 def _ego_motion(frame: Frame, motion: RadarMotion) -> EgoMotion:

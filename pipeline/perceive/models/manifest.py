@@ -24,14 +24,16 @@ from __future__ import annotations
 import hashlib
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipeline.errors import ModelError
 from pipeline.perceive.labels import DETECTOR_SETS, LABEL_SETS
 
-__all__ = ["InputSpec", "Manifest", "OutputSpec", "load_manifest"]
+__all__ = ["InputSpec", "Manifest", "OutputSpec", "check_hash", "load_manifest", "read_manifest"]
+
+_Kind = TypeVar("_Kind", bound=BaseModel)
 
 _Unit = Annotated[float, Field(ge=0, le=1)]
 _Size = Annotated[int, Field(gt=0)]
@@ -108,9 +110,22 @@ def load_manifest(file: Path, task: Literal["detect", "segment"]) -> Manifest:
         manifest means;
             the message names the manifest and the key.
     """
+    manifest = read_manifest(file, Manifest)
+    if manifest.task != task:
+        raise ModelError(str(file), f'task: is "{manifest.task}", but fleet.toml uses it to {task}')
+    check_hash(file, manifest.model_file, manifest.sha256)
+    return manifest
+
+
+def read_manifest(file: Path, kind: type[_Kind]) -> _Kind:
+    """A manifest of this kind; its field `file` becomes the path that it was read from.
+
+    Raises:
+        ModelError: missing file, unknown key or impossible value.
+    """
     try:
         raw = tomllib.loads(file.read_text())
-        manifest = Manifest.model_validate({k: v for k, v in raw.items() if k != "file"} | {"file": file})
+        return kind.model_validate({k: v for k, v in raw.items() if k != "file"} | {"file": file})
     except FileNotFoundError as err:
         raise ModelError(str(file), "no such manifest") from err
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as err:
@@ -119,21 +134,18 @@ def load_manifest(file: Path, task: Literal["detect", "segment"]) -> Manifest:
         problems = err.errors(include_url=False)
         text = "; ".join(f"{'.'.join(map(str, p['loc'])) or 'manifest'}: {p['msg']}" for p in problems)
         raise ModelError(str(file), text) from err
-    if manifest.task != task:
-        raise ModelError(str(file), f'task: is "{manifest.task}", but fleet.toml uses it to {task}')
-    _check_hash(manifest)
-    return manifest
 
 
-def _check_hash(manifest: Manifest) -> None:
+def check_hash(file: Path, model_file: Path, sha256: str) -> None:
+    """Make sure that the model is the one that the manifest `file` means.
+
+    Raises:
+        ModelError: it cannot be read, or is another.
+    """
     try:
-        with manifest.model_file.open("rb") as stream:
+        with model_file.open("rb") as stream:
             found = hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as err:
-        raise ModelError(
-            str(manifest.file), f"path: cannot read {manifest.model_file}: {err.strerror}"
-        ) from err
-    if found != manifest.sha256:
-        raise ModelError(
-            str(manifest.file), f"sha256: {manifest.model_file} has {found}, not {manifest.sha256}"
-        )
+        raise ModelError(str(file), f"path: cannot read {model_file}: {err.strerror}") from err
+    if found != sha256:
+        raise ModelError(str(file), f"sha256: {model_file} has {found}, not {sha256}")

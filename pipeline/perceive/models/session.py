@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from jaxtyping import Float32, UInt8
 from pipeline.errors import ModelError
 from pipeline.perceive.models.manifest import InputSpec, Manifest
 
-__all__ = ["Fit", "Session", "fit_image"]
+__all__ = ["Fit", "Session", "fit_image", "open_session"]
 
 
 @dataclass(frozen=True)
@@ -32,17 +33,7 @@ class Session:
 
     def __init__(self, manifest: Manifest) -> None:
         self._manifest = manifest
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-        options.log_severity_level = 3  # its warnings are about graph optimisation, not about results
-        try:
-            self._session = ort.InferenceSession(
-                str(manifest.model_file), options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as err:  # onnxruntime's own exceptions share no base but this
-            raise ModelError(str(manifest.file), f"path: onnxruntime cannot load the model: {err}") from err
+        self._session = open_session(manifest.model_file, manifest.file)
         self._input = self._checked_input()
 
     def run(self, tensor: Float32[np.ndarray, "1 3 H W"]) -> np.ndarray:
@@ -73,6 +64,23 @@ class Session:
                 f"input.size: {list(size)} does not go with the model's input {shape} (1, 3, rows, columns)",
             )
         return str(inputs[0].name)
+
+
+def open_session(model_file: Path, manifest_file: Path) -> ort.InferenceSession:
+    """A session on one thread of the CPU.
+
+    Raises:
+        ModelError: onnxruntime cannot load the model.
+    """
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
+    options.log_severity_level = 3  # its warnings are about graph optimisation, not about results
+    try:
+        return ort.InferenceSession(str(model_file), options, providers=["CPUExecutionProvider"])
+    except Exception as err:  # onnxruntime's own exceptions share no base but this
+        raise ModelError(str(manifest_file), f"path: onnxruntime cannot load the model: {err}") from err
 
 
 def fit_image(

@@ -1,0 +1,113 @@
+"""`boresight train-radar-drivable`: a small network for the radar's drivable area, taught by the lidar."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.config import FleetConfig
+    from pipeline.learn.radar_drivable.samples import DrivableSamples
+    from pipeline.store.partitions import Lake, Partition
+
+__all__ = ["train_radar_drivable"]
+
+
+def train_radar_drivable(
+    *,
+    fleet: Path,
+    lake: str,
+    out: Path,
+    steps: int = 600,
+    batch_size: int = 8,
+    learning_rate: float = 3e-3,
+    seed: int = 0,
+    frames_per_day: int = 100,
+    time_limit: str | None = None,
+    threads: int = 1,
+) -> int:
+    """Train on observations, or go on with the run in OUT; a finished run leaves radar_drivable.onnx and .toml there.
+
+    Name the .toml in fleet.toml: `drivable = { source = "onnx", model = "radar_drivable.toml" }` under the rig's radar.
+    Every fifth vehicle-day is held out (at least one), of a single day its last fifth.
+
+    Args:
+        fleet: fleet.toml; says where each vehicle's prior comes from.
+        lake: folder of the tables, with observations.
+        out: folder of the run: last.pt, metrics.jsonl, the model with its manifest and card.
+        steps: steps in all.
+        batch_size: scans per step.
+        learning_rate: at the start; falls to 1e-5.
+        seed: of everything random.
+        frames_per_day: samples of a vehicle-day at most, evenly spread.
+        time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
+        threads: of the processor.
+    """
+    from dataclasses import asdict
+
+    import torch
+
+    from jobs.summary import print_summary, progress_reporter
+    from jobs.train import parse_duration
+    from pipeline.config import load_fleet
+    from pipeline.learn.radar_drivable.export import export_drivable
+    from pipeline.learn.radar_drivable.training import DrivableTraining, train_drivable
+    from pipeline.store.partitions import Lake
+
+    limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
+    config = DrivableTraining(steps, batch_size, learning_rate, seed=seed)
+    train, held_out, data = _samples(load_fleet(fleet), fleet, Lake.at(lake), frames_per_day)
+    torch.set_num_threads(threads)
+    with progress_reporter(f"train {out.name}") as progress:
+        network, result = train_drivable(train, held_out, out, config, limit, progress)
+    outputs: list[Path] = []
+    if result.status == "done":
+        card = {"data": data, "training": asdict(config), "iou_held_out": result.iou}
+        outputs = [export_drivable(network, out, card)]
+    fields = asdict(result)
+    print_summary("train-radar-drivable", fields.pop("status"), out=out, outputs=outputs, **data, **fields)
+    return 128 + result.signal if result.signal else 0
+
+
+def _samples(
+    config: FleetConfig, fleet_file: Path, lake: Lake, per_day: int
+) -> tuple[DrivableSamples, DrivableSamples, dict[str, int]]:
+    """Samples to learn from, held-out samples, and their numbers."""
+    import numpy as np
+
+    from pipeline.errors import ContractError
+    from pipeline.learn.radar_drivable.samples import joined
+    from schemas.observations import OBSERVATIONS
+
+    days = [p for p in lake.partitions(OBSERVATIONS.name) if p.vehicle in config.vehicles]
+    if not days:
+        raise ContractError(
+            str(lake.root), "no observations of a vehicle in fleet.toml: run `boresight perceive`"
+        )
+    parts = [_samples_of_day(config, fleet_file, lake, day, per_day) for day in days]
+    if len(parts) == 1:
+        # Neighbouring scans are alike: a tenth between the two sides belongs to neither.
+        rows, total = np.arange(len(parts[0])), len(parts[0])
+        train, held_out = parts[0].at(rows[: int(0.7 * total)]), parts[0].at(rows[int(0.8 * total) :])
+    else:
+        train = joined([p for i, p in enumerate(parts) if i % 5 != 1])
+        held_out = joined([p for i, p in enumerate(parts) if i % 5 == 1])
+    return (
+        train,
+        held_out,
+        {"vehicle_days": len(days), "samples": len(train), "held_out_samples": len(held_out)},
+    )
+
+
+def _samples_of_day(
+    config: FleetConfig, fleet_file: Path, lake: Lake, day: Partition, per_day: int
+) -> DrivableSamples:
+    from pipeline.learn.radar_drivable.samples import day_samples
+    from pipeline.prior import read_prior
+    from pipeline.store.tables import read_rows
+    from schemas.observations import OBSERVATIONS, Observation
+
+    rows = read_rows(lake, OBSERVATIONS, day, Observation)
+    prior = config.rig_of(day.vehicle, file=str(fleet_file)).prior
+    T_lidar_radar = read_prior(rows, prior, fleet_file).T_lidar_radar
+    return day_samples(rows, T_lidar_radar, per_day)

@@ -1,0 +1,134 @@
+"""What the network for the radar's drivable area learns from: radar grids, labelled by the lidar.
+
+The label is the lidar's drivable ground, brought into the radar frame by the day's prior, the only calibration that
+is known before calibrating; where the lidar saw nothing there is no label. A wrong prior shifts labels; the
+network sees many vehicles and mirrored scans, so that shifts to the sides cancel.
+
+Source: paper, section 4.2 (weak supervision across sensors).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float16, UInt8
+
+from pipeline.geometry.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, cell_centres, sector_mask
+from pipeline.geometry.se3 import transform_points
+from schemas.observations import Observation
+
+__all__ = ["BLOCKED", "FREE", "UNKNOWN", "DrivableSamples", "day_samples", "joined", "label_grid", "scan_of"]
+
+BLOCKED, FREE, UNKNOWN = 0, 1, 255
+_HALF_M = 64  # the lidar's grid of 1 m cells covers the radar's reach around it
+
+
+@dataclass(frozen=True, eq=False)
+class DrivableSamples:
+    """Samples of one or many days; `geometric` is the fallback's answer, for comparison only."""
+
+    features: Float16[np.ndarray, "N C A R"]
+    label: UInt8[np.ndarray, "N A R"]
+    geometric: Bool[np.ndarray, "N A R"]
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    def at(self, rows: np.ndarray) -> DrivableSamples:
+        """Some of them."""
+        return DrivableSamples(self.features[rows], self.label[rows], self.geometric[rows])
+
+
+def day_samples(
+    observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"], limit: int
+) -> DrivableSamples:
+    """Samples of a vehicle-day, at most `limit`, evenly spread; frames without drivable ground are none.
+
+    Args:
+        observations: in the order of their stamps: earlier scans show in later samples.
+        T_lidar_radar: the day's prior, never a truth.
+        limit: how many to keep.
+    """
+    usable = [i for i, o in enumerate(observations) if len(o.lidar_drivable_xyz_m)]
+    kept = {usable[k] for k in np.linspace(0, len(usable) - 1, min(limit, len(usable))).astype(int)}
+    rows = list(_rows(observations, T_lidar_radar, kept))
+    if not rows:
+        return DrivableSamples(
+            np.zeros((0, len(CHANNELS), *SHAPE), np.float16),
+            np.zeros((0, *SHAPE), np.uint8),
+            np.zeros((0, *SHAPE), bool),
+        )
+    features, labels, geometric = zip(*rows, strict=True)
+    return DrivableSamples(np.stack(features), np.stack(labels), np.stack(geometric))
+
+
+def joined(parts: Sequence[DrivableSamples]) -> DrivableSamples:
+    """All samples of these days."""
+    return DrivableSamples(
+        np.concatenate([p.features for p in parts]),
+        np.concatenate([p.label for p in parts]),
+        np.concatenate([p.geometric for p in parts]),
+    )
+
+
+def scan_of(observation: Observation) -> Scan:
+    """The scan as perception had it when it wrote the row."""
+    velocity = observation.radar_velocity_mps
+    speed = observation.ego_speed_mps
+    own = None if speed is None else (float(speed), 0.0)
+    return Scan(
+        observation.radar_stamp_ns,
+        observation.drive,
+        observation.radar_xyz_m,
+        observation.radar_power_db,
+        observation.radar_residual_mps,
+        observation.radar_motion,
+        observation.radar_has_elevation,
+        own if velocity is None else (float(velocity[0]), float(velocity[1])),
+        observation.ego_yaw_rate_radps,
+    )
+
+
+def label_grid(observation: Observation, T_lidar_radar: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "A R"]:
+    """FREE, BLOCKED or UNKNOWN by the lidar, at each cell of the radar's grid.
+
+    Heights are left out: a cell's centre is looked up where it lies at the radar's height, which a tilt of 2 deg moves
+    by centimetres.
+    """
+    free, seen = _occupied(observation.lidar_drivable_xyz_m), _occupied(observation.lidar_map_xyz_m)
+    azimuth, ranges = cell_centres()
+    x, y = ranges * np.cos(azimuth)[:, None], ranges * np.sin(azimuth)[:, None]
+    lidar = transform_points(T_lidar_radar, np.stack([x, y, np.zeros(SHAPE)], axis=-1).reshape(-1, 3))
+    column, row, inside = _cell(lidar)
+    is_free = inside & free[column, row]
+    known = is_free | (inside & seen[column, row])
+    return np.where(is_free, FREE, np.where(known, BLOCKED, UNKNOWN)).astype(np.uint8).reshape(SHAPE)
+
+
+def _rows(
+    observations: Sequence[Observation], T_lidar_radar: np.ndarray, kept: set[int]
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    memory = ScanMemory()
+    for i, observation in enumerate(observations):
+        features = memory.features(scan_of(observation))
+        if i in kept:
+            geometric = sector_mask(
+                observation.radar_drivable_azimuth_rad, observation.radar_drivable_range_m
+            )
+            yield features.astype(np.float16), label_grid(observation, T_lidar_radar), geometric
+
+
+def _occupied(xyz_m: np.ndarray) -> np.ndarray:
+    out = np.zeros((2 * _HALF_M, 2 * _HALF_M), bool)
+    column, row, inside = _cell(xyz_m)
+    out[column[inside], row[inside]] = True
+    return out
+
+
+def _cell(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cell of 1 m around the lidar of each point, and whether it is one."""
+    cell = np.floor(xyz_m[:, :2]).astype(int) + _HALF_M
+    inside = np.all((cell >= 0) & (cell < 2 * _HALF_M), axis=1)
+    return np.where(inside, cell[:, 0], 0), np.where(inside, cell[:, 1], 0), inside

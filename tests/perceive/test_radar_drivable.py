@@ -1,0 +1,122 @@
+"""A network in place of the geometric drivable area: the whole way from training to the column, and its faults."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.config import FleetConfig, config_hash
+from pipeline.errors import ModelError
+from pipeline.geometry.radar_grid import SHAPE, sector_of
+from pipeline.learn.radar_drivable.export import export_drivable
+from pipeline.learn.radar_drivable.network import build_drivable_network
+from pipeline.learn.radar_drivable.samples import day_samples, scan_of
+from pipeline.learn.radar_drivable.training import DrivableTraining, probabilities, train_drivable
+from pipeline.perceive.models.radar_drivable import RadarDrivable
+from pipeline.perceive.run import perceive_day
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_rows, write_partition
+from schemas.frames import FRAMES
+from schemas.observations import OBSERVATIONS, Observation
+
+DAY = Partition("car-1", "2026-03-02")
+COLUMNS = {"radar_drivable_azimuth_rad", "radar_drivable_range_m"}
+
+
+def fleet(**radar):
+    semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
+    camera = {"image": "/i", "info": "/c", "semantics": semantics}
+    rig = {"camera": camera, "lidar": {"points": "/p"}, "radar": {"points": "/r"} | radar}
+    return FleetConfig.model_validate(
+        {"fleet": {"name": "made"}, "rigs": {"default": rig}, "vehicles": {"car-1": {}}}
+    )
+
+
+MODEL = {"drivable": {"source": "onnx", "model": "radar_drivable.toml"}}
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory, made_frame):
+    """A lake with one drive of eight frames."""
+    lake = Lake.at(tmp_path_factory.mktemp("drive") / "lake")
+    with write_partition(lake, FRAMES, DAY, "frames-key", "test") as writer:
+        writer.append([made_frame(i) for i in range(8)])
+        writer.describe(kept={}, rejected={})
+    return lake
+
+
+def rows(lake):
+    return read_rows(lake, OBSERVATIONS, DAY, Observation)
+
+
+def test_a_network_taught_by_a_days_lidar_tells_the_days_radar_where_the_road_is(lake, tmp_path):
+    torch.set_num_threads(1)
+    file = tmp_path / "fleet.toml"
+    geometric_key = perceive_day(DAY, fleet(), lake, fleet_file=file).work_key
+    before = rows(lake)
+    samples = day_samples(before, np.eye(4), 8)
+    training = DrivableTraining(steps=30, batch_size=4, width=8)
+    network, _ = train_drivable(samples, samples, tmp_path / "run", training)
+    export_drivable(network, tmp_path, {})
+    result = perceive_day(DAY, fleet(**MODEL), lake, fleet_file=file)
+    assert result.status == "done"  # not taken from the cache of the geometric one
+    assert result.work_key != geometric_key
+    after = rows(lake)
+    # What perception feeds the model while it goes through frames is what training made of its rows.
+    for row, p in zip(after, probabilities(network, samples), strict=True):
+        azimuth, range_m = sector_of(p)
+        assert np.array_equal(row.radar_drivable_azimuth_rad, azimuth)
+        assert np.mean(row.radar_drivable_range_m == range_m) > 0.95  # samples are of half precision
+        ahead = np.abs(azimuth) < np.radians(5)
+        aside = np.abs(np.abs(azimuth) - np.radians(50)) < np.radians(5)
+        assert np.median(range_m[ahead]) > np.median(range_m[aside])
+    for a, b in zip(before, after, strict=True):
+        for name in {f.name for f in fields(Observation)} - COLUMNS:
+            assert np.array_equal(getattr(a, name), getattr(b, name)), name
+    assert perceive_day(DAY, fleet(**MODEL), lake, fleet_file=file).status == "cached"
+    assert perceive_day(DAY, fleet(), lake, fleet_file=file).work_key == geometric_key
+    for a, b in zip(before, rows(lake), strict=True):
+        assert all(np.array_equal(getattr(a, name), getattr(b, name)) for name in COLUMNS)
+
+
+def test_the_model_answers_as_the_network_does(lake, tmp_path):
+    perceive_day(DAY, fleet(), lake)
+    network = build_drivable_network(24, 3).eval()
+    model = RadarDrivable(export_drivable(network, tmp_path, {}))
+    from pipeline.geometry.radar_grid import ScanMemory
+
+    memory = ScanMemory()
+    for row in rows(lake):
+        features = torch.from_numpy(memory.features(scan_of(row)))[None]
+        with torch.no_grad():
+            wanted = torch.sigmoid(network(features))[0].numpy()
+        assert wanted.shape == SHAPE
+        assert model.probability(scan_of(row)) == pytest.approx(wanted, abs=1e-5)
+
+
+def test_a_model_is_no_reason_to_ingest_again():
+    assert config_hash(fleet().rigs["default"]) == config_hash(fleet(**MODEL).rigs["default"])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ("range_step_m = 1.0", "range_step_m = 0.5", "grid.range_step_m"),
+        ('"moving", ', "", "grid.channels"),
+        ('sha256 = "', 'sha256 = "0', "sha256"),
+        ('task = "radar_drivable"', 'task = "segment"', "task"),
+        ('path = "radar', 'path = "other', "path"),
+    ],
+)
+def test_a_manifest_that_does_not_fit_is_told_by_its_key(before, after, told, tmp_path):
+    manifest = export_drivable(build_drivable_network(4, 0), tmp_path, {})
+    assert before in manifest.read_text()
+    manifest.write_text(manifest.read_text().replace(before, after))
+    with pytest.raises(ModelError, match=told):
+        RadarDrivable(manifest)
+
+
+def test_no_manifest_is_a_plain_error(tmp_path, lake):
+    with pytest.raises(ModelError, match="no such manifest"):
+        perceive_day(DAY, fleet(**MODEL), lake, fleet_file=tmp_path / "fleet.toml")
