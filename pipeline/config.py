@@ -22,6 +22,7 @@ __all__ = [
     "LearnConfig",
     "LidarTopics",
     "OnnxDrivable",
+    "OnnxPointSemantics",
     "OnnxSemantics",
     "PerceiveConfig",
     "PrepareConfig",
@@ -73,10 +74,20 @@ class CameraTopics(_Section):
     semantics: Annotated[TopicSemantics | OnnxSemantics, Field(discriminator="source")]
 
 
+class OnnxPointSemantics(_Section):
+    """What lidar points are, computed here by a range-image model; path of its manifest, relative to fleet.toml."""
+
+    source: Literal["onnx"]
+    segmenter: str
+    remission_scale: Positive = 1.0  # makes logged intensity what the model was trained on
+
+
 class LidarTopics(_Section):
     """The lidar's topic."""
 
     points: Topic
+    # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
+    semantics: OnnxPointSemantics | None = Field(default=None, exclude=True)
 
 
 class OnnxDrivable(_Section):

@@ -4,19 +4,23 @@ RANSAC sees only the lowest point of each cell of a grid over the ground, so tha
 around the vehicle nor walls outvote the road; then each sector follows the surface outwards, because roads
 bend and crown.
 
-Source: paper, section 4.2 (RANSAC drivable area; its RangeNet++ stage is replaced by geometry here).
+Where a model tells what points are, RANSAC sees its road only, the surface carries no point of an object, and
+the drivable area ends where its road does.
+
+Source: paper, section 4.2 (RangeNet++ and RANSAC successively; geometry alone where no model is given).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import no_type_check
+from enum import IntEnum
+from typing import Any, Protocol, no_type_check, runtime_checkable
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 
-__all__ = ["Ground", "find_ground", "height_over"]
+__all__ = ["Ground", "PointKind", "PointSource", "find_ground", "height_over"]
 
 _NEAR_M = 2.5  # nearer returns are the vehicle itself
 _FAR_M = 60.0  # a 0.2 deg grazing angle and less: no ground returns worth a plane
@@ -35,26 +39,69 @@ _OBSTACLE_M = (0.35, 2.5)  # above the local ground: over kerbs, under signs and
 _FREE_BINS = 360
 
 
+class PointKind(IntEnum):
+    """What a model may say of a lidar point; of unknown ones geometry decides."""
+
+    UNKNOWN = 0
+    ROAD = 1
+    FLAT = 2  # ground that is no road: sidewalk, grass
+    ROAD_USER = 3
+    OTHER = 4
+
+
+@runtime_checkable
+class PointSource(Protocol):
+    """Who tells what lidar points are, sweep by sweep."""
+
+    provenance: dict[str, Any]  # what of it belongs into the work key
+
+    def kinds(
+        self, xyz_m: Float32[np.ndarray, "N 3"], intensity: Float32[np.ndarray, " N"] | None
+    ) -> UInt8[np.ndarray, " N"]:
+        """The PointKind of each point."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """`plane` (n, d) with n.p + d = 0, n up, lidar frame; None where none was found."""
+    """`plane` (n, d) with n.p + d = 0, n up, lidar frame; None where none was found.
+
+    `is_road` are the ground points that a model calls road, all of them without a model.
+    """
 
     plane: Float[np.ndarray, " 4"] | None
     is_ground: Bool[np.ndarray, " N"]
+    is_road: Bool[np.ndarray, " N"]
     drivable_xyz_m: Float32[np.ndarray, "M 3"]
 
 
-def find_ground(xyz_m: Float32[np.ndarray, "N 3"], inlier_m: float, rng: np.random.Generator) -> Ground:
-    """Plane, ground points and reachable ground on a 1 m grid of one sweep (lidar frame, z roughly up)."""
+def find_ground(
+    xyz_m: Float32[np.ndarray, "N 3"],
+    inlier_m: float,
+    rng: np.random.Generator,
+    kind: UInt8[np.ndarray, " N"] | None = None,
+) -> Ground:
+    """Plane, ground points and reachable ground on a 1 m grid of one sweep (lidar frame, z roughly up).
+
+    Args:
+        xyz_m: finite points.
+        inlier_m: how far ground points lie from the surface, near the vehicle.
+        rng: of RANSAC.
+        kind: the PointKind of each point by a model; None = geometry alone.
+    """
+    if kind is not None:
+        return _find_labelled_ground(xyz_m, inlier_m, rng, kind)
     plane = _fit_plane(*_lowest_of_cells(xyz_m), inlier_m, rng)
     if plane is None:
-        return Ground(None, np.zeros(len(xyz_m), bool), np.zeros((0, 3), np.float32))
+        nothing = np.zeros(len(xyz_m), bool)
+        return Ground(None, nothing, nothing, np.zeros((0, 3), np.float32))
     above_local = _follow_surface(xyz_m, height_over(plane, xyz_m), inlier_m)
     range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
     # Range noise on a grazing beam and ring tilt show as height: 0.3 % of the range.
     is_ground = (np.abs(above_local) < inlier_m + 0.003 * range_m) & (range_m > _NEAR_M) & (range_m < _FAR_M)
-    free = _reachable(xyz_m, range_m, above_local)
-    return Ground(plane, is_ground, _on_grid(xyz_m[is_ground & free]))
+    blocks = (above_local > _OBSTACLE_M[0]) & (above_local < _OBSTACLE_M[1])
+    free = _reachable(xyz_m, range_m, blocks)
+    return Ground(plane, is_ground, is_ground, _on_grid(xyz_m[is_ground & free]))
 
 
 def height_over(
@@ -62,6 +109,30 @@ def height_over(
 ) -> Float32[np.ndarray, " N"]:
     """Signed distance to the plane [m], positive upwards."""
     return (xyz_m @ plane[:3].astype(np.float32) + np.float32(plane[3])).astype(np.float32)
+
+
+def _find_labelled_ground(
+    xyz_m: np.ndarray, inlier_m: float, rng: np.random.Generator, kind: np.ndarray
+) -> Ground:
+    """RANSAC on a model's road, and what of the model's ground lies on the surface that it starts."""
+    road, labelled = kind == PointKind.ROAD, (kind == PointKind.ROAD) | (kind == PointKind.FLAT)
+    range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
+    seen = (range_m > _NEAR_M) & (range_m < _FAR_M)
+    plane = _fit_plane(*_lowest_of_cells(xyz_m[road]), inlier_m, rng)
+    if plane is None:  # too little road: its points are no objects all the same
+        return Ground(None, labelled & seen, road & seen, np.zeros((0, 3), np.float32))
+    may_be_ground = labelled | (kind == PointKind.UNKNOWN)
+    above_local = _follow_surface(xyz_m, height_over(plane, xyz_m), inlier_m, may_be_ground)
+    # As without a model. Grass is rough, and a model knows it for ground; what stands higher it mistook.
+    on_surface = np.abs(above_local) < inlier_m + 0.003 * range_m
+    near_surface = np.abs(above_local) < _OBSTACLE_M[0] + 0.003 * range_m
+    is_ground = seen & np.where(labelled, near_surface, on_surface & may_be_ground)
+    is_road = seen & road & on_surface
+    stands = (above_local > _OBSTACLE_M[0]) & (above_local < _OBSTACLE_M[1])
+    # A road user blocks by its feet and wheels too.
+    blocks = (stands & ~is_ground) | ((kind == PointKind.ROAD_USER) & (above_local < _OBSTACLE_M[1]))
+    free = _reachable(xyz_m, range_m, blocks)
+    return Ground(plane, is_ground, is_road, _on_grid(xyz_m[is_road & free]))
 
 
 def _lowest_of_cells(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,8 +193,13 @@ def _refine(low: np.ndarray, weight: np.ndarray, plane: np.ndarray, inlier_m: fl
     return plane if plane[2] > np.cos(_MAX_TILT_RAD) else None
 
 
-def _follow_surface(xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float) -> np.ndarray:
-    """Height over the local ground: each sector carries the ground's height over the plane outwards."""
+def _follow_surface(
+    xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float, may_be_ground: np.ndarray | None = None
+) -> np.ndarray:
+    """Height over the local ground: each sector carries the ground's height over the plane outwards.
+
+    Only points that may be ground make the surface, all of them where nobody knows.
+    """
     azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
     sector = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _SECTORS).astype(np.int32), _SECTORS - 1)
     ring = (np.hypot(xyz_m[:, 0], xyz_m[:, 1]) / _BIN_M).astype(np.int32)
@@ -131,6 +207,7 @@ def _follow_surface(xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float) ->
     ring = np.minimum(ring, bins - 1)
     cell = sector * bins + ring
     order = np.argsort(cell, kind="stable")
+    order = order if may_be_ground is None else order[may_be_ground[order]]
     start = np.searchsorted(cell[order], np.arange(_SECTORS * bins + 1))
     surface = _walk(height_m[order].astype(np.float64), start, _SECTORS, bins, inlier_m)
     # Neighbouring sectors see the same road: their median drops the sector that climbed onto a car.
@@ -158,11 +235,11 @@ def _walk(height: np.ndarray, start: np.ndarray, sectors: int, bins: int, inlier
     return surface
 
 
-def _reachable(xyz_m: np.ndarray, range_m: np.ndarray, above_local_m: np.ndarray) -> np.ndarray:
-    """True where no obstacle stands nearer in the same direction."""
+def _reachable(xyz_m: np.ndarray, range_m: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """True where nothing that blocks stands nearer in the same direction; the own vehicle does not."""
     azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
     direction = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _FREE_BINS).astype(np.int32), _FREE_BINS - 1)
-    blocks = (above_local_m > _OBSTACLE_M[0]) & (above_local_m < _OBSTACLE_M[1]) & (range_m > _NEAR_M)
+    blocks = blocks & (range_m > _NEAR_M)
     limit = _second_nearest(direction[blocks], range_m[blocks])
     return range_m < limit[direction]
 

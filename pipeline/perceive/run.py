@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.config import (
     FleetConfig,
+    LidarTopics,
     OnnxSemantics,
     PerceiveConfig,
     RadarTopics,
@@ -23,7 +24,7 @@ from pipeline.geometry.radar_grid import Scan
 from pipeline.perceive.camera import SemanticsSource, TopicSource, decode_grey, encode_png
 from pipeline.perceive.drivable import DrivableSource, free_sector
 from pipeline.perceive.edges import lidar_edges
-from pipeline.perceive.ground import find_ground
+from pipeline.perceive.ground import PointSource, find_ground
 from pipeline.perceive.labels import ROAD_ID
 from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
 from pipeline.perceive.radar import RadarMotion, radar_motion
@@ -77,8 +78,9 @@ def perceive_day(
         raise ContractError(str(folder), "no frames of this vehicle and day: run `boresight ingest` first")
     source, semantics_key = _source(rig.camera.semantics, fleet.perceive, fleet_file)
     drivable = _drivable(rig.radar, fleet_file)
-    if drivable is not None:
-        semantics_key |= drivable.provenance
+    points = _points(rig.lidar, fleet_file)
+    for model in (drivable, points):
+        semantics_key |= {} if model is None else model.provenance
     key = work_key("perceive", CODE_VERSION, config_hash(fleet.perceive, semantics_key), [frames.work_key])
     done = read_manifest(lake, OBSERVATIONS, partition)
     if done is not None and done.work_key == key:
@@ -89,7 +91,9 @@ def perceive_day(
         for group in iterate_rows(lake, FRAMES, partition, Frame):
             for frame in group:
                 try:
-                    observation, state = perceive_frame(frame, source, fleet.perceive, state, drivable)
+                    observation, state = perceive_frame(
+                        frame, source, fleet.perceive, state, drivable, points
+                    )
                     rows.append(observation)
                 except FrameRejectedError as rejection:
                     rejected[rejection.reason.value] += 1
@@ -111,6 +115,7 @@ def perceive_frame(
     config: PerceiveConfig,
     tracks: TrackState,
     drivable: DrivableSource | None = None,
+    points: PointSource | None = None,
 ) -> tuple[Observation, TrackState]:
     """Everything that one frame shows, and the radar tracks carried on.
 
@@ -120,8 +125,10 @@ def perceive_frame(
         config: gates and sizes.
         tracks: from the frame before.
         drivable: network for the radar's drivable area, which remembers the scans before; None = geometry.
+        points: model that tells what lidar points are; None = geometry.
 
     Raises:
+        ModelError: a model does not do what its manifest says.
         FrameRejectedError: the frame cannot be used; `tracks` stay as they were.
     """
     _check(frame)
@@ -130,7 +137,7 @@ def perceive_frame(
     contrast = road_contrast(grey, semantics.labels == ROAD_ID)
     # One generator per frame: the result does not depend on which frames came before.
     rng = np.random.default_rng([frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index])
-    lidar = _perceive_lidar(frame, config, rng)
+    lidar = _perceive_lidar(frame, config, rng, points)
     radar, motion, state = _perceive_radar(frame, config, tracks, rng, drivable)
     copied = {name: getattr(frame, name) for name in _COPIED_FIELDS}
     users = semantics.detections
@@ -187,16 +194,19 @@ def _check(frame: Frame) -> None:
         raise FrameRejectedError(FrameReason.FEW_RADAR_POINTS)
 
 
-def _perceive_lidar(frame: Frame, config: PerceiveConfig, rng: np.random.Generator) -> dict[str, Any]:
+def _perceive_lidar(
+    frame: Frame, config: PerceiveConfig, rng: np.random.Generator, points: PointSource | None
+) -> dict[str, Any]:
     """The lidar_*, marking_* and ground_* columns."""
     sweep = _finite_sweep(frame)
     xyz = sweep.xyz_m
-    ground = find_ground(xyz, config.ground_inlier_m, rng)
+    kind = None if points is None else points.kinds(xyz, sweep.intensity)
+    ground = find_ground(xyz, config.ground_inlier_m, rng, kind)
     cluster = cluster_objects(xyz, ground.is_ground, config.cluster_eps_m, config.cluster_min_points)
     boxes = cluster_boxes(xyz, cluster)
     sample = sample_uniformly(xyz, config.voxel_m)
     edges = lidar_edges(xyz, sweep.ring, cluster, config)
-    markings = lidar_markings(xyz, sweep.intensity, sweep.ring, ground.is_ground)
+    markings = lidar_markings(xyz, sweep.intensity, sweep.ring, ground.is_road)
     return {
         "lidar_map_xyz_m": xyz[sample],
         "lidar_map_is_ground": ground.is_ground[sample].astype(np.uint8),
@@ -259,6 +269,14 @@ def _drivable(radar: RadarTopics, fleet_file: Path) -> DrivableSource | None:
     from pipeline.perceive.models.radar_drivable import RadarDrivable  # noqa: PLC0415 - as in _source
 
     return RadarDrivable.load(radar.drivable, fleet_file)
+
+
+def _points(lidar: LidarTopics, fleet_file: Path) -> PointSource | None:
+    if lidar.semantics is None:
+        return None
+    from pipeline.perceive.models.range_image import RangeImageSegmenter  # noqa: PLC0415 - as in _source
+
+    return RangeImageSegmenter.load(lidar.semantics, fleet_file)
 
 
 def _scan(frame: Frame, motion: RadarMotion) -> Scan:

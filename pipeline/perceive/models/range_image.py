@@ -1,0 +1,228 @@
+"""What lidar points are, by a range-image ONNX model in RangeNet++'s convention.
+
+A manifest beside the model says what goes in and what comes out:
+
+```toml
+path = "darknet53.onnx"           # relative to the manifest
+sha256 = "..."
+task = "segment_points"
+[input]                           # float32 1x5xHxW: range, x, y, z [m], remission
+size = [64, 2048]                 # rows, columns
+fov_up_deg = 3.0
+fov_down_deg = -25.0
+mean = [12.12, 10.88, 0.23, -1.04, 0.21]
+std = [12.32, 11.47, 6.91, 0.86, 0.16]
+empty = "zero"                    # pixels without a point, once normalised; or "minus_one", before that
+[output]
+layout = "logits"                 # 1xCxHxW; probabilities do as well
+label_set = "semantickitti"       # 20 labels, 0 = unlabelled
+[knn]                             # optional: how pixels' labels become points' labels
+neighbours = 5
+search = 5
+sigma_px = 1.0
+cutoff_m = 1.0
+```
+
+Source: Milioto et al., RangeNet++ (IROS 2019); paper, section 4.2 (RangeNet++ and RANSAC successively).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pipeline.config import OnnxPointSemantics
+from pipeline.errors import ModelError
+from pipeline.perceive.ground import PointKind
+from pipeline.perceive.models.manifest import check_hash, read_manifest
+from pipeline.perceive.models.range_image_projection import EMPTY, channels_of, project, vote_of_neighbours
+from pipeline.perceive.models.session import open_session
+
+__all__ = ["POINT_LABEL_SETS", "RangeImageManifest", "RangeImageSegmenter"]
+
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Five = tuple[_Number, _Number, _Number, _Number, _Number]
+_Size = Annotated[int, Field(gt=0)]
+_ROAD, _FLAT, _USER, _OTHER = PointKind.ROAD, PointKind.FLAT, PointKind.ROAD_USER, PointKind.OTHER
+# Labels in the order of the networks' classes, as semantic-kitti.yaml's learning_map_inv has them.
+POINT_LABEL_SETS: dict[str, dict[str, PointKind]] = {
+    "semantickitti": {
+        "unlabeled": PointKind.UNKNOWN,
+        "car": _USER, "bicycle": _USER, "motorcycle": _USER, "truck": _USER, "other-vehicle": _USER,
+        "person": _USER, "bicyclist": _USER, "motorcyclist": _USER,
+        "road": _ROAD, "parking": _ROAD, "sidewalk": _FLAT, "other-ground": _FLAT,
+        "building": _OTHER, "fence": _OTHER, "vegetation": _OTHER, "trunk": _OTHER,
+        "terrain": _FLAT, "pole": _OTHER, "traffic-sign": _OTHER,
+    },
+}  # fmt: skip
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class _Input(_Section):
+    size: tuple[_Size, _Size]
+    fov_up_deg: Annotated[float, Field(ge=-90, le=90)]
+    fov_down_deg: Annotated[float, Field(ge=-90, le=90)]
+    mean: _Five
+    std: _Five
+    empty: Literal["zero", "minus_one"] = "zero"
+
+    @model_validator(mode="after")
+    def _can_be_computed(self) -> _Input:
+        if min(self.std) <= 0:
+            raise ValueError("std must be positive")
+        if self.fov_up_deg <= self.fov_down_deg:
+            raise ValueError("fov_up_deg must lie above fov_down_deg (which is negative below the horizon)")
+        return self
+
+
+class _Output(_Section):
+    layout: Literal["logits"]
+    label_set: str
+
+    @model_validator(mode="after")
+    def _labels_are_known(self) -> _Output:
+        if self.label_set not in POINT_LABEL_SETS:
+            raise ValueError(f'label_set = "{self.label_set}" is not one of {", ".join(POINT_LABEL_SETS)}')
+        return self
+
+
+class _Knn(_Section):
+    neighbours: _Size = 5
+    search: _Size = 5
+    sigma_px: Annotated[float, Field(gt=0)] = 1.0
+    cutoff_m: Annotated[float, Field(gt=0)] = 1.0
+
+    @model_validator(mode="after")
+    def _window_has_a_centre_and_enough_pixels(self) -> _Knn:
+        if self.search % 2 == 0:
+            raise ValueError("search must be odd: the window has the point's pixel in its middle")
+        if self.neighbours > self.search**2:
+            raise ValueError(f"neighbours = {self.neighbours}, but the window has {self.search**2} pixels")
+        return self
+
+
+class RangeImageManifest(_Section):
+    """One model for range images."""
+
+    path: str
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    task: Literal["segment_points"]
+    input: _Input
+    output: _Output
+    knn: _Knn = _Knn()
+    file: Path = Path()  # of the manifest itself, set on reading
+
+    @model_validator(mode="after")
+    def _window_fits(self) -> RangeImageManifest:
+        if self.knn.search > min(self.input.size):
+            raise ValueError(f"knn.search = {self.knn.search} is more than input.size has")
+        return self
+
+
+class RangeImageSegmenter:
+    """A model behind its manifest; it judges each sweep by itself."""
+
+    def __init__(self, manifest_file: Path, remission_scale: float = 1.0) -> None:
+        """Load manifest and model.
+
+        Args:
+            manifest_file: where it lies, the model beside it.
+            remission_scale: makes logged intensity what the model was trained on (0..1 for SemanticKITTI).
+
+        Raises:
+            ModelError: missing, wrong, or not the model that the hash says.
+        """
+        manifest = read_manifest(manifest_file, RangeImageManifest)
+        model = manifest_file.parent / manifest.path
+        check_hash(manifest_file, model, manifest.sha256)
+        self._manifest, self._file, self._scale = manifest, str(manifest_file), remission_scale
+        self._session = open_session(model, manifest_file)
+        self._input = self._checked_input()
+        self._kinds = np.array(list(POINT_LABEL_SETS[manifest.output.label_set].values()), np.uint8)
+        told = manifest.model_dump(mode="json", exclude={"file", "path"})
+        self.provenance: dict[str, Any] = {"lidar_segmenter": told | {"remission_scale": remission_scale}}
+
+    @classmethod
+    def load(cls, wanted: OnnxPointSemantics, fleet_file: Path) -> RangeImageSegmenter:
+        """The model that fleet.toml names; its path is relative to it.
+
+        Raises:
+            ModelError: see the constructor.
+        """
+        return cls(fleet_file.parent / wanted.segmenter, wanted.remission_scale)
+
+    def kinds(
+        self, xyz_m: Float32[np.ndarray, "N 3"], intensity: Float32[np.ndarray, " N"] | None
+    ) -> UInt8[np.ndarray, " N"]:
+        """The PointKind of each point of a sweep; unknown outside the model's field of view.
+
+        Where the log has no intensity, the model is shown the mean of its training.
+
+        Raises:
+            ModelError: the model does not run, or its output has another shape than the manifest says.
+        """
+        spec, knn = self._manifest.input, self._manifest.knn
+        image = project(xyz_m, spec.size, spec.fov_up_deg, spec.fov_down_deg)
+        channels = channels_of(image, xyz_m, self._remission(len(xyz_m), intensity))
+        logits = self._run(self._normalised(channels, image.point != EMPTY))
+        labels = vote_of_neighbours(
+            image, np.argmax(logits, axis=0), len(self._kinds), neighbours=knn.neighbours, search=knn.search,
+            sigma_px=knn.sigma_px, cutoff_m=knn.cutoff_m,
+        )  # fmt: skip
+        return self._kinds[labels]
+
+    def _remission(self, points: int, intensity: np.ndarray | None) -> np.ndarray:
+        mean = np.full(points, self._manifest.input.mean[4], np.float32)
+        if intensity is None:
+            return mean
+        scaled = intensity.astype(np.float32) * np.float32(self._scale)
+        return np.where(np.isfinite(scaled), scaled, mean)
+
+    def _normalised(self, channels: np.ndarray, filled: np.ndarray) -> np.ndarray:
+        spec = self._manifest.input
+        mean, std = (np.array(v, np.float32)[:, None, None] for v in (spec.mean, spec.std))
+        normal = (channels - mean) / std
+        if spec.empty == "zero":
+            normal[:, ~filled] = 0
+        return np.ascontiguousarray(normal[None], np.float32)
+
+    def _run(self, tensor: np.ndarray) -> np.ndarray:
+        """Logits CxHxW."""
+        try:
+            answer = self._session.run(None, {self._input: tensor})[0]
+        except Exception as err:  # onnxruntime's own exceptions share no base but this
+            raise ModelError(self._file, f"the model failed to run: {err}") from err
+        wanted = [1, len(self._kinds), *self._manifest.input.size]
+        if list(answer.shape) != wanted:
+            raise ModelError(
+                self._file,
+                f"output.layout: logits must be {wanted} (1, labels of {self._manifest.output.label_set}, "
+                f"rows, columns), the model gives {list(answer.shape)}",
+            )
+        if not np.isfinite(answer).all():
+            raise ModelError(self._file, "the model gives logits that are not finite")
+        return np.asarray(answer[0], np.float32)
+
+    def _checked_input(self) -> str:
+        inputs = self._session.get_inputs()
+        if len(inputs) != 1 or inputs[0].type != "tensor(float)":
+            found = ", ".join(f"{i.name} {i.type}" for i in inputs)
+            raise ModelError(self._file, f"path: the model must take one float32 image, it takes {found}")
+        wanted, shape = (1, 5, *self._manifest.input.size), inputs[0].shape
+        fits = len(shape) == len(wanted) and all(
+            not isinstance(s, int) or s == w for s, w in zip(shape, wanted, strict=True)
+        )
+        if not fits:
+            raise ModelError(
+                self._file,
+                f"input.size: {list(self._manifest.input.size)} does not go with the model's input {shape} "
+                "(1, 5, rows, columns)",
+            )
+        return str(inputs[0].name)

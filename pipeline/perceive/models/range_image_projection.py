@@ -1,0 +1,136 @@
+"""Sweeps as range images and back: spherical projection, a network's input, labels of points by their neighbours.
+
+Conventions of RangeNet++: azimuth runs from left behind (column 0) over ahead (the middle) to right behind,
+rows from the upper edge of the field of view down; where several points share a pixel, the nearest is drawn.
+
+Source: Milioto et al., RangeNet++ (IROS 2019), sections III-A and III-D; the paper's reference 67.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+__all__ = ["EMPTY", "RangeImage", "channels_of", "project", "vote_of_neighbours"]
+
+EMPTY = -1  # range, and index of the point, of a pixel that no point fell into
+_POINTS_AT_ONCE = 16384  # 5 x 5 neighbours of each: some 10 MB
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """Ranges [m] and drawn points by pixel; pixel and range of each point, drawn or hidden.
+
+    Points outside the field of view have a pixel of its border and are not `inside`.
+    """
+
+    range_m: Float32[np.ndarray, "H W"]
+    point: Int[np.ndarray, "H W"]
+    row: Int[np.ndarray, " N"]
+    column: Int[np.ndarray, " N"]
+    point_range_m: Float32[np.ndarray, " N"]
+    inside: Bool[np.ndarray, " N"]
+
+
+def project(
+    xyz_m: Float32[np.ndarray, "N 3"], size: tuple[int, int], fov_up_deg: float, fov_down_deg: float
+) -> RangeImage:
+    """Spherical projection of a sweep (lidar frame: x ahead, y left, z up).
+
+    Args:
+        xyz_m: finite points.
+        size: rows, columns; the columns go all the way round.
+        fov_up_deg: elevation of the upper edge, positive above the horizon.
+        fov_down_deg: elevation of the lower edge, negative below the horizon.
+    """
+    rows, columns = size
+    points = xyz_m.astype(np.float64)
+    range_m = np.linalg.norm(points, axis=1)
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    elevation = np.arcsin(np.clip(points[:, 2] / np.maximum(range_m, 1e-9), -1, 1))
+    up, down = np.deg2rad(fov_up_deg), np.deg2rad(fov_down_deg)
+    height = (up - elevation) / (up - down) * rows
+    row = np.clip(np.floor(height), 0, rows - 1).astype(np.int64)
+    column = np.clip(np.floor(0.5 * (1 - azimuth / np.pi) * columns), 0, columns - 1).astype(np.int64)
+    # The edge rows take beams that lie half a row beyond; more would pile a whole lidar up on its own border.
+    inside = (height >= -0.5) & (height < rows + 0.5) & (range_m > 0)
+    image = np.full(size, EMPTY, np.float32)
+    point = np.full(size, EMPTY, np.int64)
+    drawn = np.flatnonzero(inside)
+    drawn = drawn[np.argsort(-range_m[drawn], kind="stable")]  # of repeated pixels numpy keeps the last
+    image[row[drawn], column[drawn]] = range_m[drawn]
+    point[row[drawn], column[drawn]] = drawn
+    return RangeImage(image, point, row, column, range_m.astype(np.float32), inside)
+
+
+def channels_of(
+    image: RangeImage, xyz_m: Float32[np.ndarray, "N 3"], remission: Float32[np.ndarray, " N"]
+) -> Float32[np.ndarray, "5 H W"]:
+    """Range, x, y, z [m] and remission by pixel, EMPTY in all five where no point is."""
+    values = np.column_stack([image.point_range_m, xyz_m, remission]).astype(np.float32)
+    channels = np.full((5, *image.point.shape), EMPTY, np.float32)
+    filled = image.point != EMPTY
+    channels[:, filled] = values[image.point[filled]].T
+    return channels
+
+
+def vote_of_neighbours(
+    image: RangeImage,
+    labels: Int[np.ndarray, "H W"],
+    classes: int,
+    *,
+    neighbours: int,
+    search: int,
+    sigma_px: float,
+    cutoff_m: float,
+) -> Int[np.ndarray, " N"]:
+    """Labels of all points: the vote of the pixels around each that are the nearest to it in range.
+
+    A point behind the one that was drawn has that one's label in its own pixel; its neighbours in range outvote
+    it. Azimuth wraps around. Label 0, unlabelled, wins only where nothing else votes.
+
+    Args:
+        image: where the points are.
+        labels: of the pixels, 0..classes - 1.
+        classes: how many labels there are.
+        neighbours: pixels that vote, at most.
+        search: side of the square window that they come from [px], odd.
+        sigma_px: ranges differ by less the nearer a pixel is: of the Gauss that distances are weighed with.
+        cutoff_m: a pixel that differs by more has no vote.
+    """
+    half = search // 2
+    ranges = np.where(image.range_m == EMPTY, np.float32(np.inf), image.range_m)
+    framed_range = _framed(ranges, half, np.inf)
+    framed_label = _framed(labels, half, 0.0)
+    dy, dx = (offset.ravel() for offset in np.mgrid[0:search, 0:search])
+    far = _farness(search, sigma_px)
+    result = np.zeros(len(image.row), np.int64)
+    rows = np.flatnonzero(image.inside)
+    for first in range(0, len(rows), _POINTS_AT_ONCE):
+        part = rows[first : first + _POINTS_AT_ONCE]
+        y, x = image.row[part, None] + dy, image.column[part, None] + dx
+        distance = np.abs(framed_range[y, x] - image.point_range_m[part, None]) * far
+        distance[:, len(far) // 2] = 0  # its own pixel, whoever was drawn there
+        nearest = np.argpartition(distance, neighbours - 1, axis=1)[:, :neighbours]
+        label = np.take_along_axis(framed_label[y, x], nearest, axis=1)
+        label[np.take_along_axis(distance, nearest, axis=1) > cutoff_m] = 0
+        votes = np.zeros((len(part), classes), np.int64)
+        np.add.at(votes, (np.arange(len(part))[:, None], label), 1)
+        votes[:, 0] = 0
+        result[part] = np.argmax(votes, axis=1)
+    return result
+
+
+def _farness(search: int, sigma_px: float) -> Float[np.ndarray, " K"]:
+    """One minus the normalised Gauss of the window's pixels: what differences of range are multiplied by."""
+    offset = np.arange(search) - search // 2
+    gauss = np.exp(-(offset[:, None] ** 2 + offset[None, :] ** 2) / (2 * sigma_px**2))
+    return (1 - gauss / gauss.sum()).astype(np.float32).ravel()
+
+
+def _framed(image: np.ndarray, half: int, outside: float) -> np.ndarray:
+    """The image with what lies around it: the other side to the left and right, nothing above and below."""
+    wrapped = np.pad(image, ((0, 0), (half, half)), mode="wrap")
+    return np.pad(wrapped, ((half, half), (0, 0)), constant_values=outside)
