@@ -67,8 +67,8 @@ class Day:
         return np.array(self.truth[f"T_{pair}"], np.float64)
 
 
-def generate_day(spec: DaySpec, root: Path) -> Path:
-    """Simulate, ingest and perceive a day unless it is there; returns its folder."""
+def generate_day(spec: DaySpec, root: Path, *, images: bool = False) -> Path:
+    """Simulate, ingest and perceive a day unless it is there; returns its folder. `images` keeps table frames."""
     folder = root / spec.name
     if (folder / _FINISHED).exists():
         return folder
@@ -88,7 +88,8 @@ def generate_day(spec: DaySpec, root: Path) -> Path:
     ingest_day(logs, partition, config, lake, fleet_file=str(fleet))
     result = perceive_day(partition, config, lake, fleet_file=fleet)
     shutil.rmtree(folder / "logs")
-    shutil.rmtree(folder / "lake" / "frames")
+    if not images:
+        shutil.rmtree(folder / "lake" / "frames")
     note = asdict(spec) | {"kept_frames": result.rows, "cpu_s": round(time.process_time() - began, 1)}
     (folder / _FINISHED).write_text(json.dumps(note) + "\n")
     return folder
