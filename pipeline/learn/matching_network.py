@@ -58,6 +58,18 @@ class MatchingCore(nn.Module):
         likelihood = None if camera_logits is None else self.camera_log_likelihood(view.camera, camera_logits)
         return self.match(view, likelihood, camera_logits)
 
+    def encode(self, view: RenderedView) -> CoreOutputs:
+        """Logits of the encoders; nothing is matched, so no pose is corrected."""
+        frames = len(view.camera)
+        identity = torch.eye(4, device=view.camera.device).expand(frames, len(PAIRS), 4, 4)
+        doubt = self.heads.start.expand(frames, len(PAIRS), 6)
+        camera = self.camera_encoder(view.camera) if self.camera_encoder is not None else None
+        lidar = self.encode_lidar(view.lidar_grid) if "camera_lidar" in self.pairs else None
+        radar = None
+        if self.pairs == ("camera_radar",):
+            radar = self.radar_encoder(view.radar_features, view.radar_camera.norm(dim=-1))
+        return CoreOutputs(identity, doubt, None, camera, lidar, radar)
+
     def camera_log_likelihood(
         self, camera: Float[Tensor, "B 4 H W"], logits: Float[Tensor, "B K H W"]
     ) -> Float[Tensor, "B K H W"]:

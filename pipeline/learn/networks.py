@@ -39,6 +39,12 @@ class CalibrationNetwork(nn.Module):
         view, index = render(inputs, self.config.grid)
         return self._predictions(inputs, self.core(view), index)
 
+    def encode(self, inputs: NetworkInputs) -> Predictions:
+        """Class logits alone, at the guess: what teaches the encoders of `matching`."""
+        assert isinstance(self.core, MatchingCore)
+        view, index = render(inputs, self.config.grid)
+        return self._predictions(inputs, self.core.encode(view), index)
+
     def refine(self, inputs: NetworkInputs, iterations: int) -> list[Predictions]:
         """Several passes with the same weights, each rendered at the last one's answer; the camera is encoded once.
 

@@ -74,6 +74,9 @@ class TrainConfig(_Section):
     width: Count = 16  # channels of the encoders' first stage
     hidden: Count = 192
     iterations: Annotated[int, Field(ge=1, le=5)] = 1  # passes per frame; losses of all passes are averaged
+    # Encoders learn from classes alone, at every step; matchers have few weights, cost half of a step, and join at every
+    # so manieth step.
+    matched_every: Count = 1
     batch_size: Count = 4  # frames per process
     epochs: Positive = 20.0
     steps: Count | None = None  # in place of epochs
@@ -102,6 +105,12 @@ class TrainConfig(_Section):
             Grid(self.cell_deg)
         except ValueError as err:
             raise ValueError(f"cell_deg = {self.cell_deg:g}: {err}") from err
+        return self
+
+    @model_validator(mode="after")
+    def _encoders_exist(self) -> TrainConfig:
+        if self.matched_every > 1 and (self.architecture == "concat" or self.pairs == "lidar_radar"):
+            raise ValueError("matched_every must be 1 where no classes are learned: concat, lidar_radar")
         return self
 
     @model_validator(mode="after")

@@ -32,8 +32,10 @@ class Passes(nn.Module):
         super().__init__()
         self.network, self.iterations = network, iterations
 
-    def forward(self, inputs: NetworkInputs) -> list[Predictions]:
-        """All passes, the best answer last."""
+    def forward(self, inputs: NetworkInputs, *, matched: bool = True) -> list[Predictions]:
+        """All passes, the best answer last; not `matched`: one pass of the encoders alone, which stays at the guess."""
+        if not matched:
+            return [self.network.encode(inputs)]
         return self.network.refine(inputs, self.iterations)
 
 
@@ -52,6 +54,8 @@ def batch_loss(
     consensus: Consensus,
     generator: torch.Generator,
     network: CalibrationNetwork,
+    *,
+    matched: bool = True,
 ) -> StepLoss:
     """The loss of one batch from random guesses.
 
@@ -62,6 +66,7 @@ def batch_loss(
         consensus: each day's mean answer; the batch's answers join it.
         generator: of everything random here.
         network: of the passes, for its grid.
+        matched: whether poses are estimated and judged, or encoders learn classes only.
     """
     grid = network.config.grid
     guess = random_guess(batch, config.augment, generator)
@@ -69,7 +74,11 @@ def batch_loss(
     inputs = NetworkInputs(
         sensor_inputs(view, grid), guess.T_camera_lidar, guess.T_camera_radar, guess.T_lidar_radar
     )
-    answers: list[Predictions] = passes(inputs)
+    answers: list[Predictions] = passes(inputs, matched=matched)
+    if not matched:
+        semantics = _semantics(answers, view, guess, batch, consensus, network)
+        loss = config.loss.semantics * semantics
+        return StepLoss(loss, {"loss": loss.detach(), "semantics": semantics.detach()})
     objective, pairs = frame_objective(batch), PAIRS_OF[config.pairs]
     total = torch.zeros((), device=batch.T_camera_lidar.device)
     terms: dict[str, Tensor] = {}

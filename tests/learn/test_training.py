@@ -16,7 +16,9 @@ import torch
 from jobs.train import parse_duration
 from pipeline.errors import ConfigError, ContractError
 from pipeline.learn.checkpoints import load_checkpoint, save_checkpoint
+from pipeline.learn.layout import NetworkConfig
 from pipeline.learn.metrics import MetricsLog, read_metrics
+from pipeline.learn.networks import build_network
 from pipeline.learn.run_state import network_of_run
 from pipeline.learn.samples import About, make_row
 from pipeline.learn.schedule import DivergedError, DivergenceGuard, cosine_rate
@@ -248,3 +250,21 @@ def test_metrics_after_a_resume_hold_no_step_twice(tmp_path):
         {"step": 2, "loss": 2.0},
         {"step": 3, "loss": None},
     ]
+
+
+def test_encoders_may_learn_at_every_step_and_matchers_at_every_third(data, tmp_path):
+    settings = config(matched_every=3, steps=9, log_every=1)
+    train(TrainRequest(data, tmp_path), settings)
+    lines = [r for r in reports(tmp_path) if "loss" in r]
+    assert ["alignment" in r for r in lines] == [False, False, True] * 3
+    assert all("semantics" in r for r in lines)
+    start, trained = build_network(NetworkConfig(width=4, hidden=16), settings.seed), network_of_run(tmp_path)
+    for part in ("camera_encoder", "lidar_encoder", "lidar_matcher", "radar_matcher", "heads"):
+        ours, theirs = getattr(trained.core, part).state_dict(), getattr(start.core, part).state_dict()
+        assert any(not torch.equal(ours[name], theirs[name]) for name in ours), part
+
+
+@pytest.mark.parametrize("without_classes", [{"architecture": "concat"}, {"pairs": "lidar_radar"}])
+def test_networks_without_classes_are_matched_at_every_step(without_classes):
+    with pytest.raises(ConfigError, match="matched_every must be 1"):
+        load_train_config(None, {"matched_every": 2, **without_classes})
