@@ -74,8 +74,8 @@ class TrainConfig(_Section):
     width: Count = 16  # channels of the encoders' first stage
     hidden: Count = 192
     iterations: Annotated[int, Field(ge=1, le=5)] = 1  # passes per frame; losses of all passes are averaged
-    # Encoders learn from classes alone, at every step; matchers have few weights, cost half of a step, and join at every
-    # so manieth step.
+    # Encoders learn from classes alone, at every step; matchers have few weights and cost half of a step: they join at
+    # every n-th.
     matched_every: Count = 1
     batch_size: Count = 4  # frames per process
     epochs: Positive = 20.0
