@@ -10,6 +10,7 @@ absolute azimuth, elevation and range at the paper's three targets.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.days import SETS, DaySpec
 from tests.benchmarks.studies.engine import Run, run_study, study_arguments
 from tests.benchmarks.studies.metrics import share
+
+__all__ = ["METHODS", "cell", "errors_table", "verdicts_table"]
 
 METHODS = ("joint", "joint-optimisation", "pairwise-optimisation", "tracking")
 PRIOR = ("exact", 2.0, 0.2)
@@ -38,11 +41,12 @@ def main() -> None:
 
 def summary(results: list[dict[str, Any]]) -> str:
     """Mean errors and their standard errors, all days, urban, highway; ratios of joint to the others; the loop."""
-    parts = [_errors(results, environment) for environment in ("", "urban", "highway")]
-    return "\n\n".join([*parts, _ratios(results), _loop(results), _verdicts(results)])
+    parts = [errors_table(results, environment) for environment in ("", "urban", "highway")]
+    return "\n\n".join([*parts, _ratios(results), _loop(results), verdicts_table(results)])
 
 
-def _errors(results: list[dict[str, Any]], environment: str) -> str:
+def errors_table(results: list[dict[str, Any]], environment: str, methods: Sequence[str] = METHODS) -> str:
+    """Mean errors of the methods, pair by pair; `environment` is empty for all days."""
     lines = [
         f"{environment or 'All'} days, mean +- standard error over days:\n",
         "| method | pair | days | az [deg] | el [deg] | range [m] |",
@@ -50,10 +54,10 @@ def _errors(results: list[dict[str, Any]], environment: str) -> str:
     ]
     chosen = [r for r in results if environment in ("", r["day"]["environment"])]
     for pair in PAIRS:
-        cells = " | ".join(_cell(_values(chosen, METHODS[0], pair, f"prior_{q}")) for q, _ in QUANTITIES)
-        lines.append(f"| (prior) | {pair} | {_count(chosen, METHODS[0], pair)} | {cells} |")
-        for method in METHODS:
-            cells = " | ".join(_cell(_values(chosen, method, pair, q)) for q, _ in QUANTITIES)
+        cells = " | ".join(cell(_values(chosen, methods[0], pair, f"prior_{q}")) for q, _ in QUANTITIES)
+        lines.append(f"| (prior) | {pair} | {_count(chosen, methods[0], pair)} | {cells} |")
+        for method in methods:
+            cells = " | ".join(cell(_values(chosen, method, pair, q)) for q, _ in QUANTITIES)
             lines.append(f"| {method} | {pair} | {_count(chosen, method, pair)} | {cells} |")
     return "\n".join(lines)
 
@@ -100,9 +104,10 @@ def _loop(results: list[dict[str, Any]]) -> str:
     return "\n".join(["Loops:", "", *lines])
 
 
-def _verdicts(results: list[dict[str, Any]]) -> str:
+def verdicts_table(results: list[dict[str, Any]], methods: Sequence[str] = METHODS) -> str:
+    """How many records were accepted, held and refused, and what a day took."""
     lines = ["| method | accepted | held | refused | CPU s |", "|---|---|---|---|---|"]
-    for method in METHODS:
+    for method in methods:
         mine = [r for r in results if r["method"] == method]
         status = [p["status"] for r in mine for p in r["pairs"].values()]
         status += ["refused"] * sum(3 for r in mine if not r["pairs"])
@@ -128,7 +133,8 @@ def _count(results: list[dict[str, Any]], method: str, pair: str) -> int:
     return len(_by_seed(results, method, pair, "az_deg"))
 
 
-def _cell(values: np.ndarray) -> str:
+def cell(values: np.ndarray) -> str:
+    """Mean and standard error."""
     if not len(values):
         return "-"
     error = np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
