@@ -92,7 +92,7 @@ class SingleFrameCalibrator:
         T_camera_radar: Float[np.ndarray, "4 4"] | None = None,
         iterations: int = 3,
     ) -> list[FrameEstimate]:
-        """Estimates after each pass, each rendered at the one before.
+        """Estimates after each pass, each rendered where the one before turned to (as `CalibrationNetwork.refine`).
 
         Args:
             sensors: one frame.
@@ -101,33 +101,33 @@ class SingleFrameCalibrator:
             T_camera_radar: the guess; the product of the other two where left out.
             iterations: passes; two for guesses within 3 deg, three beyond.
         """
-        camera_lidar, lidar_radar = T_camera_lidar, T_lidar_radar
-        camera_radar = camera_lidar @ lidar_radar if T_camera_radar is None else T_camera_radar
+        camera_radar = T_camera_lidar @ T_lidar_radar if T_camera_radar is None else T_camera_radar
+        guess = (T_camera_lidar, camera_radar, T_lidar_radar)
         likelihood = None
         if self._encoder is not None:
             likelihood = self._encoder.run(None, {"camera": sensors.camera[None]})[0]
         found: list[FrameEstimate] = []
         for _ in range(iterations):
-            view = render_frame(sensors, camera_lidar, camera_radar, lidar_radar, self.grid)
+            view = render_frame(sensors, *guess, self.grid)
             if likelihood is not None:
                 view[LIKELIHOOD] = likelihood
             feed = {name: view[name] for name in self._inputs}
             corrections, log_variance = self._network.run(_ANSWERS, feed)
-            D_lidar, D_radar, D_lidar_radar = corrections[0].astype(np.float64)
-            camera_lidar = _rigid(D_lidar @ camera_lidar)
-            lidar_radar = _rigid(D_lidar_radar @ lidar_radar)
-            base = camera_lidar @ lidar_radar if self.config.composed else camera_radar
-            camera_radar = _rigid(D_radar @ base)
-            found.append(
-                FrameEstimate(
-                    camera_lidar,
-                    camera_radar,
-                    lidar_radar,
-                    log_variance[0].astype(np.float64),
-                    self.config.estimated,
-                )
-            )
+            step = corrections[0].astype(np.float64)
+            answer = self._corrected(step, guess)
+            found.append(FrameEstimate(*answer, log_variance[0].astype(np.float64), self.config.estimated))
+            step[:, :3, 3] = 0.0
+            guess = self._corrected(step, guess)
         return found
+
+    def _corrected(
+        self, corrections: Float[np.ndarray, "3 4 4"], guess: tuple[np.ndarray, np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Corrected camera_lidar, camera_radar and lidar_radar (as `networks.compose`)."""
+        camera_lidar = _rigid(corrections[0] @ guess[0])
+        lidar_radar = _rigid(corrections[2] @ guess[2])
+        base = camera_lidar @ lidar_radar if self.config.composed else guess[1]
+        return camera_lidar, _rigid(corrections[1] @ base), lidar_radar
 
 
 def config_from_metadata(path: Path, metadata: Mapping[str, str]) -> NetworkConfig:

@@ -19,7 +19,7 @@ from pipeline.learn.matching_network import MatchingCore
 from pipeline.learn.outputs import CoreOutputs, Predictions
 from pipeline.learn.views import render
 
-__all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "refine"]
+__all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "refine", "turns_only"]
 
 
 class CalibrationNetwork(nn.Module):
@@ -46,9 +46,10 @@ class CalibrationNetwork(nn.Module):
         return self._predictions(inputs, self.core.encode(view), index)
 
     def refine(self, inputs: NetworkInputs, iterations: int) -> list[Predictions]:
-        """Several passes with the same weights, each rendered at the last one's answer; the camera is encoded once.
+        """Several passes with the same weights, each rendered where the last one turned to; the camera is encoded once.
 
-        Gradients do not flow from one pass into the one before.
+        Only turns are handed on: one frame tells little of a shift, and what it tells by mistake would add up over
+        passes. Every answer holds its own pass's shift. Gradients do not flow from one pass into the one before.
         """
         found: list[Predictions] = []
         likelihood: Tensor | None = None
@@ -60,13 +61,14 @@ class CalibrationNetwork(nn.Module):
             else:
                 outputs = self.core(view)
                 likelihood, logits = outputs.camera_log_likelihood, outputs.camera_logits
-            last = self._predictions(inputs, outputs, index)
-            found.append(last)
+            found.append(self._predictions(inputs, outputs, index))
+            turned = replace(outputs, corrections=turns_only(outputs.corrections.detach()))
+            guess = self._predictions(inputs, turned, index)
             inputs = replace(
                 inputs,
-                T_camera_lidar=last.T_camera_lidar.detach(),
-                T_camera_radar=last.T_camera_radar.detach(),
-                T_lidar_radar=last.T_lidar_radar.detach(),
+                T_camera_lidar=guess.T_camera_lidar,
+                T_camera_radar=guess.T_camera_radar,
+                T_lidar_radar=guess.T_lidar_radar,
             )
         return found
 
@@ -87,6 +89,13 @@ class CalibrationNetwork(nn.Module):
             outputs.radar_logits,
             index,
         )
+
+
+def turns_only(corrections: Float[Tensor, "B 3 4 4"]) -> Float[Tensor, "B 3 4 4"]:
+    """The corrections without their shifts."""
+    turned = corrections.clone()
+    turned[..., :3, 3] = 0.0
+    return turned
 
 
 def compose(

@@ -93,7 +93,7 @@ def test_a_joint_matching_network_composes_the_camera_radar_pair():
     ).abs().max() < 5e-3  # all but a residual that has not learned yet
 
 
-def test_refinement_renders_at_the_last_answer_and_encodes_the_camera_once():
+def test_refinement_hands_turns_on_but_no_shifts_and_encodes_the_camera_once():
     network, inputs = small(), inputs_of(batch())
     calls = []
     network.core.camera_encoder.register_forward_hook(lambda *_: calls.append(1))
@@ -106,8 +106,14 @@ def test_refinement_renders_at_the_last_answer_and_encodes_the_camera_once():
                 assert torch.allclose(
                     getattr(again, names_of(pair)), getattr(answer, names_of(pair)), atol=1e-6
                 )
-            by_hand = replace(by_hand, **{names_of(p): getattr(again, names_of(p)) for p in PAIRS})
-    assert len(calls) == 1 + 3  # once in refine, once in each pass by hand
+            view, _ = render(by_hand, GRID)
+            turns = network.core(view).corrections
+            turns[:, :, :3, 3] = 0.0
+            lidar, radar = turns[:, 0] @ by_hand.T_camera_lidar, turns[:, 2] @ by_hand.T_lidar_radar
+            by_hand = replace(
+                by_hand, T_camera_lidar=lidar, T_lidar_radar=radar, T_camera_radar=turns[:, 1] @ lidar @ radar
+            )
+    assert len(calls) == 1 + 6  # once in refine, twice in each pass by hand
 
 
 def test_the_same_seed_gives_the_same_weights_and_leaves_torch_s_generator_alone():
