@@ -23,7 +23,10 @@ _HIGH_M = 4.0  # end of the height colours: a lorry's roof
 
 
 def top_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> Markup:
-    """Bird's-eye view in the lidar frame: radar left of the car at `before`, right of it at `after`."""
+    """Bird's-eye view in the lidar frame: radar left of the car at `before`, right of it at `after`.
+
+    One label for both means one state for both.
+    """
     plot = Plot(44.0, 8.0, 540.0, 567.0, (-_SIDE_M, _SIDE_M), (-_BEHIND_M, _AHEAD_M))
     uri = png_uri(top_bitmap(scene, before, after))
     plot.parts.append(
@@ -31,7 +34,8 @@ def top_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[
     )
     sides = [(float(x), f"{x:g}") for x in range(-30, 31, 10)]
     plot.frame(sides, [(float(y), f"{y:g}") for y in range(0, 61, 10)])
-    for text, u, anchor in ((labels[0], 52.0, "start"), (labels[1], 576.0, "end")):
+    said = ((labels[0], 52.0, "start"), (labels[1], 576.0, "end"))
+    for text, u, anchor in said[: len(set(labels))]:
         plot.text(u, 26.0, text, anchor=anchor, colour="#111", size=14.0, bold=True)
     plot.text(314.0, 604.0, "to the right of the lidar [m]; up: ahead [m]", anchor="middle")
     for k, height in enumerate(np.linspace(0.0, _HIGH_M, 9)):
@@ -40,9 +44,8 @@ def top_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[
         if k % 2 == 0:
             plot.text(610.0, 454.0 - 40.0 * k, f"{height:g} m")
     plot.text(594.0, 490.0, "height")
-    return document(
-        650.0, 612.0, plot.parts, f"From above: radar over lidar, left {labels[0]}, right {labels[1]}"
-    )
+    sides_said = f"left {labels[0]}, right {labels[1]}" if len(set(labels)) > 1 else labels[0]
+    return document(650.0, 612.0, plot.parts, f"From above: radar over lidar, {sides_said}")
 
 
 def top_bitmap(scene: Scene, before: Extrinsics, after: Extrinsics) -> UInt8[np.ndarray, "H W 3"]:

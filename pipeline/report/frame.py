@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.objective.problem import Prior, Solution
-from pipeline.report.overlays import Extrinsics, Scene
+from pipeline.report.above import top_view
+from pipeline.report.encode import jpeg_uri
+from pipeline.report.overlays import Extrinsics, Scene, whole_view
 from pipeline.report.page import render, write_page
-from pipeline.report.pictures import scene_pictures
+from pipeline.report.pictures import close_ups_of
 from schemas.calibrations import DOF_NAMES, PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation
@@ -34,13 +36,22 @@ def write_frame_page(
     """
     before = Extrinsics(*(prior.of(pair) for pair in PAIRS))
     after = Extrinsics(*(solution.pairs[pair].T for pair in PAIRS))
-    pictures = scene_pictures([Scene(frame, observation)], before, after, _LABELS)
+    scene = Scene(frame, observation)
+    views = [
+        {
+            "label": label,
+            "front": jpeg_uri(whole_view(scene, state, label)),
+            "top": top_view(scene, state, state, (label, label)),
+        }
+        for label, state in zip(_LABELS, (before, after), strict=True)
+    ]
     html = render(
         "frame.html",
         title=title,
         method=solution.method,
         labels=_LABELS,
-        scene=pictures[0],
+        views=views,
+        close_ups=close_ups_of(scene, before, after),
         pairs=[_told(pair, prior, solution) for pair in PAIRS],
     )
     return write_page(path, html)

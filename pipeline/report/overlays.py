@@ -18,7 +18,16 @@ from pipeline.geometry.se3 import transform_points
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = ["Extrinsics", "Scene", "Window", "camera_of", "close_up", "decode_image", "front_view"]
+__all__ = [
+    "Extrinsics",
+    "Scene",
+    "Window",
+    "camera_of",
+    "close_up",
+    "decode_image",
+    "front_view",
+    "whole_view",
+]
 
 Image = UInt8[np.ndarray, "H W 3"]
 _NEAR_M, _FAR_M = 4.0, 80.0  # ends of the colour scale; logarithmic between
@@ -76,16 +85,20 @@ def decode_image(frame: Frame) -> Image:
 
 def front_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> Image:
     """Lidar and moving radar in the image: left half at `before`, right half at `after`; always `_CANVAS_PX` wide."""
-    scale = _CANVAS_PX / scene.frame.image_width_px
-    camera = camera_of(scene.frame).scaled(scale)
-    size = (camera.width_px, camera.height_px)
-    dimmed = _dimmed(cv2.resize(decode_image(scene.frame), size, interpolation=_interpolation(scale)))
-    halves = [_draw(dimmed.copy(), scene, camera, scale, state) for state in (before, after)]
-    middle = dimmed.shape[1] // 2
+    halves = [_drawn(scene, state) for state in (before, after)]
+    middle = halves[0].shape[1] // 2
     image = np.concatenate([halves[0][:, :middle], halves[1][:, middle:]], axis=1)
     cv2.line(image, (middle, 0), (middle, image.shape[0]), _WHITE, 3)
     _tag(image, labels[0], (14, 34))
     _tag(image, labels[1], (middle + 14, 34))
+    _colour_bar(image)
+    return image
+
+
+def whole_view(scene: Scene, state: Extrinsics, label: str) -> Image:
+    """The same with all of the image at one state, for changes so large that halves show different things."""
+    image = _drawn(scene, state)
+    _tag(image, label, (14, 34))
     _colour_bar(image)
     return image
 
@@ -110,6 +123,15 @@ def close_up(scene: Scene, state: Extrinsics, window: Window, zoom: int) -> Imag
         )
         _dots(picture, at[inside], distance[inside], radius, outline=ring)
     return picture
+
+
+def _drawn(scene: Scene, state: Extrinsics) -> np.ndarray:
+    """The image, dimmed, `_CANVAS_PX` wide, with what lidar and radar saw."""
+    scale = _CANVAS_PX / scene.frame.image_width_px
+    camera = camera_of(scene.frame).scaled(scale)
+    size = (camera.width_px, camera.height_px)
+    dimmed = _dimmed(cv2.resize(decode_image(scene.frame), size, interpolation=_interpolation(scale)))
+    return _draw(dimmed, scene, camera, scale, state)
 
 
 def _draw(image: np.ndarray, scene: Scene, camera: Camera, scale: float, state: Extrinsics) -> np.ndarray:

@@ -12,10 +12,19 @@ from pipeline.report.encode import jpeg_uri
 from pipeline.report.overlays import Extrinsics, Scene, camera_of, close_up, front_view
 from pipeline.report.scenes import choose_windows
 
-__all__ = ["ScenePictures", "scene_pictures"]
+__all__ = ["CloseUps", "ScenePictures", "close_ups_of", "scene_pictures"]
 
 _CLOSE_UPS = 3
 _CLOSE_UP_WIDTH_PX = 420
+
+
+@dataclass(frozen=True)
+class CloseUps:
+    """The same windows before and after, as data URIs."""
+
+    pairs: list[tuple[str, str]]
+    zoom: int
+    window_deg: str
 
 
 @dataclass(frozen=True)
@@ -39,7 +48,8 @@ def scene_pictures(
     return [_pictures(scene, before, after, labels) for scene in scenes]
 
 
-def _pictures(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> ScenePictures:
+def close_ups_of(scene: Scene, before: Extrinsics, after: Extrinsics) -> CloseUps:
+    """Windows where the lidar has most to say, enlarged, at both states."""
     windows = choose_windows(scene.observation, after.T_camera_lidar, _CLOSE_UPS)
     width = windows[0].size_px[0] if windows else 1
     zoom = max(2, round(_CLOSE_UP_WIDTH_PX / width))
@@ -48,13 +58,18 @@ def _pictures(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple
         pair = [jpeg_uri(close_up(scene, s, window, zoom)) for s in (before, after)]
         close_ups.append((pair[0], pair[1]))
     angle = np.degrees(width / camera_of(scene.frame).focal_px[0])
+    return CloseUps(close_ups, zoom, f"{angle:.1f}")
+
+
+def _pictures(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> ScenePictures:
+    enlarged = close_ups_of(scene, before, after)
     return ScenePictures(
         scene.frame.frame_index,
         scene.frame.log,
         scene.frame.drive,
         jpeg_uri(front_view(scene, before, after, labels)),
         top_view(scene, before, after, labels),
-        close_ups,
-        zoom,
-        f"{angle:.1f}",
+        enlarged.pairs,
+        enlarged.zoom,
+        enlarged.window_deg,
     )

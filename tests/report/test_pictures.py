@@ -9,7 +9,16 @@ import pytest
 
 from pipeline.geometry.se3 import exp_se3, from_rotation_translation, inverse, transform_points
 from pipeline.report.above import top_bitmap, top_view
-from pipeline.report.overlays import Extrinsics, Scene, Window, camera_of, close_up, decode_image, front_view
+from pipeline.report.overlays import (
+    Extrinsics,
+    Scene,
+    Window,
+    camera_of,
+    close_up,
+    decode_image,
+    front_view,
+    whole_view,
+)
 from pipeline.report.residuals import MEASURES, boundary_distance_px, frame_residuals
 from pipeline.report.scenes import choose_frames, choose_windows
 from schemas.frames import Frame
@@ -95,6 +104,14 @@ def test_each_half_of_the_front_view_shows_its_own_state(scene: Scene) -> None:
     np.testing.assert_array_equal(both[:, middle + 3 :], good[:, middle + 3 :])
     np.testing.assert_array_equal(both[:, : middle - 3], bad[:, : middle - 3])
     assert (good[:, : middle - 3] != bad[:, : middle - 3]).any()
+
+
+def test_a_whole_view_shows_one_state_left_and_right(scene: Scene) -> None:
+    whole, both = whole_view(scene, GOOD, "x"), front_view(scene, GOOD, _turned(2.0), ("x", ""))
+    middle = whole.shape[1] // 2
+    np.testing.assert_array_equal(whole[:, : middle - 3], both[:, : middle - 3])
+    assert (whole[:, middle + 3 :] != both[:, middle + 3 :]).any()
+    assert top_view(scene, GOOD, GOOD, ("before", "before")).count(">before<") == 1
 
 
 def test_a_moving_track_is_a_white_cross_where_it_projects(scene: Scene) -> None:
