@@ -14,9 +14,9 @@ from onnx_models import write_manifest
 
 from pipeline.config import FleetConfig, config_hash, load_fleet
 from pipeline.errors import ConfigError, ModelError
+from pipeline.geometry.range_image import EMPTY, channels_of, project, vote_of_neighbours
 from pipeline.perceive.ground import PointKind, find_ground, height_over
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
-from pipeline.perceive.models.range_image_projection import EMPTY, channels_of, project, vote_of_neighbours
 from pipeline.perceive.run import perceive_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows, write_partition

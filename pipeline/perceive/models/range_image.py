@@ -37,9 +37,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pipeline.config import OnnxPointSemantics
 from pipeline.errors import ModelError
+from pipeline.geometry.range_image import EMPTY, channels_of, project, vote_of_neighbours
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.manifest import check_hash, read_manifest
-from pipeline.perceive.models.range_image_projection import EMPTY, channels_of, project, vote_of_neighbours
 from pipeline.perceive.models.session import open_session
 
 __all__ = ["POINT_LABEL_SETS", "RangeImageManifest", "RangeImageSegmenter"]
