@@ -21,6 +21,7 @@ def train(
     batch_size: int | None = None,
     budget: str | None = None,
     seed: int | None = None,
+    start_from: Path | None = None,
     time_limit: str | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     compiled: bool = False,
@@ -41,6 +42,7 @@ def train(
         batch_size: frames per process and step.
         budget: time of the whole run, as in 25m; the learning rate falls over it.
         seed: of everything random.
+        start_from: folder of a finished run whose best weights a new run begins with, to fine-tune them on other data.
         time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
         device: cpu, cuda, or whatever is there.
         compiled: compile the encoders (minutes at first, faster afterwards).
@@ -66,7 +68,7 @@ def train(
     }
     settings = load_train_config(config, options)
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
-    request = TrainRequest(data, out, device, limit, compiled, resident)
+    request = TrainRequest(data, out, device, limit, compiled, resident, start_from)
     if ray_workers is not None:
         from pipeline.learn.ray_training import train_on_ray
 

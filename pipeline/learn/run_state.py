@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, ContractError
 from pipeline.learn.acceleration import accelerate
 from pipeline.learn.batches import BatchStream, batch_stream
 from pipeline.learn.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
@@ -104,13 +104,29 @@ class RunState:
 
 
 def begin_run(
-    data: str, folder: Path, config: TrainConfig, processes: Processes, *, compiled: bool, resident: bool
+    data: str,
+    folder: Path,
+    config: TrainConfig,
+    processes: Processes,
+    *,
+    compiled: bool,
+    resident: bool,
+    start: Path | None = None,
 ) -> RunState:
     """A fresh run, or the one in the folder where its last checkpoint left it.
 
+    Args:
+        data: see `TrainRequest`.
+        folder: of the run.
+        config: a run goes on only with the same.
+        processes: who trains.
+        compiled: see `TrainRequest`.
+        resident: see `TrainRequest`.
+        start: run whose weights a fresh run begins with; a run that goes on has its own.
+
     Raises:
-        ConfigError: the folder's run has another configuration.
-        ContractError: no training data, or other data than the run began with.
+        ConfigError: the folder's run has another configuration; `start` has another kind of network.
+        ContractError: no training data, or other data than the run began with; nothing trained in `start`.
     """
     stream = batch_stream(data, config, processes, resident=resident)
     try:
@@ -136,6 +152,8 @@ def begin_run(
             state = load_checkpoint(folder / LAST, processes.device)
             _same_config(folder, state["config"], config)
             run.load(state, processes)
+        elif start is not None:
+            _take_weights(network, start)
     except BaseException:
         stream.close()
         raise
@@ -149,11 +167,21 @@ def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
         ContractError: no readable checkpoint.
     """
     path = folder / (BEST if best and (folder / BEST).exists() else LAST)
+    if not path.exists():
+        raise ContractError(str(folder), f"no run: there is neither {BEST} nor {LAST}")
     state = load_checkpoint(path)
     config = TrainConfig.model_validate(state["config"])
     network = CalibrationNetwork(_network_config(config, Grid(**state["grid"])))
     network.load_state_dict(state["network"])
     return network.eval()
+
+
+def _take_weights(network: CalibrationNetwork, start: Path) -> None:
+    trained = network_of_run(start)
+    if trained.config != network.config:
+        told = f"{start} has a network of another kind, {trained.config}, not {network.config}"
+        raise ConfigError("train", "start-from", told)
+    network.load_state_dict(trained.state_dict())
 
 
 def _network_config(config: TrainConfig, grid: Grid) -> NetworkConfig:

@@ -51,6 +51,7 @@ class TrainRequest:
         time_limit_s: stop with a checkpoint after so long in this call; None = no limit.
         compiled: compile the encoders.
         resident: hold the whole split on the device.
+        start: run whose best weights a fresh run begins with, for fine-tuning on other data.
     """
 
     data: str
@@ -59,6 +60,7 @@ class TrainRequest:
     time_limit_s: float | None = None
     compiled: bool = False
     resident: bool = False
+    start: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,13 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
         processes = stack.enter_context(joined(request.device))
         told = stack.enter_context(told_to_stop())
         run = begin_run(
-            request.data, request.out, config, processes, compiled=request.compiled, resident=request.resident
+            request.data,
+            request.out,
+            config,
+            processes,
+            compiled=request.compiled,
+            resident=request.resident,
+            start=request.start,
         )
         stack.callback(run.stream.close)
         log: MetricsLog | None = None

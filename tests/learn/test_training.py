@@ -268,3 +268,20 @@ def test_encoders_may_learn_at_every_step_and_matchers_at_every_third(data, tmp_
 def test_networks_without_classes_are_matched_at_every_step(without_classes):
     with pytest.raises(ConfigError, match="matched_every must be 1"):
         load_train_config(None, {"matched_every": 2, **without_classes})
+
+
+def test_a_run_may_start_from_anothers_weights_and_then_goes_on_with_its_own(data, tmp_path):
+    train(TrainRequest(data, tmp_path / "old", "cpu"), config(steps=3))
+    # So small a rate moves nothing that counts: what was handed over is what is there.
+    still = config(steps=2, learning_rate=1e-9, final_learning_rate=1e-9, seed=5)
+    request = TrainRequest(data, tmp_path / "new", "cpu", start=tmp_path / "old")
+    assert train(request, still).status == "done"
+    old, new = network_of_run(tmp_path / "old"), network_of_run(tmp_path / "new", best=False)
+    for a, b in zip(old.parameters(), new.parameters(), strict=True):
+        assert torch.allclose(a, b, atol=1e-7)
+    # What lies in the folder wins: the run is finished, whatever it might start from.
+    assert train(TrainRequest(data, tmp_path / "new", "cpu", start=tmp_path / "gone"), still).step == 2
+    with pytest.raises(ContractError, match="neither"):
+        train(TrainRequest(data, tmp_path / "x", "cpu", start=tmp_path / "gone"), still)
+    with pytest.raises(ConfigError, match="another kind"):
+        train(TrainRequest(data, tmp_path / "y", "cpu", start=tmp_path / "old"), config(steps=1, width=8))
