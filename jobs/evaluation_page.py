@@ -125,7 +125,8 @@ def _views(lake: Lake, compared: Sequence[Compared]) -> list[View]:
 def _scene(
     lake: Lake, run: Mapping[str, CalibrationRecord], *, another: bool
 ) -> tuple[Scene, Extrinsics, Extrinsics] | None:
-    """A frame with much to see, and the run's two states; None where the lake has no frames of the day."""
+    """A frame with much to see, and the run's two states, the result with its time offsets; None without frames."""
+    from pipeline.report.clocks import as_stamped, clocks_of
     from pipeline.report.overlays import Extrinsics, Scene
     from pipeline.report.scenes import choose_frames
     from pipeline.store.current import prior_of, transform_of
@@ -153,4 +154,4 @@ def _scene(
     picked = [rows[i] for i in choose_frames(rows, states[1].T_camera_lidar, 2)]
     o = picked[-1 if another else 0]
     frames = [f for chunk in iterate_rows(lake, FRAMES, partition, Frame, [o.frame_index]) for f in chunk]
-    return (Scene(frames[0], o), states[0], states[1]) if frames else None
+    return (Scene(frames[0], o), states[0], as_stamped(states[1], o, clocks_of(run))) if frames else None

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from pipeline.geometry.se3 import transform_points
+from pipeline.report.clocks import Clocks, as_stamped
 from pipeline.report.overlays import Extrinsics, camera_of
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
@@ -34,13 +35,18 @@ _MIN_POINTS = 5  # shares of fewer say nothing
 
 
 def frame_residuals(
-    observations: Sequence[Observation], states: Sequence[Extrinsics]
+    observations: Sequence[Observation], states: Sequence[Extrinsics], clocks: Sequence[Clocks] = ()
 ) -> list[dict[str, Float[np.ndarray, " F"]]]:
-    """Measure per state, pair and frame, as MEASURES says; NaN where a frame has too little to tell."""
+    """Measure per state, pair and frame, as MEASURES says; NaN where a frame has too little to tell.
+
+    `clocks` are the states' time offsets; without them all are 0.
+    """
+    clocks = clocks or [Clocks()] * len(states)
     values = np.full((len(states), len(MEASURES), len(observations)), np.nan)
     for f, observation in enumerate(observations):
         boundary = boundary_distance_px(observation)
-        for s, state in enumerate(states):
+        for s, (unmoved, clock) in enumerate(zip(states, clocks, strict=True)):
+            state = as_stamped(unmoved, observation, clock)
             values[s, :, f] = (
                 _on_silhouette(observation, boundary, state.T_camera_lidar),
                 _in_boxes(observation, state.T_camera_radar),

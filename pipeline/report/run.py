@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
+from pipeline.report.clocks import Clocks, as_stamped, clocks_of
 from pipeline.report.day import PairView, answer_for, drift_sentence, pair_view, sigmas_of
 from pipeline.report.figures import drift_figure, residual_figure, sigma_figure
 from pipeline.report.fleet import drift_panels, finding_views, headline_for, vehicle_rows
@@ -66,7 +67,8 @@ def write_day_page(
     views = [pair_view(records[p]) for p in PAIRS if p in records]
     before, after = _states(records)
     labels = ("prior", _after_label(views))
-    pictures, residual_svg, no_pictures = _pictures(lake, partition, before, after, labels)
+    clocks = clocks_of(records)
+    pictures, residual_svg, no_pictures = _pictures(lake, partition, before, after, labels, clocks)
     html = render(
         "day.html",
         vehicle=partition.vehicle,
@@ -81,6 +83,7 @@ def write_day_page(
         labels=labels,
         scenes=pictures,
         no_pictures=no_pictures,
+        clocks=clocks.in_words(),
         sigma_svg=_sigma_svg(records),
         residual_svg=residual_svg,
         provenance=_provenance(list(records.values())),
@@ -213,7 +216,9 @@ def _pictures(
     before: Extrinsics | None,
     after: Extrinsics | None,
     labels: tuple[str, str],
+    clocks: Clocks,
 ) -> tuple[list[Any], Any, str]:
+    """Pictures, residuals, and why there are none; `after` is drawn with the day's time offsets, `before` had none."""
     if before is None or after is None:
         return [], "", "the records carry no prior"
     if any(read_manifest(lake, t, partition) is None for t in (FRAMES, OBSERVATIONS)):
@@ -223,12 +228,15 @@ def _pictures(
         return [], "", "no frame of the day could be used"
     some = np.unique(np.linspace(0, len(observations) - 1, _FRAMES_LOOKED_AT).astype(int))
     spread = [observations[i] for i in some]
-    residuals = residual_figure(*frame_residuals(spread, (before, after)))
+    residuals = residual_figure(*frame_residuals(spread, (before, after), (Clocks(), clocks)))
     chosen = [spread[i] for i in choose_frames(spread, after.T_camera_lidar, _SCENES)]
     rows = [o.frame_index for o in chosen]
     frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
     scenes = [Scene(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
-    return scene_pictures(scenes, before, after, labels), residuals, "no frame of the day could be drawn"
+    pictures = [
+        scene_pictures([s], before, as_stamped(after, s.observation, clocks), labels)[0] for s in scenes
+    ]
+    return pictures, residuals, "no frame of the day could be drawn"
 
 
 def _sigma_svg(records: Mapping[str, CalibrationRecord]) -> str:

@@ -1,0 +1,66 @@
+"""Time offsets in pictures: a sweep and an image with the same stamp were taken that far apart, and the car drove on.
+
+At 15 m/s an offset of 30 ms is half a metre: pictures of a calibration without its time offsets look worse than it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.report.overlays import Extrinsics
+from schemas.calibrations import CalibrationRecord
+from schemas.observations import Observation
+
+__all__ = ["Clocks", "as_stamped", "clocks_of"]
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """What to add to a stamp of the child to have it on the parent's clock [s]."""
+
+    camera_lidar_s: float = 0.0
+    lidar_radar_s: float = 0.0
+
+    def in_words(self) -> str:
+        """Both in milliseconds; empty where neither is known."""
+        known = (("camera", self.camera_lidar_s), ("radar", self.lidar_radar_s))
+        return ", ".join(f"{sensor} {1e3 * dt_s:+.0f} ms" for sensor, dt_s in known if dt_s)
+
+
+def clocks_of(records: Mapping[str, CalibrationRecord]) -> Clocks:
+    """The estimated offsets of a run, by pair; 0 where a method or a day gave none, as the prior assumes."""
+    offset_s = {pair: r.time_offset_s for pair, r in records.items() if r.time_offset_s is not None}
+    return Clocks(offset_s.get("camera_lidar", 0.0), offset_s.get("lidar_radar", 0.0))
+
+
+def as_stamped(state: Extrinsics, observation: Observation, clocks: Clocks) -> Extrinsics:
+    """Transforms between data of one frame, for what stands still: the poses and the car's own way over the offsets.
+
+    T_camera_radar stays as it is: it draws moving clusters only, whose way is their own.
+    """
+    v, yaw_rate = _velocity_lidar(state, observation), observation.ego_yaw_rate_radps or 0.0
+    to_image, to_sweep = (_way(v, yaw_rate, dt_s) for dt_s in (clocks.camera_lidar_s, clocks.lidar_radar_s))
+    return Extrinsics(state.T_camera_lidar @ to_image, state.T_camera_radar, to_sweep @ state.T_lidar_radar)
+
+
+def _way(
+    velocity_mps: Float[np.ndarray, " 3"], yaw_rate_radps: float, dt_s: float
+) -> Float[np.ndarray, "4 4"]:
+    """Where what stands lay dt earlier, in lidar coordinates: p' = Rz(yaw_rate dt) (p + v dt), as in the objective."""
+    R = exp_so3(np.array([0.0, 0.0, yaw_rate_radps * dt_s]))
+    return from_rotation_translation(R, R @ velocity_mps * dt_s)
+
+
+def _velocity_lidar(state: Extrinsics, observation: Observation) -> Float[np.ndarray, " 3"]:
+    """Own velocity in lidar axes: the radar's heading, level; straight ahead where the radar saw none."""
+    speed_mps = observation.ego_speed_mps or 0.0
+    ahead = np.array([1.0, 0.0, 0.0])
+    if observation.radar_velocity_mps is not None and speed_mps:
+        v = state.T_lidar_radar[:3, :3] @ observation.radar_velocity_mps * np.sign(speed_mps)
+        ahead = np.array([v[0], v[1], 0.0]) / max(float(np.hypot(v[0], v[1])), 1e-9)
+    return speed_mps * ahead
