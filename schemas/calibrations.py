@@ -92,10 +92,15 @@ CALIBRATIONS = TableSchema(
         scalar(
             "loop_rotation_rad",
             "float64",
-            "angle of the loop of the three INDEPENDENT pair estimates",
+            "angle of the loop of the three INDEPENDENT pair estimates, over the rotations that they determine",
             nullable=True,
         ),
-        scalar("loop_translation_m", "float64", "its translation", nullable=True),
+        scalar(
+            "loop_translation_m",
+            "float64",
+            "its translation; null where the independent estimates did not determine one",
+            nullable=True,
+        ),
         scalar(
             "loop_rotation_sigma_rad", "float64", "sigma that the pairs promise for the angle", nullable=True
         ),

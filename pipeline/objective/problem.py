@@ -64,7 +64,11 @@ class PairEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """All three pairs, and the loop of three independent pair estimates where the method made them."""
+    """All three pairs, and the loop of three independent pair estimates where the method made them.
+
+    The loop's angle counts the rotations that were determined apart; its translation is None where none was, as in
+    `joint`, whose camera-radar estimate without the lidar takes its position from the prior.
+    """
 
     method: str
     pairs: dict[str, PairEstimate]

@@ -94,7 +94,9 @@ def pair_view(record: CalibrationRecord) -> PairView:
         title=PAIR_TITLES[record.pair],
         status=record.status,
         advice=_ADVICE[record.status],
-        reason="" if record.reason.startswith(_SAID_BY_THE_AXES) else record.reason,
+        reason="; ".join(
+            part for part in record.reason.split("; ") if not part.startswith(_SAID_BY_THE_AXES)
+        ),
         known_to=_known_to(sigma, observable),
         undetermined=", ".join(unseen) if sigma is not None else "",
         moved_by=_moved_by(T, T_prior),
@@ -110,7 +112,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
         time_offset=_time_offset(record),
         loop=_loop(record),
         vouched=_vouched(record),
-        notes=list(record.notes),
+        notes=[note for note in record.notes if not note.startswith(_SAID_BY_THE_AXES)],
         assumptions=list(record.assumptions),
         missing=list(record.drive_missing),
         diagnostics=[(name, f"{value:.4g}") for name, value in sorted(record.diagnostics.items())],
@@ -249,9 +251,17 @@ def _time_offset(record: CalibrationRecord) -> str:
 
 
 def _loop(record: CalibrationRecord) -> str:
-    if record.loop_rotation_rad is None or record.loop_translation_m is None:
+    if record.loop_rotation_rad is None:
         return ""
-    return f"{np.degrees(record.loop_rotation_rad):.2f} deg, {100 * record.loop_translation_m:.1f} cm"
+    degrees = float(np.degrees(1.0))
+    angle = f"{_with_sigma(record.loop_rotation_rad, record.loop_rotation_sigma_rad, degrees, 2)} deg"
+    if record.loop_translation_m is None:
+        return f"{angle}; rotations only"
+    return f"{angle}, {_with_sigma(record.loop_translation_m, record.loop_translation_sigma_m, 100.0, 1)} cm"
+
+
+def _with_sigma(value: float, sigma: float | None, scale: float, digits: int) -> str:
+    return f"{scale * value:.{digits}f}" + ("" if sigma is None else f" ± {scale * sigma:.{digits}f}")
 
 
 def _json_text(record: CalibrationRecord, T: np.ndarray | None) -> str:

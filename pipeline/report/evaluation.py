@@ -172,7 +172,8 @@ def _setup(run: EvaluatedRun) -> Markup:
     for k, (colour, word) in enumerate(
         (("#2f9e6a", "reflector"), (MUTED, "by the prior"), ("#1f6fc0", "by the result"))
     ):
-        plot.parts.append(f'<circle cx="{600}" cy="{30 + 20 * k}" r="5" fill="{colour}"/>')
+        mark = "<circle cx='600' cy='{}' r='5'" if k else "<path d='M600 23l7 12h-14z'"
+        plot.parts.append(f"{mark.format(30 + 20 * k)} fill='{colour}'/>")
         plot.text(612.0, 34.0 + 20.0 * k, word)
     return document(720.0, 490.0, plot.parts, "Reflectors from above, and where prior and result put them")
 

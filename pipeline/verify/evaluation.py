@@ -34,7 +34,8 @@ class Comparison:
     prior_errors: dict[str, np.ndarray]
     statuses: dict[str, str]
     normalised: np.ndarray  # error / sigma of every observable DoF of every pair
-    independent_loop: tuple[float, float] | None = None  # [rad], [m], of three pairs estimated apart
+    # Angle [rad] and shift [m] of pairs estimated apart; the shift is None where they did not determine it.
+    independent_loop: tuple[float, float | None] | None = None
     truth_spread: dict[str, np.ndarray] = field(
         default_factory=dict
     )  # like errors: spread of one frame's picks
@@ -110,9 +111,9 @@ def compare(
     )
 
 
-def _independent_loop(run: Mapping[str, CalibrationRecord]) -> tuple[float, float] | None:
+def _independent_loop(run: Mapping[str, CalibrationRecord]) -> tuple[float, float | None] | None:
     for record in run.values():
-        if record.loop_rotation_rad is not None and record.loop_translation_m is not None:
+        if record.loop_rotation_rad is not None:
             return record.loop_rotation_rad, record.loop_translation_m
     return None
 

@@ -175,7 +175,7 @@ def _our_row(table: str, method: str, environment: str, members: Sequence[Compar
         return TableRow(table, method, environment, "ours", 0, (_NAN,) * len(COLUMNS))
     accepted = sum(s == "accepted" for c in members for s in c.statuses.values())
     loops = [c.independent_loop for c in members if c.independent_loop is not None]
-    angle, shift = np.mean(loops, axis=0) if loops else (None, None)
+    shifts = [shift for _, shift in loops if shift is not None]
     return TableRow(
         table,
         method,
@@ -185,8 +185,8 @@ def _our_row(table: str, method: str, environment: str, members: Sequence[Compar
         _values([c.errors for c in members]),
         accepted,
         len(PAIRS) * len(members),
-        None if angle is None else float(np.degrees(angle)),
-        None if shift is None else float(shift),
+        float(np.degrees(np.mean([angle for angle, _ in loops]))) if loops else None,
+        float(np.mean(shifts)) if shifts else None,
     )
 
 
@@ -197,12 +197,18 @@ def _loop_remarks(rows: Sequence[TableRow]) -> list[str]:
         for r in rows
         if r.source == "ours" and r.pairs and r.environment == "all" and max(r.values[7:]) < _CLOSED
     ]
-    remarks = []
-    for r in closed:
-        known = r.independent_loop_deg is not None and r.independent_loop_m is not None
-        apart = f"{r.independent_loop_deg:.3f} deg, {r.independent_loop_m:.3f} m" if known else "not known"
-        remarks.append(f"{r.method} closes the loop by construction; loop of its independent pairs: {apart}")
-    return remarks
+    return [
+        f"{r.method} closes the loop by construction; loop of its independent pairs: {_apart(r)}"
+        for r in closed
+    ]
+
+
+def _apart(row: TableRow) -> str:
+    if row.independent_loop_deg is None:
+        return "not known"
+    if row.independent_loop_m is None:
+        return f"{row.independent_loop_deg:.3f} deg, over rotations only"
+    return f"{row.independent_loop_deg:.3f} deg, {row.independent_loop_m:.3f} m"
 
 
 def _values(errors: Sequence[Mapping[str, np.ndarray]]) -> tuple[float, ...]:
@@ -219,16 +225,17 @@ def _values(errors: Sequence[Mapping[str, np.ndarray]]) -> tuple[float, ...]:
 
 def _line(row: TableRow) -> str:
     v = row.values
-    cells = " | ".join(_join(part) for part in (v[:2], v[2:4], v[4:7], v[7:]))
+    digits = 3 if row.source == "ours" else 2  # as many as the paper prints
+    cells = " | ".join(_join(part, digits) for part in (v[:2], v[2:4], v[4:7], v[7:]))
     runs = "other data" if row.runs is None else str(row.runs)
     share = f"{row.accepted_pairs} of {row.pairs} pairs" if row.pairs else ""
     return f"| {row.method} | {row.environment} | {runs} | {cells} | {share} |"
 
 
-def _join(values: Sequence[float]) -> str:
+def _join(values: Sequence[float], digits: int) -> str:
     if np.all(np.isnan(values)):
         return "-"
-    return " / ".join("-" if np.isnan(v) else f"{v:.3f}".rstrip("0").ljust(4, "0") for v in values)
+    return " / ".join("-" if np.isnan(v) else f"{v:.{digits}f}" for v in values)
 
 
 def _honesty(comparisons: Sequence[Comparison]) -> list[str]:

@@ -1,5 +1,6 @@
 """The paper's error at corner reflectors, from truth and from picks, and its Table 1."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -157,6 +158,27 @@ def test_a_loop_closed_by_construction_is_called_so_and_the_independent_one_is_t
     assert remark in as_markdown(rows, comparisons)["Table 1"]
     opened = [compare(current_runs(make_run(off_deg=0.3))[0], TRUTH)]
     assert "closes the loop" not in as_markdown(table_rows(opened), opened)["Table 1"]
+
+
+def test_a_loop_of_rotations_only_is_told_without_a_shift():
+    run = {p: replace(r, loop_rotation_rad=np.radians(0.9)) for p, r in
+           current_runs(make_run(off_deg=0.0))[0].items()}  # fmt: skip
+    comparisons = [compare(run, TRUTH)]
+    rows = table_rows(comparisons)
+    assert "independent pairs: 0.900 deg, over rotations only" in as_markdown(rows, comparisons)["Table 1"]
+    told = [
+        r for r in pq.read_table(pa.BufferReader(as_parquet(rows))).to_pylist() if r["independent_loop_deg"]
+    ]
+    assert [r["independent_loop_m"] for r in told] == [None] * len(told)
+    assert len(told) == 2  # of all environments, and of the run's own
+
+
+def test_our_numbers_have_three_digits_and_the_paper_s_its_two():
+    lines = as_markdown(table_rows(compared_runs()), compared_runs())["Table 1"].splitlines()
+    ours = next(line for line in lines if line.startswith("| joint | all"))
+    printed = next(line for line in lines if line.startswith("| paper: joint SSL | all"))
+    assert {len(n.split(".")[1]) for n in re.findall(r"\d+\.\d+", ours)} == {3}
+    assert {len(n.split(".")[1]) for n in re.findall(r"\d+\.\d+", printed)} == {2}
 
 
 def test_the_parquet_table_says_the_same_as_the_markdown():
