@@ -21,10 +21,11 @@ from pipeline.objective.differentiable.lookup import nearest_pixel
 from pipeline.objective.differentiable.paper import smooth_iou
 from pipeline.objective.differentiable.poses import inverse, loop_loss, transform_points
 from pipeline.objective.differentiable.projection import GridProjection
-from pipeline.objective.differentiable.static import static_cost
+from pipeline.objective.differentiable.static import elevation_limits, static_cost, tells_elevation
 from pipeline.objective.differentiable.terms import (
     DEG,
     GridMaps,
+    RadarTracks,
     cluster_class_cost,
     edge_cost,
     sky_cost,
@@ -61,6 +62,8 @@ class FrameObjective:
     edge_in_view: Bool[Tensor, "B E"]
     radar_in_view: Bool[Tensor, "B R"]
     centres_rad: Float[Tensor, "B G 2"]
+    tracks: RadarTracks
+    radar_tells_elevation: Bool[Tensor, "B R"]
 
     def terms(
         self,
@@ -98,21 +101,18 @@ class FrameObjective:
     def _camera_radar(self, T: Tensor) -> dict[str, Tensor]:
         b = self.batch
         return {
-            "tracks_camera": track_detection_cost(
-                T, b.track_xyz_m, b.track_valid, self.centres_rad, b.detection_valid, b.radar_has_elevation
-            ),
+            "tracks_camera": track_detection_cost(T, self.tracks, self.centres_rad, b.detection_valid),
             "radar_sky": sky_cost(self.maps, T, b.radar_xyz_m, self.radar_in_view, _RADAR_SKY_FREE_DEG),
         }
 
     def _lidar_radar(self, T: Tensor) -> dict[str, Tensor]:
         b = self.batch
         lidar, still = _at_lag(b, b.lidar_xyz_m, b.radar_lag_s), b.radar_valid & (b.radar_motion == 0)
-        elevation = b.radar_has_elevation
         return {
-            "static": static_cost(T, b.radar_xyz_m, still, lidar, b.lidar_valid, b.ground_plane, elevation),
-            "tracks_lidar": track_cluster_cost(
-                T, b.track_xyz_m, b.track_valid, b.cluster_centre_m, b.cluster_valid, elevation
+            "static": static_cost(
+                T, b.radar_xyz_m, still, lidar, b.lidar_valid, b.ground_plane, self.radar_tells_elevation
             ),
+            "tracks_lidar": track_cluster_cost(T, self.tracks, b.cluster_centre_m, b.cluster_valid),
             "drivable": self._drivable(T),
         }
 
@@ -145,6 +145,13 @@ def frame_objective(batch: TrainingBatch) -> FrameObjective:
         batch.edge_valid & _surely_in_view(maps, batch.T_camera_lidar, batch.edge_xyz_m),
         batch.radar_valid & _surely_in_view(maps, batch.T_camera_radar, batch.radar_xyz_m),
         torch.stack([(box[..., 0] + box[..., 2]) / 2, (box[..., 1] + box[..., 3]) / 2], -1),
+        RadarTracks(batch.track_xyz_m, batch.track_valid, batch.radar_has_elevation),
+        tells_elevation(
+            batch.T_lidar_radar.to(batch.radar_xyz_m.dtype),
+            batch.radar_xyz_m,
+            batch.radar_has_elevation,
+            elevation_limits(batch.lidar_xyz_m, batch.lidar_valid),
+        ),
     )
 
 

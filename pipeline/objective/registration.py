@@ -25,6 +25,12 @@ from pipeline.objective.registration_loops import STATS, accumulate_frames
 from schemas.observations import Observation
 
 __all__ = [
+    "BOUNCE_PRIOR",
+    "RANGE_M",
+    "SIDE_RAD",
+    "SIGMA_START",
+    "STRAY",
+    "VIEW_MARGIN_RAD",
     "NormalEquations",
     "RegistrationFrames",
     "normal_equations",
@@ -38,10 +44,11 @@ _SIGMA_LEAST = np.array([np.radians(0.10), np.radians(0.5), 0.05])
 _SIGMA_MOST = np.array([np.radians(1.5), np.radians(5.0), 0.60])
 BOUNCE_PRIOR = 0.12
 _BOUNCE_MOST = 0.3
-_RANGE_M = (3.0, 60.0)  # nearer is the car's own clutter; farther the lidar has too few points
+RANGE_M = (3.0, 60.0)  # over ground; nearer is the car's own clutter; farther the lidar has too few points
 _RADAR_POINTS = 500  # per frame; more say the same again
-_SIDE_RAD = 1.25
-_VIEW_MARGIN_RAD = np.radians(1.0)  # half a wide radar's cell, less what its detections prefer
+SIDE_RAD = 1.25
+STRAY = 200  # one in so many lidar points may lie outside the lidar's view
+VIEW_MARGIN_RAD = np.radians(1.0)  # half a wide radar's cell, less what its detections prefer
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +216,7 @@ def normal_equations(
         outlier,
         bounce_prior,
         stride,
-        _RANGE_M[1] + 5.0,
+        RANGE_M[1] + 5.0,
         H,
         g,
         info,
@@ -246,9 +253,9 @@ def _elevation_limits(observations: Sequence[Observation]) -> np.ndarray:
         p = o.lidar_map_xyz_m
         if len(p) >= 100:
             angle = np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))
-            few = np.partition(angle, (len(p) // 200, len(p) - 1 - len(p) // 200))
-            low.append(few[len(p) // 200])
-            high.append(few[-1 - len(p) // 200])
+            few = np.partition(angle, (len(p) // STRAY, len(p) - 1 - len(p) // STRAY))
+            low.append(few[len(p) // STRAY])
+            high.append(few[-1 - len(p) // STRAY])
     # No single street shows all of the field of view.
     return np.array([min(low), max(high)], np.float64) if low else np.array([-1.5, 1.5])
 
@@ -258,7 +265,7 @@ def _told_elevations(limits_rad: np.ndarray, sigma_rad: float) -> np.ndarray:
 
     What stands out of the lidar's view would be matched to its edge, always from the same side.
     """
-    margin = _VIEW_MARGIN_RAD + min(2 * sigma_rad, 0.25 * float(limits_rad[1] - limits_rad[0]))
+    margin = VIEW_MARGIN_RAD + min(2 * sigma_rad, 0.25 * float(limits_rad[1] - limits_rad[0]))
     return np.tan(np.clip(limits_rad + np.array([margin, -margin]), -1.5, 1.5))
 
 
@@ -267,10 +274,10 @@ def _static_detections(o: Observation, most: int, rng: np.random.Generator) -> n
     r = np.hypot(o.radar_xyz_m[:, 0], o.radar_xyz_m[:, 1])
     azimuth = np.arctan2(o.radar_xyz_m[:, 1], o.radar_xyz_m[:, 0])
     use = np.flatnonzero(
-        (o.radar_motion == 0) & (r > _RANGE_M[0]) & (r < _RANGE_M[1]) & (np.abs(azimuth) < _SIDE_RAD)
+        (o.radar_motion == 0) & (r > RANGE_M[0]) & (r < RANGE_M[1]) & (np.abs(azimuth) < SIDE_RAD)
     )
     if len(use) > most:
-        bins = np.clip((azimuth[use] + _SIDE_RAD) / (2 * _SIDE_RAD) * 24, 0, 23).astype(int)
+        bins = np.clip((azimuth[use] + SIDE_RAD) / (2 * SIDE_RAD) * 24, 0, 23).astype(int)
         weight = 1 / np.sqrt(np.bincount(bins, minlength=24)[bins])
         use = np.sort(rng.choice(use, most, replace=False, p=weight / weight.sum()))
     return o.radar_xyz_m[use].astype(np.float64)
@@ -280,7 +287,7 @@ def _lidar_in_view(lidar: np.ndarray, T_lidar_radar: np.ndarray) -> np.ndarray:
     """Lidar points that the radar might see from anywhere near the guess."""
     p = transform_points(inverse(T_lidar_radar), lidar.astype(np.float64))
     r = np.hypot(p[:, 0], p[:, 1])
-    keep = (r < _RANGE_M[1] + 3) & (r > 1.5) & (np.abs(np.arctan2(p[:, 1], p[:, 0])) < _SIDE_RAD + 0.2)
+    keep = (r < RANGE_M[1] + 3) & (r > 1.5) & (np.abs(np.arctan2(p[:, 1], p[:, 0])) < SIDE_RAD + 0.2)
     return lidar[keep].astype(np.float64)
 
 

@@ -13,12 +13,12 @@ from typing import no_type_check
 import numba
 import numpy as np
 
-__all__ = ["STATS", "accumulate_frames"]
+__all__ = ["CUT", "STATS", "accumulate_frames"]
 
 STATS = 12  # per frame: log likelihood, detections, assigned, bounced, sums of g r^2 (az, el, r), sums of g (3), spare
 _CELL = 1.5  # cell size and reach in sigmas: 5 x 5 cells cover +-3 sigma
 _REACH = 2
-_CUT = 9.0  # squared distance in (azimuth, range) beyond which a lidar point is no neighbour
+CUT = 9.0  # squared distance in (azimuth, range) beyond which a lidar point is no neighbour
 
 _jit = numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 
@@ -177,7 +177,7 @@ def accumulate_frames(
                     n = order[c]
                     da, dr = (sph[n, 0] - a) / sigma[0], (sph[n, 2] - r) / sigma[2]
                     d2 = da * da + dr * dr
-                    if d2 > _CUT:
+                    if d2 > CUT:
                         continue
                     de, db = 0.0, 0.0
                     if tells:

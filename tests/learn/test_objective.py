@@ -1,7 +1,5 @@
 """What training minimises: lowest at the truth, moved only along what is wrong, the same through a turned camera."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -12,9 +10,7 @@ from pipeline.learn.consensus import Consensus, doubt_loss, twist_between
 from pipeline.learn.losses import PAIR_OF_TERM, frame_objective, weighted
 from pipeline.learn.settings import PAIRS_OF, AugmentConfig, LossConfig
 from pipeline.objective.differentiable.poses import exp_se3, exp_so3, pose, transform_points
-from pipeline.objective.differentiable.static import static_cost
 from pipeline.objective.differentiable.terms import soft_clamp, soft_minimum
-from pipeline.objective.registration import SIGMA_START, normal_equations, registration_frames
 from schemas.training import UNKNOWN_CLASS
 from tests.benchmarks.ssl_landscape import PAIRS, TOLERANCE, day_batch, minima, with_true_clocks
 from tests.simulated_days import simulated_day
@@ -108,29 +104,6 @@ def test_the_loop_counts_degrees_and_fifths_of_a_metre(few):
     loop = frame_objective(few).terms(few.T_camera_lidar, T_turned, T_lidar_radar)["loop"]
     turn, lever = np.degrees(0.01), 5 * 0.01 * few.T_camera_radar[:, :2, 3].abs().sum(-1)
     np.testing.assert_allclose(loop, turn + lever, rtol=0.05)
-
-
-def test_static_cost_is_the_registrations_likelihood(day):
-    """Where both see all neighbours: the compiled loop cuts at three sigmas and takes every static detection."""
-    rows = [o for o in day.observations if o.ground_plane is not None][:3]
-    T = day.truth["lidar_radar"]
-    frames = registration_frames(rows, T, np.random.default_rng(0), radar_points=60)
-    for f in range(frames.count):
-        # All elevations told: the torch term has no limits of the lidar's view.
-        one = replace(frames.subset(np.array([f])), lidar_elevation_rad=np.array([-1.5, 1.5]))
-        wanted = normal_equations(one, T, -float(frames.stamp_gap_s[f]), SIGMA_START).cost[0]
-        lidar, radar = (torch.tensor(p, dtype=torch.float64)[None] for p in (one.lidar_m, one.radar_m))
-        got = static_cost(
-            torch.tensor(T)[None],
-            radar,
-            torch.ones(radar.shape[:2], dtype=torch.bool),
-            lidar,
-            torch.ones(lidar.shape[:2], dtype=torch.bool),
-            torch.tensor(one.plane),
-            torch.tensor(one.has_elevation),
-            points=lidar.shape[1],
-        )
-        np.testing.assert_allclose(got.item(), wanted, rtol=0.02)
 
 
 def test_random_guesses_close_the_loop_and_stay_in_their_limits(few):

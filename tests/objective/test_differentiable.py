@@ -36,6 +36,7 @@ from pipeline.objective.semantics import camera_at_label_size, labels_of
 from pipeline.prior import read_prior
 from pipeline.store.partitions import Lake, Partition
 from tests.objective.test_kernels import CAMERAS, PENALTY, cloud, poses, smooth_cost
+from tests.objective.test_static_parity import check_static
 from tests.simulated_days import perceived, simulated_day
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
@@ -65,12 +66,16 @@ def real(real_logs, tmp_path_factory):
 def test_parity_on_a_simulated_day(simulated):
     check_paper_losses(*simulated)
     check_edges(*simulated)
+    rows, truth = simulated
+    check_static(rows[:2], truth["lidar_radar"], thin=4)
 
 
 @pytest.mark.real_logs
 def test_parity_on_the_real_day(real):
     check_paper_losses(*real)
     check_edges(*real)
+    rows, truth = real
+    check_static(rows[:2], truth["lidar_radar"], thin=10)
 
 
 def near(T, count, seed):

@@ -1,9 +1,9 @@
 """Static radar detections against lidar points in torch: the log likelihood that `registration` climbs, at zero lag.
 
-Every pair of a detection and a point counts (the compiled loop looks at neighbours within three sigmas), so frames
-are thinned first.
+The same neighbours (within three sigmas of azimuth and range), the same ground bounce, the same elevations that count;
+frames are thinned first, for every detection is held against every point.
 
-Source: `pipeline.objective.registration`, whose sigmas and bounce prior are used here.
+Source: `pipeline.objective.registration`, which has the reasons, and whose constants are used here.
 """
 
 from __future__ import annotations
@@ -13,13 +13,22 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.objective.differentiable.poses import inverse, transform_points
-from pipeline.objective.registration import BOUNCE_PRIOR, SIGMA_START
+from pipeline.objective.registration import (
+    BOUNCE_PRIOR,
+    RANGE_M,
+    SIDE_RAD,
+    SIGMA_START,
+    STRAY,
+    VIEW_MARGIN_RAD,
+)
+from pipeline.objective.registration_loops import CUT
 
-__all__ = ["static_cost"]
+__all__ = ["elevation_limits", "static_cost", "tells_elevation"]
 
-_RANGE_M = (3.0, 60.0)
 _DETECTIONS, _POINTS = 96, 768  # of a frame at most: every pair of them is weighed
 _LEAST_HEIGHT_M = 0.3  # what is lower mirrors onto itself
+_STEEPEST_RAD = 1.5
+_NEVER = -1e4  # log weight of what is no partner
 
 
 def static_cost(
@@ -29,10 +38,12 @@ def static_cost(
     lidar: Float[Tensor, "F N 3"],
     lidar_present: Bool[Tensor, "F N"],
     plane: Float[Tensor, "F 4"],
-    has_elevation: Bool[Tensor, " F"],
+    tells: Bool[Tensor, "*batch #F M"],
     *,
     widen: float = 1.0,
     outlier: float = 1.0,
+    bounce_prior: float = BOUNCE_PRIOR,
+    detections: int = _DETECTIONS,
     points: int = _POINTS,
 ) -> Float[Tensor, "*batch F"]:
     """Minus the mean log likelihood of a frame's static detections, each drawn from a lidar point or its mirror image.
@@ -44,36 +55,88 @@ def static_cost(
         lidar: points of the sweep, ground kept.
         lidar_present: which rows are points.
         plane: ground, n.p + d = 0 in the lidar frame; zeros = none.
-        has_elevation: whether the radar measures it.
+        tells: whose elevations count, from `tells_elevation`; the others are held against azimuth and range alone.
         widen: factor of the sigmas; wider ones make a wider basin.
         outlier: weight of "no lidar point", in units of one lidar point at distance 0.
+        bounce_prior: prior probability of a detection by way of the ground.
+        detections: most detections of a frame; more are strided.
         points: most lidar points of a frame; more are strided.
     """
     # Rows are in no order that matters once they are strided: each stands for its neighbours.
-    thin, sparse = -(-radar.shape[1] // _DETECTIONS), -(-lidar.shape[1] // points)
-    radar, radar_present = radar[:, ::thin], radar_present[:, ::thin]
+    thin, sparse = -(-radar.shape[1] // detections), -(-lidar.shape[1] // points)
+    radar, radar_present, tells = radar[:, ::thin], radar_present[:, ::thin], tells[..., ::thin, None]
     lidar, lidar_present = lidar[:, ::sparse], lidar_present[:, ::sparse]
     sigma = torch.tensor(SIGMA_START * widen, dtype=radar.dtype, device=radar.device)
     T_radar_lidar = inverse(T_lidar_radar)
     measured = _spherical(radar) / sigma
     seen = _spherical(transform_points(T_radar_lidar, lidar)) / sigma
-    near = radar_present & (radar.norm(dim=-1) > _RANGE_M[0]) & (radar.norm(dim=-1) < _RANGE_M[1])
     plane = plane.to(lidar.dtype)
     height = (lidar * plane[:, None, :3]).sum(-1) + plane[:, None, 3]
     mirrored = lidar - 2 * height[..., None] * plane[:, None, :3]
     below = _spherical(transform_points(T_radar_lidar, mirrored))[..., 1] / sigma[1]
     delta = seen[..., None, :, :] - measured[:, :, None]  # *batch F M N 3
     flat = delta[..., 0].square() + delta[..., 2].square()
-    use = has_elevation[:, None, None].to(flat.dtype)
-    direct = flat + use * delta[..., 1].square()
+    reached = lidar_present[:, None] & (flat <= CUT)
+    bounces = reached & tells & (height > _LEAST_HEIGHT_M)[:, None]
+    direct = flat + tells.to(flat.dtype) * delta[..., 1].square()
     bounced = flat + (below[..., None, :] - measured[..., 1][:, :, None]).square()
-    can_bounce = has_elevation[:, None, None] & ((height > _LEAST_HEIGHT_M) & lidar_present)[:, None]
-    direct = (-0.5 * direct).masked_fill(~lidar_present[:, None], -1e4)
-    bounced = (-0.5 * bounced).masked_fill(~can_bounce, -1e4)
-    weight = (1 - BOUNCE_PRIOR) * direct.exp().sum(-1) + BOUNCE_PRIOR * bounced.exp().sum(-1)
-    likelihood = torch.log(weight + outlier)
-    count = near.sum(-1).clamp_min(1)
-    return -(likelihood * near).sum(-1) / count
+    direct = (-0.5 * direct).masked_fill(~reached, _NEVER).exp().sum(-1)
+    bounced = (-0.5 * bounced).masked_fill(~bounces, _NEVER).exp().sum(-1)
+    likelihood = torch.log((1 - bounce_prior) * direct + bounce_prior * bounced + outlier)
+    counts = radar_present & _useful(radar)
+    return -(likelihood * counts).sum(-1) / counts.sum(-1).clamp_min(1)
+
+
+def tells_elevation(
+    T_lidar_radar: Float[Tensor, "*batch #F 4 4"],
+    radar: Float[Tensor, "F M 3"],
+    has_elevation: Bool[Tensor, " F"],
+    limits_rad: Float[Tensor, "F 2"],
+    *,
+    widen: float = 1.0,
+) -> Bool[Tensor, "*batch F M"]:
+    """Detections whose elevation can be compared with the lidar's: others would be matched to the edge of its view.
+
+    The registration asks this anew at every pose, and steps as if the answer stayed. What is minimised by its value
+    should ask once: each detection that a turn moves out of the limits costs less there.
+
+    Args:
+        T_lidar_radar: poses.
+        radar: detections, radar frame.
+        has_elevation: whether the radar measures it.
+        limits_rad: lowest and highest elevation that the lidar sees.
+        widen: factor of the sigmas, as for the cost.
+    """
+    limits_rad = limits_rad.to(radar.dtype)
+    reach = (0.25 * (limits_rad[:, 1] - limits_rad[:, 0])).clamp_max(2 * widen * float(SIGMA_START[1]))
+    inner = limits_rad + torch.stack([VIEW_MARGIN_RAD + reach, -VIEW_MARGIN_RAD - reach], -1)
+    slope = torch.tan(inner.clamp(-_STEEPEST_RAD, _STEEPEST_RAD))[:, None]
+    points = transform_points(T_lidar_radar, radar)
+    flat, up = points[..., :2].norm(dim=-1), points[..., 2]
+    return (slope[..., 0] * flat < up) & (up < slope[..., 1] * flat) & has_elevation[:, None]
+
+
+def elevation_limits(
+    lidar: Float[Tensor, "F N 3"], lidar_present: Bool[Tensor, "F N"]
+) -> Float[Tensor, "F 2"]:
+    """Lowest and highest elevation [rad] of each frame's points, a few stray ones aside.
+
+    The estimator takes a day's; one street shows less of the lidar's view, and fewer elevations count.
+    """
+    angle = torch.atan2(lidar[..., 2], lidar[..., :2].norm(dim=-1))
+    away = torch.full_like(angle, torch.inf)
+    stray = (lidar_present.sum(-1, keepdim=True) // STRAY).clamp_max(angle.shape[1] - 1)
+    low = torch.where(lidar_present, angle, away).sort(-1).values.gather(-1, stray)
+    high = torch.where(lidar_present, -angle, away).sort(-1).values.gather(-1, stray)
+    found = torch.cat([low, -high], -1)
+    return torch.where(found.isfinite(), found, found.new_tensor([-_STEEPEST_RAD, _STEEPEST_RAD]))
+
+
+def _useful(radar: Tensor) -> Tensor:
+    """Detections that the registration takes."""
+    over_ground = radar[..., :2].norm(dim=-1)
+    ahead = torch.atan2(radar[..., 1], radar[..., 0]).abs() < SIDE_RAD
+    return (over_ground > RANGE_M[0]) & (over_ground < RANGE_M[1]) & ahead
 
 
 def _spherical(points: Tensor) -> Tensor:

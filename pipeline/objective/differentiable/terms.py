@@ -23,6 +23,7 @@ from pipeline.objective.registration import SIGMA_START
 
 __all__ = [
     "GridMaps",
+    "RadarTracks",
     "cluster_class_cost",
     "edge_cost",
     "sky_cost",
@@ -150,51 +151,61 @@ def sky_cost(
     return masked_mean(torch.where(seen, (depth - free_deg).clamp_min(0), torch.zeros_like(depth)), present)
 
 
+@dataclass(frozen=True, eq=False)
+class RadarTracks:
+    """Tracked clusters of F frames."""
+
+    xyz_m: Float[Tensor, "F M 3"]  # radar frame
+    present: Bool[Tensor, "F M"]  # which rows are tracks
+    has_elevation: Bool[Tensor, " F"]  # whether the radar measures it; else azimuth and the plane count alone
+
+    def nearest_cost(
+        self,
+        flat: Float[Tensor, "*batch F M G"],
+        upwards: Float[Tensor, "*batch F M G"],
+        target_present: Bool[Tensor, "F G"],
+        tau: float,
+        clamp: float,
+    ) -> Float[Tensor, "*batch F"]:
+        """Mean over the tracks of the soft smallest clamped distance; 0 where a frame lacks either side.
+
+        Args:
+            flat: distance of every track to every target in azimuth or in the plane, squared.
+            upwards: in elevation or height, signed; counts by what a radar's elevation is worth.
+            target_present: which targets there are.
+            tau: of the soft minimum, in units of the distances.
+            clamp: largest distance.
+        """
+        worth = _ELEVATION_WORTH * self.has_elevation.to(upwards.dtype)[:, None, None]
+        distance = safe_sqrt(flat + (worth * upwards).square())
+        clamped = soft_clamp(distance, clamp).masked_fill(~target_present[:, None], 2 * clamp)
+        return masked_mean(soft_minimum(clamped, tau), self.present) * target_present.any(-1)
+
+
 def track_detection_cost(
     T_camera_radar: Float[Tensor, "*batch #F 4 4"],
-    tracks: Float[Tensor, "F M 3"],
-    track_present: Bool[Tensor, "F M"],
+    tracks: RadarTracks,
     centres_rad: Float[Tensor, "F G 2"],
-    centre_present: Bool[Tensor, "F G"],
-    has_elevation: Bool[Tensor, " F"],
+    present: Bool[Tensor, "F G"],
 ) -> Float[Tensor, "*batch F"]:
-    """Tracked clusters lie at road users' box centres: soft smallest angle, clamped [deg].
-
-    Azimuth alone counts where the radar measures no elevation.
-
-    Args:
-        T_camera_radar: poses.
-        tracks: tracked clusters, radar frame.
-        track_present: which rows are tracks.
-        centres_rad: azimuth to the left and elevation upwards of box centres, camera frame.
-        centre_present: which rows are boxes.
-        has_elevation: whether the radar measures it.
-    """
-    p = transform_points(T_camera_radar, tracks)
-    azimuth, elevation = directions(p)
-    da = (azimuth[..., :, None] - centres_rad[:, None, :, 0]) * DEG
-    de = (elevation[..., :, None] - centres_rad[:, None, :, 1]) * DEG
-    worth = _ELEVATION_WORTH * has_elevation.to(de.dtype)[:, None, None]
-    angle = safe_sqrt(da.square() + (worth * de).square())
-    return _nearest_cost(angle, track_present, centre_present, DETECTION_TAU_DEG, DETECTION_CLAMP_DEG)
+    """Tracked clusters lie at road users' box centres, which lie so far to the left and upwards of the camera [deg]."""
+    directions_rad = torch.stack(directions(transform_points(T_camera_radar, tracks.xyz_m)), -1)
+    off = (directions_rad[..., :, None, :] - centres_rad[:, None]) * DEG
+    return tracks.nearest_cost(
+        off[..., 0].square(), off[..., 1], present, DETECTION_TAU_DEG, DETECTION_CLAMP_DEG
+    )
 
 
 def track_cluster_cost(
     T_lidar_radar: Float[Tensor, "*batch #F 4 4"],
-    tracks: Float[Tensor, "F M 3"],
-    track_present: Bool[Tensor, "F M"],
+    tracks: RadarTracks,
     centres: Float[Tensor, "F K 3"],
-    centre_present: Bool[Tensor, "F K"],
-    has_elevation: Bool[Tensor, " F"],
+    present: Bool[Tensor, "F K"],
 ) -> Float[Tensor, "*batch F"]:
-    """Tracked clusters lie at lidar clusters' centres: soft smallest distance, clamped [m].
-
-    In the plane where the radar measures no elevation.
-    """
-    delta = transform_points(T_lidar_radar, tracks)[..., :, None, :] - centres[:, None]
-    height = _ELEVATION_WORTH * has_elevation.to(delta.dtype)[:, None, None] * delta[..., 2]
-    distance = safe_sqrt(delta[..., :2].square().sum(-1) + height.square())
-    return _nearest_cost(distance, track_present, centre_present, CLUSTER_TAU_M, CLUSTER_CLAMP_M)
+    """Tracked clusters lie at lidar clusters' centres [m]."""
+    off = transform_points(T_lidar_radar, tracks.xyz_m)[..., :, None, :] - centres[:, None]
+    flat = off[..., :2].square().sum(-1)
+    return tracks.nearest_cost(flat, off[..., 2], present, CLUSTER_TAU_M, CLUSTER_CLAMP_M)
 
 
 def directions(
@@ -223,11 +234,3 @@ def soft_clamp(values: Float[Tensor, "*shape"], limit: float) -> Float[Tensor, "
 def safe_sqrt(squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Square root with a finite slope at 0."""
     return (squared + 1e-8).sqrt()
-
-
-def _nearest_cost(
-    distance: Tensor, present: Tensor, target_present: Tensor, tau: float, clamp: float
-) -> Tensor:
-    """Mean over the present rows of the soft smallest clamped distance; 0 where a frame lacks either side."""
-    clamped = soft_clamp(distance, clamp).masked_fill(~target_present[:, None], 2 * clamp)
-    return masked_mean(soft_minimum(clamped, tau), present) * target_present.any(-1)
