@@ -89,12 +89,17 @@ def _errors(pair: str, T: np.ndarray, T_true: np.ndarray) -> list[float]:
 
 
 def measure_day(
-    models: ModelSet, day: SslDay, frames: int | None = None, *, polish: bool = False
+    models: ModelSet,
+    day: SslDay,
+    frames: int | None = None,
+    *,
+    iterations: int = ITERATIONS,
+    polish: bool = False,
 ) -> dict[str, Any]:
     """The product's records of the day, from Table 1's prior, against the truth; `frames` thins the day."""
     how = ("exact", *STARTS["prior"])
     prior = day.prior(*STARTS["prior"], seed=day.where.seed)
-    plain = models.configured(day.fleet).model_dump(mode="json")
+    plain = models.configured(day.fleet, iterations).model_dump(mode="json")
     plain["solve"] |= search_range(how) | {"polish": polish}
     fleet = type(day.fleet).model_validate(plain)
     rows = spoiled(day.rows, f"few:{frames}" if frames else "")

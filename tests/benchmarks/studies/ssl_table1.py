@@ -24,11 +24,11 @@ from typing import Any
 
 from tests.benchmarks.studies.engine import _commit, _quiet, read_results
 from tests.benchmarks.studies.ssl_days import ModelSet, Where, fleet_days, open_day, table1_days
-from tests.benchmarks.studies.ssl_measures import STARTS, measure_day, measure_frames
+from tests.benchmarks.studies.ssl_measures import ITERATIONS, STARTS, measure_day, measure_frames
 from tests.benchmarks.studies.ssl_tables import abrupt_table, frames_table, rows_of, sigma_table
 from tests.benchmarks.studies.table1 import METHODS, errors_table, verdicts_table
 
-__all__ = ["Task", "run_tasks", "summary"]
+__all__ = ["Task", "heading", "run_tasks", "summary"]
 
 _RESULTS = Path("tests/benchmarks/results")
 _ENVIRONMENTS = ("", "urban", "highway")
@@ -43,11 +43,13 @@ class Task:
     where: Where
     part: str
     frames: int | None
+    iterations: int = ITERATIONS  # passes per frame; single frames are measured after each of them
 
     @property
     def key(self) -> str:
         """What tells this measurement from all others; another network under the same name is another one."""
-        return json.dumps([self.models.name, self.models.key, self.where.name, self.part, self.frames])
+        what = [self.models.name, self.models.key, self.where.name, self.part, self.frames, self.iterations]
+        return json.dumps(what)
 
     def measured(self) -> dict[str, Any]:
         """A line of the result file."""
@@ -56,10 +58,14 @@ class Task:
             "key": self.key,
             "method": self.models.row + (" + polish" if self.part == "polish" else ""),
             "part": self.part,
+            "iterations": self.iterations,
             "day": {"name": self.where.name, "seed": self.where.seed, "environment": day.environment},
         }
         if self.part in {"days", "polish"}:
-            return about | measure_day(self.models, day, self.frames, polish=self.part == "polish")
+            polish = self.part == "polish"
+            return about | measure_day(
+                self.models, day, self.frames, iterations=self.iterations, polish=polish
+            )
         starts = ["prior"] if self.part == "frames" else [s for s in STARTS if s != "prior"]
         return about | measure_frames(self.models, day, self.frames or len(day.rows), starts)
 
@@ -88,6 +94,13 @@ def run_tasks(tasks: Sequence[Task], out: Path, workers: int = 1) -> list[dict[s
             print(f"{said} ({line['cpu_s']} CPU s)", flush=True)
     wanted = {t.key for t in tasks}
     return [r for r in read_results(out) if r["key"] in wanted]
+
+
+def heading(results: Sequence[dict[str, Any]], tasks: Sequence[Task]) -> str:
+    """What was measured, at which commits, of which files."""
+    commits, dates = (", ".join(sorted({r[k] for r in results})) for k in ("commit", "date"))
+    models = ", ".join(dict.fromkeys(f"{t.models.row} = {t.models.key}" for t in tasks))
+    return f"{len(results)} of {len(tasks)} measurements; commit {commits}; {dates}; {models}"
 
 
 def summary(results: list[dict[str, Any]], others: list[dict[str, Any]]) -> str:
@@ -129,10 +142,7 @@ def main() -> None:
     if not results:
         return
     others = [] if args.tuning else read_results(_RESULTS / "table1.jsonl")
-    said = ", ".join(f"{m.row} {m.key}" for m in args.models)
-    about = sorted({r["commit"] for r in results}), sorted({r["date"] for r in results})
-    head = f"{len(results)} of {len(tasks)} measurements; commit {', '.join(about[0])}; {', '.join(about[1])}; {said}"
-    text = f"{head}\n\n{summary(results, others)}\n"
+    text = f"{heading(results, tasks)}\n\n{summary(results, others)}\n"
     args.out.with_suffix(".md").write_text(text)
     print(text)
 

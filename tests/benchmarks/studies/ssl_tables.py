@@ -11,7 +11,7 @@ from pipeline.learn.aggregate import BIAS_SIGMA
 from schemas.calibrations import DOF_NAMES, PAIRS
 from tests.benchmarks.studies.metrics import inside_share, rms
 
-__all__ = ["abrupt_table", "frames_table", "rows_of", "sigma_table"]
+__all__ = ["abrupt_table", "frame_values", "frames_table", "rows_of", "sigma_table"]
 
 _ANGLES = 3  # the first of the six degrees of freedom
 
@@ -31,7 +31,7 @@ def frames_table(results: list[dict[str, Any]], start: str = "prior") -> str:
     ]
     for method in rows_of(results):
         for pair in PAIRS:
-            errors, prior, change = (_frames(results, method, start, pair, k) for k in _KEYS)
+            errors, prior, change = (frame_values(results, method, start, pair, k) for k in _KEYS)
             if not len(errors):
                 continue
             means = " | ".join(_three(errors[:, k].mean(axis=0)) for k in range(errors.shape[1]))
@@ -55,7 +55,7 @@ def abrupt_table(results: list[dict[str, Any]], starts: Sequence[str]) -> str:
         for pair in PAIRS:
             cells = []
             for start in starts:
-                errors, prior, _ = (_frames(results, method, start, pair, k) for k in _KEYS)
+                errors, prior, _ = (frame_values(results, method, start, pair, k) for k in _KEYS)
                 cells.append(
                     f"{_three(np.median(errors[:, -1], axis=0))} ({_three(np.median(prior, axis=0))})"
                     if len(errors)
@@ -69,8 +69,8 @@ def abrupt_table(results: list[dict[str, Any]], starts: Sequence[str]) -> str:
 _KEYS = ("errors", "prior", "change")
 
 
-def _frames(results: list[dict[str, Any]], method: str, start: str, pair: str, what: str) -> np.ndarray:
-    """All frames of all days."""
+def frame_values(results: list[dict[str, Any]], method: str, start: str, pair: str, what: str) -> np.ndarray:
+    """`errors`, `prior` or `change` of `measure_frames`, of all frames of all days; empty where there are none."""
     found = [
         r["starts"][start][pair][what]
         for r in results
