@@ -2,21 +2,9 @@ import pytest
 
 from pipeline.config import PriorConfig, config_hash, load_fleet
 from pipeline.errors import ConfigError
+from tests.fleet_files import fleet_toml
 
-GOOD = """
-[fleet]
-name = "test"
-[rigs.default.camera]
-image = "/camera/image"
-info = "/camera/info"
-semantics = { source = "topics", labels = "/labels", detections = "/detections" }
-[rigs.default.lidar]
-points = "/lidar"
-[rigs.default.radar]
-points = "/radar"
-[vehicles."car-1"]
-rig = "default"
-"""
+GOOD = fleet_toml("car-1")
 
 
 def load(tmp_path, text):
@@ -36,15 +24,18 @@ def test_a_small_file_is_enough_and_defaults_are_physical(tmp_path):
     ("change", "key"),
     [
         (("[fleet]", "[fleet]\ncolour = 1"), "fleet.colour"),
-        (('points = "/radar"', 'points = "/radar"\ndoppler_period_mps = -1'), "doppler_period_mps"),
-        (('points = "/radar"', 'points = "radar"'), "radar.points"),
+        (
+            ('points = "/radar/points"', 'points = "/radar/points"\ndoppler_period_mps = -1'),
+            "doppler_period_mps",
+        ),
+        (('points = "/radar/points"', 'points = "radar"'), "radar.points"),
         (('source = "topics"', 'source = "magic"'), "semantics"),
         (('rig = "default"', 'rig = "other"'), "vehicles.car-1.rig"),
         (("[fleet]", "[ingest]\nsync_gate_s = 0\n[fleet]"), "ingest.sync_gate_s"),
         (("[fleet]", "[ingest]\nsync_gate_s = nan\n[fleet]"), "ingest.sync_gate_s"),
         (("[fleet]", "[select]\nholdout_fraction = 1.0\n[fleet]"), "select.holdout_fraction"),
         (("[fleet]", "[rigs.default.prior]\nsource = 'file'\n[fleet]"), "prior"),
-        (('name = "test"', ""), "fleet.name"),
+        (('name = "tests"', ""), "fleet.name"),
     ],
 )
 def test_what_cannot_be_right_is_refused_by_the_name_of_its_key(change, key, tmp_path):

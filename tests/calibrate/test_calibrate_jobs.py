@@ -13,26 +13,12 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_partition
 from pipeline.verify.targets import DEFAULT_TARGETS
 from schemas.observations import OBSERVATIONS
+from tests.fleet_files import fleet_toml
 from tests.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
-FLEET = """
-[fleet]
-name = "f"
-[rigs.default.camera]
-image = "/i"
-info = "/c"
-semantics = { source = "topics", labels = "/l", detections = "/d" }
-[rigs.default.lidar]
-points = "/p"
-[rigs.default.radar]
-points = "/r"
-[vehicles.v]
-[select]
-frames = 12
-[solve]
-paper_population = 12
-paper_generations = 5
-"""
+FLEET = fleet_toml(
+    "v", sections="[select]\nframes = 12\n[solve]\npaper_population = 12\npaper_generations = 5\n"
+)
 
 
 @pytest.fixture(scope="module")

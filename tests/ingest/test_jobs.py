@@ -7,27 +7,13 @@ import pytest
 from jobs.check import check
 from jobs.ingest import ingest
 from pipeline.errors import ConfigError
-
-FLEET = """
-[fleet]
-name = "test"
-[rigs.default.camera]
-image = "/camera/image"
-info = "/camera/info"
-semantics = { source = "topics", labels = "/perception/labels", detections = "/perception/detections" }
-[rigs.default.lidar]
-points = "/lidar/points"
-[rigs.default.radar]
-points = "/radar/points"
-doppler_positive = "approaching"
-[vehicles.car]
-"""
+from tests.fleet_files import fleet_toml
 
 
 @pytest.fixture
 def fleet(tmp_path):
     path = tmp_path / "fleet.toml"
-    path.write_text(FLEET)
+    path.write_text(fleet_toml("car", radar='doppler_positive = "approaching"'))
     return path
 
 

@@ -16,6 +16,7 @@ from pipeline.store.tables import read_manifest, read_rows, write_partition
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.training import SPLITS, TRAINING, TrainingRow
 from tests import training_lakes
+from tests.fleet_files import fleet_toml
 
 VEHICLES = ("a", "b", "c", "d", "e")
 
@@ -183,7 +184,7 @@ def test_prepare_without_perception_says_what_to_run(tmp_path):
 
 def test_any_number_of_workers_writes_the_same_rows(tmp_path, capsys):
     fleet = tmp_path / "fleet.toml"
-    fleet.write_text(FLEET + "".join(f'[vehicles.{v}]\nrig = "default"\n' for v in "abc"))
+    fleet.write_text(fleet_toml(*"abc", sections=PREPARE))
     written = []
     for name, options in (("one", ["--executor", "inline"]), ("two", ["--workers", "2"])):
         lake = training_lakes.fleet_lake(tmp_path / name, "abc", frames=2)
@@ -195,17 +196,7 @@ def test_any_number_of_workers_writes_the_same_rows(tmp_path, capsys):
         assert all(np.array_equal(getattr(a, n), getattr(b, n)) for n in a.__dataclass_fields__)
 
 
-FLEET = """
-[fleet]
-name = "tests"
-[rigs.default.camera]
-image = "/image"
-info = "/info"
-semantics = { source = "topics", labels = "/labels", detections = "/detections" }
-[rigs.default.lidar]
-points = "/lidar"
-[rigs.default.radar]
-points = "/radar"
+PREPARE = """
 [prepare]
 lidar_points = 512
 cluster_points = 64
@@ -217,7 +208,7 @@ split_by = ["vehicle"]
 def test_the_job_tells_counts_and_exit_codes(tmp_path, capsys):
     lake = training_lakes.fleet_lake(tmp_path / "lake", VEHICLES[:3], frames=2)
     fleet = tmp_path / "fleet.toml"
-    fleet.write_text(FLEET + "".join(f'[vehicles.{v}]\nrig = "default"\n' for v in VEHICLES))
+    fleet.write_text(fleet_toml(*VEHICLES, sections=PREPARE))
     arguments = ["prepare", "--fleet", str(fleet), "--lake", str(lake.root), "--executor", "inline"]
 
     def run(*more):

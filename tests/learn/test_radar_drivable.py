@@ -21,6 +21,7 @@ from pipeline.perceive.drivable import free_sector
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_partition
 from schemas.observations import OBSERVATIONS
+from tests.fleet_files import fleet_toml
 from tests.solve_scenes import make_observation, prior_columns
 
 PRIOR = np.eye(4)
@@ -152,12 +153,7 @@ def test_the_job_labels_by_the_logged_prior_trains_and_leaves_model_manifest_and
     from pipeline.config import load_fleet
 
     fleet = tmp_path / "fleet.toml"
-    fleet.write_text(
-        '[fleet]\nname = "t"\n[rigs.default.camera]\nimage = "/i"\ninfo = "/c"\n'
-        '[rigs.default.camera.semantics]\nsource = "topics"\nlabels = "/l"\ndetections = "/d"\n'
-        '[rigs.default.lidar]\npoints = "/p"\n[rigs.default.radar]\npoints = "/r"\n'
-        "[vehicles.a]\n[vehicles.b]\n"
-    )
+    fleet.write_text(fleet_toml("a", "b"))
     turned = turn_left(4.0)
     lake, labels = Lake.at(tmp_path / "lake"), []
     for vehicle, prior in (("a", PRIOR), ("b", turned)):

@@ -22,6 +22,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests import training_lakes
+from tests.fleet_files import fleet_toml
 from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 TRUTH = {
@@ -180,20 +181,9 @@ def lake(tmp_path_factory):
     torch.manual_seed(0)
     for pairs in ("joint", *PAIRS):
         export_onnx(build_network(NetworkConfig(pairs=pairs, width=8, hidden=32)), root / f"{pairs}.onnx", {})
-    topics = """
-[rigs.default.camera]
-image = "/image"
-info = "/info"
-semantics = { source = "topics", labels = "/labels", detections = "/detections" }
-[rigs.default.lidar]
-points = "/lidar"
-[rigs.default.radar]
-points = "/radar"
-"""
     names = ", ".join(f'{pair} = "{pair}.onnx"' for pair in PAIRS)
     learn = f'[learn]\nmodel = "joint.onnx"\npairwise_models = {{ {names} }}\niterations = 1\n'
-    vehicles = '[vehicles.a]\nrig = "default"\n'
-    (root / "fleet.toml").write_text(f'[fleet]\nname = "t"\n{topics}{learn}{vehicles}')
+    (root / "fleet.toml").write_text(fleet_toml("a", sections=learn))
     return root
 
 

@@ -22,6 +22,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows, write_partition
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
+from tests.fleet_files import fleet_toml
 
 DAY = Partition("car-1", "2026-03-02")
 SIZE, UP, DOWN = (32, 360), 10.0, -22.0  # 1 deg x 1 deg
@@ -399,25 +400,10 @@ def test_too_little_road_gives_no_plane_and_no_drivable_area_but_keeps_the_model
 
 # days
 
-FLEET = """
-[fleet]
-name = "made"
-[rigs.default.camera]
-image = "/i"
-info = "/c"
-semantics = {{ source = "topics", labels = "/l", detections = "/d" }}
-[rigs.default.lidar]
-points = "/p"
-{semantics}
-[rigs.default.radar]
-points = "/r"
-[vehicles.car-1]
-"""
-
 
 def fleet(folder, semantics=""):
     toml = folder / "fleet.toml"
-    toml.write_text(FLEET.format(semantics=semantics))
+    toml.write_text(fleet_toml("car-1", lidar=semantics))
     return toml
 
 
@@ -471,7 +457,7 @@ def test_a_day_without_a_model_is_what_it_was_and_models_need_no_new_ingest(tmp_
     assert told.rigs["default"].lidar.semantics.segmenter == "seg.toml"
     assert config_hash(plain.rigs["default"]) == config_hash(told.rigs["default"])
     assert FleetConfig.model_validate(plain.model_dump(mode="json")) == plain
-    assert plain.model_dump(mode="json")["rigs"]["default"]["lidar"] == {"points": "/p"}
+    assert plain.model_dump(mode="json")["rigs"]["default"]["lidar"] == {"points": "/lidar/points"}
 
 
 def test_a_sweep_without_intensity_and_with_bad_points_is_perceived_too(tmp_path, made_frame):

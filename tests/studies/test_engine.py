@@ -16,6 +16,7 @@ from tests.benchmarks.studies.ablation import _settings, setting_of
 from tests.benchmarks.studies.days import SETS, Day, DaySpec
 from tests.benchmarks.studies.engine import Run, key_of, prior_of, read_results, run_study, spoiled
 from tests.benchmarks.studies.verdict import _derived, _simulated, fault_of
+from tests.fleet_files import fleet_toml
 from tests.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 SPEC = DaySpec(7, "urban")
@@ -27,24 +28,11 @@ TRUTH = {
     "dt_lidar_radar_s": 0.0,
     "dt_camera_radar_s": 0.0,
 }
-FLEET = """
-[fleet]
-name = "f"
-[rigs.default.camera]
-image = "/i"
-info = "/c"
-semantics = { source = "topics", labels = "/l", detections = "/d" }
-[rigs.default.lidar]
-points = "/p"
-[rigs.default.radar]
-points = "/r"
-[vehicles.vehicle-1]
-"""
 
 
 @pytest.fixture
 def day(tmp_path) -> Day:
-    (tmp_path / "fleet.toml").write_text(FLEET)
+    (tmp_path / "fleet.toml").write_text(fleet_toml("vehicle-1"))
     return Day(SPEC, make_day(frames=10), TRUTH, load_fleet(tmp_path / "fleet.toml"))
 
 
