@@ -6,7 +6,7 @@ record.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,22 +71,12 @@ def calibrate_day(
     Raises:
         ConfigError: no such vehicle or method, or an impossible prior file.
     """
-    solver = solver_of(method) if method not in SSL_METHODS else None
     seed = fleet.solve.seed if seed is None else seed
     rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
+    solver, settings = _method(method, partition, fleet, lake, fleet_file)
+    settings |= {"perturb": perturb, "seed": seed, "prior_file": prior_key(rig.prior, fleet_file)}
     observations = read_manifest(lake, OBSERVATIONS, partition)
     inputs = [observations.work_key] if observations else []
-    settings: dict[str, Any] = {
-        "method": method,
-        "perturb": perturb,
-        "seed": seed,
-        "prior_file": prior_key(rig.prior, fleet_file),
-    }
-    if solver is None:
-        from pipeline.calibrate_ssl import ssl_key, ssl_solver  # noqa: PLC0415 - brings onnxruntime
-
-        settings |= ssl_key(method, partition, fleet, lake, fleet_file)
-        solver = ssl_solver(method, partition, fleet, lake, fleet_file)
     resolved = config_hash(fleet.select, fleet.trigger, fleet.solve, fleet.verify, rig.prior, settings)
     key = work_key("calibrate", CODE_VERSION, resolved, inputs)
     about = Inputs(partition, method, key, seed, tuple(inputs))
@@ -129,7 +119,7 @@ def calibrate_observations(
     sample = _spread(observations, selection)
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in PAIRS})
     fired = {pair: exceeded(before[pair], fleet.trigger) for pair in PAIRS}
-    active = [p for p in PAIRS if fired[p] or fleet.trigger.when == "always"]
+    active = _to_calibrate(about.method, fired, fleet.trigger.when)
     progress(1, 4, f"solve by {about.method}")
     solution = (solver or solver_of(about.method))(
         frames,
@@ -159,6 +149,30 @@ def calibrate_observations(
     ]
     progress(4, 4, "done")
     return records
+
+
+def _method(
+    method: str, partition: Partition, fleet: FleetConfig, lake: Lake, fleet_file: Path
+) -> tuple[Solver, dict[str, Any]]:
+    """The method's solver, and what its answer depends on besides observations and configuration."""
+    if method not in SSL_METHODS:
+        return solver_of(method), {"method": method}
+    from pipeline.calibrate_ssl import ssl_key, ssl_solver  # noqa: PLC0415 - brings onnxruntime
+
+    settings = {"method": method} | ssl_key(method, partition, fleet, lake, fleet_file)
+    return ssl_solver(method, partition, fleet, lake, fleet_file), settings
+
+
+def _to_calibrate(method: str, fired: Mapping[str, Sequence[str]], when: str) -> list[str]:
+    """Pairs to estimate and to judge: all, or those with a metric beyond its threshold.
+
+    A composed pair is as good as its factors: where it is asked for, so are they.
+    """
+    wanted = {p for p in PAIRS if fired[p] or when == "always"}
+    composed = set(COMPOSED.get(method, ()))
+    if wanted & composed:
+        wanted |= set(PAIRS) - composed
+    return [p for p in PAIRS if p in wanted]
 
 
 def _observations(lake: Lake, partition: Partition) -> list[Observation]:
