@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.learn.batch import TrainingBatch
+from pipeline.learn.consensus import twist_between
 from pipeline.learn.settings import PAIRS_OF, LossConfig
 from pipeline.objective.differentiable.lookup import nearest_pixel
 from pipeline.objective.differentiable.paper import smooth_iou
@@ -45,10 +46,14 @@ PAIR_OF_TERM = {
     "tracks_lidar": "lidar_radar",
     "drivable": "lidar_radar",
     "loop": "joint",
+    "prior_camera_lidar": "camera_lidar",
+    "prior_camera_radar": "camera_radar",
+    "prior_lidar_radar": "lidar_radar",
 }
 _MARGIN_DEG = 3.0  # what the reference may be wrong by, for points that are asked to lie in view
 _RADAR_SKY_FREE_DEG = 2.0  # a radar's elevation is noisy: only what is deep in the sky is wrong
 _LOOP_METRE = 5.0  # a fifth of a metre counts as a degree: what it moves at 11 m
+_PRIOR_ROUND_DEG = 0.05  # below this the absolute value is rounded off
 _RADAR_CELL_M = 1.0  # of the stored drivable map
 
 
@@ -84,7 +89,12 @@ class FrameObjective:
             found["loop"] = loop_loss(
                 T_camera_lidar, T_lidar_radar, T_camera_radar, angle_unit=DEG, metre_unit=_LOOP_METRE
             )
-        return found
+        poses = {
+            "camera_lidar": (T_camera_lidar, self.batch.T_camera_lidar),
+            "camera_radar": (T_camera_radar, self.batch.T_camera_radar),
+            "lidar_radar": (T_lidar_radar, self.batch.T_lidar_radar),
+        }
+        return found | {f"prior_{pair}": _from_prior(*poses[pair]) for pair in pairs if pair in poses}
 
     def _camera_lidar(self, T: Tensor) -> dict[str, Tensor]:
         b = self.batch
@@ -155,16 +165,34 @@ def frame_objective(batch: TrainingBatch) -> FrameObjective:
     )
 
 
+def _from_prior(
+    T: Float[Tensor, "*batch 4 4"], T_prior: Float[Tensor, "*batch 4 4"]
+) -> Float[Tensor, "*batch"]:
+    """How far a pose lies from the day's prior: absolute angles [deg] and shifts (a metre as in the loop), rounded off.
+
+    Absolute values, not squares: over a fleet the priors' errors cancel in the median, and a constant small pull holds
+    what frames say nothing of (a shift along the camera's axis, a radar's height), where the bias of some other term
+    would move it for nothing; what frames do tell, pulls harder.
+    """
+    twist = twist_between(T, T_prior.to(T.dtype))
+    scaled = torch.cat([twist[..., :3] * DEG, twist[..., 3:] * _LOOP_METRE], -1)
+    return (torch.sqrt(scaled.square() + _PRIOR_ROUND_DEG**2) - _PRIOR_ROUND_DEG).sum(-1)
+
+
 def weighted(
     terms: dict[str, Float[Tensor, "*batch"]], weights: LossConfig, pairs: tuple[str, ...]
 ) -> Float[Tensor, "*batch"]:
     """Weighted sum of the terms of some pairs, and of the loop where all three are there."""
     chosen = [
-        getattr(weights, name) * value
+        _weight(weights, name) * value
         for name, value in terms.items()
-        if PAIR_OF_TERM[name] in pairs and getattr(weights, name) > 0
+        if PAIR_OF_TERM[name] in pairs and _weight(weights, name) > 0
     ]
     return torch.stack(chosen).sum(0)
+
+
+def _weight(weights: LossConfig, name: str) -> float:
+    return float(weights.prior if name.startswith("prior_") else getattr(weights, name))
 
 
 def _at_lag(batch: TrainingBatch, points: Float[Tensor, "B N 3"], lag_s: Float[Tensor, " B"]) -> Tensor:

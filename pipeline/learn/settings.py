@@ -45,6 +45,7 @@ class LossConfig(_Section):
     tracks_lidar: NotNegative = 0.5
     drivable: NotNegative = 2.0
     loop: NotNegative = 1.0
+    prior: NotNegative = 0.1  # holds what no frame tells, and is weaker than all that frames do tell
     semantics: NotNegative = 1.0  # the encoders' cross-entropy to the precomputed classes
 
 

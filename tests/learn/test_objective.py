@@ -15,6 +15,9 @@ from schemas.training import UNKNOWN_CLASS
 from tests.benchmarks.ssl_landscape import PAIRS, TOLERANCE, day_batch, minima, with_true_clocks
 from tests.simulated_days import simulated_day
 
+# One vehicle's prior is off by its own error, which only a fleet's median takes out.
+DATA_ALONE = LossConfig(prior=0.0)
+
 
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
@@ -32,7 +35,7 @@ def few(batch):
 
 
 def test_the_minimum_over_a_fleet_is_at_the_truth_in_all_that_it_determines(batch, day):
-    found = minima(batch, day.truth, LossConfig())
+    found = minima(batch, day.truth, DATA_ALONE)
     determined = {
         (pair, dof): found[pair][dof].offset
         for pair in PAIRS
@@ -59,15 +62,24 @@ def test_all_six_together_come_back_to_the_truth(batch, day):
     for step in range(80):
         optimiser.param_groups[0]["lr"] = 2e-3 * (1 - step / 80)
         T = (exp_se3(xi) @ truth).expand(len(half), 4, 4)
-        loss = weighted(
-            objective.terms(T, *others, ("camera_lidar",)), LossConfig(), ("camera_lidar",)
-        ).mean()
+        loss = weighted(objective.terms(T, *others, ("camera_lidar",)), DATA_ALONE, ("camera_lidar",)).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     turn_deg, shift_m = np.degrees(xi.detach()[:3].numpy()), xi.detach()[3:].numpy()
     assert np.abs(turn_deg[:2]).max() < 0.15  # pitch and yaw, about the camera's x and y
     assert np.abs(shift_m[:2]).max() < 0.05  # sideways and upwards
+
+
+def test_the_prior_pulls_with_the_same_small_force_however_far_away_and_rests_at_itself(few):
+    objective, pull = frame_objective(few), []
+    for shift_m in (0.0, 0.1, 0.3):
+        xi = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, shift_m], requires_grad=True)
+        T = exp_se3(xi) @ few.T_lidar_radar
+        terms = objective.terms(few.T_camera_lidar, few.T_camera_radar, T, ("lidar_radar",))
+        (slope,) = torch.autograd.grad(terms["prior_lidar_radar"].mean(), xi)
+        pull.append(slope[5].item())
+    assert pull == pytest.approx([0.0, 5.0, 5.0], abs=0.05)  # a metre counts as five degrees
 
 
 def test_every_term_is_finite_with_a_finite_gradient_even_at_absurd_poses(few):
