@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import nn
 
 from pipeline.learn.encoders import CameraEncoder, LidarEncoder
-from pipeline.learn.networks import CalibrationNetwork
 
 __all__ = ["accelerate"]
 
 
-def accelerate(network: CalibrationNetwork, *, half: bool, compiled: bool) -> None:
+def accelerate(network: nn.Module, *, half: bool, compiled: bool) -> None:
     """Run the network's image encoders in bfloat16, compiled, or both; parameters and outputs stay float32.
 
     Args:
@@ -23,22 +20,19 @@ def accelerate(network: CalibrationNetwork, *, half: bool, compiled: bool) -> No
     """
     for module in network.modules():
         if isinstance(module, CameraEncoder | LidarEncoder):
-            if compiled:
-                module.compile()
             if half:
                 _in_bfloat16(module)
+            if compiled:
+                module.compile()
 
 
 def _in_bfloat16(module: nn.Module) -> None:
-    contexts: list[Any] = []
+    forward = module.forward
 
-    def enter(_module: nn.Module, _inputs: Any) -> None:
-        contexts.append(torch.autocast("cuda", torch.bfloat16))
-        contexts[-1].__enter__()
+    def in_bfloat16(inputs: torch.Tensor) -> torch.Tensor:
+        with torch.autocast(inputs.device.type, torch.bfloat16):
+            output: torch.Tensor = forward(inputs)
+        return output.float()
 
-    def leave(_module: nn.Module, _inputs: Any, output: Any) -> Any:
-        contexts.pop().__exit__(None, None, None)
-        return output.float() if isinstance(output, torch.Tensor) else output
-
-    module.register_forward_pre_hook(enter)
-    module.register_forward_hook(leave)
+    # In place of hooks, which a compiler would have to stop at.
+    module.forward = in_bfloat16  # type: ignore[method-assign]
