@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 __all__ = ["BoresightError", "ConfigError", "ContractError", "LogError", "ModelError", "SolveError"]
 
 
@@ -9,6 +11,16 @@ class BoresightError(Exception):
     """Base of all errors that the commands report in one line; `exit_code` is what the command returns."""
 
     exit_code = 1
+
+    def __reduce__(self) -> Any:
+        # Errors come home from other processes; by default Python would build them from their message alone.
+        return _revived, (type(self), self.args, self.__dict__)
+
+
+def _revived(kind: type[BoresightError], args: tuple[Any, ...], fields: dict[str, Any]) -> BoresightError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(fields)
+    return error
 
 
 class ConfigError(BoresightError):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ConfigError
+import torch
+
+from pipeline.errors import BoresightError, ConfigError, ContractError
 from pipeline.learn.settings import TrainConfig
 from pipeline.learn.training import TrainRequest, TrainResult, train
 
@@ -21,20 +23,52 @@ def train_on_ray(request: TrainRequest, config: TrainConfig, workers: int) -> Tr
 
     Raises:
         ConfigError: Ray is not installed, or `workers` is below 1.
+        BoresightError: what `train` raised in a worker.
+        ContractError: a worker failed otherwise, or was lost.
     """
     if workers < 1:
         raise ConfigError("command line", "ray-workers", f"{workers} is below 1")
     try:
-        from ray.train import ScalingConfig  # noqa: PLC0415 - an extra
+        from ray.train import RunConfig, ScalingConfig, TrainingFailedError  # noqa: PLC0415 - an extra
         from ray.train.torch import TorchTrainer  # noqa: PLC0415
     except ImportError as err:
         raise ConfigError(
             "command line", "ray-workers", "needs the extra: pip install 'boresight[ray]'"
         ) from err
+    # Workers run elsewhere: what is relative here is another place there.
+    request = replace(request, out=request.out.absolute(), data=_absolute(request.data))
+    request.out.mkdir(parents=True, exist_ok=True)
+    (request.out / _RESULT).unlink(missing_ok=True)
     settings = {"request": asdict(request), "config": config.model_dump(mode="json")}
-    scaling = ScalingConfig(num_workers=workers, use_gpu=request.device == "cuda")
-    TorchTrainer(_work, train_loop_config=settings, scaling_config=scaling).fit()
+    on_gpu = request.device == "cuda" or (request.device == "auto" and torch.cuda.is_available())
+    trainer = TorchTrainer(
+        _work,
+        train_loop_config=settings,
+        scaling_config=ScalingConfig(num_workers=workers, use_gpu=on_gpu),
+        # Ray's own notes lie with the run, not in the home folder.
+        run_config=RunConfig(name="ray", storage_path=str(request.out)),
+    )
+    try:
+        trainer.fit()
+    except TrainingFailedError as err:
+        raise _cause(request.out, err) from err
     return _read_result(request.out)
+
+
+def _absolute(data: str) -> str:
+    return data if "://" in data else str(Path(data).absolute())
+
+
+def _cause(out: Path, error: Exception) -> BoresightError:
+    """What a worker of ours complained of, where Ray tells; otherwise Ray's own words."""
+    failures = getattr(error, "worker_failures", None) or {}
+    for found in [*failures.values(), error]:
+        cause: BaseException | None = found
+        while cause is not None:
+            if isinstance(cause, BoresightError):
+                return cause
+            cause = getattr(cause, "cause", None) or cause.__cause__
+    return ContractError(str(out), f"training on Ray failed: {error}")
 
 
 def _work(settings: dict[str, Any]) -> None:
