@@ -40,27 +40,44 @@ def calibrate(
         page: HTML page of that frame, before and after.
         polish: let the optimiser finish from the networks' answer, as solve.polish in fleet.toml.
     """
-    from jobs.summary import exit_code, print_summary, progress_reporter
-    from pipeline.calibrate import calibrate_day
     from pipeline.config import load_fleet
+    from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake, Partition
 
+    if page is not None and frame is None:
+        raise ConfigError(
+            "command line", "page", "is of one frame: name it by --frame (days: boresight report)"
+        )
     config = load_fleet(fleet)
     if polish:
         config = config.model_copy(update={"solve": config.solve.model_copy(update={"polish": True})})
+    partition, tables, moved = Partition(vehicle, day), Lake.at(lake), parse_perturb(perturb)
     if frame is not None:
-        partition, tables = Partition(vehicle, day), Lake.at(lake)
         ssl = "joint-ssl" if method == "joint" else method
-        return _calibrate_frame(
-            config, fleet, tables, partition, frame, ssl, parse_perturb(perturb), seed, page
-        )
-    with progress_reporter(f"calibrate {vehicle} {day}") as progress:
+        return _calibrate_frame(config, fleet, tables, partition, frame, ssl, moved, seed, page)
+    return _calibrate_day(config, fleet, tables, partition, method, moved, seed)
+
+
+def _calibrate_day(
+    config: FleetConfig,
+    fleet: Path,
+    lake: Lake,
+    partition: Partition,
+    method: str,
+    perturb: tuple[float, float] | None,
+    seed: int | None,
+) -> int:
+    """The day's records in the lake, their statuses in the summary."""
+    from jobs.summary import exit_code, print_summary, progress_reporter
+    from pipeline.calibrate import calibrate_day
+
+    with progress_reporter(f"calibrate {partition.vehicle} {partition.day}") as progress:
         result = calibrate_day(
-            Partition(vehicle, day),
+            partition,
             config,
-            Lake.at(lake),
+            lake,
             method=method,
-            perturb=parse_perturb(perturb),
+            perturb=perturb,
             seed=seed,
             progress=progress,
             fleet_file=fleet,
@@ -68,8 +85,8 @@ def calibrate(
     print_summary(
         "calibrate",
         result.status,
-        vehicle=vehicle,
-        day=day,
+        vehicle=partition.vehicle,
+        day=partition.day,
         method=method,
         pairs=result.kept,
         reason=result.reason,

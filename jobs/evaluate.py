@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["evaluate"]
 
+_KINDS = ("", ".md", ".parquet", ".html")  # of --out; without a suffix it is a folder
+
 
 def evaluate(
     *,
@@ -64,6 +66,7 @@ def evaluate(
         raise ConfigError("command line", "truth", "give either --truth or --reflectors")
     if truth is not None and (recording_lake or recording_day):
         raise ConfigError("command line", "recording-lake", "a reflector recording needs --reflectors")
+    _check_kind(out)
     tables = Lake.at(lake)
     records = [r for r in read_records(tables, CALIBRATIONS, CalibrationRecord) if method in (None, r.method)]
     recording = (recording_lake or lake, recording_day) if recording_lake or recording_day else None
@@ -107,6 +110,15 @@ def _compare_all(
     return compared, counts
 
 
+def _check_kind(out: Path | None) -> None:
+    """Refuse a file of an unknown kind before anything is compared."""
+    from pipeline.errors import ConfigError
+
+    if out is not None and not out.is_dir() and out.suffix not in _KINDS:
+        kinds = ", ".join(kind for kind in _KINDS if kind)
+        raise ConfigError("command line", "out", f"{out.name} is neither a folder nor one of {kinds}")
+
+
 def _write(out: Path, compared: Sequence[Compared], notes: Sequence[str], lake: Lake) -> None:
     from jobs.evaluation_page import page_of
     from pipeline.report.page import write_page
@@ -116,11 +128,12 @@ def _write(out: Path, compared: Sequence[Compared], notes: Sequence[str], lake: 
     rows = table_rows(comparisons)
     texts = as_markdown(rows, comparisons, notes)
     out.parent.mkdir(parents=True, exist_ok=True)
-    if out.suffix == ".parquet":
+    kind = "" if out.is_dir() else out.suffix
+    if kind == ".parquet":
         out.write_bytes(as_parquet(rows, notes))
-    elif out.suffix == ".html":
+    elif kind == ".html":
         write_page(out, page_of(lake, compared, texts))
-    elif out.suffix:
+    elif kind == ".md":
         out.write_text("\n".join(texts.values()))
     else:
         out.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from pipeline.simulate.fleet import FleetSpec
 
 __all__ = ["simulate"]
 
@@ -45,10 +48,8 @@ def simulate(
         seed: same seed, same logs.
         workers: processes.
     """
-    from jobs.summary import print_summary, progress_reporter
     from pipeline.simulate.faults import parse_faults
-    from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
-    from pipeline.simulate.reflectors import simulate_reflectors
+    from pipeline.simulate.fleet import FleetSpec, day_names
 
     named = parse_faults(faults, day_names(first_day, days))
     spec = FleetSpec(
@@ -64,9 +65,21 @@ def simulate(
         seed=seed,
         remount_deg=remount_deg,
     )
-    with progress_reporter(f"simulate {vehicles} x {days}") as progress:
+    return _write(spec, out, reflectors, workers)
+
+
+def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
+    """Logs and truth in `out`, what was written in the summary."""
+    from jobs.summary import print_summary, progress_reporter
+    from pipeline.simulate.fleet import simulate_fleet
+    from pipeline.simulate.reflectors import simulate_reflectors
+
+    with progress_reporter(f"simulate {spec.vehicles} x {spec.days}") as progress:
         result = simulate_fleet(spec, out, progress, workers)
         if reflectors:
-            result["reflectors"] = [str(simulate_reflectors(spec, v, days - 1, out)) for v in range(vehicles)]
+            last = spec.days - 1
+            result["reflectors"] = [
+                str(simulate_reflectors(spec, v, last, out, progress=progress)) for v in range(spec.vehicles)
+            ]
     print_summary("simulate", "done", **result)
     return 0

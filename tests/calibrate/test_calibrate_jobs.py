@@ -123,3 +123,20 @@ def test_perturb_must_be_two_possible_numbers(text):
 def test_perturb_is_degrees_and_metres():
     assert parse_perturb("2,0.1") == (2.0, 0.1)
     assert parse_perturb(None) is None
+
+
+def test_a_page_without_a_frame_is_a_usage_error_and_not_forgotten(workplace):
+    with pytest.raises(ConfigError, match="page"):
+        calibrate(
+            fleet=workplace / "fleet.toml",
+            lake=str(workplace / "lake"),
+            vehicle="v",
+            day="2024-05-06",
+            page=workplace / "page.html",
+        )
+
+
+def test_evaluate_writes_no_table_into_a_file_of_an_unknown_kind(workplace):
+    with pytest.raises(ConfigError, match=r"table\.csv"):
+        evaluate(lake=str(workplace / "lake"), truth=workplace / "truth", out=workplace / "table.csv")
+    assert not (workplace / "table.csv").exists()
