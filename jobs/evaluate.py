@@ -78,8 +78,9 @@ def evaluate(
     sys.stderr.write("\n".join(as_markdown(table_rows(comparisons), comparisons, notes).values()))
     if out is not None:
         _write(out, compared, notes, tables)
-    status = "done" if compared else "refused"
-    print_summary("evaluate", status, runs=len(compared), **counts, positions=notes, out=out)
+    print_summary(
+        "evaluate", "done" if compared else "refused", runs=len(compared), **counts, positions=notes, out=out
+    )
     return 0 if compared else 3
 
 

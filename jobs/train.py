@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from pipeline.learn.settings import TrainConfig
+    from pipeline.learn.training import TrainRequest
 
 __all__ = ["parse_duration", "train"]
 
@@ -49,13 +53,8 @@ def train(
         resident: hold all training data on the device.
         ray_workers: train on a Ray cluster with so many workers; needs the extra [ray].
     """
-    import os
-    from dataclasses import asdict
-
-    from jobs.summary import print_summary, progress_reporter
     from pipeline.learn.settings import load_train_config
     from pipeline.learn.training import TrainRequest
-    from pipeline.learn.training import train as run
 
     minutes = None if budget is None else parse_duration(budget, "budget") / 60
     options = {
@@ -69,6 +68,17 @@ def train(
     settings = load_train_config(config, options)
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
     request = TrainRequest(data, out, device, limit, compiled, resident, start_from)
+    return _run(request, settings, ray_workers)
+
+
+def _run(request: TrainRequest, settings: TrainConfig, ray_workers: int | None) -> int:
+    """Train here, as one of torchrun's processes, or on Ray; the summary is told once."""
+    import os
+    from dataclasses import asdict
+
+    from jobs.summary import print_summary, progress_reporter
+    from pipeline.learn.training import train as run
+
     if ray_workers is not None:
         from pipeline.learn.ray_training import train_on_ray
 
@@ -77,10 +87,10 @@ def train(
         result = run(request, settings)
         return 128 + result.signal if result.signal else 0
     else:
-        with progress_reporter(f"train {out.name}") as progress:
+        with progress_reporter(f"train {request.out.name}") as progress:
             result = run(request, settings, progress)
     fields = asdict(result)
-    print_summary("train", fields.pop("status"), out=out, **fields)
+    print_summary("train", fields.pop("status"), out=request.out, **fields)
     return 128 + result.signal if result.signal else 0
 
 
