@@ -114,7 +114,8 @@ def calibrate_observations(
     select = fleet.select
     if about.method in UNTHINNED:
         select = select.model_copy(update={"frames": max(len(observations), 1)})
-    selection = select_frames(observations, select, paper=about.method in PAPER_METHODS)
+    paper, gate_s = about.method in PAPER_METHODS, fleet.ingest.sync_gate_s
+    selection = select_frames(observations, select, paper=paper, sync_gate_s=gate_s)
     frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in PAIRS}
     sample = _spread(observations, selection)
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in PAIRS})

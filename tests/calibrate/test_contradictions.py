@@ -8,9 +8,11 @@ import pytest
 from pipeline.calibrate import calibrate_observations
 from pipeline.calibration_records import Inputs
 from pipeline.config import FleetConfig
+from pipeline.errors import SolveError
 from pipeline.geometry.se3 import exp_so3, perturb_exactly
-from pipeline.objective.problem import Prior
+from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.store.partitions import Partition
+from schemas.calibrations import PAIRS
 from tests.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.solve_scenes import T_CAMERA_LIDAR, make_day
 
@@ -26,12 +28,12 @@ RIG = {
 }
 
 
-def records_of(day, prior=PRIOR, method="joint", **sections):
+def records_of(day, prior=PRIOR, method="joint", solver=None, **sections):
     fleet = FleetConfig.model_validate(
         {"fleet": {"name": "f"}, "rigs": {"default": RIG}, "vehicles": {"v": {}}} | sections
     )
     about = Inputs(Partition("v", "2024-05-06"), method, "k", 1, ())
-    return {r.pair: r for r in calibrate_observations(day, prior, fleet, about)}
+    return {r.pair: r for r in calibrate_observations(day, prior, fleet, about, solver=solver)}
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +118,23 @@ def test_pairs_that_no_trigger_asked_for_keep_the_prior_beside_one_that_is_calib
         np.testing.assert_allclose(r.covariance, r.prior_covariance)
         assert not any(r.observable)
         assert r.determined == []
+
+
+def test_frames_that_ingest_was_told_to_pair_are_not_thrown_away_by_another_gate():
+    late = [replace(o, camera_stamp_ns=o.camera_stamp_ns + 8_000_000) for o in make_day(24)]
+
+    def nothing_found(frames, prior, config, *, seed, triggered, progress):
+        del config, seed, triggered, progress
+        kept = {
+            p: PairEstimate(
+                p, prior.of(p), prior.covariance(p), np.zeros(6), np.zeros(6, bool), len(frames[p])
+            )
+            for p in PAIRS
+        }
+        return Solution("joint", kept)
+
+    with pytest.raises(SolveError, match="sync 24"):
+        records_of(late, solver=nothing_found)
+    found = records_of(late, solver=nothing_found, ingest={"sync_gate_s": 0.02})
+    assert all("sync" not in r.frames_rejected for r in found.values())
+    assert found["camera_lidar"].frames_used >= 12
