@@ -86,7 +86,8 @@ MATERIALS: Final = (
     Material("bus_tyre", "bus", (0.025, 0.025, 0.027), 0.05, 4.0),
     Material("bike_metal", "bicycle", (0.12, 0.12, 0.14), 0.25, 8.0),
     Material("bike_tyre", "bicycle", (0.03, 0.03, 0.03), 0.08, 1.0),
-    Material("corner_reflector", "pole", (0.65, 0.65, 0.66), 0.85, 4000.0),
+    # All ways through a trihedral are as long as the one to its apex: its echo is a beacon there, not its plates.
+    Material("corner_reflector", "pole", (0.65, 0.65, 0.66), 0.85, 0.0),
     Material("tripod", "pole", (0.05, 0.05, 0.05), 0.12, 0.3),
 )  # fmt: skip
 _INDEX = {m.name: i for i, m in enumerate(MATERIALS)}

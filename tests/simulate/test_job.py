@@ -34,9 +34,7 @@ def test_the_job_records_reflectors_where_asked(tmp_path, capsys, monkeypatch):
     import pipeline.simulate.reflectors as module
 
     full = module.simulate_reflectors
-    monkeypatch.setattr(
-        module, "simulate_reflectors", lambda spec, v, d, out: full(spec, v, d, out, frames=2)
-    )
+    monkeypatch.setattr(module, "simulate_reflectors", lambda *where, **how: full(*where, frames=2, **how))
     simulate(out=tmp_path, vehicles=1, days=1, frames=1, reflectors=True)
     summary = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert json.loads((tmp_path / "reflectors/vehicle-1/2026-03-02.json").read_text())["frames"] == 2

@@ -123,6 +123,9 @@ def test_reflectors_are_picked_where_all_sensors_agree_under_the_truth(tmp_path,
     assert len(lidar) == 3
     offset = np.linalg.norm(radar @ T[:3, :3].T + T[:3, 3] - lidar, axis=1)
     assert np.all(offset < 0.1 + 0.02 * np.linalg.norm(lidar, axis=1))  # 6 deg of elevation resolution
+    # A trihedral's echo comes from its apex: at every distance the same range error, the radar's own.
+    range_error_m = np.linalg.norm(radar, axis=1) - np.linalg.norm(picks["truth"]["radar_m"], axis=1)
+    assert np.ptp(range_error_m) < 0.06
     assert np.abs(pixels - np.array(picks["truth"]["pixels"])).max() < 2
     messages = read(path.with_suffix(".mcap"))
     assert sum(topic == TOPICS["lidar"] for topic, _, _ in messages) == 12
