@@ -11,7 +11,7 @@ from pipeline.objective.problem import Prior
 from schemas.calibrations import CalibrationRecord
 from tests.benchmarks.studies.coverage import summary as coverage_summary
 from tests.benchmarks.studies.metrics import claimed_error_deg, inside_share, measure, rms, within
-from tests.benchmarks.studies.verdict import precision_recall, worse_than_prior
+from tests.benchmarks.studies.verdict import is_right, precision_recall, worse_than_prior
 from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
 
 PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
@@ -89,3 +89,20 @@ def test_the_coverage_table_names_what_lies_beyond_three_sigma():
     text = coverage_summary([result])
     assert "seed 7 urban camera_lidar tx: error +0.050 m" in text
     assert "camera_lidar ty" not in text
+
+
+def test_a_held_record_that_vouches_for_nothing_is_not_right_by_that():
+    """Right is what the pair is good for; a radar's elevation counts only where a record vouches for it."""
+    silent = {
+        "az_deg": 12.0,
+        "el_deg": 0.1,
+        "observable": [0] * 6,
+        "diagnostics": {"vouched_az": 0, "vouched_el": 0},
+    }
+    assert within("lidar_radar", silent, claimed=True)
+    assert not is_right("lidar_radar", silent)
+    assert not is_right("camera_lidar", silent)
+    coarse = silent | {"az_deg": 0.1, "el_deg": 2.0}
+    assert is_right("lidar_radar", coarse)
+    assert not is_right("camera_lidar", coarse)
+    assert not is_right("lidar_radar", coarse | {"diagnostics": {"vouched_az": 1, "vouched_el": 1}})

@@ -10,6 +10,9 @@ perceive copies these columns: focal length wrong by 3 %, principal point wrong 
 and good days with a prior that is 12 deg off unbeknown, twice the search range. A wrong principal point is a turned
 camera to any alignment: those days are measured against the truth turned likewise (`engine.reference`).
 
+The precision-recall curve asks every computed record, held ones too, for the angles that its pair is good for: azimuth,
+camera-lidar's elevation, and whatever else it vouches for. What vouches for nothing is not right by that.
+
 The score of the precision-recall curve is the record's `diagnostics["confidence"]` where it carries one; else
 minus the largest of the 6 sigmas' angles [deg] among the determined ones, so that surer records come first.
 """
@@ -26,7 +29,7 @@ import numpy as np
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.days import SETS, DaySpec
 from tests.benchmarks.studies.engine import Run, read_results, run_study, study_arguments
-from tests.benchmarks.studies.metrics import AZIMUTH_ELEVATION_DOF, share, within
+from tests.benchmarks.studies.metrics import AZIMUTH_ELEVATION_DOF, LIMITS_DEG, share, within
 
 DERIVED = ("focal:0.03", "focal:-0.03", "centre:20", "few:1", "hidden prior")
 
@@ -160,6 +163,13 @@ def score_of(pair: str, measured: dict[str, Any]) -> float:
     return rank - max(angles, default=10.0)
 
 
+def is_right(pair: str, measured: dict[str, Any]) -> bool:
+    """What the pair is good for is within its limit, and whatever else the record vouches for."""
+    if pair == "camera_lidar":
+        return within(pair, measured)
+    return measured["az_deg"] <= LIMITS_DEG[pair] and within(pair, measured, claimed=True)
+
+
 def precision_recall(scored: list[tuple[float, bool]]) -> list[tuple[float, float, float]]:
     """(score, precision, recall) of taking all records down to each score; recall is of the right records."""
     ordered = sorted(scored, key=lambda s: -s[0])
@@ -183,7 +193,7 @@ def _curve(results: list[dict[str, Any]], path: Path) -> str:
         writer.writerow(["pair", "score", "precision", "recall", "accepted"])
         for pair in PAIRS:
             computed = [p for r in results if "az_deg" in (p := r["pairs"].get(pair, {}))]
-            points = precision_recall([(score_of(pair, p), within(pair, p, claimed=True)) for p in computed])
+            points = precision_recall([(score_of(pair, p), is_right(pair, p)) for p in computed])
             accepted = sum(p["status"] == "accepted" for p in computed)
             writer.writerows(
                 [pair, f"{s:.4g}", f"{precision:.4f}", f"{recall:.4f}", int(i < accepted)]
