@@ -1,5 +1,7 @@
 """The day's answer: right where the network knows, the prior where it only repeats its guess, honest in between."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -7,6 +9,8 @@ from scipy.stats import chi2
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.learn import aggregate
 from pipeline.learn.aggregate import Answers, day_estimate, twists_about
+from pipeline.verify.claims import target_sigmas
+from pipeline.verify.targets import errors_at_targets
 from tests.solve_scenes import T_CAMERA_LIDAR
 
 PRIOR_SD = np.array([*np.radians([1.2] * 3), *[0.05] * 3])
@@ -37,7 +41,9 @@ def estimate(answers, rng, x_prior=None, **more):
     return day_estimate("camera_lidar", answers, T_prior, P, rng, **more)
 
 
-def test_a_network_that_knows_is_followed_whatever_the_prior_says():
+def test_a_network_that_knows_is_followed_whatever_the_prior_says(monkeypatch):
+    rotation = aggregate.BIAS_SIGMA["camera_lidar"][:3]
+    monkeypatch.setitem(aggregate.BIAS_SIGMA, "camera_lidar", (*rotation, 0.01, 0.01, 0.01))
     rng = np.random.default_rng(0)
     x = PRIOR_SD * [0.3, -0.4, 0.2, 0.3, -0.2, 0.4]
     found = estimate(day(rng, np.zeros((6, 6)), x), rng, x_prior=x + PRIOR_SD * [1, -1, 1, 1, 1, -1])
@@ -85,6 +91,39 @@ def test_what_is_repeated_stays_and_what_is_known_is_taken():
     assert np.radians(0.1) < sigma < np.radians(0.25)
     assert abs(error[1]) < 2 * sigma
     assert off(found, np.zeros(6))[3:] == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def targets_deg(estimate, x, pair="camera_lidar"):
+    """Azimuth and elevation error at the targets."""
+    return np.degrees(errors_at_targets(pair, estimate.T, exp_se3(x) @ T_CAMERA_LIDAR)[:2])
+
+
+def test_a_wrong_translation_of_the_network_turns_nothing_that_is_seen():
+    """It puts the lidar .3 m to the right, turns it back by .3 m over 25 m, and sees everything where it is."""
+    rng = np.random.default_rng(12)
+    aside = np.array([0.0, -0.3 / 25, 0.0, 0.3, 0.0, 0.0])
+    answers = day(rng, np.zeros((6, 6)), np.zeros(6), count=40, blocks=8)
+    aligned = replace(answers, answer=answers.answer + aside)
+    found = estimate(aligned, rng, x_prior=PRIOR_SD * [1, -1, 1, 0, 0, 0])
+    assert targets_deg(found, np.zeros(6)).max() < 0.12
+    assert np.degrees(np.abs(off(found, np.zeros(6))[:3])).max() < 0.2
+    assert np.linalg.norm(off(found, np.zeros(6))[3:]) < 0.03  # the prior's, not the network's
+
+
+def test_a_roll_that_nobody_knows_does_not_leak_into_elevations_of_a_short_day():
+    """A radar's roll of 1.4 deg scatter, 40 frames, a prior of 2 deg: gains that are noise must not carry it over."""
+    noise = np.array([*np.radians([0.3, 0.2, 1.4]), 0.1, 0.1, 0.1])  # a camera's roll is its third
+    wide = np.diag(np.array([*np.radians([2.0] * 3), 0.2, 0.2, 0.2]) ** 2)
+    errors, sigmas = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        answers = day(rng, np.zeros((6, 6)), np.zeros(6), count=40, blocks=8, noise=noise)
+        x_prior = np.array([*np.radians([1.2, -1.2, 1.2]), 0.1, -0.1, 0.1])
+        found = day_estimate("camera_radar", answers, exp_se3(x_prior) @ T_CAMERA_LIDAR, wide, rng)
+        errors.append(targets_deg(found, np.zeros(6), "camera_radar")[1])
+        sigmas.append(np.degrees(target_sigmas("camera_radar", found.T, found.covariance)[1]))
+    assert np.mean(errors) < 0.12
+    assert np.mean(sigmas) < 0.4
 
 
 def test_wrong_frames_count_for_nothing():
