@@ -39,6 +39,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "jobs.train_radar_drivable:train_radar_drivable",
         "A small network for the radar's drivable area, taught by the lidar.",
     ),
+    "train-lidar-semantics": (
+        "jobs.train_lidar_semantics:train_lidar_semantics",
+        "A small range-image network for lidar points, taught by the camera.",
+    ),
     "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
     "report": ("jobs.report:report", "HTML pages of vehicle-days and of the fleet."),
     "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),

@@ -35,4 +35,4 @@ def _in_bfloat16(module: nn.Module) -> None:
         return output.float()
 
     # In place of hooks, which a compiler would have to stop at.
-    module.forward = in_bfloat16  # type: ignore[method-assign]
+    module.forward = in_bfloat16
