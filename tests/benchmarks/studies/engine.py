@@ -26,7 +26,9 @@ from pipeline.calibration_records import Inputs
 from pipeline.config import FleetConfig, PriorConfig, SolveConfig
 from pipeline.errors import SolveError
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.learn.radar_drivable.samples import scan_of
 from pipeline.objective.problem import Prior
+from pipeline.perceive.models.radar_drivable import RadarDrivable
 from pipeline.prior import perturbed, read_prior
 from pipeline.store.partitions import Partition
 from pipeline.verify.targets import loop_errors
@@ -35,10 +37,20 @@ from schemas.observations import Observation
 from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, load_day
 from tests.benchmarks.studies.metrics import measure, transform_of
 
-__all__ = ["Run", "calibrate_once", "prior_of", "read_results", "run_study", "study_arguments"]
+__all__ = [
+    "DRIVABLE_MODEL",
+    "Run",
+    "calibrate_once",
+    "learned_drivable",
+    "prior_of",
+    "read_results",
+    "run_study",
+    "study_arguments",
+]
 
 # The default sigmas of `rigs.*.prior` in fleet.toml: what a user has who says nothing.
 ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M = 2.0, 0.05
+DRIVABLE_MODEL = Path("radar_drivable") / "radar_drivable.toml"  # under the days' folder
 _DIAGNOSTICS = {
     "confidence",
     "vouched_az",
@@ -118,9 +130,9 @@ def spoiled(rows: Sequence[Observation], how: str) -> list[Observation]:
     """Faults that can be put into observations exactly, because perceive hands these columns on as it finds them.
 
     `focal:F` scales the camera's focal length by 1 + F as a wrong calibration file would; `centre:PX` shifts its
-    principal point; `few:N` leaves N frames, spread over the day.
+    principal point; `few:N` leaves N frames, spread over the day. `drivable` is no fault, and done before (`_work`).
     """
-    if not how:
+    if how in {"", "drivable"}:
         return list(rows)
     kind, _, amount = how.partition(":")
     if kind == "few":
@@ -254,8 +266,26 @@ def _configured(fleet: FleetConfig, run: Run) -> FleetConfig:
     return FleetConfig.model_validate(plain)
 
 
+def learned_drivable(rows: Sequence[Observation], model: Path) -> list[Observation]:
+    """The observations as perceive would have written them with this network for the radar's drivable area."""
+    network, changed = RadarDrivable(model), []
+    for row in rows:
+        sector = network.free_sector(scan_of(row))
+        changed.append(
+            replace(
+                row,
+                radar_drivable_azimuth_rad=sector.azimuth_rad,
+                radar_drivable_range_m=sector.range_m,
+            )
+        )
+    return changed
+
+
 def _work(run: Run, root: Path) -> dict[str, Any]:
-    return calibrate_once(run, _day(run.day, root))
+    day = _day(run.day, root)
+    if run.spoil == "drivable":
+        day = replace(day, rows=learned_drivable(day.rows, root / DRIVABLE_MODEL))
+    return calibrate_once(run, day)
 
 
 @lru_cache(maxsize=4)
