@@ -55,18 +55,13 @@ def evaluate(
 
     from jobs.calibrate import parse_pair
     from jobs.summary import print_summary
-    from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake
     from pipeline.store.tables import read_records
     from pipeline.verify.recording import ReflectorFiles
     from pipeline.verify.table import as_markdown, table_rows
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
-    if (truth is None) == (reflectors is None):
-        raise ConfigError("command line", "truth", "give either --truth or --reflectors")
-    if truth is not None and (recording_lake or recording_day):
-        raise ConfigError("command line", "recording-lake", "a reflector recording needs --reflectors")
-    _check_kind(out)
+    _check(truth, reflectors, recording_lake or recording_day, out)
     tables = Lake.at(lake)
     records = [r for r in read_records(tables, CALIBRATIONS, CalibrationRecord) if method in (None, r.method)]
     recording = (recording_lake or lake, recording_day) if recording_lake or recording_day else None
@@ -111,10 +106,14 @@ def _compare_all(
     return compared, counts
 
 
-def _check_kind(out: Path | None) -> None:
-    """Refuse a file of an unknown kind before anything is compared."""
+def _check(truth: Path | None, reflectors: Path | None, recording: str | None, out: Path | None) -> None:
+    """Refuse what cannot be meant before anything is compared."""
     from pipeline.errors import ConfigError
 
+    if (truth is None) == (reflectors is None):
+        raise ConfigError("command line", "truth", "give either --truth or --reflectors")
+    if truth is not None and recording:
+        raise ConfigError("command line", "recording-lake", "a reflector recording needs --reflectors")
     if out is not None and not out.is_dir() and out.suffix not in _KINDS:
         kinds = ", ".join(kind for kind in _KINDS if kind)
         raise ConfigError("command line", "out", f"{out.name} is neither a folder nor one of {kinds}")
