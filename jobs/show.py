@@ -47,8 +47,10 @@ def show(
         from jobs.summary import print_json
 
         print_json(rows, indent=2)
-    else:
+    elif rows:
         _print_table(table, rows)
+    else:
+        sys.stdout.write(f"{table}: nothing of this choice in {lake}\n")
     return 0
 
 
@@ -93,8 +95,8 @@ def _print_table(table: Table, rows: list[dict[str, Any]]) -> None:
 
     cells = {"calibrations": _calibration_cells, "drift": _drift_cells}.get(table, _partition_cells)
     lines = [cells(row) for row in rows]
-    view = RichTable(title=f"{table}: {len(rows)} rows", title_justify="left")
-    for name in lines[0] if lines else ():
+    view = RichTable(title=f"{table}: {len(rows)} row{'' if len(rows) == 1 else 's'}", title_justify="left")
+    for name in lines[0]:
         # Numbers and names never break; only the words at the end of a line may.
         view.add_column(name, no_wrap=name not in ("reason", "rejected"))
     colours = {"accepted": "green", "held": "yellow", "refused": "red"}

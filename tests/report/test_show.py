@@ -59,6 +59,8 @@ def test_a_lake_without_records_is_an_empty_list(tmp_path: Path, capsys: pytest.
     for table in ("calibrations", "drift", "frames", "observations"):
         assert show(table, lake=str(tmp_path / "none"), json=True) == 0
         assert json.loads(capsys.readouterr().out) == []
+        assert show(table, lake=str(tmp_path / "none")) == 0
+        assert capsys.readouterr().out == f"{table}: nothing of this choice in {tmp_path / 'none'}\n"
 
 
 def test_the_table_for_people_names_status_and_reason(lake: Path, capsys: pytest.CaptureFixture[str]) -> None:
