@@ -23,7 +23,8 @@ _SIDEWAYS_MPS = (
 )
 # What radar and odometry may differ by: on 15 of 16 simulated days no frame was beyond .4 m/s, but for real outliers.
 _DIFFERENT_MPS = 0.5
-_DIFFERENT_SHARE = 0.03  # of the speed: tyres wear
+_DIFFERENT_SHARE = 0.03  # of the speed
+_MOST = 0.5  # of the frames: more of them say that the odometry errs
 _LEVER_M = (-1.0, 6.0)  # of a radar ahead of the rear axle
 _PASSES = 8  # of fitting lever arm and mounting in turn
 
@@ -42,15 +43,20 @@ def turns_unmeasured(observations: Sequence[Observation]) -> Bool[np.ndarray, " 
 def contradicts_odometry(observations: Sequence[Observation]) -> Bool[np.ndarray, " F"]:
     """Which frames' radar velocity is none that a radar on this car can have had, by its speed or its yaw rate.
 
-    Sideways the radar moves by yaw rate times a lever arm, the same all day. What the car does not log cannot be
-    contradicted.
+    Sideways the radar moves by yaw rate times a lever arm, the same all day; an odometer may count a constant share too
+    much. What the car does not log cannot be contradicted, and an odometry that most frames contradict is itself wrong.
     """
     travel = _travel(observations)
-    speed = np.array([np.nan if o.ego_speed_mps is None else o.ego_speed_mps for o in observations])
-    turning = np.array([o.ego_yaw_rate_radps is not None for o in observations], bool)
-    allowed = _DIFFERENT_MPS + _DIFFERENT_SHARE * np.abs(speed)
-    too_fast = np.abs(np.hypot(travel[:, 0], travel[:, 1]) - np.abs(speed)) > allowed
-    return too_fast | (turning & (np.abs(travel[:, 1]) > _DIFFERENT_MPS))
+    radar_mps = np.hypot(travel[:, 0], travel[:, 1])
+    odometer_mps = np.abs([np.nan if o.ego_speed_mps is None else o.ego_speed_mps for o in observations])
+    both = (radar_mps > _MOVING_MPS) & (odometer_mps > _MOVING_MPS)
+    wrong = np.array([o.ego_yaw_rate_radps is not None for o in observations], bool)
+    wrong &= np.abs(travel[:, 1]) > _DIFFERENT_MPS
+    if both.any():
+        scale = float(np.median(radar_mps[both] / odometer_mps[both]))
+        apart_mps = np.abs(radar_mps - scale * odometer_mps)
+        wrong |= apart_mps > _DIFFERENT_MPS + _DIFFERENT_SHARE * odometer_mps
+    return wrong if wrong.sum() <= _MOST * len(wrong) else np.zeros_like(wrong)
 
 
 def _travel(observations: Sequence[Observation]) -> Float[np.ndarray, "F 2"]:

@@ -104,7 +104,7 @@ def test_a_height_that_the_day_cannot_tell_stays_while_a_knock_aside_is_found(da
 def test_others_are_less_sure_where_what_they_lean_on_rests_on_a_wider_prior(day):
     sure, vague = (
         solve(day[:24], Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, SIGMA_ROTATION, sigma))
-        for sigma in (0.002, 0.018)
+        for sigma in (0.002, 0.012)
     )
     for found in (sure, vague):
         assert not found.observable[3:].any()
@@ -115,9 +115,12 @@ def test_others_are_less_sure_where_what_they_lean_on_rests_on_a_wider_prior(day
 
 
 def test_frames_of_a_turn_that_no_odometry_measured_are_left_out(day):
-    turn = [
-        replace(o, radar_velocity_mps=np.array([8.0, 1.0, 0.0]), ego_yaw_rate_radps=None) for o in day[:6]
-    ]
+    turning = {
+        "radar_velocity_mps": np.array([8.0, 1.0, 0.0]),
+        "ego_speed_mps": 8.0,
+        "ego_yaw_rate_radps": None,
+    }
+    turn = [replace(o, **turning) for o in day[:6]]
     straight = [replace(o, ego_yaw_rate_radps=None) for o in day[6:24]]
     found = solve([*turn, *straight], prior_off_by(1, 0.02))
     assert found.frames_used == len(straight)

@@ -66,6 +66,23 @@ def test_what_the_car_does_not_log_contradicts_nothing(day):
     assert not turns_unmeasured(blind)[5]
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda o, _: {"ego_speed_mps": 1.08 * o.ego_speed_mps},  # another tyre
+        lambda o, _: {"ego_speed_mps": 3.6 * o.ego_speed_mps},  # km/h
+        lambda _, k: {"ego_speed_mps": float(k), "ego_yaw_rate_radps": 0.4 * np.cos(3 * k)},
+    ],
+)
+def test_an_odometry_that_is_itself_wrong_contradicts_no_day(day, wrong):
+    assert not contradicts_odometry([replace(o, **wrong(o, k)) for k, o in enumerate(day)]).any()
+
+
+def test_no_frames_contradict_nothing():
+    assert not len(contradicts_odometry([]))
+    assert not len(turns_unmeasured([]))
+
+
 def test_a_third_of_a_day_in_a_convoy_moves_nothing_and_is_counted():
     """Frames whose radar takes vehicles that pull away for the ground: they agree among themselves, and are wrong."""
     honest = street_day(24)
