@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
@@ -26,18 +26,25 @@ from pipeline.solve.camera_lidar_ascent import (
     NOTHING,
     AlignmentState,
     climb,
-    derivatives,
-    scales,
     weighted,
 )
-from pipeline.solve.camera_lidar_motion import motion_biases, sweep_s_per_rad
-from pipeline.solve.camera_lidar_profile import TZ, Profile, profile_tz, with_tz
+from pipeline.solve.camera_lidar_clock import FOCAL, s_per_metre
+from pipeline.solve.camera_lidar_motion import sweep_s_per_rad
 from pipeline.solve.camera_lidar_search import Basin, difference, find_basin
-from pipeline.solve.covariance import OBSERVABLE, blocks_of, held_covariance, response
+from pipeline.solve.camera_lidar_settle import IS_TZ, Day, Found, determined, measured
+from pipeline.solve.covariance import OBSERVABLE
 from pipeline.solve.search_range import search_range
 from schemas.observations import Observation
 
-__all__ = ["AlignmentState", "camera_lidar_cost", "camera_lidar_information", "estimate_camera_lidar"]
+__all__ = [
+    "Aligned",
+    "AlignmentState",
+    "align_camera_lidar",
+    "camera_lidar_cost",
+    "camera_lidar_information",
+    "estimate_camera_lidar",
+    "settle_camera_lidar",
+]
 
 _FEWEST_FRAMES = 5
 _THIN_POINTS, _FINE_POINTS = 8000, 18000  # of edges, and of markings; more say the same again
@@ -46,13 +53,32 @@ _MARGIN_RAD = np.radians(2.0)  # points further out of view than this stay out o
 _LADDER = ((4.0, 0), (2.5, 1), (1.5, 2))
 _VERDICT = Level.wide(1.5, 2)
 _MAX_GAP_PX = 5.0  # edges whose interval is wider (16 rings: 30 px) are for the basin only
-# What no resampling shows: mask dilation, focal length off by 0.1-0.5 %, rolling shutter
-# (evidence/method.md, section 4).
-_BIAS_FLOOR = np.array([np.radians(0.03)] * 3 + [0.01, 0.01, 0.01])
 _NEAR_PRIOR_M = 0.25
 _HEADING_SIGMA_RAD = np.radians(0.3)  # of velocities that a caller knows
-_IS_TZ = np.arange(8) == TZ
-_TIME_OFFSET_FLOOR_S = 0.004
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """An alignment good to a tenth of a degree: where `settle_camera_lidar` goes on, maybe with better velocities."""
+
+    day: Day
+    frames: list[Observation]
+    rejected: dict[str, int]
+    basin: Basin
+    state: AlignmentState
+    level: Level
+
+    @property
+    def T_camera_lidar(self) -> Float[np.ndarray, "4 4"]:
+        """The pose."""
+        return self.state.T_camera_lidar
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "6 6"]:
+        """Of the pose, by left perturbation."""
+        chart = measured(self.day, self.state, self.level, IS_TZ)[0][:6, :6]
+        to_left = np.linalg.inv(change_jacobian(self.state.T_camera_lidar))
+        return to_left @ chart @ to_left.T
 
 
 def estimate_camera_lidar(
@@ -76,6 +102,19 @@ def estimate_camera_lidar(
     Raises:
         SolveError: too few frames, or nothing to align in them.
     """
+    aligned = align_camera_lidar(observations, prior, config, rng, velocity_lidar=velocity_lidar)
+    return settle_camera_lidar(aligned, rng)
+
+
+def align_camera_lidar(
+    observations: Sequence[Observation],
+    prior: Prior,
+    config: SolveConfig,
+    rng: np.random.Generator,
+    *,
+    velocity_lidar: Float[np.ndarray, "F 3"] | None = None,
+) -> Aligned:
+    """Find the basin and climb it, from wide kernels to sharp ones; arguments as of `estimate_camera_lidar`."""
     used, rejected = _usable(observations)
     heading_sigma = _HEADING_SIGMA_RAD
     if velocity_lidar is None:
@@ -97,13 +136,13 @@ def estimate_camera_lidar(
     sharp = sharp.in_view(basin.state.T_camera_lidar, _MARGIN_RAD).at_most(_FINE_POINTS, rng)
     # Wide kernels are biased along the optical axis: where the prior is better than that, enter the valley there.
     near = prior.translation_sigma_m <= _NEAR_PRIOR_M
-    held = _IS_TZ if near else NOTHING
-    state = replace(basin.state, dt_s=0.0) if near else basin.state
+    held = IS_TZ if near else NOTHING
+    state = _at_prior_tz(basin.state, prior, terms) if near else basin.state
     state = climb(thin, state, first, prior, config, steps=8, held=held)
     for sigma_px, contrast in _LADDER[1:]:
         level = weighted(sharp, state, sharp.fitted(state.alone, Level.wide(sigma_px, contrast), rng))
-        state = climb(sharp, state, level, prior, config, steps=5, held=held)
-    day = _Day(
+        state = climb(sharp, state, level, prior, config, steps=4, held=held)
+    day = Day(
         sharp,
         prior,
         config,
@@ -113,16 +152,41 @@ def estimate_camera_lidar(
         heading_sigma,
         sweep_s_per_rad(frames),
     )
-    found = _determined(day, state, level, rng)
+    return Aligned(day, frames, rejected, basin, state, level)
+
+
+def settle_camera_lidar(
+    aligned: Aligned,
+    rng: np.random.Generator,
+    *,
+    heading: tuple[Float[np.ndarray, "4 4"], float] | None = None,
+) -> PairEstimate:
+    """The estimate: tz, the clock, what the day determines, how surely.
+
+    Args:
+        aligned: where to begin.
+        rng: of the chance densities and the clock's points.
+        heading: T_lidar_radar that turns the radar's Doppler velocities into lidar axes, and its sigma of yaw [rad];
+            by default the velocities stay those of `aligned`.
+    """
+    day = aligned.day
+    if heading is not None:
+        velocity = lidar_velocities(aligned.frames, heading[0])
+        day = replace(
+            day,
+            terms=replace(day.terms, velocity_lidar=velocity),
+            heading_sigma_rad=float(np.hypot(_HEADING_SIGMA_RAD, heading[1])),
+        )
+    found = determined(day, aligned.state, aligned.level, rng)
     halves = [
         climb(
-            sharp.of_frames(np.arange(k, len(used), 2)), found.state, found.level, found.prior, config,
-            steps=3, held=found.held,
+            day.terms.of_frames(np.arange(k, day.terms.frames, 2)), found.state, found.level, found.prior,
+            day.config, steps=3, held=found.held | (np.arange(8) == FOCAL),
         )
         for k in (0, 1)
     ]  # fmt: skip
-    diagnostics = _diagnostics(sharp, found, basin, halves)
-    return _conclude(found, config, len(frames), rejected, diagnostics)
+    diagnostics = _diagnostics(day.terms, found, aligned.basin, halves)
+    return _conclude(found, day.config, len(aligned.frames), aligned.rejected, diagnostics)
 
 
 def camera_lidar_cost(
@@ -178,9 +242,15 @@ def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, i
     return used, {"another camera": others} if others else {}
 
 
+def _at_prior_tz(state: AlignmentState, prior: Prior, terms: Terms) -> AlignmentState:
+    """The state with the prior's tz, and the clock that keeps what the car passes where it was."""
+    shift_m = float(state.T_camera_lidar[2, 3] - prior.T_camera_lidar[2, 3])
+    return replace(state, dt_s=state.dt_s + s_per_metre(terms, state) * shift_m).held(prior, IS_TZ)
+
+
 def _diagnostics(
     terms: Terms,
-    found: _Found,
+    found: Found,
     basin: Basin,
     halves: list[AlignmentState],
 ) -> dict[str, float]:
@@ -211,114 +281,8 @@ def _diagnostics(
     }
 
 
-@dataclass(frozen=True, eq=False)
-class _Day:
-    """What every solution of one day shares."""
-
-    terms: Terms
-    prior: Prior
-    config: SolveConfig
-    drives: list[int]
-    seed: int  # of the bootstrap: solutions compare on the same resampled days
-    tz_variance: float  # [m2]
-    heading_sigma_rad: float
-    sweep_s_per_rad: float
-    clock_bias_s: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """A solution: what of it the day determined, and how surely (chart of `AlignmentState.changed`)."""
-
-    prior: Prior  # with the tz that was found
-    state: AlignmentState
-    level: Level
-    held: np.ndarray  # 8, bool
-    covariance: np.ndarray  # 8 8
-    observability: np.ndarray  # 6
-    profile: Profile
-
-
-def _determined(day: _Day, state: AlignmentState, level: Level, rng: np.random.Generator) -> _Found:
-    """Fix tz by its profile, then solve again with what the day cannot determine held at the prior.
-
-    Left free, such a degree of freedom wanders as far as its prior lets it and drags others along: lane lines
-    pull tz, and with it dt, by decimetres. To hold one can leave another undetermined, whose optimum follows it.
-    """
-    follow = response(_curvature(day, state, level), _IS_TZ, NOTHING)[:, 0]
-    profile = profile_tz(day.terms, state, level, day.prior, day.config, follow)
-    before = float(day.prior.T_camera_lidar[2, 3]), day.prior.translation_sigma_m
-    tz_m, variance = profile.with_prior(*before)
-    seen = 1 - variance / before[1] ** 2
-    if seen < OBSERVABLE:
-        tz_m, variance = before[0], before[1] ** 2
-    # Seen from a moving car, a shift of the evidence along the axis is one in time.
-    speed_mps = max(float(np.sqrt(np.mean(day.terms.velocity_lidar**2) * 3)), 1.0)
-    clock_bias_s = profile.bias_m / speed_mps
-    day = replace(day, prior=with_tz(day.prior, tz_m), tz_variance=variance, clock_bias_s=clock_bias_s)
-    state = state.stepped(follow * (tz_m - state.T_camera_lidar[2, 3]))
-    held, observability = _IS_TZ, np.ones(6)
-    while True:
-        state = climb(day.terms, state, level, day.prior, day.config, steps=2, held=held)
-        level = weighted(day.terms, state, day.terms.fitted(state.alone, level, rng))
-        state = climb(day.terms, state, level, day.prior, day.config, steps=4, held=held)
-        covariance, shrunk = _measured(day, state, level, held)
-        observability = np.where(held[:6], observability, shrunk)
-        held_too = held | np.append(observability < OBSERVABLE, [False, False])
-        if held_too.sum() == held.sum():
-            break
-        held = held_too
-    observability[TZ] = max(seen, 0.0)
-    return _Found(day.prior, state, level, held, covariance, observability, profile)
-
-
-def _measured(
-    day: _Day, state: AlignmentState, level: Level, held: Bool[np.ndarray, " 8"]
-) -> tuple[Float[np.ndarray, "8 8"], Float[np.ndarray, " 6"]]:
-    """Covariance of a solution and observability; what is held has its own variance, and the others follow it."""
-    terms, prior_variance = day.terms, _prior_variance(day)
-    scale, curvature = scales(terms, level), _curvature(day, state, level)
-    gradient = derivatives(terms, state, level, scale)[0] / scale
-    # After `weighted`, the scatter of the frames' gradients is the curvature, without its roughness
-    # (Bartlett's identity).
-    information = gradient[:, :, None] * gradient[:, None, :]
-    block = blocks_of(np.array(day.drives), day.config.bootstrap_blocks)
-    covariance = held_covariance(
-        information,
-        -gradient,
-        prior_variance,
-        curvature,
-        held,
-        block,
-        np.random.default_rng(day.seed),
-    )
-    clock_floor_s = np.hypot(_TIME_OFFSET_FLOOR_S, day.clock_bias_s)
-    floor = np.where(held, 0.0, np.append(_BIAS_FLOOR, [clock_floor_s, 0.0]))
-    motion = motion_biases(terms, state, level, curvature, held, day.heading_sigma_rad, day.sweep_s_per_rad)
-    covariance = covariance + np.diag(floor**2) + motion.T @ motion
-    return covariance, np.clip(1 - np.diag(covariance) / prior_variance, 0.0, 1.0)[:6]
-
-
-def _prior_variance(day: _Day) -> Float[np.ndarray, " 8"]:
-    """Of every unknown before the frames' gradients are asked: of tz what its profile left."""
-    rotation, translation = day.prior.rotation_sigma_rad, day.prior.translation_sigma_m
-    sigma = np.array([rotation] * 3 + [translation] * 3 + [day.config.time_offset_sigma_s, FOCAL_SIGMA])
-    return np.where(_IS_TZ, day.tz_variance, sigma**2)
-
-
-def _curvature(day: _Day, state: AlignmentState, level: Level) -> Float[np.ndarray, "8 8"]:
-    """Curvature of the cost without its roughness, in the chart of `changed`: Gauss-Newton, from the points' slopes.
-
-    For ratios only. Moving tz on real logs moves dt by -0.04 s/m: this says -0.03, response surfaces +0.1 to -0.1.
-    """
-    _, information = day.terms.gradient(state.alone, level)
-    to_left = np.eye(8)
-    to_left[:6, :6] = np.linalg.inv(change_jacobian(state.T_camera_lidar))
-    return to_left.T @ information.sum(0) @ to_left + np.diag(1 / _prior_variance(day))
-
-
 def _conclude(
-    found: _Found,
+    found: Found,
     config: SolveConfig,
     frames: int,
     rejected: dict[str, int],

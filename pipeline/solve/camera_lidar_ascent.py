@@ -133,12 +133,14 @@ def _surface(
     """Slope and curvature (positive definite) of score and prior over a ball of `scale`, in units of it.
 
     At least half the curvature that the frames' gradients promise by their scatter (Fisher scoring): a direction
-    that the roughness makes flat or convex would send a Newton step anywhere.
+    that the roughness makes flat or convex would send a Newton step anywhere. About their mean: what frames agree on
+    is way still to go, not curvature, and steps shortened by it left clocks where they began.
     """
     at = state.changed(DESIGN * scale)
     gradient, H = fit_quadratics(terms.score(at, level))
     (before,), (H_prior,) = fit_quadratics(prior_value(at, prior, config)[:, None])
-    promised = gradient.T @ gradient - H_prior
+    apart = gradient - gradient.mean(0)
+    promised = apart.T @ apart - H_prior
     least = 0.5 * promised + 1e-9 * np.trace(promised) * np.eye(8)
     return gradient.sum(0) + before, at_least(-H.sum(0) - H_prior, least)
 

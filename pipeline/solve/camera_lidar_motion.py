@@ -25,7 +25,8 @@ from schemas.observations import Observation
 __all__ = ["motion_biases", "sweep_s_per_rad"]
 
 _SWEEP_S = 0.1  # rotating and scanning lidars alike run at 10 Hz
-_MOUNT_SIGMA_RAD = np.radians(1.0)
+# Roll's errors on simulated days of seeds 110 to 145, most of them of this kind, were two thirds of what 1 deg says.
+_MOUNT_SIGMA_RAD = np.radians(0.6)
 _STAMP_SIGMA_S = _SWEEP_S / np.sqrt(12)  # a sweep's stamp may be of its begin, middle or end
 
 

@@ -1,5 +1,7 @@
 """Method `joint`: camera-lidar, then lidar-radar with the camera's help, camera-radar composed; checked three ways.
 
+Camera-lidar is settled last: its clock moves the cloud along the car's way, which lidar-radar tells in lidar axes.
+
 The hard loop `T_camera_radar = T_camera_lidar T_lidar_radar` leaves 12 unknowns. They are solved one pair after the
 other: the camera-lidar terms know their pose ten times better than any radar term could tell them, so a common last
 step moves nothing but noise. What a constructed loop cannot show is asked of estimates that were not used:
@@ -19,7 +21,7 @@ from pipeline.geometry.changes import change_covariance, change_jacobian
 from pipeline.geometry.se3 import adjoint, compose_covariance, inverse, log_so3
 from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.results import Progress, silent
-from pipeline.solve.camera_lidar import estimate_camera_lidar
+from pipeline.solve.camera_lidar import align_camera_lidar, settle_camera_lidar
 from pipeline.solve.camera_lidar_search import SAME_ROTATION_RAD
 from pipeline.solve.camera_radar import estimate_camera_radar
 from pipeline.solve.covariance import OBSERVABLE
@@ -61,12 +63,13 @@ def solve_joint(
     doubts: dict[str, list[str]] = {pair: [] for pair in PAIRS}
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
     progress(0, 3, "camera-lidar")
-    camera_lidar = _kept("camera_lidar", prior)
+    camera_lidar, aligned = _kept("camera_lidar", prior), None
+    T_camera_lidar, covariance = camera_lidar.T, camera_lidar.covariance
+    rng = np.random.default_rng([seed, 0])
     if "camera_lidar" in wanted:
         try:
-            camera_lidar = estimate_camera_lidar(
-                observations["camera_lidar"], prior, config, np.random.default_rng([seed, 0])
-            )
+            aligned = align_camera_lidar(observations["camera_lidar"], prior, config, rng)
+            T_camera_lidar, covariance = aligned.T_camera_lidar, aligned.covariance
         except SolveError as err:
             doubts["camera_lidar"].append(err.reason)
     progress(1, 3, "lidar-radar")
@@ -76,13 +79,15 @@ def solve_joint(
             lidar_radar = estimate_lidar_radar(
                 observations["lidar_radar"],
                 prior,
-                camera_lidar.T,
+                T_camera_lidar,
                 config,
                 np.random.default_rng([seed, 1]),
-                covariance_camera_lidar=camera_lidar.covariance,
+                covariance_camera_lidar=covariance,
             )
         except SolveError as err:
             doubts["lidar_radar"].append(err.reason)
+    if aligned is not None:
+        camera_lidar = settle_camera_lidar(aligned, rng, heading=_heading(lidar_radar))
     progress(2, 3, "camera-radar")
     alone = estimate_camera_radar(
         observations["camera_radar"], prior, config, np.random.default_rng([seed, 2])
@@ -222,6 +227,13 @@ def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfi
     if "translation_prior" not in config.terms:
         prior = replace(prior, translation_sigma_m=_ANYWHERE_M)
     return prior, config
+
+
+def _heading(lidar_radar: PairEstimate) -> tuple[np.ndarray, float] | None:
+    """What lidar-radar found of the way the car goes in the lidar's axes; None where it did not find its yaw."""
+    if not lidar_radar.observable[2]:
+        return None
+    return lidar_radar.T, float(np.sqrt(lidar_radar.covariance[2, 2]))
 
 
 def _size(k: int, value: float) -> str:

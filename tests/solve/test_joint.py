@@ -1,6 +1,7 @@
 """Method `joint`: the hard loop, what camera and radar alone may contradict, pairs that cannot be solved."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -106,7 +107,9 @@ def test_pairs_that_cannot_be_solved_keep_the_prior_with_a_doubt():
 def test_a_camera_lidar_end_that_no_restart_came_near_is_a_doubt_about_both_camera_pairs(monkeypatch):
     for apart_deg, doubted in ((0.1, False), (2.6, True)):
         found = replace(camera_lidar(), diagnostics={"restart_rotation_spread_deg": apart_deg})
-        monkeypatch.setattr("pipeline.solve.joint.estimate_camera_lidar", lambda *_, found=found: found)
+        aligned = SimpleNamespace(T_camera_lidar=found.T, covariance=found.covariance)
+        monkeypatch.setattr("pipeline.solve.joint.align_camera_lidar", lambda *_, a=aligned: a)
+        monkeypatch.setattr("pipeline.solve.joint.settle_camera_lidar", lambda *_, e=found, **__: e)
         solution = solve_joint(dict.fromkeys(PAIRS, street_day(3)), PRIOR, SolveConfig(), seed=0)
         for pair in ("camera_lidar", "camera_radar"):
             assert any("no restart" in why for why in solution.doubts.get(pair, [])) == doubted
