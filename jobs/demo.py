@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 
 __all__ = ["demo"]
 
+# What is compared with the truth at the end: the night's method, and the shipped network.
+_NETWORK = "joint-ssl"
 # The radar of the second vehicle is knocked before the third day: 1.2 deg is what a kerb or a car wash does.
 _FAULTS = "vehicle-2:2:radar:yaw:1.2"
 _VEHICLES, _DAYS = 3, 4
@@ -27,7 +30,7 @@ def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = No
         workers: processes at a time; default: one per CPU that this process may use.
         seed: another seed is another fleet.
     """
-    from jobs.demo_table import print_comparison
+    from jobs.demo_table import print_comparison, print_methods
     from jobs.nightly import close_night, moved_sensors, usable_cpus, watch_night
     from jobs.summary import exit_code, print_summary
     from pipeline.config import load_fleet
@@ -50,10 +53,14 @@ def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = No
     _say("[bold]2/3[/]  the night: ingest, perceive, calibrate every vehicle-day")
     work = find_vehicle_days(str(out / "logs" / "{vehicle}" / "{day}" / "*"), days[0], days[-1])
     outcomes = watch_night(night, work, "process", workers)
+    # The same last day by the network that comes with Boresight: it looks at single frames, without semantics.
+    last_day = [w for w in work if w.partition.day == days[-1]]
+    outcomes += watch_night(replace(night, method=_NETWORK), last_day, "process", workers)
     _say("[bold]3/3[/]  the audit: which sensor moved, and since when")
     truth = read_truth(out / "truth")
     findings, pages = close_night(night, None, out / "report" / "fleet.html", truth)
     errors = print_comparison(night.lake, night.method, truth, days[-1], findings)
+    errors += print_methods(night.lake, (night.method, _NETWORK), truth, days[-1])[_NETWORK]
     (out / "comparison.json").write_text(json.dumps(errors, indent=1) + "\n")
     code = exit_code([o.status for o in outcomes])
     seconds = time.monotonic() - began
@@ -63,7 +70,7 @@ def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = No
         {0: "done", 1: "failed", 3: "held"}[code],
         report=pages[0] if pages else None,
         seconds=round(seconds, 1),
-        vehicle_days=len(outcomes),
+        vehicle_days=len(work),
         moved=moved_sensors(findings),
         knocked=[{"vehicle": f.vehicle, "sensor": f.sensor, "since": days[f.day]} for f in spec.faults],
         comparison=out / "comparison.json",

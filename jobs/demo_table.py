@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from pipeline.store.partitions import Lake
     from schemas.calibrations import CalibrationRecord
     from schemas.drift import DriftFinding
 
-__all__ = ["print_comparison"]
+__all__ = ["print_comparison", "print_methods"]
 
 _WIDTH = 124  # of the table; a narrower terminal wraps lines, which reads better than cut names
 _STATUS = {"accepted": "[green]accepted[/]", "held": "[yellow]held[/]", "refused": "[yellow]refused[/]"}
@@ -36,17 +37,7 @@ def print_comparison(
     Returns:
         For each record: errors of rotation [deg] and translation [m] against the truth, before and after.
     """
-    from rich.console import Console
-
-    from pipeline.store.current import current_records
-    from pipeline.store.tables import read_records
-    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-
-    found = current_records(
-        [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, day=day) if r.method == method]
-    )
-    console = Console(highlight=False)
-    console.width = max(console.width, _WIDTH)
+    found, console = _current(lake, method, day), _console()
     table, errors = _table(day), []
     for record in found:
         T_true = truth[record.vehicle, record.day][record.pair]
@@ -59,6 +50,83 @@ def print_comparison(
     for line in _drift_lines(findings):
         console.print(line)
     return errors
+
+
+def print_methods(
+    lake: Lake,
+    methods: Sequence[str],
+    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    day: str,
+) -> dict[str, list[dict[str, Any]]]:
+    """Print a row per method: what its records of one day are off by, on average over vehicles.
+
+    Azimuth and elevation [deg] and range [m] at the paper's targets, the prior's first.
+
+    Returns:
+        By method, for each record, what `print_comparison` returns.
+    """
+    from rich import box
+    from rich.table import Table
+
+    from schemas.calibrations import PAIRS
+
+    records = {method: _current(lake, method, day) for method in methods}
+    table = Table(
+        title=f"Mean error by method, {day}: azimuth, elevation [deg], range [m]",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+    )
+    for name in ("method", *PAIRS, "accepted"):
+        table.add_column(name, no_wrap=True)
+    first = records[methods[0]]
+    table.add_row("prior", *(_mean_error(first, truth, pair, before=True) for pair in PAIRS), "")
+    for method, own in records.items():
+        accepted = sum(r.status == "accepted" for r in own)
+        cells = [_mean_error(own, truth, pair, before=False) for pair in PAIRS]
+        table.add_row(method, *cells, f"{accepted} of {len(own)}")
+    _console().print(table)
+    return {
+        method: [_errors(r, truth[r.vehicle, r.day][r.pair]) for r in own] for method, own in records.items()
+    }
+
+
+def _mean_error(
+    records: Sequence[CalibrationRecord],
+    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    pair: str,
+    *,
+    before: bool,
+) -> str:
+    """Over the records of a pair that hold a transform."""
+    from pipeline.store.current import prior_of, transform_of
+    from pipeline.verify.targets import errors_at_targets
+
+    found = []
+    for record in (r for r in records if r.pair == pair):
+        T = prior_of(record) if before else transform_of(record)
+        if T is not None:
+            found.append(errors_at_targets(pair, T, truth[record.vehicle, record.day][pair]))
+    if not found:
+        return "refused"
+    azimuth, elevation, range_m = np.mean(found, axis=0)
+    return f"{np.degrees(azimuth):.3f} / {np.degrees(elevation):.3f} / {range_m:.3f}"
+
+
+def _current(lake: Lake, method: str, day: str) -> list[CalibrationRecord]:
+    from pipeline.store.current import current_records
+    from pipeline.store.tables import read_records
+    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+
+    found = read_records(lake, CALIBRATIONS, CalibrationRecord, day=day)
+    return current_records([r for r in found if r.method == method])
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    console.width = max(console.width, _WIDTH)
+    return console
 
 
 def _table(day: str) -> Table:
@@ -117,6 +185,7 @@ def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
     return {
         "vehicle": record.vehicle,
         "day": record.day,
+        "method": record.method,
         "pair": record.pair,
         "status": record.status,
         "rotation_error_prior_deg": before[0],

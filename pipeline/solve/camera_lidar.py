@@ -290,7 +290,9 @@ def _conclude(
 ) -> PairEstimate:
     """The estimate, its covariance by left perturbation, notes."""
     dt_sigma = float(np.sqrt(found.covariance[6, 6]))
-    notes = [f"focal length free within {FOCAL_SIGMA:.1%} of the log's: {found.state.focal - 1:+.2%}"]
+    notes = [
+        f"focal length {found.state.focal - 1:+.2%} off the log's, where {FOCAL_SIGMA:.1%} was expected (1 sigma)"
+    ]
     if dt_sigma > 0.7 * config.time_offset_sigma_s:
         notes.append("camera time offset: the day's speeds do not determine it")
     to_left = np.linalg.inv(change_jacobian(found.state.T_camera_lidar))

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -39,14 +40,23 @@ def test_the_demo_ends_with_a_table_a_report_and_a_summary(demo):
         assert table.count(vehicle) >= 4  # three pairs, and what the audit says
     assert "turn deg" in table
     assert "shift cm" in table
+    assert [
+        line.split()[0] for line in table.splitlines() if line.split()[:1] in (["joint"], ["joint-ssl"])
+    ] == [
+        "joint",
+        "joint-ssl",
+    ]
 
 
 @pytest.mark.slow
 def test_the_comparison_with_the_truth_is_kept(demo):
     out, _ = demo
     rows = json.loads((out / "comparison.json").read_text())
-    assert len(rows) == 9
-    assert {r["pair"] for r in rows} == {"camera_lidar", "camera_radar", "lidar_radar"}
+    assert Counter((r["method"], r["pair"]) for r in rows) == {
+        (method, pair): 3
+        for method in ("joint", "joint-ssl")
+        for pair in ("camera_lidar", "camera_radar", "lidar_radar")
+    }
     computed = [r for r in rows if r["status"] != "refused"]
     # The prior is what the drawing says: wrong by as much as sensors are mounted askew, and by the knock.
     assert all(0 < r["rotation_error_prior_deg"] < 6 for r in computed)

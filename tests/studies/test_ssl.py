@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import onnx
 import pytest
 
 from pipeline.config import load_fleet
@@ -29,8 +30,23 @@ TRUTH = {
 
 @pytest.fixture
 def models(tmp_path) -> ModelSet:
-    (tmp_path / "a.onnx").write_bytes(b"one network")
+    write_network(tmp_path / "a.onnx", "one network")
     return ModelSet.parse(f"matching={tmp_path / 'a.onnx'}")
+
+
+def write_network(path, name, card=""):
+    """A file with a graph, though one that answers nothing."""
+    model = onnx.helper.make_model(onnx.helper.make_graph([], name, [], []))
+    onnx.helper.set_model_props(model, {"card": card})
+    onnx.save(model, path)
+
+
+def test_a_network_is_measured_again_when_it_was_trained_on_and_not_when_its_card_was_written(models):
+    before = models.key
+    write_network(models.files[0], "one network", card="measured: well")
+    assert models.key == before
+    write_network(models.files[0], "another network")
+    assert models.key != before
 
 
 @pytest.fixture
@@ -204,7 +220,7 @@ def test_a_network_that_was_trained_on_is_measured_again_and_the_old_lines_left_
     assert len(ssl_table1.run_tasks(tasks, tmp_path / "r.jsonl")) == 1
     assert calls == ["paper_urban_100_200"]
     assert replace(tasks[0], iterations=2).key != tasks[0].key
-    models.files[0].write_bytes(b"the same, trained on")
+    write_network(models.files[0], "the same, trained on")
     again = ssl_table1.run_tasks(tasks, tmp_path / "r.jsonl")
     assert len(calls) == 2
     assert [r["key"] for r in again] == [tasks[0].key]

@@ -6,6 +6,7 @@ that no network learned from: the sides val and test of table training.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
 from collections.abc import Sequence
@@ -13,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import onnx
 
 from pipeline.calibration_records import environment_of
 from pipeline.config import FleetConfig, load_fleet
-from pipeline.learn.onnx_networks import models_key
 from pipeline.objective.problem import Prior
 from pipeline.prior import perturbed
 from pipeline.store.partitions import Lake, Partition
@@ -158,8 +159,11 @@ class ModelSet:
 
     @property
     def key(self) -> str:
-        """Hash of the contents: a network that was trained on is another network."""
-        return models_key(self.by_name)
+        """Hash of the graphs: a network that was trained on is another one, the same with another card is not."""
+        digest = hashlib.sha256()
+        for _, path in sorted(self.by_name.items()):
+            digest.update(onnx.load(path).graph.SerializeToString(deterministic=True))
+        return digest.hexdigest()[:16]
 
     def configured(self, fleet: FleetConfig, iterations: int = 3) -> FleetConfig:
         """A configuration that names these files."""

@@ -1,0 +1,59 @@
+"""The network that comes with Boresight: its size, its card, and what it does on a rig that it never learned from."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate_ssl import calibrate_frame
+from pipeline.config import LearnConfig, PrepareConfig
+from pipeline.learn.onnx_networks import SHIPPED, model_files, open_networks
+from pipeline.verify.targets import errors_at_targets
+from schemas.calibrations import PAIRS
+from tests.simulated_days import simulated_day
+
+MODEL = SHIPPED / "joint.onnx"
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory):
+    return simulated_day(tmp_path_factory.mktemp("day"), frames=6, rig="demo", seed=77)
+
+
+def test_it_is_small_and_onnxruntime_opens_it():
+    assert MODEL.stat().st_size <= 2_500_000
+    [network] = open_networks({"joint": MODEL}, LearnConfig(), PrepareConfig())
+    assert network.pairs == PAIRS
+
+
+def test_its_card_says_what_it_comes_from_and_what_it_cannot_do():
+    card = json.loads(MODEL.with_suffix(".json").read_text())
+    assert card["bytes"] == MODEL.stat().st_size
+    for heading in ("data", "seeds", "time", "results", "limits"):
+        assert card[heading], heading
+        assert f"## {heading}" in MODEL.with_suffix(".md").read_text()
+    assert "simulated" in json.dumps(card["data"])
+    assert any("translations" in limit for limit in card["limits"])
+
+
+def test_a_fleet_that_names_no_network_gets_it(day):
+    assert model_files("joint-ssl", day.fleet.learn, day.fleet_file) == {"joint": MODEL}
+
+
+def test_one_frame_puts_sensors_right_that_were_knocked_by_five_degrees(day):
+    """Median over frames, of a rig with half the lidar rows that it learned from."""
+    before, after = [], []
+    for o in day.observations:
+        found = calibrate_frame(
+            day.partition, day.fleet, day.lake, o.frame_index, method="joint-ssl",
+            perturb=(5.0, 0.05), seed=o.frame_index, fleet_file=day.fleet_file,
+        )  # fmt: skip
+        before.append([off(day, pair, found.prior.of(pair)) for pair in PAIRS])
+        after.append([off(day, pair, found.solution.pairs[pair].T) for pair in PAIRS])
+    before, after = np.median(np.degrees(before), axis=0), np.median(np.degrees(after), axis=0)
+    assert (np.linalg.norm(after, axis=1) < np.linalg.norm(before, axis=1) / 4).all(), (before, after)
+
+
+def off(day, pair, T):
+    """Azimuth and elevation [rad] at the paper's targets."""
+    return errors_at_targets(pair, T, day.truth[pair])[:2]
