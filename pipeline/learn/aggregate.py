@@ -27,7 +27,7 @@ from pipeline.geometry.se3 import exp_se3, hat, inverse, log_se3, transform_poin
 from pipeline.geometry.spherical import from_spherical
 from pipeline.objective.problem import PairEstimate
 
-__all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "twists_about"]
+__all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "shared_bias", "twists_about"]
 
 OBSERVABLE = 0.5  # the day at least halved the variance, as in all methods
 _RESAMPLES = 200
@@ -47,9 +47,9 @@ _OWN_GAIN, _OTHER_GAIN = 1.0, 0.1
 # Directions [deg] and distances [m] of what sight is about, in the child's frame: what all three sensors see.
 _SEEN_AZIMUTH_DEG, _SEEN_ELEVATION_DEG = (-25.0, -12.0, 0.0, 12.0, 25.0), (-6.0, 0.0, 3.0)
 _SEEN_M = (15.0, 25.0, 40.0)
-# What averaging does not lower: where networks of this kind differ from the truth on every frame alike. Sight and
-# translation in parent axes: a camera's are (elevation, azimuth, roll), a lidar's (roll, elevation, azimuth).
-# Translations are hardly learned: half an hour's training put lidars .3 m too far ahead, radars .5 m too high.
+# What averaging does not lower: where a network's answers differ from H x on every frame alike. Sight and translation
+# in parent axes: a camera's are (elevation, azimuth, roll), a lidar's (roll, elevation, azimuth). Of networks that
+# nobody measured (`OnnxNetwork.bias_sigma`) no translation is believed: some put lidars .3 m too far ahead.
 BIAS_SIGMA: dict[str, tuple[float, ...]] = {
     "camera_lidar": (*np.radians([0.06, 0.05, 0.1]), 0.4, 0.4, 0.4),
     "camera_radar": (*np.radians([0.2, 0.1, 0.5]), 0.4, 0.4, 0.4),
@@ -67,6 +67,7 @@ class Answers:
     variance: Float[np.ndarray, "N 6"]  # as the network predicts it
     block: Int[np.ndarray, " N"]  # frames of one block see the same things
     frames: int  # different ones among the N
+    bias_sigma: Float[np.ndarray, " 6"] | None = None  # (sight, translation); None: BIAS_SIGMA of the pair
 
 
 def twists_about(
@@ -128,6 +129,14 @@ def day_estimate(
     )
 
 
+def shared_bias(answers: Answers, T_true: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 6"]:
+    """By what all answers differ from H x where x is known: what `bias_sigma` should allow for ([rad], [m])."""
+    S = _sight_of_twist(answers.T_centre)
+    fit = _robust_regression(replace(answers, guess=answers.guess @ S.T, answer=answers.answer @ S.T))
+    H = np.eye(6) - fit.coefficients[1:].T
+    return np.asarray(fit.coefficients[0] - H @ S @ log_se3(T_true @ inverse(answers.T_centre)))
+
+
 def mean_answer(
     answers: Answers, T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, "4 4"]:
@@ -158,7 +167,8 @@ def _spread(pair: str, answers: Answers, draws: np.ndarray, blind: np.ndarray) -
     """Covariance of the mean answer: what blocks say, no less than the network says itself, and the bias."""
     spread = np.cov(draws[:, 0].T)
     claimed = np.median(answers.variance, axis=0) / answers.frames
-    spread += np.diag(np.maximum(claimed - np.diag(spread), 0.0) + np.square(BIAS_SIGMA[pair]))
+    bias = BIAS_SIGMA[pair] if answers.bias_sigma is None else answers.bias_sigma
+    spread += np.diag(np.maximum(claimed - np.diag(spread), 0.0) + np.square(bias))
     return np.asarray(spread + np.diag(np.where(blind, _NOTHING, 0.0)))
 
 

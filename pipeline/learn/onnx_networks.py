@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -83,6 +84,12 @@ class OnnxNetwork:
         self._path, self._calibrator = path, SingleFrameCalibrator(path, config.threads)
         self._iterations, self._rows = config.iterations, rows
         self._prepare = _prepare_for(self._calibrator.grid, prepare)
+        self._bias_sigma = _bias_of_card(path, self._calibrator.metadata.get("card", "{}"))
+
+    @property
+    def bias_sigma(self) -> Mapping[str, np.ndarray]:
+        """What all its answers may be off by alike, (sight [rad], translation [m]), measured as its card says."""
+        return self._bias_sigma
 
     @property
     def pairs(self) -> tuple[str, ...]:
@@ -134,6 +141,25 @@ class _LastRow:
             self.row = sensor_row(frame, observation, prior, _NOBODY, config)
             self.key = key
         return self.row
+
+
+def _bias_of_card(path: Path, card: str) -> dict[str, np.ndarray]:
+    """`bias_sigma` of a card: by pair, three angles [deg] and three shifts [m].
+
+    Raises:
+        ModelError: something else stands there.
+    """
+    try:
+        told = json.loads(card).get("bias_sigma", {})
+        found = {pair: np.array(values, np.float64) for pair, values in told.items()}
+    except (AttributeError, TypeError, ValueError) as err:
+        raise ModelError(str(path), f"bias_sigma of its card is unreadable: {err}") from err
+    for pair, values in found.items():
+        if pair not in PAIRS or values.shape != (6,) or not (np.isfinite(values) & (values >= 0)).all():
+            raise ModelError(
+                str(path), f"bias_sigma of its card: {pair} needs three degrees and three metres"
+            )
+    return {pair: np.append(np.radians(values[:3]), values[3:]) for pair, values in found.items()}
 
 
 def _prepare_for(grid: Grid, config: PrepareConfig) -> PrepareConfig:

@@ -20,7 +20,14 @@ from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = ["FrameAnswer", "FrameNetwork", "FrameSource", "single_frame_solution", "solve_by_networks"]
+__all__ = [
+    "FrameAnswer",
+    "FrameNetwork",
+    "FrameSource",
+    "day_answers",
+    "single_frame_solution",
+    "solve_by_networks",
+]
 
 # Guesses are scattered by this much (sd per axis): several times what one frame's answer scatters by.
 _SCATTER_RAD, _SCATTER_M = np.radians(0.4), 0.03
@@ -63,6 +70,11 @@ class FrameNetwork(Protocol):
         """True where its camera_radar stands on the product of the other two."""
         ...
 
+    @property
+    def bias_sigma(self) -> Mapping[str, np.ndarray]:
+        """By pair, what all its answers may be off by alike; pairs are missing where nobody measured it."""
+        ...
+
     def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> Any:
         """What `answer` needs of a frame; SampleRejectedError where it shows too little."""
         ...
@@ -98,26 +110,8 @@ def solve_by_networks(
     Raises:
         SolveError: too few frames can be shown to the networks.
     """
-    chosen = _chosen(observations)
-    rejected: Counter[str] = Counter()
-    asked = _Asked(networks, prior, [], [])
-    total = len(chosen)
-    for done, frame in enumerate(frames([o.frame_index for o in chosen])):
-        progress(done, 2 * total, "see frames")
-        try:
-            asked.sensors.append([n.sensors(frame, chosen[done], prior) for n in networks])
-            asked.observations.append(chosen[done])
-        except SampleRejectedError as rejection:
-            rejected[rejection.reason.value] += 1
-    if len(asked.sensors) < _MIN_FRAMES:
-        why = ", ".join(f"{n} {name}" for name, n in sorted(rejected.items()))
-        raise SolveError(
-            f"too few frames for a network: {len(asked.sensors)} of {total} ({why or 'short day'})"
-        )
     rng = np.random.default_rng([seed, 7])
-    centre = _scouted(asked, {pair: prior.of(pair) for pair in PAIRS}, rng)
-    everything = range(len(asked.sensors))
-    found = _ask(asked, everything, centre, rng, lambda i: progress(total + i, 2 * total, "ask networks"))
+    asked, found, rejected = _asked_day(observations, prior, networks, frames, rng, progress)
     estimates = {
         pair: replace(_estimate(pair, found[pair], asked, rng), frames_rejected=dict(rejected))
         if pair in triggered
@@ -171,6 +165,53 @@ class _Asked:
         return np.zeros(6, bool) if seen else _ELEVATION[pair]
 
 
+def day_answers(
+    observations: Mapping[str, Sequence[Observation]],
+    prior: Prior,
+    *,
+    networks: Sequence[FrameNetwork],
+    frames: FrameSource,
+    seed: int,
+) -> dict[str, Answers]:
+    """What `solve_by_networks` makes its estimates of: each pair's answers at scattered guesses.
+
+    Raises:
+        SolveError: too few frames can be shown to the networks.
+    """
+    return _asked_day(observations, prior, networks, frames, np.random.default_rng([seed, 7]), silent)[1]
+
+
+def _asked_day(
+    observations: Mapping[str, Sequence[Observation]],
+    prior: Prior,
+    networks: Sequence[FrameNetwork],
+    frames: FrameSource,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[_Asked, dict[str, Answers], Counter[str]]:
+    """Show all frames, walk to where they point, ask them there; with the frames left out, by reason."""
+    chosen = _chosen(observations)
+    rejected: Counter[str] = Counter()
+    asked = _Asked(networks, prior, [], [])
+    total = len(chosen)
+    for done, frame in enumerate(frames([o.frame_index for o in chosen])):
+        progress(done, 2 * total, "see frames")
+        try:
+            asked.sensors.append([n.sensors(frame, chosen[done], prior) for n in networks])
+            asked.observations.append(chosen[done])
+        except SampleRejectedError as rejection:
+            rejected[rejection.reason.value] += 1
+    if len(asked.sensors) < _MIN_FRAMES:
+        why = ", ".join(f"{n} {name}" for name, n in sorted(rejected.items()))
+        raise SolveError(
+            f"too few frames for a network: {len(asked.sensors)} of {total} ({why or 'short day'})"
+        )
+    centre = _scouted(asked, {pair: prior.of(pair) for pair in PAIRS}, rng)
+    everything = range(len(asked.sensors))
+    found = _ask(asked, everything, centre, rng, lambda i: progress(total + i, 2 * total, "ask networks"))
+    return asked, found, rejected
+
+
 def _chosen(observations: Mapping[str, Sequence[Observation]]) -> list[Observation]:
     """The selected frames of all pairs in order, thinned evenly."""
     every = {o.frame_index: o for selected in observations.values() for o in selected}
@@ -216,6 +257,7 @@ def _ask(
                 answers[pair].append(said.T[pair])
                 variances[pair].append(said.variance[pair])
     block = _blocks([asked.observations[row].drive for row in rows])
+    bias = {pair: n.bias_sigma[pair] for n in asked.networks for pair in n.pairs if pair in n.bias_sigma}
     return {
         pair: Answers(
             centre[pair],
@@ -224,6 +266,7 @@ def _ask(
             np.stack(variances[pair]),
             block,
             len(set(rows)),
+            bias.get(pair),
         )
         for pair in PAIRS
     }
@@ -284,6 +327,7 @@ def _part(answers: Answers, rows: np.ndarray) -> Answers:
         answers.variance[rows],
         answers.block[rows],
         max(1, round(answers.frames * float(rows.mean()))),
+        answers.bias_sigma,
     )
 
 

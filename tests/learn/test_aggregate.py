@@ -53,6 +53,32 @@ def test_a_network_that_knows_is_followed_whatever_the_prior_says(monkeypatch):
     assert found.frames_used == 96
 
 
+def test_what_all_answers_are_off_by_alike_is_found_where_the_truth_is_known():
+    rng = np.random.default_rng(4)
+    x, bias = (
+        PRIOR_SD * [0.3, -0.4, 0.2, 0.3, -0.2, 0.4],
+        np.array([*np.radians([0.1, -0.2, 0.3]), 0.05, -0.02, 0.03]),
+    )
+    answers = day(rng, np.zeros((6, 6)), x, noise=NOISE / 5)
+    S = aggregate._sight_of_twist(answers.T_centre)
+    biased = replace(answers, answer=answers.answer + np.linalg.solve(S, bias))
+    found = aggregate.shared_bias(biased, exp_se3(x) @ answers.T_centre)
+    assert np.degrees(found[:3]) == pytest.approx(np.degrees(bias[:3]), abs=0.05)
+    assert found[3:] == pytest.approx(bias[3:], abs=0.012)
+
+
+def test_shifts_are_believed_of_a_network_that_was_measured_and_of_no_other():
+    rng = np.random.default_rng(5)
+    x = PRIOR_SD * [0.3, -0.4, 0.2, 0.8, -0.9, 0.7]
+    answers = day(rng, np.diag([0, 0, 0, 0.6, 0.6, 0.6]), x)
+    measured = replace(answers, bias_sigma=np.array([*np.radians([0.05] * 3), *[0.008] * 3]))
+    unknown, known = (estimate(a, np.random.default_rng(0), x_prior=np.zeros(6)) for a in (answers, measured))
+    assert not unknown.observable[3:].any()
+    assert known.observable[3:].all()
+    assert np.abs(off(known, x)[3:]).max() < np.abs(off(unknown, x)[3:]).max() / 2
+    assert (np.abs(off(known, x)) < 3 * np.sqrt(np.diag(known.covariance))).all()
+
+
 def test_a_network_that_repeats_its_guess_leaves_the_prior_as_it_was():
     rng = np.random.default_rng(1)
     quiet = NOISE * 1e-3  # all its answers agree: scatter alone would call that certainty

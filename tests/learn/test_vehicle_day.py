@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import pytest
 import torch
 
@@ -41,6 +42,7 @@ class Oracle:
         self.pairs, self.gain, self.noise, self.composed = pairs, gain, noise, composed
         self.reach_rad, self.blind_frames = reach_rad, blind_frames
         self.rng = np.random.default_rng(3)
+        self.bias_sigma = {}
 
     def sensors(self, frame, observation, _prior):
         if frame.frame_index in self.blind_frames:
@@ -239,6 +241,40 @@ def test_another_model_is_other_work(lake, tmp_path):
     assert models_key(files) != models_key({"joint": other})
     with pytest.raises(ModelError, match="estimates camera_lidar, not"):
         open_networks({"joint": other}, fleet.learn, fleet.prepare)
+
+
+def with_bias(path, out, bias):
+    model = onnx.load(path)
+    card = next(p for p in model.metadata_props if p.key == "card")
+    card.value = json.dumps(json.loads(card.value) | {"bias_sigma": bias})
+    onnx.save(model, out)
+    return {"joint": out}
+
+
+def test_a_card_may_say_by_what_all_answers_are_off_alike(lake, tmp_path):
+    from pipeline.config import load_fleet
+
+    fleet = load_fleet(lake / "fleet.toml")
+    files = model_files("joint-ssl", fleet.learn, lake / "fleet.toml")
+    assert open_networks(files, fleet.learn, fleet.prepare)[0].bias_sigma == {}
+    told = with_bias(
+        files["joint"], tmp_path / "told.onnx", {"lidar_radar": [0.3, 0.2, 0.1, 0.03, 0.02, 0.01]}
+    )
+    [network] = open_networks(told, fleet.learn, fleet.prepare)
+    assert network.bias_sigma["lidar_radar"] == pytest.approx(
+        [*np.radians([0.3, 0.2, 0.1]), 0.03, 0.02, 0.01]
+    )
+    for wrong in (
+        {"lidar_radar": [0.3]},
+        {"sonar": [0.1] * 6},
+        {"lidar_radar": [-1] * 6},
+        [1],
+        {"lidar_radar": "x"},
+    ):
+        with pytest.raises(ModelError, match="bias_sigma"):
+            open_networks(
+                with_bias(files["joint"], tmp_path / "wrong.onnx", wrong), fleet.learn, fleet.prepare
+            )
 
 
 def test_a_missing_model_names_its_key(lake, tmp_path):

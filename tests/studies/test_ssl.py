@@ -34,17 +34,19 @@ def models(tmp_path) -> ModelSet:
     return ModelSet.parse(f"matching={tmp_path / 'a.onnx'}")
 
 
-def write_network(path, name, card=""):
+def write_network(path, name, card=None):
     """A file with a graph, though one that answers nothing."""
     model = onnx.helper.make_model(onnx.helper.make_graph([], name, [], []))
-    onnx.helper.set_model_props(model, {"card": card})
+    onnx.helper.set_model_props(model, {"card": json.dumps(card or {})})
     onnx.save(model, path)
 
 
 def test_a_network_is_measured_again_when_it_was_trained_on_and_not_when_its_card_was_written(models):
     before = models.key
-    write_network(models.files[0], "one network", card="measured: well")
+    write_network(models.files[0], "one network", card={"results": "good"})
     assert models.key == before
+    write_network(models.files[0], "one network", card={"bias_sigma": {"camera_lidar": [0.1] * 6}})
+    assert models.key != before
     write_network(models.files[0], "another network")
     assert models.key != before
 

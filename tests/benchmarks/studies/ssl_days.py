@@ -159,10 +159,17 @@ class ModelSet:
 
     @property
     def key(self) -> str:
-        """Hash of the graphs: a network that was trained on is another one, the same with another card is not."""
+        """Hash of what is computed with: a network that was trained on is another one, another card says nothing new.
+
+        But for its `bias_sigma`, which decides how far answers are believed.
+        """
         digest = hashlib.sha256()
         for _, path in sorted(self.by_name.items()):
-            digest.update(onnx.load(path).graph.SerializeToString(deterministic=True))
+            model = onnx.load(path)
+            digest.update(model.graph.SerializeToString(deterministic=True))
+            card = next((json.loads(p.value) for p in model.metadata_props if p.key == "card"), {})
+            if "bias_sigma" in card:
+                digest.update(json.dumps(card["bias_sigma"], sort_keys=True).encode())
         return digest.hexdigest()[:16]
 
     def configured(self, fleet: FleetConfig, iterations: int = 3) -> FleetConfig:

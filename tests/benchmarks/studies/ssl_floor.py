@@ -24,7 +24,7 @@ __all__ = ["best_turn_errors"]
 
 
 def best_turn_errors(pair: str, T_prior: np.ndarray, T_true: np.ndarray) -> tuple[float, float, float]:
-    """Azimuth [rad], elevation [rad], range [m] at the paper's targets, with the prior's translation, turned at best."""
+    """Azimuth [rad], elevation [rad], range [m] at the paper's targets: the prior's translation, turned at best."""
 
     def errors(turn_deg: np.ndarray) -> tuple[float, float, float]:
         R = exp_so3(np.radians(turn_deg)) @ T_true[:3, :3]

@@ -1,0 +1,70 @@
+"""Study: by what a network's answers are off on all frames of a day alike, for `bias_sigma` of its card.
+
+    python -m tests.benchmarks.studies.ssl_bias --root SSL/fleet --models matching=joint.onnx
+
+Root mean squares over the vehicles of the training fleet that no network learned from, a day each, from Table 1's
+prior; (sight, translation) as in `pipeline/learn/aggregate.py`: three angles [deg], three shifts [m]. Days of Table 1
+stay unseen. Pairwise networks are measured by the same command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.learn.aggregate import shared_bias
+from pipeline.learn.onnx_networks import open_networks
+from pipeline.learn.vehicle_day import day_answers
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import iterate_rows
+from schemas.calibrations import PAIRS
+from schemas.frames import FRAMES, Frame
+from tests.benchmarks.studies.ssl_days import ModelSet, SslDay, fleet_days, open_day
+from tests.benchmarks.studies.ssl_measures import STARTS
+
+__all__ = ["biases"]
+
+
+def biases(models: ModelSet, day: SslDay) -> dict[str, np.ndarray]:
+    """By pair: three angles [deg], three shifts [m]."""
+    partition = Partition(day.where.vehicle, day.where.day)
+    lake = Lake.at(day.where.folder / "lake")
+
+    def frames(indices: Sequence[int]) -> Iterator[Frame]:
+        wanted = set(indices)
+        batches = iterate_rows(lake, FRAMES, partition, Frame)
+        return (f for f in chain.from_iterable(batches) if f.frame_index in wanted)
+
+    answers = day_answers(
+        dict.fromkeys(PAIRS, day.rows),
+        day.prior(*STARTS["prior"], seed=day.where.seed),
+        networks=open_networks(models.by_name, models.configured(day.fleet).learn, day.fleet.prepare),
+        frames=frames,
+        seed=0,
+    )
+    unit = np.array([np.degrees(1.0)] * 3 + [1.0] * 3)
+    return {pair: shared_bias(answers[pair], day.true_of(pair)) * unit for pair in PAIRS}
+
+
+def main() -> None:
+    """Measure and print, ready for the notes of `boresight export onnx`."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--root", type=Path, required=True, help="folder of ssl_fleet.py: fleet")
+    parser.add_argument("--models", type=ModelSet.parse, required=True, metavar="NAME=FILE[,..]")
+    args = parser.parse_args()
+    found = [biases(args.models, open_day(where)) for where in fleet_days(args.root)]
+    for pair in PAIRS:
+        print(pair, *("[" + " ".join(f"{v:+.3f}" for v in day[pair]) + "]" for day in found), sep="\n  ")
+    rms = {pair: np.sqrt(np.mean([day[pair] ** 2 for day in found], axis=0)) for pair in PAIRS}
+    print(json.dumps({"bias_sigma": {pair: [round(float(v), 3) for v in rms[pair]] for pair in PAIRS}}))
+
+
+if __name__ == "__main__":
+    main()
