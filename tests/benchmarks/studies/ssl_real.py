@@ -3,7 +3,7 @@
     boresight train --data LAKE --out TUNED --config tests/benchmarks/studies/ssl_recipes/real.toml --start-from RUN
     python -m tests.benchmarks.studies.ssl_real --data LAKE --runs before=RUN after=TUNED
 
-Held-out frames of table training (side test, of places that no other side has) are started 2 deg / .1 m off the logs'
+Held-out frames of table training, of places that no other side has, are started 2 deg / .1 m off the logs'
 own calibration, each by a draw of its own. Alignment is the weighted sum that training descends, at the starts, at the
 networks' answers and at the logs' own calibration, which nobody trained on; distances are to that calibration, itself
 good to about .2 deg.
@@ -35,11 +35,12 @@ from pipeline.verify.targets import errors_at_targets
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.engine import _commit
 
-__all__ = ["alignment", "answers", "starts", "table"]
+__all__ = ["alignment", "answers", "measured", "starts", "table"]
 
 _START = (2.0, 0.1)  # deg, m
 _PASSES = 3
 _AT_ONCE = 16
+SIDES = ("val", "test")  # the first chose among weights, the second has seen nothing
 Poses = Mapping[str, torch.Tensor]  # by pair, frames x 4 x 4
 
 
@@ -104,11 +105,24 @@ def distances(at: Poses, given: Poses) -> dict[str, dict[str, list[float]]]:
     return out
 
 
-def table(told: dict[str, Any]) -> str:
+def measured(batch: TrainingBatch, networks: Mapping[str, CalibrationNetwork], seed: int) -> dict[str, Any]:
+    """Frames, and for each set of poses its alignment and its distance to the logs' own calibration."""
+    guess, given = starts(batch, seed), given_poses(batch)
+    poses = {"start": guess}
+    poses |= {name: answers(network, batch, guess) for name, network in networks.items()}
+    poses["the logs' own"] = given
+    rows = {
+        name: {"alignment": round(alignment(batch, at), 3), "distance": distances(at, given)}
+        for name, at in poses.items()
+    }
+    return {"frames": len(batch), "rows": rows}
+
+
+def table(side: str, told: dict[str, Any]) -> str:
     """Markdown: a row for the starts, for each network and for the logs' own calibration."""
     what = "Alignment and distance to the logs' own calibration, az / el [deg] / range [m]"
     lines = [
-        f"{what}, mean (median) of {told['frames']} held-out frames (side {told['side']}):",
+        f"{what}, mean (median) of {told['frames']} held-out frames (side {side}):",
         "",
         f"| poses | alignment | {' | '.join(PAIRS)} |",
         f"|---|---|{'---|' * len(PAIRS)}",
@@ -131,29 +145,16 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, required=True, help="lake with table training of real logs")
     parser.add_argument("--runs", nargs="+", required=True, metavar="NAME=RUN")
-    parser.add_argument("--side", choices=["val", "test"], default="test", help="val chose the weights")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("tests/benchmarks/results/ssl_real.json"))
     args = parser.parse_args()
-    batch = load_split(Lake.at(args.data), args.side)
-    guess, given = starts(batch, args.seed), given_poses(batch)
-    poses = {"start": guess}
-    for name, run in (text.split("=", 1) for text in args.runs):
-        poses[name] = answers(network_of_run(Path(run)), batch, guess)
-    poses["the logs' own"] = given
-    told = {
-        "commit": _commit(),
-        "date": time.strftime("%Y-%m-%d"),
-        "seed": args.seed,
-        "side": args.side,
-        "frames": len(batch),
-        "rows": {
-            name: {"alignment": round(alignment(batch, at), 3), "distance": distances(at, given)}
-            for name, at in poses.items()
-        },
-    }
-    args.out.write_text(json.dumps(told, indent=1) + "\n")
-    print(table(told))
+    networks = {name: network_of_run(Path(run)) for name, run in (text.split("=", 1) for text in args.runs)}
+    sides = {side: measured(load_split(Lake.at(args.data), side), networks, args.seed) for side in SIDES}
+    about = {"commit": _commit(), "date": time.strftime("%Y-%m-%d"), "seed": args.seed}
+    args.out.write_text(json.dumps(about | sides, indent=1) + "\n")
+    told = "\n\n".join(table(side, found) for side, found in sides.items())
+    args.out.with_suffix(".md").write_text(f"commit {about['commit']}; {about['date']}\n\n{told}\n")
+    print(told)
 
 
 if __name__ == "__main__":
