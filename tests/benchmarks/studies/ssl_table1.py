@@ -100,7 +100,8 @@ def heading(results: Sequence[dict[str, Any]], tasks: Sequence[Task]) -> str:
     """What was measured, at which commits, of which files."""
     commits, dates = (", ".join(sorted({r[k] for r in results})) for k in ("commit", "date"))
     models = ", ".join(dict.fromkeys(f"{t.models.row} = {t.models.key}" for t in tasks))
-    return f"{len(results)} of {len(tasks)} measurements; commit {commits}; {dates}; {models}"
+    asked = f"{len(results)} of {len(tasks)}" if tasks else f"{len(results)}"
+    return f"{asked} measurements; commit {commits}; {dates}; {models}".removesuffix("; ")
 
 
 def summary(results: list[dict[str, Any]], others: list[dict[str, Any]]) -> str:
@@ -138,7 +139,8 @@ def main() -> None:
         for part in args.parts
         for where in places
     ]
-    results = run_tasks(tasks, args.out, args.workers)
+    # Without models: tables of all that was measured before.
+    results = run_tasks(tasks, args.out, args.workers) if tasks else read_results(args.out)
     if not results:
         return
     others = [] if args.tuning else read_results(_RESULTS / "table1.jsonl")
@@ -151,7 +153,7 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--models", nargs="+", type=ModelSet.parse, required=True, metavar="NAME=FILE[,..]")
+    parser.add_argument("--models", nargs="*", type=ModelSet.parse, default=[], metavar="NAME=FILE[,..]")
     parser.add_argument(
         "--root", type=Path, required=True, help="folder of ssl_fleet.py: table1, or fleet with --tuning"
     )
