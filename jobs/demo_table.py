@@ -72,7 +72,7 @@ def print_methods(
 
     records = {method: _current(lake, method, day) for method in methods}
     table = Table(
-        title=f"Mean error by method, {day}: azimuth, elevation [deg], range [m]",
+        title=f"Mean error by method, {day}: azimuth, elevation \\[deg], range \\[m]",
         title_style="bold",
         box=box.SIMPLE_HEAD,
     )
