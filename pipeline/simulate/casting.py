@@ -1,4 +1,4 @@
-"""Rays against the world: Embree (open3d) on a sliding window of the standing world and on each road user apart.
+"""Rays against the world: Embree on a sliding window of the standing world and on each road user apart.
 
 Road users are hit in their own frame with the ray moved to the ray's own time, so a sweep that takes 100 ms sees
 each of them where it was when the beam came by, and no mesh is ever rebuilt for a frame.
@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import open3d as o3d
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float
 
 from pipeline.simulate.actors import VARIANTS, actor_mesh
@@ -26,7 +27,6 @@ __all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "shadow_map", "st
 
 _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 60.0
-_MISS: Final = np.uint32(0xFFFFFFFF)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Standing:
 
     origin: np.ndarray
     mesh: Mesh
-    scene: Any
+    scene: EmbreeScene
     shadows: ShadowMap
     normals: np.ndarray
 
@@ -168,7 +168,7 @@ class Moment:
 class _Prototype:
     """An actor's scene and normals in its own frame, and the sphere around it."""
 
-    scene: Any
+    scene: EmbreeScene
     normals: np.ndarray
     reach_m: float
     centre: np.ndarray
@@ -204,26 +204,33 @@ def _may_be_seen(centre: np.ndarray, reach_m: float, axis: np.ndarray, cosine: f
     return bool(np.arccos(np.clip(centre @ axis / distance, -1, 1)) < widest)
 
 
-def _scene(mesh: Mesh) -> Any:
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+def _scene(mesh: Mesh) -> EmbreeScene:
+    scene = EmbreeScene()
     corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), np.float32)
-    index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-    scene.add_triangles(o3d.core.Tensor.from_numpy(corners), o3d.core.Tensor.from_numpy(index))
+    TriangleMesh(
+        scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    )  # belongs to the scene
     return scene
 
 
 def _cast(
-    scene: Any, origins: np.ndarray, directions: np.ndarray
+    scene: EmbreeScene, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
-    found = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
-    primitive = found["primitive_ids"].numpy()
-    triangle = np.where(primitive == _MISS, -1, primitive.astype(np.int64)).astype(np.int32)
-    return found["t_hit"].numpy(), triangle, found["primitive_uvs"].numpy()
+    """Range (inf = nothing met), triangle (-1 = nothing met) and barycentric coordinates of each ray's first hit."""
+    found = scene.run(
+        np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32), output=True
+    )
+    triangle = found["primID"]
+    range_m = np.where(triangle < 0, np.float32(np.inf), found["tfar"])
+    return range_m, triangle, np.stack([found["u"], found["v"]], axis=1)
 
 
 def shadow_map(
-    scene: Any, origin: np.ndarray, sun: np.ndarray, to_map: Callable[[np.ndarray], np.ndarray], s_m: float
+    scene: EmbreeScene,
+    origin: np.ndarray,
+    sun: np.ndarray,
+    to_map: Callable[[np.ndarray], np.ndarray],
+    s_m: float,
 ) -> ShadowMap:
     """Cast the ground around an arc length towards the sun; once per window, not per image."""
     cell, half = 0.4, 22.0

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -34,7 +33,7 @@ from pipeline.store.partitions import Partition
 from pipeline.verify.targets import loop_errors
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
-from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, load_day
+from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, commit_now, load_day
 from tests.benchmarks.studies.metrics import measure, transform_of
 
 __all__ = [
@@ -201,7 +200,7 @@ def run_study(
     """
     done = {key_of(r) for r in read_results(args.out)}
     todo = [r for r in runs if r.key not in done][: args.limit]
-    about = {"commit": _commit(), "date": time.strftime("%Y-%m-%d")}
+    about = {"commit": commit_now(), "date": time.strftime("%Y-%m-%d")}
     args.out.parent.mkdir(parents=True, exist_ok=True)
     print(f"{len(runs)} runs, {len(todo)} to do", flush=True)
     with (
@@ -226,16 +225,20 @@ def run_study(
     results = [r for r in read_results(args.out) if key_of(r) in wanted]
     if not results:
         return
-    commits = sorted({r["commit"] for r in results})
+    commits = {name: _all_of(results, name) for name in ("commit", "simulated_by", "perceived_by")}
     seeds = sorted({r["day"]["seed"] for r in results})
     dates = sorted({r["date"] for r in results})
     head = (
-        f"{len(results)} of {len(runs)} runs; commit {', '.join(commits)}; {', '.join(dates)}; "
-        f"days of seeds {seeds[0]}-{seeds[-1]}\n"
+        f"{len(results)} of {len(runs)} runs; calibrated by commit {commits['commit']}, perceived by "
+        f"{commits['perceived_by']}, simulated by {commits['simulated_by']}; {', '.join(dates)}; days of seeds {seeds[0]}-{seeds[-1]}\n"
     )
     text = f"{head}\n{summary(results)}\n"
     args.out.with_suffix(".md").write_text(text)
     print(text)
+
+
+def _all_of(results: Sequence[dict[str, Any]], name: str) -> str:
+    return ", ".join(sorted({r.get(name, "unknown") or "nobody" for r in results}))
 
 
 def study_arguments(description: str, name: str) -> argparse.ArgumentParser:
@@ -285,7 +288,7 @@ def _work(run: Run, root: Path) -> dict[str, Any]:
     day = _day(run.day, root)
     if run.spoil == "drivable":
         day = replace(day, rows=learned_drivable(day.rows, root / DRIVABLE_MODEL))
-    return calibrate_once(run, day)
+    return day.made_by | calibrate_once(run, day)
 
 
 @lru_cache(maxsize=4)
@@ -319,13 +322,3 @@ def _line(result: dict[str, Any]) -> str:
         for pair, p in result["pairs"].items()
     ]
     return f"{head}: {'; '.join(cells)} ({result['cpu_s']} CPU s)"
-
-
-def _commit() -> str:
-    """The commit, with a + where the working tree differs from it in pipeline."""
-    head = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
-    )
-    diff = ["git", "diff", "--quiet", "HEAD", "--", "pipeline", "schemas"]
-    changed = subprocess.run(diff, capture_output=True, check=False)
-    return (head.stdout.strip() or "unknown") + ("+" if changed.returncode else "")

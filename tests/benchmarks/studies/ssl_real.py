@@ -33,7 +33,7 @@ from pipeline.learn.settings import LossConfig
 from pipeline.store.partitions import Lake
 from pipeline.verify.targets import errors_at_targets
 from schemas.calibrations import PAIRS
-from tests.benchmarks.studies.engine import _commit
+from tests.benchmarks.studies.days import commit_now
 
 __all__ = ["alignment", "answers", "measured", "starts", "table"]
 
@@ -150,7 +150,7 @@ def main() -> None:
     args = parser.parse_args()
     networks = {name: network_of_run(Path(run)) for name, run in (text.split("=", 1) for text in args.runs)}
     sides = {side: measured(load_split(Lake.at(args.data), side), networks, args.seed) for side in SIDES}
-    about = {"commit": _commit(), "date": time.strftime("%Y-%m-%d"), "seed": args.seed}
+    about = {"commit": commit_now(), "date": time.strftime("%Y-%m-%d"), "seed": args.seed}
     args.out.write_text(json.dumps(about | sides, indent=1) + "\n")
     told = "\n\n".join(table(side, found) for side, found in sides.items())
     args.out.with_suffix(".md").write_text(f"commit {about['commit']}; {about['date']}\n\n{told}\n")

@@ -22,7 +22,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.studies.engine import _commit, _quiet, read_results
+from tests.benchmarks.studies.days import commit_now
+from tests.benchmarks.studies.engine import _quiet, read_results
 from tests.benchmarks.studies.ssl_days import ModelSet, Where, fleet_days, open_day, table1_days
 from tests.benchmarks.studies.ssl_measures import ITERATIONS, STARTS, measure_day, measure_frames
 from tests.benchmarks.studies.ssl_tables import abrupt_table, frames_table, rows_of, sigma_table
@@ -74,7 +75,7 @@ def run_tasks(tasks: Sequence[Task], out: Path, workers: int = 1) -> list[dict[s
     """Measure what is missing in `out`, a line each as it finishes; returns the lines of these tasks."""
     done = {r["key"] for r in read_results(out)}
     todo = [t for t in tasks if t.key not in done]
-    about = {"commit": _commit(), "date": time.strftime("%Y-%m-%d")}
+    about = {"commit": commit_now(), "date": time.strftime("%Y-%m-%d")}
     out.parent.mkdir(parents=True, exist_ok=True)
     print(f"{len(tasks)} measurements, {len(todo)} to do", flush=True)
     with (
