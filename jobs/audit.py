@@ -29,8 +29,8 @@ def audit(
         method: method of the audited records; default: audit.method.
         report: also write the fleet page, and a page per vehicle-day beside it.
     """
-    from jobs.summary import print_summary, progress_reporter
-    from pipeline.audit.run import audit_fleet
+    from jobs.terminal.summary import print_summary, progress_reporter
+    from pipeline.audit.stage import audit_fleet
     from pipeline.config import load_fleet
     from pipeline.store.partitions import Lake
 
@@ -43,7 +43,7 @@ def audit(
     moved = sorted({(f.vehicle, f.moved_sensor, f.start_day) for f in findings if f.moved_sensor})
     outputs = []
     if report is not None:
-        from pipeline.report.run import write_fleet_report
+        from pipeline.report.stage import write_fleet_report
 
         outputs = write_fleet_report(tables, config, report, method=method)
     print_summary(

@@ -68,8 +68,8 @@ def _calibrate_day(
     seed: int | None,
 ) -> int:
     """The day's records in the lake, their statuses in the summary."""
-    from jobs.summary import exit_code, print_summary, progress_reporter
-    from pipeline.calibrate import calibrate_day
+    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+    from pipeline.calibrate.stage import calibrate_day
 
     with progress_reporter(f"calibrate {partition.vehicle} {partition.day}") as progress:
         result = calibrate_day(
@@ -108,8 +108,8 @@ def _calibrate_frame(
     page: Path | None,
 ) -> int:
     """One frame's transforms in the summary, and its page where one is wanted."""
-    from jobs.summary import print_summary
-    from pipeline.calibrate_ssl import calibrate_frame
+    from jobs.terminal.summary import print_summary
+    from pipeline.calibrate.networks import calibrate_frame
 
     found = calibrate_frame(
         partition, config, lake, frame, method=method, perturb=perturb, seed=seed, fleet_file=fleet

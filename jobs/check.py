@@ -25,7 +25,7 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
     """
     from dataclasses import asdict
 
-    from jobs.summary import print_json, print_summary, progress_reporter
+    from jobs.terminal.summary import print_json, print_summary, progress_reporter
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.ingest.check import check_logs

@@ -14,8 +14,8 @@ from typing import Any
 
 from cyclopts import App, CycloptsError
 
-from jobs.logging import configure, logger
-from jobs.summary import print_summary
+from jobs.terminal.logging import configure, logger
+from jobs.terminal.summary import print_summary
 from pipeline.errors import BoresightError
 
 __all__ = ["COMMANDS", "app", "main"]

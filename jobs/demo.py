@@ -30,9 +30,9 @@ def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = No
         workers: processes at a time; default: one per CPU that this process may use.
         seed: another seed is another fleet.
     """
-    from jobs.demo_table import print_comparison, print_methods
     from jobs.nightly import close_night, moved_sensors, usable_cpus, watch_night
-    from jobs.summary import exit_code, print_summary
+    from jobs.terminal.demo_table import print_comparison, print_methods
+    from jobs.terminal.summary import exit_code, print_summary
     from pipeline.config import load_fleet
     from pipeline.fleet.nightly import Night
     from pipeline.fleet.pattern import find_vehicle_days
@@ -83,13 +83,13 @@ def _simulate(spec: FleetSpec, out: Path, workers: int) -> None:
     import shutil
     from contextlib import closing
 
-    from jobs.night_view import night_view
+    from jobs.terminal.night_view import night_view
     from pipeline.config import config_hash
     from pipeline.errors import LogError
     from pipeline.fleet.executor import EXECUTORS
     from pipeline.simulate.fleet import day_names, vehicle_names
-    from pipeline.simulate.rigs import rig_named
-    from pipeline.simulate.toml import fleet_toml
+    from pipeline.simulate.logs.fleet_toml import fleet_toml
+    from pipeline.simulate.sensors.rigs import rig_named
     from schemas.versions import CODE_VERSION
 
     stamp, key = out / ".simulated", config_hash({"spec": repr(spec), "code": CODE_VERSION})
@@ -122,7 +122,7 @@ def _simulate_one(work: tuple[FleetSpec, int, int, Path], progress: Progress) ->
 
 def _say(text: str) -> None:
     """A line for whoever watches; without a terminal the log lines say it."""
-    from jobs.summary import is_terminal
+    from jobs.terminal.summary import is_terminal
 
     if is_terminal():
         from rich.console import Console

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from jobs.evaluation_page import Compared
+    from pipeline.evaluate.recording import ReflectorFiles
     from pipeline.store.partitions import Lake
-    from pipeline.verify.recording import ReflectorFiles
     from schemas.calibrations import CalibrationRecord
 
 __all__ = ["evaluate"]
@@ -40,7 +40,7 @@ def evaluate(
         truth: JSON with T_camera_lidar and T_lidar_radar (4x4), or a folder with VEHICLE/DAY.json.
         reflectors: instead of a truth, JSON of reflector positions as picked in each sensor's data (what `simulate
             --reflectors` writes; {"camera": {...}, "targets": [{"pixel", "lidar_m", "radar_m", ...}]}, described in
-            pipeline/verify/picks.py), or a folder with VEHICLE/DAY.json. It judges the vehicle and day that it names.
+            pipeline/evaluate/picks.py), or a folder with VEHICLE/DAY.json. It judges the vehicle and day that it names.
         recording_lake: lake that the reflector recording was ingested into: lidar and radar positions are then found
             in its frames near the picks, camera pixels stay as picked. Default: --lake where --recording-day is given.
         recording_day: day under which it was ingested; default: the day of the picks. A lake holds one partition of
@@ -54,11 +54,11 @@ def evaluate(
     import sys
 
     from jobs.calibrate import parse_pair
-    from jobs.summary import print_summary
+    from jobs.terminal.summary import print_summary
+    from pipeline.evaluate.recording import ReflectorFiles
+    from pipeline.evaluate.table import as_markdown, table_rows
     from pipeline.store.partitions import Lake
     from pipeline.store.tables import read_records
-    from pipeline.verify.recording import ReflectorFiles
-    from pipeline.verify.table import as_markdown, table_rows
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
     _check(truth, reflectors, recording_lake or recording_day, out)
@@ -87,7 +87,7 @@ def _compare_all(
 ) -> tuple[list[Compared], dict[str, int]]:
     """Every current run that has a truth, and how many have none or no result."""
     from jobs.evaluation_page import Compared
-    from pipeline.verify.evaluation import compare, current_runs
+    from pipeline.evaluate.comparison import compare, current_runs
 
     compared, counts = [], {"refused_runs": 0, "runs_without_truth": 0}
     for run in current_runs(records):
@@ -121,8 +121,8 @@ def _check(truth: Path | None, reflectors: Path | None, recording: str | None, o
 
 def _write(out: Path, compared: Sequence[Compared], notes: Sequence[str], lake: Lake) -> None:
     from jobs.evaluation_page import page_of
+    from pipeline.evaluate.table import as_markdown, as_parquet, table_rows
     from pipeline.report.page import write_page
-    from pipeline.verify.table import as_markdown, as_parquet, table_rows
 
     comparisons = [c.comparison for c in compared]
     rows = table_rows(comparisons)
@@ -144,7 +144,7 @@ def _write(out: Path, compared: Sequence[Compared], notes: Sequence[str], lake: 
 
 
 def _truth_of(truth: Path, record: CalibrationRecord) -> dict[str, np.ndarray] | None:
-    from pipeline.prior import read_transforms
+    from pipeline.extrinsics.prior import read_transforms
 
     path = truth / record.vehicle / f"{record.day}.json" if truth.is_dir() else truth
     if truth.is_dir() and not path.exists():

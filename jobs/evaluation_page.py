@@ -9,11 +9,11 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from pipeline.evaluate.comparison import Comparison
+    from pipeline.geometry.targets import Picks
     from pipeline.report.evaluation import EvaluatedRun, TableView, View
     from pipeline.report.overlays import Extrinsics, Scene
     from pipeline.store.partitions import Lake
-    from pipeline.verify.evaluation import Comparison
-    from pipeline.verify.targets import Picks
     from schemas.calibrations import CalibrationRecord
 
 __all__ = ["Compared", "page_of"]
@@ -64,9 +64,9 @@ def _evaluated(compared: Compared) -> EvaluatedRun:
     import numpy as np
 
     from pipeline.geometry.se3 import transform_points
+    from pipeline.geometry.targets import DEFAULT_TARGETS
     from pipeline.report.evaluation import EvaluatedRun
     from pipeline.store.current import prior_of, transform_of
-    from pipeline.verify.targets import DEFAULT_TARGETS
     from schemas.calibrations import PAIRS
 
     def degrees(errors: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

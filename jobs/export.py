@@ -19,7 +19,7 @@ def export(
         run: folder of `boresight train`; needed for "onnx".
         notes: JSON object for the card: what was measured, what the data was.
     """
-    from jobs.summary import print_summary
+    from jobs.terminal.summary import print_summary
 
     if what == "schemas":
         from schemas.versions import write_json_schemas
@@ -38,9 +38,9 @@ def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
         raise ConfigError("command line", "run", "onnx needs --run FOLDER, as `boresight train` left it")
     if out.suffix != ".onnx":
         raise ConfigError("command line", "out", f"{out} must end in .onnx")
-    from pipeline.learn.model_card import card_of_run
-    from pipeline.learn.onnx_export import export_onnx
-    from pipeline.learn.run_state import network_of_run
+    from pipeline.learn.export.model_card import card_of_run
+    from pipeline.learn.export.onnx_file import export_onnx
+    from pipeline.learn.train.run_state import network_of_run
 
     export_onnx(network_of_run(run), out, card_of_run(run, notes))
     return [out, out.with_suffix(".json"), out.with_suffix(".md")]

@@ -19,10 +19,10 @@ def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     """
     from dataclasses import asdict
 
-    from jobs.summary import exit_code, print_summary, progress_reporter
+    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
-    from pipeline.ingest.run import ingest_day
+    from pipeline.ingest.stage import ingest_day
     from pipeline.store.partitions import Lake, Partition
 
     if not logs:

@@ -43,7 +43,7 @@ def nightly(
         seed: of everything random; the configuration's where left out.
         report: HTML page of the fleet; default: report/fleet.html inside the lake.
     """
-    from jobs.summary import exit_code, print_summary
+    from jobs.terminal.summary import exit_code, print_summary
     from pipeline.config import load_fleet
     from pipeline.fleet.nightly import Night
     from pipeline.fleet.pattern import find_vehicle_days
@@ -73,7 +73,7 @@ def watch_night(
     night: Night, days: Sequence[VehicleDay], executor: str, workers: int | None
 ) -> list[DayOutcome]:
     """Run the night in view of whoever watches; outcomes in order of their end."""
-    from jobs.night_view import night_view
+    from jobs.terminal.night_view import night_view
     from pipeline.errors import ConfigError
     from pipeline.fleet.nightly import run_night
 
@@ -95,7 +95,7 @@ def close_night(
 
     However few days the night was about, the charts look back over `audit.window_days`.
     """
-    from jobs.summary import progress_reporter
+    from jobs.terminal.summary import progress_reporter
     from pipeline.stages import AUDIT, REPORT
 
     with progress_reporter("audit") as progress:

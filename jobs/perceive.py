@@ -18,9 +18,9 @@ def perceive(*, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     """
     from dataclasses import asdict
 
-    from jobs.summary import exit_code, print_summary, progress_reporter
+    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from pipeline.config import load_fleet
-    from pipeline.perceive.run import perceive_day
+    from pipeline.perceive.stage import perceive_day
     from pipeline.store.partitions import Lake, Partition
 
     config = load_fleet(fleet)

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.config import FleetConfig
-    from pipeline.learn.inventory import Inventory
-    from pipeline.learn.prepare_fleet import PrepareWork
+    from pipeline.learn.prepare.fleet import PrepareWork
+    from pipeline.learn.prepare.inventory import Inventory
     from pipeline.results import StageResult
     from pipeline.store.partitions import Lake, Partition
 
@@ -40,9 +40,9 @@ def prepare(
         executor: process (a pool) or inline (one after the other in this process).
         workers: processes at a time; default: one per CPU that this process may use.
     """
-    from jobs.summary import exit_code, print_summary, progress_reporter
+    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from pipeline.config import load_fleet
-    from pipeline.learn.inventory import take_inventory, write_inventory
+    from pipeline.learn.prepare.inventory import take_inventory, write_inventory
     from pipeline.store.partitions import Lake
 
     config, tables = load_fleet(fleet), Lake.at(lake)
@@ -101,11 +101,11 @@ def _days(
 
 def _plan(config: FleetConfig, lake: Lake, fleet: Path, days: Sequence[Partition]) -> list[PrepareWork]:
     """Look over all days and divide them; each worker gets the keys of its own day."""
-    from jobs.summary import progress_reporter
-    from pipeline.learn.prepare import decided_sides
-    from pipeline.learn.prepare_fleet import PrepareWork
-    from pipeline.learn.split import SplitPlan, Unit
-    from pipeline.learn.survey import plan_days, survey_day
+    from jobs.terminal.summary import progress_reporter
+    from pipeline.learn.prepare.fleet import PrepareWork
+    from pipeline.learn.prepare.split import SplitPlan, Unit
+    from pipeline.learn.prepare.stage import decided_sides
+    from pipeline.learn.prepare.survey import plan_days, survey_day
 
     surveys = []
     with progress_reporter("survey") as progress:
@@ -127,10 +127,10 @@ def _run(work: Sequence[PrepareWork], executor: str, workers: int | None) -> lis
     from contextlib import closing
 
     from jobs.nightly import usable_cpus
-    from jobs.summary import progress_reporter
+    from jobs.terminal.summary import progress_reporter
     from pipeline.errors import ConfigError
     from pipeline.fleet.executor import EXECUTORS
-    from pipeline.learn.prepare_fleet import run_prepare
+    from pipeline.learn.prepare.fleet import run_prepare
     from pipeline.results import StageResult
 
     if workers is not None and workers < 1:

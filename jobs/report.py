@@ -28,10 +28,10 @@ def report(
         method: method of the records; default: audit.method.
         truth: JSON with the true extrinsics of a simulated fleet, shown beside the estimates.
     """
-    from jobs.summary import print_summary
+    from jobs.terminal.summary import print_summary
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
-    from pipeline.report.run import write_day_page, write_fleet_report
+    from pipeline.report.stage import write_day_page, write_fleet_report
     from pipeline.report.truth import read_truth
     from pipeline.store.partitions import Lake, Partition
 

@@ -44,7 +44,7 @@ def show(
     else:
         rows = _records(tables, table, vehicle, day, method, current=current)
     if json:
-        from jobs.summary import print_json
+        from jobs.terminal.summary import print_json
 
         print_json(rows, indent=2)
     elif rows:

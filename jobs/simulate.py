@@ -70,7 +70,7 @@ def simulate(
 
 def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
     """Logs and truth in `out`, what was written in the summary."""
-    from jobs.summary import print_summary, progress_reporter
+    from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.simulate.fleet import simulate_fleet
     from pipeline.simulate.reflectors import simulate_reflectors
 

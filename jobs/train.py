@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from pipeline.learn.settings import TrainConfig
-    from pipeline.learn.training import TrainRequest
+    from pipeline.learn.train.run import TrainRequest
+    from pipeline.learn.train.settings import TrainConfig
 
 __all__ = ["parse_duration", "train"]
 
@@ -53,8 +53,8 @@ def train(
         resident: hold all training data on the device.
         ray_workers: train on a Ray cluster with so many workers; needs the extra [ray].
     """
-    from pipeline.learn.settings import load_train_config
-    from pipeline.learn.training import TrainRequest
+    from pipeline.learn.train.run import TrainRequest
+    from pipeline.learn.train.settings import load_train_config
 
     minutes = None if budget is None else parse_duration(budget, "budget") / 60
     options = {
@@ -76,11 +76,11 @@ def _run(request: TrainRequest, settings: TrainConfig, ray_workers: int | None) 
     import os
     from dataclasses import asdict
 
-    from jobs.summary import print_summary, progress_reporter
-    from pipeline.learn.training import train as run
+    from jobs.terminal.summary import print_summary, progress_reporter
+    from pipeline.learn.train.run import train as run
 
     if ray_workers is not None:
-        from pipeline.learn.ray_training import train_on_ray
+        from pipeline.learn.train.ray import train_on_ray
 
         result = train_on_ray(request, settings, ray_workers)
     elif os.environ.get("RANK", "0") != "0":  # one of torchrun's: the first one speaks for all

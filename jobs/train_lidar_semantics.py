@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.config import FleetConfig
-    from pipeline.learn.lidar_semantics.samples import SweepImages, SweepLayout
+    from pipeline.learn.perception.lidar_semantics.samples import SweepImages, SweepLayout
     from pipeline.store.partitions import Lake, Partition
     from schemas.frames import Frame
     from schemas.observations import Observation
@@ -58,11 +58,11 @@ def train_lidar_semantics(
 
     import torch
 
-    from jobs.summary import print_summary, progress_reporter
+    from jobs.terminal.summary import print_summary, progress_reporter
     from jobs.train import parse_duration
     from pipeline.config import load_fleet
-    from pipeline.learn.lidar_semantics.export import export_sweeps
-    from pipeline.learn.lidar_semantics.training import SweepTraining, normal_of, train_sweeps
+    from pipeline.learn.perception.lidar_semantics.export import export_sweeps
+    from pipeline.learn.perception.lidar_semantics.training import SweepTraining, normal_of, train_sweeps
     from pipeline.store.partitions import Lake
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
@@ -87,7 +87,7 @@ def _days(
 ) -> list[tuple[Partition, list[Observation], np.ndarray, bool]]:
     """Days with their observations, T_camera_lidar, and whether it was accepted."""
     from pipeline.errors import ContractError
-    from pipeline.prior import read_prior
+    from pipeline.extrinsics.prior import read_prior
     from pipeline.store.current import current_records, transform_of
     from pipeline.store.tables import read_records, read_rows
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
@@ -118,7 +118,7 @@ def _layout(
     days: list[tuple[Partition, list[Observation], np.ndarray, bool]], lake: Lake, rows: int, columns: int
 ) -> SweepLayout:
     """From the first sweep of each day."""
-    from pipeline.learn.lidar_semantics.samples import layout_of
+    from pipeline.learn.perception.lidar_semantics.samples import layout_of
 
     return layout_of((next(_frames(lake, day[0])) for day in days), rows, columns)
 
@@ -130,7 +130,7 @@ def _samples(
     per_day: int,
 ) -> tuple[SweepImages, SweepImages, dict[str, int]]:
     """Sweeps to learn from, held-out sweeps, and their numbers."""
-    from pipeline.learn.lidar_semantics.samples import cut, day_images
+    from pipeline.learn.perception.lidar_semantics.samples import cut, day_images
 
     parts = [
         day_images(_frames(lake, partition), rows, T_camera_lidar, layout, per_day)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pipeline.config import FleetConfig
-    from pipeline.learn.radar_drivable.samples import DrivableSamples
+    from pipeline.learn.perception.radar_drivable.samples import DrivableSamples
     from pipeline.store.partitions import Lake, Partition
 
 __all__ = ["train_radar_drivable"]
@@ -47,11 +47,11 @@ def train_radar_drivable(
 
     import torch
 
-    from jobs.summary import print_summary, progress_reporter
+    from jobs.terminal.summary import print_summary, progress_reporter
     from jobs.train import parse_duration
     from pipeline.config import load_fleet
-    from pipeline.learn.radar_drivable.export import export_drivable
-    from pipeline.learn.radar_drivable.training import DrivableTraining, train_drivable
+    from pipeline.learn.perception.radar_drivable.export import export_drivable
+    from pipeline.learn.perception.radar_drivable.training import DrivableTraining, train_drivable
     from pipeline.store.partitions import Lake
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
@@ -76,7 +76,7 @@ def _samples(
     import numpy as np
 
     from pipeline.errors import ContractError
-    from pipeline.learn.radar_drivable.samples import joined
+    from pipeline.learn.perception.radar_drivable.samples import joined
     from schemas.observations import OBSERVATIONS
 
     days = [p for p in lake.partitions(OBSERVATIONS.name) if p.vehicle in config.vehicles]
@@ -102,8 +102,8 @@ def _samples(
 def _samples_of_day(
     config: FleetConfig, fleet_file: Path, lake: Lake, day: Partition, per_day: int
 ) -> DrivableSamples:
-    from pipeline.learn.radar_drivable.samples import day_samples
-    from pipeline.prior import read_prior
+    from pipeline.extrinsics.prior import read_prior
+    from pipeline.learn.perception.radar_drivable.samples import day_samples
     from pipeline.store.tables import read_rows
     from schemas.observations import OBSERVATIONS, Observation
 

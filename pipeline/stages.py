@@ -38,16 +38,16 @@ class Stage:
         return function
 
 
-INGEST = Stage("ingest", (), (FRAMES,), "pipeline.ingest.run:ingest_day")
-PERCEIVE = Stage("perceive", (FRAMES,), (OBSERVATIONS,), "pipeline.perceive.run:perceive_day")
-PREPARE = Stage("prepare", (FRAMES, OBSERVATIONS), (TRAINING,), "pipeline.learn.prepare:prepare_day")
-CALIBRATE = Stage("calibrate", (OBSERVATIONS,), (CALIBRATIONS,), "pipeline.calibrate:calibrate_day")
-AUDIT = Stage("audit", (CALIBRATIONS,), (DRIFT,), "pipeline.audit.run:audit_fleet", per_vehicle_day=False)
+INGEST = Stage("ingest", (), (FRAMES,), "pipeline.ingest.stage:ingest_day")
+PERCEIVE = Stage("perceive", (FRAMES,), (OBSERVATIONS,), "pipeline.perceive.stage:perceive_day")
+PREPARE = Stage("prepare", (FRAMES, OBSERVATIONS), (TRAINING,), "pipeline.learn.prepare.stage:prepare_day")
+CALIBRATE = Stage("calibrate", (OBSERVATIONS,), (CALIBRATIONS,), "pipeline.calibrate.stage:calibrate_day")
+AUDIT = Stage("audit", (CALIBRATIONS,), (DRIFT,), "pipeline.audit.stage:audit_fleet", per_vehicle_day=False)
 REPORT = Stage(
     "report",
     (FRAMES, OBSERVATIONS, CALIBRATIONS, DRIFT),
     (),
-    "pipeline.report.run:write_fleet_report",
+    "pipeline.report.stage:write_fleet_report",
     per_vehicle_day=False,
 )
 

@@ -2,7 +2,7 @@ import pytest
 
 from pipeline.config import PriorConfig, config_hash, load_fleet
 from pipeline.errors import ConfigError
-from tests.fleet_files import fleet_toml
+from tests.makers.fleet_files import fleet_toml
 
 GOOD = fleet_toml("car-1")
 

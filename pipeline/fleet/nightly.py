@@ -114,7 +114,7 @@ def _outcome(finished: Finished[tuple[Night, VehicleDay], DayOutcome]) -> DayOut
 
 def _record_refusal(night: Night, partition: Partition, refused: StageResult) -> None:
     """A record for a day that never reached the solver, so that whoever reads the lake finds the reason."""
-    from pipeline.calibration_records import Inputs, refused_records  # noqa: PLC0415 - brings the solver
+    from pipeline.calibrate.records import Inputs, refused_records  # noqa: PLC0415 - brings the solver
     from pipeline.store.partitions import work_key  # noqa: PLC0415
     from pipeline.store.tables import write_records  # noqa: PLC0415
     from schemas.versions import CODE_VERSION  # noqa: PLC0415

@@ -13,10 +13,10 @@ from jaxtyping import Float, Int64
 from pipeline.config import IngestConfig, OnnxSemantics, Rig
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion
+from pipeline.ingest.frame_builder import FrameBuilder, Rejected
 from pipeline.ingest.index import ACCEPTED_TYPES, DayIndex, index_logs, topics_of
-from pipeline.ingest.messages import FrameBuilder, Rejected
-from pipeline.ingest.run import pick_trios, read_file_prior
-from pipeline.ingest.verdict import DofVerdict, Evidence, judge, overall
+from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
+from pipeline.ingest.stage import pick_trios, read_file_prior
 from pipeline.results import Progress, silent
 from schemas.frames import Frame
 

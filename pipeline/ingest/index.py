@@ -13,11 +13,11 @@ from jaxtyping import Int64
 from pipeline.config import Rig, TopicSemantics
 from pipeline.errors import LogError
 from pipeline.geometry.cameras import Camera
-from pipeline.ingest.decoding import DECODE_ERRORS, decode, header_stamp_ns
-from pipeline.ingest.ego import EgoTrack
-from pipeline.ingest.images import read_camera_info
-from pipeline.ingest.readers import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
-from pipeline.ingest.transforms import TransformTree
+from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
+from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stamp_ns
+from pipeline.ingest.messages.image import read_camera_info
+from pipeline.ingest.messages.odometry import EgoTrack
+from pipeline.ingest.messages.transforms import TransformTree
 
 __all__ = ["ACCEPTED_TYPES", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.objective.problem import Prior, Solution
+from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.report.above import top_view
 from pipeline.report.encode import jpeg_uri
 from pipeline.report.overlays import Extrinsics, Scene, whole_view

@@ -1,7 +1,7 @@
 """How well the sensors agree in each frame, before and after: for the eye, never for the verdict.
 
 A low residual is not accuracy: a calibration can be repeatable, fit best and still be wrong. The verdict
-rests on held-out frames, restarts and sigmas (pipeline.verify); these numbers show what a person can check
+rests on held-out frames, restarts and sigmas (pipeline.calibrate.verify); these numbers show what a person can check
 in the pictures.
 """
 

@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.errors import ConfigError
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3
-from pipeline.simulate.rigs import Mounting
+from pipeline.simulate.sensors.rigs import Mounting
 
 __all__ = ["KINDS", "DayFaults", "Fault", "faults_on", "parse_faults", "shaken"]
 

@@ -17,14 +17,14 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.results import Progress, silent
-from pipeline.simulate.casting import World
-from pipeline.simulate.drives import Drive
 from pipeline.simulate.faults import DayFaults, Fault, faults_on, shaken
-from pipeline.simulate.logs import CONTAINERS, log_name, open_log
-from pipeline.simulate.recording import FIRST_FRAME_S, record_drive
-from pipeline.simulate.rigs import Mounting, mounting_of, rig_named
-from pipeline.simulate.semantics import SemanticsSpec
-from pipeline.simulate.toml import fleet_toml
+from pipeline.simulate.logs.fleet_toml import fleet_toml
+from pipeline.simulate.logs.recording import FIRST_FRAME_S, record_drive
+from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log
+from pipeline.simulate.sensors.rigs import Mounting, mounting_of, rig_named
+from pipeline.simulate.sensors.semantics import SemanticsSpec
+from pipeline.simulate.world.casting import World
+from pipeline.simulate.world.drives import Drive
 
 __all__ = [
     "FleetSpec",

@@ -1,7 +1,7 @@
 """The paper's controlled recording: three trihedral corner reflectors on a level empty lot, seen standing still.
 
 The JSON beside the recording is the file that `boresight evaluate --reflectors` reads as it is: its format is
-described in pipeline/verify/picks.py. What is true stands in it under `truth`, which evaluate does not read.
+described in pipeline/evaluate/picks.py. What is true stands in it under `truth`, which evaluate does not read.
 
 Source: paper, section 2.1 (150 frames, positions picked by hand in each sensor's data) and figure 2.
 """
@@ -19,15 +19,15 @@ from jaxtyping import Float
 
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.results import Progress, silent
-from pipeline.simulate.casting import Moment, standing_of
-from pipeline.simulate.drives import Parked
 from pipeline.simulate.faults import DayFaults
 from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, vehicle_names
-from pipeline.simulate.frames import Scene, SimulatedFrame, frame_of
-from pipeline.simulate.logs import TOPICS, open_log
-from pipeline.simulate.meshes import Mesh, MeshBuilder, Number
-from pipeline.simulate.recording import nominal_poses, trio
-from pipeline.simulate.rigs import Mounting, rig_named
+from pipeline.simulate.logs.recording import nominal_poses, trio
+from pipeline.simulate.logs.writers import TOPICS, open_log
+from pipeline.simulate.sensors.frames import Scene, SimulatedFrame, frame_of
+from pipeline.simulate.sensors.rigs import Mounting, rig_named
+from pipeline.simulate.world.casting import Moment, standing_of
+from pipeline.simulate.world.drives import Parked
+from pipeline.simulate.world.meshes import Mesh, MeshBuilder, Number
 
 __all__ = ["REFLECTORS_VEHICLE", "simulate_reflectors"]
 

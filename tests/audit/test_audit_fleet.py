@@ -6,7 +6,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from pipeline.audit.run import audit_fleet
+from pipeline.audit.stage import audit_fleet
 from pipeline.audit.vehicle import PairDays, judge_vehicle
 from pipeline.config import AuditConfig, FleetConfig
 from pipeline.errors import ConfigError

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_se3
-from pipeline.objective.kernels import fold_frames
+from pipeline.objective.paper.cost_maps import fold_frames
 
 POSES, FRAMES, POINTS, WIDTH, HEIGHT, PENALTY = 90, 6, 10_000, 912, 470, 1.0
 ROBUST_PX, SKY = 20.0, 1.0

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.calibrate.joint.camera_lidar.estimate import estimate_camera_lidar
 from pipeline.config import SolveConfig
+from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import from_quaternion, inverse, log_so3, perturb_exactly, transform_points
 from pipeline.geometry.spherical import camera_direction_angles
-from pipeline.objective.problem import Prior
-from pipeline.solve.camera_lidar import estimate_camera_lidar
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
 from schemas.observations import OBSERVATIONS, Observation

@@ -29,15 +29,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibrate import calibrate_observations
-from pipeline.calibration_records import Inputs
+from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import FleetConfig, load_fleet
 from pipeline.errors import SolveError
+from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.se3 import exp_so3, from_quaternion, inverse, log_se3
-from pipeline.prior import perturbed, read_prior
+from pipeline.geometry.targets import errors_at_targets
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
-from pipeline.verify.targets import errors_at_targets
 from schemas.calibrations import CalibrationRecord
 from schemas.observations import OBSERVATIONS, Observation
 from tests.benchmarks.studies.engine import search_range

@@ -23,13 +23,13 @@ import torch
 from scipy.interpolate import CubicSpline
 
 from pipeline.config import load_fleet
+from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry.se3 import exp_so3
-from pipeline.learn.batch import TrainingBatch
-from pipeline.learn.collate import collate
-from pipeline.learn.losses import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
-from pipeline.learn.samples import About, make_row
-from pipeline.learn.settings import LossConfig
-from pipeline.prior import read_prior
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.batches.collate import collate
+from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.train.losses import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
+from pipeline.learn.train.settings import LossConfig
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
 from schemas.frames import FRAMES, Frame

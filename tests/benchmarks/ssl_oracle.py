@@ -17,22 +17,22 @@ import numpy as np
 import torch
 
 from pipeline.config import PrepareConfig, load_fleet
+from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.geometry.spherical import camera_direction_angles, to_spherical
-from pipeline.learn.collate import collate
-from pipeline.learn.distillation import class_of_points
-from pipeline.learn.grid import Grid
-from pipeline.learn.inputs import NetworkInputs, crop, sensor_inputs
-from pipeline.learn.matching import NEUTRAL, ClassMatcher
-from pipeline.learn.occupancy import OccupancyMatcher
-from pipeline.learn.outputs import pose_of_twist
-from pipeline.learn.samples import About, SampleRejectedError, make_row
-from pipeline.learn.views import render
+from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.learn.batches.collate import collate
+from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
+from pipeline.learn.network.matching import NEUTRAL, ClassMatcher
+from pipeline.learn.network.occupancy import OccupancyMatcher
+from pipeline.learn.network.outputs import pose_of_twist
+from pipeline.learn.network.views import render
+from pipeline.learn.sample.frame_sample import About, SampleRejectedError, make_row
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.train.distillation import class_of_points
 from pipeline.objective.differentiable.poses import transform_points
-from pipeline.prior import read_prior
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
-from pipeline.verify.targets import DEFAULT_TARGETS
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.training import UNKNOWN_CLASS

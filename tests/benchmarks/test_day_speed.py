@@ -4,10 +4,10 @@ import time
 
 import pytest
 
-from pipeline.calibrate import calibrate_day
+from pipeline.calibrate.stage import calibrate_day
 from pipeline.config import load_fleet
-from pipeline.ingest.run import ingest_day
-from pipeline.perceive.run import perceive_day
+from pipeline.ingest.stage import ingest_day
+from pipeline.perceive.stage import perceive_day
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
 from tests.benchmarks.kernel_workload import FRAMES, POINTS, naive_cpu_s

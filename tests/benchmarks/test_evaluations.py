@@ -10,10 +10,10 @@ Source of scene and goal: evidence on performance, section A.3 and benchmark def
 import numpy as np
 from scipy.optimize import differential_evolution
 
+from pipeline.calibrate.numerics.differential_evolution import evolve
+from pipeline.calibrate.paper.minimise import poses_about
 from pipeline.geometry.se3 import exp_so3, log_so3
-from pipeline.objective.kernels import fold_frames, frame_costs, frame_gradients
-from pipeline.solve.globalise import evolve
-from pipeline.solve.minimise import poses_about
+from pipeline.objective.paper.cost_maps import fold_frames, frame_costs, frame_gradients
 from tests.benchmarks.kernel_workload import CAMERA, CENTRE_PX, FOCAL_PX, HEIGHT, PENALTY, WIDTH
 
 FRAMES, POINTS, SHARE = 8, 3000, 20

@@ -9,9 +9,19 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from pipeline.ingest.run import ingest_day
+from pipeline.ingest.stage import ingest_day
 from pipeline.store.partitions import Lake, Partition
-from tests.written_logs import HEIGHT, IMAGE, LIDAR, PERIOD_NS, RADAR, START_NS, WIDTH, Kit, fleet_config
+from tests.makers.written_logs import (
+    HEIGHT,
+    IMAGE,
+    LIDAR,
+    PERIOD_NS,
+    RADAR,
+    START_NS,
+    WIDTH,
+    Kit,
+    fleet_config,
+)
 
 DAY = Partition("car", "2023-11-14")
 GOAL = 4.0  # evidence on performance, benchmark definition 10; met on the real logs
@@ -20,9 +30,9 @@ LIMIT = 1.6 * GOAL
 _MEASURE_MEMORY = """
 import sys
 from pathlib import Path
-from pipeline.ingest.run import ingest_day
+from pipeline.ingest.stage import ingest_day
 from pipeline.store.partitions import Lake, Partition
-from tests.written_logs import fleet_config
+from tests.makers.written_logs import fleet_config
 result = ingest_day([Path(sys.argv[1])], Partition("car", "2023-11-14"), fleet_config(), Lake.at(sys.argv[2]))
 # Not ru_maxrss: a child inherits its parent's.
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))

@@ -6,7 +6,7 @@ Source of workload and goals: evidence on performance, benchmark definitions 1, 
 import numpy as np
 import pytest
 
-from pipeline.objective.kernels import frame_costs, frame_gradients
+from pipeline.objective.paper.cost_maps import frame_costs, frame_gradients
 from tests.benchmarks.kernel_workload import (
     CENTRE_PX,
     FOCAL_PX,

@@ -6,15 +6,15 @@ import time
 import numpy as np
 import pytest
 
-from pipeline.learn.collate import collate
-from pipeline.learn.loader import TrainingLoader
-from pipeline.learn.samples import About, make_row
-from pipeline.prior import read_prior
+from pipeline.extrinsics.prior import read_prior
+from pipeline.learn.batches.collate import collate
+from pipeline.learn.batches.loader import TrainingLoader
+from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.store.partitions import Lake
 from pipeline.store.tables import iterate_rows
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
-from tests import training_lakes
+from tests.makers import training_lakes
 
 GOAL = 8.0  # issue 4
 BATCH, DAY_FRAMES = 4, 24
@@ -27,7 +27,7 @@ def lake(tmp_path_factory):
     for vehicle in "ab":
         training_lakes.fill(lake, vehicle, "2026-01-01", DAY_FRAMES)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.learn.prepare._ROWS_PER_GROUP", 4)  # more groups than a window holds
+        patch.setattr("pipeline.learn.prepare.stage._ROWS_PER_GROUP", 4)  # more groups than a window holds
         training_lakes.prepare_all(lake, usual_fleet())
     return lake
 

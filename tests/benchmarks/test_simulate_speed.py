@@ -5,11 +5,11 @@ import time
 import numpy as np
 import pytest
 
-from pipeline.simulate.camera import _rays_of
-from pipeline.simulate.casting import World
-from pipeline.simulate.drives import Drive
 from pipeline.simulate.fleet import FleetSpec, simulate_vehicle_day
-from pipeline.simulate.rigs import mounting_of, rig_named
+from pipeline.simulate.sensors.camera import _rays_of
+from pipeline.simulate.sensors.rigs import mounting_of, rig_named
+from pipeline.simulate.world.casting import World
+from pipeline.simulate.world.drives import Drive
 
 
 def seconds_per_frame(rig, frames, out):

@@ -5,11 +5,11 @@ import time
 import numpy as np
 import pytest
 
-from pipeline.learn.compiled_rendering import FrameSensors
-from pipeline.learn.inference import SingleFrameCalibrator
-from pipeline.learn.layout import NetworkConfig
-from pipeline.learn.networks import build_network
-from pipeline.learn.onnx_export import export_onnx
+from pipeline.learn.export.onnx_file import export_onnx
+from pipeline.learn.infer.compiled_rendering import FrameSensors
+from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.network.networks import build_network
+from pipeline.learn.sample.layout import NetworkConfig
 
 GOAL_MS = 60.0
 BUSY = 4.0  # a shared machine: the goal is for idle cores, and the best of many runs comes near it

@@ -9,12 +9,12 @@ from jobs.calibrate import calibrate, parse_perturb
 from jobs.evaluate import evaluate
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_partition
-from pipeline.verify.targets import DEFAULT_TARGETS
 from schemas.observations import OBSERVATIONS
-from tests.fleet_files import fleet_toml
-from tests.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.makers.fleet_files import fleet_toml
+from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 FLEET = fleet_toml(
     "v", sections="[select]\nframes = 12\n[solve]\npaper_population = 12\npaper_generations = 5\n"

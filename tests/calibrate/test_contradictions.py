@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate import calibrate_observations
-from pipeline.calibration_records import Inputs
+from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import FleetConfig
 from pipeline.errors import SolveError
+from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_so3, perturb_exactly
-from pipeline.objective.problem import PairEstimate, Prior, Solution
 from pipeline.store.partitions import Partition
 from schemas.calibrations import PAIRS
-from tests.radar_scenes import T_LIDAR_RADAR, street_day
-from tests.solve_scenes import T_CAMERA_LIDAR, make_day
+from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, make_day
 
 PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
 RIG = {

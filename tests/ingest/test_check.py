@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
 from pipeline.ingest.check import check_logs, doppler_speed
-from pipeline.ingest.verdict import Evidence, judge, overall
+from pipeline.ingest.readiness import Evidence, judge, overall
 
 GOOD = Evidence(
     frames=120,

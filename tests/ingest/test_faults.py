@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.ingest.mcap_log import McapLog
+from pipeline.ingest.containers.mcap import McapLog
 from pipeline.ingest.sync import Rejection
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest

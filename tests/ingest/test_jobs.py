@@ -7,7 +7,7 @@ import pytest
 from jobs.check import check
 from jobs.ingest import ingest
 from pipeline.errors import ConfigError
-from tests.fleet_files import fleet_toml
+from tests.makers.fleet_files import fleet_toml
 
 
 @pytest.fixture

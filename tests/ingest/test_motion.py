@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.se3 import exp_se3, inverse, to_quaternion, transform_points
 from pipeline.ingest.deskew import deskew, planar_motion
-from pipeline.ingest.ego import EgoTrack
-from pipeline.ingest.transforms import TransformTree
+from pipeline.ingest.messages.odometry import EgoTrack
+from pipeline.ingest.messages.transforms import TransformTree
 
 START = 1_700_000_000 * 10**9
 

@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.ingest.check import check_logs
-from pipeline.ingest.run import ingest_day
+from pipeline.ingest.stage import ingest_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import iterate_rows
 from schemas.frames import FRAMES, Frame

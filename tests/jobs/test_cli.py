@@ -121,7 +121,7 @@ from pathlib import Path
 from jobs import cli
 
 def export(what: str, *, out: Path) -> int:
-    from pipeline.store.aside import new_file_aside
+    from pipeline.store.atomic_write import new_file_aside
     with new_file_aside(out / "x.parquet") as stream:
         stream.write(b"half")
         stream.flush()

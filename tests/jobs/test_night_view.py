@@ -1,6 +1,6 @@
 import json
 
-from jobs.night_view import night_view
+from jobs.terminal.night_view import night_view
 from pipeline.fleet.nightly import DayOutcome
 
 NAMES = ["car 2026-03-02", "car 2026-03-03", "bus 2026-03-02"]
@@ -34,7 +34,7 @@ def test_without_a_terminal_every_vehicle_day_is_one_json_line(capsys):
 
 
 def test_on_a_terminal_every_end_is_a_line_and_bars_do_not_stay(capsys, monkeypatch):
-    monkeypatch.setattr("jobs.night_view.is_terminal", lambda: True)
+    monkeypatch.setattr("jobs.terminal.night_view.is_terminal", lambda: True)
     show()
     text = capsys.readouterr().err
     assert "2/2 pairs accepted" in text

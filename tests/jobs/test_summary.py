@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jobs.summary import exit_code, print_json, print_summary, progress_reporter
+from jobs.terminal.summary import exit_code, print_json, print_summary, progress_reporter
 
 
 def test_the_summary_is_one_strict_json_line(capsys):

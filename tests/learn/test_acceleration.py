@@ -5,8 +5,8 @@ import copy
 import pytest
 import torch
 
-from pipeline.learn.acceleration import accelerate
-from pipeline.learn.encoders import CameraEncoder, LidarEncoder
+from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder
+from pipeline.learn.train.acceleration import accelerate
 
 
 @pytest.fixture(params=["camera", "lidar"])

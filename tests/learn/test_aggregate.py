@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from pipeline.calibrate.verify.target_accuracy import target_sigmas
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
+from pipeline.geometry.targets import errors_at_targets
 from pipeline.learn import aggregate
-from pipeline.learn.aggregate import Answers, day_estimate, twists_about
-from pipeline.verify.claims import target_sigmas
-from pipeline.verify.targets import errors_at_targets
-from tests.solve_scenes import T_CAMERA_LIDAR
+from pipeline.learn.infer.aggregate import Answers, day_estimate, twists_about
+from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 PRIOR_SD = np.array([*np.radians([1.2] * 3), *[0.05] * 3])
 P = np.diag(PRIOR_SD**2)

@@ -11,21 +11,21 @@ import pytest
 import torch
 
 from pipeline.errors import ModelError
+from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import exp_so3
-from pipeline.learn.collate import collate
-from pipeline.learn.compiled_rendering import frame_sensors, render_frame
-from pipeline.learn.grid import Grid
-from pipeline.learn.inference import SingleFrameCalibrator
-from pipeline.learn.inputs import NetworkInputs, sensor_inputs
-from pipeline.learn.layout import NetworkConfig
-from pipeline.learn.networks import build_network
-from pipeline.learn.onnx_export import export_onnx
-from pipeline.learn.samples import About, make_row
-from pipeline.learn.views import render
-from pipeline.objective.problem import Prior
+from pipeline.learn.batches.collate import collate
+from pipeline.learn.export.onnx_file import export_onnx
+from pipeline.learn.infer.compiled_rendering import frame_sensors, render_frame
+from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.network.inputs import NetworkInputs, sensor_inputs
+from pipeline.learn.network.networks import build_network
+from pipeline.learn.network.views import render
+from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import NetworkConfig
 from schemas.training import GRID_CLASSES
 from schemas.versions import CODE_VERSION
-from tests import solve_scenes, training_lakes
+from tests.makers import solve_scenes, training_lakes
 
 GRID = Grid(0.4, 25.6, 12.8, -12.8)
 CARD = {"data": "two frames", "seeds": [0], "results": {"azimuth_deg": 0.1}}
@@ -140,7 +140,7 @@ def test_inference_sees_what_training_saw():
 
 
 def test_inference_loads_no_torch():
-    code = "import sys; import pipeline.learn.inference; print('torch' in sys.modules)"
+    code = "import sys; import pipeline.learn.infer.single_frame; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

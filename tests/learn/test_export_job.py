@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from jobs.cli import main
-from pipeline.learn.checkpoints import BEST, LAST, save_checkpoint
-from pipeline.learn.grid import Grid
-from pipeline.learn.inference import SingleFrameCalibrator
-from pipeline.learn.layout import NetworkConfig
-from pipeline.learn.networks import build_network
-from pipeline.learn.settings import TrainConfig
+from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.network.networks import build_network
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.learn.train.checkpoints import BEST, LAST, save_checkpoint
+from pipeline.learn.train.settings import TrainConfig
 
 
 @pytest.fixture(scope="module")

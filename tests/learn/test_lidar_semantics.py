@@ -11,19 +11,30 @@ import torch
 
 from pipeline.errors import ConfigError, ContractError
 from pipeline.geometry.range_image import EMPTY
-from pipeline.learn.checkpoints import load_checkpoint
-from pipeline.learn.lidar_semantics.export import export_sweeps
-from pipeline.learn.lidar_semantics.labels import KIND_OF_LABEL, KINDS, LABELS, UNLABELLED, project_labels
-from pipeline.learn.lidar_semantics.network import build_sweep_network
-from pipeline.learn.lidar_semantics.samples import SweepLayout, cut, day_images, layout_of
-from pipeline.learn.lidar_semantics.training import SweepTraining, kind_scores, normal_of, train_sweeps
+from pipeline.learn.perception.lidar_semantics.export import export_sweeps
+from pipeline.learn.perception.lidar_semantics.labels import (
+    KIND_OF_LABEL,
+    KINDS,
+    LABELS,
+    UNLABELLED,
+    project_labels,
+)
+from pipeline.learn.perception.lidar_semantics.network import build_sweep_network
+from pipeline.learn.perception.lidar_semantics.samples import SweepLayout, cut, day_images, layout_of
+from pipeline.learn.perception.lidar_semantics.training import (
+    SweepTraining,
+    kind_scores,
+    normal_of,
+    train_sweeps,
+)
+from pipeline.learn.train.checkpoints import load_checkpoint
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows, write_partition
 from schemas.observations import OBSERVATIONS, Observation
-from tests.solve_scenes import CAMERA, LABEL_SCALE, T_CAMERA_LIDAR, make_observation
-from tests.training_lakes import fill, frame_of
+from tests.makers.solve_scenes import CAMERA, LABEL_SCALE, T_CAMERA_LIDAR, make_observation
+from tests.makers.training_lakes import fill, frame_of
 
 LAYOUT = SweepLayout(24, 720, 8.0, -24.0)
 ROAD, CAR = LABELS.index("road"), LABELS.index("car")

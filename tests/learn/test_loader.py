@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from pipeline.errors import ContractError
-from pipeline.learn.loader import TrainingLoader, load_split
-from pipeline.learn.prepare import prepare_day
-from pipeline.learn.survey import plan_days, survey_day
+from pipeline.learn.batches.loader import TrainingLoader, load_split
+from pipeline.learn.prepare.stage import prepare_day
+from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Partition
 from pipeline.store.tables import read_rows
 from schemas.training import TRAINING, TrainingRow
-from tests import training_lakes
+from tests.makers import training_lakes
 
 VEHICLES = ("a", "b", "c", "d", "e", "f")
 
@@ -21,7 +21,7 @@ def lake(tmp_path_factory):
     """Six vehicles, 10 frames each in row groups of 4 (the writer's 16 would leave a group per vehicle)."""
     lake = training_lakes.fleet_lake(tmp_path_factory.mktemp("lake"), VEHICLES, frames=10)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.learn.prepare._ROWS_PER_GROUP", 4)
+        patch.setattr("pipeline.learn.prepare.stage._ROWS_PER_GROUP", 4)
         training_lakes.prepare_all(lake, training_lakes.fleet_of(VEHICLES, split_by=["vehicle"]))
     return lake
 

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.learn.batch import TrainingBatch
-from pipeline.learn.collate import collate
-from pipeline.learn.distillation import class_of_points, semantics_loss
-from pipeline.learn.grid import Grid
-from pipeline.learn.inputs import NetworkInputs, crop, sensor_inputs
-from pipeline.learn.layout import GRAPH_INPUTS, PAIRS, NetworkConfig
-from pipeline.learn.networks import build_network, refine
-from pipeline.learn.samples import About, make_row
-from pipeline.learn.views import render
+from pipeline.extrinsics.estimates import Prior
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.batches.collate import collate
+from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
+from pipeline.learn.network.networks import build_network, refine
+from pipeline.learn.network.views import render
+from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import GRAPH_INPUTS, PAIRS, NetworkConfig
+from pipeline.learn.train.distillation import class_of_points, semantics_loss
 from pipeline.objective.differentiable.poses import transform_points
-from pipeline.objective.problem import Prior
 from schemas.training import UNKNOWN_CLASS
-from tests import solve_scenes, training_lakes
+from tests.makers import solve_scenes, training_lakes
 
 GRID = Grid(0.4, 25.6, 12.8, -12.8)
 KINDS = [(a, p) for a in ("matching", "concat") for p in ("joint", *PAIRS)]

@@ -9,14 +9,14 @@ import pytest
 from jobs.cli import main
 from pipeline.config import load_fleet
 from pipeline.errors import ContractError
-from pipeline.learn.inventory import alike, read_leaks, take_inventory, write_inventory
-from pipeline.learn.survey import survey_day
+from pipeline.learn.prepare.inventory import alike, read_leaks, take_inventory, write_inventory
+from pipeline.learn.prepare.survey import survey_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_rows, write_partition
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.training import SPLITS, TRAINING, TrainingRow
-from tests import training_lakes
-from tests.fleet_files import fleet_toml
+from tests.makers import training_lakes
+from tests.makers.fleet_files import fleet_toml
 
 VEHICLES = ("a", "b", "c", "d", "e")
 

@@ -13,16 +13,16 @@ import torch
 from pipeline.errors import ConfigError, ContractError
 from pipeline.geometry.radar_grid import cell_centres, sector_mask, sector_of
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.learn.checkpoints import load_checkpoint
-from pipeline.learn.radar_drivable.network import build_drivable_network
-from pipeline.learn.radar_drivable.samples import BLOCKED, FREE, UNKNOWN, day_samples, label_grid
-from pipeline.learn.radar_drivable.training import DrivableTraining, area_iou, train_drivable
+from pipeline.learn.perception.radar_drivable.network import build_drivable_network
+from pipeline.learn.perception.radar_drivable.samples import BLOCKED, FREE, UNKNOWN, day_samples, label_grid
+from pipeline.learn.perception.radar_drivable.training import DrivableTraining, area_iou, train_drivable
+from pipeline.learn.train.checkpoints import load_checkpoint
 from pipeline.perceive.drivable import free_sector
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_partition
 from schemas.observations import OBSERVATIONS
-from tests.fleet_files import fleet_toml
-from tests.solve_scenes import make_observation, prior_columns
+from tests.makers.fleet_files import fleet_toml
+from tests.makers.solve_scenes import make_observation, prior_columns
 
 PRIOR = np.eye(4)
 QUICK = DrivableTraining(steps=40, batch_size=4, width=12, report_every=10)

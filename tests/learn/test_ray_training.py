@@ -5,13 +5,13 @@ import pickle
 import pytest
 
 from pipeline.errors import BoresightError, ConfigError, ContractError, LogError, SolveError
-from pipeline.learn.ray_training import train_on_ray
-from pipeline.learn.run_state import network_of_run
-from pipeline.learn.schedule import DivergedError
-from pipeline.learn.settings import TrainConfig
-from pipeline.learn.training import TrainRequest
+from pipeline.learn.train.ray import train_on_ray
+from pipeline.learn.train.run import TrainRequest
+from pipeline.learn.train.run_state import network_of_run
+from pipeline.learn.train.schedule import DivergedError
+from pipeline.learn.train.settings import TrainConfig
 from pipeline.store.partitions import Lake
-from tests.training_lakes import fill, fleet_of, prepare_all
+from tests.makers.training_lakes import fill, fleet_of, prepare_all
 
 CONFIG = TrainConfig(steps=2, batch_size=1, width=4, hidden=8, validation_frames=2)
 

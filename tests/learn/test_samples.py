@@ -7,17 +7,24 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import transform_points
 from pipeline.geometry.spherical import camera_direction_angles
-from pipeline.learn.camera_maps import camera_features, stored_grid
-from pipeline.learn.clouds import range_edges
-from pipeline.learn.grid import grid_rays, resample_camera
-from pipeline.learn.samples import About, SampleReason, SampleRejectedError, fingerprint, make_row, sensor_row
-from pipeline.objective.problem import Prior
+from pipeline.learn.sample.camera_maps import camera_features, stored_grid
+from pipeline.learn.sample.clouds import range_edges
+from pipeline.learn.sample.frame_sample import (
+    About,
+    SampleReason,
+    SampleRejectedError,
+    fingerprint,
+    make_row,
+    sensor_row,
+)
+from pipeline.learn.sample.grid import grid_rays, resample_camera
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, POINT_IS_EDGE, POINT_IS_GROUND
-from tests import solve_scenes, training_lakes
+from tests.makers import solve_scenes, training_lakes
 
 ABOUT = About("v", "2026-01-01", "default", "train", "p", "urban")
 PRIOR = Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05)

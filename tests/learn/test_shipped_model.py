@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.calibrate_ssl import calibrate_frame
+from pipeline.calibrate.networks import calibrate_frame
 from pipeline.config import LearnConfig, PrepareConfig
-from pipeline.learn.onnx_networks import SHIPPED, model_files, open_networks
-from pipeline.verify.targets import errors_at_targets
+from pipeline.geometry.targets import errors_at_targets
+from pipeline.learn.infer.onnx_networks import SHIPPED, model_files, open_networks
 from schemas.calibrations import PAIRS
-from tests.simulated_days import simulated_day
+from tests.makers.simulated_days import simulated_day
 
 MODEL = SHIPPED / "joint.onnx"
 

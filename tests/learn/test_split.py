@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.learn.split import Unit, environment_of_speeds, plan_split
+from pipeline.learn.prepare.split import Unit, environment_of_speeds, plan_split
 from schemas.training import SPLITS
 
 ALL = ("vehicle", "day", "place")

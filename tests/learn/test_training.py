@@ -15,21 +15,21 @@ import torch
 
 from jobs.train import parse_duration
 from pipeline.errors import ConfigError, ContractError
-from pipeline.learn.checkpoints import load_checkpoint, save_checkpoint
-from pipeline.learn.layout import NetworkConfig
-from pipeline.learn.metrics import MetricsLog, read_metrics
-from pipeline.learn.networks import build_network
-from pipeline.learn.run_state import network_of_run
-from pipeline.learn.samples import About, make_row
-from pipeline.learn.schedule import DivergedError, DivergenceGuard, cosine_rate
-from pipeline.learn.settings import TrainConfig, load_train_config
-from pipeline.learn.training import TrainRequest, train
-from pipeline.prior import read_prior
+from pipeline.extrinsics.prior import read_prior
+from pipeline.learn.network.networks import build_network
+from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.learn.train.checkpoints import load_checkpoint, save_checkpoint
+from pipeline.learn.train.metrics import MetricsLog, read_metrics
+from pipeline.learn.train.run import TrainRequest, train
+from pipeline.learn.train.run_state import network_of_run
+from pipeline.learn.train.schedule import DivergedError, DivergenceGuard, cosine_rate
+from pipeline.learn.train.settings import TrainConfig, load_train_config
 from pipeline.store.partitions import Partition
 from pipeline.store.tables import read_rows, write_partition
 from schemas.frames import FRAMES, Frame
 from schemas.training import TRAINING
-from tests.simulated_days import simulated_day
+from tests.makers.simulated_days import simulated_day
 
 SMALL = {"width": 4, "hidden": 16, "batch_size": 2, "validate_every": 10, "validation_frames": 4}
 

@@ -9,22 +9,22 @@ import pytest
 import torch
 
 from jobs.cli import main
-from pipeline.calibrate import calibrate_day
+from pipeline.calibrate.stage import calibrate_day
 from pipeline.errors import ConfigError, ModelError, SolveError
+from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
-from pipeline.learn.layout import NetworkConfig
-from pipeline.learn.networks import build_network
-from pipeline.learn.onnx_export import export_onnx
-from pipeline.learn.onnx_networks import model_files, models_key, open_networks
-from pipeline.learn.samples import SampleReason, SampleRejectedError
-from pipeline.learn.vehicle_day import FrameAnswer, single_frame_solution, solve_by_networks
-from pipeline.objective.problem import Prior
+from pipeline.learn.export.onnx_file import export_onnx
+from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
+from pipeline.learn.infer.vehicle_day import FrameAnswer, single_frame_solution, solve_by_networks
+from pipeline.learn.network.networks import build_network
+from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
+from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
-from tests import training_lakes
-from tests.fleet_files import fleet_toml
-from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.makers import training_lakes
+from tests.makers.fleet_files import fleet_toml
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 TRUTH = {
     "camera_lidar": T_CAMERA_LIDAR,

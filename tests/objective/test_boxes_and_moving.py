@@ -6,16 +6,22 @@ import numpy as np
 
 from pipeline.geometry.se3 import exp_se3, transform_points
 from pipeline.geometry.spherical import camera_direction_angles
-from pipeline.objective.boxes import BoxPairs, box_equations, box_pairs, elevation_residuals, vehicle_boxes
-from pipeline.objective.moving import (
+from pipeline.objective.radar.moving_clusters import (
     azimuth_equations_camera,
     azimuth_equations_lidar,
     camera_azimuth_residuals,
     lidar_azimuth_residuals,
     moving_clusters,
 )
-from tests.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
-from tests.solve_scenes import T_CAMERA_LIDAR
+from pipeline.objective.radar.vehicle_boxes import (
+    BoxPairs,
+    box_equations,
+    box_pairs,
+    elevation_residuals,
+    vehicle_boxes,
+)
+from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
+from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 T_CAMERA_RADAR = T_CAMERA_LIDAR @ T_LIDAR_RADAR
 

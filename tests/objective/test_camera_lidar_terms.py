@@ -3,16 +3,21 @@
 import numpy as np
 import pytest
 
+from pipeline.calibrate.joint.camera_lidar.estimate import AlignmentState, camera_lidar_cost
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import perturb_exactly
-from pipeline.objective.camera_lidar_points import Points
-from pipeline.objective.camera_lidar_terms import Alignments, Level, Terms, lidar_velocities, prepare_terms
-from pipeline.objective.edges import chance_of, fit_match_share
-from pipeline.objective.image_maps import NO_BOUNDARY, CameraMaps, boundary_offsets, contrast_levels
-from pipeline.objective.projection_loops import camera_parameters, project_point, project_points
-from pipeline.solve.camera_lidar import AlignmentState, camera_lidar_cost
+from pipeline.objective.camera_lidar.edges import chance_of, fit_match_share
+from pipeline.objective.camera_lidar.image_maps import (
+    NO_BOUNDARY,
+    CameraMaps,
+    boundary_offsets,
+    contrast_levels,
+)
+from pipeline.objective.camera_lidar.points import Points
+from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_point, project_points
+from pipeline.objective.camera_lidar.score import Alignments, Level, Terms, lidar_velocities, prepare_terms
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
-from tests.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
+from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
 
 SKY, CAR = 10, 13
 

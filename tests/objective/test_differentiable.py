@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry import se3
 from pipeline.objective import loop
-from pipeline.objective.camera_lidar import camera_lidar_loss
-from pipeline.objective.camera_lidar_terms import Alignments, Level, prepare_terms
-from pipeline.objective.camera_radar import camera_radar_loss
+from pipeline.objective.camera_lidar.score import Alignments, Level, prepare_terms
 from pipeline.objective.differentiable.edges import edge_residuals_px, edge_scores
 from pipeline.objective.differentiable.lookup import bilinear
 from pipeline.objective.differentiable.paper import (
@@ -30,14 +29,15 @@ from pipeline.objective.differentiable.poses import (
     transform_points,
 )
 from pipeline.objective.differentiable.projection import GridProjection, camera_projection
-from pipeline.objective.kernels import fold_frames, frame_gradients
-from pipeline.objective.lidar_radar import lidar_radar_loss
-from pipeline.objective.semantics import camera_at_label_size, labels_of
-from pipeline.prior import read_prior
+from pipeline.objective.paper.camera_lidar import camera_lidar_loss
+from pipeline.objective.paper.camera_radar import camera_radar_loss
+from pipeline.objective.paper.classes import camera_at_label_size, labels_of
+from pipeline.objective.paper.cost_maps import fold_frames, frame_gradients
+from pipeline.objective.paper.lidar_radar import lidar_radar_loss
 from pipeline.store.partitions import Lake, Partition
+from tests.makers.simulated_days import perceived, simulated_day
 from tests.objective.test_kernels import CAMERAS, PENALTY, cloud, poses, smooth_cost
 from tests.objective.test_static_parity import check_static
-from tests.simulated_days import perceived, simulated_day
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
 MARGIN_RAD = np.radians(3.0)

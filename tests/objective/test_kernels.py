@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_se3, transform_points
-from pipeline.objective.kernels import fold_frames, frame_costs, frame_gradients, pack_quads
+from pipeline.objective.paper.cost_maps import fold_frames, frame_costs, frame_gradients, pack_quads
 
 WIDTH, HEIGHT, PENALTY = 320, 200, 1.5
 K = np.array([[180.0, 0, 158.3], [0, 182.0, 99.1], [0, 0, 1]])

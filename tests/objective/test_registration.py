@@ -7,14 +7,14 @@ import pytest
 
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, transform_points
 from pipeline.geometry.spherical import to_spherical
-from pipeline.objective.registration import (
+from pipeline.objective.radar.registration import (
     SIGMA_START,
     RegistrationFrames,
     normal_equations,
     registration_frames,
     updated_sigma,
 )
-from tests.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
+from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
 
 RADAR = np.array([12.0, -4.0, 1.1])
 VELOCITY = np.array([9.0, -0.4, 0.2])

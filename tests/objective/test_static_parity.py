@@ -1,8 +1,8 @@
 """The torch term of static detections against the compiled registration: value and gradient, also beyond the limits.
 
-Scenes: streets drawn by hand (`tests.radar_scenes`) with posts that stand out of the lidar's view at the top, so that a
-share of detections counts by azimuth and range alone; `test_differentiable` runs the same check on perceived rows of
-the simulated rig and of the real one.
+Scenes: streets drawn by hand (`tests.makers.radar_scenes`) with posts that stand out of the lidar's view at the top, so
+that a share of detections counts by azimuth and range alone; `test_differentiable` runs the same check
+on perceived rows of the simulated rig and of the real one.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ from pipeline.geometry import se3
 from pipeline.objective.differentiable.paper import padded
 from pipeline.objective.differentiable.poses import exp_se3, inverse, transform_points
 from pipeline.objective.differentiable.static import elevation_limits, static_cost, tells_elevation
-from pipeline.objective.registration import (
+from pipeline.objective.radar.registration import (
     BOUNCE_PRIOR,
     RANGE_M,
     SIDE_RAD,
@@ -24,7 +24,7 @@ from pipeline.objective.registration import (
     normal_equations,
     registration_frames,
 )
-from tests.radar_scenes import GROUND_M, T_LIDAR_RADAR, street_day
+from tests.makers.radar_scenes import GROUND_M, T_LIDAR_RADAR, street_day
 
 PARITY = 1e-3
 ALL = 10**6  # thin nothing out

@@ -252,7 +252,7 @@ def test_both_models_together_give_a_frames_semantics(tmp_path, made_frame):
 
 def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, made_frame):
     from pipeline.config import load_fleet
-    from pipeline.perceive.run import perceive_day
+    from pipeline.perceive.stage import perceive_day
     from pipeline.store.partitions import Lake, Partition
     from pipeline.store.tables import read_rows, write_partition
     from schemas.frames import FRAMES

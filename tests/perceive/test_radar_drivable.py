@@ -9,12 +9,12 @@ import torch
 from pipeline.config import FleetConfig, config_hash
 from pipeline.errors import ModelError
 from pipeline.geometry.radar_grid import SHAPE, sector_of
-from pipeline.learn.radar_drivable.export import export_drivable
-from pipeline.learn.radar_drivable.network import build_drivable_network
-from pipeline.learn.radar_drivable.samples import day_samples, scan_of
-from pipeline.learn.radar_drivable.training import DrivableTraining, probabilities, train_drivable
+from pipeline.learn.perception.radar_drivable.export import export_drivable
+from pipeline.learn.perception.radar_drivable.network import build_drivable_network
+from pipeline.learn.perception.radar_drivable.samples import day_samples, scan_of
+from pipeline.learn.perception.radar_drivable.training import DrivableTraining, probabilities, train_drivable
 from pipeline.perceive.models.radar_drivable import RadarDrivable
-from pipeline.perceive.run import perceive_day
+from pipeline.perceive.stage import perceive_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows, write_partition
 from schemas.frames import FRAMES

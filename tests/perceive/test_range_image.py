@@ -17,12 +17,12 @@ from pipeline.errors import ConfigError, ModelError
 from pipeline.geometry.range_image import EMPTY, channels_of, project, vote_of_neighbours
 from pipeline.perceive.ground import PointKind, find_ground, height_over
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
-from pipeline.perceive.run import perceive_day
+from pipeline.perceive.stage import perceive_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows, write_partition
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
-from tests.fleet_files import fleet_toml
+from tests.makers.fleet_files import fleet_toml
 
 DAY = Partition("car-1", "2026-03-02")
 SIZE, UP, DOWN = (32, 360), 10.0, -22.0  # 1 deg x 1 deg

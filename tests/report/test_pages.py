@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.audit.run import audit_fleet
+from pipeline.audit.stage import audit_fleet
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
-from pipeline.report.run import write_day_page, write_fleet_page, write_fleet_report
+from pipeline.report.stage import write_day_page, write_fleet_page, write_fleet_report
 from pipeline.report.truth import read_truth
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_records

@@ -9,12 +9,12 @@ from mcap.reader import make_reader
 from rosbags.rosbag1 import Reader as Bag1
 from rosbags.rosbag2 import Reader as Bag2
 
-from pipeline.simulate.casting import Moment, World
-from pipeline.simulate.drives import Drive
-from pipeline.simulate.frames import Scene, SimulatedFrame, frame_of, scene_of
-from pipeline.simulate.messages import Messages
-from pipeline.simulate.rigs import Mounting, RigSpec, mounting_of, rig_named
-from pipeline.simulate.semantics import SemanticsSpec
+from pipeline.simulate.logs.messages import Messages
+from pipeline.simulate.sensors.frames import Scene, SimulatedFrame, frame_of, scene_of
+from pipeline.simulate.sensors.rigs import Mounting, RigSpec, mounting_of, rig_named
+from pipeline.simulate.sensors.semantics import SemanticsSpec
+from pipeline.simulate.world.casting import Moment, World
+from pipeline.simulate.world.drives import Drive
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from pipeline.simulate.casting import World
-from pipeline.simulate.drives import Drive
-from pipeline.simulate.recording import _odometry
-from pipeline.simulate.scenes import CHUNK_M, chunk_mesh
-from pipeline.simulate.traffic import actors_at
+from pipeline.simulate.logs.recording import _odometry
+from pipeline.simulate.world.casting import World
+from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.scenes import CHUNK_M, chunk_mesh
+from pipeline.simulate.world.traffic import actors_at
 
 
 @pytest.mark.parametrize("environment", ["urban", "highway"])

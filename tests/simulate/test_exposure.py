@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.simulate.camera import _exposed
+from pipeline.simulate.sensors.camera import _exposed
 
 
 def test_pixels_beyond_black_and_white_are_black_and_white():

@@ -3,10 +3,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from pipeline.simulate.materials import LABELS
-from pipeline.simulate.radar import RadarErrors, scan_radar
-from pipeline.simulate.rigs import rig_named
-from pipeline.simulate.semantics import Box, SemanticsSpec, noisy_boxes, noisy_labels
+from pipeline.simulate.sensors.radar import RadarErrors, scan_radar
+from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.simulate.sensors.semantics import Box, SemanticsSpec, noisy_boxes, noisy_labels
+from pipeline.simulate.world.materials import LABELS
 
 
 def test_the_paper_rig_has_the_data_sheet_of_the_paper():
@@ -79,7 +79,7 @@ def test_edges_of_objects_give_mixed_points(urban):
     """Some returns lie between two surfaces, so an estimator may not trust each depth jump."""
     spec = urban[0].rig.lidar
     sharp = replace(spec, divergence_deg=1e-6)
-    from pipeline.simulate.lidar import sweep_lidar
+    from pipeline.simulate.sensors.lidar import sweep_lidar
 
     args = (urban[0].moment, urban[0].scene.ego, urban[0].mounting.T_vehicle_lidar)
     end = urban[0].frame.lidar_stamp_s

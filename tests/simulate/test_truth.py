@@ -4,9 +4,9 @@ import pytest
 
 from pipeline.geometry.se3 import exp_so3, inverse, transform_points
 from pipeline.geometry.spherical import from_spherical, to_spherical
-from pipeline.simulate.casting import _cast
-from pipeline.simulate.materials import LABELS
-from pipeline.simulate.radar import RadarErrors, scan_radar
+from pipeline.simulate.sensors.radar import RadarErrors, scan_radar
+from pipeline.simulate.world.casting import _cast
+from pipeline.simulate.world.materials import LABELS
 
 MOVERS = [LABELS.index(n) for n in ("person", "rider", "car", "truck", "bus", "bicycle")]
 
@@ -112,7 +112,7 @@ def test_truth_is_one_consistent_triangle(urban):
 
 def test_the_nominal_mounting_is_off_by_a_degree_or_so_but_not_more():
     from pipeline.geometry.se3 import rotation_angle_rad
-    from pipeline.simulate.rigs import mounting_of, rig_named
+    from pipeline.simulate.sensors.rigs import mounting_of, rig_named
 
     off = []
     for vehicle in range(12):

@@ -16,8 +16,8 @@ from tests.benchmarks.studies.ablation import _settings, setting_of
 from tests.benchmarks.studies.days import SETS, Day, DaySpec
 from tests.benchmarks.studies.engine import Run, key_of, prior_of, read_results, run_study, spoiled
 from tests.benchmarks.studies.verdict import _derived, _simulated, fault_of
-from tests.fleet_files import fleet_toml
-from tests.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.makers.fleet_files import fleet_toml
+from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 SPEC = DaySpec(7, "urban")
 TRUTH = {
@@ -33,7 +33,7 @@ TRUTH = {
 @pytest.fixture
 def day(tmp_path) -> Day:
     (tmp_path / "fleet.toml").write_text(fleet_toml("vehicle-1"))
-    return Day(SPEC, make_day(frames=10), TRUTH, load_fleet(tmp_path / "fleet.toml"))
+    return Day(SPEC, make_day(frames=10), TRUTH, load_fleet(tmp_path / "fleet.toml"), {})
 
 
 def off_by(day: Day, how) -> tuple[float, float]:

@@ -5,14 +5,14 @@ import json
 import numpy as np
 import pytest
 
+from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, to_quaternion
-from pipeline.objective.problem import Prior
 from schemas.calibrations import CalibrationRecord
 from tests.benchmarks.studies.coverage import summary as coverage_summary
 from tests.benchmarks.studies.metrics import claimed_error_deg, inside_share, measure, rms, within
 from tests.benchmarks.studies.verdict import is_right, precision_recall, worse_than_prior
-from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
 
 PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
 COVARIANCE = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03]) ** 2

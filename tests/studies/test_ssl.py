@@ -11,15 +11,15 @@ import pytest
 
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
-from pipeline.learn.aggregate import BIAS_SIGMA
+from pipeline.learn.infer.aggregate import BIAS_SIGMA
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies import ssl_ablation, ssl_cross_rig, ssl_fleet, ssl_measures, ssl_table1
 from tests.benchmarks.studies.days import SETS
 from tests.benchmarks.studies.ssl_days import ModelSet, SslDay, Where, fleet_days, table1_days
 from tests.benchmarks.studies.ssl_pages import fleet_file_with
 from tests.benchmarks.studies.ssl_tables import abrupt_table, frame_values, frames_table, sigma_table
-from tests.fleet_files import fleet_toml
-from tests.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.makers.fleet_files import fleet_toml
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 TRUTH = {
     "T_camera_lidar": T_CAMERA_LIDAR.tolist(),

@@ -1,6 +1,7 @@
 """Directed edges in torch: residuals of depth jumps to mask boundaries, and `joint`'s likelihood score of them.
 
-Source: `pipeline.objective.edges`, which has the reasons; the same constants, the same nearest-pixel lookup.
+Source: `pipeline.objective.camera_lidar.edges`, which has the reasons; the same constants, the same
+nearest-pixel lookup.
 """
 
 from __future__ import annotations
@@ -9,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int8, Int64
 from torch import Tensor
 
+from pipeline.objective.camera_lidar.edges import CHANCE_BINS
+from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY
 from pipeline.objective.differentiable.lookup import nearest_pixel
-from pipeline.objective.edges import CHANCE_BINS
-from pipeline.objective.image_maps import NO_BOUNDARY
 
 __all__ = ["edge_residuals_px", "edge_scores"]
 

@@ -18,14 +18,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.geometry.cameras import Camera
-from pipeline.objective import camera_radar, lidar_radar
-from pipeline.objective.camera_lidar import CameraLidarLoss
-from pipeline.objective.camera_radar import CameraRadarLoss
 from pipeline.objective.differentiable.lookup import bilinear, masked_mean
 from pipeline.objective.differentiable.poses import inverse, transform_points
 from pipeline.objective.differentiable.projection import Projection, camera_projection
-from pipeline.objective.kernels import FoldedFrames, without_tangential
-from pipeline.objective.lidar_radar import LidarRadarLoss
+from pipeline.objective.paper import camera_radar, lidar_radar
+from pipeline.objective.paper.camera_lidar import CameraLidarLoss
+from pipeline.objective.paper.camera_radar import CameraRadarLoss
+from pipeline.objective.paper.cost_maps import FoldedFrames, without_tangential
+from pipeline.objective.paper.lidar_radar import LidarRadarLoss
 
 __all__ = [
     "CameraRadarTensors",
@@ -42,7 +42,7 @@ __all__ = [
 
 
 def distance_cost(squared: Float[Tensor, "*shape"], scale: float | Tensor) -> Float[Tensor, "*shape"]:
-    """d^2 / (d^2 + s^2) of squared distances, as `pipeline.objective.semantics.distance_cost`."""
+    """d^2 / (d^2 + s^2) of squared distances, as `pipeline.objective.paper.classes.distance_cost`."""
     return squared / (squared + scale * scale)
 
 

@@ -112,7 +112,7 @@ def loop_loss(
         T_camera_lidar: the three estimates.
         T_lidar_radar: the three estimates.
         T_camera_radar: the three estimates.
-        angle_unit: factor of the angles [1/rad]; the paper names no units, so 1 as in `pipeline.objective.loop`.
+        angle_unit: factor of the angles [1/rad]; the paper names no units, so 1 as in `pipeline.objective.paper.loop`.
         metre_unit: factor of the translation [1/m].
     """
     loop = T_camera_lidar @ T_lidar_radar @ inverse(T_camera_radar)

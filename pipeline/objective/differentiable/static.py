@@ -3,7 +3,7 @@
 The same neighbours (within three sigmas of azimuth and range), the same ground bounce, the same elevations that count;
 frames are thinned first, for every detection is held against every point.
 
-Source: `pipeline.objective.registration`, which has the reasons, and whose constants are used here.
+Source: `pipeline.objective.radar.registration`, which has the reasons, and whose constants are used here.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.objective.differentiable.poses import inverse, transform_points
-from pipeline.objective.registration import (
+from pipeline.objective.radar.registration import (
     BOUNCE_PRIOR,
     RANGE_M,
     SIDE_RAD,
@@ -21,7 +21,7 @@ from pipeline.objective.registration import (
     STRAY,
     VIEW_MARGIN_RAD,
 )
-from pipeline.objective.registration_loops import CUT
+from pipeline.objective.radar.registration_loops import CUT
 
 __all__ = ["elevation_limits", "static_cost", "tells_elevation"]
 

@@ -14,12 +14,12 @@ import torch
 from jaxtyping import Bool, Float, Int8, Int64, UInt8
 from torch import Tensor
 
-from pipeline.objective.camera_lidar import SCALE_RAD as CLASS_SCALE_RAD
 from pipeline.objective.differentiable.edges import edge_residuals_px
 from pipeline.objective.differentiable.lookup import bilinear_groups, masked_mean, nearest_pixel
 from pipeline.objective.differentiable.poses import transform_points
 from pipeline.objective.differentiable.projection import GridProjection
-from pipeline.objective.registration import SIGMA_START
+from pipeline.objective.paper.camera_lidar import SCALE_RAD as CLASS_SCALE_RAD
+from pipeline.objective.radar.registration import SIGMA_START
 
 __all__ = [
     "GridMaps",
@@ -119,7 +119,8 @@ def edge_cost(
 ) -> Float[Tensor, "*batch F"]:
     """Depth jumps lie on mask boundaries of their own direction: distance along that direction's axis, robust.
 
-    As `pipeline.objective.edges`: the boundary is looked up at the nearest cell, the distance is taken from the point.
+    As `pipeline.objective.camera_lidar.edges`: the boundary is looked up at the nearest cell, the distance is taken
+    from the point.
     """
     uv, seen = maps.pixels(T_camera_lidar, points)
     step_deg = maps.projection.step_rad * DEG

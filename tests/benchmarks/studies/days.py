@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config import FleetConfig, load_fleet
-from pipeline.ingest.run import ingest_day
-from pipeline.perceive.run import perceive_day
-from pipeline.prior import read_prior
+from pipeline.extrinsics.prior import read_prior
+from pipeline.ingest.stage import ingest_day
+from pipeline.perceive.stage import perceive_day
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
 from pipeline.store.partitions import Lake, Partition

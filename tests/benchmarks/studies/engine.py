@@ -20,17 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibrate import calibrate_observations
-from pipeline.calibration_records import Inputs
+from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import FleetConfig, PriorConfig, SolveConfig
 from pipeline.errors import SolveError
+from pipeline.extrinsics.estimates import Prior
+from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.learn.radar_drivable.samples import scan_of
-from pipeline.objective.problem import Prior
+from pipeline.geometry.targets import loop_errors
+from pipeline.learn.perception.radar_drivable.samples import scan_of
 from pipeline.perceive.models.radar_drivable import RadarDrivable
-from pipeline.prior import perturbed, read_prior
 from pipeline.store.partitions import Partition
-from pipeline.verify.targets import loop_errors
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, commit_now, load_day
@@ -230,7 +230,8 @@ def run_study(
     dates = sorted({r["date"] for r in results})
     head = (
         f"{len(results)} of {len(runs)} runs; calibrated by commit {commits['commit']}, perceived by "
-        f"{commits['perceived_by']}, simulated by {commits['simulated_by']}; {', '.join(dates)}; days of seeds {seeds[0]}-{seeds[-1]}\n"
+        f"{commits['perceived_by']}, simulated by {commits['simulated_by']}; {', '.join(dates)}; "
+        f"days of seeds {seeds[0]}-{seeds[-1]}\n"
     )
     text = f"{head}\n{summary(results)}\n"
     args.out.with_suffix(".md").write_text(text)

@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.learn.lidar_semantics.training import kind_scores
+from pipeline.learn.perception.lidar_semantics.training import kind_scores
 from pipeline.perceive.ground import PointKind, find_ground
 from pipeline.perceive.models.range_image import RangeImageSegmenter
-from pipeline.simulate.casting import World
 from pipeline.simulate.fleet import drive_of, mounting_on
-from pipeline.simulate.frames import scene_of
-from pipeline.simulate.lidar import sweep_lidar
-from pipeline.simulate.recording import FIRST_FRAME_S
-from pipeline.simulate.rigs import rig_named
+from pipeline.simulate.logs.recording import FIRST_FRAME_S
+from pipeline.simulate.sensors.frames import scene_of
+from pipeline.simulate.sensors.lidar import sweep_lidar
+from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.simulate.world.casting import World
 from tests.benchmarks.studies.ssl_fleet import FLEET
 
 _INLIER_M = 0.15

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import from_quaternion
-from pipeline.objective.problem import Prior
-from pipeline.verify.targets import errors_at_targets
+from pipeline.geometry.targets import errors_at_targets
 from schemas.calibrations import CalibrationRecord
 
 __all__ = [

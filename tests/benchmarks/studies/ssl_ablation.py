@@ -35,8 +35,8 @@ def exported(name: str, run: Path, folder: Path) -> ModelSet:
     digest = hashlib.sha256((run / "best.pt").read_bytes()).hexdigest()[:10]
     path = folder / f"{name}_{digest}.onnx"
     if not path.exists():
-        from pipeline.learn.onnx_export import export_onnx
-        from pipeline.learn.run_state import network_of_run
+        from pipeline.learn.export.onnx_file import export_onnx
+        from pipeline.learn.train.run_state import network_of_run
 
         folder.mkdir(parents=True, exist_ok=True)
         export_onnx(network_of_run(run), path)

@@ -3,8 +3,8 @@
     python -m tests.benchmarks.studies.ssl_bias --root SSL/fleet --models matching=joint.onnx
 
 Root mean squares over the vehicles of the training fleet that no network learned from, a day each, from Table 1's
-prior; (sight, translation) as in `pipeline/learn/aggregate.py`: three angles [deg], three shifts [m]. Days of Table 1
-stay unseen. Pairwise networks are measured by the same command.
+prior; (sight, translation) as in `pipeline/learn/infer/aggregate.py`: three angles [deg], three shifts [m]. Days
+of Table 1 stay unseen. Pairwise networks are measured by the same command.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.learn.aggregate import shared_bias
-from pipeline.learn.onnx_networks import open_networks
-from pipeline.learn.vehicle_day import day_answers
+from pipeline.learn.infer.aggregate import shared_bias
+from pipeline.learn.infer.onnx_networks import open_networks
+from pipeline.learn.infer.vehicle_day import day_answers
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import iterate_rows
 from schemas.calibrations import PAIRS

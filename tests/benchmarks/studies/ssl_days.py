@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from pipeline.calibration_records import environment_of
+from pipeline.calibrate.records import environment_of
 from pipeline.config import FleetConfig, load_fleet
-from pipeline.objective.problem import Prior
-from pipeline.prior import perturbed
+from pipeline.extrinsics.estimates import Prior
+from pipeline.extrinsics.prior import perturbed
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import iterate_rows, read_rows
 from schemas.calibrations import PAIRS

@@ -17,11 +17,11 @@ import time
 from pathlib import Path
 
 from pipeline.config import load_fleet
-from pipeline.ingest.run import ingest_day
-from pipeline.perceive.run import perceive_day
+from pipeline.ingest.stage import ingest_day
+from pipeline.perceive.stage import perceive_day
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_vehicle_day, vehicle_names
-from pipeline.simulate.rigs import rig_named
-from pipeline.simulate.toml import fleet_toml
+from pipeline.simulate.logs.fleet_toml import fleet_toml
+from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.store.partitions import Lake, Partition
 from tests.benchmarks.studies.days import SETS, generate_day
 

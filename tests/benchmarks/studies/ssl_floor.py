@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.verify.targets import errors_at_targets
+from pipeline.geometry.targets import errors_at_targets
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.ssl_days import open_day, table1_days
 from tests.benchmarks.studies.ssl_measures import STARTS

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibrate import calibrate_observations
-from pipeline.calibrate_ssl import ssl_solver
-from pipeline.calibration_records import Inputs
+from pipeline.calibrate.networks import ssl_solver
+from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.stage import calibrate_observations
 from pipeline.errors import SolveError
+from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between
-from pipeline.learn.inference import SingleFrameCalibrator
-from pipeline.learn.onnx_networks import OnnxNetwork, open_networks
-from pipeline.learn.samples import SampleRejectedError
-from pipeline.objective.problem import Prior
-from pipeline.verify.targets import errors_at_targets, loop_errors
+from pipeline.geometry.targets import errors_at_targets, loop_errors
+from pipeline.learn.infer.onnx_networks import OnnxNetwork, open_networks
+from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.sample.frame_sample import SampleRejectedError
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation

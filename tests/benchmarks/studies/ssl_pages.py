@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.verify.targets import errors_at_targets
+from pipeline.geometry.targets import errors_at_targets
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.days import SETS
 from tests.benchmarks.studies.ssl_days import SslDay, open_day, simulated_days

@@ -22,16 +22,16 @@ import numpy as np
 import torch
 
 from pipeline.geometry.se3 import perturb_exactly
-from pipeline.learn.batch import TrainingBatch
-from pipeline.learn.batches import frames_at
-from pipeline.learn.inputs import NetworkInputs, sensor_inputs
-from pipeline.learn.loader import load_split
-from pipeline.learn.losses import frame_objective, weighted
-from pipeline.learn.networks import CalibrationNetwork
-from pipeline.learn.run_state import network_of_run
-from pipeline.learn.settings import LossConfig
+from pipeline.geometry.targets import errors_at_targets
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.batches.loader import load_split
+from pipeline.learn.batches.source import frames_at
+from pipeline.learn.network.inputs import NetworkInputs, sensor_inputs
+from pipeline.learn.network.networks import CalibrationNetwork
+from pipeline.learn.train.losses import frame_objective, weighted
+from pipeline.learn.train.run_state import network_of_run
+from pipeline.learn.train.settings import LossConfig
 from pipeline.store.partitions import Lake
-from pipeline.verify.targets import errors_at_targets
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.days import commit_now
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.learn.aggregate import BIAS_SIGMA
+from pipeline.learn.infer.aggregate import BIAS_SIGMA
 from schemas.calibrations import DOF_NAMES, PAIRS
 from tests.benchmarks.studies.metrics import inside_share, rms
 

@@ -1,0 +1,1 @@
+"""What commands show: logs, progress, tables, the last line."""

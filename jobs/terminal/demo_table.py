@@ -1,0 +1,212 @@
+"""True against estimated extrinsics, as a table for people and as numbers for the summary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from pipeline.store.partitions import Lake
+    from schemas.calibrations import CalibrationRecord
+    from schemas.drift import DriftFinding
+
+__all__ = ["print_comparison", "print_methods"]
+
+_WIDTH = 124  # of the table; a narrower terminal wraps lines, which reads better than cut names
+_STATUS = {"accepted": "[green]accepted[/]", "held": "[yellow]held[/]", "refused": "[yellow]refused[/]"}
+
+
+def print_comparison(
+    lake: Lake,
+    method: str,
+    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    day: str,
+    findings: Sequence[DriftFinding],
+) -> list[dict[str, Any]]:
+    """Print the records of one day beside the truth, and what the audit found.
+
+    Both are shown as what differs from the prior, i.e. what the drawing did not know: rotation vector [deg] and
+    shift of the child's origin [cm], in the axes of the pair's parent sensor. An estimate in brackets is a DoF
+    that the day did not determine.
+
+    Returns:
+        For each record: errors of rotation [deg] and translation [m] against the truth, before and after.
+    """
+    found, console = _current(lake, method, day), _console()
+    table, errors = _table(day), []
+    for record in found:
+        T_true = truth[record.vehicle, record.day][record.pair]
+        errors.append(_errors(record, T_true))
+        for row in _rows(record, T_true):
+            table.add_row(*row)
+    console.print(table)
+    for record in (r for r in found if r.status == "refused"):
+        console.print(f"[yellow]refused[/]  {record.vehicle} {record.pair}: {record.reason}")
+    for line in _drift_lines(findings):
+        console.print(line)
+    return errors
+
+
+def print_methods(
+    lake: Lake,
+    methods: Sequence[str],
+    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    day: str,
+) -> dict[str, list[dict[str, Any]]]:
+    """Print a row per method: what its records of one day are off by, on average over vehicles.
+
+    Azimuth and elevation [deg] and range [m] at the paper's targets, the prior's first.
+
+    Returns:
+        By method, for each record, what `print_comparison` returns.
+    """
+    from rich import box
+    from rich.table import Table
+
+    from schemas.calibrations import PAIRS
+
+    records = {method: _current(lake, method, day) for method in methods}
+    table = Table(
+        title=f"Mean error by method, {day}: azimuth, elevation \\[deg], range \\[m]",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+    )
+    for name in ("method", *PAIRS, "accepted"):
+        table.add_column(name, no_wrap=True)
+    first = records[methods[0]]
+    table.add_row("prior", *(_mean_error(first, truth, pair, before=True) for pair in PAIRS), "")
+    for method, own in records.items():
+        accepted = sum(r.status == "accepted" for r in own)
+        cells = [_mean_error(own, truth, pair, before=False) for pair in PAIRS]
+        table.add_row(method, *cells, f"{accepted} of {len(own)}")
+    _console().print(table)
+    return {
+        method: [_errors(r, truth[r.vehicle, r.day][r.pair]) for r in own] for method, own in records.items()
+    }
+
+
+def _mean_error(
+    records: Sequence[CalibrationRecord],
+    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    pair: str,
+    *,
+    before: bool,
+) -> str:
+    """Over the records of a pair that hold a transform."""
+    from pipeline.geometry.targets import errors_at_targets
+    from pipeline.store.current import prior_of, transform_of
+
+    found = []
+    for record in (r for r in records if r.pair == pair):
+        T = prior_of(record) if before else transform_of(record)
+        if T is not None:
+            found.append(errors_at_targets(pair, T, truth[record.vehicle, record.day][pair]))
+    if not found:
+        return "refused"
+    azimuth, elevation, range_m = np.mean(found, axis=0)
+    return f"{np.degrees(azimuth):.3f} / {np.degrees(elevation):.3f} / {range_m:.3f}"
+
+
+def _current(lake: Lake, method: str, day: str) -> list[CalibrationRecord]:
+    from pipeline.store.current import current_records
+    from pipeline.store.tables import read_records
+    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+
+    found = read_records(lake, CALIBRATIONS, CalibrationRecord, day=day)
+    return current_records([r for r in found if r.method == method])
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    console.width = max(console.width, _WIDTH)
+    return console
+
+
+def _table(day: str) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(
+        title=f"What the drawing did not know, {day}",
+        title_style="bold",
+        caption="true: from the simulator. In brackets: the day did not determine it.",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+    for name in ("vehicle", "pair", "verdict", ""):
+        table.add_column(name, no_wrap=True)
+    for axis in "xyz":
+        table.add_column(f"{axis} true", justify="right", no_wrap=True, style="cyan")
+        table.add_column("estimate, sigma", justify="right", no_wrap=True)
+    return table
+
+
+def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
+    from pipeline.geometry.changes import change_between, change_covariance
+    from pipeline.store.current import prior_of, transform_of
+
+    T, T_prior = transform_of(record), prior_of(record)
+    if T is None or T_prior is None or record.covariance is None:
+        return [[record.vehicle, record.pair, _STATUS[record.status]]]
+    true, estimate = change_between(T_prior, T_true), change_between(T_prior, T)
+    sigma = np.sqrt(np.diag(change_covariance(T, record.covariance)))
+    seen = record.observable or [True] * 6
+    rows = []
+    for first, unit, scale, digits in ((0, "deg", np.degrees(1), 2), (3, "cm", 100.0, 1)):
+        head = [record.vehicle, record.pair, _STATUS[record.status]] if first == 0 else [""] * 3
+        cells = [f"turn {unit}" if first == 0 else f"shift {unit}"]
+        for i in range(first, first + 3):
+            shown = f"{estimate[i] * scale:+.{digits}f} ± {sigma[i] * scale:.{digits}f}"
+            cells.append(f"{true[i] * scale:+.{digits}f}")
+            cells.append(f"{shown} " if seen[i] else f"[dim]({shown})[/]")
+        rows.append(head + cells)
+    return rows
+
+
+def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
+    from pipeline.geometry.se3 import inverse, rotation_angle_rad
+    from pipeline.store.current import prior_of, transform_of
+
+    def error(T: np.ndarray | None) -> tuple[float | None, float | None]:
+        if T is None:
+            return None, None
+        angle = float(np.degrees(rotation_angle_rad(T_true @ inverse(T))))
+        return round(angle, 4), round(float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), 4)
+
+    before, after = error(prior_of(record)), error(transform_of(record))
+    return {
+        "vehicle": record.vehicle,
+        "day": record.day,
+        "method": record.method,
+        "pair": record.pair,
+        "status": record.status,
+        "rotation_error_prior_deg": before[0],
+        "rotation_error_deg": after[0],
+        "translation_error_prior_m": before[1],
+        "translation_error_m": after[1],
+    }
+
+
+def _drift_lines(findings: Sequence[DriftFinding]) -> list[str]:
+    """One line per vehicle: what moved, or that nothing did."""
+    lines = []
+    colours = {"RED": "bold red", "YELLOW": "yellow", "GREEN": "green", "UNKNOWN": "dim"}
+    for vehicle in sorted({f.vehicle for f in findings}):
+        own = [f for f in findings if f.vehicle == vehicle]
+        worst = min(own, key=lambda f: list(colours).index(f.status))
+        moved = next((f for f in own if f.moved_sensor), None)
+        text = (
+            f"the {moved.moved_sensor} moved, first seen on {moved.start_day}: {moved.reason}"
+            if moved
+            else {"GREEN": "nothing moved", "UNKNOWN": worst.reason}.get(worst.status, worst.reason)
+        )
+        lines.append(f"[{colours[worst.status]}]{worst.status:8}[/] {vehicle}  {text}")
+    return lines

@@ -1,0 +1,123 @@
+"""What a person sees of a night: bars on a terminal, one structured line per vehicle-day otherwise."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol
+
+from jobs.terminal.logging import logger
+from jobs.terminal.summary import is_terminal
+
+if TYPE_CHECKING:
+    from pipeline.fleet.nightly import DayOutcome
+
+__all__ = ["NightView", "night_view"]
+
+_MARKS = {
+    "done": "[green]ok[/]",
+    "cached": "[dim]up to date[/]",
+    "held": "[yellow]held[/]",
+    "refused": "[yellow]refused[/]",
+    "failed": "[bold red]failed[/]",
+}
+
+
+class NightView(Protocol):
+    """Told of what is in work and of what ended."""
+
+    def watch(self, index: int, done: int, total: int, what: str) -> None:
+        """The index-th vehicle-day is at this point."""
+
+    def finished(self, outcome: DayOutcome) -> None:
+        """A vehicle-day ended."""
+
+    def ended(self, name: str) -> None:
+        """The work of that name ended well, and there is nothing to say about it."""
+
+
+@contextmanager
+def night_view(names: list[str], total: int, title: str = "night") -> Iterator[NightView]:
+    """A view of `total` vehicle-days, of which those in work have `names` in order of their index."""
+    if not is_terminal():
+        yield _Lines(total, title)
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        SpinnerColumn,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+    )
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=24),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("[dim]{task.fields[what]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        yield _Bars(bars, names, total, title)
+
+
+class _Lines:
+    def __init__(self, total: int, title: str) -> None:
+        self._total, self._title, self._ended = total, title, 0
+
+    def watch(self, index: int, done: int, total: int, what: str) -> None:
+        pass  # only ends are worth a log line
+
+    def finished(self, outcome: DayOutcome) -> None:
+        self._ended += 1
+        log = logger().error if outcome.status == "failed" else logger().info
+        trace = {"trace": outcome.trace} if outcome.trace else {}
+        log(
+            "vehicle-day",
+            vehicle=outcome.vehicle,
+            day=outcome.day,
+            status=outcome.status,
+            reason=outcome.reason,
+            pairs=outcome.pairs,
+            frames=outcome.frames,
+            ended=self._ended,
+            total=self._total,
+            **trace,
+        )
+
+    def ended(self, name: str) -> None:
+        self._ended += 1
+        logger().info(self._title, what=name, ended=self._ended, total=self._total)
+
+
+class _Bars:
+    def __init__(self, bars: Any, names: list[str], total: int, title: str) -> None:
+        self._bars, self._names = bars, names
+        self._all = bars.add_task(title, total=total, what="")
+        self._tasks: dict[int, Any] = {}
+        self._began: dict[str, float] = {}
+
+    def watch(self, index: int, done: int, total: int, what: str) -> None:
+        if index not in self._tasks:
+            self._tasks[index] = self._bars.add_task(f"  {self._names[index]}", total=None, what="")
+            self._began[self._names[index]] = time.monotonic()
+        text = what.replace(self._names[index], "").strip()  # the name stands in front already
+        self._bars.update(self._tasks[index], completed=done, total=total or None, what=text)
+
+    def finished(self, outcome: DayOutcome) -> None:
+        name = f"{outcome.vehicle} {outcome.day}"
+        self.ended(name)
+        seconds = f"{time.monotonic() - self._began[name]:5.1f} s" if name in self._began else "      -"
+        accepted = sum(s == "accepted" for s in outcome.pairs.values())
+        pairs = f"{accepted}/{len(outcome.pairs)} pairs accepted" if outcome.pairs else ""
+        why = f"[dim]{outcome.reason[:90]}[/]" if outcome.status not in ("done", "cached") else ""
+        self._bars.print(f"{name}  {seconds}  {_MARKS[outcome.status]}  {pairs}  {why}", highlight=False)
+
+    def ended(self, name: str) -> None:
+        for index in [i for i in self._tasks if self._names[i] == name]:
+            self._bars.remove_task(self._tasks.pop(index))
+        self._bars.advance(self._all)

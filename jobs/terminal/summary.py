@@ -1,0 +1,108 @@
+"""What every command ends with: one JSON line on stdout and an exit code; and progress on stderr."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline.results import Progress
+
+__all__ = ["exit_code", "is_terminal", "print_json", "print_summary", "progress_reporter"]
+
+_LOG_EVERY_S = 5.0  # without a terminal: often enough for a watchdog, rare enough for a log store
+
+
+def print_summary(command: str, status: str, **fields: Any) -> None:
+    """Print the last line of stdout, `{"command": ..., "status": ..., ...}`; nan and inf become null."""
+    sys.stderr.flush()
+    print_json({"command": command, "status": status} | fields)
+
+
+def print_json(value: Any, *, indent: int | None = None) -> None:
+    """Print strict JSON (numpy values and paths included) on stdout, on one line unless indented."""
+    sys.stdout.write(json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n")
+    sys.stdout.flush()
+
+
+def exit_code(statuses: Iterable[str]) -> int:
+    """Exit code of a job from the statuses of what it did.
+
+    1 where anything "failed" (a retry may help), else 3 where anything was "held" or "refused", else 0.
+    """
+    seen = set(statuses)
+    if "failed" in seen:
+        return 1
+    return 3 if seen & {"held", "refused"} else 0
+
+
+def is_terminal() -> bool:
+    """True where a person watches stderr."""
+    return sys.stderr.isatty()
+
+
+@contextmanager
+def progress_reporter(title: str) -> Iterator[Progress]:
+    """A `Progress` for a stage: a bar on a terminal, else a log line every few seconds."""
+    with _bar(title) if is_terminal() else _lines(title) as report:
+        yield report
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Progress]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        TextColumn("[dim]{task.fields[what]}"),
+        TimeElapsedColumn(),
+    )
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task(title, total=None, what="")
+
+        def report(done: int, total: int, what: str) -> None:
+            bars.update(task, completed=done, total=total or None, what=what)
+
+        yield report
+
+
+@contextmanager
+def _lines(title: str) -> Iterator[Progress]:
+    from jobs.terminal.logging import logger
+
+    last = time.monotonic()
+
+    def report(done: int, total: int, what: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= _LOG_EVERY_S:
+            last = now
+            logger().info("progress", job=title, done=done, total=total, what=what)
+
+    yield report
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(v) for v in value]
+    if isinstance(value, bool | int | str | None):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):  # numpy scalars and arrays, without importing numpy here
+        return _plain(value.tolist())
+    raise TypeError(f"{type(value).__name__} has no place in a JSON summary")

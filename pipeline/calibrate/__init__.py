@@ -1,0 +1,1 @@
+"""Stage calibrate: select, trigger, solve, verify; one folder for each, one per family of methods."""

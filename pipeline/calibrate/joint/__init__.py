@@ -1,0 +1,1 @@
+"""Method `joint`: the best direct optimisation here."""

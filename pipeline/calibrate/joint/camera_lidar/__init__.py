@@ -1,0 +1,1 @@
+"""Camera-lidar half of method `joint`: initialise, refine, what the day determines."""

@@ -1,0 +1,311 @@
+"""Camera-lidar half of method `joint`: T_camera_lidar and the camera's time offset from a day of observations.
+
+A small differential evolution finds the basin (wide kernels, few points, restarts), annealed response
+surfaces find the optimum, and the frames' own curvatures and gradients say how sure it is. Weights of the
+terms come from the data: the share of matching edges, the contrast under markings, and how much a term's
+gradient scatters from frame to frame against what its curvature promises (composite likelihood: Varin,
+Reid, Firth 2011, section 2.3). A degree of freedom that the day does not determine is then held at the prior and
+the others solved again; their covariance includes what the prior leaves open in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.calibrate.joint.camera_lidar.heading_bias import sweep_s_per_rad
+from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
+from pipeline.calibrate.joint.camera_lidar.observability import IS_TZ, Day, Found, determined, measured
+from pipeline.calibrate.joint.camera_lidar.refine import (
+    FOCAL_SIGMA,
+    NOTHING,
+    AlignmentState,
+    climb,
+    weighted,
+)
+from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, s_per_metre
+from pipeline.calibrate.numerics.covariance import OBSERVABLE
+from pipeline.calibrate.numerics.search_range import search_range
+from pipeline.config import SolveConfig
+from pipeline.errors import SolveError
+from pipeline.extrinsics.estimates import PairEstimate, Prior
+from pipeline.geometry.changes import change_jacobian
+from pipeline.objective.camera_lidar.score import Level, Terms, lidar_velocities, prepare_terms
+from schemas.observations import Observation
+
+__all__ = [
+    "Aligned",
+    "AlignmentState",
+    "align_camera_lidar",
+    "camera_lidar_cost",
+    "camera_lidar_information",
+    "estimate_camera_lidar",
+    "settle_camera_lidar",
+]
+
+_FEWEST_FRAMES = 5
+_THIN_POINTS, _FINE_POINTS = 8000, 18000  # of edges, and of markings; more say the same again
+_MARGIN_RAD = np.radians(2.0)  # points further out of view than this stay out of it
+# Kernel widths [label px] and contrast levels, from wide to sharp.
+_LADDER = ((4.0, 0), (2.5, 1), (1.5, 2))
+_VERDICT = Level.wide(1.5, 2)
+_MAX_GAP_PX = 5.0  # edges whose interval is wider (16 rings: 30 px) are for the basin only
+_NEAR_PRIOR_M = 0.25
+_HEADING_SIGMA_RAD = np.radians(0.3)  # of velocities that a caller knows
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """An alignment good to a tenth of a degree: where `settle_camera_lidar` goes on, maybe with better velocities."""
+
+    day: Day
+    frames: list[Observation]
+    rejected: dict[str, int]
+    basin: Basin
+    state: AlignmentState
+    level: Level
+
+    @property
+    def T_camera_lidar(self) -> Float[np.ndarray, "4 4"]:
+        """The pose."""
+        return self.state.T_camera_lidar
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "6 6"]:
+        """Of the pose, by left perturbation."""
+        chart = measured(self.day, self.state, self.level, IS_TZ)[0][:6, :6]
+        to_left = np.linalg.inv(change_jacobian(self.state.T_camera_lidar))
+        return to_left @ chart @ to_left.T
+
+
+def estimate_camera_lidar(
+    observations: Sequence[Observation],
+    prior: Prior,
+    config: SolveConfig,
+    rng: np.random.Generator,
+    *,
+    velocity_lidar: Float[np.ndarray, "F 3"] | None = None,
+) -> PairEstimate:
+    """Estimate T_camera_lidar and the camera's time offset.
+
+    Args:
+        observations: the day's frames; those with another camera or label size than the first are left out.
+        prior: start, and weak information about pose; dt has prior 0 +- `time_offset_sigma_s`.
+        config: search box and resampling.
+        rng: decides everything random.
+        velocity_lidar: own velocity per observation in lidar axes [m/s]; by default the speed along the
+            heading that the radar's Doppler and the prior T_lidar_radar show.
+
+    Raises:
+        SolveError: too few frames, or nothing to align in them.
+    """
+    aligned = align_camera_lidar(observations, prior, config, rng, velocity_lidar=velocity_lidar)
+    return settle_camera_lidar(aligned, rng)
+
+
+def align_camera_lidar(
+    observations: Sequence[Observation],
+    prior: Prior,
+    config: SolveConfig,
+    rng: np.random.Generator,
+    *,
+    velocity_lidar: Float[np.ndarray, "F 3"] | None = None,
+) -> Aligned:
+    """Find the basin and climb it, from wide kernels to sharp ones; arguments as of `estimate_camera_lidar`."""
+    used, rejected = _usable(observations)
+    heading_sigma = _HEADING_SIGMA_RAD
+    if velocity_lidar is None:
+        velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar)
+        heading_sigma = float(np.hypot(heading_sigma, prior.rotation_sigma_rad))
+    if len(used) < _FEWEST_FRAMES:
+        raise SolveError(f"camera-lidar needs {_FEWEST_FRAMES} frames of one camera, the day has {len(used)}")
+    frames = [observations[i] for i in used]
+    reach = search_range(prior, config)[0] + _MARGIN_RAD
+    terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar[used], reach_rad=reach)
+    terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
+    if "edges" in config.terms and len(terms.edges.xyz_m) < 20 * len(used):
+        raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
+
+    first = Level.wide(*_LADDER[0])
+    sharp = terms.sharp(_MAX_GAP_PX)
+    thin = sharp.at_most(_THIN_POINTS, rng)
+    basin = find_basin(terms, thin, first, prior, config, rng)
+    sharp = sharp.in_view(basin.state.T_camera_lidar, _MARGIN_RAD).at_most(_FINE_POINTS, rng)
+    # Wide kernels are biased along the optical axis: where the prior is better than that, enter the valley there.
+    near = prior.translation_sigma_m <= _NEAR_PRIOR_M
+    held = IS_TZ if near else NOTHING
+    state = _at_prior_tz(basin.state, prior, terms) if near else basin.state
+    state = climb(thin, state, first, prior, config, steps=8, held=held)
+    for sigma_px, contrast in _LADDER[1:]:
+        level = weighted(sharp, state, sharp.fitted(state.alone, Level.wide(sigma_px, contrast), rng))
+        state = climb(sharp, state, level, prior, config, steps=4, held=held)
+    day = Day(
+        sharp,
+        prior,
+        config,
+        [o.drive for o in frames],
+        int(rng.integers(2**32)),
+        prior.translation_sigma_m**2,
+        heading_sigma,
+        sweep_s_per_rad(frames),
+    )
+    return Aligned(day, frames, rejected, basin, state, level)
+
+
+def settle_camera_lidar(
+    aligned: Aligned,
+    rng: np.random.Generator,
+    *,
+    heading: tuple[Float[np.ndarray, "4 4"], float] | None = None,
+) -> PairEstimate:
+    """The estimate: tz, the clock, what the day determines, how surely.
+
+    Args:
+        aligned: where to begin.
+        rng: of the chance densities and the clock's points.
+        heading: T_lidar_radar that turns the radar's Doppler velocities into lidar axes, and its sigma of yaw [rad];
+            by default the velocities stay those of `aligned`.
+    """
+    day = aligned.day
+    if heading is not None:
+        velocity = lidar_velocities(aligned.frames, heading[0])
+        day = replace(
+            day,
+            terms=replace(day.terms, velocity_lidar=velocity),
+            heading_sigma_rad=float(np.hypot(_HEADING_SIGMA_RAD, heading[1])),
+        )
+    found = determined(day, aligned.state, aligned.level, rng)
+    halves = [
+        climb(
+            day.terms.of_frames(np.arange(k, day.terms.frames, 2)), found.state, found.level, found.prior,
+            day.config, steps=3, held=found.held | (np.arange(8) == FOCAL),
+        )
+        for k in (0, 1)
+    ]  # fmt: skip
+    diagnostics = _diagnostics(day.terms, found, aligned.basin, halves)
+    return _conclude(found, day.config, len(aligned.frames), aligned.rejected, diagnostics)
+
+
+def camera_lidar_cost(
+    observations: Sequence[Observation],
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    dt_s: float = 0.0,
+    *,
+    velocity_lidar: Float[np.ndarray, "F 3"] | None = None,
+    T_lidar_radar: Float[np.ndarray, "4 4"] | None = None,
+) -> Float[np.ndarray, " F"]:
+    """Cost of each frame at a pose, for held-out verdicts: lower is better, sharp kernels, nothing fitted.
+
+    Args:
+        observations: frames of one camera.
+        T_camera_lidar: the pose.
+        dt_s: camera time offset, stamp_camera = stamp_lidar + dt.
+        velocity_lidar: own velocity per frame in lidar axes; else from the observations and T_lidar_radar.
+        T_lidar_radar: turns Doppler velocities into lidar axes; identity by default.
+    """
+    if velocity_lidar is None:
+        velocity_lidar = lidar_velocities(observations, np.eye(4) if T_lidar_radar is None else T_lidar_radar)
+    terms = prepare_terms(observations, T_camera_lidar, velocity_lidar, reach_rad=0.0).sharp(_MAX_GAP_PX)
+    at = AlignmentState(T_camera_lidar, dt_s).alone
+    return -(terms.edge_excess(at, _VERDICT) + terms.marking_score(at, _VERDICT))[0]
+
+
+def camera_lidar_information(
+    terms: Terms, T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float, level: Level | None = None
+) -> tuple[Float[np.ndarray, " 7"], Float[np.ndarray, "7 7"]]:
+    """Gradient of the COST (minus score) and information by (left perturbation, dt), for a joint solver.
+
+    The focal scale is marginalised within its prior, so the translation along the optical axis says what it is worth.
+    """
+    gradient, information = terms.gradient(AlignmentState(T_camera_lidar, dt_s).alone, level or _VERDICT)
+    g, I = -gradient.sum(0), information.sum(0)
+    focal = I[7, 7] + FOCAL_SIGMA**-2
+    return g[:7] - I[:7, 7] * g[7] / focal, I[:7, :7] - np.outer(I[:7, 7], I[7, :7]) / focal
+
+
+# -- steps -----------------------------------------------------------------------------------------------------------
+
+
+def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, int]]:
+    """Frames that share the first frame's camera and label size."""
+    if not observations:
+        return [], {}
+    key = [
+        (o.camera_model, o.camera_K.tobytes(), o.camera_D.tobytes(), o.image_width_px, o.label_scale)
+        for o in observations
+    ]
+    used = [i for i, k in enumerate(key) if k == key[0]]
+    others = len(observations) - len(used)
+    return used, {"another camera": others} if others else {}
+
+
+def _at_prior_tz(state: AlignmentState, prior: Prior, terms: Terms) -> AlignmentState:
+    """The state with the prior's tz, and the clock that keeps what the car passes where it was."""
+    shift_m = float(state.T_camera_lidar[2, 3] - prior.T_camera_lidar[2, 3])
+    return replace(state, dt_s=state.dt_s + s_per_metre(terms, state) * shift_m).held(prior, IS_TZ)
+
+
+def _diagnostics(
+    terms: Terms,
+    found: Found,
+    basin: Basin,
+    halves: list[AlignmentState],
+) -> dict[str, float]:
+    """Numbers behind the verdict."""
+    apart = difference(halves[0], halves[1])
+    level, profile = found.level, found.profile
+    return {
+        "restarts": float(basin.restarts),
+        "restart_rotation_spread_deg": float(np.degrees(basin.rotation_spread_rad)),
+        "restart_translation_spread_m": basin.translation_spread_m,
+        "restart_score_spread": basin.score_spread,
+        **{f"halves_{n}_deg": float(np.degrees(abs(apart[i]))) for i, n in enumerate(("rx", "ry", "rz"))},
+        **{f"halves_{n}_m": float(abs(apart[3 + i])) for i, n in enumerate(("tx", "ty", "tz"))},
+        "halves_dt_s": float(abs(apart[6])),
+        **{
+            f"edge_match_share_{n}": float(terms.mean_match(level)[i])
+            for i, n in enumerate(("left", "right", "above", "below"))
+        },
+        "tz_bias_m": profile.bias_m,
+        "tz_kinds_apart_m": profile.kinds_apart_m,
+        "tz_kinds_sigma_m": profile.kinds_sigma_m,
+        "focal_scale": found.state.focal,
+        "edge_weight": level.edge_weight,
+        "marking_contrast_sd": level.delta,
+        "marking_weight": level.marking_weight,
+        "edges_per_frame": len(terms.edges.xyz_m) / terms.frames,
+        "markings_per_frame": len(terms.markings.xyz_m) / terms.frames,
+    }
+
+
+def _conclude(
+    found: Found,
+    config: SolveConfig,
+    frames: int,
+    rejected: dict[str, int],
+    diagnostics: dict[str, float],
+) -> PairEstimate:
+    """The estimate, its covariance by left perturbation, notes."""
+    dt_sigma = float(np.sqrt(found.covariance[6, 6]))
+    notes = [
+        f"focal length {found.state.focal - 1:+.2%} off the log's, where {FOCAL_SIGMA:.1%} was expected (1 sigma)"
+    ]
+    if dt_sigma > 0.7 * config.time_offset_sigma_s:
+        notes.append("camera time offset: the day's speeds do not determine it")
+    to_left = np.linalg.inv(change_jacobian(found.state.T_camera_lidar))
+    return PairEstimate(
+        "camera_lidar",
+        found.state.T_camera_lidar,
+        to_left @ found.covariance[:6, :6] @ to_left.T,
+        found.observability,
+        found.observability >= OBSERVABLE,
+        frames_used=frames,
+        frames_rejected=rejected,
+        time_offset_s=found.state.dt_s,
+        time_offset_sigma_s=dt_sigma,
+        diagnostics=diagnostics,
+        notes=notes,
+    )

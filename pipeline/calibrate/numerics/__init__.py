@@ -1,0 +1,1 @@
+"""What several methods share: searches, response surfaces, covariance, bias floors."""

@@ -1,0 +1,1 @@
+"""The paper's direct optimisation: pairwise, then joint under the loop."""

@@ -1,0 +1,233 @@
+"""Calibration records from what select, solve and verify returned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.verify.held_out_test import HeldOutTest
+from pipeline.calibrate.verify.target_accuracy import Claim, target_sigmas
+from pipeline.calibrate.verify.verdict import Verdict, loop_sigmas
+from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.store.partitions import Partition
+from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.observations import Observation
+from schemas.versions import CODE_VERSION
+
+__all__ = ["Inputs", "Judged", "environment_of", "record_of", "refused_records"]
+
+# Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
+_FAST_MPS = 20.0
+_MOVING_MPS = 1.0
+_DOUBTFUL_FOCAL = 0.009  # three sigmas of what intrinsics are known to
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What identifies a calibration: the same inputs give the same record."""
+
+    partition: Partition
+    method: str
+    work_key: str
+    seed: int
+    inputs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The verdict on one pair and the evidence behind it."""
+
+    verdict: Verdict
+    test: HeldOutTest | None
+    claims: Mapping[str, Claim]
+
+
+def record_of(
+    about: Inputs,
+    pair: str,
+    solution: Solution,
+    prior: Prior,
+    judged: Judged,
+    selection: Selection,
+    observations: Sequence[Observation],
+    *,
+    before: Mapping[str, float],
+    after: Mapping[str, float],
+    triggered: bool,
+) -> CalibrationRecord:
+    """The record of one pair that was computed."""
+    estimate, verdict, test = solution.pairs[pair], judged.verdict, judged.test
+    loop_sigma = _loop_sigmas(solution)
+    sigma = target_sigmas(pair, estimate.T, estimate.covariance)
+    refused = verdict.status == "refused"
+    computed: dict[str, Any] = {
+        "covariance": estimate.covariance,
+        "observability": [float(v) for v in estimate.observability],
+        "observable": [bool(v) for v in estimate.observable],
+        "azimuth_sigma_rad": float(sigma[0]),
+        "elevation_sigma_rad": float(sigma[1]),
+        **_transform_fields("", estimate.T),
+    }
+    return CalibrationRecord(
+        **_identity(about, pair, len(observations), prior),
+        **({} if refused else computed),
+        status=verdict.status,
+        reason=verdict.reason,
+        score=verdict.score,
+        determined=list(verdict.determined),
+        limit_rad=judged.claims["azimuth"].limit,
+        frames_used=estimate.frames_used,
+        frames_rejected=_add(selection.rejected[pair], estimate.frames_rejected),
+        environment=environment_of(observations),
+        triggered=triggered,
+        trigger_before=dict(before),
+        trigger_after=dict(after),
+        alignment_before=test.before if test else None,
+        alignment_after=test.after if test else None,
+        loop_rotation_rad=solution.loop_rotation_rad,
+        loop_translation_m=solution.loop_translation_m,
+        loop_rotation_sigma_rad=loop_sigma[0],
+        loop_translation_sigma_m=loop_sigma[1],
+        time_offset_s=estimate.time_offset_s,
+        time_offset_sigma_s=estimate.time_offset_sigma_s,
+        notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable), *_focal(estimate)],
+        assumptions=[*_assumed(pair, observations), *estimate.notes],
+        drive_missing=selection.missing.get(pair, []),
+        diagnostics=dict(estimate.diagnostics)
+        | _test_numbers(test)
+        | _claim_numbers(judged)
+        | {"paper_frames": float(selection.passed[pair])},
+    )
+
+
+def refused_records(about: Inputs, reason: str, frames: int, prior: Prior | None) -> list[CalibrationRecord]:
+    """Records of a day that could not be calibrated at all."""
+    return [
+        CalibrationRecord(**_identity(about, pair, frames, prior), status="refused", reason=reason)
+        for pair in PAIRS
+    ]
+
+
+def environment_of(observations: Sequence[Observation]) -> str:
+    """Highway, urban, mixed or unknown, from the speeds of the moving frames.
+
+    More than 70 % of them at 20 m/s or more is a highway, less than 30 % a town; a traffic jam on a highway
+    passes for a town. Unknown where less than half of the frames have a speed or none moves.
+    """
+    speeds = np.array([abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None])
+    moving = speeds[speeds > _MOVING_MPS]
+    if 2 * len(speeds) < len(observations) or not len(moving):
+        return "unknown"
+    fast = float(np.mean(moving >= _FAST_MPS))
+    return "highway" if fast > 0.7 else "urban" if fast < 0.3 else "mixed"
+
+
+def _identity(about: Inputs, pair: str, frames: int, prior: Prior | None) -> dict[str, Any]:
+    parent, child = FRAMES_OF_PAIR[pair]
+    fields: dict[str, Any] = {
+        "vehicle": about.partition.vehicle,
+        "day": about.partition.day,
+        "method": about.method,
+        "pair": pair,
+        "parent_frame": parent,
+        "child_frame": child,
+        "work_key": about.work_key,
+        "code_version": CODE_VERSION,
+        "seed": about.seed,
+        "inputs": list(about.inputs),
+        "frames_total": frames,
+    }
+    if prior is not None:
+        fields |= _transform_fields("prior_", prior.of(pair)) | {"prior_covariance": prior.covariance(pair)}
+    return fields
+
+
+def _transform_fields(prefix: str, T: np.ndarray) -> dict[str, float]:
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    values = (*to_quaternion(T), *T[:3, 3])
+    return {f"{prefix}{name}": float(value) for name, value in zip(names, values, strict=True)}
+
+
+def _unobservable(observable: np.ndarray) -> list[str]:
+    names = [name for name, seen in zip(DOF_NAMES, observable, strict=True) if not seen]
+    return [f"not determined by the day: {', '.join(names)}"] if names else []
+
+
+def _assumed(pair: str, observations: Sequence[Observation]) -> list[str]:
+    """What every method takes as known, and what an error of it is worth."""
+    assumed = ["sensors are rigid, clocks keep their offsets and scales over the day"]
+    if "camera" not in FRAMES_OF_PAIR[pair] or not observations:
+        return assumed
+    o = observations[0]
+    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+    wrong = Camera(
+        o.camera_model, _scaled(o.camera_K, 1.001), o.camera_D, o.image_width_px, o.image_height_px
+    )
+    edge = np.array([[0.0, o.image_height_px / 2], [o.image_width_px - 1.0, o.image_height_px / 2]])
+    angles = camera_direction_angles(camera.unproject(edge)) - camera_direction_angles(wrong.unproject(edge))
+    worth = float(np.degrees(np.abs(angles[:, 0]).max()))
+    return [
+        *assumed,
+        f"camera intrinsics as logged: a focal length wrong by 0.1 % puts the image's edge {worth:.2f} deg off",
+    ]
+
+
+def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
+    out = np.array(K, np.float64)
+    out[[0, 1], [0, 1]] *= factor
+    return out
+
+
+def _focal(estimate: PairEstimate) -> list[str]:
+    """A focal length that the images contradict is worth a sentence: the pose allows for it, its users may not."""
+    scale = estimate.diagnostics.get("focal_scale", 1.0)
+    if abs(scale - 1) < _DOUBTFUL_FOCAL:
+        return []
+    return [f"the images look as if the focal length were {100 * (scale - 1):+.1f} % off the logged one"]
+
+
+def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
+    if test is None:
+        return {}
+    return {
+        "holdout_frames": float(test.frames),
+        "holdout_blocks": float(test.blocks),
+        "holdout_z": test.z,
+    }
+
+
+def _claim_numbers(judged: Judged) -> dict[str, float]:
+    """Score, what is vouched for, what held-out frames would change and what is left unknown with them."""
+    vouched = judged.verdict.determined
+    return {
+        "confidence": judged.verdict.score,
+        "vouched_az": float("azimuth" in vouched),
+        "vouched_el": float("elevation" in vouched),
+    } | {
+        f"holdout_{name}_{what}_rad": value
+        for name, claim in judged.claims.items()
+        for what, value in (
+            ("shift", claim.shift),
+            ("shift_sigma", claim.shift_sigma),
+            ("remaining_sigma", claim.remaining),
+        )
+    }
+
+
+def _loop_sigmas(solution: Solution) -> tuple[float | None, float | None]:
+    """Sigma of the loop's angle and translation, from three pairs estimated apart or from the method's own check."""
+    apart = loop_sigmas(solution)
+    if apart is not None:
+        return apart
+    return solution.pairs["camera_radar"].diagnostics.get("loop_rotation_sigma_rad"), None
+
+
+def _add(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
+    return {name: a.get(name, 0) + b.get(name, 0) for name in {*a, *b}}

@@ -1,0 +1,1 @@
+"""Which frames calibrate, which judge, and whether a calibration is due."""

@@ -1,0 +1,1 @@
+"""Method `tracking`, the paper's baseline: moving objects tracked by each sensor."""

@@ -1,0 +1,197 @@
+"""Which track of one sensor is which track of another: by how they move first, by where they are last.
+
+Range and range rate over ground do not depend on how a sensor is turned; nor does the course of the bearing, up to a
+constant. The constant itself, the mean difference of the bearings, may be as large as the prior is uncertain. All are
+compared over the frames that both tracks share. No sighting belongs to two pairs; but a track may continue another
+sensor's track after that one broke off, so one track may have several partners, one after the other.
+
+Source: Persic et al. 2021, "calibration-agnostic track to track association"; the measure is our reading of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.calibrate.tracking.kalman import Track
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.geometry.spherical import to_spherical, wrap_angle
+
+__all__ = ["Association", "Shared", "associate", "bearing_sigma_rad", "shared_rows", "shared_sightings"]
+
+_LEAST_SHARED = 2
+_MOST_COUNTED = 8  # sightings of one track err together: a longer one is not ever more certain
+_GATE = 6.0  # mean squared deviation in sigmas over up to four quantities
+_MOST_SQUARE = 9.0  # of one quantity in one sighting: first velocities and half-hidden boxes may be far off
+_CONSTANT_SIGMAS = 3.0
+_CENTRE_SIGMA_M, _ANGLE_SIGMA_RAD = 0.5, np.radians(0.5)  # the sensors mean different points of one object
+_RANGE_OFFSET_SIGMA_M = 1.0  # near side against centre
+
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """Pairs of tracks (rows of the reference's and of the other sensor's) and how well each pair agrees."""
+
+    reference: Int64[np.ndarray, " K"]
+    other: Int64[np.ndarray, " K"]
+    score: Float[np.ndarray, " K"]  # larger is better, positive
+
+    @property
+    def count(self) -> int:
+        """Number of pairs."""
+        return len(self.reference)
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """Sightings in the same frames, by pairs of tracks seen by both at least twice, one pair after the other."""
+
+    reference: Int64[np.ndarray, " P"]
+    other: Int64[np.ndarray, " P"]
+    first: Int64[np.ndarray, " P"]  # of each pair's sightings
+    count: Int64[np.ndarray, " P"]
+    of_reference: Track  # S sightings each, row by row of the same frame
+    of_other: Track
+
+
+def associate(
+    shared: Shared,
+    T_other_reference: Float[np.ndarray, "4 4"],
+    rotation_sigma_rad: float,
+    *,
+    elevation: bool = True,
+) -> Association:
+    """Pair tracks, best scores first, none with a sighting that a better pair has; nothing outside the gates.
+
+    Args:
+        shared: what reference and other sensor saw in the same frames, level axes.
+        T_other_reference: transform between the level axes, as believed.
+        rotation_sigma_rad: how uncertain its rotation is per axis.
+        elevation: False where one of the two measures none.
+    """
+    if not len(shared.first):
+        return Association(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+    score = _scores(shared, T_other_reference, rotation_sigma_rad, elevation=elevation)
+    kept = _without_conflict(shared, score)
+    return Association(shared.reference[kept], shared.other[kept], score[kept])
+
+
+def shared_sightings(reference: Sequence[Track], other: Sequence[Track]) -> Shared:
+    """All pairs of tracks of one drive that were seen in at least two frames by both."""
+    rows = [(i, k, t.drive, int(f)) for i, t in enumerate(reference) for k, f in enumerate(t.frame)]
+    at: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for j, t in enumerate(other):
+        for k, f in enumerate(t.frame):
+            at.setdefault((t.drive, int(f)), []).append((j, k))
+    joined = np.array(
+        sorted((i, j, k, m) for i, k, drive, f in rows for j, m in at.get((drive, f), ())), np.int64
+    ).reshape(-1, 4)
+    _, first, count = np.unique(joined[:, :2], axis=0, return_index=True, return_counts=True)
+    often = count >= _LEAST_SHARED
+    joined = joined[np.repeat(often, count)]
+    count = count[often].astype(np.int64)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]]).astype(np.int64) if len(count) else count
+    return Shared(
+        joined[first, 0],
+        joined[first, 1],
+        first,
+        count,
+        _gathered(reference, joined[:, 0], joined[:, 2]),
+        _gathered(other, joined[:, 1], joined[:, 3]),
+    )
+
+
+def shared_rows(a: Track, b: Track) -> tuple[Int64[np.ndarray, " S"], Int64[np.ndarray, " S"]]:
+    """Sightings of two tracks in the same frames."""
+    _, rows_a, rows_b = np.intersect1d(a.frame, b.frame, assume_unique=True, return_indices=True)
+    return rows_a.astype(np.int64), rows_b.astype(np.int64)
+
+
+def bearing_sigma_rad(range_m: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """How far apart two sensors' bearings of one object may lie: half a metre on it, and half a degree."""
+    return np.hypot(_ANGLE_SIGMA_RAD, _CENTRE_SIGMA_M / np.maximum(range_m, 1.0))
+
+
+def _without_conflict(shared: Shared, score: Float[np.ndarray, " P"]) -> Int64[np.ndarray, " K"]:
+    """The best pairs first; another pair with a track of theirs only where it claims none of its sightings again."""
+    taken: set[tuple[int, int, int]] = set()
+    kept = []
+    for k in np.argsort(-score, kind="stable"):
+        if score[k] <= 0:
+            break
+        rows = slice(shared.first[k], shared.first[k] + shared.count[k])
+        claims = {
+            (side, int(track), int(f))
+            for side, track in enumerate((shared.reference[k], shared.other[k]))
+            for f in shared.of_reference.frame[rows]
+        }
+        if taken.isdisjoint(claims):
+            taken |= claims
+            kept.append(int(k))
+    return np.array(sorted(kept), np.int64)
+
+
+def _scores(
+    shared: Shared, T_b_a: np.ndarray, rotation_sigma_rad: float, *, elevation: bool
+) -> Float[np.ndarray, " P"]:
+    """Evidence for each pair of tracks that both are one object; 0 outside the gates.
+
+    It is what the gate leaves over the mean squared deviation, times sightings, less the constant's square.
+    """
+    a, b, first, count = shared.of_reference, shared.of_other, shared.first, shared.count
+    expected = to_spherical(transform_points(T_b_a, a.position_m))
+    seen = to_spherical(b.position_m)
+    sigma = bearing_sigma_rad(seen[:, 2])
+    axes = 2 if elevation else 1
+    gap = wrap_angle(seen[:, :axes] - expected[:, :axes])
+    constant = np.stack([_medians(gap[:, k], first, count) for k in range(axes)], axis=1)
+    # Ranges about the other sensor's origin and range rates along its line of sight: no rotation enters.
+    rate_a = _along(a.velocity_mps, a.position_m - inverse(T_b_a)[:3, 3])
+    rate_b = _along(b.velocity_mps, b.position_m)
+    range_var = a.range_sigma_m**2 + b.range_sigma_m**2 + _RANGE_OFFSET_SIGMA_M**2
+    rate_var = a.rate_sigma_mps**2 + b.rate_sigma_mps**2
+    squares = np.column_stack(
+        [
+            (seen[:, 2] - expected[:, 2]) ** 2 / range_var,
+            (rate_b - rate_a) ** 2 / rate_var,
+            ((gap - np.repeat(constant, count, axis=0)) / sigma[:, None]) ** 2,
+        ]
+    )
+    deviation = np.minimum(squares, _MOST_SQUARE).sum(axis=1)
+    left = _GATE - np.add.reduceat(deviation, first) / count
+    typical = _medians(sigma, first, count)
+    constant_square = np.sum(constant**2, axis=1) / (rotation_sigma_rad**2 + typical**2)
+    inside = (left > 0) & (constant_square < _CONSTANT_SIGMAS**2 * axes)
+    return np.where(inside, np.maximum(np.minimum(count, _MOST_COUNTED) * left - constant_square, 0.0), 0.0)
+
+
+def _medians(value: np.ndarray, first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Median of each stretch of values."""
+    ordered = value[np.lexsort((value, np.repeat(np.arange(len(first)), count)))]
+    return 0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2])
+
+
+def _along(velocity: np.ndarray, sight: np.ndarray) -> np.ndarray:
+    return np.sum(velocity * sight, axis=1) / np.maximum(np.linalg.norm(sight, axis=1), 1e-6)
+
+
+def _gathered(tracks: Sequence[Track], track: np.ndarray, row: np.ndarray) -> Track:
+    """The named sightings of many tracks in one, in the order named."""
+    if not len(track):
+        none, nothing = np.zeros(0, np.int64), np.zeros(0)
+        return Track(-1, none, none, nothing, np.zeros((0, 3)), np.zeros((0, 3)), nothing, nothing)
+    start = np.concatenate([[0], np.cumsum([t.sightings for t in tracks])[:-1]])
+    rows = start[track] + row
+    return Track(
+        -1,
+        np.concatenate([t.frame for t in tracks])[rows],
+        np.concatenate([t.detection for t in tracks])[rows],
+        np.concatenate([t.stamp_s for t in tracks])[rows],
+        np.concatenate([t.position_m for t in tracks])[rows],
+        np.concatenate([t.velocity_mps for t in tracks])[rows],
+        np.concatenate([t.rate_sigma_mps for t in tracks])[rows],
+        np.concatenate([t.range_sigma_m for t in tracks])[rows],
+    )

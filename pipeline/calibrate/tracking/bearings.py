@@ -1,0 +1,209 @@
+"""Rotation between two sensors from the bearings of objects that both track, robustly; and whether it has changed.
+
+The reference sensor knows where an object is, the other one in which direction. Translations stay at the
+prior: bearings of distant objects hardly see them. Geman-McClure weights, from wide to narrow, turn wrong
+pairs of tracks down.
+
+Source: Persic et al. 2021 (graph-based rotation calibration, decalibration detection; their translations are known);
+Yang et al. 2020, "Graduated non-convexity for robust spatial perception"; Hotelling 1931 (the test).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from scipy.stats import f as f_distribution
+
+from pipeline.calibrate.numerics.covariance import bootstrap_covariance
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, hat, log_so3
+from pipeline.geometry.spherical import spherical_jacobian, to_spherical, wrap_angle
+
+__all__ = ["AlignedBearings", "Bearings", "Consistency", "align_bearings", "consistency"]
+
+_WIDEST, _NARROWEST, _NARROWING = 12.0, 2.0, 0.7  # Geman-McClure scale in sigmas
+_POLISHING = 12
+_LEAST_SCALE, _INTRACLASS = 0.2, 0.5
+_OUTLIER_WEIGHT = 0.25
+_CONFIDENCE = 0.999
+
+
+@dataclass(frozen=True, eq=False)
+class Bearings:
+    """Sightings of objects by both sensors.
+
+    `inverted` False: T takes reference points to the other sensor (q = R p + t); True: T takes the other
+    sensor's points to the reference (q = R^T (p - t)). `level` turns the other sensor's axes level (x forward,
+    y left, z up).
+    """
+
+    point_m: Float[np.ndarray, "N 3"]  # reference axes
+    bearing_rad: Float[np.ndarray, "N A"]  # azimuth and, where measured, elevation; other sensor, level axes
+    sigma_rad: Float[np.ndarray, " N"]
+    track: Int64[np.ndarray, " N"]
+    level: np.ndarray
+    inverted: bool
+
+    @property
+    def tracks(self) -> int:
+        """Number of tracks."""
+        return int(self.track.max(initial=-1)) + 1
+
+    def residuals(self, T: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
+        """Expected minus seen bearings [rad] (N A), d/d(left turn of T's rotation, shift of its origin) (N A 6)."""
+        R, t = T[:3, :3], T[:3, 3]
+        if self.inverted:
+            L = self.level @ R.T
+            arm = self.point_m - t
+            q = arm @ L.T
+            turn, shift = L @ hat(arm), -np.broadcast_to(L, (len(q), 3, 3))
+        else:
+            arm = self.point_m @ R.T
+            q = (arm + t) @ self.level.T
+            turn, shift = -self.level @ hat(arm), np.broadcast_to(self.level, (len(q), 3, 3))
+        axes = self.bearing_rad.shape[1]
+        angles = spherical_jacobian(q)[:, :axes]
+        J = np.concatenate([angles @ turn, angles @ shift], axis=2)
+        return wrap_angle(to_spherical(q)[:, :axes] - self.bearing_rad), J
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedBearings:
+    """The rotation found, and what it rests on."""
+
+    T: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]  # without a bias floor; translation is the prior's
+    spread: Float[
+        np.ndarray, "3 3"
+    ]  # the part of the rotation's covariance that is known from resampling tracks
+    weight: Float[np.ndarray, " N"]  # Geman-McClure, 0..1
+    kept: Bool[np.ndarray, " K"]  # tracks that agree
+    residual_rad: Float[np.ndarray, " A"]  # robust standard deviation of the kept sightings
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Does the prior explain the bearings? Squared distance in sigmas, and what chance reaches once in 1000."""
+
+    statistic: float
+    threshold: float
+
+    @property
+    def miscalibrated(self) -> bool:
+        """The rotation differs from the prior by more than chance and bias."""
+        return self.statistic > self.threshold
+
+
+def align_bearings(
+    bearings: Bearings,
+    T_prior: Float[np.ndarray, "4 4"],
+    prior_covariance: Float[np.ndarray, "6 6"],
+    rng: np.random.Generator,
+) -> AlignedBearings:
+    """Turn T_prior until the bearings agree; its translation stays.
+
+    Args:
+        bearings: at least one sighting.
+        T_prior: start, and centre of the weak prior on the rotation.
+        prior_covariance: of the prior, left perturbation.
+        rng: resamples tracks for the covariance.
+    """
+    T, prior_information = T_prior, np.linalg.inv(prior_covariance[:3, :3])
+    count = np.bincount(bearings.track, minlength=bearings.tracks)[bearings.track]
+    share = 1 / (1 + _INTRACLASS * (count - 1))  # sightings of one track err together
+    scale = np.ones(bearings.bearing_rad.shape[1])
+    c, rounds = _WIDEST, 0
+    while True:
+        z, J = _whitened(bearings, T, scale)
+        weight = _geman_mcclure(z, c)
+        H = np.einsum("n,nai,naj->ij", share * weight, J[..., :3], J[..., :3]) + prior_information
+        turned = log_so3(T[:3, :3] @ T_prior[:3, :3].T)
+        g = np.einsum("n,nai,na->i", share * weight, J[..., :3], z) + prior_information @ turned
+        step = -np.linalg.solve(H, g)
+        T = from_rotation_translation(exp_so3(step) @ T[:3, :3], T[:3, 3])
+        if c <= _NARROWEST:
+            rounds += 1
+            if rounds == _POLISHING:
+                break
+            z, _ = _whitened(bearings, T, np.ones_like(scale))
+            scale = np.maximum(_spread(z), _LEAST_SCALE) if rounds < 6 else scale
+        c = max(c * _NARROWING, _NARROWEST)
+    z, J = _whitened(bearings, T, scale)
+    weight = _geman_mcclure(z, c)
+    per_track = np.bincount(bearings.track, weight, minlength=bearings.tracks)
+    kept = per_track > _OUTLIER_WEIGHT * np.bincount(bearings.track, minlength=bearings.tracks)
+    covariance, resampled = _covariance(bearings, z, J, share * weight, prior_covariance, rng)
+    inliers = weight > _OUTLIER_WEIGHT
+    spread = _spread(bearings.residuals(T)[0][inliers]) if inliers.any() else np.full(len(scale), np.nan)
+    return AlignedBearings(T, covariance, resampled, weight, kept, spread)
+
+
+def consistency(
+    aligned: AlignedBearings, T_prior: Float[np.ndarray, "4 4"], bias_floor_rad: Float[np.ndarray, " 3"]
+) -> Consistency:
+    """Test whether the rotation found differs from the prior's by more than its own uncertainty.
+
+    Hotelling's threshold rather than chi^2: with few tracks their spread itself is uncertain, in so far as it
+    and not the bias makes up the sigma (effective degrees of freedom after Welch and Satterthwaite).
+
+    Args:
+        aligned: result of `align_bearings`.
+        T_prior: what stands.
+        bias_floor_rad: sigma per axis of what is common to all tracks.
+    """
+    turned = log_so3(aligned.T[:3, :3] @ T_prior[:3, :3].T)
+    covariance = aligned.covariance[:3, :3] + np.diag(bias_floor_rad**2)
+    n, p = int(aligned.kept.sum()), 3
+    if n < 2:
+        return Consistency(0.0, float("inf"))
+    # Along the axis that tells most of the turn: how much of the variance is known only from the spread of n tracks.
+    u = np.linalg.solve(covariance, turned)
+    share = float(u @ aligned.spread @ u) / max(float(u @ covariance @ u), 1e-300)
+    dof = (n - 1) / max(share, 1e-3) ** 2
+    if dof <= p:
+        return Consistency(0.0, float("inf"))
+    threshold = p * dof / (dof - p + 1) * f_distribution.ppf(_CONFIDENCE, p, dof - p + 1)
+    return Consistency(float(turned @ u), float(threshold))
+
+
+def _whitened(bearings: Bearings, T: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    residual, J = bearings.residuals(T)
+    sigma = bearings.sigma_rad[:, None] * scale
+    return residual / sigma, J / sigma[..., None]
+
+
+def _geman_mcclure(z: np.ndarray, c: float) -> np.ndarray:
+    return (c * c / (c * c + np.sum(z**2, axis=1))) ** 2
+
+
+def _spread(z: np.ndarray) -> np.ndarray:
+    """Robust standard deviation per column, about zero."""
+    return 1.4826 * np.median(np.abs(z), axis=0) if len(z) else np.ones(z.shape[1])
+
+
+def _covariance(
+    bearings: Bearings,
+    z: np.ndarray,
+    J: np.ndarray,
+    weight: np.ndarray,
+    prior_covariance: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bootstrap over tracks of the rotation, with what the fixed translation's own sigma does to it, and without."""
+    K = bearings.tracks
+    H6, g6 = np.zeros((K, 6, 6)), np.zeros((K, 6))
+    np.add.at(H6, bearings.track, np.einsum("n,nai,naj->nij", weight, J, J))
+    np.add.at(g6, bearings.track, np.einsum("n,nai,na->ni", weight, J, z))
+    prior_information = np.linalg.inv(prior_covariance[:3, :3])
+    rotation = bootstrap_covariance(H6[:, :3, :3], g6[:, :3], prior_information, np.arange(K), rng)
+    total = H6.sum(0)
+    slope = -np.linalg.solve(
+        total[:3, :3] + prior_information, total[:3, 3:]
+    )  # turn per metre of translation error
+    translation = prior_covariance[3:, 3:]
+    covariance = prior_covariance.copy()
+    covariance[:3, :3] = rotation + slope @ translation @ slope.T
+    covariance[:3, 3:] = slope @ translation
+    covariance[3:, :3] = covariance[:3, 3:].T
+    return covariance, rotation

@@ -1,0 +1,253 @@
+"""Road users as radar, lidar and camera see them: tracks in each sensor's own level axes.
+
+Radar: the tracked moving clusters of perception. Lidar: clusters of a road user's size and height above the
+ground, followed here; against the radar only those that move over ground. Camera: boxes of road users, their range
+by the usual height of their class, as a monocular 3D detector would guess it (about 20 %); parked ones are boxes too,
+and pass by the sensors like any other.
+
+Source: Persic et al. 2021, whose lidar and camera detections come from 3D networks; clusters and sized boxes
+stand for these here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from scipy.spatial import cKDTree
+
+from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow, take_sightings
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.spherical import camera_direction_angles, from_spherical
+from schemas.observations import Observation
+
+__all__ = [
+    "box_centres",
+    "camera_tracks",
+    "lidar_tracks",
+    "motions",
+    "moves_over_ground",
+    "passes_by",
+    "radar_tracks",
+    "turn_between",
+]
+
+_HEIGHT_M = {
+    "person": 1.7,
+    "rider": 1.7,
+    "bicycle": 1.6,
+    "motorcycle": 1.6,
+    "truck": 2.9,
+    "bus": 3.0,
+    "train": 3.5,
+}
+_CAR_HEIGHT_M = 1.55
+_BOX_RANGE_FRACTION, _BOX_BEARING_SIGMA_RAD = 0.2, np.radians(0.5)
+_BORDER_PX = 6.0  # a box that ends at the image's border ends there by accident
+_LEAST_HEIGHT_M = 1.45  # no road user is lower: where beams are sparse, the topmost one hits below the top
+_LARGEST_M, _SMALLEST_M = 12.0, 0.3
+_LOWEST_M, _HIGHEST_M = 0.5, 4.2  # of a road user's top above the ground
+_STANDS_M = 0.8  # its underside is no higher: ground removal takes the lowest part
+_CLUSTER_SIGMA_M = 0.5  # which part of an object the beams meet changes from frame to frame
+_FAR_M = 80.0
+_LEAST_WAY_M = 2.0
+_LEAST_SPEED_MPS, _SPEED_SIGMAS = 2.0, 3.0
+_RADAR_AGE, _RADAR_POINTS = 2, 2
+_RADAR_RATE_SIGMA_MPS, _RADAR_RANGE_SIGMA_M = 0.6, 0.7
+_MAX_YAW_RATE_RADPS, _YAW_STEPS = 0.4, 81
+_TURN_SCALE_M = 0.6
+_LEAST_CLUSTERS = 6  # to tell a turn from the standing world
+
+
+def motions(observations: Sequence[Observation], prior: Prior) -> list[Motion]:
+    """Own motion at each frame: speed as observed, yaw rate from odometry or from the lidar's standing clusters."""
+    speeds = [_speed(o, prior) for o in observations]
+    found = []
+    for i, o in enumerate(observations):
+        velocity = None if speeds[i] is None else (float(speeds[i] or 0.0), 0.0)
+        if o.ego_yaw_rate_radps is not None:
+            found.append(Motion(velocity, o.ego_yaw_rate_radps, 0.01))
+            continue
+        last = observations[i - 1] if i else None
+        dt = 0.0 if last is None else (o.stamp_ns - last.stamp_ns) * 1e-9
+        a, b = speeds[i - 1], speeds[i]
+        turn = None
+        if last is not None and last.drive == o.drive and 0 < dt < 2.5 and a is not None and b is not None:
+            turn = turn_between(_objects(last), _objects(o), 0.5 * (a + b) * dt, dt)
+        found.append(Motion(velocity) if turn is None else Motion(velocity, turn / dt, 0.02))
+    return found
+
+
+def turn_between(
+    before_m: Float[np.ndarray, "A 3"], now_m: Float[np.ndarray, "B 3"], moved_m: float, dt_s: float
+) -> float | None:
+    """Angle [rad] by which the car turned, so that clusters seen before lie at clusters seen now; None where too few.
+
+    Args:
+        before_m: cluster centres in the axes of then.
+        now_m: in the axes of now.
+        moved_m: way driven in between.
+        dt_s: time in between.
+    """
+    if min(len(before_m), len(now_m)) < _LEAST_CLUSTERS:
+        return None
+    tree = cKDTree(now_m[:, :2])
+    turns = np.linspace(-1, 1, _YAW_STEPS) * _MAX_YAW_RATE_RADPS * dt_s
+    score = np.empty(len(turns))
+    for k, turn in enumerate(turns):
+        c, s = np.cos(turn), np.sin(turn)
+        shifted = before_m[:, :2] - moved_m * np.array([np.cos(turn / 2), np.sin(turn / 2)])
+        seen = shifted @ np.array([[c, -s], [s, c]])
+        distance = tree.query(seen)[0]
+        score[k] = np.sum(1 / (1 + (distance / _TURN_SCALE_M) ** 2))
+    return float(turns[int(np.argmax(score))])
+
+
+def radar_tracks(observations: Sequence[Observation]) -> list[Track]:
+    """Moving clusters that perception followed for at least two scans and saw with at least two detections."""
+    rows: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, o in enumerate(observations):
+        for k in np.flatnonzero(o.radar_track_points >= _RADAR_POINTS):
+            if np.linalg.norm(o.radar_track_xyz_m[k]) < _FAR_M:
+                rows.setdefault((o.drive, int(o.radar_track_id[k])), []).append((i, int(k)))
+    tracks = []
+    for (drive, _), seen in rows.items():
+        if len(seen) < 2 or max(observations[i].radar_track_age[k] for i, k in seen) < _RADAR_AGE:
+            continue
+        velocity = np.array([observations[i].radar_track_velocity_mps[k] for i, k in seen], np.float64)
+        if np.median(np.linalg.norm(velocity, axis=1)) < _LEAST_SPEED_MPS:
+            continue
+        tracks.append(
+            Track(
+                drive,
+                np.array([i for i, _ in seen]),
+                np.array([k for _, k in seen]),
+                np.array([observations[i].radar_stamp_ns * 1e-9 for i, _ in seen]),
+                np.array([observations[i].radar_track_xyz_m[k] for i, k in seen], np.float64),
+                velocity,
+                np.full(len(seen), _RADAR_RATE_SIGMA_MPS),
+                np.full(len(seen), _RADAR_RANGE_SIGMA_M),
+            )
+        )
+    return tracks
+
+
+def lidar_tracks(observations: Sequence[Observation], motion: Sequence[Motion]) -> list[Track]:
+    """Clusters that can be road users. Sightings are those of the clusters' points' centres."""
+    scans, kept = [], []
+    for i, o in enumerate(observations):
+        rows = _road_users(o)
+        kept.append(rows)
+        centres = o.lidar_cluster_centre_m[rows].astype(np.float64)
+        covariance = np.tile(_CLUSTER_SIGMA_M**2 * np.eye(2), (len(centres), 1, 1))
+        scans.append(Scan(i, o.drive, o.stamp_ns * 1e-9, motion[i], centres, covariance))
+    return [_renumbered(t, kept) for t in follow(scans)]
+
+
+def moves_over_ground(track: Track) -> bool:
+    """Faster over ground than 2 m/s and than its sigma explains, over the later half of its sightings."""
+    later = take_sightings(track, np.arange(track.sightings // 2, track.sightings))
+    speed = np.median(np.linalg.norm(later.velocity_mps[:, :2], axis=1))
+    return bool(speed > max(_LEAST_SPEED_MPS, _SPEED_SIGMAS * float(np.median(later.rate_sigma_mps))))
+
+
+def passes_by(track: Track) -> bool:
+    """Seen in places more than 2 m apart: what stands before a standing car could be any other thing there."""
+    way_m = np.linalg.norm(track.position_m - track.position_m[0], axis=1)
+    return bool(way_m.max() > _LEAST_WAY_M)
+
+
+def camera_tracks(observations: Sequence[Observation], motion: Sequence[Motion]) -> list[Track]:
+    """Boxes of road users, followed in the camera's level axes (x forward, y left, z up)."""
+    scans = []
+    for i, o in enumerate(observations):
+        angles, range_m = _boxes(o)
+        centres = from_spherical(np.column_stack([angles, range_m]))
+        along, across = (
+            (_BOX_RANGE_FRACTION * range_m) ** 2,
+            (0.5**2 + (_BOX_BEARING_SIGMA_RAD * range_m) ** 2),
+        )
+        u = np.stack([np.cos(angles[:, 0]), np.sin(angles[:, 0])], axis=-1)
+        outer = u[:, :, None] * u[:, None, :]
+        covariance = along[:, None, None] * outer + across[:, None, None] * (np.eye(2) - outer)
+        scans.append(Scan(i, o.drive, o.camera_stamp_ns * 1e-9, motion[i], centres, covariance))
+    return follow(scans)
+
+
+def box_centres(track: Track, observations: Sequence[Observation]) -> Float[np.ndarray, "N 3"]:
+    """Centre of the box about a lidar track's cluster at each sighting, let down to the ground where that is known.
+
+    An object's lowest part is cut off with the ground, its highest lies above the topmost beam that meets it; a 3D
+    detector's box stands on the ground and is as high as road users are.
+    """
+    centres = np.empty((track.sightings, 3))
+    for k, (i, row) in enumerate(zip(track.frame, track.detection, strict=True)):
+        o = observations[i]
+        low, high = (
+            o.lidar_cluster_min_m[row].astype(np.float64),
+            o.lidar_cluster_max_m[row].astype(np.float64),
+        )
+        middle = 0.5 * (low + high)
+        if o.ground_plane is not None:
+            n, d = o.ground_plane[:3], o.ground_plane[3]
+            ground = -(n[0] * middle[0] + n[1] * middle[1] + d) / n[2]
+            if 0 < low[2] - ground < 1.0:
+                middle[2] = 0.5 * (ground + max(high[2], ground + _LEAST_HEIGHT_M))
+        centres[k] = middle
+    return centres
+
+
+def _speed(o: Observation, prior: Prior) -> float | None:
+    if o.ego_speed_mps is not None:
+        return o.ego_speed_mps
+    if o.radar_velocity_mps is None:
+        return None
+    return float((prior.T_lidar_radar[:3, :3] @ o.radar_velocity_mps)[0])
+
+
+def _objects(o: Observation) -> Float[np.ndarray, "K 3"]:
+    """Centres of all clusters no larger than a lorry."""
+    return o.lidar_cluster_centre_m[_no_larger_than_a_lorry(o)].astype(np.float64)
+
+
+def _no_larger_than_a_lorry(o: Observation) -> Bool[np.ndarray, " K"]:
+    size = np.max(o.lidar_cluster_max_m[:, :2] - o.lidar_cluster_min_m[:, :2], axis=1, initial=0.0)
+    near = np.linalg.norm(o.lidar_cluster_centre_m[:, :2], axis=1) < _FAR_M
+    return np.asarray((size <= _LARGEST_M) & (size >= _SMALLEST_M) & near)
+
+
+def _road_users(o: Observation) -> Int64[np.ndarray, " K"]:
+    """Rows of the clusters that can be road users: of their size, standing on the ground where that is known."""
+    possible = _no_larger_than_a_lorry(o)
+    if o.ground_plane is not None:
+        n, d = o.ground_plane[:3], o.ground_plane[3]
+        x, y, _ = o.lidar_cluster_centre_m.astype(np.float64).T
+        ground = -(n[0] * x + n[1] * y + d) / n[2]
+        top, bottom = o.lidar_cluster_max_m[:, 2] - ground, o.lidar_cluster_min_m[:, 2] - ground
+        possible &= (bottom < _STANDS_M) & (top > _LOWEST_M) & (top < _HIGHEST_M)
+    return np.flatnonzero(possible).astype(np.int64)
+
+
+def _renumbered(track: Track, kept: Sequence[np.ndarray]) -> Track:
+    """Detections numbered as the observation's clusters, not as the ones that were followed."""
+    rows = np.array([kept[i][k] for i, k in zip(track.frame, track.detection, strict=True)])
+    return Track(
+        track.drive, track.frame, rows, track.stamp_s, track.position_m, track.velocity_mps,
+        track.rate_sigma_mps, track.range_sigma_m,
+    )  # fmt: skip
+
+
+def _boxes(o: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth and elevation [rad] of box centres, and ranges [m] by height; boxes cut by the border are left out."""
+    x0, y0, x1, y1 = o.road_user_boxes_px.astype(np.float64).reshape(-1, 4).T
+    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+    inside = (x0 > _BORDER_PX) & (y0 > _BORDER_PX)
+    inside &= (x1 < o.image_width_px - _BORDER_PX) & (y1 < o.image_height_px - _BORDER_PX)
+    xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+    angle = camera_direction_angles(camera.unproject(np.stack([np.stack([xm, y], -1) for y in (ym, y0, y1)])))
+    height = np.array([_HEIGHT_M.get(name, _CAR_HEIGHT_M) for name in o.road_user_classes], np.float64)
+    distance = height / np.maximum(angle[1, :, 1] - angle[2, :, 1], 1e-3)
+    ok = inside & np.isfinite(angle).all(axis=(0, 2)) & (distance < _FAR_M)
+    return angle[0, ok], distance[ok]

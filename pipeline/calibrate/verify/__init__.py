@@ -1,0 +1,1 @@
+"""Whether a result may be trusted: held-out frames, errors at targets, verdict."""

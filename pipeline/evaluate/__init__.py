@@ -1,0 +1,1 @@
+"""Against the truth: reflector targets or a simulator's answer, and the paper's tables."""

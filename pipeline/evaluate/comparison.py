@@ -1,0 +1,134 @@
+"""Runs against the truth: errors at the reflectors as the paper measures them, and errors in sigmas."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import from_quaternion, inverse, log_se3
+from pipeline.geometry.targets import (
+    DEFAULT_TARGETS,
+    Doubt,
+    Picks,
+    doubt_of_loop,
+    doubt_of_picks,
+    errors_at_targets,
+    errors_of_picks,
+    loop_errors,
+)
+from schemas.calibrations import PAIRS, CalibrationRecord
+
+__all__ = ["Comparison", "compare", "current_runs"]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """One run (all pairs of one work key) against the truth."""
+
+    method: str
+    environment: str
+    errors: dict[str, np.ndarray]  # pair or "loop" -> azimuth, elevation [rad], range [m]
+    prior_errors: dict[str, np.ndarray]
+    statuses: dict[str, str]
+    normalised: np.ndarray  # error / sigma of every observable DoF of every pair
+    # Angle [rad] and shift [m] of pairs estimated apart; the shift is None where they did not determine it.
+    independent_loop: tuple[float, float | None] | None = None
+    truth_spread: dict[str, np.ndarray] = field(
+        default_factory=dict
+    )  # like errors: spread of one frame's picks
+    truth_sigma: dict[str, np.ndarray] = field(
+        default_factory=dict
+    )  # and what is left of it in the truth, 1 sigma
+
+
+def current_runs(records: Sequence[CalibrationRecord]) -> list[dict[str, CalibrationRecord]]:
+    """Records by run; of runs that differ only in code or configuration the last one counts."""
+    runs: dict[tuple[object, ...], dict[str, CalibrationRecord]] = {}
+    by_key: dict[tuple[str, str, str, str], dict[str, CalibrationRecord]] = {}
+    for r in records:
+        by_key.setdefault((r.vehicle, r.day, r.method, r.work_key), {})[r.pair] = r
+    for (vehicle, day, method, _), run in by_key.items():
+        first = run.get("camera_lidar")
+        start = (
+            None
+            if first is None or first.prior_qw is None
+            else (first.prior_qw, first.prior_qx, first.prior_tx_m)
+        )
+        seed = next(iter(run.values())).seed
+        runs[(vehicle, day, method, seed, start)] = run
+    return list(runs.values())
+
+
+def compare(
+    run: Mapping[str, CalibrationRecord],
+    truth: Mapping[str, Float[np.ndarray, "4 4"]] | None,
+    picks: Picks | None = None,
+    truth_sigma: tuple[float, float] = (0.0, 0.0),
+) -> Comparison | None:
+    """Errors of one run, from truth or from picked reflectors; None where a pair was refused.
+
+    Args:
+        run: the records of one work key, by pair.
+        truth: T of each pair.
+        picks: reflector positions, instead of a truth.
+        truth_sigma: how well the truth itself is known, per axis: rotation [rad], translation [m].
+    """
+    if set(run) != set(PAIRS) or any(r.qw is None for r in run.values()):
+        return None
+    T = {pair: _transform(run[pair], "") for pair in PAIRS}
+    priors = {pair: _transform(run[pair], "prior_") for pair in PAIRS}
+
+    def errors(of: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        if picks is not None:
+            found = {pair: errors_of_picks(pair, of[pair], picks) for pair in PAIRS}
+        else:
+            assert truth is not None, "either truth or picks"
+            found = {pair: errors_at_targets(pair, of[pair], truth[pair]) for pair in PAIRS}
+        return found | {"loop": loop_errors(of, DEFAULT_TARGETS if picks is None else picks.lidar_m)}
+
+    def doubts(doubt: Doubt | None) -> dict[str, np.ndarray]:
+        if picks is None or doubt is None:
+            return {}
+        found = {pair: doubt_of_picks(pair, T[pair], picks, doubt) for pair in PAIRS}
+        return found | {"loop": doubt_of_loop(T, picks, doubt)}
+
+    first = run["camera_lidar"]
+    return Comparison(
+        first.method,
+        first.environment,
+        errors(T),
+        errors(priors),
+        {pair: run[pair].status for pair in PAIRS},
+        np.concatenate([_normalised(run[pair], T[pair], truth[pair], truth_sigma) for pair in PAIRS])
+        if truth
+        else np.zeros(0),
+        _independent_loop(run),
+        doubts(picks.spread if picks else None),
+        doubts(picks.sigma if picks else None),
+    )
+
+
+def _independent_loop(run: Mapping[str, CalibrationRecord]) -> tuple[float, float | None] | None:
+    for record in run.values():
+        if record.loop_rotation_rad is not None:
+            return record.loop_rotation_rad, record.loop_translation_m
+    return None
+
+
+def _transform(record: CalibrationRecord, prefix: str) -> np.ndarray:
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    values = np.array([getattr(record, prefix + name) for name in names], np.float64)
+    return from_quaternion(values[:4], values[4:])
+
+
+def _normalised(
+    record: CalibrationRecord, T: np.ndarray, T_true: np.ndarray, truth_sigma: tuple[float, float]
+) -> np.ndarray:
+    if record.covariance is None or record.observable is None:
+        return np.zeros(0)
+    of_truth = np.repeat(np.square(truth_sigma), 3)
+    z = log_se3(T @ inverse(T_true)) / np.sqrt(np.diag(record.covariance) + of_truth)
+    return z[np.array(record.observable, bool)]

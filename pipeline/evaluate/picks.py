@@ -1,0 +1,156 @@
+"""The file of picked reflectors, the one format that `boresight simulate --reflectors` writes and `evaluate` reads.
+
+    {"vehicle": "vehicle-1", "day": "2026-03-02",        whose mounting it shows; left out: that of every record
+     "frames": 150,                                      of the standing recording
+     "reflector": {"edge_m": 0.35},                      optional: trihedral, edges that meet in its apex; it opens
+                                                         towards the lidar, one edge upright, to 2 deg
+     "camera": {"model", "K", "D", "width_px", "height_px"},
+     "targets": [{"pixel": [u, v], "lidar_m": [x, y, z], "radar_m": [x, y, z],
+                  "spread": {"pixel": [su, sv], "lidar_m": [sx, sy, sz], "radar_m": [sx, sy, sz]},
+                  "frames": {"pixel": 1, "lidar_m": 1, "radar_m": 150}}, ...]}
+
+Pixels refer to the full image, (0, 0) the centre of its first pixel; metres in each sensor's own frame. `spread`
+(optional) is the standard deviation of one pick, `frames` how many picks the position is the mean of: its standard
+error is spread / sqrt(frames). Further keys, such as the simulator's `truth`, are not read.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.evaluate.reflectors import Echoes, Found, find_in_lidar, find_in_radar
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.targets import Doubt, Picks
+
+__all__ = ["ReflectorFile", "find_again", "read_reflectors"]
+
+_KEYS = ("pixel", "lidar_m", "radar_m")
+
+
+@dataclass(frozen=True, eq=False)
+class ReflectorFile:
+    """Picks, whose they are, and where each sensor's positions come from."""
+
+    picks: Picks
+    vehicle: str | None
+    day: str | None
+    edge_m: float | None
+    sources: tuple[str, ...]  # sentences
+
+    def applies_to(self, vehicle: str, day: str) -> bool:
+        """True where the recording shows the mounting of that vehicle-day."""
+        return self.vehicle in (None, vehicle) and self.day in (None, day)
+
+
+def read_reflectors(path: Path) -> ReflectorFile:
+    """The file at `path`.
+
+    Raises:
+        ConfigError: no such file, no JSON, or not of this form.
+    """
+    try:
+        content = json.loads(path.read_text())
+        c, targets = content["camera"], content["targets"]
+        size = int(c["width_px"]), int(c["height_px"])
+        camera = Camera(c["model"], np.array(c["K"], float), np.array(c["D"], float), *size)
+        at = {key: np.array([t[key] for t in targets], float) for key in _KEYS}
+        spread = {key: _each(targets, "spread", key, np.zeros(at[key].shape[-1:])) for key in _KEYS}
+        frames = {key: _each(targets, "frames", key, np.ones(1)) for key in _KEYS}
+        error = {key: spread[key] / np.sqrt(frames[key].reshape(-1, 1)) for key in _KEYS}
+        edge = content.get("reflector", {}).get("edge_m")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as err:
+        raise ConfigError(str(path), "", f"no readable reflector file: {err!r}") from err
+    shapes = [a.shape[1:] for a in (*at.values(), *spread.values())]
+    if not targets or shapes != [(2,), (3,), (3,)] * 2 or not all(np.isfinite(a).all() for a in at.values()):
+        raise ConfigError(
+            str(path), "targets", "each needs pixel [u, v], lidar_m [x, y, z] and radar_m [x, y, z], finite"
+        )
+    known = any("spread" in t for t in targets)
+    picks = Picks(
+        at["pixel"],
+        at["lidar_m"],
+        at["radar_m"],
+        camera,
+        spread=Doubt(*(spread[key] for key in _KEYS)) if known else None,
+        sigma=Doubt(*(error[key] for key in _KEYS)) if known else None,
+    )
+    names = ("camera pixels", "lidar", "radar")
+    counts = [f"{name}: picked, {_count(frames[key])}" for name, key in zip(names, _KEYS, strict=True)]
+    sources = tuple(counts if known else [f"{name}: picked, spread unknown" for name in names])
+    return ReflectorFile(picks, content.get("vehicle"), content.get("day"), edge, sources)
+
+
+def find_again(
+    file: ReflectorFile, lidar: list[Echoes] | None, radar: list[Echoes] | None, where: str
+) -> ReflectorFile:
+    """The same with lidar and radar positions found in the frames of the recording, near the picks.
+
+    A reflector that is not found in a sensor keeps its pick there; `sources` says which.
+
+    Args:
+        file: picks, taken as guesses.
+        lidar: points and intensities of each frame, None where the log has no intensity.
+        radar: points and power of each frame, None where the log has no power.
+        where: name of the recording, for `sources`.
+    """
+    picks, edge = file.picks, file.edge_m
+    in_lidar = [find_in_lidar(lidar, at, edge) if lidar else None for at in picks.lidar_m]
+    in_radar = [find_in_radar(radar, at) if radar else None for at in picks.radar_m]
+    moved = _moved(_moved(picks, "lidar_m", in_lidar), "radar_m", in_radar)
+    how = f"apex of a {edge:g} m trihedral" if edge else "centre of the bright echoes, its apex lies deeper,"
+    sources = (
+        file.sources[0],
+        _source(f"lidar: {how}", in_lidar, where, file.sources[1]),
+        _source("radar: strongest echo", in_radar, where, file.sources[2]),
+    )
+    return replace(file, picks=moved, sources=sources)
+
+
+def _source(what: str, found: Sequence[Found | None], where: str, picked: str) -> str:
+    """Which reflectors were found in the recording, in how many frames, and what holds for the others."""
+    hits = [f"{k} ({f.frames} frames)" for k, f in enumerate(found, 1) if f is not None]
+    lost = [str(k) for k, f in enumerate(found, 1) if f is None]
+    if not hits:
+        return f"{picked}; none was found in {where}"
+    text = f"{what} found in {where}, reflectors {', '.join(hits)}"
+    return f"{text}; not found: {', '.join(lost)}, {picked}" if lost else text
+
+
+def _moved(picks: Picks, sensor: str, found: Sequence[Found | None]) -> Picks:
+    """Positions of that sensor, their spread and their sigma, as found."""
+    values = {
+        "position_m": getattr(picks, sensor).copy(),
+        "spread_m": getattr(picks.spread or _none(picks), sensor).copy(),
+        "sigma_m": getattr(picks.sigma or _none(picks), sensor).copy(),
+    }
+    for k, one in enumerate(found):
+        if one is not None:
+            for name, rows in values.items():
+                rows[k] = getattr(one, name)
+    changes: dict[str, Any] = {
+        sensor: values["position_m"],
+        "spread": replace(picks.spread or _none(picks), **{sensor: values["spread_m"]}),
+        "sigma": replace(picks.sigma or _none(picks), **{sensor: values["sigma_m"]}),
+    }
+    return replace(picks, **changes)
+
+
+def _none(picks: Picks) -> Doubt:
+    return Doubt(np.zeros_like(picks.pixels), np.zeros_like(picks.lidar_m), np.zeros_like(picks.radar_m))
+
+
+def _each(targets: list[dict[str, Any]], group: str, key: str, default: np.ndarray) -> np.ndarray:
+    return np.array([np.ravel(t.get(group, {}).get(key, default)) for t in targets], float)
+
+
+def _count(frames: np.ndarray) -> str:
+    if np.all(frames == 1):
+        return "once"
+    return f"mean of {' / '.join(f'{int(n)}' for n in frames.ravel())} frames"

@@ -1,0 +1,1 @@
+"""Extrinsics as values: priors, estimates of pairs, solutions."""

@@ -1,0 +1,134 @@
+"""The prior of a vehicle-day: from tf_static as logged, or from a file; moved on purpose for tests."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.config import PriorConfig
+from pipeline.errors import ConfigError, SolveError
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.se3 import from_quaternion, inverse, log_se3, perturb_exactly
+from schemas.observations import Observation
+
+__all__ = ["perturbed", "prior_key", "read_prior", "read_transforms"]
+
+_QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
+_SAME = 1e-6  # rad and m: tf_static repeats numbers, it does not measure
+
+
+def read_prior(observations: Sequence[Observation], config: PriorConfig, fleet_file: Path) -> Prior:
+    """The prior as configured.
+
+    Raises:
+        SolveError: no frame carries a tf_static prior, or it changes over the day.
+        ConfigError: the prior file cannot be read.
+    """
+    sigmas = np.radians(config.rotation_sigma_deg), config.translation_sigma_m
+    if config.source == "file":
+        assert config.file is not None, "the configuration was validated"
+        transforms = read_transforms(fleet_file.parent / config.file)
+        return Prior(transforms["camera_lidar"], transforms["lidar_radar"], *sigmas)
+    return Prior(_logged(observations, "camera_lidar"), _logged(observations, "lidar_radar"), *sigmas)
+
+
+def perturbed(prior: Prior, perturb: tuple[float, float] | None, seed: int) -> Prior:
+    """The prior moved by an exact angle [deg] and shift [m] on both transforms, with sigmas that allow for it.
+
+    The sigmas become max(configured sigma, size of the perturbation): whoever moves a prior on purpose knows
+    how far, as a workshop knows its tolerance, but not which way.
+    """
+    if perturb is None:
+        return prior
+    angle, shift = np.radians(perturb[0]), perturb[1]
+    rng = np.random.default_rng(seed)
+    T_camera_lidar = perturb_exactly(prior.T_camera_lidar, float(angle), shift, rng)
+    T_lidar_radar = perturb_exactly(prior.T_lidar_radar, float(angle), shift, rng)
+    return replace(
+        prior,
+        T_camera_lidar=T_camera_lidar,
+        T_lidar_radar=T_lidar_radar,
+        rotation_sigma_rad=max(prior.rotation_sigma_rad, float(angle)),
+        translation_sigma_m=max(prior.translation_sigma_m, shift),
+    )
+
+
+def prior_key(config: PriorConfig, fleet_file: Path) -> str:
+    """Hash of the prior file's content for the work key; empty where the prior is logged."""
+    if config.file is None:
+        return ""
+    path = fleet_file.parent / config.file
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    except OSError as err:
+        raise ConfigError(str(fleet_file), "prior.file", f"cannot read {path}: {err.strerror}") from err
+
+
+def read_transforms(path: Path) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """The three transforms from a JSON file with T_camera_lidar and T_lidar_radar (or T_radar_lidar), 4x4 row-major.
+
+    A file of several such objects by name (one per log) must agree with itself.
+
+    Raises:
+        ConfigError: not such a file, or not rigid transforms.
+    """
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError) as err:
+        raise ConfigError(str(path), "", f"no readable JSON: {err}") from err
+    if isinstance(content, dict) and "T_camera_lidar" not in content:
+        entries = [v for v in content.values() if isinstance(v, dict) and "T_camera_lidar" in v]
+        found = [_transforms(path, entry) for entry in entries]
+        if not found:
+            raise ConfigError(str(path), "T_camera_lidar", "missing")
+        for other in found[1:]:
+            if any(np.abs(other[pair] - found[0][pair]).max() > _SAME for pair in other):
+                raise ConfigError(str(path), "T_camera_lidar", "the file's entries disagree")
+        return found[0]
+    if not isinstance(content, dict):
+        raise ConfigError(str(path), "", "holds no object")
+    return _transforms(path, content)
+
+
+def _transforms(path: Path, entry: dict[str, object]) -> dict[str, np.ndarray]:
+    cl = _rigid(path, "T_camera_lidar", entry.get("T_camera_lidar"))
+    if "T_lidar_radar" in entry:
+        lr = _rigid(path, "T_lidar_radar", entry["T_lidar_radar"])
+    else:
+        lr = inverse(_rigid(path, "T_radar_lidar", entry.get("T_radar_lidar")))
+    return {"camera_lidar": cl, "lidar_radar": lr, "camera_radar": cl @ lr}
+
+
+def _rigid(path: Path, key: str, value: object) -> np.ndarray:
+    try:
+        T = np.array(value, np.float64)
+    except (TypeError, ValueError) as err:
+        raise ConfigError(str(path), key, "is no 4x4 matrix") from err
+    if T.shape != (4, 4) or not np.allclose(T[3], [0, 0, 0, 1]):
+        raise ConfigError(str(path), key, "is no 4x4 matrix with the last row 0 0 0 1")
+    R = T[:3, :3]
+    # 1e-3: calibrations shipped with three or four digits are still meant as rotations.
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        raise ConfigError(str(path), key, "its upper left 3x3 is no rotation")
+    u, _, vt = np.linalg.svd(R)
+    T[:3, :3] = u @ vt
+    return T
+
+
+def _logged(observations: Sequence[Observation], pair: str) -> np.ndarray:
+    names = [f"prior_{pair}_{part}" for part in (*_QUATERNION, *_TRANSLATION)]
+    rows = [[getattr(o, name) for name in names] for o in observations]
+    known = np.array([row for row in rows if None not in row], np.float64)
+    if not len(known):
+        raise SolveError(f'no prior: the logs have no tf_static chain for {pair}; give prior.source = "file"')
+    values = np.unique(known, axis=0)
+    T = from_quaternion(values[:, :4], values[:, 4:])
+    if np.abs(log_se3(inverse(T[0]) @ T)).max() > _SAME:
+        raise SolveError(f"the logged prior of {pair} changes over the day ({len(values)} values)")
+    return T[0]

@@ -1,0 +1,1 @@
+"""Three log containers behind one interface."""

@@ -1,0 +1,242 @@
+"""MCAP logs, read chunk by chunk: a wrong checksum, a lost tail or a broken record costs only itself.
+
+Source: MCAP specification, https://mcap.dev/spec (records, chunks, summary section, footer).
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Collection, Iterator
+from io import BytesIO
+from pathlib import Path
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import ChunkIndex, Footer, Schema
+
+from pipeline.errors import LogError
+from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
+
+__all__ = ["McapLog"]
+
+_MAGIC_SIZE = 8
+_RECORD = struct.Struct("<BQ")  # opcode, content length
+_MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
+_CHUNK = struct.Struct(
+    "<QQQII"
+)  # start and end time, uncompressed size and CRC, length of the compression's name
+_FOOTER_SIZE = _RECORD.size + 20
+_MAX_CHUNK_BYTES = 1 << 30  # a larger claim is a damaged length, not a chunk
+_LAST_OPCODE = max(Opcode)
+_DAMAGED = (*READ_ERRORS, struct.error, zstandard.ZstdError)
+
+
+class McapLog:
+    """LogReader of one .mcap file."""
+
+    def __init__(self, path: Path, cache: ChunkCache) -> None:
+        self.path, self.damage = path, Counter[str]()
+        self._cache, self._file = cache, path.open("rb")
+        self._size = path.stat().st_size
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, ChannelRecord] = {}
+        self._resolved: dict[int, Channel] = {}
+        self._trusted = (
+            False  # the summary's checksum was right: its schemas and channels win over the data section's
+        )
+        self._chunk_starts = self._read_summary()
+
+    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """See LogReader."""
+        self.damage.clear()
+        for opcode, start, length in self._records():
+            content = self._content(start, length)
+            if opcode == Opcode.CHUNK:
+                chunk = self._open_chunk(content, check=True)
+                if chunk is not None:
+                    self._cache.offer((str(self.path), start), chunk)
+                    yield from self._scan_chunk(chunk, start, topics)
+            elif opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
+                channel_id, _, log_time, _ = _MESSAGE.unpack_from(content)
+                channel = self._wanted(channel_id, topics)
+                if channel is not None:
+                    yield RawMessage(
+                        channel,
+                        log_time,
+                        (-1, start + _MESSAGE.size, start + length),
+                        memoryview(content)[_MESSAGE.size :],
+                    )
+            else:
+                self._learn(opcode, content)
+
+    def read(self, position: Position) -> memoryview:
+        """See LogReader."""
+        chunk_start, start, end = position
+        if chunk_start < 0:
+            return memoryview(self._content(start, end - start))
+        chunk = self._cache.get((str(self.path), chunk_start))
+        if chunk is None:
+            length = _RECORD.unpack(self._content(chunk_start - _RECORD.size, _RECORD.size))[1]
+            chunk = self._open_chunk(self._content(chunk_start, length), check=False)
+            if chunk is None or len(chunk) < end:
+                raise LogError(str(self.path), "changed while it was read")
+            self._cache.put((str(self.path), chunk_start), chunk)
+        return memoryview(chunk)[start:end]
+
+    def close(self) -> None:
+        """See LogReader."""
+        self._file.close()
+
+    # -- records ------------------------------------------------------------
+
+    def _content(self, start: int, length: int) -> bytes:
+        self._file.seek(start)
+        return self._file.read(length)
+
+    def _records(self) -> Iterator[tuple[int, int, int]]:
+        """(opcode, start of content, length) of records; lost footing is regained at the next known chunk."""
+        position = _MAGIC_SIZE
+        while True:
+            head = self._content(position, _RECORD.size)
+            if len(head) < _RECORD.size:
+                self.damage["truncated"] += 1
+                return
+            opcode, length = _RECORD.unpack(head)
+            start, end = position + _RECORD.size, position + _RECORD.size + length
+            next_chunk = self._next_chunk(position)
+            overruns = end > self._size or (next_chunk is not None and end > next_chunk)
+            if overruns or not (0 < opcode <= _LAST_OPCODE or opcode >= 0x80):
+                if next_chunk is None:
+                    self.damage["truncated" if end > self._size else "damaged_records"] += 1
+                    return
+                self.damage["damaged_records"] += 1
+                position = next_chunk
+                continue
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                if next_chunk is None:
+                    return
+                self.damage["damaged_records"] += 1
+                position = next_chunk
+                continue
+            if opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                yield opcode, start, length
+            position = end
+
+    def _next_chunk(self, position: int) -> int | None:
+        i = bisect_right(self._chunk_starts, position)
+        return self._chunk_starts[i] if i < len(self._chunk_starts) else None
+
+    def _read_summary(self) -> list[int]:
+        """Chunk positions from the summary, none where it is lost or damaged; learns schemas and channels."""
+        try:
+            tail = self._content(max(self._size - _FOOTER_SIZE - _MAGIC_SIZE, 0), _FOOTER_SIZE)
+            footer = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :])))
+            summary_end = self._size - _FOOTER_SIZE - _MAGIC_SIZE
+            if tail[0] != Opcode.FOOTER or not 0 < footer.summary_start < summary_end:
+                return []
+            summary = self._content(footer.summary_start, summary_end - footer.summary_start)
+            if footer.summary_crc and zlib.crc32(summary + tail[: _FOOTER_SIZE - 4]) != footer.summary_crc:
+                return []
+            starts = []
+            for opcode, start, end in _inner_records(summary):
+                content = summary[start:end]
+                self._learn(opcode, content)
+                if opcode == Opcode.CHUNK_INDEX:
+                    starts.append(ChunkIndex.read(ReadDataStream(BytesIO(content))).chunk_start_offset)
+            self._trusted = footer.summary_crc != 0
+            return sorted(s for s in starts if s < footer.summary_start)
+        except _DAMAGED:
+            return []
+
+    def _learn(self, opcode: int, content: bytes) -> None:
+        try:
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(ReadDataStream(BytesIO(content)))
+                if not (self._trusted and schema.id in self._schemas):
+                    self._schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = ChannelRecord.read(ReadDataStream(BytesIO(content)))
+                if not (self._trusted and channel.id in self._channels):
+                    self._channels[channel.id] = channel
+                    self._resolved.pop(channel.id, None)
+        except _DAMAGED:
+            self.damage["damaged_records"] += 1
+
+    # -- chunks ------------------------------------------------------------
+
+    def _open_chunk(self, content: bytes, *, check: bool) -> bytes | None:
+        """The chunk's records, None (and counted) where it is damaged."""
+        try:
+            _, _, size, crc, name_length = _CHUNK.unpack_from(content)
+            name_end = _CHUNK.size + name_length
+            compression = content[_CHUNK.size : name_end].decode()
+            data = _decompress(compression, memoryview(content)[name_end + 8 :], size)
+            if len(data) != size or (check and crc and zlib.crc32(data) != crc):
+                raise ValueError("checksum")  # counted below with what the codecs raise
+        except _DAMAGED:
+            self.damage["damaged_chunks"] += 1
+            return None
+        return data
+
+    def _scan_chunk(
+        self, chunk: bytes, chunk_start: int, topics: Collection[str] | None
+    ) -> Iterator[RawMessage]:
+        view = memoryview(chunk)
+        for opcode, start, end in _inner_records(chunk):
+            if opcode == Opcode.MESSAGE and end - start >= _MESSAGE.size:
+                channel_id, _, log_time, _ = _MESSAGE.unpack_from(chunk, start)
+                channel = self._wanted(channel_id, topics)
+                if channel is not None:
+                    first = start + _MESSAGE.size
+                    yield RawMessage(channel, log_time, (chunk_start, first, end), view[first:end])
+            else:
+                self._learn(opcode, chunk[start:end])
+
+    def _wanted(self, channel_id: int, topics: Collection[str] | None) -> Channel | None:
+        channel = self._resolved.get(channel_id)
+        if channel is None:
+            record = self._channels.get(channel_id)
+            if record is None:
+                self.damage["messages_of_unknown_channel"] += 1
+                return None
+            channel = self._resolved[channel_id] = _channel(record, self._schemas.get(record.schema_id))
+        return channel if topics is None or channel.topic in topics else None
+
+
+def _inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
+    position, size = 0, len(data)
+    while position + _RECORD.size <= size:
+        opcode, length = _RECORD.unpack_from(data, position)
+        start = position + _RECORD.size
+        position = start + length
+        if position > size:
+            return
+        yield opcode, start, position
+
+
+def _decompress(compression: str, data: memoryview, size: int) -> bytes:
+    if size > _MAX_CHUNK_BYTES:
+        raise ValueError("damaged length")
+    if compression == "zstd":
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+    if compression == "lz4":
+        return lz4.frame.decompress(data)
+    if compression:
+        raise ValueError(f"compression {compression}")
+    return bytes(data)
+
+
+def _channel(record: ChannelRecord, schema: Schema | None) -> Channel:
+    if schema is None:
+        return Channel(record.topic, "", record.message_encoding)
+    definition_format = "idl" if schema.encoding == "ros2idl" else "msg"
+    name = schema.name if schema.name.count("/") != 1 else schema.name.replace("/", "/msg/")  # ROS 1 spelling
+    return Channel(
+        record.topic, name, record.message_encoding, schema.data.decode(errors="replace"), definition_format
+    )

@@ -1,0 +1,196 @@
+"""One interface over MCAP, ROS 1 and ROS 2 bags: scan once for an index, then read messages by position.
+
+Every backend reads the containers' own records in file order and never a whole file, so damage costs the
+damaged part and memory stays bounded by the chunk cache, whatever the log's length. What is not whole is
+counted in `damage`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+from collections import Counter, OrderedDict
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from pipeline.errors import LogError
+
+__all__ = [
+    "BACKENDS",
+    "READ_ERRORS",
+    "Channel",
+    "ChunkCache",
+    "LogReader",
+    "Position",
+    "RawMessage",
+    "content_identity",
+    "open_log",
+]
+
+# Where a message lies inside its log: opaque to all but the backend that gave it.
+Position = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A stream of messages in a log.
+
+    `encoding` is "cdr" or "ros1" (others cannot be decoded); `definition` is the embedded schema, "" where
+    there is none; `definition_format` is "msg" or "idl".
+    """
+
+    topic: str
+    msgtype: str
+    encoding: str
+    definition: str = ""
+    definition_format: str = "msg"
+
+
+@dataclass(frozen=True, slots=True)
+class RawMessage:
+    """One message as logged: `data` is valid until the next one is taken from the scan."""
+
+    channel: Channel
+    log_time_ns: int
+    position: Position
+    data: memoryview
+
+
+@runtime_checkable
+class LogReader(Protocol):
+    """What a backend can do. `damage` counts by name what could not be read, complete after a scan."""
+
+    path: Path
+    damage: Counter[str]
+
+    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """All whole messages of the topics (None = every topic) in file order."""
+
+    def read(self, position: Position) -> memoryview:
+        """The payload of a message that a scan has given.
+
+        Raises:
+            LogError: the log changed since the scan.
+        """
+
+    def close(self) -> None:
+        """Let go of files."""
+
+
+# By what the first bytes say, whatever the file is called. Values are resolved on use.
+BACKENDS: dict[str, str] = {
+    ".mcap": "pipeline.ingest.containers.mcap:McapLog",
+    ".bag": "pipeline.ingest.containers.rosbag1:BagLog",
+    ".db3": "pipeline.ingest.containers.rosbag2_sqlite:Db3Log",
+    ".zstd": "pipeline.ingest.containers.rosbag2_folder:CompressedLog",
+    "folder": "pipeline.ingest.containers.rosbag2_folder:FolderLog",
+}
+_MAGIC = {
+    b"\x89MCAP": ".mcap",
+    b"#ROSBAG": ".bag",
+    b"SQLite format 3\0": ".db3",
+    b"\x28\xb5\x2f\xfd": ".zstd",
+}
+# What damaged bytes make the container libraries raise; a backend turns it into counted damage or a LogError.
+READ_ERRORS = (
+    ValueError,
+    KeyError,
+    IndexError,
+    OSError,
+    EOFError,
+    OverflowError,
+    RuntimeError,
+    ArithmeticError,
+    AssertionError,
+)
+
+
+def open_log(path: Path, cache: ChunkCache | None = None) -> LogReader:
+    """The reader of a log: an MCAP, .bag or .db3 file, or a ROS 2 bag folder.
+
+    Raises:
+        LogError: there is no such file, or it is none of these.
+    """
+    module, name = BACKENDS[_kind(path)].split(":")
+    backend = getattr(importlib.import_module(module), name)
+    return backend(path, cache or ChunkCache())
+
+
+def content_identity(path: Path) -> str:
+    """Name, size and a hash of samples of a log, for work keys.
+
+    Hashed are the first and last MiB of each file and 64 samples of 4 KiB evenly between. A full hash would
+    read a fleet's terabytes only to find that nothing is to be done; logs are written once, and what changes
+    in them (an appended, recovered, re-indexed or re-recorded log) changes size, head or tail. Modification
+    times are left out: copies differ in them.
+    """
+    digest = hashlib.sha256(path.name.encode())
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    try:
+        for file in files:
+            size = file.stat().st_size
+            digest.update(f"{file.relative_to(path) if path.is_dir() else ''}\0{size}\0".encode())
+            with file.open("rb") as stream:
+                for start, length in _samples(size):
+                    stream.seek(start)
+                    digest.update(stream.read(length))
+    except OSError as err:
+        raise LogError(str(path), f"cannot be read: {err}") from err
+    return f"{path.name}:{digest.hexdigest()[:24]}"
+
+
+class ChunkCache:
+    """Decompressed chunks of all open logs, the oldest dropped first: the bound on a reader's memory."""
+
+    def __init__(self, max_bytes: int = 128 << 20) -> None:
+        self._max_bytes, self._bytes = max_bytes, 0
+        self._chunks: OrderedDict[tuple[str, int], bytes] = OrderedDict()
+
+    def get(self, key: tuple[str, int]) -> bytes | None:
+        """The chunk, None where it was dropped."""
+        chunk = self._chunks.get(key)
+        if chunk is not None:
+            self._chunks.move_to_end(key)
+        return chunk
+
+    def offer(self, key: tuple[str, int], chunk: bytes) -> None:
+        """Keep a chunk where there is room: a scan of a short day saves the second pass its decompression."""
+        if self._bytes + len(chunk) <= self._max_bytes and key not in self._chunks:
+            self.put(key, chunk)
+
+    def put(self, key: tuple[str, int], chunk: bytes) -> None:
+        """Keep a chunk; at least the last one stays, however large."""
+        self._chunks[key] = chunk
+        self._bytes += len(chunk)
+        while self._bytes > self._max_bytes and len(self._chunks) > 1:
+            _, dropped = self._chunks.popitem(last=False)
+            self._bytes -= len(dropped)
+
+
+def _kind(path: Path) -> str:
+    if path.is_dir():
+        return "folder"
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(16)
+    except OSError as err:
+        raise LogError(str(path), f"cannot be read: {err.strerror}") from err
+    if not head:
+        raise LogError(str(path), "is empty")
+    for magic, kind in _MAGIC.items():
+        # Half of the bytes are enough: a flipped bit must not cost the whole log.
+        if 2 * sum(a == b for a, b in zip(head, magic, strict=False)) > len(magic):
+            return kind
+    raise LogError(
+        str(path), "is no log that Boresight reads: an .mcap, .bag or .db3 file, or a ROS 2 bag folder"
+    )
+
+
+def _samples(size: int) -> list[tuple[int, int]]:
+    mib, block, count = 1 << 20, 4096, 64
+    if size <= 2 * mib + count * block:
+        return [(0, size)]
+    step = (size - 2 * mib) // count
+    return [(0, mib), *((mib + i * step, block) for i in range(count)), (size - mib, mib)]

@@ -1,0 +1,230 @@
+"""ROS 1 bags (format 2.0), read chunk by chunk: one cut off, without its index, reads as far as it goes.
+
+Source: http://wiki.ros.org/Bags/Format/2.0
+"""
+
+from __future__ import annotations
+
+import bz2
+import struct
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import lz4.frame
+
+from pipeline.errors import LogError
+from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
+
+__all__ = ["BagLog"]
+
+_FIRST_RECORD = 13  # after "#ROSBAG V2.0\n"
+_MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
+_KNOWN = (_MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION)
+_U32 = struct.Struct("<I")
+_MAX_HEADER_BYTES = 1 << 20
+_MAX_CHUNK_BYTES = 1 << 30
+_DAMAGED = (*READ_ERRORS, struct.error)
+
+
+class BagLog:
+    """LogReader of one .bag file."""
+
+    def __init__(self, path: Path, cache: ChunkCache) -> None:
+        self.path, self.damage = path, Counter[str]()
+        self._cache, self._file = cache, path.open("rb")
+        self._size = path.stat().st_size
+        self._channels: dict[int, Channel] = {}
+        self._chunk_starts = self._read_index()
+
+    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """See LogReader."""
+        self.damage.clear()
+        for position, header, start, length in self._records():
+            if header["op"] == bytes([_CHUNK]):
+                chunk = self._open_chunk(header, start, length)
+                if chunk is not None:
+                    self._cache.offer((str(self.path), position), chunk)
+                    yield from self._scan_records(chunk, position, topics)
+            elif header["op"] == bytes([_MESSAGE]):  # bags of an unchunked writer
+                channel, stamp = self._message(header, topics)
+                if channel is not None:
+                    yield RawMessage(
+                        channel, stamp, (-1, start, start + length), memoryview(self._content(start, length))
+                    )
+            elif header["op"] == bytes([_CONNECTION]):
+                self._learn(header, self._content(start, length))
+
+    def read(self, position: Position) -> memoryview:
+        """See LogReader."""
+        chunk_start, start, end = position
+        if chunk_start < 0:
+            return memoryview(self._content(start, end - start))
+        chunk = self._cache.get((str(self.path), chunk_start))
+        if chunk is None:
+            record = self._record(chunk_start)
+            chunk = self._open_chunk(*record) if record is not None else None
+            if chunk is None or len(chunk) < end:
+                raise LogError(str(self.path), "changed while it was read")
+            self._cache.put((str(self.path), chunk_start), chunk)
+        return memoryview(chunk)[start:end]
+
+    def close(self) -> None:
+        """See LogReader."""
+        self._file.close()
+
+    # -- records ------------------------------------------------------------
+
+    def _content(self, start: int, length: int) -> bytes:
+        self._file.seek(start)
+        return self._file.read(length)
+
+    def _record(self, position: int) -> tuple[dict[str, bytes], int, int] | None:
+        """(header, start of data, its length) of a record, None where there is no whole one."""
+        head = self._content(position, 4)
+        if len(head) < 4:
+            return None
+        header_length = _U32.unpack(head)[0]
+        if header_length > min(_MAX_HEADER_BYTES, self._size - position):
+            return None
+        raw = self._content(position + 4, header_length + 4)
+        header = _fields(raw[:header_length])
+        if len(raw) < header_length + 4 or header is None:
+            return None
+        length = _U32.unpack(raw[header_length:])[0]
+        start = position + 8 + header_length
+        return (header, start, length) if start + length <= self._size else None
+
+    def _records(self) -> Iterator[tuple[int, dict[str, bytes], int, int]]:
+        position = _FIRST_RECORD
+        while position < self._size:
+            record = self._record(position)
+            next_chunk = self._next_chunk(position)
+            if record is None or (next_chunk is not None and record[1] + record[2] > next_chunk):
+                self.damage["truncated" if next_chunk is None else "damaged_records"] += 1
+                if next_chunk is None:
+                    return
+                position = next_chunk
+                continue
+            yield position, *record
+            position = record[1] + record[2]
+
+    def _next_chunk(self, position: int) -> int | None:
+        i = bisect_right(self._chunk_starts, position)
+        return self._chunk_starts[i] if i < len(self._chunk_starts) else None
+
+    def _read_index(self) -> list[int]:
+        """Chunk positions from the index at the bag's end, empty where it is lost; learns its connections."""
+        starts: list[int] = []
+        try:
+            first = self._record(_FIRST_RECORD)
+            position = struct.unpack("<Q", first[0]["index_pos"])[0] if first is not None else 0
+            while 0 < position < self._size:
+                record = self._record(position)
+                if record is None:
+                    return []
+                header, start, length = record
+                if header["op"] == bytes([_CHUNK_INFO]):
+                    starts.append(struct.unpack("<Q", header["chunk_pos"])[0])
+                elif header["op"] == bytes([_CONNECTION]):
+                    self._learn(header, self._content(start, length))
+                position = start + length
+        except _DAMAGED:
+            return []
+        return sorted(starts)
+
+    def _learn(self, header: dict[str, bytes], data: bytes) -> None:
+        fields = _fields(data)
+        try:
+            if fields is None or len(header["conn"]) != 4:
+                raise ValueError("connection")
+            package, name = fields["type"].decode().split("/")
+            channel = Channel(
+                header["topic"].decode(),
+                f"{package}/msg/{name}",
+                "ros1",
+                fields["message_definition"].decode(),
+            )
+            self._channels[_U32.unpack(header["conn"])[0]] = channel
+        except _DAMAGED:
+            self.damage["damaged_records"] += 1
+
+    # -- chunks ------------------------------------------------------------
+
+    def _open_chunk(self, header: dict[str, bytes], start: int, length: int) -> bytes | None:
+        try:
+            size = _U32.unpack(header["size"])[0]
+            if size > _MAX_CHUNK_BYTES:
+                raise ValueError("damaged length")
+            data = _decompress(header["compression"], self._content(start, length), size)
+            if len(data) != size:
+                raise ValueError("damaged chunk")
+        except _DAMAGED:
+            self.damage["damaged_chunks"] += 1
+            return None
+        return data
+
+    def _scan_records(
+        self, chunk: bytes, chunk_start: int, topics: Collection[str] | None
+    ) -> Iterator[RawMessage]:
+        view, position, size = memoryview(chunk), 0, len(chunk)
+        while position < size:
+            header_length = _U32.unpack_from(chunk, position)[0] if position + 4 <= size else size
+            start = position + 8 + header_length
+            header = _fields(chunk[position + 4 : start - 4]) if start <= size else None
+            if header is None:
+                self.damage["damaged_records"] += 1
+                return
+            end = start + _U32.unpack_from(chunk, start - 4)[0]
+            if end > size:
+                self.damage["damaged_records"] += 1
+                return
+            if header["op"] == bytes([_MESSAGE]):
+                channel, stamp = self._message(header, topics)
+                if channel is not None:
+                    yield RawMessage(channel, stamp, (chunk_start, start, end), view[start:end])
+            elif header["op"] == bytes([_CONNECTION]):
+                self._learn(header, chunk[start:end])
+            position = end
+
+    def _message(
+        self, header: dict[str, bytes], topics: Collection[str] | None
+    ) -> tuple[Channel | None, int]:
+        try:
+            channel = self._channels.get(_U32.unpack(header["conn"])[0])
+            seconds, nanoseconds = struct.unpack("<II", header["time"])
+        except _DAMAGED:
+            self.damage["damaged_records"] += 1
+            return None, 0
+        if channel is None:
+            self.damage["messages_of_unknown_channel"] += 1
+            return None, 0
+        return (channel if topics is None or channel.topic in topics else None), seconds * 10**9 + nanoseconds
+
+
+def _fields(data: bytes) -> dict[str, bytes] | None:
+    """`name=value` fields of a header; None where they do not add up or a record has no known op."""
+    fields: dict[str, bytes] = {}
+    position = 0
+    while position + 4 <= len(data):
+        length = _U32.unpack_from(data, position)[0]
+        name, equals, value = data[position + 4 : position + 4 + length].partition(b"=")
+        position += 4 + length
+        if not equals or position > len(data):
+            return None
+        fields[name.decode(errors="replace")] = value
+    is_record = "message_definition" not in fields
+    if position != len(data) or (is_record and fields.get("op", b"") not in [bytes([k]) for k in _KNOWN]):
+        return None
+    return fields
+
+
+def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
+    if compression == b"lz4":
+        return lz4.frame.decompress(data)
+    if compression == b"bz2":
+        return bz2.BZ2Decompressor().decompress(data, size + 1)
+    if compression == b"none":
+        return data
+    raise ValueError(f"compression {compression!r}")

@@ -1,0 +1,87 @@
+"""ROS 2 bag folders: their .db3 or .mcap files together, with or without metadata.yaml, compressed or not."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import zstandard
+
+from pipeline.errors import LogError
+from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, RawMessage, open_log
+
+__all__ = ["CompressedLog", "FolderLog"]
+
+_FILES = ("*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd")
+
+
+class FolderLog:
+    """LogReader of a folder; a file of it that cannot be opened is counted and the others are read."""
+
+    def __init__(self, path: Path, cache: ChunkCache) -> None:
+        self.path, self.damage = path, Counter[str]()
+        self._logs: list[LogReader] = []
+        self._lost = 0
+        problems = []
+        for file in sorted(p for pattern in _FILES for p in path.glob(pattern)):
+            try:
+                self._logs.append(open_log(file, cache))
+            except LogError as err:
+                self._lost += 1
+                problems.append(str(err))
+        if not self._logs:
+            raise LogError(
+                str(path), "; ".join(problems) or "holds no .db3 or .mcap file, so it is no ROS 2 bag"
+            )
+
+    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """See LogReader."""
+        self.damage.clear()
+        for i, log in enumerate(self._logs):
+            for m in log.scan(topics):
+                yield RawMessage(m.channel, m.log_time_ns, (i, *m.position), m.data)
+            self.damage.update(log.damage)
+        if self._lost:
+            self.damage["unreadable_files"] += self._lost
+
+    def read(self, position: Position) -> memoryview:
+        """See LogReader."""
+        return self._logs[position[0]].read(position[1:])
+
+    def close(self) -> None:
+        """See LogReader."""
+        for log in self._logs:
+            log.close()
+
+
+class CompressedLog:
+    """LogReader of a file that rosbag2 compressed as a whole (.zstd), unpacked aside while it is open."""
+
+    def __init__(self, path: Path, cache: ChunkCache) -> None:
+        self.path = path
+        self._folder = tempfile.TemporaryDirectory(prefix="boresight-")
+        try:
+            plain = Path(self._folder.name) / path.with_suffix("").name
+            with path.open("rb") as source, plain.open("wb") as target:
+                shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(source), target, 1 << 22)
+            self._log = open_log(plain, cache)
+        except (zstandard.ZstdError, OSError, LogError) as err:
+            self._folder.cleanup()
+            raise LogError(str(path), f"cannot be unpacked: {err}") from err
+        self.damage = self._log.damage
+
+    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """See LogReader."""
+        return self._log.scan(topics)
+
+    def read(self, position: Position) -> memoryview:
+        """See LogReader."""
+        return self._log.read(position)
+
+    def close(self) -> None:
+        """See LogReader."""
+        self._log.close()
+        self._folder.cleanup()

@@ -1,0 +1,1 @@
+"""Messages of every kind to plain arrays."""

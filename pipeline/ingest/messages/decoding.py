@@ -1,0 +1,99 @@
+"""Messages from bytes: header stamps from the wire, whole messages by the schema that the log carries."""
+
+from __future__ import annotations
+
+import struct
+from functools import lru_cache
+from typing import Any
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from pipeline.errors import LogError
+from pipeline.ingest.containers.reader import READ_ERRORS, Channel
+from pipeline.ingest.messages.definitions import DEFINITIONS
+
+__all__ = ["DECODE_ERRORS", "decode", "header_frame_id", "header_stamp_ns"]
+
+# What malformed bytes make rosbags and numpy raise.
+DECODE_ERRORS = (*READ_ERRORS, struct.error, SerdeError, TypesysError, TypeError, AttributeError, MemoryError)
+_STAMP_END = (
+    12  # CDR: 4 bytes of encapsulation, seconds, nanoseconds; ROS 1: sequence number, seconds, nanoseconds
+)
+_SEPARATOR = "=" * 80 + "\n"
+
+
+def header_stamp_ns(channel: Channel, data: memoryview) -> int | None:
+    """Stamp of a message that starts with a std_msgs/Header; None where that is cut off, zero or no time."""
+    if len(data) < _STAMP_END:
+        return None
+    seconds, nanoseconds = struct.unpack_from(_order(channel, data) + "iI", data, 4)
+    return (
+        seconds * 10**9 + nanoseconds
+        if seconds >= 0 and 0 <= nanoseconds < 10**9 and seconds + nanoseconds > 0
+        else None
+    )
+
+
+def header_frame_id(channel: Channel, data: memoryview) -> str:
+    """Frame id of such a message, without ROS 1's leading slash; "" where there is none."""
+    if len(data) < _STAMP_END + 4:
+        return ""
+    length = struct.unpack_from(_order(channel, data) + "I", data, _STAMP_END)[0]
+    raw = bytes(data[_STAMP_END + 4 : _STAMP_END + 4 + min(length, 1024)])
+    return raw.rstrip(b"\0").decode(errors="replace").lstrip("/")
+
+
+def decode(channel: Channel, data: memoryview) -> Any:
+    """The message by its embedded definition (arrays are views: copy what outlives the bytes).
+
+    Raises:
+        LogError: no definition, neither CDR nor ROS 1, or bytes that do not fit the definition.
+    """
+    try:
+        store = _typestore(channel)
+        if channel.encoding == "ros1":
+            return store.deserialize_ros1(data, channel.msgtype)
+        return store.deserialize_cdr(data, channel.msgtype)
+    except DECODE_ERRORS as err:
+        raise LogError(
+            "", f"{channel.msgtype} cannot be decoded: {type(err).__name__}: {err}", topic=channel.topic
+        ) from err
+
+
+def _order(channel: Channel, data: memoryview) -> str:
+    return "<" if channel.encoding == "ros1" or data[1] & 1 else ">"
+
+
+@lru_cache(maxsize=64)
+def _typestore(channel: Channel) -> Typestore:
+    if channel.encoding not in {"cdr", "ros1"}:
+        raise ValueError(f"encoding {channel.encoding!r} is neither cdr nor ros1")
+    if not channel.definition:
+        return _fallback(channel.msgtype)
+    store = get_typestore(Stores.EMPTY)
+    if channel.definition_format == "msg":
+        types = get_types_from_msg(channel.definition, channel.msgtype)
+    elif channel.definition.startswith(f"{_SEPARATOR}IDL: "):
+        types = {}
+        for part in channel.definition.split(_SEPARATOR)[1:]:
+            types.update(get_types_from_idl(part.split("\n", 1)[1]))
+    else:
+        types = get_types_from_idl(channel.definition)
+    store.register(types)
+    return store
+
+
+@lru_cache(maxsize=8)
+def _fallback(msgtype: str) -> Typestore:
+    """For bags up to ROS 2 Humble, which carry no definitions: that distribution's own."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    if msgtype in DEFINITIONS:
+        for name in (*DEFINITIONS[msgtype][0], msgtype):
+            store.register(get_types_from_msg(DEFINITIONS[name][1], name))
+    elif msgtype not in store.fielddefs:
+        raise ValueError(
+            "the log carries no definition of it: record with ROS 2 Iron or newer, or convert the bag to MCAP"
+        )
+    return store

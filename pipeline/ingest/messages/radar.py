@@ -1,0 +1,127 @@
+"""Radar scans as PointCloud2, RadarScan or RadarTracks; Doppler becomes range rate, positive = receding."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from pipeline.config import RadarTopics
+from pipeline.ingest.messages.point_cloud import cloud_columns, first_field
+
+__all__ = ["RadarCloud", "read_radar"]
+
+_POWER = ("power", "rcs", "amplitude", "intensity", "snr", "snr_db", "power_db")
+_MIN_RANGE_M, _MAX_RANGE_M = 0.05, 1000.0  # no automotive radar sees farther; more is a damaged number
+_FLAT_RAD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RadarCloud:
+    """Detections of one scan, radar frame; `range_rate_mps` positive = receding, not ego-compensated."""
+
+    xyz_m: Float32[np.ndarray, "N 3"]
+    range_rate_mps: Float32[np.ndarray, " N"]
+    power_db: Float32[np.ndarray, " N"] | None
+    has_elevation: bool
+    dropped: Counter[str] = field(default_factory=Counter)
+
+
+@np.errstate(all="ignore")  # damaged numbers become inf or nan, and those are dropped
+def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
+    """Detections of one radar message, those that are not finite or at no range dropped and counted.
+
+    Args:
+        message: decoded by the log's own definition.
+        msgtype: PointCloud2, RadarScan or RadarTracks decide what is read.
+        config: name and sign of the Doppler field, sign of RadarScan's azimuth. The velocity of a RadarTrack
+            needs no sign: taken relative to the sensor, its part along the line of sight is the range rate.
+
+    Raises:
+        ValueError: a field is missing (the message names those there are), or the layout is contradictory.
+    """
+    kind = msgtype.rsplit("/", 1)[-1]
+    xyz, range_rate, power = {"RadarScan": _scan, "RadarTracks": _tracks}.get(kind, _cloud)(message, config)
+    range2 = np.einsum("ij,ij->i", xyz, xyz)
+    keep, dropped = _within(range2, range_rate)
+    xyz = xyz[keep]
+    return RadarCloud(
+        xyz.astype(np.float32),
+        range_rate[keep].astype(np.float32),
+        None if power is None else power[keep].astype(np.float32),
+        bool(np.any(np.abs(xyz[:, 2]) > _FLAT_RAD * np.sqrt(range2[keep]))),
+        dropped,
+    )
+
+
+def _within(
+    range2: Float[np.ndarray, " N"], range_rate_mps: Float[np.ndarray, " N"]
+) -> tuple[slice | Bool[np.ndarray, " N"], Counter[str]]:
+    """What to index with to keep the detections that are measurements, and how many are dropped for what."""
+    measured = np.isfinite(range_rate_mps)
+    keep = (range2 >= _MIN_RANGE_M**2) & (range2 <= _MAX_RANGE_M**2) & measured  # False for NaN
+    if keep.all():
+        return slice(None), Counter()
+    finite, near = np.isfinite(range2) & measured, range2 < _MIN_RANGE_M**2
+    dropped = {
+        "radar_points_not_finite": int(np.sum(~finite)),
+        "radar_points_at_no_range": int(np.sum(finite & near)),
+        "radar_points_beyond_range": int(np.sum(finite & ~near & ~keep)),
+    }
+    return keep, +Counter(dropped)
+
+
+_Columns = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"], Float[np.ndarray, " N"] | None]
+
+
+def _cloud(message: Any, config: RadarTopics) -> _Columns:
+    points = cloud_columns(message)
+    names = points.dtype.names or ()
+    if config.doppler_field not in names:
+        raise ValueError(
+            f"no field {config.doppler_field!r} for the Doppler; there are {', '.join(names) or 'none'}"
+        )
+    missing = [n for n in ("x", "y") if n not in names]
+    if missing:
+        raise ValueError(f"no field {' and '.join(missing)}; there are {', '.join(names)}")
+    used = ["x", "y", *(["z"] if "z" in names else []), config.doppler_field]
+    if any(points[n].ndim > 1 for n in used):
+        raise ValueError(f"a field of {', '.join(used)} holds more than one value a point")
+    # A planar radar has no z: 0 and has_elevation = False say so.
+    z = points["z"] if "z" in names else 0.0
+    xyz = np.empty((len(points), 3))
+    xyz[:, 0], xyz[:, 1], xyz[:, 2] = points["x"], points["y"], z
+    doppler = points[config.doppler_field].astype(np.float64)
+    power = first_field(points, _POWER)
+    return xyz, _receding(doppler, config), None if power is None else power.astype(np.float64)
+
+
+def _scan(message: Any, config: RadarTopics) -> _Columns:
+    raw = np.array(
+        [(r.range, r.azimuth, r.elevation, r.doppler_velocity, r.amplitude) for r in message.returns],
+        np.float64,
+    ).reshape(-1, 5)
+    distance, azimuth, elevation, doppler, amplitude = raw.T
+    azimuth = azimuth if config.azimuth_positive == "left" else -azimuth
+    level = np.cos(elevation)
+    directions = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
+    xyz = distance[:, None] * directions
+    return xyz, _receding(doppler, config), amplitude
+
+
+def _tracks(message: Any, _config: RadarTopics) -> _Columns:
+    xyz = np.array([(t.position.x, t.position.y, t.position.z) for t in message.tracks], np.float64).reshape(
+        -1, 3
+    )
+    velocity = np.array(
+        [(t.velocity.x, t.velocity.y, t.velocity.z) for t in message.tracks], np.float64
+    ).reshape(-1, 3)
+    range_rate = np.einsum("ij,ij->i", xyz, velocity) / np.linalg.norm(xyz, axis=1)
+    return xyz, range_rate, None
+
+
+def _receding(doppler: Float[np.ndarray, " N"], config: RadarTopics) -> Float[np.ndarray, " N"]:
+    return doppler if config.doppler_positive == "receding" else 0.0 - doppler  # no negative zeros

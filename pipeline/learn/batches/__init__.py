@@ -1,0 +1,1 @@
+"""Rows of table `training` to batches of tensors."""

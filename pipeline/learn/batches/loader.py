@@ -1,0 +1,221 @@
+"""Batches of table `training`: shuffled by row group, the same for the same seed, resumed to the frame.
+
+The order of an epoch is decided before anything is read: row groups in random order, cut into windows, and the frames
+of each window in random order. So a place in the stream is two numbers (epoch, frames taken), and whoever comes back
+to it continues exactly as if nothing had happened. The next window is read while the current one is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import ContractError
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.batches.collate import collate
+from pipeline.learn.prepare.inventory import read_leaks
+from pipeline.store.columns import RowGroup, read_columns, read_group, row_groups
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_manifest
+from schemas.training import TRAINING, TrainingRow
+
+__all__ = ["TrainingLoader", "load_split"]
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """A row group and those of its rows that belong to the split."""
+
+    group: RowGroup
+    rows: tuple[int, ...]
+
+
+class TrainingLoader:
+    """An iterator of batches.
+
+    Args:
+        lake: where table `training` lies.
+        batch_size: frames of a batch, on this rank.
+        split: train, val or test.
+        seed: order of the frames; the same on all ranks.
+        shuffle: False: frames in order.
+        repeat: True: epoch after epoch without end, all batches full. False: once, the last batch as it comes.
+        rank: of this process; each takes its own row groups.
+        ranks: how many processes there are.
+        window_groups: row groups that are mixed with each other and held in memory, twice (5-10 MB each).
+        partitions: only these vehicle-days.
+
+    Raises:
+        ContractError: there is no frame of that split, or fewer row groups than ranks.
+    """
+
+    def __init__(
+        self,
+        lake: Lake,
+        batch_size: int,
+        *,
+        split: str = "train",
+        seed: int = 0,
+        shuffle: bool = True,
+        repeat: bool = True,
+        rank: int = 0,
+        ranks: int = 1,
+        window_groups: int = 16,
+        partitions: Sequence[Partition] | None = None,
+    ) -> None:
+        self._lake, self._batch_size = lake, batch_size
+        self._seed, self._shuffle, self._repeat = seed, shuffle, repeat
+        self._rank, self._ranks, self._window = rank, ranks, window_groups
+        self._chunks, self._data_key = _find_chunks(lake, split, partitions)
+        if len(self._chunks) < ranks:
+            problem = f"{split} has {len(self._chunks)} row groups, not enough for {ranks} processes"
+            raise ContractError(str(lake.root / TRAINING.name), problem)
+        self._epoch, self._taken = 0, 0
+        self._order: list[tuple[RowGroup, int]] = []
+        self._windows: list[tuple[int, list[RowGroup]]] = []  # first position, groups
+        self._starts: set[int] = set()
+        self._ordered_epoch = -1
+        self._reader = ThreadPoolExecutor(1, "training-reader")
+        self._held: dict[RowGroup, Future[list[TrainingRow]]] = {}
+
+    @property
+    def frames(self) -> int:
+        """Frames of the split, on all ranks."""
+        return sum(len(c.rows) for c in self._chunks)
+
+    @property
+    def batches_per_epoch(self) -> int:
+        """Full batches that one epoch gives each rank, on average; at least one."""
+        return max(1, self.frames // (self._batch_size * self._ranks))
+
+    @property
+    def epoch(self) -> int:
+        """Epoch that the next frame comes from."""
+        return self._epoch
+
+    def __iter__(self) -> Iterator[TrainingBatch]:
+        return self
+
+    def __next__(self) -> TrainingBatch:
+        rows: list[TrainingRow] = []
+        while len(rows) < self._batch_size:
+            self._order_epoch()
+            if self._taken == len(self._order):
+                if not self._repeat:
+                    break
+                self._epoch, self._taken = self._epoch + 1, 0
+                continue
+            rows.append(self._row(self._taken))
+            self._taken += 1
+        if not rows:
+            self._epoch, self._taken = 0, 0  # whoever iterates again begins again
+            raise StopIteration
+        return collate(rows)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The place in the stream, after the last batch that was handed out."""
+        return {
+            "epoch": self._epoch,
+            "taken": self._taken,
+            "data": self._data_key,
+            "order": [self._seed, self._shuffle, self._rank, self._ranks, self._window],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where `state_dict` was asked.
+
+        Raises:
+            ContractError: the table or the order is not the one that the place was in.
+        """
+        here = self.state_dict()
+        for name, what in (("data", "table training has changed"), ("order", "seed or ranks are others")):
+            if list(state[name]) != list(here[name]):
+                raise ContractError(str(self._lake.root / TRAINING.name), f"cannot resume: {what} since")
+        self._epoch, self._taken = int(state["epoch"]), int(state["taken"])
+
+    def close(self) -> None:
+        """Stop reading ahead."""
+        self._reader.shutdown(wait=True, cancel_futures=True)
+        self._held.clear()
+
+    def _order_epoch(self) -> None:
+        """Decide the order of the current epoch, once."""
+        if self._ordered_epoch == self._epoch:
+            return
+        rng = np.random.default_rng([self._seed, self._epoch])
+        order = rng.permutation(len(self._chunks)) if self._shuffle else np.arange(len(self._chunks))
+        mine = [self._chunks[i] for i in order[self._rank :: self._ranks]]
+        # Every rank draws for itself; drawing more on one must not change another's order.
+        rng = np.random.default_rng([self._seed, self._epoch, 1 + self._rank])
+        self._order, self._windows = [], []
+        for first in range(0, len(mine), self._window):
+            window = mine[first : first + self._window]
+            frames = [(chunk.group, row) for chunk in window for row in chunk.rows]
+            picked = rng.permutation(len(frames)) if self._shuffle else range(len(frames))
+            self._windows += [(len(self._order), [chunk.group for chunk in window])]
+            self._order += [frames[i] for i in picked]
+        self._starts = {start for start, _ in self._windows}
+        self._ordered_epoch = self._epoch
+
+    def _row(self, position: int) -> TrainingRow:
+        group, row = self._order[position]
+        if group not in self._held or position in self._starts:
+            self._read_ahead(position)
+        return self._held[group].result()[row]
+
+    def _read_ahead(self, position: int) -> None:
+        """Hold the position's window and the one behind it; let go of all others."""
+        at = max(i for i, (start, _) in enumerate(self._windows) if start <= position)
+        wanted = [group for _, window in self._windows[at : at + 2] for group in window]
+        self._held = {g: f for g, f in self._held.items() if g in set(wanted)}
+        for group in wanted:
+            if group not in self._held:
+                self._held[group] = self._reader.submit(read_group, self._lake, TRAINING, group, TrainingRow)
+
+
+def load_split(
+    lake: Lake, split: str, *, limit: int | None = None, partitions: Sequence[Partition] | None = None
+) -> TrainingBatch:
+    """All frames of a split (at most `limit`, evenly spread) as one batch: to stay on a GPU, or for tests."""
+    chunks, _ = _find_chunks(lake, split, partitions)
+    frames = [(chunk.group, row) for chunk in chunks for row in chunk.rows]
+    if limit is not None and len(frames) > limit:
+        frames = [frames[i] for i in np.linspace(0, len(frames) - 1, limit).astype(int)]
+    rows: list[TrainingRow] = []
+    for group in dict.fromkeys(group for group, _ in frames):
+        content = read_group(lake, TRAINING, group, TrainingRow)
+        rows += [content[row] for g, row in frames if g == group]
+    return collate(rows)
+
+
+def _find_chunks(
+    lake: Lake, split: str, partitions: Sequence[Partition] | None
+) -> tuple[list[_Chunk], list[str]]:
+    """Row groups that hold frames of the split, in order, and the work keys of what was found."""
+    leaks = read_leaks(lake)
+    chunks, keys = [], []
+    for partition in lake.partitions(TRAINING.name) if partitions is None else sorted(partitions):
+        light = read_columns(lake, TRAINING, partition, ["frame_index", "split"])
+        barred = leaks.get(partition, set())
+        wanted = [
+            side == split and index not in barred
+            for index, side in zip(light["frame_index"], light["split"], strict=True)
+        ]
+        first = 0
+        for group in row_groups(lake, TRAINING, partition):
+            rows = tuple(i for i in range(group.rows) if wanted[first + i])
+            first += group.rows
+            if rows:
+                chunks.append(_Chunk(group, rows))
+        manifest = read_manifest(lake, TRAINING, partition)
+        keys.append(manifest.work_key if manifest else "")
+    if not chunks:
+        problem = f"no frames of split {split!r}: run `boresight prepare` first"
+        raise ContractError(str(lake.root / TRAINING.name), problem)
+    barred_key = hashlib.sha256(repr(sorted((p, sorted(i)) for p, i in leaks.items())).encode()).hexdigest()
+    return chunks, [split, barred_key[:16], *keys]

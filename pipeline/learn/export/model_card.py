@@ -1,0 +1,66 @@
+"""What a model's card says of the run that it comes from: data, seeds, time, results, limits."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import ConfigError
+from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint
+from pipeline.learn.train.metrics import read_metrics
+
+__all__ = ["LIMITS", "card_of_run"]
+
+LIMITS = (
+    "Trained without ground truth: answers inherit the losses' biases, which no average over the fleet takes out.",
+    "Looks 38 deg to each side of the camera's axis; guesses within about 5 deg, best with 2 or 3 passes.",
+    "Rotations of camera-lidar are what a single frame tells best; translations move little from their guess.",
+    "Log variances are of single frames; they say how much frames scatter, not what all frames share.",
+    "Nothing was learned of rigs, lenses or weather that the data does not show.",
+)
+
+
+def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
+    """The card of a run of `boresight train`.
+
+    Args:
+        folder: of the run.
+        notes: JSON object whose entries come on top: what was measured after training, what the data was.
+
+    Raises:
+        ContractError: no readable checkpoint.
+        ConfigError: notes that are no JSON object.
+    """
+    best = (folder / BEST).exists()
+    chosen, last = load_checkpoint(folder / (BEST if best else LAST)), load_checkpoint(folder / LAST)
+    config = chosen["config"]
+    validation = {
+        k.removeprefix("validation/"): v
+        for report in read_metrics(folder)
+        if report["step"] <= chosen["step"]
+        for k, v in report.items()
+        if k.startswith("validation/")
+    }
+    return {
+        "weights": f"of step {chosen['step']}, {'the best on held-out frames' if best else 'the last'}",
+        "data": {key: last[key] for key in ("frames", "data_key") if key in last}
+        | {"cell_deg": config["cell_deg"], "frames_per_step": config["batch_size"]},
+        "seeds": [config["seed"]],
+        "time": {"steps": last["step"], "minutes": round(last.get("trained_s", 0.0) / 60, 1)},
+        "results": validation,
+        "limits": list(LIMITS),
+        "training": config,
+    } | _notes(notes)
+
+
+def _notes(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    try:
+        notes = json.loads(path.read_text())
+    except (OSError, ValueError) as err:
+        raise ConfigError(str(path), "", f"no readable JSON: {err}") from err
+    if not isinstance(notes, dict):
+        raise ConfigError(str(path), "", "holds no JSON object")
+    return notes

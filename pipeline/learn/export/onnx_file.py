@@ -1,0 +1,182 @@
+"""A trained network as one ONNX file, with its card inside.
+
+The graph is what depends on weights: sensors rendered through a guess in, corrections out (`RenderedView` names the
+inputs). Rendering stays outside, in compiled code. `camera_log_likelihood` is an output so that a caller can cut the
+graph there and encode the camera once for several refinements (`inference.py` does).
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import onnx
+import torch
+from torch import Tensor, nn
+from torch.jit._trace import TracerWarning
+
+from pipeline.learn.network.networks import CalibrationNetwork
+from pipeline.learn.network.views import RenderedView
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import (
+    GRAPH_INPUTS,
+    LIDAR_CHANNELS,
+    LIKELIHOOD,
+    MATCHED_POINTS,
+    OBJECT_POINTS,
+    PAIRS,
+    RADAR_CHANNELS,
+    RADAR_POINTS,
+    NetworkConfig,
+)
+from schemas.training import GRID_CLASSES
+from schemas.versions import CODE_VERSION
+
+__all__ = ["OPSET", "card_markdown", "export_onnx"]
+
+OPSET = 18
+
+
+class _Graph(nn.Module):
+    """The core with tensors for arguments, which is what the exporter can trace."""
+
+    def __init__(self, network: CalibrationNetwork) -> None:
+        super().__init__()
+        self.core = network.core
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        outputs = self.core(RenderedView(*tensors))
+        found = (outputs.corrections, outputs.log_variance)
+        likelihood = outputs.camera_log_likelihood
+        return found if likelihood is None else (likelihood, *found)
+
+
+def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | None = None) -> Path:
+    """Write the network (batch 1) to `out`, and its card beside it as JSON and Markdown.
+
+    Args:
+        network: trained; left in evaluation mode.
+        out: the .onnx file.
+        card: what is known of data, seeds, time, results and limits; goes into the file's metadata too.
+    """
+    network.eval()
+    examples = _examples(network.config.grid)
+    graph = _Graph(network)
+    with torch.no_grad():
+        outputs = graph(*examples)
+    names = (
+        ["corrections", "log_variance"] if len(outputs) == 2 else [LIKELIHOOD, "corrections", "log_variance"]
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    aside = out.with_suffix(".part")
+    with warnings.catch_warnings():
+        # The tracing exporter is all that these graphs need; the newer one wants onnxscript, one more dependency.
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        warnings.filterwarnings("ignore", category=TracerWarning)
+        warnings.filterwarnings("ignore", message=".*Constant folding.*")
+        torch.onnx.export(
+            graph, examples, str(aside), dynamo=False, opset_version=OPSET,
+            input_names=list(GRAPH_INPUTS), output_names=names,
+        )  # fmt: skip
+    model = onnx.load(str(aside))
+    _shorten_names(model, {*GRAPH_INPUTS, *names})
+    metadata = _metadata(network.config, card or {})
+    for key, value in metadata.items():
+        entry = model.metadata_props.add()
+        entry.key, entry.value = key, value
+    onnx.checker.check_model(model)
+    onnx.save(model, str(aside))
+    aside.replace(out)
+    _write_card(out, network, metadata, card or {})
+    return out
+
+
+def _examples(grid: Grid) -> tuple[Tensor, ...]:
+    """Inputs of the right shapes with something ahead of the car."""
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    ahead = torch.tensor([20.0, 0.0, 0.0])
+    spread = torch.tensor([10.0, 10.0, 2.0])
+    to_camera = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    points = ahead + spread * (random(1, MATCHED_POINTS, 3) - 0.5)
+    radar = ahead + spread * (random(1, RADAR_POINTS, 3) - 0.5)
+    return (
+        random(1, 4, grid.height, grid.width),
+        random(1, LIDAR_CHANNELS, grid.height, grid.width),
+        random(1, RADAR_CHANNELS, grid.height, grid.width),
+        points @ to_camera.T,
+        torch.ones(1, MATCHED_POINTS),
+        ahead + spread * (random(1, OBJECT_POINTS, 3) - 0.5),
+        torch.ones(1, OBJECT_POINTS),
+        radar,
+        radar @ to_camera.T,
+        random(1, RADAR_POINTS, 3),
+        torch.ones(1, RADAR_POINTS, dtype=torch.bool),
+        torch.ones(1, dtype=torch.bool),
+    )
+
+
+def _shorten_names(model: onnx.ModelProto, kept: set[str]) -> None:
+    """Number the inner tensors: module paths on thousands of small nodes are a fifth of the file."""
+    numbers: dict[str, str] = {}
+
+    def short(name: str) -> str:
+        return name if not name or name in kept else numbers.setdefault(name, f"t{len(numbers)}")
+
+    for node in model.graph.node:
+        node.name = ""
+        node.doc_string = ""
+        for names in (node.input, node.output):
+            for i, name in enumerate(names):
+                names[i] = short(name)
+    for initializer in model.graph.initializer:
+        initializer.name = short(initializer.name)
+    del model.graph.value_info[:]
+
+
+def _metadata(config: NetworkConfig, card: dict[str, Any]) -> dict[str, str]:
+    return {
+        "network": json.dumps(asdict(config)),
+        "architecture": config.architecture,
+        "pairs": json.dumps(PAIRS),
+        "classes": json.dumps(GRID_CLASSES),
+        "grid": json.dumps(asdict(config.grid)),
+        "code_version": CODE_VERSION,
+        "card": json.dumps(card, default=str),
+    }
+
+
+def _write_card(
+    out: Path, network: CalibrationNetwork, metadata: dict[str, str], card: dict[str, Any]
+) -> None:
+    plain = {
+        "file": out.name,
+        "bytes": out.stat().st_size,
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "architecture": network.config.architecture,
+        "network": json.loads(metadata["network"]),
+        "classes": list(GRID_CLASSES),
+        "code_version": CODE_VERSION,
+        **card,
+    }
+    out.with_suffix(".json").write_text(json.dumps(plain, indent=2, default=str) + "\n")
+    out.with_suffix(".md").write_text(card_markdown(plain))
+
+
+def card_markdown(plain: dict[str, Any]) -> str:
+    """A card for people."""
+    lines = [f"# Model card of {plain['file']}", ""]
+    for key, value in plain.items():
+        if isinstance(value, dict):
+            lines += [f"## {key.replace('_', ' ')}", "", *(f"- {k}: {v}" for k, v in value.items()), ""]
+        elif isinstance(value, (list, tuple)):
+            lines += [f"## {key.replace('_', ' ')}", "", *(f"- {v}" for v in value), ""]
+        else:
+            lines += [f"- {key.replace('_', ' ')}: {value}", ""]
+    return "\n".join(lines)

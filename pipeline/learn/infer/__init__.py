@@ -1,0 +1,1 @@
+"""A frame or a vehicle-day by exported networks; nothing here needs torch."""

@@ -1,0 +1,200 @@
+"""One frame's sensors through a guess without torch: what `views.render` does, compiled, for inference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32
+
+from pipeline.geometry.se3 import transform_points
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import (
+    EDGE_BONUS,
+    FEATURE_UNITS,
+    GROUND_WEIGHT,
+    INDEX_BITS,
+    LIDAR_FEATURES,
+    MARGIN_DEG,
+    MATCHED_POINTS,
+    MILLIMETRES,
+    NEAR_M,
+    NEARNESS_M,
+    OBJECT_BONUS,
+    OBJECT_POINTS,
+    RADAR_POINTS,
+)
+from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
+
+__all__ = ["FrameSensors", "compiled_nearest_points", "frame_sensors", "render_frame"]
+
+_EDGE, _GROUND = LIDAR_FEATURES.index("edge"), LIDAR_FEATURES.index("ground")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSensors:
+    """One frame of `inputs.SensorInputs`, without the padding."""
+
+    camera: Float32[np.ndarray, "4 H W"]
+    lidar_xyz_m: Float32[np.ndarray, "N 3"]
+    lidar_features: Float32[np.ndarray, "N 4"]
+    radar_xyz_m: Float32[np.ndarray, "M 3"]
+    radar_features: Float32[np.ndarray, "M 3"]
+    radar_has_elevation: bool
+
+
+def frame_sensors(row: TrainingRow, grid: Grid) -> FrameSensors:
+    """Inputs from a row of table `training` (see `samples.make_row`), whose grid contains the network's.
+
+    Raises:
+        ValueError: cells of another size, or a grid that does not contain the network's.
+    """
+    shape = (row.grid_height, row.grid_width)
+    part = grid.window(shape, row.grid_step_deg)
+    image = row.image.reshape(3, *shape)[:, *part] / np.float32(255)
+    seen = row.grid_seen.reshape(shape)[part].astype(np.float32)
+    lidar = row.lidar_xyz_m[: row.lidar_count].astype(np.float32)
+    flags = row.lidar_flags[: row.lidar_count]
+    lidar_features = [
+        row.lidar_intensity[: row.lidar_count] / np.float32(255),
+        _heights(lidar, row.ground_plane) / np.float32(FEATURE_UNITS["height"]),
+        (flags & POINT_IS_EDGE) > 0,
+        (flags & POINT_IS_GROUND) > 0,
+    ]
+    count = row.radar_count
+    radar_features = [
+        np.minimum(np.abs(row.radar_residual_mps[:count]) / FEATURE_UNITS["speed"], 2.0),
+        np.clip(row.radar_power_db[:count] / FEATURE_UNITS["power"], -2.0, 2.0),
+        row.radar_motion[:count] == 1,
+    ]
+    return FrameSensors(
+        np.concatenate([image, seen[None]]).astype(np.float32),
+        lidar,
+        np.stack(lidar_features, -1).astype(np.float32),
+        row.radar_xyz_m[:count].astype(np.float32),
+        np.stack(radar_features, -1).astype(np.float32),
+        bool(row.radar_has_elevation),
+    )
+
+
+def render_frame(
+    sensors: FrameSensors,
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    T_camera_radar: Float[np.ndarray, "4 4"],
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    grid: Grid,
+) -> dict[str, np.ndarray]:
+    """Inputs of the exported graph by name, batch 1."""
+    lidar_camera = transform_points(T_camera_lidar, sensors.lidar_xyz_m).astype(np.float32)
+    radar_camera = transform_points(T_camera_radar, sensors.radar_xyz_m).astype(np.float32)
+    radar_lidar = transform_points(T_lidar_radar, sensors.radar_xyz_m).astype(np.float32)
+    edge, ground = sensors.lidar_features[:, _EDGE], sensors.lidar_features[:, _GROUND]
+    in_view = _in_view(lidar_camera, grid)
+    rank = _importance(len(lidar_camera))
+    matched = _best(rank + EDGE_BONUS * edge + OBJECT_BONUS * (1 - ground), in_view, MATCHED_POINTS)
+    solid = _best(rank, in_view & (ground < 0.5), OBJECT_POINTS)
+    weight = np.where(ground > 0.5, np.float32(GROUND_WEIGHT), np.float32(1))
+    count = min(len(radar_camera), RADAR_POINTS)
+    return {
+        "camera": sensors.camera[None],
+        "lidar_grid": _painted(lidar_camera, sensors.lidar_features, grid)[None],
+        "radar_grid": _painted(radar_camera, sensors.radar_features, grid)[None],
+        "points_camera": _padded(lidar_camera[matched], MATCHED_POINTS),
+        "point_weight": _padded(weight[matched], MATCHED_POINTS),
+        "objects": _padded(sensors.lidar_xyz_m[solid], OBJECT_POINTS),
+        "object_weight": _padded(np.ones(len(solid), np.float32), OBJECT_POINTS),
+        "radar_lidar": _padded(radar_lidar[:count], RADAR_POINTS),
+        "radar_camera": _padded(radar_camera[:count], RADAR_POINTS),
+        "radar_features": _padded(sensors.radar_features[:count], RADAR_POINTS),
+        "radar_valid": _padded(np.ones(count, bool), RADAR_POINTS),
+        "radar_has_elevation": np.array([sensors.radar_has_elevation]),
+    }
+
+
+def compiled_nearest_points(
+    points_camera: Float[np.ndarray, "N 3"], valid: Bool[np.ndarray, " N"], grid: Grid
+) -> Int32[np.ndarray, " HW"]:
+    """Index of the nearest point in each cell (row by row), -1 where there is none; as `rendering.nearest_points`."""
+    out = np.full(grid.height * grid.width, -1, np.int32)
+    limits = np.radians([grid.top_deg, grid.left_deg, grid.cell_deg]).astype(np.float32)
+    points = np.ascontiguousarray(points_camera, dtype=np.float32)
+    _nearest(points, np.ascontiguousarray(valid), limits, grid.height, grid.width, out)
+    return out
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True)
+def _nearest(points, valid, limits, height, width, out):  # noqa: ANN001, ANN202 - compiled
+    best = np.full(height * width, np.iinfo(np.int64).max, np.int64)
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        if not valid[n] or z <= NEAR_M:
+            continue
+        flat = np.sqrt(x * x + z * z)
+        row = (limits[0] - np.arctan(-y / flat)) / limits[2]
+        column = (limits[1] - np.arctan(-x / z)) / limits[2]
+        if row < 0 or column < 0 or row >= height or column >= width:
+            continue
+        cell = np.int64(row) * width + np.int64(column)
+        millimetres = np.int64(np.sqrt(flat * flat + y * y) * np.float32(MILLIMETRES))
+        key = (millimetres << INDEX_BITS) | n
+        if key < best[cell]:
+            best[cell] = key
+            out[cell] = n
+
+
+def _painted(points_camera: np.ndarray, features: np.ndarray, grid: Grid) -> np.ndarray:
+    """C H W: occupied, nearness and features of the points that won their cells."""
+    index = compiled_nearest_points(points_camera, np.ones(len(points_camera), bool), grid)
+    out = np.zeros((2 + features.shape[1], len(index)), np.float32)
+    full = np.flatnonzero(index >= 0)
+    winners = index[full]
+    distance = np.maximum(np.linalg.norm(points_camera[winners], axis=1), np.float32(NEAR_M))
+    out[0, full] = 1
+    out[1, full] = np.minimum(np.float32(NEARNESS_M) / distance, 2)
+    out[2:, full] = features[winners].T
+    return out.reshape(-1, grid.height, grid.width)
+
+
+def _heights(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """As `inputs.heights`."""
+    if np.linalg.norm(plane[:3]) > 0.5:
+        height = xyz @ plane[:3].astype(np.float32) + np.float32(plane[3])
+    else:
+        z = xyz[:, 2]
+        height = z - (np.sort(z)[int(np.float32(len(z)) * np.float32(0.02))] if len(z) else 0)
+    return np.clip(height, -5, 30)
+
+
+def _in_view(points_camera: np.ndarray, grid: Grid) -> Bool[np.ndarray, " N"]:
+    x, y, z = points_camera.T
+    flat = np.sqrt(x * x + z * z)
+    side = np.tan(np.radians(grid.left_deg + MARGIN_DEG))
+    up, down = np.tan(np.radians([grid.top_deg + MARGIN_DEG, grid.bottom_deg - MARGIN_DEG]))
+    return (z > NEAR_M) & (np.abs(x) < side * z) & (-y < up * flat) & (-y > down * flat)
+
+
+@lru_cache(maxsize=4)
+def _importance(count: int) -> Float32[np.ndarray, " N"]:
+    """As in `views`: a fixed irregular number in 0..1 per row."""
+    return ((np.arange(count, dtype=np.int64) * 2654435761) % 65536).astype(np.float32) / np.float32(65536)
+
+
+def _best(score: np.ndarray, allowed: np.ndarray, count: int) -> np.ndarray:
+    """Allowed rows of the highest scores, highest first."""
+    rows = np.flatnonzero(allowed)
+    score = -score[rows].astype(np.float32)
+    if len(rows) > count:
+        keep = np.argpartition(score, count - 1)[:count]
+        rows, score = rows[keep], score[keep]
+    return rows[np.argsort(score, kind="stable")]
+
+
+def _padded(values: np.ndarray, count: int) -> np.ndarray:
+    """1 `count` ...: the values, and zeros behind them."""
+    out = np.zeros((1, count, *values.shape[1:]), values.dtype)
+    out[0, : len(values)] = values
+    return out

@@ -1,0 +1,173 @@
+"""Exported networks as the vehicle-day asks them: which files, and frames made ready for them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
+
+from pipeline.config import LearnConfig, PrepareConfig
+from pipeline.errors import ConfigError, ModelError
+from pipeline.extrinsics.estimates import Prior
+from pipeline.learn.infer.compiled_rendering import FrameSensors, frame_sensors
+from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.infer.vehicle_day import FrameAnswer
+from pipeline.learn.sample.frame_sample import About, sensor_row
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import PAIRS as ROWS
+from schemas.calibrations import PAIRS
+from schemas.frames import Frame
+from schemas.observations import Observation
+from schemas.training import TrainingRow
+
+__all__ = ["SHIPPED", "SSL_METHODS", "OnnxNetwork", "model_files", "models_key", "open_networks"]
+
+SSL_METHODS = ("pairwise-ssl", "joint-ssl")
+SHIPPED = Path(__file__).parent.parent / "models"
+_NOBODY = About("", "", "", "", "", "")
+
+
+def model_files(method: str, config: LearnConfig, fleet_file: Path) -> dict[str, Path]:
+    """Files of a method's networks by what they estimate: those of fleet.toml, else those that are shipped.
+
+    Raises:
+        ConfigError: a file is missing; the message says which key names another.
+    """
+    if method == "joint-ssl":
+        named: Mapping[str, str | None] = {"joint": config.model}
+        keys = {"joint": "learn.model"}
+    else:
+        named = {pair: config.pairwise_models.get(pair) for pair in PAIRS}  # type: ignore[call-overload]
+        keys = {pair: f"learn.pairwise_models.{pair}" for pair in PAIRS}
+    files = {}
+    for name, given in named.items():
+        files[name] = SHIPPED / f"{name}.onnx" if given is None else fleet_file.parent / given
+        if not files[name].is_file():
+            said = f"{files[name]} does not exist" if given else "no such network is shipped"
+            raise ConfigError(str(fleet_file), keys[name], f"{said}; train one with `boresight train`")
+    return files
+
+
+def models_key(files: Mapping[str, Path]) -> str:
+    """Hash of the files' contents, for work keys."""
+    digests = [hashlib.sha256(files[name].read_bytes()).hexdigest() for name in sorted(files)]
+    return hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
+
+
+def open_networks(
+    files: Mapping[str, Path], config: LearnConfig, prepare: PrepareConfig
+) -> list[OnnxNetwork]:
+    """The networks, ready to be asked; together they estimate each pair once.
+
+    Raises:
+        ModelError: a file is no network, or estimates another pair than it was named for.
+    """
+    rows = _LastRow()
+    networks = [OnnxNetwork(path, config, prepare, rows) for path in files.values()]
+    for (name, path), network in zip(files.items(), networks, strict=True):
+        wanted = PAIRS if name == "joint" else (name,)
+        if set(network.pairs) != set(wanted):
+            raise ModelError(str(path), f"estimates {', '.join(network.pairs)}, not {', '.join(wanted)}")
+    return networks
+
+
+class OnnxNetwork:
+    """One file as a `FrameNetwork`."""
+
+    def __init__(self, path: Path, config: LearnConfig, prepare: PrepareConfig, rows: _LastRow) -> None:
+        self._path, self._calibrator = path, SingleFrameCalibrator(path, config.threads)
+        self._iterations, self._rows = config.iterations, rows
+        self._prepare = _prepare_for(self._calibrator.grid, prepare)
+        self._bias_sigma = _bias_of_card(path, self._calibrator.metadata.get("card", "{}"))
+
+    @property
+    def bias_sigma(self) -> Mapping[str, np.ndarray]:
+        """What all its answers may be off by alike, (sight [rad], translation [m]), measured as its card says."""
+        return self._bias_sigma
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Pairs that it estimates."""
+        return self._calibrator.config.estimated
+
+    @property
+    def composed(self) -> bool:
+        """Whether its camera_radar stands on the product of the other two."""
+        return self._calibrator.config.composed
+
+    def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> FrameSensors:
+        """The frame as the network sees it; no semantics are looked at.
+
+        Raises:
+            SampleRejectedError: the frame shows too little.
+        """
+        row = self._rows.of(frame, observation, prior, self._prepare)
+        return frame_sensors(row, self._calibrator.grid)
+
+    def answer(self, sensors: FrameSensors, guess: Mapping[str, np.ndarray]) -> FrameAnswer:
+        """The last pass's transforms.
+
+        Raises:
+            ModelError: the file wants other inputs than this version renders.
+        """
+        three = (guess["camera_lidar"], guess["lidar_radar"], guess["camera_radar"])
+        try:
+            last = self._calibrator.estimate(sensors, *three, self._iterations)[-1]
+        except InvalidArgument as err:
+            raise ModelError(str(self._path), f"was exported by another version: {err}") from err
+        variance = np.exp(np.clip(last.log_variance, -20.0, 5.0))
+        return FrameAnswer(
+            {pair: last.of(pair) for pair in self.pairs},
+            {pair: variance[ROWS.index(pair)] for pair in self.pairs},
+        )
+
+
+@dataclass(eq=False)
+class _LastRow:
+    """The last frame's row: three pairwise networks look at the same one."""
+
+    key: tuple[int, int, PrepareConfig] | None = None
+    row: TrainingRow | None = None
+
+    def of(self, frame: Frame, observation: Observation, prior: Prior, config: PrepareConfig) -> TrainingRow:
+        key = (frame.frame_index, frame.stamp_ns, config)
+        if self.row is None or self.key != key:
+            self.row = sensor_row(frame, observation, prior, _NOBODY, config)
+            self.key = key
+        return self.row
+
+
+def _bias_of_card(path: Path, card: str) -> dict[str, np.ndarray]:
+    """`bias_sigma` of a card: by pair, three angles [deg] and three shifts [m].
+
+    Raises:
+        ModelError: something else stands there.
+    """
+    try:
+        told = json.loads(card).get("bias_sigma", {})
+        found = {pair: np.array(values, np.float64) for pair, values in told.items()}
+    except (AttributeError, TypeError, ValueError) as err:
+        raise ModelError(str(path), f"bias_sigma of its card is unreadable: {err}") from err
+    for pair, values in found.items():
+        if pair not in PAIRS or values.shape != (6,) or not (np.isfinite(values) & (values >= 0)).all():
+            raise ModelError(
+                str(path), f"bias_sigma of its card: {pair} needs three degrees and three metres"
+            )
+    return {pair: np.append(np.radians(values[:3]), values[3:]) for pair, values in found.items()}
+
+
+def _prepare_for(grid: Grid, config: PrepareConfig) -> PrepareConfig:
+    """Samples on the smallest grid about the optical axis, 16 cells at a time, that contains the network's."""
+
+    def side_deg(half_deg: float) -> float:
+        return 16 * math.ceil(2 * half_deg / grid.cell_deg / 16 - 1e-9) * grid.cell_deg
+
+    tallest = max(abs(grid.top_deg), abs(grid.bottom_deg))
+    sides = {"grid_width_deg": side_deg(grid.left_deg), "grid_height_deg": side_deg(tallest)}
+    return config.model_copy(update={"grid_step_deg": grid.cell_deg, **sides})

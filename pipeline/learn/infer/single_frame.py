@@ -1,0 +1,165 @@
+"""Single-frame inference with onnxruntime: render at the guess, compute, correct, up to three times. No torch.
+
+No semantics are needed either: what the encoders know is in the file. The graph is cut behind the camera's encoder,
+whose answer does not depend on the guess.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnx.utils
+import onnxruntime
+from jaxtyping import Float
+
+from pipeline.errors import ModelError
+from pipeline.learn.infer.compiled_rendering import FrameSensors, render_frame
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import LIKELIHOOD, PAIRS, NetworkConfig
+
+__all__ = ["FrameEstimate", "SingleFrameCalibrator", "config_from_metadata"]
+
+_ANSWERS = ["corrections", "log_variance"]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameEstimate:
+    """Extrinsics from one frame after one pass, and how sure the network is of them.
+
+    `log_variance` has rows as PAIRS, columns a twist on the left (rotation vector [rad], translation [m]); pairs
+    that the network does not estimate keep their guess, and `estimated` does not name them.
+    """
+
+    T_camera_lidar: Float[np.ndarray, "4 4"]
+    T_camera_radar: Float[np.ndarray, "4 4"]
+    T_lidar_radar: Float[np.ndarray, "4 4"]
+    log_variance: Float[np.ndarray, "3 6"]
+    estimated: tuple[str, ...]
+
+    def of(self, pair: str) -> Float[np.ndarray, "4 4"]:
+        """The transform of a pair."""
+        return {
+            "camera_lidar": self.T_camera_lidar,
+            "camera_radar": self.T_camera_radar,
+            "lidar_radar": self.T_lidar_radar,
+        }[pair]
+
+
+class SingleFrameCalibrator:
+    """A model file, ready to run.
+
+    Args:
+        path: file of `boresight export onnx`.
+        threads: that one pass may use.
+
+    Raises:
+        ModelError: the file is no such model.
+    """
+
+    def __init__(self, path: Path, threads: int = 1) -> None:
+        try:
+            model = onnx.load(str(path))
+        except Exception as err:  # protobuf has its own exceptions, different by version
+            raise ModelError(str(path), f"is no readable ONNX file: {err}") from err
+        self.metadata = {entry.key: entry.value for entry in model.metadata_props}
+        self.config = config_from_metadata(path, self.metadata)
+        outputs = {o.name for o in model.graph.output}
+        self._encoder = None
+        if LIKELIHOOD in outputs:
+            cut = onnx.utils.Extractor(model)
+            others = [i.name for i in model.graph.input if i.name != "camera"]
+            self._encoder = _session(cut.extract_model(["camera"], [LIKELIHOOD]), threads)
+            self._network = _session(cut.extract_model([LIKELIHOOD, *others], _ANSWERS), threads)
+        else:
+            self._network = _session(model, threads)
+        self._inputs = {i.name for i in self._network.get_inputs()}
+
+    @property
+    def grid(self) -> Grid:
+        """The grid that sensors must be resampled to."""
+        return self.config.grid
+
+    def estimate(
+        self,
+        sensors: FrameSensors,
+        T_camera_lidar: Float[np.ndarray, "4 4"],
+        T_lidar_radar: Float[np.ndarray, "4 4"],
+        T_camera_radar: Float[np.ndarray, "4 4"] | None = None,
+        iterations: int = 3,
+    ) -> list[FrameEstimate]:
+        """Estimates after each pass, each rendered where the one before turned to (as `CalibrationNetwork.refine`).
+
+        Args:
+            sensors: one frame.
+            T_camera_lidar: the guess.
+            T_lidar_radar: the guess.
+            T_camera_radar: the guess; the product of the other two where left out.
+            iterations: passes; two for guesses within 3 deg, three beyond.
+        """
+        camera_radar = T_camera_lidar @ T_lidar_radar if T_camera_radar is None else T_camera_radar
+        guess = (T_camera_lidar, camera_radar, T_lidar_radar)
+        likelihood = None
+        if self._encoder is not None:
+            likelihood = self._encoder.run(None, {"camera": sensors.camera[None]})[0]
+        found: list[FrameEstimate] = []
+        for _ in range(iterations):
+            view = render_frame(sensors, *guess, self.grid)
+            if likelihood is not None:
+                view[LIKELIHOOD] = likelihood
+            feed = {name: view[name] for name in self._inputs}
+            corrections, log_variance = self._network.run(_ANSWERS, feed)
+            step = corrections[0].astype(np.float64)
+            answer = self._corrected(step, guess)
+            found.append(FrameEstimate(*answer, log_variance[0].astype(np.float64), self.config.estimated))
+            step[:, :3, 3] = 0.0
+            guess = self._corrected(step, guess)
+        return found
+
+    def _corrected(
+        self, corrections: Float[np.ndarray, "3 4 4"], guess: tuple[np.ndarray, np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Corrected camera_lidar, camera_radar and lidar_radar (as `networks.compose`)."""
+        camera_lidar = _rigid(corrections[0] @ guess[0])
+        lidar_radar = _rigid(corrections[2] @ guess[2])
+        base = camera_lidar @ lidar_radar if self.config.composed else guess[1]
+        return camera_lidar, _rigid(corrections[1] @ base), lidar_radar
+
+
+def config_from_metadata(path: Path, metadata: Mapping[str, str]) -> NetworkConfig:
+    """The configuration that a file was built with.
+
+    Raises:
+        ModelError: the file does not say.
+    """
+    try:
+        values = json.loads(metadata["network"])
+        if tuple(json.loads(metadata["pairs"])) != PAIRS:
+            raise ModelError(str(path), f"puts out pairs {metadata['pairs']}, not {PAIRS}")
+        return NetworkConfig(**(values | {"grid": Grid(**values["grid"])}))
+    except (KeyError, TypeError, ValueError) as err:
+        raise ModelError(str(path), "was not written by `boresight export onnx`") from err
+
+
+def _session(model: onnx.ModelProto, threads: int) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    # Spinning threads take the core from whoever else works on this machine.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+
+
+def _rigid(T: np.ndarray) -> np.ndarray:
+    """The nearest rotation: single precision must not add up over passes."""
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    out = T.copy()
+    out[:3, :3] = u @ vt
+    return out

@@ -1,0 +1,217 @@
+"""Where does a cloud of classified points fit into an image of class likelihoods? Correlation, coarse to fine.
+
+Every point looks up the log-likelihood of its classes around the cell it falls into. Summed over points, that gives
+a surface over shifts; strips of azimuth see a roll as shifts of opposite sign in elevation, near and far points see a
+translation as different shifts. Rotations are found level by level and applied to the points themselves, so no map is
+ever warped and a point's place within its cell counts.
+
+Source: evidence of the project's prototype; the idea of a cost volume is LCCNet's (Lv et al. 2021).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
+
+from pipeline.learn.network.least_squares import angular_jacobian, inverse_spd, small_rotation_vector
+from pipeline.learn.network.rendering import grid_cells, sphere
+from pipeline.learn.sample.grid import Grid
+from pipeline.objective.differentiable.poses import exp_so3
+
+__all__ = ["NEUTRAL", "ClassMatcher", "Level", "Match", "levels_for"]
+
+NEUTRAL = float(np.log(0.1))  # log-likelihood of any of ten classes where the camera sees nothing
+FLOOR = -5.0  # a confident mistake of the camera costs no more than this
+_STRIPS = 6
+_NEAR_FAR_M = 18.0  # about the median range of what a car's lidar meets; parallax differs by most across it
+
+
+@dataclass(frozen=True)
+class Level:
+    """One resolution of the search: `reach` cells of `cell_deg` to each side, `rolls` steps of roll to each side."""
+
+    factor: int  # cells of the grid per cell of this level
+    reach: int
+    rolls: int
+
+
+def levels_for(grid: Grid) -> tuple[Level, ...]:
+    """Cells of 1.6 deg (+- 8 deg), 0.8 deg (+- 3.2), 0.4 deg (+- 1.2) and 0.2 deg (+- 0.6) where the grid has them."""
+    wanted = ((1.6, 5, 1), (0.8, 4, 3), (0.4, 3, 3), (0.2, 3, 3))
+    found = [(round(cell / grid.cell_deg), reach, rolls) for cell, reach, rolls in wanted]
+    return tuple(Level(*level) for level in found if level[0] >= 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """What a matcher found: twist on the left in the optical frame, its variance, and the surfaces it saw last."""
+
+    twist: Float[Tensor, "B 6"]  # rotation vector [rad], translation [m]
+    variance: Float[Tensor, "B 6"]
+    surfaces: Float[Tensor, "B G S S"]  # log-probability of shifts by group, last level
+
+
+class ClassMatcher(nn.Module):
+    """Turns points until their classes lie on the camera's; three or four temperatures and a few sigmas are learned."""
+
+    def __init__(self, grid: Grid) -> None:
+        super().__init__()
+        self.grid = grid
+        self.levels = levels_for(grid)
+        # exp: how many independent observations a frame's mean log-likelihood is worth; 150 by the oracle's spread.
+        self.log_sharpness = nn.Parameter(torch.full((len(self.levels),), float(np.log(150.0))))
+        # Of what the last step may still turn [rad], and of the translation [m].
+        self.log_prior_sigma = nn.Parameter(torch.log(torch.tensor([0.01] * 3 + [0.03] * 3)))
+        self.log_error_floor = nn.Parameter(torch.tensor(float(np.log(0.001))))  # [rad] of a group's shift
+
+    @property
+    def surface_size(self) -> int:
+        """Values of `Match.surfaces` per frame."""
+        return 2 * _STRIPS * (2 * self.levels[-1].reach + 1) ** 2
+
+    def forward(
+        self,
+        log_likelihood: Float[Tensor, "B K H W"],
+        points_camera: Float[Tensor, "B N 3"],
+        probability: Float[Tensor, "B N K"],
+        weight: Float[Tensor, "B N"],
+    ) -> Match:
+        """Find the turn (and shift) of the points that fits best.
+
+        Args:
+            log_likelihood: of each class in the camera's cells, NEUTRAL where it sees nothing.
+            points_camera: points seen through the guess [m].
+            probability: of each point's classes.
+            weight: of each point, 0 = absent.
+        """
+        R = torch.eye(3, device=points_camera.device).expand(len(points_camera), 3, 3)
+        maps = self._pyramid(log_likelihood)
+        for level, table, log_sharpness in zip(self.levels, maps, self.log_sharpness, strict=True):
+            # Large cells need no dense points: every other one, as they come in an even irregular order.
+            stride = 1 if level is self.levels[-1] else 2
+            turned = points_camera[:, ::stride] @ R.transpose(1, 2)
+            groups = self._groups(turned, weight[:, ::stride])
+            scores = self._scores(table, level, turned, probability[:, ::stride])
+            by_group = torch.einsum("bgn,bnij->bgij", groups, scores)
+            weights = groups.sum(-1)
+            sharpness = torch.exp(log_sharpness) / weights.sum(-1).clamp(min=1e-3)
+            strips = groups[:, :_STRIPS] + groups[:, _STRIPS:]
+            directions, _ = self._centres(strips, turned)
+            strip_scores = by_group[:, :_STRIPS] + by_group[:, _STRIPS:]
+            omega = self._turn(level, strip_scores, directions, sharpness)
+            R = exp_so3(omega) @ R
+        centre = self._centres(groups, turned)
+        return self._finish(self.levels[-1], by_group, centre, sharpness, omega, R)
+
+    def _pyramid(self, log_likelihood: Tensor) -> list[Tensor]:
+        """Maps per level, padded by what a point at the border can reach, with channels last."""
+        maps = []
+        for level in self.levels:
+            pooled = log_likelihood
+            if level.factor > 1:
+                pooled = torch.log(F.avg_pool2d(torch.exp(log_likelihood), level.factor).clamp(min=1e-6))
+            pad = level.reach + 1
+            maps.append(
+                F.pad(pooled.clamp(min=FLOOR), (pad, pad, pad, pad), value=NEUTRAL).permute(0, 2, 3, 1)
+            )
+        return maps
+
+    def _groups(self, points: Tensor, weight: Tensor) -> Tensor:
+        """B 12 N: weights of points by strip of azimuth, near ones first."""
+        angles = sphere(points)
+        row, column = grid_cells(angles, self.grid)
+        strip = column / (self.grid.width / _STRIPS)
+        inside = (row >= 0) & (row <= self.grid.height)
+        near = (angles[..., 2] < _NEAR_FAR_M).to(weight.dtype)
+        member = torch.stack(
+            [((strip >= s) & (strip < s + 1) & inside).to(weight.dtype) for s in range(_STRIPS)], 1
+        )
+        return torch.cat([member * (weight * near)[:, None], member * (weight * (1 - near))[:, None]], 1)
+
+    def _scores(self, table: Tensor, level: Level, points: Tensor, probability: Tensor) -> Tensor:
+        """B N S S: each point's expected log-likelihood at shifts of whole cells (rows down, columns right)."""
+        frames, rows, columns, classes = table.shape
+        pad = level.reach + 1
+        row, column = grid_cells(sphere(points), self.grid)
+        # Minus one half: values stand at the centres of cells.
+        row = (row / level.factor - 0.5).clamp(-1.0, rows - 2.0 * pad)
+        column = (column / level.factor - 0.5).clamp(-1.0, columns - 2.0 * pad)
+        first_row, first_column = torch.floor(row), torch.floor(column)
+        offsets = torch.arange(-level.reach, level.reach + 2, device=table.device)
+        at_row = (first_row.long()[..., None] + offsets + pad).clamp(0, rows - 1)
+        at_column = (first_column.long()[..., None] + offsets + pad).clamp(0, columns - 1)
+        index = at_row[..., :, None] * columns + at_column[..., None, :]
+        side = len(offsets)
+        frame = torch.arange(frames, device=table.device)[:, None, None, None] * (rows * columns)
+        # One row of classes per lookup: contiguous, where an elementwise gather would be ten times slower.
+        picked = F.embedding((index + frame).flatten(1), table.reshape(-1, classes))
+        picked = picked.reshape(frames, points.shape[1], side * side, classes)
+        value = (picked @ probability[..., None]).reshape(frames, points.shape[1], side, side)
+        a, b = (row - first_row)[..., None, None], (column - first_column)[..., None, None]
+        value = value[:, :, :-1] * (1 - a) + value[:, :, 1:] * a
+        return value[..., :-1] * (1 - b) + value[..., 1:] * b
+
+    def _centres(self, groups: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean direction and mean inverse range of each group; empty groups look ahead."""
+        total = groups.sum(-1, keepdim=True)
+        distance = points.norm(dim=-1, keepdim=True).clamp(min=0.5)
+        ahead = torch.tensor([0.0, 0.0, 1.0], device=points.device)
+        mean = (groups @ (points / distance) + 1e-3 * ahead) / (total + 1e-3)
+        inverse_range = (groups @ (1 / distance) + 1e-3 * 0.05) / (total + 1e-3)
+        return mean / mean.norm(dim=-1, keepdim=True), inverse_range[..., 0]
+
+    def _turn(self, level: Level, strips: Tensor, directions: Tensor, sharpness: Tensor) -> Tensor:
+        """Rotation vector by soft-argmax over roll, elevation and azimuth shifts; all strips vote together."""
+        cell = float(np.radians(self.grid.cell_deg * level.factor))
+        size = 2 * level.reach + 1
+        steps = torch.arange(-level.rolls, level.rolls + 1, device=strips.device, dtype=strips.dtype)
+        roll = steps * 2 * cell  # about one cell at the outer strips, which look 32 deg to the side
+        place = torch.arange(size, device=strips.device, dtype=strips.dtype)
+        # A roll lifts what is to the left: rows grow downwards.
+        lifted = roll[None, :, None] * -directions[:, None, :, 0] / cell
+        at = (place - lifted[..., None]).clamp(0, size - 1)
+        blend = (1 - (at[..., None] - place).abs()).clamp(min=0)  # B R G S S: hat functions
+        volume = torch.einsum("brgpq,bgqy->brpy", blend, strips)
+        posterior = torch.softmax((volume * sharpness[:, None, None, None]).flatten(1), -1)
+        posterior = posterior.reshape(volume.shape)
+        shift = (place - level.reach) * cell
+        up = -(posterior.sum((1, 3)) * shift).sum(-1)
+        left = -(posterior.sum((1, 2)) * shift).sum(-1)
+        about_axis = (posterior.sum((2, 3)) * roll).sum(-1)
+        # Elevation grows by a turn about x (right), azimuth to the left by one about -y (down).
+        return torch.stack([up, -left, about_axis], -1)
+
+    def _finish(
+        self, level: Level, by_group: Tensor, centre: tuple[Tensor, Tensor], sharpness: Tensor,
+        omega: Tensor, R: Tensor,
+    ) -> Match:  # fmt: skip
+        """Least squares over the groups' own shifts: what is left to turn, and the translation that parallax tells."""
+        cell = float(np.radians(self.grid.cell_deg * level.factor))
+        size = 2 * level.reach + 1
+        log_posterior = torch.log_softmax((by_group * sharpness[:, None, None, None]).flatten(2), -1)
+        posterior = torch.exp(log_posterior).reshape(by_group.shape)
+        shift = (torch.arange(size, device=R.device, dtype=R.dtype) - level.reach) * cell
+        marginals = torch.stack(
+            [posterior.sum(2), posterior.sum(3)], 2
+        )  # azimuth (columns), elevation (rows)
+        mean = (marginals * shift).sum(-1)
+        spread = (marginals * (shift * shift)).sum(-1) - mean * mean + torch.exp(2 * self.log_error_floor)
+        # The window itself is a prior of its own width; a flat surface must tell nothing.
+        window = float((shift * shift).mean()) + torch.exp(2 * self.log_error_floor)
+        information = (1 / spread - 1 / window).clamp(min=0)
+        J = angular_jacobian(*centre)
+        turned = (J[..., :3] @ omega[:, None, :, None])[..., 0]
+        residual = -mean / spread - information * turned
+        H = torch.einsum("bgij,bgi,bgik->bjk", J, information, J)
+        H = H + torch.eye(6, device=R.device) * torch.exp(-2 * self.log_prior_sigma)
+        covariance = inverse_spd(H)
+        step = (covariance @ torch.einsum("bgij,bgi->bj", J, residual)[..., None])[..., 0]
+        total = exp_so3(step[:, :3]) @ R
+        twist = torch.cat([small_rotation_vector(total), step[:, 3:]], -1)
+        variance = (covariance * torch.eye(6, device=covariance.device)).sum(-1)
+        return Match(twist, variance, log_posterior.reshape(by_group.shape))

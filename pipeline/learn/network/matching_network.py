@@ -1,0 +1,165 @@
+"""`architecture = "matching"`: distilled classes, correlation, and learned residuals."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
+
+from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder, PointEncoder
+from pipeline.learn.network.matching import FLOOR, NEUTRAL, ClassMatcher, Match
+from pipeline.learn.network.occupancy import OccupancyMatch, OccupancyMatcher
+from pipeline.learn.network.outputs import CoreOutputs, Heads, pose_of_twist
+from pipeline.learn.network.rendering import grid_cells, sphere
+from pipeline.learn.network.views import RenderedView
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import LIDAR_CHANNELS, PAIRS, RADAR_FEATURES
+from schemas.training import GRID_CLASSES
+
+__all__ = ["MatchingCore"]
+
+_CLASSES = len(GRID_CLASSES)
+_RESIDUAL_STD = 1e-3  # the network starts as its geometry
+_AXES_CAMERA_OF_LIDAR = (
+    1,
+    2,
+    0,
+)  # camera x, y, z look along lidar y, z, x (signs do not matter to variances)
+
+
+class MatchingCore(nn.Module):
+    """What is computed from one rendered view; `pairs` says which of the three matchers exist."""
+
+    def __init__(self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int) -> None:
+        super().__init__()
+        self.grid, self.pairs = grid, pairs
+        uses_camera = pairs != ("lidar_radar",)
+        self.camera_encoder = CameraEncoder(_CLASSES, width) if uses_camera else None
+        sizes = []
+        if "camera_lidar" in pairs:
+            self.lidar_encoder = LidarEncoder(LIDAR_CHANNELS, _CLASSES, width)
+            self.lidar_matcher = ClassMatcher(grid)
+            sizes.append(self.lidar_matcher.surface_size + 12)
+        if "lidar_radar" in pairs:
+            self.radar_matcher = OccupancyMatcher(len(RADAR_FEATURES))
+            sizes.append(self.radar_matcher.profile_size + 12)
+        if pairs == ("camera_radar",):
+            self.radar_encoder = PointEncoder(len(RADAR_FEATURES), _CLASSES)
+            self.radar_class_matcher = ClassMatcher(grid)
+            sizes.append(self.radar_class_matcher.surface_size + 12)
+        self.summaries = nn.ModuleList([_summary(size, hidden) for size in sizes])
+        self.fusion = nn.Sequential(nn.Linear(hidden * len(sizes), 128), nn.ReLU())
+        self.heads = Heads(128, pairs, _RESIDUAL_STD)
+
+    def forward(self, view: RenderedView) -> CoreOutputs:
+        """Corrections and doubt; gradients of the corrections do not reach the encoders, which learn from classes."""
+        camera_logits = self.camera_encoder(view.camera) if self.camera_encoder is not None else None
+        likelihood = None if camera_logits is None else self.camera_log_likelihood(view.camera, camera_logits)
+        return self.match(view, likelihood, camera_logits)
+
+    def encode(self, view: RenderedView) -> CoreOutputs:
+        """Logits of the encoders; nothing is matched, so no pose is corrected."""
+        frames = len(view.camera)
+        identity = torch.eye(4, device=view.camera.device).expand(frames, len(PAIRS), 4, 4)
+        doubt = self.heads.start.expand(frames, len(PAIRS), 6)
+        camera = self.camera_encoder(view.camera) if self.camera_encoder is not None else None
+        lidar = self.encode_lidar(view.lidar_grid) if "camera_lidar" in self.pairs else None
+        radar = None
+        if self.pairs == ("camera_radar",):
+            radar = self.radar_encoder(view.radar_features, view.radar_camera.norm(dim=-1))
+        return CoreOutputs(identity, doubt, None, camera, lidar, radar)
+
+    def camera_log_likelihood(
+        self, camera: Float[Tensor, "B 4 H W"], logits: Float[Tensor, "B K H W"]
+    ) -> Float[Tensor, "B K H W"]:
+        """Log-probability of classes, the same for all of them where the camera sees nothing."""
+        log_probability = torch.log_softmax(logits.detach(), 1).clamp(min=FLOOR)
+        seen = camera[:, 3:]
+        return log_probability * seen + NEUTRAL * (1 - seen)
+
+    def match(
+        self,
+        view: RenderedView,
+        likelihood: Float[Tensor, "B K H W"] | None,
+        camera_logits: Float[Tensor, "B K H W"] | None = None,
+    ) -> CoreOutputs:
+        """All that depends on the guess."""
+        bases: dict[str, Match | OccupancyMatch] = {}
+        lidar_logits = radar_logits = None
+        features = []
+        if "camera_lidar" in self.pairs:
+            assert likelihood is not None
+            lidar_logits = self.encode_lidar(view.lidar_grid)
+            probability = torch.softmax(self._at_points(lidar_logits.detach(), view.points_camera), -1)
+            found = self.lidar_matcher(likelihood, view.points_camera, probability, view.point_weight)
+            bases["camera_lidar"] = found
+            features.append(_features(found.surfaces.flatten(1), found))
+        if "lidar_radar" in self.pairs:
+            occupied = self.radar_matcher(
+                view.radar_lidar, view.radar_features, view.radar_valid, view.radar_has_elevation,
+                view.objects, view.object_weight,
+            )  # fmt: skip
+            bases["lidar_radar"] = occupied
+            features.append(_features(occupied.profiles, occupied))
+        if self.pairs == ("camera_radar",):
+            assert likelihood is not None
+            distance = view.radar_camera.norm(dim=-1)
+            radar_logits = self.radar_encoder(view.radar_features, distance)
+            probability = torch.softmax(radar_logits.detach(), -1)
+            weight = view.radar_valid.to(probability.dtype)
+            found = self.radar_class_matcher(likelihood, view.radar_camera, probability, weight)
+            bases["camera_radar"] = found
+            features.append(_features(found.surfaces.flatten(1), found))
+        fused = self.fusion(torch.cat([s(f) for s, f in zip(self.summaries, features, strict=True)], -1))
+        corrections, log_variance = self._combine(bases, fused)
+        return CoreOutputs(corrections, log_variance, likelihood, camera_logits, lidar_logits, radar_logits)
+
+    def encode_lidar(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B K H W"]:
+        """Class logits of a rendered sweep; in training every other frame is seen in a mirror.
+
+        Classes reach the lidar through guesses that are wrong by some angle. An encoder that learns where classes
+        end would learn that angle with them; for mirrored frames it is the opposite one.
+        """
+        if not self.training:
+            return self.lidar_encoder(rendered)
+        mirrored = (torch.arange(len(rendered), device=rendered.device) % 2 == 1)[:, None, None, None]
+        logits = self.lidar_encoder(torch.where(mirrored, rendered.flip(-1), rendered))
+        return torch.where(mirrored, logits.flip(-1), logits)
+
+    def _at_points(self, maps: Tensor, points_camera: Tensor) -> Tensor:
+        """B N K: values of the cells that points fall into."""
+        row, column = grid_cells(sphere(points_camera), self.grid)
+        height, width = self.grid.height, self.grid.width
+        index = row.long().clamp(0, height - 1) * width + column.long().clamp(0, width - 1)
+        frame = torch.arange(len(maps), device=maps.device)[:, None] * (height * width)
+        return F.embedding(index + frame, maps.permute(0, 2, 3, 1).reshape(-1, maps.shape[1]))
+
+    def _combine(self, bases: dict[str, Match | OccupancyMatch], fused: Tensor) -> tuple[Tensor, Tensor]:
+        residuals = self.heads(fused)
+        variances = {pair: base.variance for pair, base in bases.items()}
+        if "camera_radar" not in bases and "camera_radar" in self.pairs:
+            lidar_radar = variances["lidar_radar"]
+            turned = [lidar_radar[:, [a + o for a in _AXES_CAMERA_OF_LIDAR]] for o in (0, 3)]
+            variances["camera_radar"] = variances["camera_lidar"] + torch.cat(turned, -1)
+        identity = torch.eye(4, device=fused.device).expand(len(fused), 4, 4)
+        corrections, log_variance = [], []
+        for pair in PAIRS:
+            if pair not in self.pairs:
+                corrections.append(identity)
+                log_variance.append(self.heads.start.expand(len(fused), 6))
+                continue
+            residual, doubt = residuals[pair]
+            base = pose_of_twist(bases[pair].twist) if pair in bases else identity
+            corrections.append(residual @ base)
+            log_variance.append(torch.log(variances[pair]) + doubt)
+        return torch.stack(corrections, 1), torch.stack(log_variance, 1)
+
+
+def _summary(inputs: int, hidden: int) -> nn.Sequential:
+    return nn.Sequential(nn.LayerNorm(inputs), nn.Linear(inputs, hidden), nn.ReLU())
+
+
+def _features(surfaces: Tensor, found: Match | OccupancyMatch) -> Tensor:
+    """Surfaces, the base in cells and its log variance, all of the order of one to ten."""
+    return torch.cat([surfaces.clamp(min=-12.0), found.twist * 100.0, torch.log(found.variance)], -1)

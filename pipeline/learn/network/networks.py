@@ -1,0 +1,132 @@
+"""The networks: sensor data and a guess in, better extrinsics and their doubt out.
+
+`matching` computes correspondences explicitly and learns what classes look like, how sharp evidence is, and residuals;
+`concat` is the paper's: encode, concatenate, fuse, regress. Both come for all pairs at once (joint) or for one alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+
+from pipeline.learn.network.concat import ConcatCore
+from pipeline.learn.network.inputs import NetworkInputs
+from pipeline.learn.network.matching_network import MatchingCore
+from pipeline.learn.network.outputs import CoreOutputs, Predictions
+from pipeline.learn.network.views import render
+from pipeline.learn.sample.layout import NetworkConfig
+
+__all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "refine", "turns_only"]
+
+
+class CalibrationNetwork(nn.Module):
+    """One network of either architecture: renders at the guess, computes, applies the corrections."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.core: MatchingCore | ConcatCore
+        if config.architecture == "matching":
+            self.core = MatchingCore(config.grid, config.estimated, config.width, config.hidden)
+        else:
+            self.core = ConcatCore(config.grid, config.estimated, config.width, config.hidden)
+
+    def forward(self, inputs: NetworkInputs) -> Predictions:
+        """One pass."""
+        view, index = render(inputs, self.config.grid)
+        return self._predictions(inputs, self.core(view), index)
+
+    def encode(self, inputs: NetworkInputs) -> Predictions:
+        """Class logits alone, at the guess: what teaches the encoders of `matching`."""
+        assert isinstance(self.core, MatchingCore)
+        view, index = render(inputs, self.config.grid)
+        return self._predictions(inputs, self.core.encode(view), index)
+
+    def refine(self, inputs: NetworkInputs, iterations: int) -> list[Predictions]:
+        """Several passes with the same weights, each rendered where the last one turned to; the camera is encoded once.
+
+        Only turns are handed on: one frame tells little of a shift, and what it tells by mistake would add up over
+        passes. Every answer holds its own pass's shift. Gradients do not flow from one pass into the one before.
+        """
+        found: list[Predictions] = []
+        likelihood: Tensor | None = None
+        logits: Tensor | None = None
+        for _ in range(iterations):
+            view, index = render(inputs, self.config.grid)
+            if isinstance(self.core, MatchingCore) and found:
+                outputs = self.core.match(view, likelihood, logits)
+            else:
+                outputs = self.core(view)
+                likelihood, logits = outputs.camera_log_likelihood, outputs.camera_logits
+            found.append(self._predictions(inputs, outputs, index))
+            turned = replace(outputs, corrections=turns_only(outputs.corrections.detach()))
+            guess = self._predictions(inputs, turned, index)
+            inputs = replace(
+                inputs,
+                T_camera_lidar=guess.T_camera_lidar,
+                T_camera_radar=guess.T_camera_radar,
+                T_lidar_radar=guess.T_lidar_radar,
+            )
+        return found
+
+    def _predictions(
+        self, inputs: NetworkInputs, outputs: CoreOutputs, index: Int64[Tensor, "B HW"]
+    ) -> Predictions:
+        T_camera_lidar, T_camera_radar, T_lidar_radar = compose(
+            outputs.corrections, inputs.T_camera_lidar, inputs.T_camera_radar, inputs.T_lidar_radar,
+            composed=self.config.composed,
+        )  # fmt: skip
+        return Predictions(
+            T_camera_lidar,
+            T_camera_radar,
+            T_lidar_radar,
+            outputs.log_variance,
+            outputs.camera_logits,
+            outputs.lidar_logits,
+            outputs.radar_logits,
+            index,
+        )
+
+
+def turns_only(corrections: Float[Tensor, "B 3 4 4"]) -> Float[Tensor, "B 3 4 4"]:
+    """The corrections without their shifts."""
+    turned = corrections.clone()
+    turned[..., :3, 3] = 0.0
+    return turned
+
+
+def compose(
+    corrections: Float[Tensor, "B 3 4 4"],
+    T_camera_lidar: Float[Tensor, "B 4 4"],
+    T_camera_radar: Float[Tensor, "B 4 4"],
+    T_lidar_radar: Float[Tensor, "B 4 4"],
+    *,
+    composed: bool,
+) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 4 4"], Float[Tensor, "B 4 4"]]:
+    """Corrected transforms (camera-lidar, camera-radar, lidar-radar).
+
+    With `composed` the camera-radar correction stands on the other two's product instead of on the guess: radar is
+    matched to the lidar six times better than to the image.
+    """
+    camera_lidar = corrections[:, 0] @ T_camera_lidar
+    lidar_radar = corrections[:, 2] @ T_lidar_radar
+    base = camera_lidar @ lidar_radar if composed else T_camera_radar
+    return camera_lidar, corrections[:, 1] @ base, lidar_radar
+
+
+def build_network(config: NetworkConfig, seed: int = 0) -> CalibrationNetwork:
+    """A fresh network; the same seed gives the same weights, whatever else used torch's generator."""
+    state = torch.random.get_rng_state()
+    torch.manual_seed(seed)
+    try:
+        return CalibrationNetwork(config)
+    finally:
+        torch.random.set_rng_state(state)
+
+
+def refine(network: CalibrationNetwork, inputs: NetworkInputs, iterations: int = 3) -> list[Predictions]:
+    """`network.refine`, for callers that hold the network as a value."""
+    return network.refine(inputs, iterations)

@@ -1,0 +1,208 @@
+"""Lidar and radar: radar detections against the density of lidar object points in azimuth, elevation and range.
+
+A radar's elevation is worth little and its azimuth much, so the search goes yaw first, then pitch (and roll, from how
+pitch changes with azimuth), each by the likelihood of the detections under the lidar's kernel density; a step of damped
+least squares over soft associations finishes all six degrees of freedom. Clutter meets a floor of the likelihood.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from pipeline.learn.network.least_squares import inverse_spd, small_rotation_vector, spherical_jacobian
+from pipeline.objective.differentiable.poses import exp_so3
+
+__all__ = ["OccupancyMatch", "OccupancyMatcher"]
+
+# Steps stay well below the kernels' widths, between which densities are interpolated.
+_REACH_DEG, _YAW_STEP_DEG, _PITCH_STEP_DEG = 8.0, 0.4, 0.5
+_FIELD_DEG = (48.0, 28.0)  # azimuth and elevation to each side: what lidar and radar share ahead
+_SECTORS = 3
+_ROLLS_DEG = 1.5 * np.arange(-4, 5)
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyMatch:
+    """What was found: twist on the left in the lidar frame, its variance, and likelihood profiles."""
+
+    twist: Float[Tensor, "B 6"]  # rotation vector [rad], translation [m]
+    variance: Float[Tensor, "B 6"]
+    profiles: Float[Tensor, "B S"]  # log-probability over yaw, then over pitch
+
+
+class OccupancyMatcher(nn.Module):
+    """Widths of the kernels, floor and temperatures are learned; everything else is geometry."""
+
+    yaws: Tensor
+    pitches: Tensor
+    rolls: Tensor
+
+    def __init__(self, radar_features: int) -> None:
+        super().__init__()
+        degree = float(np.pi / 180)
+        # Azimuth, elevation [rad], range [m]: the radar's noise and the lidar's gaps. Where training starts was tuned
+        # on simulated days (tests/benchmarks/ssl_oracle.py).
+        self.log_width = nn.Parameter(torch.log(torch.tensor([0.5 * degree, 1.2 * degree, 0.35])))
+        self.log_floor = nn.Parameter(torch.tensor(0.0))
+        # exp: how many independent detections a frame's mean log-likelihood is worth.
+        self.log_sharpness = nn.Parameter(torch.log(torch.tensor([100.0, 60.0])))
+        self.log_prior_sigma = nn.Parameter(torch.log(torch.tensor([0.02, 0.02, 0.02, 0.03, 0.03, 0.03])))
+        self.log_noise = nn.Parameter(torch.log(torch.tensor([2 * degree, 4 * degree, 1.0])))
+        self.roll_sigma_rad = 2.0 * degree
+        self.weigh = nn.Linear(radar_features, 1)
+        nn.init.zeros_(self.weigh.weight)
+        nn.init.zeros_(self.weigh.bias)
+        self.register_buffer("yaws", _steps(_YAW_STEP_DEG), persistent=False)
+        self.register_buffer("pitches", _steps(_PITCH_STEP_DEG), persistent=False)
+        self.register_buffer(
+            "rolls", torch.tensor(_ROLLS_DEG * degree, dtype=torch.float32), persistent=False
+        )
+
+    @property
+    def profile_size(self) -> int:
+        """Values of `OccupancyMatch.profiles` per frame."""
+        return len(self.yaws) + len(self.pitches)
+
+    def forward(
+        self,
+        radar_lidar: Float[Tensor, "B M 3"],
+        radar_features: Float[Tensor, "B M 3"],
+        radar_valid: Bool[Tensor, "B M"],
+        has_elevation: Bool[Tensor, " B"],
+        objects: Float[Tensor, "B L 3"],
+        object_weight: Float[Tensor, "B L"],
+    ) -> OccupancyMatch:
+        """Find the turn (and shift) of the radar that fits best.
+
+        Args:
+            radar_lidar: detections seen through the guess, lidar frame [m].
+            radar_features: as in SensorInputs.
+            radar_valid: which of them are real.
+            has_elevation: False where the radar measures none: then pitch and roll stay.
+            objects: lidar points off the ground, lidar frame [m].
+            object_weight: 0 = absent.
+        """
+        weight = torch.sigmoid(self.weigh(radar_features))[..., 0] * 2 * radar_valid.to(radar_lidar.dtype)
+        total = weight.sum(1, keepdim=True).clamp(min=1e-3)
+        tall = has_elevation.to(radar_lidar.dtype)[:, None]
+        width = torch.exp(self.log_width)
+        lidar, radar = _spherical(objects), _spherical(radar_lidar)
+        density = object_weight * lidar[..., 2] ** 2 / 400.0  # beams thin out with the square of the range
+        kernel_range = _kernel(lidar[:, None, :, 2] - radar[:, :, None, 2], width[2]) * density[:, None]
+        # Before pitch is known elevation is gated loosely; without elevation not at all.
+        elevation_gap = (lidar[:, None, :, 1] - radar[:, :, None, 1]) * tall[..., None]
+        loose = torch.sqrt(width[1] ** 2 + (2.0 * np.pi / 180) ** 2)
+        yaw_logits = self._profile(
+            kernel_range * _kernel(elevation_gap, loose), lidar[..., 0], radar[..., 0], self.yaws, 0
+        )
+        yaw_surface = (yaw_logits * weight[..., None]).sum(1) / total * torch.exp(self.log_sharpness[0])
+        yaw_posterior = torch.softmax(yaw_surface, -1)
+        yaw = (yaw_posterior * self.yaws).sum(-1)
+        azimuth = radar[..., 0] + yaw[:, None]
+        kernel_azimuth = _kernel(lidar[:, None, :, 0] - azimuth[..., None], width[0])
+        pitch_logits = self._profile(
+            kernel_range * kernel_azimuth, lidar[..., 1], radar[..., 1], self.pitches, 1
+        )
+        pitch_surface, up, roll = self._tilt(pitch_logits, azimuth, weight, total)
+        # Elevation ahead grows by a turn about -y, elevation to the left by one about x.
+        omega = torch.stack([roll * tall[:, 0], -up * tall[:, 0], yaw], -1)
+        R = exp_so3(omega)
+        step, variance = self._finish(radar_lidar @ R.transpose(1, 2), weight, tall, lidar, density, width)
+        twist = torch.cat([small_rotation_vector(exp_so3(step[:, :3]) @ R), step[:, 3:]], -1)
+        profiles = torch.cat([torch.log_softmax(yaw_surface, -1), torch.log_softmax(pitch_surface, -1)], -1)
+        return OccupancyMatch(twist, variance, profiles)
+
+    def _profile(
+        self, kernel: Tensor, lidar_angle: Tensor, radar_angle: Tensor, shifts: Tensor, axis: int
+    ) -> Tensor:
+        """B M S: log-likelihood of each detection at each shift of one angle.
+
+        The density is tabulated over absolute angles once (a matrix product) and looked up per detection.
+        """
+        step = float(np.radians((_YAW_STEP_DEG, _PITCH_STEP_DEG)[axis]))
+        bins = round(2 * _FIELD_DEG[axis] / (_YAW_STEP_DEG, _PITCH_STEP_DEG)[axis])
+        lowest = -bins / 2 * step
+        centres = lowest + step * torch.arange(bins + 1, device=kernel.device)
+        table = kernel @ _kernel(centres - lidar_angle[..., None], torch.exp(self.log_width[axis]))
+        at = ((radar_angle[..., None] + shifts - lowest) / step).clamp(0, bins - 1e-3)
+        low = torch.floor(at)
+        part = at - low
+        below = torch.gather(table, 2, low.long())
+        above = torch.gather(table, 2, low.long() + 1)
+        return torch.log(torch.exp(self.log_floor) + below * (1 - part) + above * part)
+
+    def _tilt(
+        self, logits: Tensor, azimuth: Tensor, weight: Tensor, total: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Pitch surface, elevation shift ahead and roll: sectors of azimuth vote together."""
+        edges = torch.tensor([-3.2, -10 * np.pi / 180, 10 * np.pi / 180, 3.2], device=logits.device)
+        member = torch.stack(
+            [
+                ((azimuth >= edges[s]) & (azimuth < edges[s + 1])).to(weight.dtype) * weight
+                for s in range(_SECTORS)
+            ],
+            1,
+        )
+        sectors = (member @ logits) / total[..., None]
+        side = (member @ torch.sin(azimuth)[..., None])[..., 0] / member.sum(-1).clamp(min=1e-3)
+        step = float(np.radians(_PITCH_STEP_DEG))
+        place = torch.arange(len(self.pitches), device=logits.device, dtype=logits.dtype)
+        at = place + (self.rolls[None, :, None] * side[:, None, :] / step)[..., None]
+        blend = (1 - (at.clamp(0, len(self.pitches) - 1)[..., None] - place).abs()).clamp(min=0)
+        volume = torch.einsum("brgpq,bgq->brp", blend, sectors) * torch.exp(self.log_sharpness[1])
+        volume = volume - (self.rolls[:, None] / self.roll_sigma_rad) ** 2 / 2
+        posterior = torch.softmax(volume.flatten(1), -1).reshape(volume.shape)
+        up = (posterior.sum(1) * self.pitches).sum(-1)
+        roll = (posterior.sum(2) * self.rolls).sum(-1)
+        return torch.logsumexp(volume, 1), up, roll
+
+    def _finish(
+        self, radar_lidar: Tensor, weight: Tensor, tall: Tensor, lidar: Tensor, density: Tensor, width: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """One step of damped least squares towards the softly associated lidar points."""
+        radar = _spherical(radar_lidar)
+        away = [lidar[:, None, :, axis] - radar[:, :, None, axis] for axis in range(3)]
+        near = (
+            (away[0] / width[0]) ** 2
+            + (away[1] / width[1]) ** 2 * tall[..., None]
+            + (away[2] / width[2]) ** 2
+        )
+        kernel = torch.exp(-near / 2) * density[:, None]
+        mass = kernel.sum(-1)
+        # The mean gap is the mean place less the own one: a product, not another array of all pairs.
+        mean = (kernel @ lidar) / mass.clamp(min=1e-6)[..., None] - radar
+        mean = mean * (mass > 1e-6)[..., None].to(mean.dtype)
+        inlier = mass / (mass + torch.exp(self.log_floor)) * weight
+        one = torch.ones_like(tall)
+        precision = torch.exp(-2 * self.log_noise) * torch.cat([one, tall, one], -1)
+        distance = radar[..., 2].clamp(min=0.5)
+        J = spherical_jacobian(radar_lidar / distance[..., None], distance)
+        information = inlier[..., None] * precision[:, None]
+        H = torch.einsum("bnij,bni,bnik->bjk", J, information, J)
+        H = H + torch.eye(6, device=J.device) * torch.exp(-2 * self.log_prior_sigma)
+        covariance = inverse_spd(H)
+        step = (covariance @ torch.einsum("bnij,bni->bj", J, information * mean)[..., None])[..., 0]
+        return step, (covariance * torch.eye(6, device=J.device)).sum(-1)
+
+
+def _kernel(difference: Tensor, width: Tensor) -> Tensor:
+    return torch.exp(-((difference / width) ** 2) / 2)
+
+
+def _spherical(points: Tensor) -> Tensor:
+    """Azimuth (left), elevation (up), range; by arctangents of quotients, x ahead."""
+    x, y, z = points.unbind(-1)
+    ahead = x.clamp(min=0.1)
+    flat = torch.sqrt(ahead * ahead + y * y)
+    return torch.stack([torch.atan(y / ahead), torch.atan(z / flat), torch.sqrt(flat * flat + z * z)], -1)
+
+
+def _steps(step_deg: float) -> Tensor:
+    """Shifts to both sides [rad]."""
+    reach = round(_REACH_DEG / step_deg)
+    return torch.arange(-reach, reach + 1) * float(np.radians(step_deg))

@@ -1,0 +1,84 @@
+"""What networks put out, and the heads that all of them share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+
+from pipeline.learn.sample.layout import PAIRS
+from pipeline.objective.differentiable.poses import exp_so3, pose, pose_of_euler_angles
+
+__all__ = ["PAIRS", "CoreOutputs", "Heads", "Predictions", "pose_of_twist"]
+
+_ANGLE_UNIT_RAD, _SHIFT_UNIT_M = 0.0175, 0.05  # heads put out numbers of the order of one
+# Doubt of an untrained network: 0.3 deg and 5 cm.
+_LOG_VARIANCE = (-10.5, -10.5, -10.5, -6.0, -6.0, -6.0)
+
+
+@dataclass(frozen=True, eq=False)
+class CoreOutputs:
+    """What the exported graph computes; rows of corrections are PAIRS, identity for pairs that it does not estimate."""
+
+    corrections: Float[Tensor, "B 3 4 4"]
+    log_variance: Float[Tensor, "B 3 6"]
+    camera_log_likelihood: Float[Tensor, "B K H W"] | None = None
+    camera_logits: Float[Tensor, "B K H W"] | None = None
+    lidar_logits: Float[Tensor, "B K H W"] | None = None
+    radar_logits: Float[Tensor, "B M K"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Better extrinsics, and how sure they are.
+
+    `log_variance` is of a twist on the left of each transform (rotation vector [rad], translation [m]), rows as PAIRS.
+    Logits are there for distillation: camera and lidar per cell of the grid (None in `concat` and in pairs that do
+    not use them), radar per detection; `lidar_index` is the lidar point that each cell shows, -1 where none is.
+    """
+
+    T_camera_lidar: Float[Tensor, "B 4 4"]
+    T_camera_radar: Float[Tensor, "B 4 4"]
+    T_lidar_radar: Float[Tensor, "B 4 4"]
+    log_variance: Float[Tensor, "B 3 6"]
+    camera_logits: Float[Tensor, "B K H W"] | None
+    lidar_logits: Float[Tensor, "B K H W"] | None
+    radar_logits: Float[Tensor, "B M K"] | None
+    lidar_index: Int64[Tensor, "B HW"]
+
+
+class Heads(nn.Module):
+    """One head per pair: 3 Euler angles and 3 translations, and the logarithm of their variances."""
+
+    unit: Tensor
+    start: Tensor
+
+    def __init__(self, features: int, pairs: tuple[str, ...], std: float) -> None:
+        super().__init__()
+        self.pairs = pairs
+        self.layers = nn.ModuleDict({pair: nn.Linear(features, 12) for pair in pairs})
+        for layer in self.layers.values():
+            assert isinstance(layer, nn.Linear)
+            nn.init.normal_(layer.weight, std=std)
+            nn.init.zeros_(layer.bias)
+        unit = [_ANGLE_UNIT_RAD] * 3 + [_SHIFT_UNIT_M] * 3
+        self.register_buffer("unit", torch.tensor(unit), persistent=False)
+        self.register_buffer("start", torch.tensor(_LOG_VARIANCE), persistent=False)
+
+    def forward(
+        self, features: Float[Tensor, "B F"]
+    ) -> dict[str, tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 6"]]]:
+        """By pair: correction on the left, and what its log variance differs from the start's by."""
+        found = {}
+        for pair, layer in self.layers.items():
+            raw = layer(features)
+            step = raw[:, :6] * self.unit
+            found[pair] = pose_of_euler_angles(step[:, :3], step[:, 3:]), raw[:, 6:]
+        return found
+
+
+def pose_of_twist(twist: Float[Tensor, "B 6"]) -> Float[Tensor, "B 4 4"]:
+    """Rotation vector and translation to a transform; the translation comes after the rotation."""
+    return pose(exp_so3(twist[:, :3]), twist[:, 3:])

@@ -1,0 +1,1 @@
+"""Networks that perception uses, trained weakly from the other sensors."""

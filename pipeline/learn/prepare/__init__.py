@@ -1,0 +1,1 @@
+"""Stage prepare: frames and observations of many days to table `training`."""

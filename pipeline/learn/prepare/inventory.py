@@ -1,0 +1,124 @@
+"""What table `training` holds as a whole: counts by side and environment, and frames that look alike on two sides.
+
+The split keeps vehicles, days and places apart; this looks at the pictures, because a place can have two names.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from pipeline.store.atomic_write import new_file_aside
+from pipeline.store.columns import read_columns
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_manifest
+from schemas.training import SPLITS, TRAINING
+
+__all__ = ["MANIFEST_FILE", "Inventory", "alike", "read_leaks", "take_inventory", "write_inventory"]
+
+MANIFEST_FILE = "manifest.json"
+_CHUNK = 4096
+_COLUMNS = ("frame_index", "split", "environment", "fingerprint")
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """Counts of a whole table; `leaks` are frames of val and test that look like one of an earlier side."""
+
+    frames: dict[str, int]
+    environments: dict[str, dict[str, int]]
+    vehicles: dict[str, list[str]]
+    days: dict[str, list[str]]
+    rejected: dict[str, int]
+    leaks: list[tuple[str, str, int]] = field(default_factory=list)  # vehicle, day, frame_index
+
+
+def take_inventory(lake: Lake, duplicate_bits: int) -> Inventory:
+    """Look over all partitions of the table.
+
+    Args:
+        lake: the lake.
+        duplicate_bits: fingerprints that differ in fewer bits show the same view; 0 = do not look.
+    """
+    rejected: Counter[str] = Counter()
+    environments: dict[str, Counter[str]] = {side: Counter() for side in SPLITS}
+    vehicles: dict[str, set[str]] = {side: set() for side in SPLITS}
+    days: dict[str, set[str]] = {side: set() for side in SPLITS}
+    views: dict[str, list[np.ndarray]] = {side: [] for side in SPLITS}
+    names: dict[str, list[tuple[str, str, int]]] = {side: [] for side in SPLITS}
+    for partition in lake.partitions(TRAINING.name):
+        manifest = read_manifest(lake, TRAINING, partition)
+        rejected.update(manifest.rejected if manifest else {})
+        light = read_columns(lake, TRAINING, partition, _COLUMNS)
+        for index, side, environment, bits in zip(*(light[name] for name in _COLUMNS), strict=True):
+            environments[side][environment] += 1
+            vehicles[side].add(partition.vehicle)
+            days[side].add(partition.day)
+            views[side].append(np.frombuffer(bits, np.uint8))
+            names[side].append((partition.vehicle, partition.day, index))
+    return Inventory(
+        {side: len(names[side]) for side in SPLITS},
+        {side: dict(environments[side]) for side in SPLITS},
+        {side: sorted(vehicles[side]) for side in SPLITS},
+        {side: sorted(days[side]) for side in SPLITS},
+        dict(rejected),
+        _leaks(views, names, duplicate_bits),
+    )
+
+
+def alike(
+    views: UInt8[np.ndarray, "N 32"], others: UInt8[np.ndarray, "M 32"], bits: int
+) -> Bool[np.ndarray, " N"]:
+    """True for views that differ from one of the others in fewer than `bits` of 256 bits."""
+    out = np.zeros(len(views), bool)
+    for a in range(0, len(views), _CHUNK):
+        mine = _signs(views[a : a + _CHUNK])
+        for b in range(0, len(others), _CHUNK):
+            # Bits as +-1: their product is 256 less twice the number that differ.
+            differing = (256 - mine @ _signs(others[b : b + _CHUNK]).T) / 2
+            out[a : a + _CHUNK] |= (differing < bits).any(axis=1)
+    return out
+
+
+def write_inventory(lake: Lake, inventory: Inventory, about: dict[str, Any]) -> Path:
+    """Write `training/manifest.json` beside the partitions; `about` adds what the run knows."""
+    path = lake.root / TRAINING.name / MANIFEST_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = about | inventory.__dict__
+    with new_file_aside(path) as stream:
+        stream.write((json.dumps(content, indent=2, sort_keys=True) + "\n").encode())
+    return path
+
+
+def read_leaks(lake: Lake) -> dict[Partition, set[int]]:
+    """Frames that must not be used, by partition; empty where no inventory was written."""
+    path = lake.root / TRAINING.name / MANIFEST_FILE
+    out: dict[Partition, set[int]] = {}
+    if path.exists():
+        for vehicle, day, index in json.loads(path.read_text())["leaks"]:
+            out.setdefault(Partition(vehicle, day), set()).add(int(index))
+    return out
+
+
+def _leaks(
+    views: dict[str, list[np.ndarray]], names: dict[str, list[tuple[str, str, int]]], bits: int
+) -> list[tuple[str, str, int]]:
+    found: list[tuple[str, str, int]] = []
+    stacked = {side: np.array(v, np.uint8).reshape(-1, 32) for side, v in views.items()}
+    # Test frames stay wherever they can: val gives way to test, both to train.
+    for side, others in (("val", ("train", "test")), ("test", ("train",))):
+        same = np.zeros(len(stacked[side]), bool)
+        for other in others:
+            same |= alike(stacked[side], stacked[other], bits)
+        found += [names[side][i] for i in np.flatnonzero(same)]
+    return found
+
+
+def _signs(views: np.ndarray) -> Float32[np.ndarray, "N 256"]:
+    return np.unpackbits(views, axis=1).astype(np.float32) * 2 - 1

@@ -1,0 +1,231 @@
+"""Stage prepare: frames and observations of a vehicle-day to table `training`, a row group at a time.
+
+Whoever prepares a fleet looks over all its days first (`survey_day`: a few plain columns), divides them (`plan_days`)
+and then has each day written by whichever worker is free (`prepare_day`): no row depends on another day's.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.config import FleetConfig, PrepareConfig, config_hash
+from pipeline.errors import ContractError, SolveError
+from pipeline.extrinsics.estimates import Prior
+from pipeline.extrinsics.prior import prior_key, read_prior
+from pipeline.learn.prepare.split import SplitPlan, Unit
+from pipeline.learn.prepare.survey import Survey, survey_day
+from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
+from pipeline.results import Progress, StageResult, silent
+from pipeline.store.partitions import Lake, Partition, work_key
+from pipeline.store.tables import Manifest, iterate_rows, read_manifest, write_partition
+from schemas.frames import FRAMES, Frame
+from schemas.observations import OBSERVATIONS, Observation
+from schemas.training import TRAINING, TrainingRow
+from schemas.versions import CODE_VERSION
+
+__all__ = ["decided_sides", "prepare_day"]
+
+_ROWS_PER_GROUP = 16  # a group is read at once: 5-10 MB
+_SAME = 1e-6  # rad and m: logged priors repeat numbers, they do not measure
+
+
+def decided_sides(lake: Lake, config: PrepareConfig) -> dict[tuple[str, str], str]:
+    """Sides of the vehicles, days and places that the lake's table `training` has given away already.
+
+    A table that was split by other keys, shares or seed decides nothing: it is made anew as a whole.
+    """
+    sides: dict[tuple[str, str], str] = {}
+    for partition in lake.partitions(TRAINING.name):
+        manifest = read_manifest(lake, TRAINING, partition)
+        if manifest is None or manifest.extra.get("split_rule") != _split_rule(config):
+            continue
+        sides |= {(kind, value): side for kind, value, side in manifest.extra.get("sides", [])}
+    return sides
+
+
+def prepare_day(
+    partition: Partition,
+    fleet: FleetConfig,
+    lake: Lake,
+    plan: SplitPlan,
+    progress: Progress = silent,
+    fleet_file: Path = Path("fleet.toml"),
+) -> StageResult:
+    """Write the samples of a vehicle-day as the plan divides them; `cached` where nothing changed.
+
+    Raises:
+        ContractError: the day has no frames or no observations yet.
+        ConfigError: the vehicle or its prior file is not as fleet.toml says.
+    """
+    config = fleet.prepare
+    rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
+    inputs = [_manifest(lake, schema, partition).work_key for schema in (FRAMES, OBSERVATIONS)]
+    survey = survey_day(partition, lake, config)
+    sides, rejected = _sides(survey, plan, config)
+    settings = {"prior_file": prior_key(rig.prior, fleet_file), "sides": [s or "" for s in sides]}
+    key = work_key("prepare", CODE_VERSION, config_hash(config, rig.prior, settings), inputs)
+    done = read_manifest(lake, TRAINING, partition)
+    if done is not None and done.work_key == key:
+        return _result(lake, partition, done, "cached")
+    counts: Counter[str] = Counter()
+    with write_partition(lake, TRAINING, partition, key, CODE_VERSION, inputs) as writer:
+        about = _about(survey, fleet.vehicles[partition.vehicle].rig, sides)
+        rows: list[TrainingRow] = []
+        samples = _samples(lake, partition, about, fleet, fleet_file, rejected)
+        for seen, row in enumerate(samples, 1):
+            progress(seen, len(about), "prepare")
+            if row is None:
+                continue
+            rows.append(row)
+            counts.update((row.split, f"{row.split} {row.environment}"))
+            if len(rows) == _ROWS_PER_GROUP:
+                writer.append(rows)
+                rows = []
+        writer.append(rows)
+        writer.describe(
+            kept={"frames": writer.rows, **counts},
+            rejected=dict(rejected),
+            split_rule=_split_rule(config),
+            sides=_sides_given(survey, plan),
+            grid={"step_deg": config.grid_step_deg, "shape": list(config.grid_shape)},
+        )
+    return _result(lake, partition, _manifest(lake, TRAINING, partition), "done")
+
+
+def _about(survey: Survey, rig: str, sides: Sequence[str | None]) -> dict[int, About]:
+    """What is said of each frame that is kept, by row of table frames."""
+    vehicle, day = survey.partition.vehicle, survey.partition.day
+    told = zip(sides, survey.place, survey.environment, strict=True)
+    return {
+        row: About(vehicle, day, rig, side, place, environment)
+        for row, (side, place, environment) in enumerate(told)
+        if side is not None
+    }
+
+
+def _samples(
+    lake: Lake,
+    partition: Partition,
+    about: Mapping[int, About],
+    fleet: FleetConfig,
+    fleet_file: Path,
+    rejected: Counter[str],
+) -> Iterator[TrainingRow | None]:
+    """The row of each wanted frame in order, None (counted in `rejected`) where it is no sample."""
+    if not about:
+        return
+    observations = itertools.chain.from_iterable(iterate_rows(lake, OBSERVATIONS, partition, Observation))
+    frames = itertools.chain.from_iterable(iterate_rows(lake, FRAMES, partition, Frame, rows=sorted(about)))
+    observation = next(observations)
+    try:
+        prior = read_prior([observation], fleet.rig_of(partition.vehicle).prior, fleet_file)
+    except SolveError:
+        rejected[SampleReason.NO_PRIOR.value] += len(about)
+        return
+    first = _logged_prior(observation)
+    for row, frame in zip(sorted(about), frames, strict=True):
+        while observation.frame_index < frame.frame_index:
+            observation = next(observations)
+        try:
+            yield _sample(frame, observation, prior, first, about[row], fleet.prepare)
+        except SampleRejectedError as rejection:
+            rejected[rejection.reason.value] += 1
+            yield None
+
+
+def _sample(
+    frame: Frame,
+    observation: Observation,
+    prior: Prior,
+    first: np.ndarray,
+    about: About,
+    config: PrepareConfig,
+) -> TrainingRow:
+    logged = _logged_prior(observation)
+    if not np.allclose(logged, first, atol=_SAME, rtol=0, equal_nan=True):
+        raise SampleRejectedError(SampleReason.PRIOR_CHANGED)
+    return make_row(frame, observation, prior, about, config)
+
+
+def _logged_prior(observation: Observation) -> np.ndarray:
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    pairs = ("camera_lidar", "lidar_radar")
+    return np.array([getattr(observation, f"prior_{p}_{n}") for p in pairs for n in names], np.float64)
+
+
+def _sides(survey: Survey, plan: SplitPlan, config: PrepareConfig) -> tuple[list[str | None], Counter[str]]:
+    """Side of each frame, None where it is left out, and how many are left out by reason."""
+    vehicle, day = survey.partition.vehicle, survey.partition.day
+    sides = np.array([plan.side_of(vehicle, day, place) or "" for place in survey.place])
+    reasons = np.full(len(sides), "", object)
+    reasons[sides == ""] = SampleReason.SPLIT_CONFLICT.value
+    reasons[(reasons == "") & _near_other_side(survey, sides, config.guard_s)] = (
+        SampleReason.NEXT_TO_OTHER_SPLIT.value
+    )
+    reasons[~survey.moved] = SampleReason.HARDLY_MOVED.value
+    reasons[~survey.perceived] = SampleReason.NOT_PERCEIVED.value
+    kept = np.flatnonzero(reasons == "")
+    if config.max_frames is not None and len(kept) > config.max_frames:
+        spread = np.linspace(0, len(kept) - 1, config.max_frames).astype(int)
+        reasons[np.setdiff1d(kept, kept[spread])] = SampleReason.NOT_NEEDED.value
+    counts: Counter[str] = Counter(str(r) for r in reasons if r)
+    return [str(s) if not r else None for s, r in zip(sides, reasons, strict=True)], counts
+
+
+def _near_other_side(survey: Survey, sides: np.ndarray, guard_s: float) -> np.ndarray:
+    """True where a frame of the same day on another side is nearer in time than the guard."""
+    near = np.zeros(len(sides), bool)
+    for i, j in itertools.pairwise(range(len(sides))):
+        if sides[i] == sides[j]:
+            continue
+        border = (survey.stamp_s[i] + survey.stamp_s[j]) / 2
+        near |= np.abs(survey.stamp_s - border) < guard_s / 2
+    return near
+
+
+def _sides_given(survey: Survey, plan: SplitPlan) -> list[list[str]]:
+    """The keys of this day's usable frames and their sides, for later plans."""
+    vehicle, day = survey.partition.vehicle, survey.partition.day
+    places = {place for place, usable in zip(survey.place, survey.usable, strict=True) if usable}
+    keys = {key for place in places for key in Unit(vehicle, day, place).keys(plan.by)}
+    return [[kind, value, plan.sides[kind, value]] for kind, value in sorted(keys & plan.sides.keys())]
+
+
+def _split_rule(config: PrepareConfig) -> str:
+    names = ("split_by", "val_fraction", "test_fraction", "positions", "place_m", "place_s", "seed")
+    return config_hash({name: getattr(config, name) for name in names})
+
+
+def _manifest(lake: Lake, schema: Any, partition: Partition) -> Manifest:
+    manifest = read_manifest(lake, schema, partition)
+    if manifest is None:
+        before = {"frames": "ingest", "observations": "perceive"}.get(schema.name, "prepare")
+        problem = f"no {schema.name} of this vehicle and day: run `boresight {before}` first"
+        raise ContractError(str(lake.folder(schema.name, partition)), problem)
+    return manifest
+
+
+def _result(lake: Lake, partition: Partition, manifest: Manifest, status: str) -> StageResult:
+    reason = ""
+    if manifest.rows == 0:
+        status = "refused"
+        counts = ", ".join(f"{n} {why}" for why, n in sorted(manifest.rejected.items()))
+        reason = f"no sample: {counts}" if counts else "the day has no frames"
+    return StageResult(
+        "prepare",
+        partition.vehicle,
+        partition.day,
+        status,
+        manifest.work_key,
+        rows=manifest.rows,
+        kept=dict(manifest.kept),
+        rejected=dict(manifest.rejected),
+        reason=reason,
+        outputs=[str(lake.folder(TRAINING.name, partition))],
+    )

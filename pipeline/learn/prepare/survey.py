@@ -1,0 +1,117 @@
+"""What a plan needs of each vehicle-day: where and when its frames were taken, and which can become samples."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.config import PrepareConfig
+from pipeline.learn.prepare.split import SplitPlan, Unit, environment_of_speeds, plan_split
+from pipeline.store.columns import read_columns
+from pipeline.store.partitions import Lake, Partition
+from schemas.frames import FRAMES
+from schemas.observations import OBSERVATIONS
+
+__all__ = ["Survey", "plan_days", "survey_day"]
+
+_LIGHT = ("frame_index", "log", "drive", "stamp_ns", "ego_speed_mps", "ego_tx_m", "ego_ty_m")
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What a plan needs of one vehicle-day, one entry per frame in order of time."""
+
+    partition: Partition
+    stamp_s: np.ndarray
+    drive: np.ndarray
+    perceived: np.ndarray  # bool: the frame has an observation
+    moved: np.ndarray  # bool: the vehicle moved since the last frame that counts
+    place: list[str]
+    environment: list[str]  # of the frame's drive
+
+    @property
+    def usable(self) -> np.ndarray:
+        """Frames that can become samples."""
+        return self.perceived & self.moved
+
+
+def survey_day(partition: Partition, lake: Lake, config: PrepareConfig) -> Survey:
+    """Look over a vehicle-day without reading an image or a point.
+
+    Raises:
+        ContractError: the day has no frames or no observations yet.
+    """
+    light = read_columns(lake, FRAMES, partition, _LIGHT)
+    perceived = set(read_columns(lake, OBSERVATIONS, partition, ["frame_index"])["frame_index"])
+    stamp = np.array(light["stamp_ns"], np.int64) * 1e-9
+    drive = np.array(light["drive"], np.int64)
+    x, y, speed = (np.array(light[n], np.float64) for n in ("ego_tx_m", "ego_ty_m", "ego_speed_mps"))
+    environments = {
+        int(d): environment_of_speeds(
+            [s for s, k in zip(light["ego_speed_mps"], drive, strict=True) if k == d]
+        )
+        for d in np.unique(drive)
+    }
+    return Survey(
+        partition,
+        stamp,
+        drive,
+        np.array([i in perceived for i in light["frame_index"]], bool),
+        _moved(stamp, drive, np.nan_to_num(speed, nan=np.inf), config.min_step_m),
+        _places(partition, light["log"], drive, stamp, x, y, config),
+        [environments[int(d)] for d in drive],
+    )
+
+
+def plan_days(
+    surveys: Sequence[Survey], config: PrepareConfig, decided: Mapping[tuple[str, str], str]
+) -> SplitPlan:
+    """Divide the usable frames of all days; `decided` as `decided_sides` returns them."""
+    counts = Counter(
+        (s.partition.vehicle, s.partition.day, place)
+        for s in surveys
+        for place, usable in zip(s.place, s.usable, strict=True)
+        if usable
+    )
+    units = [Unit(*key, frames) for key, frames in sorted(counts.items())]
+    return plan_split(units, config.split_by, config.val_fraction, config.test_fraction, config.seed, decided)
+
+
+def _moved(stamp: np.ndarray, drive: np.ndarray, speed: np.ndarray, step_m: float) -> np.ndarray:
+    """True for frames that lie `step_m` of way or more behind the last such frame; unknown speeds count as fast."""
+    out = np.ones(len(stamp), bool)
+    way = 0.0
+    for i in range(1, len(stamp)):
+        if drive[i] != drive[i - 1]:
+            way = 0.0
+            continue
+        way += (stamp[i] - stamp[i - 1]) * (abs(speed[i]) + abs(speed[i - 1])) / 2
+        out[i] = way >= step_m
+        if out[i]:
+            way = 0.0
+    return out
+
+
+def _places(
+    partition: Partition,
+    log: Sequence[str],
+    drive: np.ndarray,
+    stamp: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    config: PrepareConfig,
+) -> list[str]:
+    """A cell of the map, a cell of the log's own odometry, or a stretch of the drive."""
+    begin = {int(d): float(stamp[drive == d].min()) for d in np.unique(drive)}
+    names = []
+    for i in range(len(stamp)):
+        home = "" if config.positions == "map" else f"{partition.vehicle}/{partition.day}/{log[i]}:"
+        if np.isfinite(x[i]) and np.isfinite(y[i]):
+            names.append(f"{home}{x[i] // config.place_m:.0f},{y[i] // config.place_m:.0f}")
+        else:
+            stretch = int((stamp[i] - begin[int(drive[i])]) // config.place_s)
+            names.append(f"{partition.vehicle}/{partition.day}/drive {drive[i]}, stretch {stretch}")
+    return names

@@ -1,0 +1,241 @@
+"""Lidar and radar of one frame as arrays of fixed size: thinned evenly, flagged from ranges, padded with zeros."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Integer, UInt8
+from scipy.spatial import cKDTree
+
+from pipeline.config import PrepareConfig
+from pipeline.geometry.se3 import transform_points
+from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.objective.paper.lidar_radar import drivable_map
+from schemas.frames import Frame
+from schemas.observations import Observation
+from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND
+
+__all__ = ["View", "input_points", "lidar_columns", "padded_rows", "radar_columns", "range_edges"]
+
+_NEAR_M, _FAR_M = 2.5, 120.0
+_SAME_POINT_M = 0.5  # a point of the sweep and its voxel's in the map are nearer than this
+_LOSS_RANGE_M = 80.0  # the paper's far limit
+_CLUSTERS, _DRIVABLE, _DETECTIONS, _TRACKS = 48, 512, 384, 24
+# As in perception: a jump must exceed both, and a beam may be missing between the two.
+_JUMP_M, _JUMP_FRACTION, _JUMP_STEPS = 0.8, 0.06, 2.6
+
+
+@dataclass(frozen=True)
+class View:
+    """The part of the world that matters: the camera's grid and a margin, seen through a guess.
+
+    Args:
+        T_camera_lidar: the guess.
+        half_width_rad: of the grid.
+        half_height_rad: of the grid.
+        margin_rad: how wrong the guess may be.
+        step_rad: size of a cell.
+    """
+
+    T_camera_lidar: np.ndarray
+    half_width_rad: float
+    half_height_rad: float
+    margin_rad: float
+    step_rad: float
+
+    def angles(self, xyz_m: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
+        """Azimuth and elevation in the camera of points in the lidar frame."""
+        return camera_direction_angles(transform_points(self.T_camera_lidar, xyz_m.astype(np.float64)))
+
+    def contains(self, angles: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
+        """True inside the grid and its margin."""
+        limit = np.array([self.half_width_rad, self.half_height_rad]) + self.margin_rad
+        return np.all(np.abs(angles) <= limit, axis=1)
+
+
+def lidar_columns(
+    frame: Frame, observation: Observation, view: View, config: PrepareConfig, rng: np.random.Generator
+) -> dict[str, Any]:
+    """The columns of table `training` that the lidar gives."""
+    return (
+        input_points(frame, observation, view, config.lidar_points, rng)
+        | _cluster_columns(observation, view, config.cluster_points, rng)
+        | _edge_columns(observation, view, config.edge_points, rng)
+        | _drivable_columns(observation, rng)
+    )
+
+
+def input_points(
+    frame: Frame, observation: Observation, view: View, count: int, rng: np.random.Generator
+) -> dict[str, Any]:
+    """What the network sees of the sweep: at most one point per cell of the grid, then others while there is room.
+
+    Nothing here depends on the camera's image; `view` decides only which points are kept.
+    """
+    xyz = frame.lidar_xyz_m
+    flags = range_edges(xyz, frame.lidar_ring).astype(np.uint8) * POINT_IS_EDGE
+    distance = np.linalg.norm(xyz, axis=1)
+    angles = view.angles(xyz)
+    inside = view.contains(angles) & (distance > _NEAR_M) & (distance < _FAR_M)  # NaN: not inside
+    rows = _thinned(np.flatnonzero(inside), angles, view.step_rad, count, rng)
+    flags[rows] |= _ground_flags(xyz[rows], observation) * POINT_IS_GROUND
+    rank = _ranks(frame.lidar_intensity, len(xyz))
+    return {
+        "lidar_xyz_m": padded_rows(xyz[rows], count),
+        "lidar_intensity": padded_rows(rank[rows], count),
+        "lidar_flags": padded_rows(flags[rows], count),
+        "lidar_count": len(rows),
+    }
+
+
+def range_edges(
+    xyz_m: Float[np.ndarray, "N 3"], ring: Integer[np.ndarray, " N"] | None
+) -> Bool[np.ndarray, " N"]:
+    """True for points that stand in front of their neighbour along the ring by a jump in range.
+
+    From ranges alone: the class of an object would tell the network where its mask ends.
+    """
+    out = np.zeros(len(xyz_m), bool)
+    finite = np.flatnonzero(np.isfinite(xyz_m).all(axis=1))
+    if len(finite) < 2:
+        return out
+    x, y, z = xyz_m[finite].astype(np.float64).T
+    azimuth, distance = np.arctan2(y, x), np.sqrt(x * x + y * y + z * z)
+    row = ring[finite].astype(np.int64) if ring is not None else _elevation_rows(z, distance)
+    order = np.lexsort((azimuth, row))
+    step = np.diff(azimuth[order])
+    along = np.diff(row[order]) == 0
+    nominal = np.median(step[along & (step > 1e-5)]) if np.any(along & (step > 1e-5)) else 0.0
+    rise = np.diff(distance[order])
+    nearer = np.minimum(distance[order][1:], distance[order][:-1])
+    jump = along & (step <= _JUMP_STEPS * nominal)
+    jump &= np.abs(rise) > np.maximum(_JUMP_M, _JUMP_FRACTION * nearer)
+    out[finite[order[:-1][jump & (rise > 0)]]] = True
+    out[finite[order[1:][jump & (rise < 0)]]] = True
+    return out
+
+
+def radar_columns(observation: Observation, rng: np.random.Generator) -> dict[str, Any]:
+    """The columns of table `training` that the radar gives."""
+    picked = _some(len(observation.radar_xyz_m), _DETECTIONS, rng)
+    power = observation.radar_power_db
+    relative = np.zeros(len(picked)) if power is None else power[picked] - np.nanmedian(power)
+    soft = drivable_map(observation.radar_drivable_azimuth_rad, observation.radar_drivable_range_m)
+    ahead, across = soft.shape
+    metres = soft.reshape(ahead // 2, 2, across // 2, 2).mean(axis=(1, 3))
+    return {
+        "radar_xyz_m": padded_rows(observation.radar_xyz_m[picked], _DETECTIONS),
+        "radar_residual_mps": padded_rows(np.nan_to_num(observation.radar_residual_mps[picked]), _DETECTIONS),
+        "radar_power_db": padded_rows(np.nan_to_num(relative), _DETECTIONS),
+        "radar_motion": padded_rows(observation.radar_motion[picked], _DETECTIONS),
+        "radar_count": len(picked),
+        "radar_has_elevation": observation.radar_has_elevation,
+        "track_xyz_m": padded_rows(observation.radar_track_xyz_m[:_TRACKS], _TRACKS),
+        "track_velocity_mps": padded_rows(observation.radar_track_velocity_mps[:_TRACKS], _TRACKS),
+        "track_age": padded_rows(observation.radar_track_age[:_TRACKS], _TRACKS),
+        "track_count": min(len(observation.radar_track_xyz_m), _TRACKS),
+        "radar_drivable": np.rint(np.clip(metres, 0, 1) * 255).astype(np.uint8),
+    }
+
+
+def padded_rows(values: np.ndarray, count: int) -> np.ndarray:
+    """The values, and zeros behind them."""
+    out = np.zeros((count, *values.shape[1:]), values.dtype)
+    out[: len(values)] = values
+    return out
+
+
+def _thinned(
+    rows: np.ndarray, angles: np.ndarray, step_rad: float, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """At most `count` of the rows in order: a random one of each cell first, then random others."""
+    rows = rng.permutation(rows)
+    cell = np.floor(angles[rows] / step_rad).astype(np.int64)
+    _, first = np.unique(cell[:, 0] * 100_000 + cell[:, 1], return_index=True)
+    others = np.setdiff1d(np.arange(len(rows)), first, assume_unique=True)
+    first = rng.permutation(first)[:count]
+    return np.sort(rows[np.concatenate([first, others[: count - len(first)]])])
+
+
+def _ground_flags(xyz_m: np.ndarray, observation: Observation) -> np.ndarray:
+    """1 where perception's map, which holds one point per voxel, says ground."""
+    if not len(observation.lidar_map_xyz_m) or not len(xyz_m):
+        return np.zeros(len(xyz_m), np.uint8)
+    distance, nearest = cKDTree(observation.lidar_map_xyz_m).query(xyz_m, distance_upper_bound=_SAME_POINT_M)
+    found = np.isfinite(distance)
+    flags = np.zeros(len(xyz_m), np.uint8)
+    flags[found] = observation.lidar_map_is_ground[nearest[found]]
+    return flags
+
+
+def _ranks(intensity: np.ndarray | None, count: int) -> UInt8[np.ndarray, " N"]:
+    """Rank of each reflectivity within its sweep, 0..255: lidars differ in scale, not in order."""
+    if intensity is None:
+        return np.zeros(count, np.uint8)
+    values = np.sort(intensity)
+    rank = (np.searchsorted(values, intensity, "left") + np.searchsorted(values, intensity, "right")) / 2
+    return np.rint(rank * (255.0 / max(count, 1))).astype(np.uint8)
+
+
+def _cluster_columns(
+    observation: Observation, view: View, count: int, rng: np.random.Generator
+) -> dict[str, Any]:
+    cloud, cluster = observation.lidar_map_xyz_m, observation.lidar_map_cluster
+    distance = np.linalg.norm(cloud, axis=1)
+    inside = (cluster >= 0) & (distance > _NEAR_M) & (distance < _LOSS_RANGE_M)
+    inside &= view.contains(view.angles(cloud))
+    rows = np.flatnonzero(inside)
+    # Clusters are numbered by size: the largest of those in view.
+    largest = np.unique(cluster[rows])[:_CLUSTERS]
+    number = np.full(len(observation.lidar_cluster_centre_m) + 1, -1, np.int16)
+    number[largest] = np.arange(len(largest))
+    picked = rows[_some(len(rows), count, rng)]
+    size = observation.lidar_cluster_max_m - observation.lidar_cluster_min_m
+    return {
+        "cluster_xyz_m": padded_rows(cloud[picked], count),
+        "cluster_id": padded_rows(number[cluster[picked]], count),
+        "cluster_point_count": len(picked),
+        "cluster_centre_m": padded_rows(observation.lidar_cluster_centre_m[largest], _CLUSTERS),
+        "cluster_size_m": padded_rows(size[largest], _CLUSTERS),
+        "cluster_count": len(largest),
+    }
+
+
+def _edge_columns(
+    observation: Observation, view: View, count: int, rng: np.random.Generator
+) -> dict[str, Any]:
+    rows = np.flatnonzero(view.contains(view.angles(observation.lidar_edge_xyz_m)))
+    picked = rows[_some(len(rows), count, rng)]
+    return {
+        "edge_xyz_m": padded_rows(observation.lidar_edge_xyz_m[picked], count),
+        "edge_side": padded_rows(observation.lidar_edge_side[picked], count),
+        "edge_gap_rad": padded_rows(observation.lidar_edge_gap_rad[picked], count),
+        "edge_count": len(picked),
+    }
+
+
+def _drivable_columns(observation: Observation, rng: np.random.Generator) -> dict[str, Any]:
+    cells = observation.lidar_drivable_xyz_m
+    cells = cells[(np.linalg.norm(cells[:, :2], axis=1) < _LOSS_RANGE_M) & (cells[:, 0] > 0)]
+    picked = cells[_some(len(cells), _DRIVABLE, rng)]
+    plane = observation.ground_plane
+    return {
+        "drivable_xyz_m": padded_rows(picked, _DRIVABLE),
+        "drivable_count": len(picked),
+        "drivable_area_m2": float(len(cells)),  # on a grid of 1 m
+        "ground_plane": np.zeros(4) if plane is None else plane,
+    }
+
+
+def _some(available: int, count: int, rng: np.random.Generator) -> Int[np.ndarray, " K"]:
+    """At most `count` row numbers, in order."""
+    if available <= count:
+        return np.arange(available)
+    return np.sort(rng.choice(available, count, replace=False))
+
+
+def _elevation_rows(z: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Rows of a lidar that logs no rings: bands of elevation as wide as rings usually lie apart."""
+    return np.floor(np.arcsin(z / np.maximum(distance, 1e-6)) / np.radians(0.2)).astype(np.int64)

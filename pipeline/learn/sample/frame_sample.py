@@ -1,0 +1,234 @@
+"""One frame and what perception found in it, as a row of table `training`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.config import PrepareConfig
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.learn.sample.camera_maps import camera_features, stored_grid
+from pipeline.learn.sample.clouds import View, lidar_columns, padded_rows, radar_columns
+from pipeline.learn.sample.grid import Grid, resample_camera
+from pipeline.objective.camera_lidar.image_maps import camera_of
+from pipeline.objective.paper.classes import labels_of
+from schemas.frames import Frame
+from schemas.observations import Observation
+from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, TrainingRow
+
+__all__ = [
+    "About",
+    "SampleReason",
+    "SampleRejectedError",
+    "decode_small",
+    "fingerprint",
+    "make_row",
+    "sensor_row",
+]
+
+_DETECTIONS = 24
+_MARGIN_RAD = np.radians(6.0)  # beyond the grid: what a guess wrong by so much still brings into view
+_MIN_POINTS = 300  # fewer in view show a network no shape
+_MIN_SEEN = 0.2  # of the grid: a camera narrower than that has another grid
+_CLASS_OF_USER = {
+    "person": "person", "rider": "person", "bicycle": "two_wheeler", "motorcycle": "two_wheeler",
+}  # fmt: skip
+
+
+class SampleReason(StrEnum):
+    """Why a frame is no sample."""
+
+    NOT_PERCEIVED = "not_perceived"
+    HARDLY_MOVED = "hardly_moved"
+    SPLIT_CONFLICT = "split_conflict"
+    NEXT_TO_OTHER_SPLIT = "next_to_other_split"
+    NOT_NEEDED = "not_needed"
+    UNDECODABLE_IMAGE = "undecodable_image"
+    NARROW_VIEW = "narrow_view"
+    FEW_LIDAR_POINTS = "few_lidar_points_in_view"
+    NO_PRIOR = "no_prior"
+    PRIOR_CHANGED = "prior_changed"
+
+
+class SampleRejectedError(Exception):
+    """A frame that is no sample."""
+
+    def __init__(self, reason: SampleReason) -> None:
+        self.reason = reason
+        super().__init__(reason.value)
+
+
+@dataclass(frozen=True)
+class About:
+    """What a row says of its frame that neither frame nor observation knows."""
+
+    vehicle: str
+    day: str
+    rig: str
+    split: str
+    place: str
+    environment: str
+
+
+def make_row(
+    frame: Frame, observation: Observation, prior: Prior, about: About, config: PrepareConfig
+) -> TrainingRow:
+    """The row of one frame; the same frame gives the same row.
+
+    Raises:
+        SampleRejectedError: the frame shows too little.
+    """
+    sensors = sensor_row(frame, observation, prior, about, config)
+    grid = stored_grid(config.grid_shape, config.grid_step_deg)
+    camera = camera_of(observation)
+    features = camera_features(labels_of(observation), camera, grid)
+    return replace(
+        sensors,
+        grid_class=features.grid_class.ravel(),
+        class_distance=features.class_distance.reshape(len(features.class_distance), -1),
+        edge_offset=features.edge_offset.reshape(4, -1),
+        sky_depth=features.sky_depth.ravel(),
+        **_detection_columns(observation, camera),
+    )
+
+
+def sensor_row(
+    frame: Frame, observation: Observation, prior: Prior, about: About, config: PrepareConfig
+) -> TrainingRow:
+    """A row whose columns from the camera's semantics are all 0: what a network needs to be asked, not taught.
+
+    Args:
+        frame: image and sweep.
+        observation: what geometry alone says of lidar and radar: ground, clusters, motion.
+        prior: decides which lidar points are in view, and is the row's reference.
+        about: whose frame it is.
+        config: the grid and the counts.
+
+    Raises:
+        SampleRejectedError: the frame shows too little.
+    """
+    # One generator per frame: the row does not depend on which frames came before.
+    rng = np.random.default_rng([frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index, config.seed])
+    height, width = config.grid_shape
+    grid = stored_grid((height, width), config.grid_step_deg)
+    small, seen = resample_camera(decode_small(frame, config.grid_step_deg), camera_of(observation), grid)
+    if seen.mean() < _MIN_SEEN:
+        raise SampleRejectedError(SampleReason.NARROW_VIEW)
+    lidar = lidar_columns(frame, observation, _view(prior, grid), config, rng)
+    if lidar["lidar_count"] < _MIN_POINTS:
+        raise SampleRejectedError(SampleReason.FEW_LIDAR_POINTS)
+    cells = height * width
+    return TrainingRow(
+        frame_index=frame.frame_index,
+        **about.__dict__,
+        drive=frame.drive,
+        stamp_ns=frame.stamp_ns,
+        fingerprint=fingerprint(small),
+        grid_step_deg=config.grid_step_deg,
+        grid_height=height,
+        grid_width=width,
+        image=small[..., ::-1].transpose(2, 0, 1).reshape(3, -1),  # OpenCV decodes blue first
+        grid_seen=seen.ravel(),
+        grid_class=np.zeros(cells, np.uint8),
+        class_distance=np.zeros((len(DISTANCE_GROUPS), cells), np.uint8),
+        edge_offset=np.zeros((4, cells), np.int8),
+        sky_depth=np.zeros(cells, np.uint8),
+        detection_box_rad=np.zeros((_DETECTIONS, 4), np.float32),
+        detection_class=np.zeros(_DETECTIONS, np.uint8),
+        detection_score=np.zeros(_DETECTIONS, np.float32),
+        detection_count=0,
+        **lidar,
+        **radar_columns(observation, rng),
+        **_reference_columns(observation, prior),
+    )
+
+
+def decode_small(frame: Frame, cell_deg: float) -> UInt8[np.ndarray, "Y X 3"]:
+    """The image as BGR, JPEG reduced while it is decoded as far as two pixels per cell remain.
+
+    Raises:
+        SampleRejectedError: undecodable, or not of the size that the intrinsics refer to.
+    """
+    focal_px = float(max(frame.camera_K[0, 0], frame.camera_K[1, 1]))
+    per_cell = np.radians(cell_deg) * focal_px
+    reduction = next((r for r in (4, 2) if per_cell >= 2 * r), 1) if frame.image_format == "jpeg" else 1
+    flag = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}[reduction]
+    image = _decoded(frame.image, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    sides = (frame.image_height_px, frame.image_width_px)
+    if image is None or image.shape[:2] != tuple(-(-side // reduction) for side in sides):
+        raise SampleRejectedError(SampleReason.UNDECODABLE_IMAGE)
+    return image
+
+
+def fingerprint(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, " 32"]:
+    """256 bits, whether each of 16 x 16 patches is darker than its right neighbour: alike for the same view."""
+    grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (17, 16), interpolation=cv2.INTER_AREA)
+    return np.packbits(grey[:, 1:] > grey[:, :-1])
+
+
+def _decoded(blob: bytes, flag: int) -> np.ndarray | None:
+    if not blob:
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(blob, np.uint8), flag)
+    except cv2.error:
+        return None
+
+
+def _view(prior: Prior, grid: Grid) -> View:
+    half = np.radians([grid.left_deg, grid.top_deg])
+    return View(
+        prior.T_camera_lidar, float(half[0]), float(half[1]), _MARGIN_RAD, float(np.radians(grid.cell_deg))
+    )
+
+
+def _detection_columns(observation: Observation, camera: Camera) -> dict[str, Any]:
+    """Boxes as angles; those that leave the camera's model are dropped."""
+    boxes = observation.road_user_boxes_px.astype(np.float64).reshape(-1, 4)
+    angles = _box_angles(boxes, camera)
+    rows = np.flatnonzero(np.isfinite(angles).all(axis=1))
+    rows = rows[np.argsort(-observation.road_user_scores[rows], kind="stable")][:_DETECTIONS]
+    names = [_CLASS_OF_USER.get(observation.road_user_classes[i], "vehicle") for i in rows]
+    return {
+        "detection_box_rad": padded_rows(angles[rows].astype(np.float32), _DETECTIONS),
+        "detection_class": padded_rows(
+            np.array([GRID_CLASSES.index(n) for n in names], np.uint8), _DETECTIONS
+        ),
+        "detection_score": padded_rows(observation.road_user_scores[rows], _DETECTIONS),
+        "detection_count": len(rows),
+    }
+
+
+def _box_angles(boxes_px: Float[np.ndarray, "N 4"], camera: Camera) -> Float[np.ndarray, "N 4"]:
+    """Azimuth left, elevation top, azimuth right, elevation bottom at the middles of the boxes' sides."""
+    x0, y0, x1, y1 = boxes_px.T
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    sides = np.stack([np.stack(p, -1) for p in ((x0, y), (x, y0), (x1, y), (x, y1))], 1)
+    angles = camera_direction_angles(camera.unproject(sides))
+    return np.stack([angles[:, 0, 0], angles[:, 1, 1], angles[:, 2, 0], angles[:, 3, 1]], -1)
+
+
+def _reference_columns(observation: Observation, prior: Prior) -> dict[str, Any]:
+    """The camera, the clocks and the prior."""
+    columns: dict[str, Any] = {
+        "ego_speed_mps": observation.ego_speed_mps or 0.0,
+        "camera_lag_s": (observation.camera_stamp_ns - observation.stamp_ns) * 1e-9,
+        "radar_lag_s": (observation.radar_stamp_ns - observation.stamp_ns) * 1e-9,
+        **{
+            name: getattr(observation, name)
+            for name in ("camera_model", "camera_K", "camera_D", "image_width_px", "image_height_px")
+        },
+    }
+    for pair in ("camera_lidar", "lidar_radar"):
+        values = (*to_quaternion(prior.of(pair)), *prior.of(pair)[:3, 3])
+        for part, value in zip(("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"), values, strict=True):
+            columns[f"prior_{pair}_{part}"] = float(value)
+    return columns

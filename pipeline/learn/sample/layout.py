@@ -1,0 +1,88 @@
+"""Names, orders and counts that training, the exported file and inference share; nothing here needs torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from pipeline.learn.sample.grid import Grid
+
+__all__ = [
+    "EDGE_BONUS",
+    "FEATURE_UNITS",
+    "GRAPH_INPUTS",
+    "GROUND_WEIGHT",
+    "INDEX_BITS",
+    "LIDAR_CHANNELS",
+    "LIDAR_FEATURES",
+    "LIKELIHOOD",
+    "MARGIN_DEG",
+    "MATCHED_POINTS",
+    "MILLIMETRES",
+    "NEARNESS_M",
+    "NEAR_M",
+    "OBJECT_BONUS",
+    "OBJECT_POINTS",
+    "PAIRS",
+    "RADAR_CHANNELS",
+    "RADAR_FEATURES",
+    "RADAR_POINTS",
+    "NetworkConfig",
+]
+
+PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
+LIDAR_FEATURES = ("intensity", "height", "edge", "ground")
+RADAR_FEATURES = ("speed", "power", "moving")
+# What brings features to the order of one: heights [m], Doppler residuals [m/s], power over the median [dB].
+FEATURE_UNITS = {"height": 3.0, "speed": 5.0, "power": 20.0}
+
+LIDAR_CHANNELS = 2 + len(LIDAR_FEATURES)  # of a rendered sweep: occupied, nearness, features
+RADAR_CHANNELS = 2 + len(RADAR_FEATURES)
+NEARNESS_M = 8.0  # nearness = this over the range, at most 2
+NEAR_M = 0.5  # nothing outside the car is nearer
+MILLIMETRES = 1000.0  # ranges are compared in millimetres
+INDEX_BITS = 20  # up to a million points share a key with their range
+MATCHED_POINTS = 1536  # lidar points whose classes are matched with the camera's
+OBJECT_POINTS = 512  # lidar points off the ground that radar detections are matched with
+RADAR_POINTS = 384  # as table training holds them
+# Added to a rank in 0..1 to choose points: edges first, then objects. Unequal fractions of a rank's step, so that no
+# two scores are the same and all machines pick the same points.
+EDGE_BONUS, OBJECT_BONUS = 1.0 + 2.0**-19, 0.5 + 2.0**-18
+GROUND_WEIGHT = 0.3  # ground is most of the points, and its classes are the least sharp
+MARGIN_DEG = 8.0  # beyond the grid's border: for guesses that are wrong
+
+# Inputs of the exported graph in order: the fields of `views.RenderedView`.
+GRAPH_INPUTS = (
+    "camera", "lidar_grid", "radar_grid", "points_camera", "point_weight", "objects", "object_weight",
+    "radar_lidar", "radar_camera", "radar_features", "radar_valid", "radar_has_elevation",
+)  # fmt: skip
+LIKELIHOOD = "camera_log_likelihood"  # an output, where a graph can be cut to encode the camera once
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """What is built.
+
+    Args:
+        architecture: explicit matching, or the paper's concatenation.
+        pairs: all three pairs in one network, or one pair.
+        grid: part of the camera's directions that is looked at.
+        width: channels of the encoders' first stage.
+        hidden: features per pair before fusion (matching), fused features (concat).
+    """
+
+    architecture: Literal["matching", "concat"] = "matching"
+    pairs: Literal["joint", "camera_lidar", "camera_radar", "lidar_radar"] = "joint"
+    grid: Grid = field(default_factory=Grid)
+    width: int = 16
+    hidden: int = 192
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """The pairs that the network corrects."""
+        return PAIRS if self.pairs == "joint" else (self.pairs,)
+
+    @property
+    def composed(self) -> bool:
+        """Whether the camera-radar correction stands on the product of the other two instead of on the guess."""
+        return self.architecture == "matching" and self.pairs == "joint"

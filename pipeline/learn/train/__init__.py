@@ -1,0 +1,1 @@
+"""Training: from table `training` to a run folder."""

@@ -1,0 +1,108 @@
+"""Making the guess wrong on purpose and turning the camera's view: what keeps a network from learning one rig by heart.
+
+To move a cloud by A and look at it through T is to look at it as it is through T A; so clouds stay, and the guesses
+move. Lidar and radar move independently, the three guesses close the loop. A turned view is the same image on a grid
+turned by R: poses into the turned camera are R T, and the losses, which keep the unturned maps, are given R^-1 T.
+
+Source: paper section 4.5.4 (random rotation and translation of lidar and radar clouds); the project's evidence on
+self-supervision, section 1, for turning both sides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.train.settings import AugmentConfig
+from pipeline.objective.differentiable.poses import exp_so3, inverse, pose
+from schemas.training import UNKNOWN_CLASS
+
+__all__ = ["Guess", "random_guess", "turned_view"]
+
+_RAD = torch.pi / 180.0
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """Where the network starts, seen from the turned camera, and how that camera is turned."""
+
+    R_turned_camera: Float[Tensor, "B 3 3"]
+    T_camera_lidar: Float[Tensor, "B 4 4"]
+    T_camera_radar: Float[Tensor, "B 4 4"]
+    T_lidar_radar: Float[Tensor, "B 4 4"]
+
+    def unturned(self, T_turned: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
+        """A pose into the turned camera as one into the camera itself."""
+        R = self.R_turned_camera.transpose(-1, -2)
+        return pose(R, torch.zeros_like(R[..., 0])) @ T_turned
+
+
+def random_guess(batch: TrainingBatch, config: AugmentConfig, generator: torch.Generator) -> Guess:
+    """Guesses about the batch's reference poses.
+
+    Args:
+        batch: frames with their reference.
+        config: sizes.
+        generator: of the CPU, whatever the batch's device: the same numbers everywhere.
+    """
+    count = len(batch)
+
+    def even(*shape: int) -> Tensor:
+        return 2 * torch.rand(*shape, generator=generator) - 1
+
+    small = torch.rand(count, generator=generator) < config.small_share
+    scale = torch.where(small, torch.rand(count, generator=generator) ** 2, torch.ones(count))[:, None]
+    turns = [exp_so3(even(count, 3) * scale * config.rotation_deg * _RAD) for _ in range(2)]
+    shifts = [even(count, 3) * scale * config.translation_m for _ in range(2)]
+    view = exp_so3(even(count, 3) * config.view_deg * _RAD)
+    device = batch.T_camera_lidar.device
+    moved_lidar, moved_radar = (pose(R, t).to(device) for R, t in zip(turns, shifts, strict=True))
+    turned = pose(view, torch.zeros(count, 3)).to(device)
+    T_lidar_radar = inverse(moved_lidar) @ batch.T_lidar_radar @ moved_radar
+    T_camera_lidar = turned @ batch.T_camera_lidar @ moved_lidar
+    return Guess(view.to(device), T_camera_lidar, T_camera_lidar @ T_lidar_radar, T_lidar_radar)
+
+
+def turned_view(batch: TrainingBatch, R_turned_camera: Float[Tensor, "B 3 3"]) -> TrainingBatch:
+    """The batch with image, classes and visibility as a turned camera sees them; all else, losses' maps too, stays.
+
+    Cells that the stored grid does not show are unseen and of unknown class.
+    """
+    height, width = batch.sky_depth.shape[1:]
+    step = batch.grid_step_deg * _RAD
+    rays = _rays(height, width, step, R_turned_camera.device)
+    # A ray of the turned grid comes from R^T ray of the stored one.
+    source = torch.einsum("byx,hwy->bhwx", R_turned_camera, rays)
+    azimuth = torch.atan2(-source[..., 0], source[..., 2])
+    elevation = torch.atan2(-source[..., 1], torch.hypot(source[..., 0], source[..., 2]))
+    u = (width - 1) / 2 - azimuth / step
+    v = (height - 1) / 2 - elevation / step
+    at = torch.stack([2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1], -1)
+    image = _sampled(batch.image.float(), at, "bilinear")
+    classes = _sampled(batch.grid_class[:, None].float() + 1, at, "nearest")[
+        :, 0
+    ]  # 0 is left for "not there"
+    seen = _sampled(batch.grid_seen[:, None].float(), at, "bilinear")[:, 0] > 0.999
+    label = torch.where((classes > 0) & seen, classes - 1, torch.full_like(classes, UNKNOWN_CLASS))
+    return replace(
+        batch,
+        image=(image * seen[:, None]).round().to(torch.uint8),
+        grid_class=label.to(torch.uint8),
+        grid_seen=seen.to(torch.uint8),
+    )
+
+
+def _rays(height: int, width: int, step: float, device: torch.device) -> Tensor:
+    azimuth = ((width - 1) / 2 - torch.arange(width, device=device)) * step
+    elevation = (((height - 1) / 2 - torch.arange(height, device=device)) * step)[:, None]
+    c = torch.cos(elevation)
+    x, y, z = -torch.sin(azimuth) * c, -torch.sin(elevation), torch.cos(azimuth) * c
+    return torch.stack([x, y.expand_as(x), z], -1)
+
+
+def _sampled(maps: Tensor, at: Tensor, mode: str) -> Tensor:
+    return torch.nn.functional.grid_sample(maps, at, mode=mode, padding_mode="zeros", align_corners=True)

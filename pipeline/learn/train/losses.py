@@ -1,0 +1,216 @@
+"""What training minimises for a batch: terms of the three pairs and the loop, as in the estimator's objective.
+
+Angles in degrees, translations in metres, per-frame means over what is valid. No term knows a true transform: the
+reference only says which points the camera surely sees.
+
+Source: paper section 4.4 (SSL minimises L_P + L_G); the project's evidence on self-supervision, section 3, for the
+weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.train.running_mean import twist_between
+from pipeline.learn.train.settings import PAIRS_OF, LossConfig
+from pipeline.objective.differentiable.lookup import nearest_pixel
+from pipeline.objective.differentiable.paper import smooth_iou
+from pipeline.objective.differentiable.poses import inverse, loop_loss, transform_points
+from pipeline.objective.differentiable.projection import GridProjection
+from pipeline.objective.differentiable.static import elevation_limits, static_cost, tells_elevation
+from pipeline.objective.differentiable.terms import (
+    DEG,
+    GridMaps,
+    RadarTracks,
+    cluster_class_cost,
+    edge_cost,
+    sky_cost,
+    track_cluster_cost,
+    track_detection_cost,
+)
+
+__all__ = ["PAIR_OF_TERM", "FrameObjective", "frame_objective"]
+
+PAIR_OF_TERM = {
+    "classes": "camera_lidar",
+    "edges": "camera_lidar",
+    "sky": "camera_lidar",
+    "tracks_camera": "camera_radar",
+    "radar_sky": "camera_radar",
+    "static": "lidar_radar",
+    "tracks_lidar": "lidar_radar",
+    "drivable": "lidar_radar",
+    "loop": "joint",
+    "prior_camera_lidar": "camera_lidar",
+    "prior_camera_radar": "camera_radar",
+    "prior_lidar_radar": "lidar_radar",
+}
+_MARGIN_DEG = 3.0  # what the reference may be wrong by, for points that are asked to lie in view
+_RADAR_SKY_FREE_DEG = 2.0  # a radar's elevation is noisy: only what is deep in the sky is wrong
+_LOOP_METRE = 5.0  # a fifth of a metre counts as a degree: what it moves at 11 m
+_PRIOR_ROUND_DEG = 0.05  # below this the absolute value is rounded off
+_RADAR_CELL_M = 1.0  # of the stored drivable map
+
+
+@dataclass(frozen=True, eq=False)
+class FrameObjective:
+    """The objective of B frames, ready for any poses."""
+
+    batch: TrainingBatch
+    maps: GridMaps
+    cluster_in_view: Bool[Tensor, "B C"]
+    edge_in_view: Bool[Tensor, "B E"]
+    radar_in_view: Bool[Tensor, "B R"]
+    centres_rad: Float[Tensor, "B G 2"]
+    tracks: RadarTracks
+    radar_tells_elevation: Bool[Tensor, "B R"]
+
+    def terms(
+        self,
+        T_camera_lidar: Float[Tensor, "*batch B 4 4"],
+        T_camera_radar: Float[Tensor, "*batch B 4 4"],
+        T_lidar_radar: Float[Tensor, "*batch B 4 4"],
+        pairs: tuple[str, ...] = PAIRS_OF["joint"],
+    ) -> dict[str, Float[Tensor, "*batch B"]]:
+        """Every term of the pairs (`joint`: the loop) and frames, unweighted, by the names of PAIR_OF_TERM."""
+        found: dict[str, Tensor] = {}
+        if "camera_lidar" in pairs:
+            found |= self._camera_lidar(T_camera_lidar)
+        if "camera_radar" in pairs:
+            found |= self._camera_radar(T_camera_radar)
+        if "lidar_radar" in pairs:
+            found |= self._lidar_radar(T_lidar_radar)
+        if "joint" in pairs:
+            found["loop"] = loop_loss(
+                T_camera_lidar, T_lidar_radar, T_camera_radar, angle_unit=DEG, metre_unit=_LOOP_METRE
+            )
+        poses = {
+            "camera_lidar": (T_camera_lidar, self.batch.T_camera_lidar),
+            "camera_radar": (T_camera_radar, self.batch.T_camera_radar),
+            "lidar_radar": (T_lidar_radar, self.batch.T_lidar_radar),
+        }
+        return found | {f"prior_{pair}": _from_prior(*poses[pair]) for pair in pairs if pair in poses}
+
+    def _camera_lidar(self, T: Tensor) -> dict[str, Tensor]:
+        b = self.batch
+        cluster, edge = (_at_lag(b, points, b.camera_lag_s) for points in (b.cluster_xyz_m, b.edge_xyz_m))
+        most = b.cluster_centre_m.shape[1]
+        return {
+            "classes": cluster_class_cost(
+                self.maps, T, cluster, b.cluster_id.long(), self.cluster_in_view, most
+            ),
+            "edges": edge_cost(self.maps, T, edge, b.edge_side.long(), self.edge_in_view),
+            "sky": sky_cost(self.maps, T, cluster, self.cluster_in_view),
+        }
+
+    def _camera_radar(self, T: Tensor) -> dict[str, Tensor]:
+        b = self.batch
+        return {
+            "tracks_camera": track_detection_cost(T, self.tracks, self.centres_rad, b.detection_valid),
+            "radar_sky": sky_cost(self.maps, T, b.radar_xyz_m, self.radar_in_view, _RADAR_SKY_FREE_DEG),
+        }
+
+    def _lidar_radar(self, T: Tensor) -> dict[str, Tensor]:
+        b = self.batch
+        lidar, still = _at_lag(b, b.lidar_xyz_m, b.radar_lag_s), b.radar_valid & (b.radar_motion == 0)
+        return {
+            "static": static_cost(
+                T, b.radar_xyz_m, still, lidar, b.lidar_valid, b.ground_plane, self.radar_tells_elevation
+            ),
+            "tracks_lidar": track_cluster_cost(T, self.tracks, b.cluster_centre_m, b.cluster_valid),
+            "drivable": self._drivable(T),
+        }
+
+    def _drivable(self, T_lidar_radar: Tensor) -> Tensor:
+        """1 - IoU; 0 where a frame lacks one of the areas."""
+        b = self.batch
+        soft = b.radar_drivable.float() / 255
+        area = soft.sum((1, 2)) * _RADAR_CELL_M**2
+        seen = transform_points(inverse(T_lidar_radar), b.drivable_xyz_m)
+        lidar_area = b.drivable_area_m2.to(soft.dtype)
+        iou = smooth_iou(seen, b.drivable_valid, lidar_area, soft, area, _RADAR_CELL_M)
+        return (1 - iou) * ((area > 0) & (lidar_area > 0))
+
+
+def frame_objective(batch: TrainingBatch) -> FrameObjective:
+    """Prepare the objective of a batch, on the batch's device."""
+    step_rad = batch.grid_step_deg / DEG
+    height, width = batch.sky_depth.shape[1:]
+    projection = GridProjection(
+        -(width - 1) / 2 * step_rad, -(height - 1) / 2 * step_rad, step_rad, len(batch)
+    )
+    maps = GridMaps(
+        batch.class_distance, batch.edge_offset, batch.sky_depth, batch.grid_seen.bool(), projection
+    )
+    box = batch.detection_box_rad
+    return FrameObjective(
+        batch,
+        maps,
+        batch.cluster_point_valid & _surely_in_view(maps, batch.T_camera_lidar, batch.cluster_xyz_m),
+        batch.edge_valid & _surely_in_view(maps, batch.T_camera_lidar, batch.edge_xyz_m),
+        batch.radar_valid & _surely_in_view(maps, batch.T_camera_radar, batch.radar_xyz_m),
+        torch.stack([(box[..., 0] + box[..., 2]) / 2, (box[..., 1] + box[..., 3]) / 2], -1),
+        RadarTracks(batch.track_xyz_m, batch.track_valid, batch.radar_has_elevation),
+        tells_elevation(
+            batch.T_lidar_radar.to(batch.radar_xyz_m.dtype),
+            batch.radar_xyz_m,
+            batch.radar_has_elevation,
+            elevation_limits(batch.lidar_xyz_m, batch.lidar_valid),
+        ),
+    )
+
+
+def _from_prior(
+    T: Float[Tensor, "*batch 4 4"], T_prior: Float[Tensor, "*batch 4 4"]
+) -> Float[Tensor, "*batch"]:
+    """How far a pose lies from the day's prior: absolute angles [deg] and shifts (a metre as in the loop), rounded off.
+
+    Absolute values, not squares: over a fleet the priors' errors cancel in the median, and a constant small pull holds
+    what frames say nothing of (a shift along the camera's axis, a radar's height), where the bias of some other term
+    would move it for nothing; what frames do tell, pulls harder.
+    """
+    twist = twist_between(T, T_prior.to(T.dtype))
+    scaled = torch.cat([twist[..., :3] * DEG, twist[..., 3:] * _LOOP_METRE], -1)
+    return (torch.sqrt(scaled.square() + _PRIOR_ROUND_DEG**2) - _PRIOR_ROUND_DEG).sum(-1)
+
+
+def weighted(
+    terms: dict[str, Float[Tensor, "*batch"]], weights: LossConfig, pairs: tuple[str, ...]
+) -> Float[Tensor, "*batch"]:
+    """Weighted sum of the terms of some pairs, and of the loop where all three are there."""
+    chosen = [
+        _weight(weights, name) * value
+        for name, value in terms.items()
+        if PAIR_OF_TERM[name] in pairs and _weight(weights, name) > 0
+    ]
+    return torch.stack(chosen).sum(0)
+
+
+def _weight(weights: LossConfig, name: str) -> float:
+    return float(weights.prior if name.startswith("prior_") else getattr(weights, name))
+
+
+def _at_lag(batch: TrainingBatch, points: Float[Tensor, "B N 3"], lag_s: Float[Tensor, " B"]) -> Tensor:
+    """Where standing points are, lidar frame, when another sensor looks `lag_s` later: the car has driven towards them.
+
+    What the clocks do not know, a constant offset between them, stays in the answer as a shift along the way driven.
+    """
+    ahead = (batch.ego_speed_mps * lag_s)[:, None]
+    return torch.stack([points[..., 0] - ahead, points[..., 1], points[..., 2]], -1)
+
+
+def _surely_in_view(maps: GridMaps, T: Tensor, points: Tensor) -> Tensor:
+    """Points that the camera sees at this pose, and when it is turned by the margin to any side."""
+    uv, valid = maps.projection.project(transform_points(T.to(points.dtype), points))
+    margin = _MARGIN_DEG / DEG / maps.projection.step_rad
+    frame = torch.arange(len(points), device=points.device)[:, None]
+    out = valid
+    for du, dv in ((margin, 0.0), (-margin, 0.0), (0.0, margin), (0.0, -margin)):
+        row, column, inside = nearest_pixel(maps.size, uv + uv.new_tensor([du, dv]), valid)
+        out = out & inside & maps.seen[frame, row, column]
+    return out

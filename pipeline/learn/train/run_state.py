@@ -1,0 +1,204 @@
+"""Everything that a training step changes: begun anew, or read from a run's last checkpoint."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+
+from pipeline.errors import ConfigError, ContractError
+from pipeline.learn.batches.source import BatchStream, batch_stream
+from pipeline.learn.network.networks import CalibrationNetwork, build_network
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.learn.train.acceleration import accelerate
+from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
+from pipeline.learn.train.processes import Processes
+from pipeline.learn.train.running_mean import Consensus
+from pipeline.learn.train.schedule import DivergenceGuard
+from pipeline.learn.train.settings import TrainConfig
+from pipeline.learn.train.step import Passes
+
+__all__ = ["RunState", "begin_run", "network_of_run"]
+
+_ENDLESS = 10**9  # steps, where time is what ends a run
+
+
+@dataclass
+class RunState:
+    """One process's part of a run."""
+
+    config: TrainConfig
+    grid: Grid
+    network: CalibrationNetwork
+    passes: nn.Module
+    optimiser: torch.optim.Adam
+    stream: BatchStream
+    consensus: Consensus
+    guard: DivergenceGuard
+    steps: int
+    step: int = 0
+    trained_s: float = 0.0
+    best: float = math.inf
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, by what its learning rate goes by."""
+        if self.config.budget_minutes is not None:
+            return self.trained_s / (60 * self.config.budget_minutes)
+        return self.step / self.steps
+
+    @property
+    def finished(self) -> bool:
+        """True when there is nothing left to train."""
+        return self.step >= self.steps or self.progress >= 1
+
+    def save(self, folder: Path, processes: Processes) -> None:
+        """Write the last checkpoint; every process must call."""
+        own = {"stream": self.stream.state_dict(), "consensus": self.consensus.state_dict()}
+        everyone = processes.gather(own)
+        if processes.leads:
+            state = self.weights() | {
+                "optimiser": self.optimiser.state_dict(),
+                "processes": everyone,
+                "guard": self.guard.state_dict(),
+                "step": self.step,
+                "trained_s": self.trained_s,
+                "best": self.best,
+            }
+            save_checkpoint(folder / LAST, state)
+
+    def weights(self) -> dict[str, Any]:
+        """What inference needs."""
+        return {
+            "config": self.config.model_dump(mode="json"),
+            "grid": asdict(self.grid),
+            "network": self.network.state_dict(),
+        }
+
+    def load(self, state: dict[str, Any], processes: Processes) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            ConfigError: it was written by another number of processes.
+        """
+        if len(state["processes"]) != processes.count:
+            told = f"begun by {len(state['processes'])}, now {processes.count}"
+            raise ConfigError("train", "processes", f"a run goes on with as many as it was {told}")
+        self.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        own = state["processes"][processes.rank]
+        self.stream.load_state_dict(own["stream"])
+        self.consensus.load_state_dict(own["consensus"])
+        self.guard.load_state_dict(state["guard"])
+        self.step, self.trained_s, self.best = (
+            int(state["step"]),
+            float(state["trained_s"]),
+            float(state["best"]),
+        )
+
+
+def begin_run(
+    data: str,
+    folder: Path,
+    config: TrainConfig,
+    processes: Processes,
+    *,
+    compiled: bool,
+    resident: bool,
+    start: Path | None = None,
+) -> RunState:
+    """A fresh run, or the one in the folder where its last checkpoint left it.
+
+    Args:
+        data: see `TrainRequest`.
+        folder: of the run.
+        config: a run goes on only with the same.
+        processes: who trains.
+        compiled: see `TrainRequest`.
+        resident: see `TrainRequest`.
+        start: run whose weights a fresh run begins with; a run that goes on has its own.
+
+    Raises:
+        ConfigError: the folder's run has another configuration; `start` has another kind of network.
+        ContractError: no training data, or other data than the run began with; nothing trained in `start`.
+    """
+    stream = batch_stream(data, config, processes, resident=resident)
+    try:
+        grid = Grid(config.cell_deg)
+        network = build_network(_network_config(config, grid), config.seed).to(processes.device)
+        accelerate(network, half=processes.device.type == "cuda", compiled=compiled)
+        passes: nn.Module = Passes(network, config.iterations)
+        if processes.count > 1:
+            # A pair's network uses a part of the encoders only.
+            passes = DistributedDataParallel(passes, find_unused_parameters=True)
+        run = RunState(
+            config,
+            grid,
+            network,
+            passes,
+            torch.optim.Adam(network.parameters(), lr=config.learning_rate, betas=config.adam_betas),
+            stream,
+            Consensus(),
+            DivergenceGuard(config.diverged_factor),
+            _steps(config, stream.frames, processes.count),
+        )
+        if (folder / LAST).exists():
+            state = load_checkpoint(folder / LAST, processes.device)
+            _same_config(folder, state["config"], config)
+            run.load(state, processes)
+        elif start is not None:
+            _take_weights(network, start)
+    except BaseException:
+        stream.close()
+        raise
+    return run
+
+
+def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
+    """The trained network of a run, on the CPU, for inference: the best on validation frames, else the last.
+
+    Raises:
+        ContractError: no readable checkpoint.
+    """
+    path = folder / (BEST if best and (folder / BEST).exists() else LAST)
+    if not path.exists():
+        raise ContractError(str(folder), f"no run: there is neither {BEST} nor {LAST}")
+    state = load_checkpoint(path)
+    config = TrainConfig.model_validate(state["config"])
+    network = CalibrationNetwork(_network_config(config, Grid(**state["grid"])))
+    network.load_state_dict(state["network"])
+    return network.eval()
+
+
+def _take_weights(network: CalibrationNetwork, start: Path) -> None:
+    trained = network_of_run(start)
+    if trained.config != network.config:
+        told = f"{start} has a network of another kind, {trained.config}, not {network.config}"
+        raise ConfigError("train", "start-from", told)
+    network.load_state_dict(trained.state_dict())
+
+
+def _network_config(config: TrainConfig, grid: Grid) -> NetworkConfig:
+    return NetworkConfig(config.architecture, config.pairs, grid, config.width, config.hidden)
+
+
+def _steps(config: TrainConfig, frames: int, processes: int) -> int:
+    if config.steps is not None:
+        return config.steps
+    if config.budget_minutes is not None:
+        return _ENDLESS
+    return max(1, math.ceil(config.epochs * frames / (config.batch_size * processes)))
+
+
+def _same_config(folder: Path, begun: dict[str, Any], config: TrainConfig) -> None:
+    now = config.model_dump(mode="json")
+    other = sorted(k for k in begun.keys() | now.keys() if begun.get(k) != now.get(k))
+    if other:
+        told = f"the run in this folder was begun with another {other[0]}: use a new folder, or the old value"
+        raise ConfigError(str(folder), other[0], told)

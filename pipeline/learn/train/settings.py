@@ -1,0 +1,145 @@
+"""train.toml as frozen values: what is trained, how long and how; unknown keys and impossible values are errors.
+
+The defaults are the paper's recipe where it gives one: Adam (.9, .999), batch 4, cosine from 3e-4 to 3e-7.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from pipeline.errors import ConfigError
+from pipeline.learn.sample.grid import Grid
+
+__all__ = ["PAIRS_OF", "AugmentConfig", "LossConfig", "TrainConfig", "load_train_config"]
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(gt=0)]
+
+PAIRS_OF: dict[str, tuple[str, ...]] = {
+    "joint": ("camera_lidar", "camera_radar", "lidar_radar", "joint"),
+    "camera_lidar": ("camera_lidar",),
+    "camera_radar": ("camera_radar",),
+    "lidar_radar": ("lidar_radar",),
+}
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class LossConfig(_Section):
+    """Weights of the terms; angles count in degrees. 0 leaves a term out."""
+
+    classes: NotNegative = 1.0
+    edges: NotNegative = 1.0
+    sky: NotNegative = 1.0
+    tracks_camera: NotNegative = 1.0
+    radar_sky: NotNegative = 0.1  # more of it biases the radar's pitch
+    static: NotNegative = 1.0
+    tracks_lidar: NotNegative = 0.5
+    drivable: NotNegative = 2.0
+    loop: NotNegative = 1.0
+    prior: NotNegative = 0.1  # holds what no frame tells, and is weaker than all that frames do tell
+    semantics: NotNegative = 1.0  # the encoders' cross-entropy to the precomputed classes
+
+
+class AugmentConfig(_Section):
+    """How wrong the guess is made, and how far the camera's view is turned, in training.
+
+    Moving the lidar's and the radar's clouds at random is the paper's; turning the camera's view as well keeps a
+    network from learning one viewpoint by heart.
+    """
+
+    rotation_deg: NotNegative = 3.0  # per axis, even
+    translation_m: NotNegative = 0.1  # per axis, even
+    small_share: Annotated[float, Field(ge=0, le=1)] = (
+        0.5  # of the frames, moved by u^2 of that with u even in 0..1
+    )
+    view_deg: NotNegative = 4.0  # per axis, even; the stored grid must be wider than the network's by as much
+
+
+class TrainConfig(_Section):
+    """The whole of train.toml."""
+
+    architecture: Literal["matching", "concat"] = "matching"
+    pairs: Literal["joint", "camera_lidar", "camera_radar", "lidar_radar"] = "joint"
+    cell_deg: Annotated[float, Field(ge=0.1, le=0.5)] = (
+        0.4  # of the network's grid; the data's must be the same
+    )
+    width: Count = 16  # channels of the encoders' first stage
+    hidden: Count = 192
+    iterations: Annotated[int, Field(ge=1, le=5)] = 1  # passes per frame; losses of all passes are averaged
+    # Encoders learn from classes alone, at every step; matchers have few weights and cost half of a step: they join at
+    # every n-th.
+    matched_every: Count = 1
+    batch_size: Count = 4  # frames per process
+    epochs: Positive = 20.0
+    steps: Count | None = None  # in place of epochs
+    learning_rate: Positive = 3e-4
+    final_learning_rate: Positive = 3e-7
+    adam_betas: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]] = (0.9, 0.999)
+    gradient_norm: Positive = 10.0  # longer gradients are cut: single frames can be wild
+    budget_minutes: Positive | None = (
+        None  # in place of epochs: the run ends, and the cosine, after so much time
+    )
+    doubt_weight: NotNegative = (
+        0.01  # of the likelihood of each frame's scatter, which teaches the log variances
+    )
+    validate_every: Count = 500  # steps
+    validation_frames: Count = 128
+    log_every: Count = 10  # steps
+    checkpoint_minutes: Positive = 5.0
+    diverged_factor: Annotated[float, Field(gt=1)] = 10.0  # times the smallest smoothed loss so far
+    seed: int = 0
+    loss: LossConfig = LossConfig()
+    augment: AugmentConfig = AugmentConfig()
+
+    @model_validator(mode="after")
+    def _cells_fit(self) -> TrainConfig:
+        try:
+            Grid(self.cell_deg)
+        except ValueError as err:
+            raise ValueError(f"cell_deg = {self.cell_deg:g}: {err}") from err
+        return self
+
+    @model_validator(mode="after")
+    def _encoders_exist(self) -> TrainConfig:
+        if self.matched_every > 1 and (self.architecture == "concat" or self.pairs == "lidar_radar"):
+            raise ValueError("matched_every must be 1 where no classes are learned: concat, lidar_radar")
+        return self
+
+    @model_validator(mode="after")
+    def _rates_fall(self) -> TrainConfig:
+        if self.final_learning_rate > self.learning_rate:
+            raise ValueError("final_learning_rate must not exceed learning_rate")
+        return self
+
+
+def load_train_config(path: Path | None, overrides: Mapping[str, object]) -> TrainConfig:
+    """Read and validate train.toml; `overrides` (from the command line) win, None means not given.
+
+    Raises:
+        ConfigError: missing file, no TOML, unknown key, impossible value; the message names the key.
+    """
+    name = "train" if path is None else str(path)
+    raw: dict[str, object] = {}
+    if path is not None:
+        try:
+            raw = tomllib.loads(path.read_text())
+        except FileNotFoundError as err:
+            raise ConfigError(name, "", "no such file") from err
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as err:
+            raise ConfigError(name, "", f"not a TOML file: {err}") from err
+    try:
+        return TrainConfig.model_validate(raw | {k: v for k, v in overrides.items() if v is not None})
+    except ValidationError as err:
+        problems = err.errors(include_url=False)
+        key = ".".join(str(part) for part in problems[0]["loc"])
+        text = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems)
+        raise ConfigError(name, key, text) from err

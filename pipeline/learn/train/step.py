@@ -1,0 +1,156 @@
+"""One step of training: a batch, a wrong guess, the network's answers, and the loss of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
+from pipeline.learn.network.networks import CalibrationNetwork
+from pipeline.learn.network.outputs import Predictions
+from pipeline.learn.sample.layout import PAIRS
+from pipeline.learn.train.augment import Guess, random_guess, turned_view
+from pipeline.learn.train.distillation import semantics_loss
+from pipeline.learn.train.losses import frame_objective, weighted
+from pipeline.learn.train.running_mean import Consensus, doubt_loss
+from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
+from pipeline.objective.differentiable.poses import pose, transform_points
+
+__all__ = ["Passes", "StepLoss", "batch_loss"]
+
+_DEG = 180.0 / torch.pi
+
+
+class Passes(nn.Module):
+    """The network's passes as one forward call, which is what data parallelism wraps."""
+
+    def __init__(self, network: CalibrationNetwork, iterations: int) -> None:
+        super().__init__()
+        self.network, self.iterations = network, iterations
+
+    def forward(self, inputs: NetworkInputs, *, matched: bool = True) -> list[Predictions]:
+        """All passes, the best answer last; not `matched`: one pass of the encoders alone, which stays at the guess."""
+        if not matched:
+            return [self.network.encode(inputs)]
+        return self.network.refine(inputs, self.iterations)
+
+
+@dataclass(frozen=True, eq=False)
+class StepLoss:
+    """What to descend, and what to report (means over the batch, of the last pass)."""
+
+    loss: Float[Tensor, ""]
+    report: dict[str, Tensor]
+
+
+def batch_loss(
+    passes: nn.Module,
+    batch: TrainingBatch,
+    config: TrainConfig,
+    consensus: Consensus,
+    generator: torch.Generator,
+    network: CalibrationNetwork,
+    *,
+    matched: bool = True,
+) -> StepLoss:
+    """The loss of one batch from random guesses.
+
+    Args:
+        passes: a `Passes` of the network, bare or wrapped for data parallelism.
+        batch: frames on the network's device.
+        config: of the run.
+        consensus: each day's mean answer; the batch's answers join it.
+        generator: of everything random here.
+        network: of the passes, for its grid.
+        matched: whether poses are estimated and judged, or encoders learn classes only.
+    """
+    grid = network.config.grid
+    guess = random_guess(batch, config.augment, generator)
+    view = turned_view(batch, guess.R_turned_camera) if config.augment.view_deg > 0 else batch
+    inputs = NetworkInputs(
+        sensor_inputs(view, grid), guess.T_camera_lidar, guess.T_camera_radar, guess.T_lidar_radar
+    )
+    answers: list[Predictions] = passes(inputs, matched=matched)
+    if not matched:
+        semantics = _semantics(answers, view, guess, batch, consensus, network)
+        loss = config.loss.semantics * semantics
+        return StepLoss(loss, {"loss": loss.detach(), "semantics": semantics.detach()})
+    objective, pairs = frame_objective(batch), PAIRS_OF[config.pairs]
+    total = torch.zeros((), device=batch.T_camera_lidar.device)
+    terms: dict[str, Tensor] = {}
+    for answer in answers:
+        terms = objective.terms(
+            guess.unturned(answer.T_camera_lidar),
+            guess.unturned(answer.T_camera_radar),
+            answer.T_lidar_radar,
+            pairs,
+        )
+        total = total + weighted(terms, config.loss, pairs).mean() / len(answers)
+    semantics = _semantics(answers, view, guess, batch, consensus, network)
+    doubt, scatter = _doubt(answers[-1], guess, batch, consensus)
+    loss = total + config.loss.semantics * semantics + config.doubt_weight * doubt
+    report = {f"term/{name}": value.detach().mean() for name, value in terms.items()}
+    report |= {"loss": loss.detach(), "alignment": total.detach(), "semantics": semantics.detach()}
+    report |= {"doubt": doubt.detach()}
+    report |= {f"scatter_deg/{pair}": scatter[i] * _DEG for i, pair in enumerate(PAIRS) if pair in pairs}
+    return StepLoss(loss, report)
+
+
+def _semantics(
+    answers: list[Predictions],
+    view: TrainingBatch,
+    guess: Guess,
+    batch: TrainingBatch,
+    consensus: Consensus,
+    network: CalibrationNetwork,
+) -> Tensor:
+    """Cross-entropy of the encoders; classes are carried to points by each day's mean answer so far."""
+    grid = network.config.grid
+    turned = pose(guess.R_turned_camera, torch.zeros_like(guess.R_turned_camera[..., 0]))
+    days = _days(batch)
+    T_camera_lidar = turned @ consensus.pose(days, 0, batch.T_camera_lidar)
+    T_camera_radar = turned @ consensus.pose(days, 1, batch.T_camera_radar)
+    grid_class = crop(view.grid_class, view.grid_step_deg, grid)
+    radar = transform_points(T_camera_radar, batch.radar_xyz_m)
+    # The camera's logits are the same in all passes; the lidar is rendered anew in each.
+    losses = [
+        semantics_loss(
+            a,
+            grid_class,
+            batch.lidar_xyz_m,
+            batch.lidar_valid,
+            T_camera_lidar,
+            grid,
+            radar,
+            batch.radar_valid,
+        )
+        for a in answers
+    ]
+    return torch.stack(losses).mean()
+
+
+def _doubt(
+    answer: Predictions, guess: Guess, batch: TrainingBatch, consensus: Consensus
+) -> tuple[Tensor, Tensor]:
+    """Likelihood of the scatter, and the root mean square of its angles by pair [rad]."""
+    answers = torch.stack(
+        [
+            guess.unturned(answer.T_camera_lidar),
+            guess.unturned(answer.T_camera_radar),
+            answer.T_lidar_radar,
+        ],
+        1,
+    )
+    references = torch.stack([batch.T_camera_lidar, batch.T_camera_radar, batch.T_lidar_radar], 1)
+    days = _days(batch)
+    known = torch.tensor(consensus.known(days), device=answers.device).float()
+    scatter = consensus.scatter(days, answers, references)
+    return doubt_loss(answer.log_variance, scatter, known), scatter[..., :3].square().sum(-1).mean(0).sqrt()
+
+
+def _days(batch: TrainingBatch) -> list[str]:
+    return [f"{vehicle}/{day}" for vehicle, day in zip(batch.vehicle, batch.day, strict=True)]

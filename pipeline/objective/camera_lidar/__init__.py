@@ -1,0 +1,1 @@
+"""Terms of camera-lidar: edges, reflectivity, mutual information, projected into image maps."""

@@ -1,0 +1,268 @@
+"""Directed edges: depth jumps of the lidar against mask boundaries of the same direction.
+
+Each projected jump has a nearest boundary of its own direction class at the signed distance r along that
+boundary's axis. Only some jumps match (on real logs one in five is more than chance), so the score is not a
+sum of squares but the log likelihood ratio of the mixture `pi N(r; s) + (1 - pi) c(r)` against chance
+alone, c(r): how far boundaries lie from a random pixel. A class whose boundaries say nothing gets a small
+pi and loses its weight by itself.
+"""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Int8, Int64, UInt8
+
+from pipeline.objective.camera_lidar.projection_loops import (
+    most_points,
+    project_point,
+    project_points,
+    project_with_jacobian,
+)
+
+__all__ = ["CHANCE_BINS", "chance_of", "edge_gradients", "edge_residuals", "edge_scores", "fit_match_share"]
+
+CHANCE_BINS = 128
+_FEWEST_OF_KIND = 40  # fewer tell no share from chance
+
+
+def edge_scores(
+    camera: Float32[np.ndarray, " 18"],
+    offsets: Int8[np.ndarray, "F 4 H W"],
+    points: Float32[np.ndarray, "N 3"],
+    side: UInt8[np.ndarray, " N"],
+    kind: UInt8[np.ndarray, " N"],
+    gap_rad: Float32[np.ndarray, " N"],
+    start: Int64[np.ndarray, " G"],
+    poses: Float32[np.ndarray, "P F 12"],
+    focal: Float32[np.ndarray, " P"],
+    match: Float32[np.ndarray, " K"],
+    chance: Float32[np.ndarray, "K B"],
+    sigma_px: float,
+) -> Float32[np.ndarray, "P F"]:
+    """Log likelihood ratio of each frame at each pose; points outside the image count 0.
+
+    Args:
+        camera: `camera_parameters` at label size.
+        offsets: `boundary_offsets` of each frame.
+        points: jumps of all frames, lidar frame; those of frame f are start[f]:start[f+1].
+        side: direction class of each jump.
+        kind: statistical class of each jump: those that match alike.
+        gap_rad: angle between its two beams; widens its kernel by the sd of an even distribution over it.
+        start: F + 1 offsets.
+        poses: rows of the 3x4 transform into the camera, per pose and frame (frames differ by time offset
+            times speed).
+        focal: focal length in units of the camera's, by pose.
+        match: share of jumps that match, by kind.
+        chance: density of |r| at random places [1/px], by kind, in bins of one pixel.
+        sigma_px: scale of the kernel (1 + (r/s)^2)^-2.
+    """
+    width_px = np.hypot(np.float32(sigma_px), gap_rad * camera[1] * np.float32(1 / np.sqrt(12)))
+    # 2/pi makes (1 + x^2)^-2 a density
+    gain = match[:, None] * np.float32(2 / np.pi) / chance
+    return _edge_loop(
+        camera,
+        offsets,
+        np.ascontiguousarray(points.T),
+        side,
+        kind,
+        1 / width_px,
+        start,
+        poses,
+        focal,
+        1 - match,
+        gain,
+    )
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+def _edge_loop(
+    camera: np.ndarray,
+    offsets: np.ndarray,
+    xyz: np.ndarray,
+    side: np.ndarray,
+    kind: np.ndarray,
+    sharpness: np.ndarray,
+    start: np.ndarray,
+    poses: np.ndarray,
+    focal: np.ndarray,
+    base: np.ndarray,
+    gain: np.ndarray,
+) -> np.ndarray:
+    """The sum of log(base + gain sharpness (1 + (r sharpness)^2)^-2) over each frame's points."""
+    count, frames = poses.shape[0], poses.shape[1]
+    height, width = offsets.shape[2], offsets.shape[3]
+    out = np.zeros((count, frames), np.float32)
+    f4, i4 = np.float32, np.int32
+    half, one = f4(0.5), f4(1.0)
+    u_max, v_max = f4(width - 1), f4(height - 1)
+    us, vs = np.empty(most_points(start), np.float32), np.empty(most_points(start), np.float32)
+    for f in range(frames):
+        for p in range(count):
+            project_points(camera, xyz, start[f], start[f + 1], poses[p, f], focal[p], us, vs)
+            total, product, factors = f4(0.0), one, 0
+            for i in range(start[f], start[f + 1]):
+                u, v = us[i - start[f]], vs[i - start[f]]
+                if u < f4(0) or v < f4(0) or u > u_max or v > v_max:
+                    continue
+                c, n = side[i], kind[i]
+                iu, iv = i4(u + half), i4(v + half)
+                k = offsets[f, c, iv, iu]
+                ratio = base[n]
+                if k != -128:
+                    r = f4(k) + half + (f4(iu) - u if c < 2 else f4(iv) - v)
+                    x = r * sharpness[i]
+                    q = one + x * x
+                    ratio += gain[n, min(i4(abs(r)), i4(127))] * sharpness[i] / (q * q)
+                # One logarithm for eight factors: each is above 1e-4 and below 1e4.
+                product *= ratio
+                factors += 1
+                if factors == 8:
+                    total += np.log(product)
+                    product, factors = one, 0
+            out[p, f] = total + np.log(product)
+    return out
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True)
+def edge_gradients(
+    camera: np.ndarray,
+    offsets: np.ndarray,
+    points: np.ndarray,
+    side: np.ndarray,
+    kind: np.ndarray,
+    gap_rad: np.ndarray,
+    start: np.ndarray,
+    poses: np.ndarray,
+    focal: float,
+    velocity: np.ndarray,
+    match: np.ndarray,
+    chance: np.ndarray,
+    sigma_px: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient [F, 8] of each frame's score and its information [F, 8, 8].
+
+    By rotation, translation, time offset and focal scale.
+    Left perturbation of T_camera_lidar; `poses` [F, 12] and `velocity` [F, 3] (camera axes, m/s) at the pose. The
+    information is Gauss-Newton's: residuals weighted by how likely they are matches (iterated re-weighting).
+    """
+    frames = poses.shape[0]
+    height, width = offsets.shape[2], offsets.shape[3]
+    gradient, information = np.zeros((frames, 8)), np.zeros((frames, 8, 8))
+    s2, beam = sigma_px * sigma_px, camera[1] * camera[1] / 12
+    row = np.zeros(8)
+    for f in range(frames):
+        m = poses[f]
+        for i in range(start[f], start[f + 1]):
+            x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
+            x = m[0] * x0 + m[1] * y0 + m[2] * z0 + m[3]
+            y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
+            z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
+            u, v, valid, jux, juy, juz, jvx, jvy, jvz = project_with_jacobian(camera, x, y, z)
+            ou, ov = u - camera[3], v - camera[4]
+            u, v = camera[3] + focal * ou, camera[4] + focal * ov
+            if not valid or u < 0 or v < 0 or u > width - 1 or v > height - 1:
+                continue
+            c = side[i]
+            iu, iv = int(u + 0.5), int(v + 0.5)
+            k = offsets[f, c, iv, iu]
+            if k == -128:
+                continue
+            r = k + 0.5 + (iu - u if c < 2 else iv - v)
+            dx, dy, dz = (
+                (focal * jux, focal * juy, focal * juz) if c < 2 else (focal * jvx, focal * jvy, focal * jvz)
+            )
+            si2 = s2 + gap_rad[i] * gap_rad[i] * beam
+            q = 1 + r * r / si2
+            pi = match[kind[i]]
+            part = pi * 0.63661977 / (np.sqrt(si2) * q * q) / chance[kind[i], min(int(abs(r)), 127)]
+            weight = part / (1 - pi + part) * 4 / (si2 * q)  # -d score / d r = weight r, and dr = -du
+            row[0], row[1], row[2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+            row[3], row[4], row[5] = dx, dy, dz
+            row[6] = dx * velocity[f, 0] + dy * velocity[f, 1] + dz * velocity[f, 2]
+            row[7] = ou if c < 2 else ov
+            for a in range(8):
+                gradient[f, a] += weight * r * row[a]
+                for b in range(8):
+                    information[f, a, b] += weight * row[a] * row[b]
+    return gradient, information
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True)
+def edge_residuals(
+    camera: np.ndarray,
+    offsets: np.ndarray,
+    points: np.ndarray,
+    side: np.ndarray,
+    start: np.ndarray,
+    poses: np.ndarray,
+    focal: float,
+    shift_px: np.ndarray,
+) -> np.ndarray:
+    """Signed distance [px] of each jump, moved by `shift_px` [N, 2], to its boundary.
+
+    NaN outside the image, 127 where no boundary is in reach.
+    """
+    height, width = offsets.shape[2], offsets.shape[3]
+    out = np.full(points.shape[0], np.nan, np.float32)
+    for f in range(start.shape[0] - 1):
+        m = poses[f]
+        for i in range(start[f], start[f + 1]):
+            x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
+            x = m[0] * x0 + m[1] * y0 + m[2] * z0 + m[3]
+            y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
+            z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
+            u, v, valid = project_point(camera, x, y, z)
+            u = camera[3] + focal * (u - camera[3]) + shift_px[i, 0]
+            v = camera[4] + focal * (v - camera[4]) + shift_px[i, 1]
+            if not valid or u < 0 or v < 0 or u > width - 1 or v > height - 1:
+                continue
+            iu, iv = int(u + 0.5), int(v + 0.5)
+            k = offsets[f, side[i], iv, iu]
+            out[i] = 127.0 if k == -128 else k + 0.5 + (iu - u if side[i] < 2 else iv - v)
+    return out
+
+
+def chance_of(
+    residual_px: Float32[np.ndarray, " N"], kind: UInt8[np.ndarray, " N"], kinds: int
+) -> Float32[np.ndarray, "K B"]:
+    """Density of |r| at random places by kind, smoothed and never 0; the last bin holds "no boundary"."""
+    out = np.empty((kinds, CHANCE_BINS), np.float32)
+    kernel = np.ones(9) / 9
+    for c in range(kinds):
+        r = np.abs(residual_px[(kind == c) & np.isfinite(residual_px)])
+        histogram = np.bincount(
+            np.minimum(r.astype(np.int64), CHANCE_BINS - 1), minlength=CHANCE_BINS
+        ).astype(float)
+        mirrored = np.concatenate([histogram[:4][::-1], histogram[:-1], np.full(4, histogram[-6:-1].mean())])
+        histogram[:-1] = np.convolve(mirrored, kernel, "valid")
+        # r has a sign, so a bin of |r| is two pixels wide. One part in 3000: the floor of what a small kind can show.
+        out[c] = np.maximum(histogram / max(len(r), 1), 3e-4) / 2
+    return out
+
+
+def fit_match_share(
+    residual_px: Float32[np.ndarray, " N"],
+    kind: UInt8[np.ndarray, " N"],
+    sigma_px: np.ndarray,
+    chance: Float32[np.ndarray, "K B"],
+) -> Float32[np.ndarray, " K"]:
+    """Share of matching jumps by kind: the likelihood's maximum over pi, by expectation-maximisation."""
+    out = np.full(len(chance), 1e-4, np.float32)
+    for c in range(len(chance)):
+        mine = (kind == c) & np.isfinite(residual_px)
+        if np.count_nonzero(mine) < _FEWEST_OF_KIND:
+            continue
+        r, s = residual_px[mine].astype(np.float64), sigma_px[mine]
+        at_chance = chance[c, np.minimum(np.abs(r).astype(np.int64), CHANCE_BINS - 1)]
+        ratio = 0.63661977 / s / (1 + (r / s) ** 2) ** 2 / at_chance
+        pi = 0.2
+        for _ in range(60):
+            pi = float(np.mean(pi * ratio / (pi * ratio + 1 - pi)))
+        out[c] = np.clip(pi, 1e-4, 0.9)
+    return out

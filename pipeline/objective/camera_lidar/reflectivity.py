@@ -1,0 +1,115 @@
+"""Lidar reflectivity against image brightness on the road: what gives pitch, roll and yaw with only 16 rings.
+
+Ground points that are brighter than their ring should meet pixels that are brighter than their row of the road. The
+score is the log likelihood ratio of two normal laws of unit spread whose means differ by `delta` (what
+marked points see more than the road): `delta c - delta^2/2`, linear in the contrast c. `delta` comes from
+the data, so a lidar without useful intensity, or a road without paint, takes the term's weight away by
+itself.
+"""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Int8, Int64
+
+from pipeline.objective.camera_lidar.projection_loops import (
+    most_points,
+    project_points,
+    project_with_jacobian,
+)
+
+__all__ = ["marking_gradients", "marking_scores"]
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+def marking_scores(
+    camera: Float32[np.ndarray, " 18"],
+    contrast: Int8[np.ndarray, "F H W"],
+    points: Float32[np.ndarray, "N 3"],
+    weight: Float32[np.ndarray, " N"],
+    start: Int64[np.ndarray, " G"],
+    poses: Float32[np.ndarray, "P F 12"],
+    focal: Float32[np.ndarray, " P"],
+) -> Float32[np.ndarray, "P F"]:
+    """Weighted sum of the contrast under each frame's points at each pose; 0 outside the road."""
+    count, frames = poses.shape[0], poses.shape[1]
+    height, width = contrast.shape[1], contrast.shape[2]
+    out = np.zeros((count, frames), np.float32)
+    f4 = np.float32
+    u_max, v_max = f4(width - 1.01), f4(height - 1.01)
+    xyz = np.ascontiguousarray(points.T)
+    us, vs = np.empty(most_points(start), np.float32), np.empty(most_points(start), np.float32)
+    for f in range(frames):
+        for p in range(count):
+            project_points(camera, xyz, start[f], start[f + 1], poses[p, f], focal[p], us, vs)
+            total = f4(0.0)
+            for i in range(start[f], start[f + 1]):
+                u, v = us[i - start[f]], vs[i - start[f]]
+                if u < f4(0) or v < f4(0) or u > u_max or v > v_max:
+                    continue
+                iu, iv = int(u), int(v)
+                a, b = u - f4(iu), v - f4(iv)
+                c00, c01 = f4(contrast[f, iv, iu]), f4(contrast[f, iv, iu + 1])
+                c10, c11 = f4(contrast[f, iv + 1, iu]), f4(contrast[f, iv + 1, iu + 1])
+                upper, lower = c00 + a * (c01 - c00), c10 + a * (c11 - c10)
+                total += weight[i] * (upper + b * (lower - upper))
+            out[p, f] = total
+    return out
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True)
+def marking_gradients(
+    camera: np.ndarray,
+    contrast: np.ndarray,
+    points: np.ndarray,
+    weight: np.ndarray,
+    start: np.ndarray,
+    poses: np.ndarray,
+    focal: float,
+    velocity: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient [F, 8] of each frame's score and its information [F, 8, 8].
+
+    By rotation, translation, time offset and focal scale.
+    As in `edge_gradients`. The score is linear in the contrast, so the information is that of the
+    likelihood: the outer product of each point's gradient.
+    """
+    frames = poses.shape[0]
+    height, width = contrast.shape[1], contrast.shape[2]
+    gradient, information = np.zeros((frames, 8)), np.zeros((frames, 8, 8))
+    row = np.zeros(8)
+    for f in range(frames):
+        m = poses[f]
+        for i in range(start[f], start[f + 1]):
+            x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
+            x = m[0] * x0 + m[1] * y0 + m[2] * z0 + m[3]
+            y = m[4] * x0 + m[5] * y0 + m[6] * z0 + m[7]
+            z = m[8] * x0 + m[9] * y0 + m[10] * z0 + m[11]
+            u, v, valid, jux, juy, juz, jvx, jvy, jvz = project_with_jacobian(camera, x, y, z)
+            ou, ov = u - camera[3], v - camera[4]
+            u, v = camera[3] + focal * ou, camera[4] + focal * ov
+            if not valid or u < 0 or v < 0 or u > width - 1.01 or v > height - 1.01:
+                continue
+            iu, iv = int(u), int(v)
+            a, b = u - iu, v - iv
+            c00, c01 = float(contrast[f, iv, iu]), float(contrast[f, iv, iu + 1])
+            c10, c11 = float(contrast[f, iv + 1, iu]), float(contrast[f, iv + 1, iu + 1])
+            top, bottom, left = c01 - c00, c11 - c10, c10 - c00
+            gu = weight[i] * (top + b * (bottom - top))
+            gv = weight[i] * (left + a * (bottom - top))
+            gu, gv = focal * gu, focal * gv
+            dx, dy, dz = gu * jux + gv * jvx, gu * juy + gv * jvy, gu * juz + gv * jvz
+            row[0], row[1], row[2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+            row[3], row[4], row[5] = dx, dy, dz
+            row[6] = dx * velocity[f, 0] + dy * velocity[f, 1] + dz * velocity[f, 2]
+            row[7] = (gu * ou + gv * ov) / focal
+            for j in range(8):
+                gradient[f, j] += row[j]
+                for k in range(8):
+                    information[f, j, k] += row[j] * row[k]
+    return gradient, information

@@ -1,0 +1,331 @@
+"""The camera-lidar terms of method `joint`, prepared from observations and evaluated for many poses at once.
+
+Source: evidence of this project on simulated and real logs: directed edges, reflectivity on the road,
+    camera time offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Float, Float32
+
+from pipeline.objective.camera_lidar.edges import (
+    CHANCE_BINS,
+    chance_of,
+    edge_gradients,
+    edge_residuals,
+    edge_scores,
+    fit_match_share,
+)
+from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP, CameraMaps, prepare_maps
+from pipeline.objective.camera_lidar.mutual_information import class_information
+from pipeline.objective.camera_lidar.points import (
+    CLASSES,
+    EDGE_KINDS,
+    Points,
+    gather_classes,
+    gather_edges,
+    gather_markings,
+    is_near_view,
+    view_bounds,
+)
+from pipeline.objective.camera_lidar.projection_loops import camera_parameters
+from pipeline.objective.camera_lidar.reflectivity import marking_gradients, marking_scores
+from schemas.observations import Observation
+
+__all__ = ["CONTRAST_BLURS_PX", "Alignments", "Level", "Terms", "lidar_velocities", "prepare_terms"]
+
+CONTRAST_BLURS_PX = (6.0, 3.0, 1.5)
+_CHANCE_SHIFT_PX = 60.0  # far enough to be elsewhere, near enough to see the same scene
+# Chance density of an edge's distance before the data has been asked: boundaries every hundred pixels.
+_EVEN_CHANCE = np.full((EDGE_KINDS, CHANCE_BINS), 1 / 100, np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """How sharply the terms look: kernel scale, contrast level, mixture shares, weights."""
+
+    sigma_px: float
+    contrast_level: int
+    match: np.ndarray  # share of matching edges by kind
+    chance: np.ndarray
+    delta: float = 0.4  # contrast that marked points see more than the road, in standard deviations
+    edge_weight: float = 1.0
+    marking_weight: float = 1.0
+
+    @staticmethod
+    def wide(sigma_px: float, contrast_level: int, match: float = 0.25) -> Level:
+        """A level that presumes nothing of the data."""
+        return Level(sigma_px, contrast_level, np.full(EDGE_KINDS, match, np.float32), _EVEN_CHANCE)
+
+
+@dataclass(frozen=True, eq=False)
+class Alignments:
+    """P candidates: poses, camera time offsets, focal lengths in units of the camera's."""
+
+    T_camera_lidar: np.ndarray
+    dt_s: np.ndarray
+    focal: np.ndarray
+
+    @staticmethod
+    def of_poses(T_camera_lidar: Float[np.ndarray, "P 4 4"]) -> Alignments:
+        """Candidates without time offset and with the camera's own focal length."""
+        count = len(T_camera_lidar)
+        return Alignments(T_camera_lidar, np.zeros(count), np.ones(count))
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """Everything that the camera-lidar score of F frames needs."""
+
+    maps: CameraMaps
+    camera: np.ndarray
+    edges: Points
+    markings: Points
+    classes: Points  # sampled cloud by height and range, for the basin
+    velocity_lidar: np.ndarray  # F 3, own velocity in lidar axes [m/s]
+    yaw_rate: np.ndarray  # F [rad/s]
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.velocity_lidar)
+
+    def thinned(self, fraction: float, rng: np.random.Generator) -> Terms:
+        """The same frames with a random share of the points."""
+        edges, markings, classes = (
+            p.chosen(rng.random(len(p.xyz_m)) < fraction) for p in (self.edges, self.markings, self.classes)
+        )
+        return replace(self, edges=edges, markings=markings, classes=classes)
+
+    def of_kinds(self, *, edges: bool, markings: bool) -> Terms:
+        """With or without edges, and markings."""
+        kept = [
+            p if wanted else p.chosen(np.zeros(len(p.xyz_m), bool))
+            for p, wanted in ((self.edges, edges), (self.markings, markings))
+        ]
+        return replace(self, edges=kept[0], markings=kept[1])
+
+    def sharp(self, max_gap_px: float) -> Terms:
+        """Without the edges whose interval is wider than `max_gap_px`: those make the basin, not the accuracy."""
+        narrow = self.edges.gap_rad * self.camera[1] <= max_gap_px
+        return replace(self, edges=self.edges.chosen(narrow))
+
+    def in_view(self, T_camera_lidar: Float[np.ndarray, "4 4"], margin_rad: float) -> Terms:
+        """With the edges and markings that a pose puts into the image, or within a margin of it."""
+        bounds = view_bounds(self.maps.camera)
+        edges, markings = (
+            p.chosen(is_near_view(p.xyz_m, T_camera_lidar, bounds, margin_rad))
+            for p in (self.edges, self.markings)
+        )
+        return replace(self, edges=edges, markings=markings)
+
+    def at_most(self, points: int, rng: np.random.Generator) -> Terms:
+        """With at most about so many edges, and markings, drawn at random."""
+        share = [min(1.0, points / max(len(p.xyz_m), 1)) for p in (self.edges, self.markings)]
+        edges, markings = (
+            p if s >= 1.0 else p.chosen(rng.random(len(p.xyz_m)) < s)
+            for p, s in zip((self.edges, self.markings), share, strict=True)
+        )
+        return replace(self, edges=edges, markings=markings)
+
+    def of_frames(self, frames: np.ndarray) -> Terms:
+        """Some of the frames."""
+        maps = replace(
+            self.maps,
+            offsets=self.maps.offsets[frames],
+            contrast=self.maps.contrast[:, frames],
+            labels=self.maps.labels[frames],
+        )
+        return Terms(
+            maps,
+            self.camera,
+            self.edges.of_frames(frames),
+            self.markings.of_frames(frames),
+            self.classes.of_frames(frames),
+            self.velocity_lidar[frames],
+            self.yaw_rate[frames],
+        )
+
+    def poses(self, at: Alignments) -> Float32[np.ndarray, "P F 12"]:
+        """Rows of the transform from each frame's lidar points to its image [P, F, 12].
+
+        The image shows the lidar clock's time `-dt` (stamp_camera = stamp_lidar + dt). The car was then dt
+        earlier on its way, so what stands still lay dt times the own velocity further ahead: p' =
+        Rz(yaw_rate dt) (p + v dt).
+        """
+        R, t = at.T_camera_lidar[:, :3, :3], at.T_camera_lidar[:, :3, 3]
+        return _moving_poses(R, t, at.dt_s, self.velocity_lidar, self.yaw_rate)
+
+    def edge_score(self, at: Alignments, level: Level) -> Float32[np.ndarray, "P F"]:
+        """Unweighted log likelihood ratio of the edges."""
+        e, maps = self.edges, self.maps
+        return edge_scores(
+            self.camera,
+            maps.offsets,
+            e.xyz_m,
+            e.side,
+            e.kind,
+            e.gap_rad,
+            e.start,
+            self.poses(at),
+            at.focal.astype(np.float32),
+            level.match,
+            level.chance,
+            level.sigma_px,
+        )
+
+    def edge_excess(self, at: Alignments, level: Level) -> Float[np.ndarray, "P F"]:
+        """Edge score minus what the same edges score when the image is shifted: 0 for a pose that matches by chance.
+
+        So poses that see different numbers of edges compare: those that turn them out of view win nothing.
+        """
+        shifted = np.zeros((len(at.dt_s), self.frames))
+        shifts = [(u, v) for u in (-47.0, -31.0, 29.0, 43.0) for v in (-37.0, 0.0, 41.0)]
+        for u, v in shifts:
+            camera = self.camera.copy()
+            camera[3:5] += np.float32(u), np.float32(v)
+            shifted += replace(self, camera=camera).edge_score(at, level)
+        return self.edge_score(at, level) - shifted / len(shifts)
+
+    def marking_score(self, at: Alignments, level: Level) -> Float32[np.ndarray, "P F"]:
+        """Unweighted log likelihood ratio of the markings."""
+        m, contrast = self.markings, self.maps.contrast[level.contrast_level]
+        focal = at.focal.astype(np.float32)
+        return marking_scores(
+            self.camera, contrast, m.xyz_m, _weights(m, level), m.start, self.poses(at), focal
+        )
+
+    def class_information(self, at: Alignments) -> Float[np.ndarray, " P"]:
+        """Mutual information of lidar class and label, nats per point; for the basin only."""
+        c = self.classes
+        return class_information(
+            self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, self.poses(at), CLASSES
+        )
+
+    def score(self, at: Alignments, level: Level) -> Float[np.ndarray, "P F"]:
+        """Score of each frame at each alignment; higher is better."""
+        score = np.zeros((len(at.dt_s), self.frames))
+        if level.edge_weight > 0:
+            score += level.edge_weight * self.edge_score(at, level)
+        if level.marking_weight > 0:
+            score += level.marking_weight * self.marking_score(at, level)
+        return score
+
+    def gradient(
+        self, at: Alignments, level: Level
+    ) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
+        """Gradient of each frame's score at ONE alignment, and its information (positive semidefinite).
+
+        By left perturbation of T_camera_lidar, time offset, focal scale.
+        """
+        poses = self.poses(at)[0].astype(np.float64)
+        velocity = self.velocity_lidar @ at.T_camera_lidar[0, :3, :3].T
+        focal, e, m = float(at.focal[0]), self.edges, self.markings
+        g_edges, I_edges = edge_gradients(
+            self.camera,
+            self.maps.offsets,
+            e.xyz_m,
+            e.side,
+            e.kind,
+            e.gap_rad,
+            e.start,
+            poses,
+            focal,
+            velocity,
+            level.match,
+            level.chance,
+            level.sigma_px,
+        )
+        contrast = self.maps.contrast[level.contrast_level]
+        g_marks, I_marks = marking_gradients(
+            self.camera, contrast, m.xyz_m, _weights(m, level), m.start, poses, focal, velocity
+        )
+        a, b = level.edge_weight, level.marking_weight
+        return a * g_edges + b * g_marks, a * I_edges + b * I_marks
+
+    def mean_match(self, level: Level) -> Float[np.ndarray, " 4"]:
+        """Share of matching edges by direction, over the edges that there are."""
+        share = level.match[self.edges.kind]
+        counts = np.bincount(self.edges.side, minlength=4)
+        return np.bincount(self.edges.side, share, minlength=4) / np.maximum(counts, 1)
+
+    def fitted(self, at: Alignments, level: Level, rng: np.random.Generator) -> Level:
+        """The level with the mixture shares, chance densities and contrast that the data shows at ONE alignment."""
+        poses, focal = self.poses(at)[0], np.float32(at.focal[0])
+        e, m, offsets = self.edges, self.markings, self.maps.offsets
+        still = np.zeros((len(e.xyz_m), 2), np.float32)
+        elsewhere = rng.uniform(-_CHANCE_SHIFT_PX, _CHANCE_SHIFT_PX, still.shape).astype(np.float32)
+        at_chance = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses, focal, elsewhere)
+        here = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses, focal, still)
+        chance = chance_of(at_chance, e.kind, EDGE_KINDS)
+        sigma = np.hypot(level.sigma_px, e.gap_rad * self.camera[1] / np.sqrt(12))
+        match = fit_match_share(here, e.kind, sigma, chance)
+        unit = replace(level, delta=1.0)
+        delta = float(np.clip(self.marking_score(at, unit).sum() / max(len(m.xyz_m), 1), 0.0, 1.0))
+        return replace(level, match=match, chance=chance, delta=delta)
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True)
+def _moving_poses(
+    R: np.ndarray, t: np.ndarray, dt_s: np.ndarray, velocity: np.ndarray, yaw_rate: np.ndarray
+) -> np.ndarray:
+    """[R Rz(yaw_rate dt) | R Rz(yaw_rate dt) v dt + t] as rows, for each pose and frame."""
+    count, frames = R.shape[0], velocity.shape[0]
+    out = np.empty((count, frames, 12), np.float32)
+    for p in range(count):
+        for f in range(frames):
+            c, s = np.cos(yaw_rate[f] * dt_s[p]), np.sin(yaw_rate[f] * dt_s[p])
+            for i in range(3):
+                a, b, d = c * R[p, i, 0] + s * R[p, i, 1], c * R[p, i, 1] - s * R[p, i, 0], R[p, i, 2]
+                ahead = a * velocity[f, 0] + b * velocity[f, 1] + d * velocity[f, 2]
+                row = 4 * i
+                out[p, f, row], out[p, f, row + 1], out[p, f, row + 2] = a, b, d
+                out[p, f, row + 3] = ahead * dt_s[p] + t[p, i]
+    return out
+
+
+def _weights(markings: Points, level: Level) -> np.ndarray:
+    return np.full(len(markings.xyz_m), level.delta * CONTRAST_STEP, np.float32)
+
+
+def lidar_velocities(
+    observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "F 3"]:
+    """Own velocity in lidar axes [m/s]: the speed along the heading that the radar's Doppler shows (0 where unknown).
+
+    One heading for the day, in the horizontal plane: the mount's yaw. A single frame's heading is noisier
+    than it varies, and the radar's vertical velocity is no measurement.
+    """
+    speed = np.array([o.ego_speed_mps if o.ego_speed_mps is not None else 0.0 for o in observations])
+    moving = [
+        o.radar_velocity_mps
+        for o in observations
+        if o.radar_velocity_mps is not None and (o.ego_speed_mps or 0.0) > 3.0
+    ]
+    heading = 0.0
+    if len(moving) >= 5:
+        v = np.stack(moving) @ T_lidar_radar[:3, :3].T
+        heading = float(np.median(np.arctan2(v[:, 1], v[:, 0])))
+    return speed[:, None] * np.array([np.cos(heading), np.sin(heading), 0.0])
+
+
+def prepare_terms(
+    observations: Sequence[Observation],
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    velocity_lidar: Float[np.ndarray, "F 3"],
+    *,
+    reach_rad: float,
+) -> Terms:
+    """Decode maps and gather the points that can come into view within `reach_rad` of a pose."""
+    maps = prepare_maps(observations, CONTRAST_BLURS_PX)
+    view = (observations, T_camera_lidar, maps.camera, reach_rad)
+    edges, markings, classes = gather_edges(*view), gather_markings(*view), gather_classes(*view)
+    yaw_rate = np.array([o.ego_yaw_rate_radps or 0.0 for o in observations])
+    return Terms(maps, camera_parameters(maps.camera), edges, markings, classes, velocity_lidar, yaw_rate)

@@ -1,0 +1,239 @@
+"""Moving radar clusters against lidar object clusters, and against the centres of camera boxes, in azimuth.
+
+A moving cluster of detections is a road user; so is, nearly always, the lidar cluster at its place and the box at its
+azimuth. Only azimuth is compared: ranges differ by what the radar sees through (0.2-0.3 m), elevations by the bounce.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int64
+from scipy.spatial import cKDTree
+
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.geometry.spherical import camera_direction_angles, wrap_angle
+from pipeline.objective.radar.vehicle_boxes import select_frames
+from schemas.observations import Observation
+
+__all__ = [
+    "MovingClusters",
+    "azimuth_equations_camera",
+    "azimuth_equations_lidar",
+    "camera_azimuth_residuals",
+    "lidar_azimuth_residuals",
+    "moving_clusters",
+]
+
+_GATE_M = 2.5  # lidar cluster centre to radar cluster centre: half a car, twice
+_APART_M = 1e3
+_LARGEST_M = 12.0  # lidar clusters longer than a lorry are walls
+_RANGE_FACTOR = 1.8
+_HEIGHT_M = {
+    "person": 1.7,
+    "rider": 1.7,
+    "bicycle": 1.6,
+    "motorcycle": 1.6,
+    "truck": 2.9,
+    "bus": 3.0,
+    "train": 3.5,
+}
+_LEAST_SIGMA_RAD = np.radians(0.3)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingClusters:
+    """Centres of moving clusters in radar axes, with what is needed to bring them to the lidar's time."""
+
+    point_radar_m: Float[np.ndarray, "B 3"]
+    relative_mps: Float[np.ndarray, "B 3"]  # velocity relative to the radar along the line of sight
+    stamp_gap_s: Float[np.ndarray, " B"]  # radar stamp minus lidar stamp
+    frame: Int64[np.ndarray, " B"]  # index into the observations given
+    lidar_centres_m: list[np.ndarray]  # per observation: lidar clusters that can be road users
+    box_azimuths: list[tuple[np.ndarray, np.ndarray]]  # per observation: azimuth and range by height of boxes
+
+    @property
+    def count(self) -> int:
+        """Number of clusters."""
+        return len(self.frame)
+
+    @property
+    def observations(self) -> int:
+        """Number of observations that they were taken from."""
+        return len(self.box_azimuths)
+
+    @cached_property
+    def centres(self) -> cKDTree:
+        """All lidar clusters in the plane; those of different observations lie far apart in the third coordinate."""
+        frame = np.repeat(np.arange(len(self.lidar_centres_m)), [len(c) for c in self.lidar_centres_m])
+        flat = np.concatenate([*self.lidar_centres_m, np.zeros((0, 3))])[:, :2]
+        return cKDTree(np.column_stack([flat, _APART_M * frame]))
+
+    def of_frames(self, frames: Int64[np.ndarray, " S"]) -> MovingClusters:
+        """Those of some observations, which are numbered anew in the order given."""
+        index, number = select_frames(self.frame, frames)
+        return MovingClusters(
+            self.point_radar_m[index],
+            self.relative_mps[index],
+            self.stamp_gap_s[index],
+            number,
+            [self.lidar_centres_m[f] for f in frames],
+            [self.box_azimuths[f] for f in frames],
+        )
+
+    def at_lidar_time(self, dt_s: float) -> Float[np.ndarray, "B 3"]:
+        """Where they were at the lidar's stamp, radar axes; stamp_lidar = stamp_radar + dt."""
+        return self.point_radar_m - self.relative_mps * (self.stamp_gap_s + dt_s)[:, None]
+
+
+def moving_clusters(
+    observations: Sequence[Observation], least_detections: int = 2, with_boxes: bool = True
+) -> MovingClusters:
+    """Moving clusters between 3 and 60 m; without boxes it is cheaper, and enough against the lidar."""
+    points, speeds, gaps, frames = [], [], [], []
+    for index, o in enumerate(observations):
+        for label in range(int(o.radar_cluster.max(initial=-1)) + 1):
+            member = o.radar_cluster == label
+            if member.sum() < least_detections:
+                continue
+            centre = np.median(o.radar_xyz_m[member], axis=0).astype(np.float64)
+            distance = float(np.linalg.norm(centre))
+            if not 3.0 < distance < 60.0:
+                continue
+            u = centre / distance
+            own = np.zeros(3) if o.radar_velocity_mps is None else o.radar_velocity_mps
+            rate = float(np.median(o.radar_residual_mps[member])) - u @ own
+            points.append(centre)
+            speeds.append(rate * u)
+            gaps.append((o.radar_stamp_ns - o.stamp_ns) * 1e-9)
+            frames.append(index)
+    return MovingClusters(
+        np.array(points).reshape(-1, 3),
+        np.array(speeds).reshape(-1, 3),
+        np.array(gaps, np.float64),
+        np.array(frames, np.int64),
+        [_object_centres(o) for o in observations],
+        [_box_azimuths(o) if with_boxes else (np.zeros(0), np.zeros(0)) for o in observations],
+    )
+
+
+def lidar_azimuth_residuals(
+    clusters: MovingClusters,
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    dt_s: float,
+    gate_m: float = _GATE_M,
+) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
+    """Azimuth of the nearest lidar cluster minus the radar cluster's, seen from the radar, and its Jacobian.
+
+    Returns:
+        Residuals [rad] of the clusters that found a partner within `gate_m` in the plane, d/d(left twist of
+        T_lidar_radar), and the frames that they belong to.
+    """
+    points = clusters.at_lidar_time(dt_s)
+    in_lidar = transform_points(T_lidar_radar, points)
+    if not clusters.count or clusters.centres.n == 0:
+        return np.zeros(0), np.zeros((0, 6)), np.zeros(0, np.int64)
+    where = np.column_stack([in_lidar[:, :2], _APART_M * clusters.frame])
+    _, partner = clusters.centres.query(where, distance_upper_bound=gate_m)
+    chosen = np.flatnonzero(partner < clusters.centres.n)
+    p = np.concatenate(clusters.lidar_centres_m)[partner[chosen]]
+    q = transform_points(inverse(T_lidar_radar), p)
+    h2 = q[:, 0] ** 2 + q[:, 1] ** 2
+    residual = wrap_angle(np.arctan2(q[:, 1], q[:, 0]) - np.arctan2(points[chosen, 1], points[chosen, 0]))
+    gradient = np.stack([-q[:, 1] / h2, q[:, 0] / h2, np.zeros(len(q))], -1) @ T_lidar_radar[:3, :3].T
+    # The lidar point moves against the sensor: dq = R^T ([p]x dphi - drho), and g . (p x dphi) = (g x p) . dphi.
+    return residual, np.concatenate([np.cross(gradient, p), -gradient], 1), clusters.frame[chosen]
+
+
+def camera_azimuth_residuals(
+    clusters: MovingClusters,
+    T_camera_radar: Float[np.ndarray, "4 4"],
+    gate_rad: float,
+) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
+    """Azimuth of each moving cluster minus that of the nearest box of fitting size, as the camera sees them.
+
+    Returns:
+        Residuals [rad] of the clusters that found a box within `gate_rad`, d/d(left twist of T_camera_radar), frames.
+    """
+    in_camera = transform_points(T_camera_radar, clusters.point_radar_m)
+    azimuth = camera_direction_angles(in_camera)[:, 0]
+    distance = np.linalg.norm(in_camera, axis=1)
+    chosen: list[int] = []
+    residual: list[float] = []
+    for b in np.flatnonzero(in_camera[:, 2] > 1.0):
+        box_azimuth, expected_m = clusters.box_azimuths[clusters.frame[b]]
+        if not len(box_azimuth):
+            continue
+        ratio = distance[b] / expected_m
+        fits = (ratio < _RANGE_FACTOR) & (ratio > 1 / _RANGE_FACTOR)
+        gap = np.where(fits, np.abs(azimuth[b] - box_azimuth), np.inf)
+        n = int(np.argmin(gap))
+        if gap[n] <= gate_rad:
+            chosen.append(int(b))
+            residual.append(azimuth[b] - box_azimuth[n])
+    p = in_camera[chosen]
+    h2 = p[:, 0] ** 2 + p[:, 2] ** 2
+    # azimuth = atan2(-x, z); dp = dphi x p + drho
+    gradient = np.stack([-p[:, 2] / h2, np.zeros(len(p)), p[:, 0] / h2], -1)
+    return (
+        np.array(residual, np.float64),
+        np.concatenate([np.cross(p, gradient), gradient], 1),
+        clusters.frame[chosen],
+    )
+
+
+def azimuth_equations_lidar(
+    clusters: MovingClusters,
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    dt_s: float,
+) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
+    """Per frame, information and gradient of the robust azimuth cost of moving clusters against the lidar."""
+    return _robust(*lidar_azimuth_residuals(clusters, T_lidar_radar, dt_s), clusters.observations)
+
+
+def azimuth_equations_camera(
+    clusters: MovingClusters,
+    T_camera_radar: Float[np.ndarray, "4 4"],
+    gate_rad: float,
+) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
+    """The same against camera boxes; unknowns are the left twist of T_camera_radar."""
+    return _robust(*camera_azimuth_residuals(clusters, T_camera_radar, gate_rad), clusters.observations)
+
+
+def _robust(
+    residual: np.ndarray, J: np.ndarray, frame: np.ndarray, frames: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Cauchy-weighted normal equations by frame with the residuals' own spread."""
+    H, g = np.zeros((frames, 6, 6)), np.zeros((frames, 6))
+    if len(residual) < 5:  # no spread to weigh them by
+        return H, g, float("nan")
+    sigma = max(float(1.4826 * np.median(np.abs(residual - np.median(residual)))), _LEAST_SIGMA_RAD)
+    weight = 1 / (1 + (residual / (2 * sigma)) ** 2) / sigma**2
+    np.add.at(H, frame, weight[:, None, None] * J[:, :, None] * J[:, None, :])
+    np.add.at(g, frame, (weight * residual)[:, None] * J)
+    return H, g, sigma
+
+
+def _box_azimuths(o: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth of the centre and range by height of each road-user box."""
+    if not len(o.road_user_boxes_px):
+        return np.zeros(0), np.zeros(0)
+    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+    x0, y0, x1, y1 = o.road_user_boxes_px.astype(np.float64).T
+    xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+    rays = camera.unproject(np.stack([np.stack([xm, y], -1) for y in (ym, y0, y1)]))
+    angle = camera_direction_angles(rays)
+    height = np.array([_HEIGHT_M.get(name, 1.5) for name in o.road_user_classes])
+    ok = np.isfinite(angle).all(axis=(0, 2))
+    extent = np.maximum(angle[1, :, 1] - angle[2, :, 1], 1e-3)
+    return angle[0, ok, 0], (height / extent)[ok]
+
+
+def _object_centres(o: Observation) -> np.ndarray:
+    """Centres of lidar clusters that can be road users."""
+    size = np.max(o.lidar_cluster_max_m[:, :2] - o.lidar_cluster_min_m[:, :2], axis=1, initial=0.0)
+    return o.lidar_cluster_centre_m[size <= _LARGEST_M].astype(np.float64)

@@ -1,0 +1,297 @@
+"""Static radar detections against the lidar map: whitened soft assignment in the radar's azimuth, elevation, range.
+
+Each static detection is drawn from one of the lidar points near it (or their mirror images below the ground, or
+nothing): weights are Gaussian in azimuth, elevation and range with the radar's own sigmas. The ground stays in the map.
+A static lidar point p appears at `q = T_radar_lidar p - v tau - w x q tau` to a radar that looks `tau` later, where
+`tau = stamp_radar + dt - stamp_lidar` and v is the radar's own velocity; so dt is an unknown wherever the car moves,
+and so is a constant added to all ranges, which wide fields of view tell from a shift.
+
+Normal equations come apart into (azimuth, range) and elevation: on sparse lidars elevation is worth little, whatever
+its residuals say (points collapse onto the lidar's rings), and the caller weighs it.
+
+Source: Granger & Pennec 2002, "Multi-scale EM-ICP"; Louis 1982 for the information that uncertain assignment leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.objective.radar.registration_loops import STATS, accumulate_frames
+from schemas.observations import Observation
+
+__all__ = [
+    "BOUNCE_PRIOR",
+    "RANGE_M",
+    "SIDE_RAD",
+    "SIGMA_START",
+    "STRAY",
+    "VIEW_MARGIN_RAD",
+    "NormalEquations",
+    "RegistrationFrames",
+    "normal_equations",
+    "registration_frames",
+    "updated_sigma",
+]
+
+# Starts and limits of (azimuth [rad], elevation [rad], range [m]): from car radars' data sheets, wide.
+SIGMA_START = np.array([np.radians(0.6), np.radians(2.2), 0.20])
+_SIGMA_LEAST = np.array([np.radians(0.10), np.radians(0.5), 0.05])
+_SIGMA_MOST = np.array([np.radians(1.5), np.radians(5.0), 0.60])
+BOUNCE_PRIOR = 0.12
+_BOUNCE_MOST = 0.3
+RANGE_M = (3.0, 60.0)  # over ground; nearer is the car's own clutter; farther the lidar has too few points
+_RADAR_POINTS = 500  # per frame; more say the same again
+SIDE_RAD = 1.25
+STRAY = 200  # one in so many lidar points may lie outside the lidar's view
+VIEW_MARGIN_RAD = np.radians(1.0)  # half a wide radar's cell, less what its detections prefer
+
+
+@dataclass(frozen=True, eq=False)
+class RegistrationFrames:
+    """Static detections and lidar points of several frames, one frame after another."""
+
+    radar_m: Float[np.ndarray, "M 3"]
+    radar_first: Int64[np.ndarray, " F1"]
+    lidar_m: Float[np.ndarray, "N 3"]
+    lidar_first: Int64[np.ndarray, " F1"]
+    plane: Float[np.ndarray, "F 4"]
+    has_plane: Bool[np.ndarray, " F"]
+    has_elevation: Bool[np.ndarray, " F"]
+    velocity_mps: Float[np.ndarray, "F 3"]  # of the radar, in radar axes
+    yaw_rate_radps: Float[np.ndarray, " F"]
+    stamp_gap_s: Float[np.ndarray, " F"]  # radar stamp minus lidar stamp
+    block: Int64[np.ndarray, " F"]  # drive, for resampling
+    frame: Int64[np.ndarray, " F"]  # index into the observations given
+    # Lowest and highest that the lidar ever showed, lidar axes.
+    lidar_elevation_rad: Float[np.ndarray, " 2"] = field(default_factory=lambda: np.array([-1.5, 1.5]))
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+        return len(self.stamp_gap_s)
+
+    def subset(self, frames: Int64[np.ndarray, " S"]) -> RegistrationFrames:
+        """The same with these frames only."""
+        pieces = [(self.radar_m, self.radar_first), (self.lidar_m, self.lidar_first)]
+        (radar, r_first), (lidar, l_first) = (
+            _pack([points[first[f] : first[f + 1]] for f in frames]) for points, first in pieces
+        )
+        rest = (
+            a[frames]
+            for a in (
+                self.plane,
+                self.has_plane,
+                self.has_elevation,
+                self.velocity_mps,
+                self.yaw_rate_radps,
+                self.stamp_gap_s,
+                self.block,
+                self.frame,
+            )
+        )
+        return replace(
+            RegistrationFrames(radar, r_first, lidar, l_first, *rest),
+            lidar_elevation_rad=self.lidar_elevation_rad,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Per frame, for (azimuth and range) and for elevation; unknowns: left twist, dt [s], range bias [m].
+
+    `H` and `g` move the pose (step = -H^-1 g); `information` is what the frame really says (assignment is uncertain).
+    """
+
+    H: Float[np.ndarray, "2 F 8 8"]
+    g: Float[np.ndarray, "2 F 8"]
+    information: Float[np.ndarray, "2 F 8 8"]
+    cost: Float[np.ndarray, " F"]  # minus mean log likelihood per detection
+    assigned: Float[np.ndarray, " F"]  # share of detections that found a lidar point
+    bounced: float  # share of the assigned that came by way of the ground
+    second_moment: Float[np.ndarray, " 3"]  # of the residuals in sigmas (azimuth, elevation, range)
+
+
+def registration_frames(
+    observations: Sequence[Observation],
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    rng: np.random.Generator,
+    radar_points: int = _RADAR_POINTS,
+) -> RegistrationFrames:
+    """Collect what the registration needs; frames without static detections or without lidar map are left out.
+
+    Args:
+        observations: any frames.
+        T_lidar_radar: a guess, good enough to cut the lidar map to the radar's field of view.
+        rng: picks detections where a frame has more than `radar_points`.
+        radar_points: most detections per frame.
+    """
+    radar, lidar, rows = [], [], []
+    for index, o in enumerate(observations):
+        if o.radar_velocity_mps is None:
+            continue
+        static = _static_detections(o, radar_points, rng)
+        near = _lidar_in_view(o.lidar_map_xyz_m, T_lidar_radar)
+        if len(static) < 10 or len(near) < 100:
+            continue
+        radar.append(static)
+        lidar.append(near)
+        plane = o.ground_plane if o.ground_plane is not None else np.zeros(4)
+        # Angular rates about the vertical are alike in all frames of the car.
+        rows.append(
+            (
+                plane,
+                o.ground_plane is not None,
+                o.radar_has_elevation,
+                o.radar_velocity_mps,
+                o.ego_yaw_rate_radps or 0.0,
+                (o.radar_stamp_ns - o.stamp_ns) * 1e-9,
+                o.drive,
+                index,
+            )
+        )
+    columns = list(zip(*rows, strict=True)) if rows else [[]] * 8
+    (radar_m, radar_first), (lidar_m, lidar_first) = _pack(radar), _pack(lidar)
+    return RegistrationFrames(
+        radar_m,
+        radar_first,
+        lidar_m,
+        lidar_first,
+        np.array(columns[0], np.float64).reshape(-1, 4),
+        np.array(columns[1], bool),
+        np.array(columns[2], bool),
+        np.array(columns[3], np.float64).reshape(-1, 3),
+        np.array(columns[4], np.float64),
+        np.array(columns[5], np.float64),
+        np.array(columns[6], np.int64),
+        np.array(columns[7], np.int64),
+        _elevation_limits(observations),
+    )
+
+
+def normal_equations(
+    frames: RegistrationFrames,
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    dt_s: float,
+    sigma: Float[np.ndarray, " 3"],
+    bounce_prior: float = BOUNCE_PRIOR,
+    outlier: float = 1.0,
+    stride: int = 1,
+    range_bias_m: float = 0.0,
+) -> NormalEquations:
+    """Assign softly at this pose and linearise.
+
+    Args:
+        frames: from `registration_frames`.
+        T_lidar_radar: pose.
+        dt_s: time offset, stamp_lidar = stamp_radar + dt.
+        sigma: of azimuth [rad], elevation [rad], range [m]; wider ones make a wider basin.
+        bounce_prior: prior probability of a detection by way of the ground.
+        outlier: weight of "no lidar point", in units of one lidar point at distance 0.
+        stride: use every n-th detection.
+        range_bias_m: measured minus true range (the radar's own offset, and how far it sees into things).
+    """
+    F = frames.count
+    H, info = np.zeros((2, F, 8, 8)), np.zeros((2, F, 8, 8))
+    g, stats = np.zeros((2, F, 8)), np.zeros((F, STATS))
+    accumulate_frames(
+        np.ascontiguousarray(T_lidar_radar, np.float64),
+        frames.stamp_gap_s + dt_s,
+        range_bias_m,
+        frames.velocity_mps,
+        frames.yaw_rate_radps,
+        frames.radar_m,
+        frames.radar_first,
+        frames.lidar_m,
+        frames.lidar_first,
+        frames.plane,
+        frames.has_plane,
+        frames.has_elevation,
+        _told_elevations(frames.lidar_elevation_rad, float(sigma[1])),
+        np.asarray(sigma, np.float64),
+        outlier,
+        bounce_prior,
+        stride,
+        RANGE_M[1] + 5.0,
+        H,
+        g,
+        info,
+        stats,
+    )
+    seen = np.maximum(stats[:, 1], 1)
+    total = stats.sum(0)
+    moments = total[4:7] / np.maximum([total[2], total[7], total[2]], 1e-9)
+    return NormalEquations(
+        H,
+        g,
+        info,
+        -stats[:, 0] / seen,
+        stats[:, 2] / seen,
+        float(total[3] / max(total[2], 1e-9)),
+        moments,
+    )
+
+
+def updated_sigma(
+    equations: NormalEquations, sigma: Float[np.ndarray, " 3"], bounce_prior: float
+) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Sigmas and bounce probability that the assigned residuals show, within what radars do (one EM step)."""
+    # EM shrinks slowly what began wide (every lidar point within reach is a partner): twice its step, in logarithms.
+    shown = sigma * np.maximum(equations.second_moment, 1e-6)
+    bounce = float(np.clip(equations.bounced, 0.01, _BOUNCE_MOST)) if bounce_prior > 0 else 0.0
+    return np.clip(shown, _SIGMA_LEAST, _SIGMA_MOST), bounce
+
+
+def _elevation_limits(observations: Sequence[Observation]) -> np.ndarray:
+    """Lowest and highest elevation [rad] of lidar maps, a few stray points aside."""
+    low, high = [], []
+    for o in observations:
+        p = o.lidar_map_xyz_m
+        if len(p) >= 100:
+            angle = np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))
+            few = np.partition(angle, (len(p) // STRAY, len(p) - 1 - len(p) // STRAY))
+            low.append(few[len(p) // STRAY])
+            high.append(few[-1 - len(p) // STRAY])
+    # No single street shows all of the field of view.
+    return np.array([min(low), max(high)], np.float64) if low else np.array([-1.5, 1.5])
+
+
+def _told_elevations(limits_rad: np.ndarray, sigma_rad: float) -> np.ndarray:
+    """Tangents of the elevations between which a detection's elevation can be compared with the lidar's.
+
+    What stands out of the lidar's view would be matched to its edge, always from the same side.
+    """
+    margin = VIEW_MARGIN_RAD + min(2 * sigma_rad, 0.25 * float(limits_rad[1] - limits_rad[0]))
+    return np.tan(np.clip(limits_rad + np.array([margin, -margin]), -1.5, 1.5))
+
+
+def _static_detections(o: Observation, most: int, rng: np.random.Generator) -> np.ndarray:
+    """Static detections at useful ranges; at most `most`, evenly over azimuth."""
+    r = np.hypot(o.radar_xyz_m[:, 0], o.radar_xyz_m[:, 1])
+    azimuth = np.arctan2(o.radar_xyz_m[:, 1], o.radar_xyz_m[:, 0])
+    use = np.flatnonzero(
+        (o.radar_motion == 0) & (r > RANGE_M[0]) & (r < RANGE_M[1]) & (np.abs(azimuth) < SIDE_RAD)
+    )
+    if len(use) > most:
+        bins = np.clip((azimuth[use] + SIDE_RAD) / (2 * SIDE_RAD) * 24, 0, 23).astype(int)
+        weight = 1 / np.sqrt(np.bincount(bins, minlength=24)[bins])
+        use = np.sort(rng.choice(use, most, replace=False, p=weight / weight.sum()))
+    return o.radar_xyz_m[use].astype(np.float64)
+
+
+def _lidar_in_view(lidar: np.ndarray, T_lidar_radar: np.ndarray) -> np.ndarray:
+    """Lidar points that the radar might see from anywhere near the guess."""
+    p = transform_points(inverse(T_lidar_radar), lidar.astype(np.float64))
+    r = np.hypot(p[:, 0], p[:, 1])
+    keep = (r < RANGE_M[1] + 3) & (r > 1.5) & (np.abs(np.arctan2(p[:, 1], p[:, 0])) < SIDE_RAD + 0.2)
+    return lidar[keep].astype(np.float64)
+
+
+def _pack(pieces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Points one after another, and where each frame begins."""
+    first = np.concatenate([[0], np.cumsum([len(p) for p in pieces], dtype=np.int64)]).astype(np.int64)
+    return (np.concatenate(pieces) if len(pieces) else np.zeros((0, 3))), first

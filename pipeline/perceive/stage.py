@@ -1,0 +1,351 @@
+"""Stage perceive: table frames to table observations, one vehicle-day, a row group at a time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.config import (
+    FleetConfig,
+    LidarTopics,
+    OnnxSemantics,
+    PerceiveConfig,
+    RadarTopics,
+    TopicSemantics,
+    config_hash,
+)
+from pipeline.errors import ContractError
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.radar_grid import Scan
+from pipeline.perceive.camera import SemanticsSource, TopicSource, decode_grey, encode_png
+from pipeline.perceive.depth_edges import lidar_edges
+from pipeline.perceive.drivable import DrivableSource, free_sector
+from pipeline.perceive.ego_velocity import RadarMotion, radar_motion
+from pipeline.perceive.ground import PointSource, find_ground
+from pipeline.perceive.labels import ROAD_ID
+from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
+from pipeline.perceive.rejections import FrameReason, FrameRejectedError
+from pipeline.perceive.road_markings import lidar_markings, road_contrast
+from pipeline.perceive.tracks import EgoMotion, Tracks, TrackState, advance_tracks, measure_clusters
+from pipeline.results import Progress, StageResult, silent
+from pipeline.store.partitions import Lake, Partition, work_key
+from pipeline.store.tables import Manifest, iterate_rows, read_manifest, write_partition
+from schemas.frames import FRAMES, Frame
+from schemas.observations import OBSERVATIONS, Observation
+from schemas.versions import CODE_VERSION
+
+__all__ = ["perceive_day", "perceive_frame"]
+
+_MIN_LIDAR_POINTS = 100  # less shows neither ground nor objects
+_ROWS_PER_GROUP = 16
+_PRIOR_FIELDS = [
+    f"prior_{pair}_{part}"
+    for pair in ("camera_lidar", "lidar_radar")
+    for part in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+]
+_COPIED_FIELDS = [
+    "frame_index", "log", "drive", "stamp_ns", "camera_stamp_ns", "radar_stamp_ns",
+    "image_width_px", "image_height_px", "camera_model", "camera_K", "camera_D",
+    "radar_power_db", "radar_has_elevation", *_PRIOR_FIELDS,
+]  # fmt: skip
+
+
+def perceive_day(
+    partition: Partition,
+    fleet: FleetConfig,
+    lake: Lake,
+    progress: Progress = silent,
+    fleet_file: Path = Path("fleet.toml"),
+) -> StageResult:
+    """Perceive all frames of a vehicle-day and replace its partition of observations.
+
+    A frame that cannot be used is left out and counted by reason. Where none is left, the partition is empty
+    and the result "refused".
+
+    Raises:
+        ConfigError: the vehicle or a model manifest is not as fleet.toml says.
+        ContractError: the day has no frames yet.
+        ModelError: a model does not do what its manifest says.
+    """
+    rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
+    frames = read_manifest(lake, FRAMES, partition)
+    if frames is None:
+        folder = lake.folder(FRAMES.name, partition)
+        raise ContractError(str(folder), "no frames of this vehicle and day: run `boresight ingest` first")
+    source, semantics_key = _source(rig.camera.semantics, fleet.perceive, fleet_file)
+    drivable = _drivable(rig.radar, fleet_file)
+    points = _points(rig.lidar, fleet_file)
+    for model in (drivable, points):
+        semantics_key |= {} if model is None else model.provenance
+    key = work_key("perceive", CODE_VERSION, config_hash(fleet.perceive, semantics_key), [frames.work_key])
+    done = read_manifest(lake, OBSERVATIONS, partition)
+    if done is not None and done.work_key == key:
+        return _result(lake, partition, done, "cached")
+    rejected: Counter[str] = Counter()
+    with write_partition(lake, OBSERVATIONS, partition, key, CODE_VERSION, [frames.work_key]) as writer:
+        state, seen, rows = TrackState.empty(), 0, []
+        for group in iterate_rows(lake, FRAMES, partition, Frame):
+            for frame in group:
+                try:
+                    observation, state = perceive_frame(
+                        frame, source, fleet.perceive, state, drivable, points
+                    )
+                    rows.append(observation)
+                except FrameRejectedError as rejection:
+                    rejected[rejection.reason.value] += 1
+                seen += 1
+                progress(seen, frames.rows, "perceive")
+                if len(rows) == _ROWS_PER_GROUP:
+                    writer.append(rows)
+                    rows = []
+        writer.append(rows)
+        writer.describe(kept={"frames": writer.rows}, rejected=dict(rejected))
+    written = read_manifest(lake, OBSERVATIONS, partition)
+    assert written is not None, "the partition was just written"
+    return _result(lake, partition, written, "done")
+
+
+def perceive_frame(
+    frame: Frame,
+    source: SemanticsSource,
+    config: PerceiveConfig,
+    tracks: TrackState,
+    drivable: DrivableSource | None = None,
+    points: PointSource | None = None,
+) -> tuple[Observation, TrackState]:
+    """Everything that one frame shows, and the radar tracks carried on.
+
+    Args:
+        frame: the next of the day.
+        source: of the camera's semantics.
+        config: gates and sizes.
+        tracks: from the frame before.
+        drivable: network for the radar's drivable area, which remembers the scans before; None = geometry.
+        points: model that tells what lidar points are; None = geometry.
+
+    Raises:
+        ModelError: a model does not do what its manifest says.
+        FrameRejectedError: the frame cannot be used; `tracks` stay as they were.
+    """
+    _check(frame)
+    semantics = source.read(frame)
+    grey = decode_grey(frame, config.label_scale)
+    contrast = road_contrast(grey, semantics.labels == ROAD_ID)
+    # One generator per frame: the result does not depend on which frames came before.
+    rng = np.random.default_rng([frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index])
+    lidar = _perceive_lidar(frame, config, rng, points)
+    radar, motion, state = _perceive_radar(frame, config, tracks, rng, drivable)
+    copied = {name: getattr(frame, name) for name in _COPIED_FIELDS}
+    users = semantics.detections
+    observation = Observation(
+        **copied,
+        **lidar,
+        **radar,
+        ego_speed_mps=_ego_speed(frame, motion),
+        ego_yaw_rate_radps=frame.ego_yaw_rate_radps,
+        labels_png=encode_png(semantics.labels),
+        label_scale=config.label_scale,
+        sky_fraction=semantics.sky_fraction,
+        drivable_fraction=semantics.drivable_fraction,
+        road_user_boxes_px=users.boxes_px,
+        road_user_classes=users.classes,
+        road_user_scores=users.scores,
+        road_contrast_png=encode_png(contrast),
+    )
+    return observation, state
+
+
+@dataclass(frozen=True, eq=False)
+class _Sweep:
+    """The finite points of one sweep."""
+
+    xyz_m: np.ndarray
+    intensity: np.ndarray | None
+    ring: np.ndarray | None
+
+
+def _source(
+    wanted: TopicSemantics | OnnxSemantics, config: PerceiveConfig, fleet_file: Path
+) -> tuple[SemanticsSource, dict[str, Any]]:
+    """Where semantics come from, and what of it belongs into the work key."""
+    if isinstance(wanted, TopicSemantics):
+        return TopicSource(wanted, config), {"source": "topics", "label_set": wanted.label_set}
+    # onnxruntime loads only where it is used.
+    from pipeline.perceive.models.source import ModelSource  # noqa: PLC0415
+
+    models = ModelSource.load(wanted, config, fleet_file)
+    return models, {"source": "onnx", **models.provenance}
+
+
+def _check(frame: Frame) -> None:
+    try:
+        Camera(
+            frame.camera_model, frame.camera_K, frame.camera_D, frame.image_width_px, frame.image_height_px
+        )
+    except ValueError as err:
+        raise FrameRejectedError(FrameReason.CAMERA_MODEL) from err
+    if len(frame.lidar_x_m) < _MIN_LIDAR_POINTS:
+        raise FrameRejectedError(FrameReason.FEW_LIDAR_POINTS)
+    if not len(frame.radar_x_m):
+        raise FrameRejectedError(FrameReason.FEW_RADAR_POINTS)
+
+
+def _perceive_lidar(
+    frame: Frame, config: PerceiveConfig, rng: np.random.Generator, points: PointSource | None
+) -> dict[str, Any]:
+    """The lidar_*, marking_* and ground_* columns."""
+    sweep = _finite_sweep(frame)
+    xyz = sweep.xyz_m
+    kind = None if points is None else points.kinds(xyz, sweep.intensity)
+    ground = find_ground(xyz, config.ground_inlier_m, rng, kind)
+    cluster = cluster_objects(xyz, ground.is_ground, config.cluster_eps_m, config.cluster_min_points)
+    boxes = cluster_boxes(xyz, cluster)
+    sample = sample_uniformly(xyz, config.voxel_m)
+    edges = lidar_edges(xyz, sweep.ring, cluster, config)
+    markings = lidar_markings(xyz, sweep.intensity, sweep.ring, ground.is_road)
+    return {
+        "lidar_map_xyz_m": xyz[sample],
+        "lidar_map_is_ground": ground.is_ground[sample].astype(np.uint8),
+        "lidar_map_cluster": cluster[sample],
+        "lidar_cluster_centre_m": boxes.centre_m,
+        "lidar_cluster_min_m": boxes.min_m,
+        "lidar_cluster_max_m": boxes.max_m,
+        "lidar_edge_xyz_m": edges.xyz_m,
+        "lidar_edge_side": edges.side,
+        "lidar_edge_jump_m": edges.jump_m,
+        "lidar_edge_gap_rad": edges.gap_rad,
+        "lidar_edge_points": edges.points,
+        "marking_xyz_m": markings.xyz_m,
+        "marking_z": markings.z,
+        "ground_plane": ground.plane,
+        "lidar_drivable_xyz_m": ground.drivable_xyz_m,
+    }
+
+
+def _perceive_radar(
+    frame: Frame,
+    config: PerceiveConfig,
+    tracks: TrackState,
+    rng: np.random.Generator,
+    drivable: DrivableSource | None,
+) -> tuple[dict[str, Any], RadarMotion, TrackState]:
+    """The radar_* columns but those copied from the frame."""
+    xyz = frame.radar_xyz_m
+    motion = radar_motion(
+        xyz, frame.radar_range_rate_mps, frame.radar_power_db, frame.doppler_period_mps, frame.ego_speed_mps,
+        frame.radar_has_elevation, config, rng,
+    )  # fmt: skip
+    returns = measure_clusters(xyz, motion.residual_mps, motion.cluster, frame.doppler_period_mps)
+    state, found = advance_tracks(
+        tracks, frame.radar_stamp_ns, frame.drive, _ego_motion(frame, motion), returns,
+        frame.doppler_period_mps,
+    )  # fmt: skip
+    sector = (
+        free_sector(xyz, motion.motion, frame.radar_has_elevation)
+        if drivable is None
+        else drivable.free_sector(_scan(frame, motion))
+    )
+    columns = {
+        "radar_xyz_m": xyz,
+        "radar_residual_mps": motion.residual_mps,
+        "radar_motion": motion.motion,
+        "radar_cluster": motion.cluster,
+        "radar_velocity_mps": motion.velocity_mps,
+        "radar_velocity_cov": motion.velocity_cov,
+        **_track_columns(found),
+        "radar_drivable_azimuth_rad": sector.azimuth_rad,
+        "radar_drivable_range_m": sector.range_m,
+    }
+    return columns, motion, state
+
+
+def _drivable(radar: RadarTopics, fleet_file: Path) -> DrivableSource | None:
+    if radar.drivable is None:
+        return None
+    from pipeline.perceive.models.radar_drivable import RadarDrivable  # noqa: PLC0415 - as in _source
+
+    return RadarDrivable.load(radar.drivable, fleet_file)
+
+
+def _points(lidar: LidarTopics, fleet_file: Path) -> PointSource | None:
+    if lidar.semantics is None:
+        return None
+    from pipeline.perceive.models.range_image import RangeImageSegmenter  # noqa: PLC0415 - as in _source
+
+    return RangeImageSegmenter.load(lidar.semantics, fleet_file)
+
+
+def _scan(frame: Frame, motion: RadarMotion) -> Scan:
+    ego = _ego_motion(frame, motion)
+    return Scan(
+        frame.radar_stamp_ns,
+        frame.drive,
+        frame.radar_xyz_m,
+        frame.radar_power_db,
+        motion.residual_mps,
+        motion.motion,
+        frame.radar_has_elevation,
+        ego.velocity_mps,
+        ego.yaw_rate_radps,
+    )
+
+
+def _ego_motion(frame: Frame, motion: RadarMotion) -> EgoMotion:
+    """The radar's velocity, or the odometry's speed where the scan shows no static world."""
+    velocity = motion.velocity_mps
+    if velocity is not None:
+        return EgoMotion((float(velocity[0]), float(velocity[1])), frame.ego_yaw_rate_radps)
+    speed = frame.ego_speed_mps
+    return EgoMotion(None if speed is None else (speed, 0.0), frame.ego_yaw_rate_radps)
+
+
+def _track_columns(tracks: Tracks) -> dict[str, np.ndarray]:
+    return {
+        "radar_track_xyz_m": tracks.xyz_m,
+        "radar_track_velocity_mps": tracks.velocity_mps,
+        "radar_track_id": tracks.identity,
+        "radar_track_age": tracks.age,
+        "radar_track_points": tracks.points,
+    }
+
+
+def _finite_sweep(frame: Frame) -> _Sweep:
+    xyz = frame.lidar_xyz_m
+    finite = np.isfinite(xyz).all(axis=1)
+    if finite.sum() < _MIN_LIDAR_POINTS:
+        raise FrameRejectedError(FrameReason.FEW_LIDAR_POINTS)
+    if finite.all():
+        return _Sweep(xyz, frame.lidar_intensity, frame.lidar_ring)
+    intensity = None if frame.lidar_intensity is None else frame.lidar_intensity[finite]
+    return _Sweep(xyz[finite], intensity, None if frame.lidar_ring is None else frame.lidar_ring[finite])
+
+
+def _ego_speed(frame: Frame, motion: RadarMotion) -> float | None:
+    if frame.ego_speed_mps is not None or motion.velocity_mps is None:
+        return frame.ego_speed_mps
+    vx, vy = float(motion.velocity_mps[0]), float(motion.velocity_mps[1])
+    return float(np.copysign(np.hypot(vx, vy), vx))
+
+
+def _result(lake: Lake, partition: Partition, manifest: Manifest, status: str) -> StageResult:
+    reason = ""
+    if manifest.rows == 0:
+        status = "refused"
+        counts = ", ".join(f"{n} {why}" for why, n in sorted(manifest.rejected.items()))
+        reason = f"no usable frame: {counts}" if counts else "the day has no frames"
+    return StageResult(
+        stage="perceive",
+        vehicle=partition.vehicle,
+        day=partition.day,
+        status=status,
+        work_key=manifest.work_key,
+        rows=manifest.rows,
+        kept=dict(manifest.kept),
+        rejected=dict(manifest.rejected),
+        reason=reason,
+        outputs=[str(lake.folder(OBSERVATIONS.name, partition))],
+    )

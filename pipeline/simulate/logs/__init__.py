@@ -1,0 +1,1 @@
+"""Measurements as messages, messages as logs."""

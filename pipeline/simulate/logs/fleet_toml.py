@@ -1,0 +1,45 @@
+"""The fleet.toml that goes with simulated logs."""
+
+from __future__ import annotations
+
+from pipeline.simulate.logs.writers import TOPICS
+from pipeline.simulate.sensors.rigs import RigSpec
+
+__all__ = ["fleet_toml"]
+
+
+def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> str:
+    """Text of fleet.toml; the prior's sigmas are those of a mounting against CAD for a pair of sensors."""
+    period = rig.radar.doppler_period_mps
+    lines = [
+        "[fleet]",
+        f'name = "{fleet}"',
+        "",
+        f"[rigs.{rig_name}.camera]",
+        f'image = "{TOPICS["image"]}"',
+        f'info = "{TOPICS["info"]}"',
+        (
+            f'semantics = {{ source = "topics", labels = "{TOPICS["labels"]}", '
+            f'detections = "{TOPICS["detections"]}", label_set = "cityscapes" }}'
+        ),
+        "",
+        f"[rigs.{rig_name}.lidar]",
+        f'points = "{TOPICS["lidar"]}"',
+        "",
+        f"[rigs.{rig_name}.radar]",
+        f'points = "{TOPICS["radar"]}"',
+        'doppler_field = "doppler"',
+        f'doppler_positive = "{rig.radar.doppler_positive}"',
+        *([f"doppler_period_mps = {period}"] if period is not None else []),
+        "",
+        f"[rigs.{rig_name}.ego]",
+        f'odometry = "{TOPICS["odometry"]}"',
+        "",
+        f"[rigs.{rig_name}.prior]",
+        'source = "tf_static"',
+        "rotation_sigma_deg = 1.2",
+        "translation_sigma_m = 0.03",
+    ]
+    for vehicle in vehicles:
+        lines += ["", f'[vehicles."{vehicle}"]', f'rig = "{rig_name}"']
+    return "\n".join(lines) + "\n"

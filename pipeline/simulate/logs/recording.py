@@ -1,0 +1,134 @@
+"""Turns what the sensors deliver into the messages of a log, day faults included."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from pipeline.geometry.se3 import from_rotation_translation
+from pipeline.simulate.faults import DayFaults, misread
+from pipeline.simulate.logs.messages import Messages
+from pipeline.simulate.logs.writers import TOPICS, Put
+from pipeline.simulate.sensors.frames import SimulatedFrame, frame_of, scene_of
+from pipeline.simulate.sensors.rigs import Mounting, RigSpec
+from pipeline.simulate.sensors.semantics import SemanticsSpec, encode_png
+from pipeline.simulate.world.casting import World
+from pipeline.simulate.world.drives import Drive
+
+__all__ = ["FIRST_FRAME_S", "nominal_poses", "record_drive", "trio"]
+
+_ODOMETRY_HZ: Final = 20.0
+FIRST_FRAME_S: Final = 1.0  # a drive's log begins this long before its first frame
+
+
+def record_drive(
+    messages: Messages,
+    put: Put,
+    world: World,
+    rig: RigSpec,
+    mounting: Mounting,
+    semantics: SemanticsSpec,
+    today: DayFaults,
+    frames: int,
+    rate_hz: float,
+    rng: np.random.Generator,
+    tick: Callable[[int], None],
+) -> None:
+    """Write one drive; `tick` is told the number of frames written."""
+    drive = world.drive
+
+    def at(t_s: float) -> int:
+        return drive.start_ns + round(t_s * 1e9)
+
+    odometry = _odometry(drive, rng)
+    put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), nominal_poses(mounting)))
+    scene = scene_of(drive)
+    semantics = _night(semantics) if today.night else semantics
+    for k in range(frames):
+        stamp = FIRST_FRAME_S + k / rate_hz + rng.uniform(0, 0.02)
+        moment = world.moment(stamp - rig.lidar.sweep_s / 2)
+        frame = frame_of(moment, scene, rig, mounting, stamp, rng, semantics)
+        pending = trio(messages, frame, rig, mounting, today, at, rng)
+        while odometry and odometry[0][0] <= stamp + 0.1:
+            t, T, speed, yaw_rate = odometry.pop(0)
+            pending.append((at(t), TOPICS["odometry"], messages.odometry(at(t), T, speed, yaw_rate)))
+        for time_ns, topic, message in sorted(pending, key=lambda p: p[0]):
+            put(topic, time_ns, message)
+        tick(k + 1)
+
+
+def trio(
+    messages: Messages,
+    frame: SimulatedFrame,
+    rig: RigSpec,
+    mounting: Mounting,
+    today: DayFaults,
+    at: Callable[[float], int],
+    rng: np.random.Generator,
+) -> list[tuple[int, str, Any]]:
+    """The messages of one frame: (log time, topic, message)."""
+    camera, lidar, radar = at(frame.camera_stamp_s), at(frame.lidar_stamp_s), at(frame.radar_stamp_s)
+    sweep, scan = frame.sweep, frame.scan
+    sign = np.float32(-1.0 if rig.radar.doppler_positive == "approaching" else 1.0)
+    points = dict(zip("xyz", sweep.xyz_m.T, strict=True))
+    points |= {"intensity": sweep.intensity, "ring": sweep.ring, "time": sweep.time_s}
+    detections = dict(zip("xyz", scan.xyz_m.T, strict=True))
+    detections |= {"doppler": sign * scan.range_rate_mps, "power": scan.power_db}
+    lidar_topic, radar_topic = TOPICS["lidar"], TOPICS["radar"]
+    if today.swapped:
+        lidar_topic, radar_topic = radar_topic, lidar_topic
+    info = misread(mounting.nominal_camera, today.focal_factor)
+    labels = _permuted(frame.labels_png, rng) if today.labels_permuted else frame.labels_png
+    sent = {
+        "camera": [
+            (camera, TOPICS["info"], messages.camera_info(camera, info)),
+            (camera, TOPICS["image"], messages.image(camera, frame.jpeg, "jpeg")),
+            (camera, TOPICS["labels"], messages.image(camera, labels, "mono8; png compressed")),
+            (camera, TOPICS["detections"], messages.detections(camera, frame.boxes)),
+        ],
+        "lidar": [(lidar, lidar_topic, messages.cloud(lidar, "lidar", points))],
+        "radar": [(radar, radar_topic, messages.cloud(radar, "radar", detections))],
+    }
+    return [item for sensor, items in sent.items() if sensor not in today.missing for item in items]
+
+
+def nominal_poses(mounting: Mounting) -> dict[str, np.ndarray]:
+    """T_vehicle_sensor as /tf_static says."""
+    return {
+        "camera": mounting.T_vehicle_nominal_camera,
+        "lidar": mounting.T_vehicle_nominal_lidar,
+        "radar": mounting.T_vehicle_nominal_radar,
+    }
+
+
+def _permuted(png: bytes, rng: np.random.Generator) -> bytes:
+    """Labels with their classes exchanged (a model with another label set)."""
+    labels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    return encode_png(np.concatenate([rng.permutation(19), np.full(237, 255)]).astype(np.uint8)[labels])
+
+
+def _night(spec: SemanticsSpec) -> SemanticsSpec:
+    """Networks trained by day, at night."""
+    return SemanticsSpec(
+        3 * spec.boundary_px, spec.swell, 0.35, 0.5, 3 * spec.box_jitter, 3 * spec.false_boxes
+    )
+
+
+def _odometry(drive: Drive, rng: np.random.Generator) -> list[tuple[float, np.ndarray, float, float]]:
+    """Dead reckoning from wheels and a gyro: (time, T_odom_vehicle, speed, yaw rate)."""
+    t = np.arange(0.0, drive.duration_s, 1 / _ODOMETRY_HZ)
+    T = drive.ego.poses(t)
+    velocity, omega = drive.ego.velocities(t)
+    speed = np.einsum("ij,ij->i", velocity, T[:, :3, 0]) * (1 + rng.normal(0, 0.004))
+    speed += rng.normal(0, 0.03, len(t))
+    yaw_rate = np.einsum("ij,ij->i", omega, T[:, :3, 2]) + rng.normal(0, 5e-4) + rng.normal(0, 0.002, len(t))
+    yaw = np.cumsum(yaw_rate) / _ODOMETRY_HZ
+    x, y = np.cumsum(speed * np.cos(yaw)) / _ODOMETRY_HZ, np.cumsum(speed * np.sin(yaw)) / _ODOMETRY_HZ
+    R = np.zeros((len(t), 3, 3))
+    R[:, 0, 0], R[:, 0, 1] = np.cos(yaw), -np.sin(yaw)
+    R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = np.sin(yaw), np.cos(yaw), 1.0
+    poses = from_rotation_translation(R, np.stack([x, y, np.zeros_like(x)], 1))
+    return [(float(a), b, float(c), float(d)) for a, b, c, d in zip(t, poses, speed, yaw_rate, strict=True)]

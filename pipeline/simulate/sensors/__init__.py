@@ -1,0 +1,1 @@
+"""What is mounted on a vehicle and what it measures of the world."""

@@ -1,0 +1,142 @@
+"""What a scanning lidar measures: each beam from where we are, and at what it meets, at the beam's own time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.spherical import from_spherical
+from pipeline.simulate.sensors.rigs import LidarSpec
+from pipeline.simulate.world.casting import Hits, Moment
+from pipeline.simulate.world.drives import Motion
+from pipeline.simulate.world.loops import textures
+from pipeline.simulate.world.materials import LABELS, TABLE
+
+__all__ = ["Sweep", "sweep_lidar"]
+
+_VEGETATION: Final = LABELS.index("vegetation")
+# Echo of a frontal white wall at 100 m is 1; what is weaker is lost (asphalt at about 50 m from 1.8 m height).
+_FAINTEST: Final = 0.018
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Points in the lidar frame at their own times; `label` is the truth, for tests, and goes into no log."""
+
+    xyz_m: np.ndarray
+    intensity: np.ndarray
+    ring: np.ndarray
+    time_s: np.ndarray
+    label: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def _beams(spec: LidarSpec) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(azimuth, elevation, ring, column) of all beams, column by column."""
+    azimuth = np.radians(np.linspace(spec.azimuth_deg[1], spec.azimuth_deg[0], spec.columns, endpoint=False))
+    elevation = np.radians(np.linspace(*spec.elevation_deg, spec.rows))
+    a, e = np.meshgrid(azimuth, elevation, indexing="ij")
+    column, ring = np.meshgrid(np.arange(spec.columns), np.arange(spec.rows), indexing="ij")
+    return np.stack([a.ravel(), e.ravel()], 1), ring.ravel().astype(np.uint16), column.ravel()
+
+
+def sweep_lidar(
+    moment: Moment,
+    ego: Motion,
+    T_vehicle_lidar: Float[np.ndarray, "4 4"],
+    spec: LidarSpec,
+    end_s: float,
+    rng: np.random.Generator,
+) -> Sweep:
+    """One sweep that ends at `end_s` of the drive."""
+    angles, ring, column = _beams(spec)
+    column_time = np.linspace(-spec.sweep_s, 0.0, spec.columns)
+    T = ego.poses(end_s + column_time) @ T_vehicle_lidar
+    R, origin = T[:, :3, :3], T[:, :3, 3] - moment.standing.origin
+    delay = (end_s + column_time - moment.t_s)[column]
+    parts = []
+    # A beam has a footprint: a second ray inside it finds the edges where two surfaces share one beam.
+    for spread in (0.0, np.radians(spec.divergence_deg)):
+        a = angles + spread * rng.uniform(-1, 1, angles.shape) if spread else angles
+        body = from_spherical(np.concatenate([a, np.ones((len(a), 1))], 1))
+        rays = np.einsum("cij,crj->cri", R, body.reshape(spec.columns, spec.rows, 3)).reshape(-1, 3)
+        origins = np.repeat(origin, spec.rows, axis=0)
+        parts.append((_echo(moment, moment.cast(origins, rays, delay), rays, spec, rng), rays))
+    (range_m, strength, label), seen = _mixed(parts[0][0], parts[1][0], rng)
+    keep = seen & (rng.random(len(seen)) > 0.004)
+    body = from_spherical(np.concatenate([angles[keep], range_m[keep, None]], 1))
+    intensity = np.clip(
+        strength[keep] * 100 * (1 + 0.08 * rng.standard_normal(keep.sum())) + rng.normal(0, 0.8, keep.sum()),
+        0,
+        255,
+    )
+    return Sweep(
+        body.astype(np.float32),
+        np.round(intensity).astype(np.float32),
+        ring[keep],
+        column_time[column][keep].astype(np.float32),
+        label[keep],
+    )
+
+
+def _echo(
+    moment: Moment, hits: Hits, rays: np.ndarray, spec: LidarSpec, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(range, reflectivity as measured, label) per ray; infinite range where nothing comes back."""
+    found = np.flatnonzero(hits.triangle >= 0)
+    k, r = hits.triangle[found], hits.range_m[found].astype(np.float64)
+    m = moment.mesh.material[k]
+    label = TABLE.label[m]
+    cosine = np.abs(np.einsum("ij,ij->i", moment.normals[k], rays[found].astype(np.float32)))
+    # Dark paint and cloth are dark to the lidar too, though less so.
+    reflectivity = TABLE.reflectivity[m] * (0.25 + 0.75 * np.minimum(moment.mesh.tint[k].mean(1), 1.0))
+    gain, glass = textures(TABLE.texture[m], _surface_coordinates(moment, k, hits.barycentric[found]))
+    reflectivity = reflectivity * (0.4 + 0.6 * gain)  # what is worn for the eye is partly so in the infrared
+    pane = rng.random(len(k)) < np.maximum(TABLE.glass[m], glass)
+    r = np.where(
+        label == _VEGETATION, r + rng.exponential(0.15, len(k)), r
+    ) + spec.range_sigma_m * rng.standard_normal(len(k))
+    echo = reflectivity * cosine * (100.0 / np.maximum(r, 1.0)) ** 2
+    lost = (
+        (echo < _FAINTEST * rng.uniform(0.6, 1.6, len(k))) | (r > spec.max_range_m) | (r < spec.min_range_m)
+    )
+    lost |= pane | ((label == _VEGETATION) & (rng.random(len(k)) < 0.08))
+    range_m, strength, labels = (
+        np.full(len(rays), np.inf),
+        np.zeros(len(rays)),
+        np.full(len(rays), 255, np.uint8),
+    )
+    back = found[~lost]
+    range_m[back], labels[back] = r[~lost], label[~lost]
+    strength[back] = (reflectivity * cosine**0.35)[~lost]
+    return range_m, strength, labels
+
+
+def _surface_coordinates(moment: Moment, triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+    uv, (b, c) = moment.mesh.uv[triangle], barycentric.T[..., None]
+    return uv[:, 0] * (1 - b - c) + uv[:, 1] * b + uv[:, 2] * c
+
+
+def _mixed(
+    one: tuple[np.ndarray, np.ndarray, np.ndarray],
+    two: tuple[np.ndarray, np.ndarray, np.ndarray],
+    rng: np.random.Generator,
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """One return per beam out of two parts of its footprint."""
+    n = len(one[0])
+    first = np.where(np.isfinite(one[0]), one[0], two[0])
+    other = np.where(np.isfinite(two[0]), two[0], one[0])
+    seen = np.isfinite(one[0]) | (np.isfinite(two[0]) & (rng.random(n) < 0.5))
+    gap = np.abs(np.where(seen, first, 0.0) - np.where(np.isfinite(other), other, 0.0))
+    # Echoes closer than the pulse is long merge into one in between; farther apart, one of the two is taken.
+    blend = (gap > 0.15) & (gap < 1.3) & (rng.random(n) < 0.6)
+    switch = (gap >= 1.3) & (rng.random(n) < 0.35) & np.isfinite(two[0])
+    w = rng.random(n)
+    with np.errstate(invalid="ignore"):
+        range_m = np.where(blend, w * first + (1 - w) * other, np.where(switch, other, first))
+    use_two = switch | ~np.isfinite(one[0])
+    return (range_m, np.where(use_two, two[1], one[1]), np.where(use_two, two[2], one[2])), seen

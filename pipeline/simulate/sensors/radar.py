@@ -1,0 +1,309 @@
+"""What an FMCW radar reports: scatterers from cast rays, merged by resolution cell, bent by the road's mirror, aliased.
+
+Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Low-angle radar tracking" (glint).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.simulate.sensors.rigs import RadarSpec
+from pipeline.simulate.world.casting import Moment
+from pipeline.simulate.world.drives import Motion
+from pipeline.simulate.world.loops import unsuppressed
+from pipeline.simulate.world.materials import LABELS, TABLE, material
+
+__all__ = ["RadarErrors", "Scan", "scan_radar"]
+
+_GROUND: Final = tuple(LABELS.index(n) for n in ("road", "sidewalk", "terrain"))
+_PLANTS: Final = LABELS.index("vegetation")
+_BODIES: Final = tuple(LABELS.index(n) for n in ("car", "truck", "bus"))
+_SOFT: Final = tuple(LABELS.index(n) for n in ("person", "rider", "bicycle"))
+_WHEELS: Final = tuple(material(n) for n in ("car_tyre", "car_rim", "truck_tyre", "bus_tyre", "bike_tyre"))
+_THRESHOLD: Final = 12.0  # signal to noise, about 11 dB
+
+
+@dataclass(frozen=True)
+class RadarErrors:
+    """Constant errors of one radar."""
+
+    range_bias_m: float = 0.0
+    elevation_bias_rad: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Detections in the radar frame; range rate positive = receding, quantised and aliased.
+
+    `origin` is the truth and goes into no log: 0 standing, 1 moving, 2 ghost, 3 clutter.
+    """
+
+    xyz_m: np.ndarray
+    range_rate_mps: np.ndarray
+    power_db: np.ndarray
+    origin: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Azimuth, elevation, range of echoes in the radar frame, range rate, signal to noise, class, moving or not."""
+
+    aer: np.ndarray
+    rate: np.ndarray
+    snr: np.ndarray
+    ground: np.ndarray
+    moving: np.ndarray
+
+
+def scan_radar(
+    moment: Moment,
+    ego: Motion,
+    T_vehicle_radar: Float[np.ndarray, "4 4"],
+    spec: RadarSpec,
+    errors: RadarErrors,
+    rng: np.random.Generator,
+    mirrors_m: tuple[float, ...] = (),
+    beacons_map: Float[np.ndarray, "N 3"] | None = None,
+) -> Scan:
+    """One scan at the moment's time.
+
+    Args:
+        moment: the world.
+        ego: how the vehicle moves.
+        T_vehicle_radar: mounting.
+        spec: data sheet.
+        errors: constant errors.
+        rng: noise.
+        mirrors_m: offsets to the left of the vehicle of long walls and rails that mirror targets.
+        beacons_map: corner reflectors, so strong that every scan sees them.
+    """
+    T_map_vehicle = ego.poses(np.array([moment.t_s]))[0]
+    T_map_radar = T_map_vehicle @ T_vehicle_radar
+    velocity, omega = (v[0] for v in ego.velocities(np.array([moment.t_s])))
+    velocity_radar = velocity + np.cross(omega, T_map_radar[:3, 3] - T_map_vehicle[:3, 3])
+    echoes = _scatterers(moment, T_map_radar, velocity_radar, spec, rng)
+    if beacons_map is not None:
+        echoes = _with_beacons(echoes, transform_points(inverse(T_map_radar), beacons_map))
+    cells = _bounced(_merged(echoes, spec, rng), T_vehicle_radar, spec, rng)
+    ghosts, clutter = _ghosts(cells, mirrors_m, T_vehicle_radar, rng), _clutter(spec, rng)
+    origin = [
+        cells.moving.astype(np.uint8),
+        np.full(len(ghosts.snr), 2, np.uint8),
+        np.full(len(clutter.snr), 3, np.uint8),
+    ]
+    parts = (cells, ghosts, clutter)
+    snr = np.concatenate([c.snr for c in parts])
+    rates = np.concatenate([c.rate for c in parts])
+    aer, rate = _measured(np.concatenate([c.aer for c in parts]), rates, snr, spec, errors, rng)
+    a, e, r = aer.T
+    inside = (np.abs(a) < np.radians(spec.azimuth_deg)) & (np.abs(e) < np.radians(spec.elevation_deg) * 1.1)
+    inside &= (r > spec.min_range_m) & (r < spec.max_range_m)
+    if not spec.has_elevation:
+        aer[:, 1] = 0.0
+    xyz = from_spherical(aer)[inside].astype(np.float32)
+    return Scan(
+        xyz,
+        rate[inside].astype(np.float32),
+        (30 + 10 * np.log10(snr[inside])).astype(np.float32),
+        np.concatenate(origin)[inside],
+    )
+
+
+def _scatterers(
+    moment: Moment,
+    T_map_radar: np.ndarray,
+    velocity_radar: np.ndarray,
+    spec: RadarSpec,
+    rng: np.random.Generator,
+) -> _Cells:
+    """Echoes of rays spread evenly over the field of view."""
+    columns = round(np.sqrt(spec.rays * spec.azimuth_deg / spec.elevation_deg))
+    rows = max(spec.rays // columns, 1)
+    a, e = np.meshgrid((np.arange(columns) + 0.5) / columns * 2 - 1, (np.arange(rows) + 0.5) / rows * 2 - 1)
+    a = np.radians(spec.azimuth_deg) * (a.ravel() + rng.uniform(-1, 1, a.size) / columns)
+    e = np.radians(spec.elevation_deg) * (e.ravel() + rng.uniform(-1, 1, e.size) / rows)
+    rays = from_spherical(np.stack([a, e, np.ones_like(a)], 1)) @ T_map_radar[:3, :3].T
+    origin = T_map_radar[:3, 3] - moment.standing.origin
+    hits = moment.cast(np.broadcast_to(origin, rays.shape), rays, np.zeros(len(rays)))
+    near = np.flatnonzero((hits.triangle >= 0) & (hits.range_m < spec.max_range_m) & (hits.range_m > 1.5))
+    k, r = hits.triangle[near], hits.range_m[near].astype(np.float64)
+    m = moment.mesh.material[k]
+    label = TABLE.label[m]
+    cosine = np.abs(np.einsum("ij,ij->i", moment.normals[k], rays[near].astype(np.float32)))
+    # Bodies are full of corners: part of the echo does not care about the angle, part is a mirror's.
+    shape = np.where(np.isin(label, _GROUND), cosine**2, 0.2 + 0.8 * cosine**4)
+    body = np.isin(label, _BODIES)
+    inside = np.where(body & (rng.random(len(k)) < 0.45), rng.exponential(0.6, len(k)), 0.0)
+    inside += np.where(label == _PLANTS, rng.exponential(0.7, len(k)), 0.0)
+    v = moment.velocity_of_triangle[k].astype(np.float64)
+    v = v * np.where(np.isin(m, _WHEELS), rng.uniform(0.3, 1.7, len(k)), 1.0)[:, None]
+    v += np.where(np.isin(label, _SOFT), 0.2, 0.0)[:, None] * rng.standard_normal((len(k), 3))
+    rate = np.einsum("ij,ij->i", v - velocity_radar, rays[near])
+    # Power per ray: gain x solid angle / r^2; 9,000 rays of gain 1 at 120 m make a signal-to-noise ratio of 1 each.
+    snr = (
+        TABLE.radar_gain[m]
+        * shape
+        * (120.0 / r) ** 2
+        * (9000 / len(rays))
+        * rng.exponential(1.0, len(k))
+        * np.exp(-inside / 2.0)
+    )
+    aer = np.stack([a[near], e[near], r + inside], 1)
+    moving = np.linalg.norm(moment.velocity_of_triangle[k], axis=1) > 0.1
+    return _Cells(aer, rate, snr, np.isin(label, _GROUND), moving)
+
+
+def _merged(echoes: _Cells, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
+    """One detection per resolution cell whose echoes together exceed the threshold, at their power-weighted mean."""
+    size = np.array(
+        [
+            np.radians(spec.azimuth_resolution_deg),
+            np.radians(spec.elevation_resolution_deg),
+            spec.range_resolution_m,
+        ]
+    )
+    index = np.floor(
+        np.concatenate([echoes.aer / size, echoes.rate[:, None] / spec.doppler_resolution_mps], 1)
+    ).astype(np.int64)
+    key = (
+        ((index[:, 0] + 512) * 64 + index[:, 1] + 32) * 4096 * 4096
+        + (index[:, 2] + 1024) * 4096
+        + index[:, 3]
+        + 2048
+    )
+    _, cell = np.unique(key, return_inverse=True)
+    n = int(cell.max()) + 1 if len(cell) else 0
+    total = np.bincount(cell, echoes.snr, n)
+    mean = [
+        np.bincount(cell, echoes.snr * c, n) / np.maximum(total, 1e-12)
+        for c in (*echoes.aer.T, echoes.rate, echoes.ground, echoes.moving)
+    ]
+    # Swerling I: the whole cell fades from scan to scan.
+    snr = total * rng.exponential(1.0, n) + 1.0
+    keep = snr > _THRESHOLD
+    found = _Cells(
+        np.stack(mean[:3], 1)[keep], mean[3][keep], snr[keep], mean[4][keep] > 0.5, mean[5][keep] > 0.5
+    )
+    return _peaks(found, np.append(size, spec.doppler_resolution_mps))
+
+
+def _peaks(cells: _Cells, size: np.ndarray) -> _Cells:
+    """Local maxima: of two detections closer than the resolution in all four dimensions, the weaker one is not seen."""
+    strongest = np.argsort(-cells.snr)
+    x = (np.concatenate([cells.aer, cells.rate[:, None]], 1) / size)[strongest]
+    keep = strongest[unsuppressed(x)]
+    return _Cells(cells.aer[keep], cells.rate[keep], cells.snr[keep], cells.ground[keep], cells.moving[keep])
+
+
+def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
+    """Let the road mirror targets: unresolved, the image bends the elevation; resolved, it is a second detection."""
+    xyz_vehicle = transform_points(T_vehicle_radar, from_spherical(cells.aer))
+    height, radar_height = xyz_vehicle[:, 2], T_vehicle_radar[2, 3]
+    image = xyz_vehicle * [1.0, 1.0, -1.0]
+    aer_image = to_spherical(transform_points(inverse(T_vehicle_radar), image))
+    n = len(cells.snr)
+    mirror = (
+        0.6 * rng.random(n) * np.exp(1j * rng.uniform(0, 2 * np.pi, n)) * (~cells.ground & (height > 0.15))
+    )
+    apart = aer_image[:, 1] - cells.aer[:, 1]
+    resolved = np.abs(apart) > np.radians(spec.elevation_resolution_deg)
+    bend = np.clip(np.real(mirror / (1 + mirror)), -1.0, 1.0) * apart
+    aer = cells.aer.copy()
+    aer[:, 1] += np.where(resolved, 0.0, bend)
+    # The path over the road is longer by about 2 h1 h2 / r; half of it shows in the range.
+    aer[:, 2] += np.where(
+        resolved, 0.0, np.abs(mirror) ** 2 * np.maximum(height, 0) * radar_height / np.maximum(aer[:, 2], 5.0)
+    )
+    second = resolved & (np.abs(mirror) ** 4 * cells.snr > _THRESHOLD)
+    copy = aer_image[second]
+    copy[:, 2] = aer[second, 2] + 2 * height[second] * radar_height / aer[second, 2]
+    return _Cells(
+        np.concatenate([aer, copy]),
+        np.concatenate([cells.rate, cells.rate[second]]),
+        np.concatenate([cells.snr, np.abs(mirror[second]) ** 4 * cells.snr[second]]),
+        np.concatenate([cells.ground, cells.ground[second]]),
+        np.concatenate([cells.moving, cells.moving[second]]),
+    )
+
+
+def _with_beacons(echoes: _Cells, xyz_radar: np.ndarray) -> _Cells:
+    n, no = len(xyz_radar), np.zeros(len(xyz_radar), bool)
+    return _Cells(
+        np.concatenate([echoes.aer, to_spherical(xyz_radar)]),
+        np.concatenate([echoes.rate, np.zeros(n)]),
+        np.concatenate([echoes.snr, np.full(n, 3e4)]),
+        np.concatenate([echoes.ground, no]),
+        np.concatenate([echoes.moving, no]),
+    )
+
+
+def _ghosts(
+    cells: _Cells, mirrors_m: tuple[float, ...], T_vehicle_radar: np.ndarray, rng: np.random.Generator
+) -> _Cells:
+    """Mirror images behind rails and walls, and second trips between a target and ourselves."""
+    strong = cells.moving & (cells.snr > 60)
+    mirrored = strong & (rng.random(len(strong)) < (0.12 if mirrors_m else 0.0))
+    doubled = strong & (rng.random(len(strong)) < 0.03)
+    side = mirrors_m[int(rng.integers(len(mirrors_m)))] if mirrors_m else 0.0
+    image = transform_points(T_vehicle_radar, from_spherical(cells.aer[mirrored]))
+    image[:, 1] = 2 * side - image[:, 1]
+    first = to_spherical(transform_points(inverse(T_vehicle_radar), image))
+    second = cells.aer[doubled] * [1.0, 1.0, 2.0]
+    return _Cells(
+        np.concatenate([first, second]),
+        np.concatenate([cells.rate[mirrored], 2 * cells.rate[doubled]]),
+        np.concatenate([cells.snr[mirrored] / 4, cells.snr[doubled] / 5]),
+        np.zeros(int(mirrored.sum() + doubled.sum()), bool),
+        np.ones(int(mirrored.sum() + doubled.sum()), bool),
+    )
+
+
+def _clutter(spec: RadarSpec, rng: np.random.Generator) -> _Cells:
+    """False alarms, anywhere in the data cube."""
+    n = int(rng.poisson(5))
+    half = np.radians([spec.azimuth_deg, spec.elevation_deg])
+    aer = np.stack(
+        [*(rng.uniform(-h, h, n) for h in half), rng.uniform(spec.min_range_m, spec.max_range_m, n)], 1
+    )
+    return _Cells(
+        aer,
+        rng.uniform(-20, 20, n),
+        _THRESHOLD * (1 + rng.exponential(0.3, n)),
+        np.zeros(n, bool),
+        np.zeros(n, bool),
+    )
+
+
+def _measured(
+    aer: np.ndarray,
+    rate: np.ndarray,
+    snr: np.ndarray,
+    spec: RadarSpec,
+    errors: RadarErrors,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Noise by signal strength, constant errors, grids of the transforms, Doppler aliasing."""
+    size = np.array(
+        [
+            np.radians(spec.azimuth_resolution_deg),
+            np.radians(spec.elevation_resolution_deg),
+            spec.range_resolution_m,
+        ]
+    )
+    # Single-target accuracy: resolution / (1.6 sqrt(2 snr)) (Skolnik, ch. 9), never better than a tenth: the array's
+    # own calibration leaves that much.
+    sigma = size * np.maximum(1 / (1.6 * np.sqrt(2 * snr)), 0.1)[:, None]
+    aer = aer + sigma * rng.standard_normal(aer.shape) + [0.0, errors.elevation_bias_rad, errors.range_bias_m]
+    grid = size / [8, 8, 8]
+    aer = np.round(aer / grid) * grid
+    rate = rate + 0.35 * spec.doppler_resolution_mps * rng.standard_normal(len(rate))
+    if spec.doppler_period_mps is not None:
+        half = spec.doppler_period_mps / 2
+        rate = (rate + half) % spec.doppler_period_mps - half
+    return aer, np.round(rate / spec.doppler_step_mps) * spec.doppler_step_mps

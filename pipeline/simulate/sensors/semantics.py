@@ -1,0 +1,234 @@
+"""What networks in the car would have made of the image: a label map and road-user boxes, with the errors they make.
+
+Labels: boundaries wander and swell by about a pixel, thin things break, whole regions get a confused class.
+Boxes: small and hidden road users are missed, edges jitter with the size, some boxes are invented.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int32, UInt8
+
+from pipeline.simulate.world.casting import Moment
+from pipeline.simulate.world.loops import extents
+from pipeline.simulate.world.materials import LABELS, TABLE
+
+__all__ = ["Box", "SemanticsSpec", "boxes_of", "encode_png", "label_image", "noisy_boxes", "noisy_labels"]
+
+_SKY: Final = LABELS.index("sky")
+_THINGS: Final = tuple(
+    LABELS.index(n)
+    for n in ("pole", "traffic light", "traffic sign", "person", "rider", "car", "truck", "bus", "bicycle")
+)
+_COCO: Final = {
+    "person": "person",
+    "rider": "person",
+    "car": "car",
+    "truck": "truck",
+    "bus": "bus",
+    "bicycle": "bicycle",
+    "motorcycle": "motorcycle",
+}
+# What a class is taken for when a network errs; after the confusion matrices that Cityscapes networks publish.
+_CONFUSED: Final = {
+    "road": "sidewalk",
+    "sidewalk": "road",
+    "building": "wall",
+    "wall": "building",
+    "fence": "vegetation",
+    "pole": "building",
+    "traffic light": "building",
+    "traffic sign": "building",
+    "vegetation": "terrain",
+    "terrain": "vegetation",
+    "person": "rider",
+    "rider": "person",
+    "car": "truck",
+    "truck": "car",
+    "bus": "truck",
+    "bicycle": "vegetation",
+    "sky": "building",
+}
+_PRONENESS: Final = {
+    "road": 0.12,
+    "sky": 0.01,
+    "sidewalk": 1.6,
+    "building": 0.9,
+    "wall": 6.0,
+    "fence": 5.0,
+    "pole": 2.5,
+    "terrain": 2.5,
+    "vegetation": 0.8,
+    "car": 0.6,
+    "truck": 4.0,
+    "bus": 3.0,
+    "traffic sign": 2.0,
+    "rider": 3.0,
+    "bicycle": 2.5,
+}
+
+
+@dataclass(frozen=True)
+class SemanticsSpec:
+    """How well the networks work."""
+
+    boundary_px: float = 0.9  # sd of the wandering, half-size pixels
+    swell: float = 0.45  # share of boundary where things grow by a pixel
+    confusion: float = 0.05  # share of the area outside the sky with a wrong class
+    miss: float = 0.04  # of road users that are large and free
+    box_jitter: float = 0.022  # of the box's size, per edge
+    false_boxes: float = 0.12  # per image
+
+
+@dataclass(frozen=True)
+class Box:
+    """One road user in the image, full-size pixels."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+    name: str
+    score: float
+
+
+def label_image(moment: Moment, coarse: Int32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """True labels of a half-size view."""
+    of_triangle = np.append(TABLE.label[moment.mesh.material], np.uint8(_SKY))  # row -1 is the sky
+    return of_triangle[coarse]
+
+
+def _field(shape: tuple[int, int], cell_px: float, rng: np.random.Generator) -> np.ndarray:
+    """Smooth random field, zero mean, about unit variance."""
+    h, w = shape
+    small = rng.standard_normal((int(h / cell_px) + 3, int(w / cell_px) + 3), dtype=np.float32)
+    return cv2.resize(small, (w, h), interpolation=cv2.INTER_CUBIC) * np.float32(1.35)
+
+
+def noisy_labels(
+    true: UInt8[np.ndarray, "h w"], spec: SemanticsSpec, rng: np.random.Generator
+) -> UInt8[np.ndarray, "h w"]:
+    """Labels as a network would give them."""
+    h, w = true.shape
+    x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
+    # Mostly slow wandering of whole outlines, a little fray.
+    dx, dy = (
+        spec.boundary_px * (0.85 * _field((h, w), 14.0, rng) + 0.45 * _field((h, w), 4.0, rng)) for _ in "xy"
+    )
+    out = cv2.remap(
+        true,
+        x + dx.astype(np.float32),
+        y + dy.astype(np.float32),
+        cv2.INTER_NEAREST,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    things = np.where(np.isin(out, _THINGS), out, np.uint8(0))
+    grown = cv2.dilate(things, np.ones((3, 3), np.uint8))
+    swell = (
+        (grown > 0) & (things == 0) & (_field((h, w), 12.0, rng) > float(np.sqrt(2)) * _quantile(spec.swell))
+    )
+    out = cv2.medianBlur(np.where(swell, grown, out), 3)  # what stays thinner than two pixels breaks
+    return _confused(out, spec.confusion, rng)
+
+
+def _quantile(share: float) -> float:
+    """Threshold, in sqrt 2 sigma, that a share of a normal field exceeds (inverse error function, rational fit)."""
+    u = np.clip(1 - 2 * share, -0.999, 0.999)
+    log = np.log(1 - u * u)
+    inner = 2 / (np.pi * 0.147) + log / 2  # Winitzki 2008
+    return float(np.sign(u) * np.sqrt(np.sqrt(inner * inner - log / 0.147) - inner))
+
+
+def _confused(labels: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Give patches of a few dozen pixels the class that theirs is taken for."""
+    table = np.arange(256, dtype=np.uint8)
+    for name, other in _CONFUSED.items():
+        table[LABELS.index(name)] = LABELS.index(other)
+    # Roads are hardly ever mistaken, walls and fences often: share of each class, 1 = the mean.
+    proneness = np.ones(256)
+    for name, factor in _PRONENESS.items():
+        proneness[LABELS.index(name)] = factor
+    threshold = np.array([np.sqrt(2) * _quantile(min(share * p, 0.45)) for p in proneness], np.float32)
+    w = labels.shape[1]
+    field = 0.9 * _field(labels.shape, w / 13, rng) + 0.42 * _field(labels.shape, w / 50, rng)
+    return np.where(field > threshold[labels], table[labels], labels)
+
+
+def boxes_of(moment: Moment, coarse: Int32[np.ndarray, "h w"]) -> list[tuple[Box, int]]:
+    """Tight boxes of the visible parts of road users, with their visible half-size pixels."""
+    mesh = moment.mesh
+    bodies = np.flatnonzero(mesh.instance > 0)
+    who = mesh.instance[bodies].astype(np.int64) * 32 + TABLE.label[mesh.material[bodies]]
+    keys, number = np.unique(who, return_inverse=True)
+    group = np.full(len(mesh), -1, np.int64)
+    group[bodies] = number
+    found = []
+    for key, (x0, y0, x1, y1, pixels) in zip(keys, extents(coarse, group, len(keys)), strict=True):
+        if pixels > 0 and LABELS[key % 32] in _COCO:
+            # half-size pixel j covers full-size pixels 2j and 2j + 1
+            found.append(
+                (
+                    Box(
+                        2.0 * x0 - 0.5,
+                        2.0 * y0 - 0.5,
+                        2.0 * x1 + 1.5,
+                        2.0 * y1 + 1.5,
+                        _COCO[LABELS[key % 32]],
+                        1.0,
+                    ),
+                    int(pixels),
+                )
+            )
+    return found
+
+
+def noisy_boxes(
+    true: list[tuple[Box, int]], size_px: tuple[int, int], spec: SemanticsSpec, rng: np.random.Generator
+) -> list[Box]:
+    """Boxes as a detector would give them; size_px = (width, height)."""
+    width, height = size_px
+    out = []
+    for box, pixels in true:
+        w, h = box.x1 - box.x0, box.y1 - box.y0
+        filled = 4.0 * pixels / max(w * h, 1.0)  # little where something stands before it
+        visible = np.clip((h / height - 0.012) / 0.025, 0, 1) * np.clip((filled - 0.18) / 0.25, 0, 1)
+        if rng.random() > (1 - spec.miss) * visible:
+            continue
+        jitter = spec.box_jitter * np.array([w, h, w, h]) * rng.standard_normal(
+            4
+        ) + 0.5 * rng.standard_normal(4)
+        edges = np.array([box.x0, box.y0, box.x1, box.y1]) + jitter
+        name = "truck" if box.name == "car" and rng.random() < 0.03 else box.name
+        out.append(
+            _clipped(
+                edges,
+                width,
+                height,
+                name,
+                float(np.clip(0.35 + 0.6 * visible + 0.08 * rng.standard_normal(), 0.25, 0.99)),
+            )
+        )
+    for _ in range(rng.poisson(spec.false_boxes)):
+        x, y, h = rng.uniform(0, width), height * rng.uniform(0.45, 0.7), height * rng.uniform(0.04, 0.15)
+        edges = np.array([x, y, x + h * rng.uniform(0.5, 1.8), y + h])
+        out.append(
+            _clipped(
+                edges, width, height, ("car", "person")[int(rng.integers(2))], float(rng.uniform(0.25, 0.6))
+            )
+        )
+    return out
+
+
+def _clipped(edges: Float[np.ndarray, " 4"], width: int, height: int, name: str, score: float) -> Box:
+    x0, x1 = np.clip(edges[[0, 2]], -0.5, width - 0.5)
+    y0, y1 = np.clip(edges[[1, 3]], -0.5, height - 0.5)
+    return Box(float(x0), float(y0), float(x1), float(y1), name, score)
+
+
+def encode_png(labels: UInt8[np.ndarray, "h w"]) -> bytes:
+    """PNG mono8."""
+    return cv2.imencode(".png", labels, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()

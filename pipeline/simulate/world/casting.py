@@ -1,0 +1,253 @@
+"""Rays against the world: Embree on a sliding window of the standing world and on each road user apart.
+
+Road users are hit in their own frame with the ray moved to the ray's own time, so a sweep that takes 100 ms sees
+each of them where it was when the beam came by, and no mesh is ever rebuilt for a frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Final
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Float
+
+from pipeline.simulate.world.actors import VARIANTS, actor_mesh
+from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.loops import near as rays_near
+from pipeline.simulate.world.meshes import Mesh, join
+from pipeline.simulate.world.scenes import CHUNK_M, chunk_mesh
+from pipeline.simulate.world.traffic import Actor, actors_at
+
+__all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "shadow_map", "standing_of"]
+
+_AHEAD_M: Final = 170.0
+_BEHIND_M: Final = 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What N rays met: range along the ray, row of the moment's triangles (-1 = nothing), barycentric coordinates."""
+
+    range_m: np.ndarray
+    triangle: np.ndarray
+    barycentric: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowMap:
+    """Sunlight (0 = shadow) on the ground by arc length and offset."""
+
+    light: np.ndarray
+    s0: float
+    d0: float
+    cell_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """The standing world around us; map coordinates less `origin` (single precision is exact to 0.1 mm near 0)."""
+
+    origin: np.ndarray
+    mesh: Mesh
+    scene: EmbreeScene
+    shadows: ShadowMap
+    normals: np.ndarray
+
+
+class World:
+    """The world of one drive; holds one window of it at a time."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.drive = drive
+        self._chunks: dict[int, Mesh] = {}
+        self._window: tuple[int, int] | None = None
+        self._standing: Standing | None = None
+
+    def around(self, s_m: float) -> Standing:
+        """The standing world from 60 m behind to 170 m ahead of an arc length."""
+        window = int((s_m - _BEHIND_M) // CHUNK_M), int((s_m + _AHEAD_M) // CHUNK_M)
+        if self._standing is None or window != self._window:
+            self._chunks = {
+                i: self._chunks.get(i) or chunk_mesh(self.drive, i) for i in range(window[0], window[1] + 1)
+            }
+            origin = np.round(self.drive.road.to_map(np.array([[s_m, 0.0, 0.0]]))[0])
+            mesh, road = join(list(self._chunks.values())), self.drive.road
+            self._window, self._standing = window, standing_of(mesh, origin, self.drive.sun, road.to_map, s_m)
+        return self._standing
+
+    def moment(self, t_s: float) -> Moment:
+        """The world at a time of the drive."""
+        standing = self.around(self.drive.ego.arc(t_s))
+        return Moment(standing, actors_at(self.drive, t_s), t_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """The world at one time; for rays at other times, road users move on with constant velocity."""
+
+    standing: Standing
+    actors: list[Actor]
+    t_s: float
+
+    def advanced(self, t_s: float) -> Moment:
+        """The same world some milliseconds later or earlier."""
+        return Moment(self.standing, [a.advanced(t_s - self.t_s) for a in self.actors], t_s)
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """All triangles, in map coordinates less the window's origin: the standing ones, then actor by actor."""
+        parts = [self.standing.mesh]
+        for actor in self.actors:
+            proto, R = actor_mesh(actor.kind, actor.variant), actor.T_map_actor[:3, :3].astype(np.float32)
+            corners = proto.corners @ R.T + self._place(actor)
+            ids = np.full(len(proto), actor.key, np.int32)
+            parts.append(Mesh(corners, proto.material, proto.tint, proto.uv, ids))
+        return join(parts)
+
+    @cached_property
+    def normals(self) -> Float[np.ndarray, "T 3"]:
+        """Unit normals of the triangles, of either side."""
+        turned = (
+            _prototype(a.kind, a.variant).normals @ a.T_map_actor[:3, :3].T.astype(np.float32)
+            for a in self.actors
+        )
+        return np.concatenate([self.standing.normals, *turned])
+
+    @cached_property
+    def velocity_of_triangle(self) -> Float[np.ndarray, "T 3"]:
+        """Velocity in the map [m/s]."""
+        v = np.zeros((len(self.mesh), 3), np.float32)
+        for actor, start in zip(self.actors, self._starts, strict=True):
+            v[start : start + len(actor_mesh(actor.kind, actor.variant))] = actor.velocity_map
+        return v
+
+    @cached_property
+    def _starts(self) -> list[int]:
+        sizes = [len(self.standing.mesh)] + [len(actor_mesh(a.kind, a.variant)) for a in self.actors]
+        return [int(n) for n in np.cumsum(sizes)[:-1]]
+
+    def _place(self, actor: Actor) -> np.ndarray:
+        return (actor.T_map_actor[:3, 3] - self.standing.origin).astype(np.float32)
+
+    def cast(
+        self,
+        origins: Float[np.ndarray, "N 3"],
+        directions: Float[np.ndarray, "N 3"],
+        delay_s: Float[np.ndarray, " N"],
+    ) -> Hits:
+        """First hits of rays given in map coordinates less the window's origin, `delay_s` after this moment."""
+        origins = np.ascontiguousarray(origins, np.float32)
+        directions = np.ascontiguousarray(directions, np.float32)
+        delay = delay_s.astype(np.float32)
+        range_m, triangle, barycentric = _cast(self.standing.scene, origins, directions)
+        axis, cosine = _cone(directions)
+        for actor, start in zip(self.actors, self._starts, strict=True):
+            proto = _prototype(actor.kind, actor.variant)
+            R, v = actor.T_map_actor[:3, :3].astype(np.float32), actor.velocity_map.astype(np.float32)
+            p = self._place(actor)
+            centre = p + R @ proto.centre
+            if not _may_be_seen(centre - origins[0], proto.reach_m + 3.0, axis, cosine):
+                continue
+            near = rays_near(origins, directions, delay, centre, v, np.float32(proto.reach_m), range_m)
+            if not near.size:
+                continue
+            o = (origins[near] - p - v * delay[near, None]) @ R
+            r, k, b = _cast(proto.scene, o, directions[near] @ R)
+            closer = r < range_m[near]
+            hit = near[closer]
+            range_m[hit], triangle[hit], barycentric[hit] = r[closer], k[closer] + start, b[closer]
+        return Hits(range_m, triangle, barycentric)
+
+
+@dataclass(frozen=True, eq=False)
+class _Prototype:
+    """An actor's scene and normals in its own frame, and the sphere around it."""
+
+    scene: EmbreeScene
+    normals: np.ndarray
+    reach_m: float
+    centre: np.ndarray
+
+
+@lru_cache(maxsize=128)
+def _prototype(kind: str, variant: int) -> _Prototype:
+    mesh = actor_mesh(kind, variant % VARIANTS[kind])
+    points = mesh.corners.reshape(-1, 3)
+    centre = (points.min(0) + points.max(0)) / 2
+    reach = float(np.linalg.norm(points - centre, axis=1).max())
+    return _Prototype(_scene(mesh), _normals(mesh.corners), reach, centre.astype(np.float32))
+
+
+def _normals(corners: np.ndarray) -> np.ndarray:
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+
+def _cone(directions: np.ndarray) -> tuple[np.ndarray, float]:
+    """Middle of some unit vectors, and the cosine of the widest angle from it."""
+    axis = directions[:: max(len(directions) // 512, 1)].mean(0)
+    axis /= max(float(np.linalg.norm(axis)), 1e-6)
+    return axis, float((directions @ axis).min())
+
+
+def _may_be_seen(centre: np.ndarray, reach_m: float, axis: np.ndarray, cosine: float) -> bool:
+    """Whether a sphere can meet a cone of rays from the origin."""
+    distance = float(np.linalg.norm(centre))
+    if distance <= reach_m or cosine < 0:
+        return True
+    widest = np.arccos(np.clip(cosine, -1, 1)) + np.arcsin(reach_m / distance)
+    return bool(np.arccos(np.clip(centre @ axis / distance, -1, 1)) < widest)
+
+
+def _scene(mesh: Mesh) -> EmbreeScene:
+    scene = EmbreeScene()
+    corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), np.float32)
+    TriangleMesh(
+        scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    )  # belongs to the scene
+    return scene
+
+
+def _cast(
+    scene: EmbreeScene, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Range (inf = nothing met), triangle (-1 = nothing met) and barycentric coordinates of each ray's first hit."""
+    found = scene.run(
+        np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32), output=True
+    )
+    triangle = found["primID"]
+    range_m = np.where(triangle < 0, np.float32(np.inf), found["tfar"])
+    return range_m, triangle, np.stack([found["u"], found["v"]], axis=1)
+
+
+def shadow_map(
+    scene: EmbreeScene,
+    origin: np.ndarray,
+    sun: np.ndarray,
+    to_map: Callable[[np.ndarray], np.ndarray],
+    s_m: float,
+) -> ShadowMap:
+    """Cast the ground around an arc length towards the sun; once per window, not per image."""
+    cell, half = 0.4, 22.0
+    s0 = s_m - 8.0
+    s, d = np.meshgrid(np.arange(s0, s_m + 95.0, cell), np.arange(-half, half, cell), indexing="ij")
+    ground = to_map(np.stack([s.ravel(), d.ravel(), np.full(s.size, 0.2)], 1)) - origin
+    hit = (
+        _cast(scene, ground.astype(np.float32), np.broadcast_to(sun, ground.shape).astype(np.float32))[1] >= 0
+    )
+    return ShadowMap(np.where(hit, 0.0, 1.0).astype(np.float32).reshape(s.shape), s0, -half, cell)
+
+
+def standing_of(
+    mesh: Mesh, origin: np.ndarray, sun: np.ndarray, to_map: Callable[[np.ndarray], np.ndarray], s_m: float
+) -> Standing:
+    """A standing world of a mesh given in the map."""
+    corners = (mesh.corners - origin.astype(np.float32)).astype(np.float32)
+    local = Mesh(corners, mesh.material, mesh.tint, mesh.uv, mesh.instance)
+    scene = _scene(local)
+    return Standing(origin, local, scene, shadow_map(scene, origin, sun, to_map, s_m), _normals(corners))

@@ -1,0 +1,202 @@
+"""Triangle meshes with a material, a tint, an instance and surface coordinates per triangle, and how to build them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.simulate.world.materials import material
+
+__all__ = ["Colour", "Mesh", "MeshBuilder", "Number", "join", "placed"]
+
+# Integers are numbers too: beartype does not take them for floats.
+Number = float | int
+Colour = tuple[Number, Number, Number]
+
+_WHITE = (1.0, 1.0, 1.0)
+# Corner order of a hexahedron's faces; 0-3 bottom, 4-7 top, each (x0 y0), (x1 y0), (x1 y1), (x0 y1).
+_FACES = {
+    "bottom": (3, 2, 1, 0),
+    "top": (4, 5, 6, 7),
+    "front": (1, 2, 6, 5),
+    "rear": (3, 0, 4, 7),
+    "left": (2, 3, 7, 6),
+    "right": (0, 1, 5, 4),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """T triangles; all arrays have T rows."""
+
+    corners: np.ndarray  # T 3 3 [m]
+    material: np.ndarray  # T, uint8
+    tint: np.ndarray  # T 3, multiplies the material's albedo
+    uv: np.ndarray  # T 3 2 [m]
+    instance: np.ndarray  # T, int32; 0 = part of the scenery
+
+    def __len__(self) -> int:
+        """Number of triangles."""
+        return len(self.material)
+
+
+def join(meshes: list[Mesh]) -> Mesh:
+    """All triangles of some meshes."""
+    if not meshes:
+        o = np.zeros
+        return Mesh(
+            o((0, 3, 3), np.float32),
+            o(0, np.uint8),
+            o((0, 3), np.float32),
+            o((0, 3, 2), np.float32),
+            o(0, np.int32),
+        )
+    return Mesh(
+        np.concatenate([m.corners for m in meshes]),
+        np.concatenate([m.material for m in meshes]),
+        np.concatenate([m.tint for m in meshes]),
+        np.concatenate([m.uv for m in meshes]),
+        np.concatenate([m.instance for m in meshes]),
+    )
+
+
+def placed(mesh: Mesh, T_map_mesh: Float[np.ndarray, "4 4"], instance: int | None = None) -> Mesh:
+    """The mesh moved rigidly, as one instance where a number is given."""
+    corners = mesh.corners @ T_map_mesh[:3, :3].T.astype(np.float32) + T_map_mesh[:3, 3].astype(np.float32)
+    ids = mesh.instance if instance is None else np.full(len(mesh), instance, np.int32)
+    return Mesh(corners, mesh.material, mesh.tint, mesh.uv, ids)
+
+
+@dataclass
+class MeshBuilder:
+    """Collects quads; everything else is made of them."""
+
+    _corners: list[np.ndarray] = field(default_factory=list)
+    _material: list[np.ndarray] = field(default_factory=list)
+    _tint: list[np.ndarray] = field(default_factory=list)
+    _uv: list[np.ndarray] = field(default_factory=list)
+
+    def quads(
+        self,
+        corners: np.ndarray,
+        name: str,
+        tint: Colour = _WHITE,
+        uv: np.ndarray | None = None,
+    ) -> None:
+        """Add Q quads (Q 4 3); uv (Q 4 2) defaults to lengths along the first and the last edge."""
+        c = np.asarray(corners, np.float32).reshape(-1, 4, 3)
+        if uv is None:
+            along = np.linalg.norm(c[:, 1] - c[:, 0], axis=1)
+            up = np.linalg.norm(c[:, 3] - c[:, 0], axis=1)
+            o = np.zeros_like(along)
+            uv = np.stack(
+                [
+                    np.stack([o, o], 1),
+                    np.stack([along, o], 1),
+                    np.stack([along, up], 1),
+                    np.stack([o, up], 1),
+                ],
+                1,
+            )
+        w = np.asarray(uv, np.float32).reshape(-1, 4, 2)
+        n = 2 * len(c)
+        self._corners.append(np.concatenate([c[:, [0, 1, 2]], c[:, [0, 2, 3]]]))
+        self._uv.append(np.concatenate([w[:, [0, 1, 2]], w[:, [0, 2, 3]]]))
+        self._material.append(np.full(n, material(name), np.uint8))
+        self._tint.append(np.broadcast_to(np.asarray(tint, np.float32), (n, 3)))
+
+    def hexahedron(self, corners: np.ndarray, faces: dict[str, str], tint: Colour = _WHITE) -> None:
+        """Add the named faces (face name -> material) of 8 corners in the order of _FACES."""
+        c = np.asarray(corners, np.float32)
+        for face, name in faces.items():
+            self.quads(c[list(_FACES[face])][None], name, tint)
+
+    def frustum(
+        self,
+        bottom: tuple[Number, Number, Number, Number, Number],
+        top: tuple[Number, Number, Number, Number, Number],
+        faces: dict[str, str] | str,
+        tint: Colour = _WHITE,
+    ) -> None:
+        """Add a block between two level rectangles (x0, x1, y0, y1, z)."""
+        corners = []
+        for x0, x1, y0, y1, z in (bottom, top):
+            corners += [(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]
+        named = dict.fromkeys(_FACES, faces) if isinstance(faces, str) else faces
+        self.hexahedron(np.array(corners), named, tint)
+
+    def box(
+        self,
+        centre: tuple[Number, Number, Number],
+        size: tuple[Number, Number, Number],
+        name: str,
+        tint: Colour = _WHITE,
+    ) -> None:
+        """Add an upright box."""
+        (x, y, z), (a, b, c) = centre, (size[0] / 2, size[1] / 2, size[2] / 2)
+        self.frustum((x - a, x + a, y - b, y + b, z - c), (x - a, x + a, y - b, y + b, z + c), name, tint)
+
+    def tube(
+        self,
+        a: np.ndarray,
+        b: np.ndarray,
+        radius_m: float,
+        name: str,
+        sides: int = 6,
+        tint: Colour = _WHITE,
+    ) -> None:
+        """Add a closed tube from a to b."""
+        a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+        axis = (b - a) / np.linalg.norm(b - a)
+        side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
+        side /= np.linalg.norm(side)
+        other = np.cross(axis, side)
+        phi = np.linspace(0, 2 * np.pi, sides + 1)
+        ring = radius_m * (np.cos(phi)[:, None] * side + np.sin(phi)[:, None] * other)
+        low, high = a + ring, b + ring
+        self.quads(np.stack([low[:-1], low[1:], high[1:], high[:-1]], 1), name, tint)
+        for centre, rim in ((a, low), (b, high)):
+            c = np.broadcast_to(centre, (sides, 3))
+            self.quads(np.stack([c, rim[:-1], rim[1:], c], 1), name, tint)
+
+    def blob(
+        self,
+        centre: np.ndarray,
+        radii: np.ndarray,
+        name: str,
+        rng: np.random.Generator,
+        tint: Colour = _WHITE,
+    ) -> None:
+        """Add a lumpy ellipsoid: tree crown, bush, head."""
+        lat, lon = np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 10)
+        bump = 1 + 0.16 * rng.uniform(-1, 1, (len(lat), len(lon)))
+        bump[:, -1], bump[0], bump[-1] = bump[:, 0], 1.0, 1.0
+        direction = np.stack(
+            [
+                np.outer(np.cos(lat), np.cos(lon)),
+                np.outer(np.cos(lat), np.sin(lon)),
+                np.outer(np.sin(lat), np.ones_like(lon)),
+            ],
+            -1,
+        )
+        p = np.asarray(centre) + direction * bump[..., None] * np.asarray(radii)
+        self.quads(
+            np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], 2).reshape(-1, 4, 3), name, tint
+        )
+
+    def mesh(self, instance: int = 0) -> Mesh:
+        """The triangles so far, degenerate ones left out."""
+        if not self._corners:
+            return join([])
+        corners, uv = np.concatenate(self._corners), np.concatenate(self._uv)
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        keep = area > 1e-8
+        return Mesh(
+            corners[keep],
+            np.concatenate(self._material)[keep],
+            np.concatenate(self._tint)[keep].astype(np.float32),
+            uv[keep],
+            np.full(int(keep.sum()), instance, np.int32),
+        )

@@ -1,0 +1,392 @@
+"""The standing world along a road, made chunk by chunk: asphalt, paint, kerbs, houses, poles, trees, parked cars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from pipeline.simulate.world.actors import VARIANTS, actor_mesh
+from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.meshes import Colour, Mesh, MeshBuilder, join, placed
+from pipeline.simulate.world.props import (
+    PANEL,
+    SIGN_COLOURS,
+    bollards,
+    bush,
+    delineator,
+    farm,
+    lamp,
+    litter_bin,
+    rail_post,
+    sign,
+    signal,
+    tree,
+)
+
+__all__ = ["CHUNK_M", "chunk_mesh"]
+
+CHUNK_M: Final = 40.0
+
+
+@dataclass
+class _Chunk:
+    """Two ways of adding: `along` bends with the road (corners are s, d, h), `rigid` is placed as it is."""
+
+    drive: Drive
+    index: int
+    rng: np.random.Generator
+    along: MeshBuilder = field(default_factory=MeshBuilder)
+    rigid: list[Mesh] = field(default_factory=list)
+
+    @property
+    def s0(self) -> float:
+        """Where the chunk begins."""
+        return self.index * CHUNK_M
+
+    def strip(
+        self,
+        d0: float,
+        d1: float,
+        h0: float,
+        h1: float,
+        name: str,
+        step: float = 5.0,
+        tint: Colour = (1, 1, 1),
+    ) -> None:
+        """Add a band along the whole chunk, d0 < d1."""
+        self.band(self.s0, self.s0 + CHUNK_M, d0, d1, h0, h1, name, step, tint)
+
+    def band(
+        self, s0: float, s1: float, d0: float, d1: float, h0: float, h1: float, name: str, step: float = 5.0,
+        tint: Colour = (1, 1, 1),
+    ) -> None:  # fmt: skip
+        """Add a band from s0 to s1."""
+        s = np.linspace(s0, s1, max(2, round((s1 - s0) / step) + 1))
+        n = len(s) - 1
+        c = np.empty((n, 4, 3))
+        c[:, 0], c[:, 1] = (
+            np.stack([s[:-1], np.full(n, d0), np.full(n, h0)], 1),
+            np.stack([s[1:], np.full(n, d0), np.full(n, h0)], 1),
+        )
+        c[:, 2], c[:, 3] = (
+            np.stack([s[1:], np.full(n, d1), np.full(n, h1)], 1),
+            np.stack([s[:-1], np.full(n, d1), np.full(n, h1)], 1),
+        )
+        vertical = abs(h1 - h0) > abs(d1 - d0)
+        self.along.quads(c, name, tint, c[..., [0, 2]] if vertical else c[..., :2])
+
+    def wall(
+        self,
+        s0: float,
+        s1: float,
+        d: float,
+        h0: float,
+        h1: float,
+        name: str,
+        tint: Colour = (1, 1, 1),
+    ) -> None:
+        """Add an upright band."""
+        self.band(s0, s1, d, d, h0, h1, name, 10.0, tint)
+
+    def put(
+        self, mesh: Mesh, s: float, d: float, h: float = 0.0, yaw: float = 0.0, instance: int | None = None
+    ) -> None:
+        """Place a rigid mesh."""
+        self.rigid.append(placed(mesh, self.drive.road.pose(s, d, h, yaw), instance))
+
+    def every(self, step: float, jitter: float = 0.0, chance: float = 1.0) -> list[float]:
+        """Places along the chunk on a grid that goes on in the next chunk."""
+        first = int(np.ceil(self.s0 / step))
+        grid = [k * step for k in range(first, int(np.ceil((self.s0 + CHUNK_M) / step)))]
+        return [float(s + self.rng.uniform(-jitter, jitter)) for s in grid if self.rng.random() < chance]
+
+
+def chunk_mesh(drive: Drive, index: int) -> Mesh:
+    """The standing world between arc lengths `index * CHUNK_M` and `(index + 1) * CHUNK_M`, in the map."""
+    chunk = _Chunk(drive, index, np.random.default_rng([drive.seed, 31, index + 1000]))
+    _asphalt(chunk)
+    if drive.environment == "highway":
+        _highway(chunk)
+    else:
+        _urban(chunk)
+    flat = chunk.along.mesh()
+    bent = drive.road.to_map(flat.corners.astype(np.float64)).astype(np.float32)
+    return join([Mesh(bent, flat.material, flat.tint, flat.uv, flat.instance), *chunk.rigid])
+
+
+def _asphalt(c: _Chunk) -> None:
+    layout, lift = c.drive.layout, 0.004
+    c.strip(layout.right_edge, layout.left_edge, 0.0, 0.0, "asphalt")
+    for _ in range(int(c.rng.integers(0, 4))):  # repairs: dark to the eye, less so to the lidar
+        s, d = c.s0 + c.rng.uniform(2, 30), c.rng.uniform(layout.right_edge + 1, layout.left_edge - 3)
+        c.band(
+            s, s + c.rng.uniform(1.5, 9), d, d + c.rng.uniform(0.6, 2.4), lift / 2, lift / 2, "asphalt_patch"
+        )
+    for _ in range(int(c.rng.integers(0, 3))):
+        s, d = c.s0 + c.rng.uniform(0, 39), c.rng.uniform(layout.right_edge + 1, layout.left_edge - 1)
+        c.band(s, s + 0.62, d, d + 0.62, lift, lift, "manhole")
+    _lanes(c)
+
+
+def _lanes(c: _Chunk) -> None:
+    layout, lift = c.drive.layout, 0.004
+    own, other = sorted(layout.lanes_own), sorted(layout.lanes_oncoming)
+    half = layout.lane_m / 2
+    inner = [d + half for d in own[:-1]] + [d + half for d in other[:-1]]
+    for d in inner:
+        _dashes(c, d, 6.0, 12.0) if layout.environment == "highway" else _dashes(c, d, 3.0, 9.0)
+    w = 0.075 if layout.environment == "urban" else 0.10
+    if layout.environment == "highway":
+        for d in (own[-1] + half, own[0] - half, other[0] - half, other[-1] + half):
+            c.strip(d - 1.5 * w, d + 1.5 * w, lift, lift, "paint")
+        return
+    if c.index % 5 in (1, 2):
+        c.strip(-w, w, lift, lift, "paint")
+    else:
+        _dashes(c, 0.0, 3.0, 9.0)
+    for side in (-1, 1):
+        edge = side * (layout.left_edge - layout.parking_m)
+        if layout.parking_m:
+            c.strip(edge - w, edge + w, lift, lift, "paint")
+            for s in c.every(6.5):
+                c.band(
+                    s - w,
+                    s + w,
+                    min(edge, side * layout.left_edge),
+                    max(edge, side * layout.left_edge),
+                    lift,
+                    lift,
+                    "paint",
+                )
+    if c.index % 4 == 1:
+        _crossing(c, c.s0 + 20.0)
+
+
+def _dashes(c: _Chunk, d: float, dash_m: float, period_m: float) -> None:
+    for s in c.every(period_m):
+        c.band(s, s + dash_m, d - 0.075, d + 0.075, 0.004, 0.004, "paint", step=3.0)
+
+
+def _crossing(c: _Chunk, s: float) -> None:
+    layout = c.drive.layout
+    edge = layout.left_edge
+    for d in np.arange(-edge + 0.5, edge - 0.5, 1.0):
+        c.band(s, s + 3.5, float(d), float(d) + 0.5, 0.005, 0.005, "paint")
+    c.band(s - 1.6, s - 1.2, -edge + layout.parking_m, 0.0, 0.005, 0.005, "paint")
+    c.band(s + 4.8, s + 5.2, 0.0, edge - layout.parking_m, 0.005, 0.005, "paint")
+    for d in layout.lanes_own:
+        _arrow(c, s - 12.0, d)
+    for side, yaw in ((-1, np.pi), (1, 0.0)):
+        c.put(signal(), s - 1.0 if side < 0 else s + 4.5, side * (edge + 0.5), 0.12, yaw)
+
+
+def _arrow(c: _Chunk, s: float, d: float) -> None:
+    c.band(s, s + 2.4, d - 0.08, d + 0.08, 0.005, 0.005, "paint")
+    head = np.array(
+        [[[s + 2.4, d - 0.35, 0.005], [s + 4.0, d, 0.005], [s + 4.0, d, 0.005], [s + 2.4, d + 0.35, 0.005]]]
+    )
+    c.along.quads(head, "paint", uv=head[..., :2])
+
+
+def _urban(c: _Chunk) -> None:
+    layout = c.drive.layout
+    style = np.random.default_rng([c.drive.seed, 32])
+    walk = style.uniform(2.6, 4.2)
+    for side in (-1, 1):
+        kerb = side * layout.left_edge
+        far = side * (layout.left_edge + walk)
+        c.band(c.s0, c.s0 + CHUNK_M, kerb, kerb + side * 0.001, 0.0, 0.12, "kerb", 5.0)
+        c.strip(min(kerb, kerb + side * 0.15), max(kerb, kerb + side * 0.15), 0.12, 0.12, "kerb")
+        c.strip(min(kerb + side * 0.15, far), max(kerb + side * 0.15, far), 0.12, 0.12, "paving")
+        c.strip(min(far, side * 90.0), max(far, side * 90.0), 0.10, 0.10, "grass", 10.0)
+        _furniture(c, side, layout.left_edge, walk)
+        _frontage(c, side, layout.left_edge + walk)
+        if layout.parking_m:
+            _parked(c, side, layout.left_edge - layout.parking_m / 2)
+
+
+def _furniture(c: _Chunk, side: int, edge: float, walk: float) -> None:
+    rng = c.rng
+    for s in c.every(32.0):
+        c.put(lamp(-side * 1.4), s + 8.0 * side, side * (edge + 0.45), 0.12)
+    for s in c.every(21.0, 6.0, 0.6):
+        c.put(sign(int(rng.integers(24))), s, side * (edge + 0.5), 0.12, 0.0 if side < 0 else np.pi)
+    avenue = np.random.default_rng([c.drive.seed, 33, side + 1]).random() < 0.55
+    for s in c.every(9.0, 1.5, 0.75 if avenue else 0.12):
+        c.put(
+            tree(int(rng.integers(40))),
+            s,
+            side * (edge + min(1.3, walk - 0.8)),
+            0.12,
+            rng.uniform(0, 6.28),
+        )
+    for s in c.every(14.0, 4.0, 0.35):
+        c.put(bollards(), s, side * (edge + 0.35), 0.12)
+    for s in c.every(26.0, 8.0, 0.4):
+        c.put(litter_bin(), s, side * (edge + walk - 0.5), 0.12)
+
+
+def _frontage(c: _Chunk, side: int, d: float) -> None:
+    """Houses, gardens, walls and gaps behind the pavement, as plots of about 13 m."""
+    rng, s = c.rng, c.s0
+    while s < c.s0 + CHUNK_M - 4.0:
+        width = min(float(rng.uniform(9, 18)), c.s0 + CHUNK_M - s)
+        kind = rng.random()
+        if kind < 0.50:
+            _house(c, side, s, width, d + float(rng.choice([0.2, 3.0, 5.0, 8.0])))
+        elif kind < 0.62:
+            c.wall(s, s + width, side * (d + 0.1), 0.0, float(rng.uniform(1.2, 2.2)), "stone")
+        elif kind < 0.76:
+            c.wall(
+                s,
+                s + width,
+                side * (d + 0.1),
+                0.0,
+                float(rng.uniform(1.0, 1.8)),
+                "slats",
+                (0.8, 0.8, float(rng.uniform(0.6, 1.2))),
+            )
+        if kind > 0.45:
+            for _ in range(int(rng.integers(1, 4))):
+                c.put(
+                    tree(int(rng.integers(40))),
+                    s + rng.uniform(1, width),
+                    side * (d + rng.uniform(3, 14)),
+                    0.1,
+                    rng.uniform(0, 6),
+                )
+                c.put(
+                    bush(int(rng.integers(20))),
+                    s + rng.uniform(1, width),
+                    side * (d + rng.uniform(1.2, 3)),
+                    0.1,
+                    rng.uniform(0, 6),
+                )
+        s += width
+
+
+def _house(c: _Chunk, side: int, s: float, width: float, d: float) -> None:
+    rng = c.rng
+    storeys = int(rng.choice([1, 2, 2, 3, 4]))
+    top, depth, gap = 3.0 * storeys + 0.6, float(rng.uniform(8, 12)), float(rng.choice([0.0, 0.0, 1.5]))
+    tone = rng.uniform(0.55, 1.35)
+    tint = (
+        float(tone * rng.uniform(0.9, 1.15)),
+        float(tone * rng.uniform(0.9, 1.1)),
+        float(tone * rng.uniform(0.75, 1.1)),
+    )
+    s1, near, far = s + width - gap, side * d, side * (d + depth)
+    c.wall(s, s1, near, 0.0, top, "facade", tint)
+    for end in (s, s1):
+        face = np.array([[[end, near, 0.0], [end, far, 0.0], [end, far, top], [end, near, top]]])
+        c.along.quads(face, "facade", tint, np.abs(face[..., 1:]))
+    ridge = top + float(rng.uniform(0.3, 3.0))
+    middle = (near + far) / 2
+    for edge in (near, far):
+        c.along.quads(
+            np.array([[[s, edge, top], [s1, edge, top], [s1, middle, ridge], [s, middle, ridge]]]),
+            "roof",
+            tint,
+        )
+    for end in (s, s1):
+        c.along.quads(
+            np.array([[[end, near, top], [end, far, top], [end, middle, ridge], [end, middle, ridge]]]),
+            "facade",
+            tint,
+        )
+
+
+def _parked(c: _Chunk, side: int, d: float) -> None:
+    for k, s in enumerate(c.every(6.5)):
+        if c.rng.random() > 0.68 or (c.index % 4 == 1 and abs(s + 3.2 - c.s0 - 20.0) < 9.0):
+            continue
+        kind = "car" if c.rng.random() < 0.88 else "van"
+        instance = 1_000_001 + ((c.index * 64 + k) * 2 + (side > 0)) % 1_000_000
+        yaw = (0.0 if side < 0 else np.pi) + c.rng.normal(0, 0.02)
+        mesh = actor_mesh(kind, int(c.rng.integers(VARIANTS[kind])))
+        c.put(mesh, s + 3.25 + c.rng.uniform(-0.3, 0.3), side * d + c.rng.normal(0, 0.08), 0.0, yaw, instance)
+
+
+def _highway(c: _Chunk) -> None:
+    layout, rng = c.drive.layout, c.rng
+    style = np.random.default_rng([c.drive.seed, 34])
+    _guard_rail(c, 0.0, both=True)
+    for side in (-1, 1):
+        edge = side * layout.left_edge
+        walled, railed = style.random() < 0.35, style.random() < 0.75
+        verge, slope = edge + side * 3.0, float(style.uniform(-1.0, 2.5))
+        _sloped(c, edge, verge, 0.0, -0.1, "grass")
+        _sloped(c, verge, edge + side * 14.0, -0.1, slope, "grass")
+        _sloped(
+            c,
+            edge + side * 14.0,
+            side * 150.0,
+            slope,
+            slope + 2.0,
+            "soil" if style.random() < 0.3 else "grass",
+        )
+        if railed:
+            _guard_rail(c, edge + side * 0.8, both=False)
+        if walled and (c.index // 6) % 2 == 0:
+            c.wall(
+                c.s0, c.s0 + CHUNK_M, edge + side * 4.5, -0.2, float(3.5 + 0.5 * (c.index % 2)), "noise_wall"
+            )
+        for s in c.every(25.0):
+            c.put(delineator(), s, edge + side * 1.4)
+        for s in c.every(6.0, 3.0, 0.55):
+            d = edge + side * rng.uniform(8, 26)
+            c.put(tree(int(rng.integers(40))), s, d, slope * 0.7 - 0.2, rng.uniform(0, 6.28))
+        for s in c.every(5.0, 2.0, 0.5):
+            c.put(
+                bush(int(rng.integers(20))),
+                s,
+                edge + side * rng.uniform(5, 10),
+                0.2 * slope,
+                rng.uniform(0, 6.28),
+            )
+        for s in c.every(55.0, 15.0, 0.7):
+            c.put(sign(int(rng.integers(24))), s, edge + side * 1.7, 0.0, 0.0 if side < 0 else np.pi)
+    if c.index % 7 == 3:
+        _gantry(c, c.s0 + 20.0)
+    if c.index % 5 == 2:
+        c.put(
+            farm(rng),
+            c.s0 + 20.0,
+            float(rng.choice([-1, 1])) * rng.uniform(45, 80),
+            1.0,
+            rng.uniform(0, 6.28),
+        )
+
+
+def _sloped(c: _Chunk, d0: float, d1: float, h0: float, h1: float, name: str) -> None:
+    if d0 > d1:
+        d0, d1, h0, h1 = d1, d0, h1, h0
+    c.strip(d0, d1, h0, h1, name, 10.0)
+
+
+def _guard_rail(c: _Chunk, d: float, *, both: bool) -> None:
+    for offset in (-0.18, 0.18) if both else (0.0,):
+        for low, high, out in ((0.48, 0.58, 0.0), (0.58, 0.68, 0.05), (0.68, 0.78, 0.0)):
+            c.band(c.s0, c.s0 + CHUNK_M, d + offset + out, d + offset + out + 1e-3, low, high, "rail", 4.0)
+    for s in c.every(4.0):
+        c.put(rail_post(), s, d)
+
+
+def _gantry(c: _Chunk, s: float) -> None:
+    layout = c.drive.layout
+    left, right = 0.0, layout.right_edge - 1.6
+    b = MeshBuilder()
+    for d in (left, right):
+        b.tube(np.array([0, d, 0.0]), np.array([0, d, 7.6]), 0.16, "metal_pole", 8)
+    for z in (6.6, 7.5):
+        b.tube(np.array([0, left, z]), np.array([0, right, z]), 0.10, "metal_pole", 6)
+    for d in layout.lanes_own:
+        b.frustum(
+            (-0.25, -0.20, d - 1.6, d + 1.6, 5.6),
+            (-0.25, -0.20, d - 1.6, d + 1.6, 8.0),
+            PANEL,
+            SIGN_COLOURS[2],
+        )
+    c.put(b.mesh(), s, 0.0)

@@ -1,0 +1,191 @@
+"""Who else is on the road at a moment: endless streams per lane, leaders that drive as we do, people on pavements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.simulate.world.actors import VARIANTS
+from pipeline.simulate.world.drives import Drive
+
+__all__ = ["Actor", "actors_at"]
+
+_AHEAD_M: Final = 150.0
+_BEHIND_M: Final = 45.0
+
+
+@dataclass(frozen=True, eq=False)
+class Actor:
+    """One road user at one time; `key` stays the same over the drive."""
+
+    key: int
+    kind: str
+    variant: int
+    T_map_actor: np.ndarray
+    velocity_map: np.ndarray
+
+    def advanced(self, dt_s: float) -> Actor:
+        """Where it is a moment later, at constant velocity."""
+        T = self.T_map_actor.copy()
+        T[:3, 3] += dt_s * self.velocity_map
+        return replace(self, T_map_actor=T)
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """Road users one behind the other with a common speed; every `spacing_m` a place that may be empty."""
+
+    number: int
+    offset_m: float
+    speed_mps: float  # along the road, negative = oncoming
+    spacing_m: float
+    occupancy: float
+    kinds: tuple[str, ...]
+    height_m: float = 0.0
+
+
+def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (_BEHIND_M, _AHEAD_M)) -> list[Actor]:
+    """Road users from `within_m[0]` behind us to `within_m[1]` ahead."""
+    here = drive.ego.arc(t_s)
+    actors = _leaders(drive, t_s, here, within_m)
+    for stream in _streams(drive):
+        actors += _members(drive, stream, t_s, here, within_m)
+    return _apart(actors, drive.ego.poses(np.array([t_s]))[0])
+
+
+def _streams(drive: Drive) -> list[_Stream]:
+    rng = np.random.default_rng([drive.seed, 21])
+    layout, streams = drive.layout, []
+    if drive.environment == "highway":
+        for i, d in enumerate(layout.lanes_own):
+            slow = d == min(layout.lanes_own)
+            kinds = ("truck", "truck", "car", "van") if slow else ("car", "car", "car", "van")
+            if i:  # our own lane has leaders
+                streams.append(
+                    _Stream(
+                        i,
+                        d,
+                        rng.uniform(21, 25) if slow else rng.uniform(27, 36),
+                        rng.uniform(24, 36),
+                        0.75,
+                        kinds,
+                    )
+                )
+        for i, d in enumerate(layout.lanes_oncoming):
+            streams.append(
+                _Stream(
+                    10 + i, d, -rng.uniform(24, 35), rng.uniform(26, 42), 0.65, ("car", "car", "van", "truck")
+                )
+            )
+        return streams
+    for i, d in enumerate(layout.lanes_own[1:], 1):
+        streams.append(
+            _Stream(i, d, rng.uniform(7, 13), rng.uniform(18, 28), 0.7, ("car", "car", "car", "van", "bus"))
+        )
+    for i, d in enumerate(layout.lanes_oncoming):
+        streams.append(
+            _Stream(
+                10 + i,
+                d,
+                -rng.uniform(7, 13),
+                rng.uniform(20, 32),
+                0.7,
+                ("car", "car", "van", "truck", "bus"),
+            )
+        )
+    edge = -layout.right_edge
+    for i, (side, speed) in enumerate(((-1, 1.3), (-1, -1.2), (1, -1.4), (1, 1.1))):
+        d = side * (edge + 1.0 + 0.8 * (i % 2))
+        streams.append(
+            _Stream(20 + i, d, speed * rng.uniform(0.8, 1.2), rng.uniform(12, 22), 0.5, ("pedestrian",), 0.12)
+        )
+    kerb = edge - layout.parking_m
+    streams.append(_Stream(30, -(kerb - 0.45), rng.uniform(4.0, 5.5), 45.0, 0.55, ("cyclist",)))
+    streams.append(_Stream(31, kerb - 0.45, -rng.uniform(4.0, 5.5), 55.0, 0.55, ("cyclist",)))
+    return streams
+
+
+def _member(drive: Drive, stream: _Stream, k: int, t_s: float) -> tuple[float, float, float, str, int] | None:
+    """(arc length, offset, speed, kind, variant) of the k-th place of a stream, None where it is empty."""
+    rng = np.random.default_rng([drive.seed, 22, stream.number, k + 1_000_000])
+    if rng.random() > stream.occupancy:
+        return None
+    kind = stream.kinds[int(rng.integers(len(stream.kinds)))]
+    swing, rate, phase = rng.uniform(0.5, 2.5), rng.uniform(0.1, 0.35), rng.uniform(0, 2 * np.pi)
+    if kind == "pedestrian":
+        swing = 0.2
+    jitter = rng.uniform(-0.2, 0.2) * stream.spacing_m
+    s = k * stream.spacing_m + jitter + stream.speed_mps * t_s + swing * np.sin(rate * t_s + phase)
+    d = stream.offset_m + rng.uniform(-0.25, 0.25)
+    speed = stream.speed_mps + swing * rate * np.cos(rate * t_s + phase)
+    return float(s), float(d), float(speed), kind, int(rng.integers(VARIANTS[kind]))
+
+
+def _members(
+    drive: Drive, stream: _Stream, t_s: float, here_m: float, within_m: tuple[float, float]
+) -> list[Actor]:
+    behind, ahead = within_m
+    base = here_m - stream.speed_mps * t_s
+    first, last = int((base - behind) // stream.spacing_m) - 1, int((base + ahead) // stream.spacing_m) + 1
+    actors = []
+    for k in range(first, last + 1):
+        found = _member(drive, stream, k, t_s)
+        if found is None or not -behind <= found[0] - here_m <= ahead:
+            continue
+        s, d, speed, kind, variant = found
+        if kind == "pedestrian":  # gait: the pose changes twice a second
+            variant = variant // 4 * 4 + int(t_s * 2.2 + k) % 4
+        yaw = 0.0 if stream.speed_mps > 0 else np.pi
+        key = 1 + ((stream.number + 1) * 100_003 + k * 7919) % 1_000_000
+        actors.append(_actor(drive, key, kind, variant, s, d, stream.height_m, speed, yaw))
+    return actors
+
+
+def _leaders(drive: Drive, t_s: float, here_m: float, within_m: tuple[float, float]) -> list[Actor]:
+    """Vehicles before (and behind) us in our lane do what we shall do (did) some seconds later (earlier)."""
+    rng = np.random.default_rng([drive.seed, 23])
+    actors: list[Actor] = []
+    for sign in (1, -1):
+        headway, gap = 0.0, 0.0
+        for i in range(5):
+            headway += rng.uniform(1.1, 3.2)
+            gap += rng.uniform(7.5, 10.0)
+            kind = ("car", "car", "van", "truck", "car")[int(rng.integers(5))]
+            variant = int(rng.integers(VARIANTS[kind]))
+            t = t_s + sign * headway
+            s = drive.ego.arc(t) + sign * gap
+            if -within_m[0] <= s - here_m <= within_m[1]:
+                speed = (drive.ego.arc(t + 0.05) - drive.ego.arc(t - 0.05)) / 0.1
+                d = drive.layout.lanes_own[0] + float(rng.uniform(-0.2, 0.2))
+                actors.append(
+                    _actor(drive, 900_000 + 10 * (sign + 1) + i, kind, variant, s, d, 0.0, speed, 0.0)
+                )
+    return actors
+
+
+def _actor(
+    drive: Drive, key: int, kind: str, variant: int, s: float, d: float, h: float, speed: float, yaw: float
+) -> Actor:
+    T = drive.road.pose(s, d, h, yaw)
+    ahead = drive.road.to_map(np.array([[s - 0.5, d, h], [s + 0.5, d, h]]))
+    return Actor(key, kind, variant, T, speed * (ahead[1] - ahead[0]))
+
+
+def _apart(actors: list[Actor], T_map_vehicle: Float[np.ndarray, "4 4"]) -> list[Actor]:
+    """Leave out whoever would stand inside another or inside us (streams know nothing of one another)."""
+    kept: list[Actor] = []
+    places = [(T_map_vehicle[:2, 3] + 1.3 * T_map_vehicle[:2, 0], T_map_vehicle[:2, 0], 3.5)]
+    reach = {"car": 2.6, "van": 3.2, "truck": 7.4, "bus": 6.2, "cyclist": 1.0, "pedestrian": 0.4}
+    for actor in actors:
+        p, r = actor.T_map_actor[:2, 3], reach[actor.kind]
+        clear = True
+        for q, axis, other in places:
+            along, across = abs((p - q) @ axis), abs((p - q) @ np.array([-axis[1], axis[0]]))
+            clear &= bool(along > r + other or across > (2.2 if min(r, other) > 2 else 1.5))
+        if clear:
+            kept.append(actor)
+            places.append((p, actor.T_map_actor[:2, 0], r))
+    return kept

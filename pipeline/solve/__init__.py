@@ -1,1 +1,0 @@
-"""How it is minimised: selection, triggers, solvers, covariance."""

@@ -1,1 +1,0 @@
-"""Whether a result may be trusted: held-out frames, verdict, targets."""

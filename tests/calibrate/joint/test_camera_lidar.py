@@ -1,0 +1,151 @@
+"""Recovery of a known pose and time offset, honest sigmas, determinism, and the cases that must be refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar, estimate_camera_lidar
+from pipeline.calibrate.joint.camera_lidar.observability import clock_variance
+from pipeline.calibrate.joint.camera_lidar.time_offset import ClockProfile, s_per_metre
+from pipeline.calibrate.numerics.differential_evolution import evolve
+from pipeline.calibrate.numerics.search_range import search_range
+from pipeline.config import SolveConfig
+from pipeline.errors import SolveError
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.geometry.se3 import inverse, log_so3, perturb_exactly
+from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
+
+
+def prior_off_by(degrees, metres, seed):
+    T = perturb_exactly(T_TRUE, np.radians(degrees), metres, np.random.default_rng(seed))
+    return Prior(T, np.eye(4), float(np.radians(2.0)), 0.05)
+
+
+@pytest.mark.parametrize(
+    ("rig", "frames", "dt_s"),
+    [(SPARSE, 16, 0.03), (DENSE, 8, -0.02), (DENSE, 8, 0.08)],
+    ids=["16 rings", "dense", "dense, a clock far off"],
+)
+def test_pose_and_time_offset_are_recovered_from_four_degrees(rig, frames, dt_s):
+    day = traced_day(rig, frames, seed=1, dt_s=dt_s)
+    e = estimate_camera_lidar(day, prior_off_by(4.0, 0.05, 0), SolveConfig(), np.random.default_rng(0))
+    turn = np.degrees(log_so3((e.T @ inverse(T_TRUE))[:3, :3]))
+    assert np.abs(turn).max() < 0.35
+    sigma = np.sqrt(np.diag(e.covariance))
+    assert (np.abs(np.radians(turn)) < 5 * sigma[:3]).all()
+    assert abs(e.time_offset_s - dt_s) < 0.015
+    assert e.frames_used == frames
+
+
+def test_road_without_reflectivity_leaves_the_edges_to_do_it():
+    day = traced_day(DENSE, 8, seed=1, reflective=False)
+    e = estimate_camera_lidar(day, prior_off_by(3.0, 0.05, 1), SolveConfig(), np.random.default_rng(0))
+    assert np.abs(np.degrees(log_so3((e.T @ inverse(T_TRUE))[:3, :3]))).max() < 0.3
+    assert e.diagnostics["marking_weight"] == 0.0
+
+
+def prior_along_the_axis(sigma_m):
+    """A prior that is wrong only along the optical axis, where a few frames say little."""
+    T = T_TRUE.copy()
+    T[2, 3] += 0.04
+    return Prior(T, np.eye(4), float(np.radians(2.0)), sigma_m)
+
+
+def test_what_the_day_cannot_determine_stays_at_the_prior_with_its_sigma_and_the_clock_says_so():
+    day = traced_day(SPARSE, 12, seed=1, dt_s=0.03)
+    for sigma_m in (0.02, 0.1):
+        prior = prior_along_the_axis(sigma_m)
+        e = estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
+        change = change_between(prior.T_camera_lidar, e.T)
+        sigma = np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
+        assert not e.observable[5]
+        assert e.observability[5] < 0.5
+        assert change[5] == pytest.approx(0.0, abs=1e-9)
+        assert sigma[5] == pytest.approx(sigma_m, rel=0.05)
+        assert e.observable[:3].all()
+        assert np.abs(change[:3]).max() > 1e-6
+        assert np.linalg.eigvalsh(e.covariance).min() > 0
+        assert abs(e.time_offset_s - 0.03) < 3 * e.time_offset_sigma_s
+
+
+def test_the_less_is_known_along_the_axis_the_less_is_known_of_the_clock():
+    # A car that stands dt later looks as if it stood further on.
+    day = traced_day(SPARSE, 6, seed=3)
+    begun = align_camera_lidar(day, prior_off_by(1.0, 0.03, 2), SolveConfig(), np.random.default_rng(5))
+    clock = ClockProfile(begun.state, 1e-6)
+    little, much = (
+        clock_variance(replace(begun.day, tz_variance=m**2), begun.state, begun.level, clock)
+        for m in (0.02, 0.1)
+    )
+    share = s_per_metre(begun.day.terms, begun.state) * 0.1
+    assert 0.5 * share**2 < much - little < share**2
+
+
+def test_what_the_day_knows_better_than_the_prior_is_left_to_the_day():
+    day = traced_day(DENSE, 10, seed=1, dt_s=0.03)
+    prior = prior_along_the_axis(0.6)
+    e = estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
+    sigma = np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
+    assert e.observable.all()
+    assert 0.03 < sigma[5] < 0.3
+    assert abs(e.T[2, 3] - T_TRUE[2, 3]) < 3 * sigma[5]
+    assert e.T[2, 3] != prior.T_camera_lidar[2, 3]
+
+
+def test_what_sparse_rings_leave_open_of_a_vague_prior_is_said_with_a_sigma_that_covers_it():
+    day = traced_day(SPARSE, 12, seed=1, dt_s=0.03)
+    e = estimate_camera_lidar(day, prior_along_the_axis(0.6), SolveConfig(), np.random.default_rng(0))
+    sigma = np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
+    assert abs(e.T[2, 3] - T_TRUE[2, 3]) < 3 * sigma[5]
+
+
+def test_the_search_follows_a_prior_that_says_it_may_be_far_off():
+    day = traced_day(DENSE, 10, seed=1, dt_s=0.03)
+    T = perturb_exactly(T_TRUE, np.radians(14.0), 0.5, np.random.default_rng(3))
+    prior = Prior(T, np.eye(4), float(np.radians(14.0)), 0.5)
+    rotation, shift = search_range(prior, SolveConfig())
+    assert np.degrees(rotation) > 14
+    assert shift > 0.5
+    e = estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
+    assert np.abs(np.degrees(log_so3((e.T @ inverse(T_TRUE))[:3, :3]))).max() < 0.4
+    near = Prior(T, np.eye(4), 0.01, 0.01)
+    assert search_range(near, SolveConfig()) == (np.radians(6.0), 0.3)
+
+
+def test_same_seed_gives_the_same_estimate():
+    day = traced_day(SPARSE, 6, seed=3)
+    a, b = (
+        estimate_camera_lidar(day, prior_off_by(1.0, 0.03, 2), SolveConfig(), np.random.default_rng(5))
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(a.T, b.T)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_days_of_hardly_any_frame_or_edge_are_refused():
+    day = traced_day(SPARSE, 6, seed=3)
+    with pytest.raises(SolveError, match="frames"):
+        estimate_camera_lidar(day[:3], prior_off_by(1.0, 0.03, 2), SolveConfig(), np.random.default_rng(0))
+    away = prior_off_by(0.0, 0.0, 0).T_camera_lidar.copy()
+    away[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ away[:3, :3]  # looks backwards, where nothing was traced
+    with pytest.raises(SolveError, match="edges"):
+        estimate_camera_lidar(
+            day, Prior(away, np.eye(4), 0.03, 0.05), SolveConfig(), np.random.default_rng(0)
+        )
+
+
+def test_evolution_finds_the_deep_well_among_shallow_ones_and_keeps_to_its_box():
+    seen = []
+
+    def cost(x):
+        seen.append((x.min(), x.max()))
+        shallow = 1 - np.exp(-((x - 0.6) ** 2).sum(1) / 0.02)
+        return shallow - 2 * np.exp(-((x + 0.5) ** 2).sum(1) / 0.08)
+
+    best, value = evolve(cost, -np.ones(3), np.ones(3), np.random.default_rng(0), generations=60)
+    np.testing.assert_allclose(best, -0.5, atol=0.05)
+    assert value < -0.9
+    assert min(lo for lo, _ in seen) >= -1
+    assert max(hi for _, hi in seen) <= 1

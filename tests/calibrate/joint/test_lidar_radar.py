@@ -1,0 +1,212 @@
+"""Lidar-radar of method `joint` on streets with known truth: basin, time offset, honest sigmas, faults."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.joint.camera_radar import camera_radar_cost, estimate_camera_radar
+from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar, lidar_radar_cost
+from pipeline.config import SolveConfig
+from pipeline.errors import SolveError
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.geometry.se3 import exp_se3, log_se3, perturb_exactly
+from pipeline.geometry.spherical import from_spherical, to_spherical
+from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
+from tests.makers.solve_scenes import T_CAMERA_LIDAR
+
+CONFIG = SolveConfig()
+SIGMA_ROTATION = np.radians(2.0)
+SIGMA_SHIFT = 0.05
+
+
+def prior_off_by(rotation_deg, shift_m, seed=0):
+    rng = np.random.default_rng(seed)
+    T = perturb_exactly(T_LIDAR_RADAR, np.radians(rotation_deg), shift_m, rng)
+    return Prior(T_CAMERA_LIDAR, T, SIGMA_ROTATION, SIGMA_SHIFT)
+
+
+def solve(day, prior, camera=T_CAMERA_LIDAR, seed=0):
+    return estimate_lidar_radar(day, prior, camera, CONFIG, np.random.default_rng(seed))
+
+
+def error_of(estimate):
+    return log_se3(estimate.T @ np.linalg.inv(T_LIDAR_RADAR))
+
+
+def assert_kept(found, prior):
+    """What was not determined is the prior's, to the last digit: rotation vector, position and their sigmas."""
+    held = ~found.observable
+    moved = change_between(prior.T_lidar_radar, found.T)
+    sigma = np.sqrt(np.diag(change_covariance(found.T, found.covariance)))
+    before = np.sqrt(np.diag(prior.covariance("lidar_radar")))
+    assert np.allclose(moved[held], 0, atol=1e-9)
+    assert np.allclose(sigma[held], before[held], rtol=1e-6)
+    assert np.all(sigma <= before * (1 + 1e-6))
+
+
+@pytest.fixture(scope="module")
+def day():
+    return street_day(40)
+
+
+@pytest.mark.parametrize(("rotation_deg", "shift_m"), [(2, 0.1), (5, 0.3), (10, 0.3)])
+def test_wrong_priors_lead_to_the_truth(day, rotation_deg, shift_m):
+    for seed in range(2):
+        found = solve(day, prior_off_by(rotation_deg, shift_m, seed))
+        error, sigma = error_of(found), np.sqrt(np.diag(found.covariance))
+        assert abs(error[2]) < np.radians(0.12)
+        assert np.abs(error[3:5]).max() < 0.06
+        assert np.all(np.abs(error[:5]) < 3 * sigma[:5])
+        assert abs(found.time_offset_s - DT_S) < 3 * found.time_offset_sigma_s
+
+
+def test_errors_have_the_spread_that_the_covariance_says():
+    z = []
+    for seed in range(8):
+        found = solve(street_day(24, seed=100 + seed), prior_off_by(1.5, 0.04, seed), seed=seed)
+        pose = error_of(found)[:5] / np.sqrt(np.diag(found.covariance))[:5]
+        z.append([*pose, (found.time_offset_s - DT_S) / found.time_offset_sigma_s])
+    assert np.all(np.abs(z) < 3.5)
+    # Bias floors stand for what these scenes do not have, so errors may be smaller, never larger.
+    assert np.sqrt(np.mean(np.square(z))) < 1.3
+
+
+def test_the_same_seed_gives_the_same_numbers(day):
+    a, b = (solve(day[:12], prior_off_by(2, 0.1), seed=3) for _ in range(2))
+    assert np.array_equal(a.T, b.T)
+    assert np.array_equal(a.covariance, b.covariance)
+    assert a.diagnostics == b.diagnostics
+
+
+def test_a_radar_without_elevation_leaves_roll_and_pitch_to_the_prior():
+    prior = prior_off_by(2, 0.1, 1)
+    found = solve(street_day(24, elevation=False), prior)
+    assert not found.observable[[0, 1, 5]].any()
+    assert_kept(found, prior)
+    assert abs(error_of(found)[2]) < np.radians(0.2)
+    assert any("roll, pitch" in note for note in found.notes)
+
+
+def test_a_height_that_the_day_cannot_tell_stays_while_a_knock_aside_is_found(day):
+    knocked = T_LIDAR_RADAR.copy()
+    knocked[:3, 3] += [0.0, 0.12, 0.04]
+    prior = Prior(T_CAMERA_LIDAR, knocked, SIGMA_ROTATION, 0.03)
+    found = solve(day[:24], prior)
+    assert_kept(found, prior)
+    assert not found.observable[5]
+    assert found.observable[4]
+    assert abs(found.T[1, 3] - T_LIDAR_RADAR[1, 3]) < 0.04  # four prior sigmas away, all but a quarter found
+    assert any("z" in note and "kept at the prior" in note for note in found.notes)
+
+
+def test_others_are_less_sure_where_what_they_lean_on_rests_on_a_wider_prior(day):
+    sure, vague = (
+        solve(day[:24], Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, SIGMA_ROTATION, sigma))
+        for sigma in (0.002, 0.012)
+    )
+    for found in (sure, vague):
+        assert not found.observable[3:].any()
+        assert found.observable[2]
+        assert np.allclose(found.T[:3, 3], T_LIDAR_RADAR[:3, 3], atol=1e-9)
+    # A radar that stands 1 cm aside sees the street turned: without knowing y, yaw is that much less sure.
+    assert vague.covariance[2, 2] > sure.covariance[2, 2] + np.radians(0.01) ** 2
+
+
+def test_frames_of_a_turn_that_no_odometry_measured_are_left_out(day):
+    turning = {
+        "radar_velocity_mps": np.array([8.0, 1.0, 0.0]),
+        "ego_speed_mps": 8.0,
+        "ego_yaw_rate_radps": None,
+    }
+    turn = [replace(o, **turning) for o in day[:6]]
+    straight = [replace(o, ego_yaw_rate_radps=None) for o in day[6:24]]
+    found = solve([*turn, *straight], prior_off_by(1, 0.02))
+    assert found.frames_used == len(straight)
+    assert found.frames_rejected == {"turns at an unknown yaw rate": 6}
+    measured = [replace(o, ego_yaw_rate_radps=0.3) for o in turn]
+    assert solve([*measured, *straight], prior_off_by(1, 0.02)).frames_used == 24
+
+
+def test_boxes_make_roll_surer(day):
+    with_camera, without = (solve(day, prior_off_by(1, 0.02), camera) for camera in (T_CAMERA_LIDAR, None))
+    assert with_camera.covariance[0, 0] < without.covariance[0, 0]
+    assert with_camera.diagnostics["boxes"] > 20
+    assert without.diagnostics["boxes"] == 0
+
+
+def test_a_radar_of_poor_elevation_is_not_trusted_with_roll(day):
+    rng = np.random.default_rng(5)
+
+    def blurred(o):
+        aer = to_spherical(o.radar_xyz_m.astype(np.float64))
+        aer[:, 1] += np.radians(4.0) * rng.standard_normal(len(aer))
+        return replace(o, radar_xyz_m=from_spherical(aer).astype(np.float32))
+
+    sharp = solve(day[:20], prior_off_by(1, 0.02), None)
+    poor = solve([blurred(o) for o in day[:20]], prior_off_by(1, 0.02), None)
+    sigma = [np.sqrt(found.covariance[0, 0]) for found in (sharp, poor)]
+    assert sigma[1] > 2 * sigma[0]
+    for found, s in zip((sharp, poor), sigma, strict=True):
+        assert abs(error_of(found)[0]) < 3 * s
+
+
+def test_constant_elevation_and_range_errors_are_named_as_assumptions(day):
+    notes = "\n".join(solve(day[:20], prior_off_by(1, 0.02)).notes)
+    assert "constant elevation error of the radar of 0 +- 0.20 deg" in notes
+    assert "range bias" in notes
+
+
+def test_a_standing_car_does_not_determine_the_time_offset():
+    still = [replace(o, radar_velocity_mps=np.zeros(3)) for o in street_day(16, dt_s=0.0)]
+    found = solve(still, prior_off_by(1, 0.02))
+    assert found.time_offset_s == 0.0
+    assert found.time_offset_sigma_s == pytest.approx(CONFIG.time_offset_sigma_s)
+    assert any("time offset not determined" in note for note in found.notes)
+
+
+def test_too_few_frames_are_refused(day):
+    with pytest.raises(SolveError, match="lidar-radar needs 5 frames"):
+        solve(day[:3], prior_off_by(1, 0.02))
+    deaf = [replace(o, radar_velocity_mps=None) for o in day]
+    with pytest.raises(SolveError, match="the day has 0"):
+        solve(deaf, prior_off_by(1, 0.02))
+
+
+def test_half_of_a_day_that_was_turned_is_found(day):
+    yaw = np.radians(0.4)
+    turn = exp_se3(np.array([0, 0, -yaw, 0, 0, 0]))
+    turned = [replace(o, radar_xyz_m=(o.radar_xyz_m @ turn[:3, :3].T).astype(np.float32)) for o in day[20:]]
+    first, second = (solve(part, prior_off_by(1, 0.02)) for part in (day[:20], turned))
+    change = log_se3(second.T @ np.linalg.inv(first.T))
+    assert abs(change[2] - yaw) < np.radians(0.1)
+
+
+def test_held_out_costs_prefer_the_truth_and_name_frames_that_cannot_tell(day):
+    frames = [
+        *day[:8],
+        replace(day[8], radar_velocity_mps=None, radar_cluster=np.full_like(day[8].radar_cluster, -1)),
+    ]
+    wrong = exp_se3(np.array([0, 0, np.radians(1.0), 0, 0, 0])) @ T_LIDAR_RADAR
+    right_cost, wrong_cost = (lidar_radar_cost(frames, T, DT_S) for T in (T_LIDAR_RADAR, wrong))
+    assert np.mean(right_cost[:8] < wrong_cost[:8]) > 0.8
+    assert np.isnan(right_cost[8])
+    camera_right, camera_wrong = (
+        camera_radar_cost(frames, T_CAMERA_LIDAR @ T) for T in (T_LIDAR_RADAR, wrong)
+    )
+    assert np.nanmean(camera_right) < np.nanmean(camera_wrong)
+    assert np.isnan(camera_right[8])
+
+
+def test_camera_and_radar_alone_find_their_azimuth(day):
+    T_true = T_CAMERA_LIDAR @ T_LIDAR_RADAR
+    for seed in range(3):
+        found = estimate_camera_radar(day, prior_off_by(4, 0.05, seed), CONFIG, np.random.default_rng(0))
+        error = log_se3(found.T @ np.linalg.inv(T_true))
+        assert abs(error[1]) < np.radians(0.5)
+        assert np.all(
+            np.abs(error[:3])[found.observable[:3]]
+            < 3.5 * np.sqrt(np.diag(found.covariance))[:3][found.observable[:3]]
+        )
+        assert not found.observable[3:].all()

@@ -1,0 +1,182 @@
+"""Differential evolution and Nelder-Mead, alone and with the loop: recovery, determinism, honesty."""
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.methods import METHOD, solver_of
+from pipeline.calibrate.paper.joint_optimisation import joint_costs, solve_joint_optimisation
+from pipeline.calibrate.paper.minimise import Search, minimise, poses_about
+from pipeline.calibrate.paper.pairwise import pair_problem, solve_pairwise
+from pipeline.calibrate.paper.sandwich import sandwich_covariance
+from pipeline.config import SolveConfig
+from pipeline.errors import ConfigError
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.se3 import exp_so3, perturb_exactly, rotation_angle_rad
+from pipeline.geometry.targets import errors_at_targets
+from schemas.calibrations import METHODS, PAIRS
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+
+CONFIG = SolveConfig(
+    search_rotation_deg=4.0, search_translation_m=0.2, paper_population=40, paper_generations=30
+)
+TRUTH = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2), 0.05)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    day = make_day(24)
+    return dict.fromkeys(PAIRS, day)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    rng = np.random.default_rng(3)
+    return Prior(
+        perturb_exactly(T_CAMERA_LIDAR, np.radians(2), 0.1, rng),
+        perturb_exactly(T_LIDAR_RADAR, np.radians(2), 0.1, rng),
+        np.radians(2),
+        0.1,
+    )
+
+
+@pytest.fixture(scope="module")
+def pairwise(frames, prior):
+    return solve_pairwise(frames, prior, CONFIG, seed=1)
+
+
+@pytest.fixture(scope="module")
+def joint(frames, prior):
+    return solve_joint_optimisation(frames, prior, CONFIG, seed=1)
+
+
+def test_minimise_finds_the_lowest_of_several_basins():
+    target = np.array([0.03, -0.02, 0.01, 0.05, -0.1, 0.0])
+
+    def bumpy(x):
+        d = (x - target) / np.array([0.02] * 3 + [0.1] * 3)
+        return (d**2).sum(axis=1) + 2 * (1 - np.cos(5 * d)).sum(axis=1)
+
+    found = minimise(bumpy, Search(0.07, 0.2, 60, 120), np.zeros(6), np.random.default_rng(0))
+    np.testing.assert_allclose(found.x, target, atol=1e-3)
+    assert not found.at_border
+    assert found.evaluations > 60 * 30
+
+
+def test_minimise_says_when_the_minimum_lies_at_the_border():
+    found = minimise(lambda x: x[:, 0], Search(0.07, 0.2, 20, 20), np.zeros(6), np.random.default_rng(0))
+    assert found.at_border
+    assert found.x[0] == pytest.approx(-0.07)
+
+
+def test_poses_about_turn_and_shift_by_exactly_the_parameters():
+    x = np.array([[0.01, -0.02, 0.03, 0.1, 0.2, -0.3]])
+    T = poses_about(T_CAMERA_LIDAR, x)[0]
+    np.testing.assert_allclose(T[:3, :3], exp_so3(x[0, :3]) @ T_CAMERA_LIDAR[:3, :3])
+    np.testing.assert_allclose(T[:3, 3] - T_CAMERA_LIDAR[:3, 3], x[0, 3:])
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_pairwise_lowers_the_loss_and_the_target_error(pairwise, prior, pair):
+    estimate = pairwise.pairs[pair]
+    assert estimate.diagnostics["loss_result"] < estimate.diagnostics["loss_prior"]
+    before = errors_at_targets(pair, prior.of(pair), TRUTH.of(pair))
+    after = errors_at_targets(pair, estimate.T, TRUTH.of(pair))
+    assert np.degrees(after[:2]).max() < 0.6
+    assert after[:2].sum() < before[:2].sum()
+
+
+def test_joint_closes_the_loop_that_pairwise_leaves_open(pairwise, joint):
+    assert pairwise.loop_rotation_rad > np.radians(0.05)
+    assert joint.loop_rotation_rad < np.radians(0.01)
+    assert joint.loop_translation_m < 1e-3
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_joint_recovers_the_truth_at_the_targets(joint, pair):
+    after = errors_at_targets(pair, joint.pairs[pair].T, TRUTH.of(pair))
+    assert np.degrees(after[:2]).max() < 0.6
+
+
+def test_the_same_seed_gives_the_same_result_to_the_last_bit(frames, prior, pairwise):
+    again = solve_pairwise(frames, prior, CONFIG, seed=1)
+    for pair in PAIRS:
+        assert np.array_equal(again.pairs[pair].T, pairwise.pairs[pair].T)
+        assert np.array_equal(again.pairs[pair].covariance, pairwise.pairs[pair].covariance)
+
+
+def test_pairs_that_did_not_trigger_keep_the_prior(frames, prior):
+    for solve in (solve_pairwise, solve_joint_optimisation):
+        solution = solve(frames, prior, CONFIG, seed=0, triggered=["camera_radar"])
+        for pair in ("camera_lidar", "lidar_radar"):
+            assert np.array_equal(solution.pairs[pair].T, prior.of(pair))
+            assert not solution.pairs[pair].observable.any()
+            assert "not triggered" in solution.pairs[pair].notes[0]
+        assert rotation_angle_rad(solution.pairs["camera_radar"].T @ np.linalg.inv(prior.T_camera_radar)) > 0
+
+
+def test_joint_with_nothing_triggered_returns_the_prior(frames, prior):
+    solution = solve_joint_optimisation(frames, prior, CONFIG, seed=0, triggered=[])
+    assert all(np.array_equal(solution.pairs[p].T, prior.of(p)) for p in PAIRS)
+
+
+def test_joint_objective_is_one_plus_losses_times_one_plus_loop(frames, prior):
+    problems = {pair: pair_problem(pair, frames[pair], prior, CONFIG) for pair in PAIRS}
+    scales = {"camera_lidar": 0.5, "lidar_radar": 2.0}
+    x = np.zeros((2, 12))
+    x[1, 0] = 0.01
+    cost = joint_costs(problems, prior, scales, x)
+    losses = {p: problems[p].loss(np.stack([prior.of(p)]))[0] for p in scales}
+    assert cost[0] == pytest.approx(
+        1 + losses["camera_lidar"] / 0.5 + losses["lidar_radar"] / 2.0
+    )  # the prior's loop is closed
+    moved = problems["camera_lidar"].loss(poses_about(prior.T_camera_lidar, x[1:, :6]))[0]
+    T_loop = poses_about(prior.T_camera_lidar, x[1:, :6])[0] @ np.linalg.inv(prior.T_camera_lidar)
+    loop = 0.01 + np.abs(T_loop[:3, 3]).sum()
+    assert cost[1] == pytest.approx((1 + moved / 0.5 + losses["lidar_radar"] / 2.0) * (1 + loop), rel=1e-9)
+
+
+def test_uncertainty_is_said_to_be_ours_and_is_no_smaller_than_the_bias_floor(pairwise):
+    estimate = pairwise.pairs["camera_lidar"]
+    assert "the paper gives no uncertainty" in estimate.notes[0]
+    assert np.all(np.sqrt(np.diag(estimate.covariance)[:3]) >= np.radians(0.33))
+
+
+def test_sandwich_covariance_is_that_of_the_mean_for_independent_quadratic_losses():
+    rng = np.random.default_rng(0)
+    sigma = np.array([0.004] * 3 + [0.05] * 3)
+    centres = rng.normal(size=(4000, 6)) * sigma
+
+    def frame_losses(T):
+        from pipeline.geometry.se3 import log_se3
+
+        return (((log_se3(T)[:, None] - centres[None]) / sigma) ** 2).sum(axis=2)
+
+    wide = np.eye(6) * 100.0
+    covariance, observability = sandwich_covariance(
+        frame_losses, np.eye(4), np.arange(4000), wide, (0.0, 0.0)
+    )
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), sigma / np.sqrt(4000), rtol=0.05)
+    assert np.all(observability > 0.999)
+
+
+def test_sandwich_keeps_the_prior_along_what_the_losses_do_not_see():
+    def blind(T):
+        return np.outer(T[:, 0, 3] ** 2, np.ones(20))  # sees tx only
+
+    prior_covariance = np.diag([1e-3] * 3 + [0.01] * 3)
+    covariance, observability = sandwich_covariance(
+        blind, np.eye(4), np.arange(20), prior_covariance, (0.0, 0.0)
+    )
+    np.testing.assert_allclose(covariance[1, 1], 1e-3, rtol=0.05)
+    assert observability[3] > 0.9
+    assert observability[[0, 1, 2, 4, 5]].max() < 0.1
+
+
+def test_every_method_of_the_table_resolves_and_others_are_a_usage_error():
+    for name in ("pairwise-optimisation", "joint-optimisation"):
+        assert callable(solver_of(name))
+    assert set(METHOD) <= set(METHODS)
+    with pytest.raises(ConfigError, match="not in this version"):
+        solver_of(next(m for m in METHODS if m not in METHOD))
+    with pytest.raises(ConfigError, match="does not exist"):
+        solver_of("magic")

@@ -1,0 +1,163 @@
+"""Which frames are chosen, which are held out, and what is said about the others."""
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.select.coverage import choose_for_information, contents_of
+from pipeline.calibrate.select.frames import (
+    MIN_FRAMES,
+    hold_out,
+    missing_content,
+    select_frames,
+    unmet_conditions,
+)
+from pipeline.config import SelectConfig
+from pipeline.errors import SolveError
+from schemas.calibrations import PAIRS
+from tests.makers.solve_scenes import make_day
+
+CONFIG = SelectConfig(frames=30)
+
+
+@pytest.fixture(scope="module")
+def day():
+    return make_day(60, per_drive=20)
+
+
+def test_every_condition_of_the_paper_is_named_when_it_is_missed(day):
+    frame = day[0]
+    assert unmet_conditions(frame, "camera_lidar", CONFIG) == []
+    late = frame.stamp_ns + 6_000_000
+    assert unmet_conditions(make_changed(frame, camera_stamp_ns=late), "camera_lidar", CONFIG) == ["sync"]
+    assert unmet_conditions(make_changed(frame, sky_fraction=0.19), "camera_radar", CONFIG) == ["sky"]
+    assert unmet_conditions(make_changed(frame, drivable_fraction=0.09), "lidar_radar", CONFIG) == [
+        "drivable"
+    ]
+    two = make_changed(frame, road_user_boxes_px=frame.road_user_boxes_px[:2])
+    assert unmet_conditions(two, "camera_radar", CONFIG) == ["road_users"]
+    two = make_changed(frame, radar_track_xyz_m=frame.radar_track_xyz_m[:2])
+    assert unmet_conditions(two, "lidar_radar", CONFIG) == ["radar_clusters"]
+
+
+def test_conditions_of_a_sensor_that_is_not_in_the_pair_do_not_count(day):
+    dark = make_changed(day[0], sky_fraction=0.0, road_user_boxes_px=np.zeros((0, 4), np.float32))
+    assert unmet_conditions(dark, "lidar_radar", CONFIG) == []
+    no_radar = make_changed(day[0], radar_track_xyz_m=np.zeros((0, 3), np.float32), radar_stamp_ns=0)
+    assert unmet_conditions(no_radar, "camera_lidar", CONFIG) == []
+
+
+def test_held_out_frames_are_no_neighbours_of_the_fit():
+    day = make_day(160, step_s=0.2, per_drive=80)
+    chosen = select_frames(day, CONFIG, paper=True)
+    stamps = np.array([o.stamp_ns for o in day]) * 1e-9
+    for pair in PAIRS:
+        assert len(chosen.holdout[pair]) >= 10
+        gaps = np.abs(stamps[chosen.fit[pair]][:, None] - stamps[chosen.holdout[pair]][None])
+        assert gaps.min() >= 1.0
+
+
+def test_both_parts_reach_over_the_whole_day(day):
+    held = np.array([h is True for h in hold_out(day, 0.2)])
+    assert 0.1 < held.mean() < 0.35
+    assert held[:30].any()
+    assert held[30:].any()
+
+
+def test_a_short_day_still_holds_a_block_out():
+    assert any(h is True for h in hold_out(make_day(12, per_drive=12), 0.2))
+
+
+def edges_at(azimuth_deg, range_m, count=30):
+    angle = np.radians(np.full(count, azimuth_deg) + np.linspace(-2, 2, count))
+    return (range_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], -1)).astype(np.float32)
+
+
+def test_frames_are_spread_over_the_day_and_of_each_stretch_the_one_that_adds_most_is_taken(day):
+    """Every third frame shows what no other shows: it is taken, however many edges of the usual kind others have."""
+    usual = [make_changed(o, lidar_edge_xyz_m=edges_at(0, 15, 300)) for o in day]
+    rare = {
+        i: make_changed(o, lidar_edge_xyz_m=edges_at((-25, 25, 15)[i % 9 // 3], 8))
+        for i, o in enumerate(day)
+        if i % 3 == 1
+    }
+    chosen = select_frames(
+        [rare.get(i, o) for i, o in enumerate(usual)], SelectConfig(frames=15), paper=False
+    )
+    picked = chosen.fit["camera_lidar"]
+    assert len(picked) == 15
+    assert np.diff(picked).max() < 15
+    assert np.mean([i in rare for i in picked]) > 0.6  # by chance a third
+    assert any(i not in rare for i in picked)  # and one of the usual kind
+
+
+def test_chosen_frames_cover_more_of_the_view_than_evenly_spaced_ones():
+    day = make_day(200, seed=4, per_drive=50)
+    contents = contents_of(day, "camera_lidar")
+    chosen = choose_for_information(range(len(day)), contents, 20)
+    covered, even = (np.log1p(contents[list(rows)].sum(axis=0)).sum() for rows in (chosen, range(0, 200, 10)))
+    assert covered > even
+    assert len(set(chosen)) == 20
+
+
+def test_the_same_day_gives_the_same_frames(day):
+    assert select_frames(day, CONFIG, paper=True) == select_frames(day, CONFIG, paper=True)
+
+
+def test_every_frame_is_used_or_counted_with_a_reason(day):
+    late = [make_changed(o, camera_stamp_ns=0) if i % 10 == 0 else o for i, o in enumerate(day)]
+    chosen = select_frames(late, CONFIG, paper=True)
+    for pair in PAIRS:
+        assert len(chosen.fit[pair]) + sum(chosen.rejected[pair].values()) == len(day)
+    assert chosen.rejected["camera_lidar"]["sync"] == 6
+    assert "sync" not in chosen.rejected["lidar_radar"]
+
+
+def test_where_the_paper_leaves_too_few_frames_the_nearest_fill_up_and_the_record_says_so():
+    day = [make_changed(o, sky_fraction=0.05 if i > 3 else 0.3) for i, o in enumerate(make_day(60))]
+    chosen = select_frames(day, CONFIG, paper=True)
+    assert chosen.passed["camera_lidar"] == 4
+    assert len(chosen.fit["camera_lidar"]) == 30
+    assert "hold for 4 frames" in chosen.notes["camera_lidar"][0]
+    assert chosen.notes["lidar_radar"] == []
+
+
+def test_what_the_drive_lacks_is_said_per_pair(day):
+    for pair in PAIRS:
+        assert not any("time offsets" in m or "road users in" in m for m in missing_content(day, pair))
+    slow = [make_changed(o, ego_speed_mps=1.0, radar_has_elevation=False) for o in day]
+    assert "time offsets" in missing_content(slow, "camera_lidar")[0]
+    assert "no elevation" in missing_content(slow, "lidar_radar")[1]
+    empty = [make_changed(o, radar_track_xyz_m=np.zeros((0, 3), np.float32)) for o in day]
+    assert "hardly any moving road users for the radar" in missing_content(empty, "lidar_radar")
+
+
+def test_parts_of_the_view_without_content_are_named(day):
+    right_and_near = [
+        make_changed(o, lidar_edge_xyz_m=np.concatenate([edges_at(-20, 15), edges_at(0, 8)])) for o in day
+    ]
+    assert "hardly any depth edges left of 15 deg or beyond 40 m" in missing_content(
+        right_and_near, "camera_lidar"
+    )
+    everywhere = [
+        make_changed(o, lidar_edge_xyz_m=np.concatenate([edges_at(a, r) for a in (-25, 25) for r in (8, 50)]))
+        for o in day
+    ]
+    assert not any("depth edges" in m for m in missing_content(everywhere, "camera_lidar"))
+    blank = [make_changed(o, marking_xyz_m=np.zeros((0, 3), np.float32)) for o in everywhere]
+    assert "no road markings" in missing_content(blank, "camera_lidar")
+    chosen = select_frames(right_and_near, CONFIG, paper=False)
+    assert chosen.missing["camera_lidar"] == missing_content(
+        [right_and_near[i] for i in chosen.fit["camera_lidar"]], "camera_lidar"
+    )
+
+
+def test_too_few_frames_are_an_error_that_names_the_pair_and_the_reasons():
+    day = [make_changed(o, radar_stamp_ns=0) if i >= 5 else o for i, o in enumerate(make_day(30))]
+    with pytest.raises(SolveError, match=f"camera_radar has . of 30, needs {MIN_FRAMES}.*sync 25"):
+        select_frames(day, CONFIG, paper=True)
+
+
+def make_changed(observation, **changes):
+    from dataclasses import replace
+
+    return replace(observation, **changes)

@@ -1,0 +1,101 @@
+"""What held-out frames say of a pose: the truth is near their own optimum, a displaced pose is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.verify.held_out_score import alignment_of
+from pipeline.calibrate.verify.held_out_update import second_opinion
+from pipeline.calibrate.verify.target_accuracy import claims_of
+from pipeline.config import SolveConfig
+from pipeline.extrinsics.estimates import PairEstimate, Prior
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
+from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
+from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
+
+SIGMA = np.array([*np.radians([0.05] * 3), 0.02, 0.02, 0.02])
+LIMIT = np.radians(0.4)
+
+
+def result(pair, T, dt_s):
+    seen = np.ones(6, bool)
+    return PairEstimate(
+        pair,
+        T,
+        np.diag(SIGMA**2),
+        seen.astype(float),
+        seen,
+        50,
+        time_offset_s=dt_s,
+        time_offset_sigma_s=0.003,
+    )
+
+
+def turned(T, axis, degrees):
+    vector = np.zeros(3)
+    vector[axis] = np.radians(degrees)
+    return from_rotation_translation(exp_so3(vector) @ T[:3, :3], T[:3, 3])
+
+
+def claims(estimate, day, prior):
+    ask = alignment_of(estimate, day, prior, SolveConfig())
+    covariance = np.diag([*SIGMA**2, *ask.extra_variance])
+    opinion = second_opinion(ask.slopes, covariance, ask.bias, np.arange(len(day)) // 2)
+    return claims_of(estimate.pair, estimate.T, estimate.covariance, opinion, LIMIT, 0.995)
+
+
+@pytest.fixture(scope="module", params=[SPARSE, DENSE], ids=["16 rings", "dense"])
+def traced(request):
+    return traced_day(request.param, 16, seed=7)
+
+
+@pytest.fixture(scope="module")
+def street():
+    return street_day(16, seed=5)
+
+
+def test_camera_lidar_frames_agree_with_the_truth_and_contradict_half_a_degree(traced):
+    prior = Prior(T_TRUE, np.eye(4), np.radians(2), 0.1)
+    here = claims(result("camera_lidar", T_TRUE, 0.0), traced, prior)
+    assert all(c.agreement > 0 for c in here.values())
+    for axis, name in ((1, "azimuth"), (0, "elevation")):
+        off = claims(result("camera_lidar", turned(T_TRUE, axis, 0.5), 0.0), traced, prior)[name]
+        assert off.agreement < 0
+        assert off.margin < here[name].margin
+
+
+def test_registration_contradicts_a_degree_of_yaw_and_leaves_elevation_alone(street):
+    prior = Prior(np.eye(4), T_LIDAR_RADAR, np.radians(2), 0.1)
+    here = claims(result("lidar_radar", T_LIDAR_RADAR, DT_S), street, prior)
+    assert here["azimuth"].agreement > 0
+    off = claims(result("lidar_radar", turned(T_LIDAR_RADAR, 2, 1.0), DT_S), street, prior)
+    assert off["azimuth"].agreement < 0
+    tilted = claims(result("lidar_radar", turned(T_LIDAR_RADAR, 1, 2.0), DT_S), street, prior)
+    assert tilted["elevation"].shift < np.radians(0.05)  # its elevations are no judge
+    assert tilted["elevation"].remaining == pytest.approx(tilted["elevation"].sigma, rel=0.02)
+
+
+def test_costs_compare_what_the_radar_can_tell_and_nothing_else(street):
+    prior = Prior(np.eye(4), T_LIDAR_RADAR, np.radians(2), 0.1)
+    ask = alignment_of(result("lidar_radar", T_LIDAR_RADAR, DT_S), street, prior, SolveConfig())
+    best = np.nanmean(ask.cost(T_LIDAR_RADAR))
+    np.testing.assert_allclose(ask.cost(turned(T_LIDAR_RADAR, 1, 3.0)), ask.cost(T_LIDAR_RADAR), rtol=1e-3)
+    for yaw in (-1.0, 1.0):
+        assert np.nanmean(ask.cost(turned(T_LIDAR_RADAR, 2, yaw))) > best
+
+
+def test_camera_lidar_costs_prefer_the_truth(traced):
+    wrong = turned(T_TRUE, 1, 2.0)
+    prior = Prior(wrong, np.eye(4), np.radians(2), 0.1)
+    ask = alignment_of(result("camera_lidar", T_TRUE, 0.0), traced, prior, SolveConfig())
+    assert ask.cost(T_TRUE).sum() < ask.cost(wrong).sum()
+    blind = [replace(o, lidar_edge_xyz_m=np.zeros((0, 3), np.float32), lidar_edge_side=np.zeros(0, np.uint8),
+                     lidar_edge_jump_m=np.zeros(0, np.float32), lidar_edge_gap_rad=np.zeros(0, np.float32),
+                     lidar_edge_points=np.zeros(0, np.int32), marking_xyz_m=np.zeros((0, 3), np.float32),
+                     marking_z=np.zeros(0, np.float32)) if i == 0 else o
+             for i, o in enumerate(traced)]  # fmt: skip
+    cost = alignment_of(result("camera_lidar", T_TRUE, 0.0), blind, prior, SolveConfig()).cost(T_TRUE)
+    assert np.isnan(cost[0])
+    assert np.isfinite(cost[1:]).all()
+    assert np.degrees(np.linalg.norm(log_so3(wrong[:3, :3] @ T_TRUE[:3, :3].T))) == pytest.approx(2.0)

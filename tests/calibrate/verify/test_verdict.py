@@ -1,0 +1,268 @@
+"""Held-out frames decide, doubts hold, and nothing worse than the prior passes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
+from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
+from pipeline.calibrate.verify.verdict import Limits, heading_doubts, judge, loop_doubts, moved
+from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
+from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation
+from tests.makers.solve_scenes import make_day
+
+PRIOR = Prior(np.eye(4), np.eye(4), np.radians(2), 0.05)
+SIGMA = np.array([np.radians(0.1)] * 3 + [0.02] * 3)
+LIMITS = Limits(np.radians(6), 0.3)
+BETTER = HeldOutTest(1.0, 0.8, 0.02, 20, 10)
+SAME = HeldOutTest(1.0, 0.99, 0.02, 20, 10)
+WORSE = HeldOutTest(1.0, 1.1, 0.02, 20, 10)
+
+
+def estimate(rotation_deg=0.0, shift_m=0.0, pair="camera_lidar", observable=None):
+    T = from_rotation_translation(
+        exp_so3(np.array([0, np.radians(rotation_deg), 0])), np.array([shift_m, 0, 0])
+    )
+    seen = np.ones(6, bool) if observable is None else np.array(observable, bool)
+    return PairEstimate(pair, T, np.diag(SIGMA**2), np.where(seen, 0.9, 0.1), seen, 50)
+
+
+SURE = {name: Claim(0.001, 0.0, 0.001, 0.001, np.radians(0.2), 0.995) for name in DIRECTIONS}
+
+
+def verdict(result, test, doubts=(), claims=SURE, **changes):
+    prior = PRIOR.covariance("camera_lidar")
+    return judge(result, np.eye(4), prior, test, claims, doubts, LIMITS, **changes)
+
+
+def test_a_better_alignment_is_accepted_without_remark():
+    assert verdict(estimate(1.5), BETTER) == verdict(estimate(1.5), BETTER)
+    assert (verdict(estimate(1.5), BETTER).status, verdict(estimate(1.5), BETTER).reason) == ("accepted", "")
+
+
+def test_a_worse_alignment_is_held_whatever_else_looks_fine():
+    found = verdict(estimate(0.01), WORSE)
+    assert found.status == "held"
+    assert "align worse than at the prior" in found.reason
+
+
+def test_no_better_alignment_is_accepted_where_the_result_agrees_with_the_prior():
+    assert verdict(estimate(0.2), SAME).status == "accepted"
+
+
+def test_no_better_alignment_is_held_where_the_result_claims_to_have_moved():
+    found = verdict(estimate(1.0), SAME)
+    assert found.status == "held"
+    assert "ry moved 10.0 of its sigmas" in found.reason
+
+
+def test_a_dof_that_the_day_did_not_determine_may_not_hold_but_is_named():
+    found = verdict(estimate(1.0, observable=[1, 0, 1, 1, 1, 1]), SAME)
+    assert (found.status, found.reason) == ("accepted", "not determined by the day: ry")
+
+
+def test_doubts_hold_and_are_repeated():
+    found = verdict(
+        estimate(1.5), BETTER, doubts=["restarts disagree by 0.8 deg", "the camera contradicts radar roll"]
+    )
+    assert found.status == "held"
+    assert found.reason == "restarts disagree by 0.8 deg; the camera contradicts radar roll"
+
+
+@pytest.mark.parametrize(
+    ("rotation_deg", "shift_m", "words"),
+    [
+        (11.0, 0.0, "beyond the search range"),
+        (8.5, 0.0, "prior sigmas"),
+        (0.5, 0.31, "beyond the search range"),
+    ],
+)
+def test_moves_beyond_search_range_or_prior_are_held(rotation_deg, shift_m, words):
+    found = verdict(estimate(rotation_deg, shift_m), BETTER)
+    assert found.status == "held"
+    assert words in found.reason
+
+
+def test_without_held_out_frames_nothing_is_accepted():
+    assert verdict(estimate(1.0), None).status == "held"
+    assert "too few held-out frames" in verdict(estimate(1.0), replace(BETTER, frames=2)).reason
+
+
+def test_a_day_that_determines_nothing_is_held():
+    assert "no degree of freedom" in verdict(estimate(0.0, observable=[0] * 6), SAME).reason
+
+
+def test_a_composed_pair_moves_as_far_as_its_factors_do():
+    """Two turns within the search range, or one shift of a lever arm, may add up to more than one range."""
+    good = verdict(estimate(1.5), BETTER)
+    far = estimate(12.0, 0.4)
+    assert verdict(far, BETTER).status == "held"
+    assert verdict(far, BETTER, factors=[good, good]).status == "accepted"
+
+
+def test_a_composed_pair_is_as_good_as_its_factors():
+    good, bad = verdict(estimate(1.5), BETTER), verdict(estimate(1.5), WORSE)
+    assert verdict(estimate(1.0), SAME, factors=[good, good]).status == "accepted"
+    assert (
+        verdict(estimate(1.0), BETTER, factors=[good, bad]).reason
+        == "composed of a pair that is not accepted"
+    )
+    assert "align worse" in verdict(estimate(1.0), WORSE, factors=[good, good]).reason
+    # The composed prior may by chance be better; within the result's sigma that contradicts nothing.
+    assert verdict(estimate(0.2), WORSE, factors=[good, good]).status == "accepted"
+
+
+def test_a_radar_answers_only_for_the_moves_that_held_out_frames_can_tell():
+    tilted = estimate(1.0, pair="lidar_radar")  # pitch
+    assert verdict(tilted, SAME).status == "accepted"
+    turned = replace(tilted, T=from_rotation_translation(exp_so3(np.array([0, 0, 0.02])), np.zeros(3)))
+    assert "rz moved" in verdict(turned, SAME).reason
+
+
+def claim(sigma_deg, shift_deg=0.0, shift_sigma_deg=0.1):
+    sigma, shift, shift_sigma = np.radians([sigma_deg, shift_deg, shift_sigma_deg])
+    return Claim(sigma, shift, shift_sigma, sigma, np.radians(0.2), 0.995)
+
+
+def test_what_the_purpose_needs_more_exactly_than_it_is_known_is_held():
+    found = verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(0.3)})
+    assert found.status == "held"
+    assert found.reason == "azimuth is known to 0.30 deg (1 sigma), not within 0.20 deg at 99.5 %"
+
+
+def test_a_radar_is_accepted_for_its_azimuth_and_says_that_elevation_is_not_vouched_for():
+    claims = SURE | {"elevation": claim(0.5)}
+    assert verdict(estimate(1.5), BETTER, claims=claims).status == "held"
+    found = verdict(estimate(1.5, pair="lidar_radar"), BETTER, claims=claims)
+    assert (found.status, found.determined) == ("accepted", ("azimuth",))
+    assert "elevation not vouched for: known to 0.50 deg" in found.reason
+
+
+def test_held_out_frames_that_lie_elsewhere_by_more_than_their_sigma_hold():
+    off = SURE | {"elevation": claim(0.01, shift_deg=0.15, shift_sigma_deg=0.04)}
+    found = verdict(estimate(1.5, pair="lidar_radar"), BETTER, claims=off)
+    assert found.status == "held"
+    assert "would move the elevation by 0.15 deg, sigma of that 0.04 deg" in found.reason
+    near = SURE | {"elevation": claim(0.01, shift_deg=0.05, shift_sigma_deg=0.04)}
+    assert verdict(estimate(1.5), BETTER, claims=near).status == "accepted"
+
+
+def test_the_score_is_the_smallest_margin_and_ranks():
+    scores = [
+        verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(s)}).score for s in (0.01, 0.04, 0.3)
+    ]
+    assert scores == sorted(scores, reverse=True)
+    assert scores[1] > 0 > scores[2]
+    assert verdict(estimate(1.5), BETTER, doubts=["x"]).score < 0
+    weak = verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(0.06)})
+    strong = verdict(estimate(1.0), BETTER)
+    assert verdict(estimate(1.0), BETTER, factors=[weak, strong]).score == weak.score
+
+
+def test_too_few_frames_are_refused():
+    found = verdict(replace(estimate(1.0), frames_used=3), BETTER)
+    assert (found.status, found.reason) == ("refused", "too few frames: 3, needs 8")
+    why = verdict(replace(estimate(1.0), frames_used=0), BETTER, doubts=["hardly any depth edges"]).reason
+    assert why == "hardly any depth edges; too few frames: 0, needs 8"
+
+
+def test_an_untriggered_pair_keeps_the_prior():
+    assert verdict(estimate(0.0), SAME, calibrated=False).reason == "not triggered: the prior stays"
+
+
+def test_moved_measures_turn_and_shift_apart():
+    T = from_rotation_translation(exp_so3(np.array([0.1, 0, 0])), np.array([1.0, 2, 3]))
+    np.testing.assert_allclose(
+        moved(T, from_rotation_translation(np.eye(3), np.ones(3))), [0.1, 0, 0, 0, 1, 2]
+    )
+
+
+def solution(open_by):
+    pairs = {p: estimate(pair=p) for p in ("camera_lidar", "camera_radar", "lidar_radar")}
+    angle, shift = open_by
+    return Solution("joint", pairs, angle, shift)
+
+
+def test_a_loop_within_its_sigma_raises_no_doubt():
+    assert loop_doubts(solution((np.radians(0.3), 0.05))) == []
+
+
+def test_a_loop_beyond_three_sigma_is_a_doubt():
+    assert "open by 2.00 deg" in loop_doubts(solution((np.radians(2), 0.05)))[0]
+    assert "open by 0.500 m" in loop_doubts(solution((0.0, 0.5)))[0]
+
+
+def test_a_method_without_independent_pairs_has_no_loop_to_doubt():
+    assert loop_doubts(solution((None, None))) == []
+
+
+def test_loop_doubts_come_at_their_rate_when_the_sigmas_are_right():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(400):
+        cl, lr, cr = (exp_se3(rng.normal(size=6) * SIGMA) for _ in range(3))
+        loop = cl @ lr @ np.linalg.inv(cr)
+        angle = float(np.arccos(np.clip((np.trace(loop[:3, :3]) - 1) / 2, -1, 1)))
+        hits += bool(loop_doubts(solution((angle, float(np.linalg.norm(loop[:3, 3]))))))
+    assert hits <= 4
+
+
+def test_paired_test_sees_a_small_change_in_large_scatter():
+    rng = np.random.default_rng(0)
+    level = rng.normal(size=200) * 5
+    blocks = np.arange(200) // 5
+    found = paired_test(level, level - 0.1 + rng.normal(size=200) * 0.2, blocks)
+    assert found.z < -4
+    assert (found.frames, found.blocks) == (200, 40)
+
+
+def test_paired_test_counts_blocks_not_frames():
+    rng = np.random.default_rng(0)
+    blocks = np.repeat(np.arange(10), 50)
+    shared = np.repeat(rng.normal(size=10), 50)  # the same scene fifty times says it once
+    found = paired_test(np.zeros(500), shared, blocks)
+    assert found.standard_error == pytest.approx(shared[::50].std(ddof=1) / np.sqrt(10), rel=1e-6)
+
+
+def test_paired_test_is_rarely_fooled_by_noise():
+    rng = np.random.default_rng(1)
+    z = [paired_test(np.zeros(40), rng.normal(size=40), np.arange(40) // 2).z for _ in range(500)]
+    assert np.mean(np.abs(z) > 1.64) == pytest.approx(0.10, abs=0.05)
+
+
+def test_paired_test_leaves_out_frames_that_cannot_tell():
+    found = paired_test(np.array([1.0, np.nan, 2, 3]), np.array([0.0, 1, np.nan, 2]), np.arange(4))
+    assert (found.before, found.after, found.frames) == (2.0, 1.0, 2)
+    assert paired_test(np.full(3, np.nan), np.ones(3), np.arange(3)) is None
+
+
+def test_two_blocks_are_no_proof_however_well_they_agree():
+    before = np.zeros(8)
+    blocks = np.repeat([0, 1], 4)
+    after = np.repeat([1.0, 1.1], 4)
+    found = paired_test(before, after, blocks)
+    assert (after.mean() - 0) / found.standard_error > 15
+    assert 1 < found.z < 2.5
+
+
+def test_nothing_changed_is_neither_better_nor_worse():
+    assert paired_test(np.ones(5), np.ones(5), np.arange(5)).z == 0
+
+
+def test_a_radar_that_turned_beyond_its_prior_casts_doubt_on_what_was_solved_along_its_heading():
+    day = make_day(5, ego_speed_mps=30.0)
+    limit = np.radians(0.2)
+
+    def doubts(turn_deg, dt_s):
+        T = from_rotation_translation(exp_so3(np.array([0, 0, np.radians(turn_deg)])), np.zeros(3))
+        pairs = {
+            "camera_lidar": replace(estimate(), time_offset_s=dt_s),
+            "lidar_radar": replace(estimate(pair="lidar_radar"), T=T),
+        }
+        return heading_doubts(Solution("joint", pairs), PRIOR, day, limit)
+
+    assert "turns by 9.0 deg: 0.09 m aside" in doubts(9.0, 0.02)[0]
+    assert doubts(9.0, 0.0) == []  # nothing was moved
+    assert doubts(9.0, None) == []
+    assert doubts(2.0, 0.02) == []  # within the prior's sigma: the covariance's business

@@ -1,0 +1,106 @@
+"""Radar messages of three kinds become points with range rates that grow when things recede."""
+
+import numpy as np
+import pytest
+
+from pipeline.config import RadarTopics
+from pipeline.ingest.messages.radar import read_radar
+
+
+def config(**fields):
+    return RadarTopics(points="/radar", **fields)
+
+
+def test_range_rate_is_positive_for_receding_whatever_the_sign_in_the_log(kit):
+    message = kit.Kit().cloud(0, kit.radar(0))
+    doppler = kit.radar(0)["doppler"]
+    receding = read_radar(message, "sensor_msgs/msg/PointCloud2", config(doppler_positive="receding"))
+    approaching = read_radar(message, "sensor_msgs/msg/PointCloud2", config(doppler_positive="approaching"))
+    np.testing.assert_array_equal(receding.range_rate_mps, doppler)
+    np.testing.assert_array_equal(approaching.range_rate_mps, -doppler)
+
+
+def test_a_doppler_field_that_is_not_there_is_named_with_those_that_are(kit):
+    message = kit.Kit().cloud(0, kit.radar(0))
+    with pytest.raises(ValueError, match=r"'velocity'.*x, y, z, doppler, power"):
+        read_radar(message, "sensor_msgs/msg/PointCloud2", config(doppler_field="velocity"))
+
+
+def test_a_planar_radar_is_flagged(kit):
+    columns = kit.radar(0)
+    with_elevation = read_radar(kit.Kit().cloud(0, columns), "PointCloud2", config())
+    del columns["z"]
+    planar = read_radar(kit.Kit().cloud(0, columns), "PointCloud2", config())
+    assert with_elevation.has_elevation
+    assert not planar.has_elevation
+    assert not planar.xyz_m[:, 2].any()
+
+
+def test_radar_points_that_are_not_finite_are_dropped_and_counted(kit):
+    columns = kit.radar(0)
+    columns["doppler"][0], columns["x"][1] = np.nan, np.inf
+    for name in "xyz":
+        columns[name][2] = 0
+    columns["y"][3] = 4e6
+    cloud = read_radar(kit.Kit().cloud(0, columns), "PointCloud2", config())
+    assert dict(cloud.dropped) == {
+        "radar_points_not_finite": 2,
+        "radar_points_at_no_range": 1,
+        "radar_points_beyond_range": 1,
+    }
+    np.testing.assert_array_equal(cloud.power_db, columns["power"][4:])
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+@pytest.mark.parametrize("azimuth_positive", ["left", "right"])
+def test_radar_scans_are_read_by_their_angles(kit, tmp_path, run_ingest, ros, azimuth_positive):
+    drive = kit.Kit(ros=ros).drive()
+    azimuth, elevation, distance = np.array([0.5, -0.2]), np.array([0.1, -0.05]), np.array([20.0, 50.0])
+    for i in range(4):
+        kind = "radar_msgs/msg/RadarReturn"
+        returns = [
+            drive.new(kind, range=r, azimuth=a, elevation=e, doppler_velocity=-5.0, amplitude=12.0)
+            for r, a, e in zip(distance, azimuth, elevation, strict=True)
+        ]
+        stamp = kit.START_NS + i * kit.PERIOD_NS
+        scan = drive.new("radar_msgs/msg/RadarScan", header=drive.header(stamp, "radar"), returns=returns)
+        drive.replaced(kit.RADAR, i, scan)
+    log = drive.bag(tmp_path / "a.bag") if ros == 1 else drive.mcap(tmp_path / "a.mcap")
+    fleet = kit.fleet(radar={"azimuth_positive": azimuth_positive, "doppler_positive": "receding"})
+    _, frames = run_ingest(log, fleet=fleet)
+    assert len(frames) == 4
+    sign = 1 if azimuth_positive == "left" else -1
+    xyz = frames[0].radar_xyz_m.astype(float)
+    np.testing.assert_allclose(np.arctan2(xyz[:, 1], xyz[:, 0]), sign * azimuth, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(xyz, axis=1), distance, rtol=1e-6)
+    np.testing.assert_allclose(np.arcsin(xyz[:, 2] / distance), elevation, atol=1e-6)
+    np.testing.assert_array_equal(frames[0].radar_range_rate_mps, [-5.0, -5.0])
+    np.testing.assert_array_equal(frames[0].radar_power_db, [12.0, 12.0])
+
+
+@pytest.mark.parametrize("old_types", [False, True])
+def test_radar_tracks_are_read_by_the_definition_in_the_log_whichever_version_it_is(
+    kit, tmp_path, run_ingest, old_types
+):
+    drive = kit.Kit(old_types=old_types).drive()
+    zero = drive.vector("Vector3", 0, 0, 0)
+    uuid = (
+        {}
+        if old_types
+        else {"uuid": drive.new("unique_identifier_msgs/msg/UUID", uuid=np.arange(16, dtype=np.uint8))}
+    )
+    rest = {"track_id": 7, "classification": "car"} if old_types else {**uuid, "classification": 32001}
+    for i in range(4):
+        track = drive.new(
+            "radar_msgs/msg/RadarTrack",
+            position=drive.vector("Point", 30, 40, 0),
+            velocity=drive.vector("Vector3", 3, 4, 0),
+            acceleration=zero,
+            size=zero,
+            **rest,
+        )
+        header = drive.header(kit.START_NS + i * kit.PERIOD_NS, "radar")
+        drive.replaced(kit.RADAR, i, drive.new("radar_msgs/msg/RadarTracks", header=header, tracks=[track]))
+    _, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    np.testing.assert_array_equal(frames[2].radar_xyz_m, [[30, 40, 0]])
+    np.testing.assert_allclose(frames[2].radar_range_rate_mps, [5.0])  # along the line of sight, moving away

@@ -1,0 +1,158 @@
+"""Boxes, poles and painted lines on a road, traced ray by ray for a camera and a lidar, truth known.
+
+Exact geometry and no noise model: what the camera-lidar terms must find is in the picture by construction. The world
+is where the camera's clock says it is: with a time offset dt it has moved dt times the own speed (stamp_camera =
+stamp_lidar + dt).
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from pipeline.config import PerceiveConfig
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.perceive.depth_edges import lidar_edges
+from pipeline.perceive.road_markings import lidar_markings, road_contrast
+from schemas.observations import Observation
+from tests.makers.solve_scenes import AXES, make_observation
+
+GROUND_M = -1.8
+ROAD_HALF_WIDTH_M = 6.0
+ROAD, TERRAIN, VEGETATION, POLE, SKY, CAR = 0, 9, 8, 5, 10, 13
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A camera at label size times two, and a lidar's beams."""
+
+    camera: Camera
+    elevations_deg: np.ndarray
+    azimuth_step_deg: float
+    half_width_deg: float
+    T_camera_lidar: np.ndarray
+    has_ring: bool = True
+
+
+T_TRUE = from_rotation_translation(
+    exp_so3(np.array([0.012, -0.02, 0.015])) @ AXES, np.array([0.05, -0.2, -0.1])
+)
+PINHOLE = Camera(
+    "plumb_bob", np.array([[900.0, 0, 449.5], [0, 900.0, 159.5], [0, 0, 1]]), np.zeros(0), 900, 320
+)
+FISHEYE = Camera(
+    "equidistant", np.array([[600.0, 0, 449.5], [0, 600.0, 199.5], [0, 0, 1]]), np.zeros(4), 900, 400
+)
+SPARSE = Rig(PINHOLE, np.arange(-15.0, 16.0, 2.0), 0.2, 40.0, T_TRUE)
+DENSE = Rig(FISHEYE, np.arange(-12.0, 6.0, 0.25), 0.25, 30.0, T_TRUE, has_ring=False)
+
+
+def traced_day(
+    rig: Rig, frames: int, seed: int, dt_s: float = 0.0, *, reflective: bool = True
+) -> list[Observation]:
+    """Observations of independent scenes, six frames to a drive, every third standing still."""
+    rng = np.random.default_rng(seed)
+    speeds = [0.0 if i % 3 == 0 else float(rng.uniform(5, 25)) for i in range(frames)]
+    return [traced_frame(rig, rng, i, speeds[i], dt_s, reflective=reflective) for i in range(frames)]
+
+
+def traced_frame(
+    rig: Rig, rng: np.random.Generator, index: int, speed_mps: float, dt_s: float, *, reflective: bool
+) -> Observation:
+    """One scene, seen by both sensors."""
+    boxes, labels_of_box = scatter_boxes(rng)
+    phase = rng.uniform(0, 12)
+    label_camera = rig.camera.scaled(0.5)
+    u, v = np.meshgrid(
+        np.arange(label_camera.width_px, dtype=float), np.arange(label_camera.height_px, dtype=float)
+    )
+    rays = label_camera.unproject(np.stack([u, v], -1).reshape(-1, 2))
+    T_lidar_camera = inverse(rig.T_camera_lidar)
+    # The image is dt older on the lidar's clock: the car stood speed * dt behind.
+    origin = T_lidar_camera[:3, 3] - np.array([speed_mps * dt_s, 0, 0])
+    _, what, paint = trace(origin, rays @ T_lidar_camera[:3, :3].T, boxes, labels_of_box, phase)
+    labels = what.reshape(u.shape).astype(np.uint8)
+    grey = np.where(what == ROAD, np.where(paint, 200, 80), 120).reshape(u.shape).astype(np.uint8)
+    grey = cv2.GaussianBlur(grey, (3, 3), 0.7)
+
+    xyz, ring, cluster, is_ground, intensity = sweep(rig, boxes, labels_of_box, phase)
+    edges = lidar_edges(xyz, ring, cluster, PerceiveConfig())
+    marks = lidar_markings(xyz, intensity if reflective else None, ring, is_ground)
+    return replace(
+        make_observation(rng, index, index // 6, float(index)),
+        image_width_px=rig.camera.width_px, image_height_px=rig.camera.height_px,
+        camera_model=rig.camera.model, camera_K=rig.camera.K, camera_D=rig.camera.D,
+        ego_speed_mps=speed_mps, ego_yaw_rate_radps=None, radar_velocity_mps=None,
+        labels_png=cv2.imencode(".png", labels)[1].tobytes(), label_scale=0.5,
+        road_contrast_png=cv2.imencode(".png", road_contrast(grey, labels == ROAD))[1].tobytes(),
+        lidar_map_xyz_m=xyz, lidar_map_is_ground=is_ground.astype(np.uint8), lidar_map_cluster=cluster,
+        lidar_edge_xyz_m=edges.xyz_m, lidar_edge_side=edges.side, lidar_edge_jump_m=edges.jump_m,
+        lidar_edge_gap_rad=edges.gap_rad, lidar_edge_points=edges.points,
+        marking_xyz_m=marks.xyz_m, marking_z=marks.z, ground_plane=np.array([0.0, 0, 1, -GROUND_M]),
+    )  # fmt: skip
+
+
+def scatter_boxes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (lower, upper corner) and their labels: cars, poles, and a hedge far behind."""
+    lower, upper, labels = [], [], []
+    for _ in range(7):
+        x, y = rng.uniform(8, 40), rng.uniform(-12, 12)
+        lower.append([x, y - 0.9, GROUND_M])
+        upper.append([x + 4.0, y + 0.9, GROUND_M + 1.6])
+        labels.append(CAR)
+    for _ in range(8):
+        x, y = rng.uniform(7, 35), rng.choice([-1, 1]) * rng.uniform(4, 14)
+        lower.append([x, y - 0.15, GROUND_M])
+        upper.append([x + 0.3, y + 0.15, GROUND_M + 5.0])
+        labels.append(POLE)
+    lower.append([60.0, -80, GROUND_M])
+    upper.append([62.0, 80, GROUND_M + 3.0])
+    labels.append(VEGETATION)
+    return np.stack([lower, upper]), np.array(labels)
+
+
+def trace(
+    origin: np.ndarray, direction: np.ndarray, boxes: np.ndarray, labels_of_box: np.ndarray, phase: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Range (inf = sky), label and paint of what each ray meets first."""
+    safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+    t0, t1 = ((corner[:, None] - origin) / safe for corner in boxes)
+    near, far = np.minimum(t0, t1).max(-1), np.maximum(t0, t1).min(-1)
+    to_box = np.where((near <= far) & (near > 0), near, np.inf)
+    to_ground = np.where(safe[:, 2] < 0, (GROUND_M - origin[2]) / safe[:, 2], np.inf)
+    to_ground = np.where(to_ground < 90.0, to_ground, np.inf)
+    first = to_box.argmin(0)
+    box = to_box.min(0)
+    distance = np.minimum(box, to_ground)
+    at = origin + np.where(np.isfinite(distance), distance, 0.0)[:, None] * direction
+    is_ground = (to_ground < box) & np.isfinite(distance)
+    on_road = is_ground & (np.abs(at[:, 1]) < ROAD_HALF_WIDTH_M)
+    label = np.where(
+        np.isfinite(distance),
+        np.where(is_ground, np.where(on_road, ROAD, TERRAIN), labels_of_box[first]),
+        SKY,
+    )
+    dashed = (np.abs(at[:, 1]) < 0.1) & ((at[:, 0] + phase) % 12 < 6)
+    solid = np.abs(np.abs(at[:, 1]) - 4.5) < 0.1
+    arrow = (np.abs(at[:, 1] - 2.2) < 0.5) & ((at[:, 0] + phase) % 17 < 1.0)
+    return distance, label, on_road & (dashed | solid | arrow)
+
+
+def sweep(
+    rig: Rig, boxes: np.ndarray, labels_of_box: np.ndarray, phase: float
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray, np.ndarray]:
+    """Points, ring, cluster, ground mask and intensity of one sweep."""
+    azimuth = np.radians(np.arange(-rig.half_width_deg, rig.half_width_deg, rig.azimuth_step_deg))
+    e, a = np.meshgrid(np.radians(rig.elevations_deg), azimuth, indexing="ij")
+    rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1).reshape(-1, 3)
+    distance, label, paint = trace(np.zeros(3), rays, boxes, labels_of_box, phase)
+    ring = np.repeat(np.arange(len(rig.elevations_deg)), len(azimuth)).astype(np.uint16)
+    hit = np.isfinite(distance)
+    xyz = (rays * np.where(hit, distance, 0.0)[:, None])[hit].astype(np.float32)
+    inside = [np.all((xyz > lo - 0.05) & (xyz < hi + 0.05), axis=1) for lo, hi in zip(*boxes, strict=True)]
+    is_ground = np.isin(label[hit], (ROAD, TERRAIN))
+    cluster = np.where(is_ground, -1, np.argmax(inside, axis=0)).astype(np.int32)
+    intensity = np.where(paint, 90.0, 20.0)[hit].astype(np.float32)
+    intensity += np.random.default_rng(0).normal(0, 2.0, len(intensity)).astype(np.float32)
+    return xyz, ring[hit] if rig.has_ring else None, cluster, is_ground, intensity

@@ -1,0 +1,91 @@
+"""Lakes of a small fleet for the tests of prepare, loader and what trains on them: no simulator, seconds to make."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipeline.config import FleetConfig
+from pipeline.learn.prepare.stage import decided_sides, prepare_day
+from pipeline.learn.prepare.survey import plan_days, survey_day
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import write_partition
+from schemas.frames import FRAMES, Frame
+from schemas.observations import OBSERVATIONS, Observation
+from tests.makers import solve_scenes
+
+TOPICS = {
+    "camera": {
+        "image": "/image", "info": "/info",
+        "semantics": {"source": "topics", "labels": "/labels", "detections": "/detections"},
+    },
+    "lidar": {"points": "/lidar"},
+    "radar": {"points": "/radar"},
+}  # fmt: skip
+SMALL = {
+    "lidar_points": 1024, "cluster_points": 256, "edge_points": 128, "grid_width_deg": 51.2, "grid_height_deg": 25.6,
+}  # fmt: skip
+PALETTE = np.random.default_rng(7).integers(0, 255, (256, 3)).astype(np.uint8)
+
+
+def fleet_of(vehicles, **prepare) -> FleetConfig:
+    """A configuration that knows these vehicles, with small rows."""
+    return FleetConfig.model_validate(
+        {
+            "fleet": {"name": "tests"},
+            "rigs": {"default": TOPICS},
+            "vehicles": {v: {"rig": "default"} for v in vehicles},
+            "prepare": SMALL | prepare,
+        }
+    )
+
+
+def fill(lake: Lake, vehicle: str, day: str, frames: int = 6, seed: int | None = None, **changes) -> None:
+    """Write frames and observations of one vehicle-day; each (vehicle, day) has scenes of its own."""
+    if seed is None:
+        seed = int.from_bytes(f"{vehicle}{day}".encode(), "big") % 2**31
+    observations = solve_scenes.make_day(frames, seed=seed)
+    rows = [frame_of(o, np.random.default_rng([seed, i]), **changes) for i, o in enumerate(observations)]
+    partition = Partition(vehicle, day)
+    for schema, content in ((FRAMES, rows), (OBSERVATIONS, observations)):
+        with write_partition(lake, schema, partition, f"{schema.name}-{seed}-{frames}", "test") as writer:
+            for first in range(0, frames, 4):
+                writer.append(content[first : first + 4])
+            writer.describe(kept={}, rejected={})
+
+
+def prepare_all(lake, fleet):
+    """What `boresight prepare` does, in this process; results by partition."""
+    surveys = [survey_day(p, lake, fleet.prepare) for p in lake.partitions(OBSERVATIONS.name)]
+    plan = plan_days(surveys, fleet.prepare, decided_sides(lake, fleet.prepare))
+    return {s.partition: prepare_day(s.partition, fleet, lake, plan) for s in surveys}
+
+
+def frame_of(observation: Observation, rng: np.random.Generator, **changes) -> Frame:
+    """The frame that an observation could come from: its label image painted, its map as the sweep."""
+    labels = cv2.imdecode(np.frombuffer(observation.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    size = (observation.image_width_px, observation.image_height_px)
+    texture = cv2.resize(rng.integers(0, 120, (12, 16, 3)).astype(np.uint8), size)
+    image = cv2.resize(PALETTE[labels], size, interpolation=cv2.INTER_NEAREST) // 2 + texture
+    cloud, radar = observation.lidar_map_xyz_m, observation.radar_xyz_m
+    values = dict.fromkeys((f.name for f in fields(Frame)), None)
+    values |= {f.name: getattr(observation, f.name) for f in fields(Observation) if f.name in values}
+    values |= {
+        "lidar_stamp_ns": observation.stamp_ns, "labels_png": None,
+        "image": cv2.imencode(".jpg", image)[1].tobytes(), "image_format": "jpeg",
+        "lidar_x_m": cloud[:, 0], "lidar_y_m": cloud[:, 1], "lidar_z_m": cloud[:, 2],
+        "lidar_intensity": rng.uniform(0, 90, len(cloud)).astype(np.float32), "lidar_deskewed": False,
+        "radar_x_m": radar[:, 0], "radar_y_m": radar[:, 1], "radar_z_m": radar[:, 2],
+        "radar_range_rate_mps": np.zeros(len(radar), np.float32),
+    }  # fmt: skip
+    return Frame(**(values | changes))
+
+
+def fleet_lake(folder: Path, vehicles=("a", "b", "c", "d"), days=("2026-01-01",), frames: int = 6) -> Lake:
+    """Vehicles that all drive on all of these days."""
+    lake = Lake.at(folder)
+    for vehicle in vehicles:
+        for day in days:
+            fill(lake, vehicle, day, frames)
+    return lake

@@ -1,0 +1,169 @@
+"""The stage: frames in, observations out; faults are counted, and the same work is not done twice."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config import FleetConfig
+from pipeline.errors import ConfigError, ContractError
+from pipeline.perceive.stage import perceive_day
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_manifest, read_rows, write_partition
+from schemas.frames import FRAMES
+from schemas.observations import OBSERVATIONS, Observation
+
+DAY = Partition("car-1", "2026-03-02")
+
+
+def fleet(**perceive):
+    return FleetConfig.model_validate(
+        {
+            "fleet": {"name": "made"},
+            "rigs": {
+                "default": {
+                    "camera": {
+                        "image": "/i", "info": "/c",
+                        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
+                    },
+                    "lidar": {"points": "/p"},
+                    "radar": {"points": "/r"},
+                }
+            },
+            "vehicles": {"car-1": {}},
+            "perceive": perceive,
+        }
+    )  # fmt: skip
+
+
+def write_frames(lake, frames, key="frames-key", group=3):
+    with write_partition(lake, FRAMES, DAY, key, "test") as writer:
+        for first in range(0, len(frames), group):
+            writer.append(frames[first : first + group])
+        writer.describe(kept={}, rejected={})
+
+
+@pytest.fixture
+def lake(tmp_path, made_frame):
+    """A lake with one drive of five frames."""
+    lake = Lake.at(tmp_path / "lake")
+    write_frames(lake, [made_frame(i) for i in range(5)])
+    return lake
+
+
+def rows(lake):
+    return read_rows(lake, OBSERVATIONS, DAY, Observation)
+
+
+def test_a_days_frames_become_observations(lake):
+    result = perceive_day(DAY, fleet(), lake)
+    assert (result.stage, result.status, result.rows, result.rejected) == ("perceive", "done", 5, {})
+    observations = rows(lake)
+    assert [o.frame_index for o in observations] == [0, 1, 2, 3, 4]
+    for o in observations:
+        assert o.ground_plane[3] == pytest.approx(1.7, abs=0.05)
+        assert o.ego_speed_mps == pytest.approx(8.0, abs=0.1)
+        assert o.road_user_classes == ["car", "person"]
+        assert len(o.lidar_map_xyz_m) == len(o.lidar_map_is_ground) == len(o.lidar_map_cluster)
+        assert o.lidar_map_cluster.max() < len(o.lidar_cluster_centre_m)
+        assert len(o.lidar_edge_xyz_m) > 0
+        # The driving car is one lidar object, one radar cluster and one track.
+        car = np.array([14.1, 0.0, -0.8])
+        assert np.min(np.linalg.norm(o.lidar_cluster_centre_m - car, axis=1)) < 0.3
+        assert np.all(o.radar_drivable_range_m > 3)
+
+
+def test_the_car_ahead_is_one_track_through_the_drive(lake):
+    perceive_day(DAY, fleet(), lake)
+    tracked = [(o.radar_track_id.tolist(), o.radar_track_age.tolist()) for o in rows(lake)]
+    assert tracked == [([0], [k]) for k in range(1, 6)]
+    last = rows(lake)[-1]
+    assert last.radar_track_velocity_mps[0] == pytest.approx([5.0, 0.0, 0.0], abs=0.5)
+
+
+def test_the_same_work_is_cached_and_other_work_is_not(lake, made_frame):
+    first = perceive_day(DAY, fleet(), lake)
+    again = perceive_day(DAY, fleet(), lake)
+    assert (again.status, again.work_key, again.rows) == ("cached", first.work_key, 5)
+    other = perceive_day(DAY, fleet(voxel_m=0.5), lake)
+    assert other.status == "done"
+    assert other.work_key != first.work_key
+    write_frames(lake, [made_frame(0)], key="other-key")
+    assert perceive_day(DAY, fleet(voxel_m=0.5), lake).rows == 1
+
+
+def test_the_same_frames_give_the_same_bytes(lake, tmp_path, made_frame):
+    perceive_day(DAY, fleet(), lake)
+    twin = Lake.at(tmp_path / "twin")
+    write_frames(twin, [made_frame(i) for i in range(5)], group=1)
+    perceive_day(DAY, fleet(), twin)
+    for a, b in zip(rows(lake), rows(twin), strict=True):
+        assert a.labels_png == b.labels_png
+        for name in ("lidar_map_xyz_m", "lidar_edge_xyz_m", "marking_z", "ground_plane", "radar_track_xyz_m"):
+            assert np.array_equal(getattr(a, name), getattr(b, name)), name
+
+
+def test_bad_frames_are_counted_by_reason_and_do_not_stop_the_day(lake, made_frame):
+    frames = [made_frame(i) for i in range(8)]
+    frames[1] = replace(frames[1], image=b"broken")
+    frames[2] = replace(frames[2], labels_png=None)
+    frames[3] = replace(frames[3], detection_boxes_px=None, detection_classes=None, detection_scores=None)
+    frames[4] = replace(frames[4], **{f"lidar_{a}_m": np.full(6000, np.nan, np.float32) for a in "xyz"})
+    frames[5] = replace(frames[5], camera_D=np.zeros(3))
+    none = np.zeros(0, np.float32)
+    frames[6] = replace(frames[6], radar_x_m=none, radar_y_m=none, radar_z_m=none, radar_range_rate_mps=none)
+    write_frames(lake, frames, key="faulty")
+    result = perceive_day(DAY, fleet(), lake)
+    assert result.status == "done"
+    assert [o.frame_index for o in rows(lake)] == [0, 7]
+    assert result.rejected == {
+        "image_undecodable": 1, "labels_missing": 1, "detections_missing": 1, "lidar_points_too_few": 1,
+        "camera_model_invalid": 1, "radar_points_too_few": 1,
+    }  # fmt: skip
+    assert read_manifest(lake, OBSERVATIONS, DAY).rejected == result.rejected
+
+
+def test_points_that_are_not_numbers_are_left_out(lake, made_frame):
+    frame = made_frame(0)
+    x = frame.lidar_x_m.copy()
+    x[::7] = np.nan
+    write_frames(lake, [replace(frame, lidar_x_m=x)], key="nan")
+    perceive_day(DAY, fleet(), lake)
+    assert np.isfinite(rows(lake)[0].lidar_map_xyz_m).all()
+
+
+def test_sensors_that_say_little_are_enough(lake, made_frame):
+    # No rings, no reflectivity, no power, no elevation: what many sensors log.
+    frame = made_frame(0)
+    bare = replace(
+        frame, lidar_ring=None, lidar_intensity=None, radar_power_db=None,
+        radar_z_m=np.zeros_like(frame.radar_z_m), radar_has_elevation=False,
+    )  # fmt: skip
+    write_frames(lake, [bare], key="bare")
+    assert perceive_day(DAY, fleet(), lake).rows == 1
+    assert rows(lake)[0].marking_xyz_m.shape == (0, 3)
+    assert len(rows(lake)[0].lidar_edge_xyz_m) > 0
+
+
+def test_a_day_without_a_usable_frame_is_refused_and_leaves_no_stale_observations(lake, made_frame):
+    perceive_day(DAY, fleet(), lake)
+    write_frames(lake, [replace(made_frame(i), labels_png=None) for i in range(3)], key="unlabelled")
+    for _ in range(2):
+        result = perceive_day(DAY, fleet(), lake)
+        assert result.status == "refused"
+        assert "3 labels_missing" in result.reason
+        assert rows(lake) == []
+
+
+def test_a_day_without_frames_and_an_unknown_vehicle_are_named(lake):
+    with pytest.raises(ContractError, match="ingest"):
+        perceive_day(Partition("car-1", "2026-03-03"), fleet(), lake)
+    with pytest.raises(ConfigError, match="car-2"):
+        perceive_day(Partition("car-2", DAY.day), fleet(), lake, fleet_file=Path("fleet.toml"))
+
+
+def test_progress_counts_every_frame(lake):
+    seen = []
+    perceive_day(DAY, fleet(), lake, progress=lambda done, total, what: seen.append((done, total, what)))
+    assert seen == [(k, 5, "perceive") for k in range(1, 6)]
