@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from pipeline.calibrate.verify.target_accuracy import target_sigmas
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.geometry.targets import errors_at_targets
-from pipeline.learn import aggregate
+from pipeline.learn.infer import aggregate
 from pipeline.learn.infer.aggregate import Answers, day_estimate, twists_about
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 

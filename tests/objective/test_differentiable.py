@@ -9,7 +9,6 @@ import torch
 
 from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry import se3
-from pipeline.objective import loop
 from pipeline.objective.camera_lidar.score import Alignments, Level, prepare_terms
 from pipeline.objective.differentiable.edges import edge_residuals_px, edge_scores
 from pipeline.objective.differentiable.lookup import bilinear
@@ -29,6 +28,7 @@ from pipeline.objective.differentiable.poses import (
     transform_points,
 )
 from pipeline.objective.differentiable.projection import GridProjection, camera_projection
+from pipeline.objective.paper import loop
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.classes import camera_at_label_size, labels_of
