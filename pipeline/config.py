@@ -206,6 +206,8 @@ class SolveConfig(_Section):
     search_translation_m: Positive = 0.3
     paper_population: Annotated[int, Field(gt=3)] = 90
     paper_generations: Annotated[int, Field(gt=0)] = 60
+    # of joint-optimisation, in equation 2: each pair's loss over its pairwise minimum, or to the letter
+    paper_loss_scale: Literal["pairwise_minimum", "none"] = "pairwise_minimum"
     bootstrap_blocks: Annotated[int, Field(gt=1)] = 24
     time_offset_sigma_s: Positive = 0.05
     terms: tuple[Term, ...] = TERMS  # of method joint; leave some out to see what they are worth
