@@ -3,8 +3,8 @@
 L_P sums the losses of the triggered pairs; the others stay at the prior and still close the loop.
 
 Source: section 4.5.3, equations 1 and 2, the row "joint optimization" of Table 1. Differences are those of `pairwise`,
-and one more: in L_P each pair's loss is divided by the value of its pairwise minimum, unless `solve.paper_loss_scale` is
-"none": equation 2 to the letter. Neither is better in every cell: the study table1 reports both.
+and one more: in L_P each pair's loss is divided by the value of its pairwise minimum, unless `solve.paper_loss_scale`
+is "none": equation 2 to the letter. Neither is better in every cell: the study table1 reports both.
 """
 
 from __future__ import annotations
