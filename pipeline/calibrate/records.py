@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim, target_sigmas
 from pipeline.calibrate.verify.verdict import Verdict, loop_sigmas
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.store.partitions import Partition
@@ -166,10 +166,8 @@ def _assumed(pair: str, observations: Sequence[Observation]) -> list[str]:
     if "camera" not in FRAMES_OF_PAIR[pair] or not observations:
         return assumed
     o = observations[0]
-    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
-    wrong = Camera(
-        o.camera_model, _scaled(o.camera_K, 1.001), o.camera_D, o.image_width_px, o.image_height_px
-    )
+    camera = camera_of(o)
+    wrong = replace(camera, K=_scaled(o.camera_K, 1.001))
     edge = np.array([[0.0, o.image_height_px / 2], [o.image_width_px - 1.0, o.image_height_px / 2]])
     angles = camera_direction_angles(camera.unproject(edge)) - camera_direction_angles(wrong.unproject(edge))
     worth = float(np.degrees(np.abs(angles[:, 0]).max()))

@@ -8,13 +8,16 @@ Brandt 2006, eq. 6).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = ["CAMERA_MODELS", "Camera"]
+from schemas.frames import Frame
+from schemas.observations import Observation
+
+__all__ = ["CAMERA_MODELS", "Camera", "camera_of"]
 
 CAMERA_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
 _MIN_DEPTH_M = 0.05  # nothing that a car camera sees is nearer; keeps 1/z bounded
@@ -62,7 +65,9 @@ class Camera:
         K = self.K.astype(np.float64).copy()
         K[:2, :2] *= scale
         K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5
-        return Camera(self.model, K, self.D, round(self.width_px * scale), round(self.height_px * scale))
+        return replace(
+            self, K=K, width_px=round(self.width_px * scale), height_px=round(self.height_px * scale)
+        )
 
     @cached_property
     def max_angle_rad(self) -> float:
@@ -252,3 +257,13 @@ class Camera:
         theta = np.where(np.abs(self._radius(theta) - radius) > 1e-9, np.nan, theta)
         s = np.where(radius > 1e-12, np.sin(theta) / np.where(radius > 1e-12, radius, 1.0), 1.0)
         return np.stack([s * xd, s * yd, np.cos(theta)], -1)
+
+
+def camera_of(row: Frame | Observation) -> Camera:
+    """The camera of a row, at the size of the full image.
+
+    Raises:
+        ValueError: the columns describe no camera (unknown model, wrong number of coefficients, focal length not
+            positive).
+    """
+    return Camera(row.camera_model, row.camera_K, row.camera_D, row.image_width_px, row.image_height_px)

@@ -19,7 +19,7 @@ from pipeline.config import (
     config_hash,
 )
 from pipeline.errors import ContractError
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.radar_grid import Scan
 from pipeline.perceive.camera import SemanticsSource, TopicSource, decode_grey, encode_png
 from pipeline.perceive.depth_edges import lidar_edges
@@ -183,9 +183,7 @@ def _source(
 
 def _check(frame: Frame) -> None:
     try:
-        Camera(
-            frame.camera_model, frame.camera_K, frame.camera_D, frame.image_width_px, frame.image_height_px
-        )
+        camera_of(frame)
     except ValueError as err:
         raise FrameRejectedError(FrameReason.CAMERA_MODEL) from err
     if len(frame.lidar_x_m) < _MIN_LIDAR_POINTS:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.geometry.se3 import transform_points
 from schemas.frames import Frame
 from schemas.observations import Observation
@@ -22,7 +22,6 @@ __all__ = [
     "Extrinsics",
     "Scene",
     "Window",
-    "camera_of",
     "close_up",
     "decode_image",
     "front_view",
@@ -67,11 +66,6 @@ class Window:
         x0 = int(np.clip(self.centre_px[0] - self.size_px[0] / 2, 0, max(width_px - self.size_px[0], 0)))
         y0 = int(np.clip(self.centre_px[1] - self.size_px[1] / 2, 0, max(height_px - self.size_px[1], 0)))
         return x0, y0
-
-
-def camera_of(row: Frame | Observation) -> Camera:
-    """Intrinsics of a row."""
-    return Camera(row.camera_model, row.camera_K, row.camera_D, row.image_width_px, row.image_height_px)
 
 
 def decode_image(frame: Frame) -> Image:

@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import transform_points
 from pipeline.report.clocks import Clocks, as_stamped
-from pipeline.report.overlays import Extrinsics, camera_of
+from pipeline.report.overlays import Extrinsics
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["MEASURES", "at_pixels", "boundary_distance_px", "frame_residuals"]

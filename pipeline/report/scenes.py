@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import transform_points
-from pipeline.report.overlays import Window, camera_of
+from pipeline.report.overlays import Window
 from pipeline.report.residuals import at_pixels, boundary_distance_px
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 

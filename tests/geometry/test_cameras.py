@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -5,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pipeline.geometry.cameras import CAMERA_MODELS, Camera
+from pipeline.geometry.cameras import CAMERA_MODELS, Camera, camera_of
+from tests.makers.solve_scenes import CAMERA, make_observation
 
 # Coefficients as calibrations of car cameras give them; a barrel that folds over far outside the image.
 DISTORTIONS = {
@@ -167,3 +170,14 @@ def test_contains_counts_the_outer_half_of_border_pixels_and_respects_a_margin()
 def test_impossible_intrinsics_are_refused(model, K, D, match):
     with pytest.raises(ValueError, match=match):
         Camera(model, K, np.array(D), 10, 10)
+
+
+def test_a_row_gives_the_camera_that_its_columns_describe():
+    rng = np.random.default_rng(0)
+    row = make_observation(rng, 0, 0, 0.0, camera_D=np.array([-0.1, 0.02, 0.0, 0.0]))
+    camera = camera_of(row)
+    assert (camera.model, camera.width_px, camera.height_px) == (CAMERA.model, 640, 320)
+    np.testing.assert_array_equal(camera.K, CAMERA.K)
+    np.testing.assert_array_equal(camera.D, row.camera_D)
+    with pytest.raises(ValueError, match="camera model"):
+        camera_of(replace(row, camera_model="thin_prism"))

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import exp_se3, from_rotation_translation, inverse, transform_points
 from pipeline.report.above import top_bitmap, top_view
 from pipeline.report.overlays import (
     Extrinsics,
     Scene,
     Window,
-    camera_of,
     close_up,
     decode_image,
     front_view,

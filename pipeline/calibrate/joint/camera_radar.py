@@ -15,7 +15,7 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import tempered
 from pipeline.calibrate.numerics.covariance import blocks_of, held_covariance, posterior
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3, transform_points
 from pipeline.objective.radar.moving_clusters import (
@@ -174,7 +174,7 @@ def _in_view(
     out = np.zeros(clusters.count, bool)
     for f in np.unique(clusters.frame):
         o = observations[f]
-        camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+        camera = camera_of(o)
         index = np.flatnonzero(clusters.frame == f)
         uv, valid = camera.project(points[index])
         out[index] = valid & (uv[:, 0] > 0) & (uv[:, 0] < o.image_width_px - 1)

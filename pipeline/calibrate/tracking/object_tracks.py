@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow, take_sightings
 from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical
 from schemas.observations import Observation
 
@@ -242,7 +242,7 @@ def _renumbered(track: Track, kept: Sequence[np.ndarray]) -> Track:
 def _boxes(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth and elevation [rad] of box centres, and ranges [m] by height; boxes cut by the border are left out."""
     x0, y0, x1, y1 = o.road_user_boxes_px.astype(np.float64).reshape(-1, 4).T
-    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+    camera = camera_of(o)
     inside = (x0 > _BORDER_PX) & (y0 > _BORDER_PX)
     inside &= (x1 < o.image_width_px - _BORDER_PX) & (y1 < o.image_height_px - _BORDER_PX)
     xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)

@@ -12,13 +12,12 @@ from jaxtyping import Float, UInt8
 
 from pipeline.config import PrepareConfig
 from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.learn.sample.camera_maps import camera_features, stored_grid
 from pipeline.learn.sample.clouds import View, lidar_columns, padded_rows, radar_columns
 from pipeline.learn.sample.grid import Grid, resample_camera
-from pipeline.objective.camera_lidar.image_maps import camera_of
 from pipeline.objective.paper.classes import labels_of
 from schemas.frames import Frame
 from schemas.observations import Observation

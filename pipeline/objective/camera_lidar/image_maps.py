@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Int8, UInt8
 
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, camera_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,7 +26,6 @@ __all__ = [
     "NO_BOUNDARY",
     "CameraMaps",
     "boundary_offsets",
-    "camera_of",
     "contrast_levels",
     "prepare_maps",
 ]
@@ -57,17 +56,6 @@ class CameraMaps:
         np.ndarray
     )  # int8, L F H W: road contrast in CONTRAST_STEP standard deviations of its row, 0 outside
     labels: np.ndarray  # uint8, F H W
-
-
-def camera_of(observation: Observation) -> Camera:
-    """The camera at full image size."""
-    return Camera(
-        observation.camera_model,
-        np.asarray(observation.camera_K, np.float64),
-        np.asarray(observation.camera_D, np.float64),
-        observation.image_width_px,
-        observation.image_height_px,
-    )
 
 
 def _foreground_table() -> UInt8[np.ndarray, "256 256"]:

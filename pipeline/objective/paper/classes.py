@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.errors import ContractError
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.geometry.se3 import transform_points
 from schemas.observations import Observation
 
@@ -17,7 +17,6 @@ __all__ = [
     "SKY",
     "camera_at_label_size",
     "distance_cost",
-    "full_camera",
     "in_camera",
     "labels_of",
     "safely_in_view",
@@ -38,20 +37,9 @@ def labels_of(observation: Observation) -> UInt8[np.ndarray, "H W"]:
     return labels.astype(np.uint8, copy=False)
 
 
-def full_camera(observation: Observation) -> Camera:
-    """The frame's camera at full image size."""
-    return Camera(
-        observation.camera_model,
-        observation.camera_K,
-        observation.camera_D,
-        observation.image_width_px,
-        observation.image_height_px,
-    )
-
-
 def camera_at_label_size(observation: Observation, labels: UInt8[np.ndarray, "H W"]) -> Camera:
     """The frame's camera scaled to its label image, whose size wins over rounding."""
-    scaled = full_camera(observation).scaled(observation.label_scale)
+    scaled = camera_of(observation).scaled(observation.label_scale)
     return Camera(scaled.model, scaled.K, scaled.D, labels.shape[1], labels.shape[0])
 
 

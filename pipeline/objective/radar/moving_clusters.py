@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, wrap_angle
 from pipeline.objective.radar.vehicle_boxes import select_frames
@@ -222,7 +222,7 @@ def _box_azimuths(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth of the centre and range by height of each road-user box."""
     if not len(o.road_user_boxes_px):
         return np.zeros(0), np.zeros(0)
-    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+    camera = camera_of(o)
     x0, y0, x1, y1 = o.road_user_boxes_px.astype(np.float64).T
     xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
     rays = camera.unproject(np.stack([np.stack([xm, y], -1) for y in (ym, y0, y1)]))

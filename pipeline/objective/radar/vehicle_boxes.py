@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import hat, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical, to_spherical
 from schemas.observations import Observation
@@ -194,7 +194,7 @@ def box_equations(
 
 def _boxes_of_frame(o: Observation) -> np.ndarray:
     """Rows (class index, azimuth, elevation, azimuth of left and right side, range by height) of one frame's boxes."""
-    camera = Camera(o.camera_model, o.camera_K, o.camera_D, o.image_width_px, o.image_height_px)
+    camera = camera_of(o)
     boxes = o.road_user_boxes_px.astype(np.float64)
     x0, y0, x1, y1 = boxes.T
     inside = (x0 > 3) & (y0 > 3) & (x1 < o.image_width_px - 4) & (y1 < o.image_height_px - 4)

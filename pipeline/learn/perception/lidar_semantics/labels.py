@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import transform_points
 from schemas.observations import Observation
 
@@ -55,13 +55,7 @@ def project_labels(
     """
     png = np.frombuffer(observation.labels_png, np.uint8)
     image = np.asarray(cv2.imdecode(png, cv2.IMREAD_GRAYSCALE), np.uint8)
-    camera = Camera(
-        observation.camera_model,
-        observation.camera_K,
-        observation.camera_D,
-        observation.image_width_px,
-        observation.image_height_px,
-    ).scaled(observation.label_scale)
+    camera = camera_of(observation).scaled(observation.label_scale)
     half = max(1, round(np.radians(margin_deg) * camera.focal_px[0]))
     window = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
     agreed = cv2.erode(image, window) == cv2.dilate(image, window)
