@@ -6,7 +6,7 @@ Source of workload and goals: evidence on performance, benchmark definitions 1, 
 import numpy as np
 import pytest
 
-from pipeline.objective.paper.cost_maps import frame_costs, frame_gradients
+from pipeline.objective.paper.cost_maps import frame_costs
 from tests.benchmarks.kernel_workload import (
     CENTRE_PX,
     FOCAL_PX,
@@ -28,16 +28,15 @@ HAND_WRITTEN = 1800 / 984
 
 @pytest.fixture(scope="module")
 def times():
-    """CPU seconds per point and pose: naive NumPy, the kernel's value, its gradient, few poses, the bare bound."""
+    """CPU seconds per point and pose: naive NumPy, the kernel, few poses, the bare bound."""
     maps, points, frames, T = workload()
     bound = bare_bound(points, T)
     few = T[:6]  # naive cost is linear in poses: nothing to gain from running all of them
-    frame_gradients(frames, T[:2])
-    slow, value, gradient, batch, bare = best_cpu_s(
+    frame_costs(frames, T[:2])
+    slow, value, batch, bare = best_cpu_s(
         ROUNDS,
         lambda: naive(maps, points, few),
         lambda: frame_costs(frames, T),
-        lambda: frame_gradients(frames, T),
         lambda: frame_costs(frames, few),
         bound,
     )
@@ -45,7 +44,6 @@ def times():
     return {
         "naive": slow / (len(few) * every),
         "value": value / (POSES * every),
-        "gradient": gradient / (POSES * every),
         "few": batch / (len(few) * every),
         "bare": bare / (POSES * POINTS),
     }
@@ -89,11 +87,6 @@ def test_kernel_is_thirty_times_as_fast_as_naive_numpy(times, gate):
 
 def test_kernel_is_near_the_hand_written_one(times, gate):
     gate("objective_vs_hand_written", times["value"] / (times["bare"] * HAND_WRITTEN))
-
-
-def test_gradient_and_matrix_cost_little_more_than_a_value(times, gate):
-    gate("gradient_overhead", times["gradient"] / times["value"])
-    gate("gradient_vs_numpy", times["naive"] / times["gradient"])
 
 
 def test_small_batches_keep_a_third_of_the_rate(times, gate):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.camera_lidar.estimate import AlignmentState, camera_lidar_cost
+from pipeline.calibrate.joint.camera_lidar.estimate import AlignmentState
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import perturb_exactly
 from pipeline.objective.camera_lidar.edges import chance_of, fit_match_share
@@ -15,7 +15,13 @@ from pipeline.objective.camera_lidar.image_maps import (
 )
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_point, project_points
-from pipeline.objective.camera_lidar.score import Alignments, Level, Terms, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar.score import (
+    Alignments,
+    KernelSettings,
+    Terms,
+    lidar_velocities,
+    prepare_terms,
+)
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
 
@@ -93,7 +99,7 @@ def test_gradients_agree_with_differences_of_the_score(camera):
     maps = CameraMaps(camera, offsets, contrast, np.stack([labels] * F))
     velocity = np.array([[12.0, 0.5, 0.0], [5.0, 0.0, 0.0]])
     terms = Terms(maps, camera_parameters(camera), points, points, points, velocity, np.zeros(F))
-    level = Level.wide(20.0, 0)
+    level = KernelSettings.wide(20.0, 0)
     state = AlignmentState(T_TRUE, 0.02, 1.001)
     analytic = terms.gradient(state.alone, level)[0].sum(0)
     h = np.array([1e-3] * 3 + [1e-2] * 3 + [2e-3, 2e-3])
@@ -115,12 +121,12 @@ def test_vector_projection_agrees_with_the_point_by_point_one_and_marks_what_can
 
 
 def test_information_is_positive_semidefinite(terms):
-    _, information = terms.gradient(AlignmentState(T_TRUE, 0.03).alone, Level.wide(3.0, 1))
+    _, information = terms.gradient(AlignmentState(T_TRUE, 0.03).alone, KernelSettings.wide(3.0, 1))
     assert np.linalg.eigvalsh(information.sum(0)).min() > -1e-6 * np.trace(information.sum(0))
 
 
 def test_score_is_best_at_the_true_pose_and_time_offset(terms):
-    level = Level.wide(3.0, 1)
+    level = KernelSettings.wide(3.0, 1)
     rng = np.random.default_rng(0)
     wrong = [perturb_exactly(T_TRUE, np.radians(1.0), 0.05, rng) for _ in range(20)]
     T = np.stack([T_TRUE, *wrong])
@@ -138,12 +144,19 @@ def test_positive_time_offset_moves_static_points_along_the_ego_motion(terms):
     np.testing.assert_allclose(ahead_lidar, 0.1 * terms.velocity_lidar, atol=1e-5)
 
 
-def test_held_out_cost_prefers_the_truth_to_poses_that_turn_everything_out_of_view():
+def test_score_above_chance_prefers_the_truth_to_poses_that_turn_everything_out_of_view():
     day = traced_day(SPARSE, 6, seed=4)
-    truth = camera_lidar_cost(day, T_TRUE).sum()
+    velocity, settings = lidar_velocities(day, np.eye(4)), KernelSettings.wide(1.5, 2)
+
+    def score(T):
+        terms = prepare_terms(day, T, velocity, reach_rad=0.0).sharp(5.0)
+        at = Alignments.of_poses(T[None])
+        return (terms.edge_excess(at, settings) + terms.marking_score(at, settings)).sum()
+
+    truth = score(T_TRUE)
     rng = np.random.default_rng(1)
     for degrees, metres in ((0.5, 0.03), (2.0, 0.1), (8.0, 0.2), (60.0, 0.5)):
-        assert camera_lidar_cost(day, perturb_exactly(T_TRUE, np.radians(degrees), metres, rng)).sum() > truth
+        assert score(perturb_exactly(T_TRUE, np.radians(degrees), metres, rng)) < truth
 
 
 def test_share_of_matches_is_recovered_and_vanishes_where_there_are_none():

@@ -1,11 +1,11 @@
-"""The kernel against a plain NumPy reference, and its gradient against finite differences."""
+"""The kernel of folded cost maps against a plain NumPy reference."""
 
 import numpy as np
 import pytest
 
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_se3, transform_points
-from pipeline.objective.paper.cost_maps import fold_frames, frame_costs, frame_gradients, pack_quads
+from pipeline.geometry.se3 import exp_se3
+from pipeline.objective.paper.cost_maps import fold_frames, frame_costs, pack_quads
 
 WIDTH, HEIGHT, PENALTY = 320, 200, 1.5
 K = np.array([[180.0, 0, 158.3], [0, 182.0, 99.1], [0, 0, 1]])
@@ -73,52 +73,6 @@ def test_costs_equal_the_numpy_reference_for_every_camera_model(name):
     # sides.
     np.testing.assert_allclose(got, want, atol=3 * PENALTY + 0.3)
     assert np.mean(np.abs(got - want) / frames.counts) < 3e-3
-
-
-@pytest.mark.parametrize("name", CAMERAS)
-def test_gradient_equals_finite_differences(name):
-    camera = CAMERAS[name]
-    # Only points that stay inside the image: at its rim the cost jumps to the penalty.
-    p = cloud(5, 3000)[7:]
-    uv, valid = camera.project(p)
-    p = p[valid & camera.contains(uv, 25.0)]
-    frames = fold_frames([p], [smooth_cost(6)], [camera], PENALTY)
-    values, g, H = frame_gradients(frames, np.eye(4)[None])
-    steps = np.array([4e-3] * 3 + [4e-2] * 3)
-    up = frame_costs(frames, exp_se3(np.diag(steps)))[:, 0]
-    down = frame_costs(frames, exp_se3(-np.diag(steps)))[:, 0]
-    numeric = (up - down) / (2 * steps)
-    scale = np.sqrt(len(p) * np.diag(H[0, 0]))
-    np.testing.assert_allclose(g[0, 0] / scale, numeric / scale, atol=6e-3)
-    np.testing.assert_allclose(values, frame_costs(frames, np.eye(4)[None]), rtol=1e-5)
-
-
-def test_gauss_newton_matrix_is_the_sum_of_outer_products():
-    camera = CAMERAS["pinhole"]
-    cost = smooth_cost(7)
-    p = cloud(8)[50:51]
-    frames = fold_frames([p], [cost], [camera], PENALTY)
-    values, g, H = frame_gradients(frames, np.eye(4)[None])
-    np.testing.assert_allclose(H[0, 0], np.outer(g[0, 0], g[0, 0]) / (2 * values[0, 0]), rtol=1e-4, atol=1e-9)
-
-
-def test_newton_steps_with_gradient_and_matrix_find_the_minimum():
-    camera = CAMERAS["f-theta"]
-    v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
-    rng = np.random.default_rng(9)
-    target = rng.uniform([30, 30], [WIDTH - 30, HEIGHT - 30], (12, 2))
-    points = camera.unproject(target) * rng.uniform(8, 40, (12, 1))
-    d2 = np.min((u[..., None] - target[:, 0]) ** 2 + (v[..., None] - target[:, 1]) ** 2, axis=-1)
-    frames = fold_frames([points], [d2 / (d2 + 15.0**2)], [camera], PENALTY)
-    T = exp_se3(np.array([0.01, -0.015, 0.01, 0.0, 0.0, 0.0]))
-    damping = 1e-2
-    for _ in range(60):
-        value, g, H = frame_gradients(frames, T[None])
-        step = np.linalg.solve(H[0, 0] + damping * np.diag(np.diag(H[0, 0]) + 1e-3), -g[0, 0])
-        better = frame_costs(frames, (exp_se3(step) @ T)[None])[0, 0] < value[0, 0]
-        T, damping = (exp_se3(step) @ T, damping / 3) if better else (T, damping * 4)
-    uv, _ = camera.project(transform_points(T, points))
-    assert np.abs(uv - target).max() < 0.7  # from up to 3.5 px
 
 
 def test_points_out_of_view_and_behind_the_camera_cost_the_penalty():

@@ -20,7 +20,13 @@ from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3, rotation_angle_rad
-from pipeline.objective.camera_lidar.score import Alignments, Level, Terms, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar.score import (
+    Alignments,
+    KernelSettings,
+    Terms,
+    lidar_velocities,
+    prepare_terms,
+)
 from pipeline.objective.radar.moving_clusters import azimuth_equations_camera, moving_clusters
 from pipeline.objective.radar.registration import RegistrationFrames, normal_equations, registration_frames
 from schemas.observations import Observation
@@ -95,7 +101,7 @@ def _camera_lidar(estimate: PairEstimate, observations: Sequence[Observation], p
     terms = prepare_terms(observations, estimate.T, velocity, reach_rad=reach).sharp(_MAX_GAP_PX)
     focal, dt_s = estimate.diagnostics.get("focal_scale", 1.0), estimate.time_offset_s or 0.0
     told = np.array([len(o.lidar_edge_xyz_m) + len(o.marking_xyz_m) > 0 for o in observations])
-    sharp = Level.wide(_SHARP_PX, _SHARP_CONTRAST)
+    sharp = KernelSettings.wide(_SHARP_PX, _SHARP_CONTRAST)
 
     def cost(T: np.ndarray) -> np.ndarray:
         at = Alignments(T[None], np.array([dt_s]), np.array([focal]))
@@ -107,7 +113,7 @@ def _camera_lidar(estimate: PairEstimate, observations: Sequence[Observation], p
         x = step + DESIGN * scale
         at = Alignments(exp_se3(x[:, :6]) @ estimate.T, dt_s + x[:, 6], focal + x[:, 7])
         contrast = _SHARP_CONTRAST if width < 2 else _WIDE_CONTRAST
-        gradient, H = fit_quadratics(terms.score(at, Level.wide(width * _SHARP_PX, contrast)))
+        gradient, H = fit_quadratics(terms.score(at, KernelSettings.wide(width * _SHARP_PX, contrast)))
         return gradient / scale, -H / np.outer(scale, scale)
 
     return cost, slopes, _FOCAL_SIGMA

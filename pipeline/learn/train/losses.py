@@ -141,9 +141,7 @@ def frame_objective(batch: TrainingBatch) -> FrameObjective:
     """Prepare the objective of a batch, on the batch's device."""
     step_rad = batch.grid_step_deg / DEG
     height, width = batch.sky_depth.shape[1:]
-    projection = GridProjection(
-        -(width - 1) / 2 * step_rad, -(height - 1) / 2 * step_rad, step_rad, len(batch)
-    )
+    projection = GridProjection(-(width - 1) / 2 * step_rad, -(height - 1) / 2 * step_rad, step_rad)
     maps = GridMaps(
         batch.class_distance, batch.edge_offset, batch.sky_depth, batch.grid_seen.bool(), projection
     )

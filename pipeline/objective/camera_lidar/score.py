@@ -38,7 +38,7 @@ from pipeline.objective.camera_lidar.projection_loops import camera_parameters
 from pipeline.objective.camera_lidar.reflectivity import marking_gradients, marking_scores
 from schemas.observations import Observation
 
-__all__ = ["CONTRAST_BLURS_PX", "Alignments", "Level", "Terms", "lidar_velocities", "prepare_terms"]
+__all__ = ["CONTRAST_BLURS_PX", "Alignments", "KernelSettings", "Terms", "lidar_velocities", "prepare_terms"]
 
 CONTRAST_BLURS_PX = (6.0, 3.0, 1.5)
 _CHANCE_SHIFT_PX = 60.0  # far enough to be elsewhere, near enough to see the same scene
@@ -47,7 +47,7 @@ _EVEN_CHANCE = np.full((EDGE_KINDS, CHANCE_BINS), 1 / 100, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class KernelSettings:
     """How sharply the terms look: kernel scale, contrast level, mixture shares, weights."""
 
     sigma_px: float
@@ -59,9 +59,9 @@ class Level:
     marking_weight: float = 1.0
 
     @staticmethod
-    def wide(sigma_px: float, contrast_level: int, match: float = 0.25) -> Level:
+    def wide(sigma_px: float, contrast_level: int, match: float = 0.25) -> KernelSettings:
         """A level that presumes nothing of the data."""
-        return Level(sigma_px, contrast_level, np.full(EDGE_KINDS, match, np.float32), _EVEN_CHANCE)
+        return KernelSettings(sigma_px, contrast_level, np.full(EDGE_KINDS, match, np.float32), _EVEN_CHANCE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ class Terms:
         R, t = at.T_camera_lidar[:, :3, :3], at.T_camera_lidar[:, :3, 3]
         return _moving_poses(R, t, at.dt_s, self.velocity_lidar, self.yaw_rate)
 
-    def edge_score(self, at: Alignments, level: Level) -> Float32[np.ndarray, "P F"]:
+    def edge_score(self, at: Alignments, level: KernelSettings) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the edges."""
         e, maps = self.edges, self.maps
         return edge_scores(
@@ -180,7 +180,7 @@ class Terms:
             level.sigma_px,
         )
 
-    def edge_excess(self, at: Alignments, level: Level) -> Float[np.ndarray, "P F"]:
+    def edge_excess(self, at: Alignments, level: KernelSettings) -> Float[np.ndarray, "P F"]:
         """Edge score minus what the same edges score when the image is shifted: 0 for a pose that matches by chance.
 
         So poses that see different numbers of edges compare: those that turn them out of view win nothing.
@@ -193,7 +193,7 @@ class Terms:
             shifted += replace(self, camera=camera).edge_score(at, level)
         return self.edge_score(at, level) - shifted / len(shifts)
 
-    def marking_score(self, at: Alignments, level: Level) -> Float32[np.ndarray, "P F"]:
+    def marking_score(self, at: Alignments, level: KernelSettings) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the markings."""
         m, contrast = self.markings, self.maps.contrast[level.contrast_level]
         focal = at.focal.astype(np.float32)
@@ -208,7 +208,7 @@ class Terms:
             self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, self.poses(at), CLASSES
         )
 
-    def score(self, at: Alignments, level: Level) -> Float[np.ndarray, "P F"]:
+    def score(self, at: Alignments, level: KernelSettings) -> Float[np.ndarray, "P F"]:
         """Score of each frame at each alignment; higher is better."""
         score = np.zeros((len(at.dt_s), self.frames))
         if level.edge_weight > 0:
@@ -218,7 +218,7 @@ class Terms:
         return score
 
     def gradient(
-        self, at: Alignments, level: Level
+        self, at: Alignments, level: KernelSettings
     ) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
         """Gradient of each frame's score at ONE alignment, and its information (positive semidefinite).
 
@@ -249,13 +249,13 @@ class Terms:
         a, b = level.edge_weight, level.marking_weight
         return a * g_edges + b * g_marks, a * I_edges + b * I_marks
 
-    def mean_match(self, level: Level) -> Float[np.ndarray, " 4"]:
+    def mean_match(self, level: KernelSettings) -> Float[np.ndarray, " 4"]:
         """Share of matching edges by direction, over the edges that there are."""
         share = level.match[self.edges.kind]
         counts = np.bincount(self.edges.side, minlength=4)
         return np.bincount(self.edges.side, share, minlength=4) / np.maximum(counts, 1)
 
-    def fitted(self, at: Alignments, level: Level, rng: np.random.Generator) -> Level:
+    def fitted(self, at: Alignments, level: KernelSettings, rng: np.random.Generator) -> KernelSettings:
         """The level with the mixture shares, chance densities and contrast that the data shows at ONE alignment."""
         poses, focal = self.poses(at)[0], np.float32(at.focal[0])
         e, m, offsets = self.edges, self.markings, self.maps.offsets
@@ -291,7 +291,7 @@ def _moving_poses(
     return out
 
 
-def _weights(markings: Points, level: Level) -> np.ndarray:
+def _weights(markings: Points, level: KernelSettings) -> np.ndarray:
     return np.full(len(markings.xyz_m), level.delta * CONTRAST_STEP, np.float32)
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from pipeline.geometry.cameras import Camera
 from pipeline.objective.differentiable.lookup import bilinear, masked_mean
 from pipeline.objective.differentiable.poses import inverse, transform_points
-from pipeline.objective.differentiable.projection import Projection, camera_projection
+from pipeline.objective.differentiable.projection import CameraProjection, camera_projection
 from pipeline.objective.paper import camera_radar, lidar_radar
 from pipeline.objective.paper.camera_lidar import CameraLidarLoss
 from pipeline.objective.paper.camera_radar import CameraRadarLoss
@@ -53,7 +53,7 @@ class FoldedTensors:
     points: Float[Tensor, "F N 3"]
     present: Bool[Tensor, "F N"]
     maps: Float[Tensor, "F H W"]
-    projection: Projection
+    projection: CameraProjection
     penalty: float
 
     def frame_losses(self, T_camera_points: Float[Tensor, "*batch #F 4 4"]) -> Float[Tensor, "*batch F"]:
@@ -70,7 +70,7 @@ class CameraRadarTensors:
     track_present: Bool[Tensor, "F M"]
     centres_px: Float[Tensor, "F B 2"]
     informative: Bool[Tensor, " F"]
-    projection: Projection
+    projection: CameraProjection
     scale_px: float
     detections: FoldedTensors
 

@@ -1,6 +1,6 @@
 """Projection of points into images of several frames, differentiable: camera models and the equirectangular grid.
 
-One class of both: a frame's points go to map pixels (u right, v down, (0, 0) = centre of the first pixel), whatever
+Either one takes a frame's points to map pixels (u right, v down, (0, 0) = centre of the first pixel), whatever
 the map is. Models are exact, as in `pipeline.geometry.cameras`; the compiled kernels fit polynomials to them.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,25 +16,9 @@ from torch import Tensor
 
 from pipeline.geometry.cameras import Camera
 
-__all__ = ["CameraProjection", "GridProjection", "Projection", "camera_projection"]
+__all__ = ["CameraProjection", "GridProjection", "camera_projection"]
 
 NEAR_M = 0.5  # as in the kernels: nothing outside the car is nearer
-
-
-@runtime_checkable
-class Projection(Protocol):
-    """Takes points in the optical frames of F images to their pixels."""
-
-    def project(
-        self, points_camera: Float[Tensor, "*batch F N 3"]
-    ) -> tuple[Float[Tensor, "*batch F N 2"], Bool[Tensor, "*batch F N"]]:
-        """Pixels, and a mask that is False where they mean nothing (behind the camera, beyond the model)."""
-        ...
-
-    @property
-    def pixels_per_rad(self) -> Float[Tensor, " F"]:
-        """Scale at the image's centre."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +39,6 @@ class CameraProjection:
         xy, valid = distort(points_camera, self.distortion[:, None], self.max_angle_rad[:, None])
         return xy * self.focal[:, None] + self.centre[:, None], valid
 
-    @property
-    def pixels_per_rad(self) -> Float[Tensor, " F"]:
-        """Horizontal focal length."""
-        return self.focal[:, 0]
-
 
 @dataclass(frozen=True, eq=False)
 class GridProjection:
@@ -70,13 +48,11 @@ class GridProjection:
         left_rad: azimuth (right positive) of the centres of the first column.
         top_rad: elevation (down positive) of the centres of the first row.
         step_rad: cell size.
-        frames: number of frames that share the grid.
     """
 
     left_rad: float
     top_rad: float
     step_rad: float
-    frames: int
 
     def project(
         self, points_camera: Float[Tensor, "*batch F N 3"]
@@ -91,15 +67,8 @@ class GridProjection:
         u, v = (azimuth - self.left_rad) / self.step_rad, (elevation - self.top_rad) / self.step_rad
         return torch.stack([u, v], -1), valid
 
-    @property
-    def pixels_per_rad(self) -> Float[Tensor, " F"]:
-        """Cells per radian."""
-        return torch.full((self.frames,), 1 / self.step_rad)
 
-
-def camera_projection(
-    cameras: Sequence[Camera], dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu"
-) -> CameraProjection:
+def camera_projection(cameras: Sequence[Camera], dtype: torch.dtype = torch.float32) -> CameraProjection:
     """The cameras of F frames as tensors.
 
     Raises:
@@ -113,7 +82,7 @@ def camera_projection(
         row[: len(camera.D)] = camera.D
 
     def tensor(values: object) -> Tensor:
-        return torch.tensor(np.asarray(values, np.float64), dtype=dtype, device=device)
+        return torch.tensor(np.asarray(values, np.float64), dtype=dtype)
 
     return CameraProjection(
         "equidistant" if kinds.pop() else "plumb_bob",

@@ -124,7 +124,7 @@ def edge_cost(
     """
     uv, seen = maps.pixels(T_camera_lidar, points)
     step_deg = maps.projection.step_rad * DEG
-    residual, _, found = edge_residuals_px(
+    residual, found = edge_residuals_px(
         maps.edge_offset, uv, seen, side, step_px=OFFSET_STEP_DEG / step_deg, shift_px=0.0
     )
     way = (residual * step_deg).abs()

@@ -1,4 +1,4 @@
-"""Cost of projected points in folded cost maps, for many poses at once: value, gradient, Gauss-Newton matrix.
+"""Cost of projected points in folded cost maps, for many poses at once.
 
 A frame's cost map already holds robust distance, sky penalty and whatever else a pixel can say ("folded"), as
 one byte per pixel; the four bytes that bilinear interpolation needs lie in one 32-bit word ("quad"), so a
@@ -21,19 +21,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8, UInt32
 
 from pipeline.geometry.cameras import Camera
-from pipeline.objective.paper.cost_map_loops import (
-    pinhole_costs,
-    pinhole_gradients,
-    polynomial_costs,
-    polynomial_gradients,
-)
+from pipeline.objective.paper.cost_map_loops import pinhole_costs, polynomial_costs
 
 __all__ = [
     "FoldedFrames",
     "fold_frames",
     "fold_map",
     "frame_costs",
-    "frame_gradients",
     "pack_quads",
     "without_tangential",
 ]
@@ -150,29 +144,6 @@ def frame_costs(
         frames.camera, _f4(frames.penalty), out,
     )  # fmt: skip
     return out
-
-
-def frame_gradients(
-    frames: FoldedFrames, T_camera_points: Float[np.ndarray, "P 4 4"]
-) -> tuple[Float[np.ndarray, "P F"], Float[np.ndarray, "P F 6"], Float[np.ndarray, "P F 6 6"]]:
-    """Costs as `frame_costs`, gradients for a left perturbation (rotation vector, translation), Gauss-Newton matrices.
-
-    The Gauss-Newton residual of a point is the root of its cost c, so its matrix is `g g^T / (2 c)`, with c
-    no smaller than one byte of the map. The matrix is positive semidefinite and vanishes where all points
-    cost nothing: damp the steps (Levenberg-Marquardt).
-    """
-    terms = np.zeros((len(T_camera_points), frames.frames, 28))
-    poses = np.ascontiguousarray(T_camera_points[:, :3, :], dtype=np.float32).reshape(-1, 12)
-    kernel = polynomial_gradients if frames.is_polynomial else pinhole_gradients
-    kernel(
-        poses, frames.x_m, frames.y_m, frames.z_m, frames.first, frames.quads, frames.map_first, frames.size_px,
-        frames.camera, _f4(frames.penalty), terms,
-    )  # fmt: skip
-    upper = np.triu_indices(6)
-    H = np.zeros((*terms.shape[:2], 6, 6))
-    H[..., upper[0], upper[1]] = terms[..., 7:]
-    H[..., upper[1], upper[0]] = terms[..., 7:]
-    return terms[..., 0], terms[..., 1:7], H
 
 
 def without_tangential(camera: Camera) -> Camera:

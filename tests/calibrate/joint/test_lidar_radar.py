@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_radar import camera_radar_cost, estimate_camera_radar
-from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar, lidar_radar_cost
+from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
@@ -183,15 +183,12 @@ def test_half_of_a_day_that_was_turned_is_found(day):
     assert abs(change[2] - yaw) < np.radians(0.1)
 
 
-def test_held_out_costs_prefer_the_truth_and_name_frames_that_cannot_tell(day):
+def test_the_held_out_cost_of_camera_radar_prefers_the_truth_and_names_frames_that_cannot_tell(day):
     frames = [
         *day[:8],
         replace(day[8], radar_velocity_mps=None, radar_cluster=np.full_like(day[8].radar_cluster, -1)),
     ]
     wrong = exp_se3(np.array([0, 0, np.radians(1.0), 0, 0, 0])) @ T_LIDAR_RADAR
-    right_cost, wrong_cost = (lidar_radar_cost(frames, T, DT_S) for T in (T_LIDAR_RADAR, wrong))
-    assert np.mean(right_cost[:8] < wrong_cost[:8]) > 0.8
-    assert np.isnan(right_cost[8])
     camera_right, camera_wrong = (
         camera_radar_cost(frames, T_CAMERA_LIDAR @ T) for T in (T_LIDAR_RADAR, wrong)
     )

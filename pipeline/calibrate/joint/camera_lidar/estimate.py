@@ -33,15 +33,13 @@ from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
-from pipeline.objective.camera_lidar.score import Level, Terms, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms, lidar_velocities, prepare_terms
 from schemas.observations import Observation
 
 __all__ = [
     "Aligned",
     "AlignmentState",
     "align_camera_lidar",
-    "camera_lidar_cost",
-    "camera_lidar_information",
     "estimate_camera_lidar",
     "settle_camera_lidar",
 ]
@@ -51,7 +49,6 @@ _THIN_POINTS, _FINE_POINTS = 8000, 18000  # of edges, and of markings; more say 
 _MARGIN_RAD = np.radians(2.0)  # points further out of view than this stay out of it
 # Kernel widths [label px] and contrast levels, from wide to sharp.
 _LADDER = ((4.0, 0), (2.5, 1), (1.5, 2))
-_VERDICT = Level.wide(1.5, 2)
 _MAX_GAP_PX = 5.0  # edges whose interval is wider (16 rings: 30 px) are for the basin only
 _NEAR_PRIOR_M = 0.25
 _HEADING_SIGMA_RAD = np.radians(0.3)  # of velocities that a caller knows
@@ -66,7 +63,7 @@ class Aligned:
     rejected: dict[str, int]
     basin: Basin
     state: AlignmentState
-    level: Level
+    level: KernelSettings
 
     @property
     def T_camera_lidar(self) -> Float[np.ndarray, "4 4"]:
@@ -129,7 +126,7 @@ def align_camera_lidar(
     if "edges" in config.terms and len(terms.edges.xyz_m) < 20 * len(used):
         raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
 
-    first = Level.wide(*_LADDER[0])
+    first = KernelSettings.wide(*_LADDER[0])
     sharp = terms.sharp(_MAX_GAP_PX)
     thin = sharp.at_most(_THIN_POINTS, rng)
     basin = find_basin(terms, thin, first, prior, config, rng)
@@ -140,7 +137,9 @@ def align_camera_lidar(
     state = _at_prior_tz(basin.state, prior, terms) if near else basin.state
     state = climb(thin, state, first, prior, config, steps=8, held=held)
     for sigma_px, contrast in _LADDER[1:]:
-        level = weighted(sharp, state, sharp.fitted(state.alone, Level.wide(sigma_px, contrast), rng))
+        level = weighted(
+            sharp, state, sharp.fitted(state.alone, KernelSettings.wide(sigma_px, contrast), rng)
+        )
         state = climb(sharp, state, level, prior, config, steps=4, held=held)
     day = Day(
         sharp,
@@ -187,43 +186,6 @@ def settle_camera_lidar(
     ]  # fmt: skip
     diagnostics = _diagnostics(day.terms, found, aligned.basin, halves)
     return _conclude(found, day.config, len(aligned.frames), aligned.rejected, diagnostics)
-
-
-def camera_lidar_cost(
-    observations: Sequence[Observation],
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    dt_s: float = 0.0,
-    *,
-    velocity_lidar: Float[np.ndarray, "F 3"] | None = None,
-    T_lidar_radar: Float[np.ndarray, "4 4"] | None = None,
-) -> Float[np.ndarray, " F"]:
-    """Cost of each frame at a pose, for held-out verdicts: lower is better, sharp kernels, nothing fitted.
-
-    Args:
-        observations: frames of one camera.
-        T_camera_lidar: the pose.
-        dt_s: camera time offset, stamp_camera = stamp_lidar + dt.
-        velocity_lidar: own velocity per frame in lidar axes; else from the observations and T_lidar_radar.
-        T_lidar_radar: turns Doppler velocities into lidar axes; identity by default.
-    """
-    if velocity_lidar is None:
-        velocity_lidar = lidar_velocities(observations, np.eye(4) if T_lidar_radar is None else T_lidar_radar)
-    terms = prepare_terms(observations, T_camera_lidar, velocity_lidar, reach_rad=0.0).sharp(_MAX_GAP_PX)
-    at = AlignmentState(T_camera_lidar, dt_s).alone
-    return -(terms.edge_excess(at, _VERDICT) + terms.marking_score(at, _VERDICT))[0]
-
-
-def camera_lidar_information(
-    terms: Terms, T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float, level: Level | None = None
-) -> tuple[Float[np.ndarray, " 7"], Float[np.ndarray, "7 7"]]:
-    """Gradient of the COST (minus score) and information by (left perturbation, dt), for a joint solver.
-
-    The focal scale is marginalised within its prior, so the translation along the optical axis says what it is worth.
-    """
-    gradient, information = terms.gradient(AlignmentState(T_camera_lidar, dt_s).alone, level or _VERDICT)
-    g, I = -gradient.sum(0), information.sum(0)
-    focal = I[7, 7] + FOCAL_SIGMA**-2
-    return g[:7] - I[:7, 7] * g[7] / focal, I[:7, :7] - np.outer(I[:7, 7], I[7, :7]) / focal
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.points import Points
-from pipeline.objective.camera_lidar.score import Level, Terms
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from schemas.observations import Observation
 
 __all__ = ["motion_biases", "sweep_s_per_rad"]
@@ -42,7 +42,7 @@ def sweep_s_per_rad(observations: Sequence[Observation]) -> float:
 def motion_biases(
     terms: Terms,
     state: AlignmentState,
-    level: Level,
+    level: KernelSettings,
     curvature: Float[np.ndarray, "8 8"],
     held: Bool[np.ndarray, " 8"],
     heading_sigma_rad: float,
@@ -79,7 +79,7 @@ def motion_biases(
     return out
 
 
-def _slope(terms: Terms, state: AlignmentState, level: Level) -> Float[np.ndarray, " 8"]:
+def _slope(terms: Terms, state: AlignmentState, level: KernelSettings) -> Float[np.ndarray, " 8"]:
     """Gradient of the score by left perturbation, time offset, focal scale."""
     return terms.gradient(state.alone, level)[0].sum(0)
 

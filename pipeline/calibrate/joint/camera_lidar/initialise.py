@@ -13,7 +13,7 @@ from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3
-from pipeline.objective.camera_lidar.score import Alignments, Level, Terms
+from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
 
 __all__ = ["SAME_ROTATION_RAD", "Basin", "difference", "find_basin"]
 
@@ -23,7 +23,7 @@ SAME_ROTATION_RAD, _SAME_SHIFT_M = float(np.radians(0.4)), 0.15  # ends nearer t
 _NARROW, _WIDE, _WIDE_RAD = (48, 36, 6000), (64, 70, 9000), np.radians(9.0)
 _SIGMAS_OF_CLOCK = 2.0
 _STEPS = 10
-_COARSE = Level.wide(10.0, 0, match=0.1)
+_COARSE = KernelSettings.wide(10.0, 0, match=0.1)
 # Nats per point of class information against log likelihood ratios: over the search box both then vary alike.
 _CLASS_WEIGHT_PER_POINT = 0.12
 
@@ -40,7 +40,12 @@ class Basin:
 
 
 def find_basin(
-    terms: Terms, thin: Terms, first: Level, prior: Prior, config: SolveConfig, rng: np.random.Generator
+    terms: Terms,
+    thin: Terms,
+    first: KernelSettings,
+    prior: Prior,
+    config: SolveConfig,
+    rng: np.random.Generator,
 ) -> Basin:
     """Restart until another end vouches for the best one, at most six times.
 

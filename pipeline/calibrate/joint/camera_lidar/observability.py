@@ -32,7 +32,7 @@ from pipeline.calibrate.numerics.covariance import OBSERVABLE, blocks_of, held_c
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_jacobian
-from pipeline.objective.camera_lidar.score import Level, Terms
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 
 __all__ = ["IS_TZ", "Day", "Found", "clock_variance", "determined", "measured"]
 
@@ -64,14 +64,14 @@ class Found:
 
     prior: Prior  # with the tz that was found
     state: AlignmentState
-    level: Level
+    level: KernelSettings
     held: np.ndarray  # 8, bool
     covariance: np.ndarray  # 8 8
     observability: np.ndarray  # 6
     profile: Profile
 
 
-def determined(day: Day, state: AlignmentState, level: Level, rng: np.random.Generator) -> Found:
+def determined(day: Day, state: AlignmentState, level: KernelSettings, rng: np.random.Generator) -> Found:
     """Fix tz by its profile, then solve again with what the day cannot determine held at the prior.
 
     Left free, such a degree of freedom wanders as far as its prior lets it and drags others along: lane lines
@@ -111,13 +111,13 @@ def determined(day: Day, state: AlignmentState, level: Level, rng: np.random.Gen
     return Found(day.prior, state, level, held, covariance, observability, profile)
 
 
-def _timed(day: Day, state: AlignmentState, level: Level, rng: np.random.Generator) -> ClockProfile:
+def _timed(day: Day, state: AlignmentState, level: KernelSettings, rng: np.random.Generator) -> ClockProfile:
     """The clock's profile, by some of the points."""
     some = day.terms.at_most(_CLOCK_POINTS, rng)
     return profile_clock(some, state, level, day.prior, day.config, IS_TZ)
 
 
-def clock_variance(day: Day, state: AlignmentState, level: Level, clock: ClockProfile) -> float:
+def clock_variance(day: Day, state: AlignmentState, level: KernelSettings, clock: ClockProfile) -> float:
     """Of the profile, its floor, and what tz and the focal length leave open [s2]; at most the prior's."""
     of_tz = s_per_metre(day.terms, state) ** 2 * day.tz_variance
     of_focal = response(_curvature(day, state, level), _FOCAL_HELD, IS_TZ)[DT, 0] * FOCAL_SIGMA
@@ -126,7 +126,7 @@ def clock_variance(day: Day, state: AlignmentState, level: Level, clock: ClockPr
 
 
 def measured(
-    day: Day, state: AlignmentState, level: Level, held: Bool[np.ndarray, " 8"]
+    day: Day, state: AlignmentState, level: KernelSettings, held: Bool[np.ndarray, " 8"]
 ) -> tuple[Float[np.ndarray, "8 8"], Float[np.ndarray, " 6"]]:
     """Covariance of a solution and observability; what is held has its own variance, and the others follow it."""
     terms, prior_variance = day.terms, _prior_variance(day)
@@ -158,7 +158,7 @@ def _prior_variance(day: Day) -> Float[np.ndarray, " 8"]:
     return np.where(IS_TZ, day.tz_variance, sigma**2)
 
 
-def _curvature(day: Day, state: AlignmentState, level: Level) -> Float[np.ndarray, "8 8"]:
+def _curvature(day: Day, state: AlignmentState, level: KernelSettings) -> Float[np.ndarray, "8 8"]:
     """Curvature of the cost without its roughness, in the chart of `changed`: Gauss-Newton, from the points' slopes.
 
     For ratios only. Moving tz on real logs moves dt by -0.04 s/m: this says -0.03, response surfaces +0.1 to -0.1.

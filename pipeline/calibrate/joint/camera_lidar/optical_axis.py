@@ -23,7 +23,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, climb, 
 from pipeline.calibrate.numerics.response_surface import DESIGN
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
-from pipeline.objective.camera_lidar.score import Level, Terms
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 
 __all__ = ["TZ", "Profile", "profile_tz", "with_tz"]
 
@@ -57,7 +57,7 @@ class Profile:
 def profile_tz(
     terms: Terms,
     state: AlignmentState,
-    level: Level,
+    level: KernelSettings,
     prior: Prior,
     config: SolveConfig,
     follow: Float[np.ndarray, " 8"],
@@ -111,7 +111,7 @@ def with_tz(prior: Prior, tz_m: float) -> Prior:
 
 
 def _smooth_values(
-    terms: Terms, state: AlignmentState, level: Level, prior: Prior, config: SolveConfig
+    terms: Terms, state: AlignmentState, level: KernelSettings, prior: Prior, config: SolveConfig
 ) -> tuple[float, float, float]:
     """Score of edges and of markings, means over a ball in which the score is rough, and the others' prior."""
     at = state.changed(DESIGN * np.where(np.arange(8) == TZ, 0.0, scales(terms, level)))

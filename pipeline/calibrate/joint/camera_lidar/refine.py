@@ -11,7 +11,7 @@ from pipeline.calibrate.numerics.response_surface import DESIGN, at_least, fit_q
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3
-from pipeline.objective.camera_lidar.score import Alignments, Level, Terms
+from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
 
 __all__ = [
     "FOCAL_SIGMA",
@@ -83,7 +83,7 @@ def prior_value(at: Alignments, prior: Prior, config: SolveConfig) -> Float[np.n
     return -0.5 * ((turn**2).sum(1) + (shift**2).sum(1) + clock)
 
 
-def scales(terms: Terms, level: Level) -> Float[np.ndarray, " 8"]:
+def scales(terms: Terms, level: KernelSettings) -> Float[np.ndarray, " 8"]:
     """Step per DoF that moves typical points by about one kernel width."""
     angle = level.sigma_px / float(terms.camera[1])
     shift = angle * _TYPICAL_RANGE_M
@@ -93,7 +93,7 @@ def scales(terms: Terms, level: Level) -> Float[np.ndarray, " 8"]:
 def climb(
     terms: Terms,
     state: AlignmentState,
-    level: Level,
+    level: KernelSettings,
     prior: Prior,
     config: SolveConfig,
     *,
@@ -125,7 +125,7 @@ def climb(
 def _surface(
     terms: Terms,
     state: AlignmentState,
-    level: Level,
+    level: KernelSettings,
     prior: Prior,
     config: SolveConfig,
     scale: Float[np.ndarray, " 8"],
@@ -146,13 +146,13 @@ def _surface(
 
 
 def derivatives(
-    terms: Terms, state: AlignmentState, level: Level, scale: Float[np.ndarray, " 8"]
+    terms: Terms, state: AlignmentState, level: KernelSettings, scale: Float[np.ndarray, " 8"]
 ) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
     """Gradient and Hessian of each frame's score over a ball of `scale`, in units of `scale`."""
     return fit_quadratics(terms.score(state.changed(DESIGN * scale), level))
 
 
-def weighted(terms: Terms, state: AlignmentState, level: Level) -> Level:
+def weighted(terms: Terms, state: AlignmentState, level: KernelSettings) -> KernelSettings:
     """Scale each term so that its curvature equals the scatter of its gradient over frames.
 
     Points of one frame err together (one mask boundary, one lane line), so a sum of log likelihood ratios

@@ -20,7 +20,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, climb, 
 from pipeline.calibrate.numerics.response_surface import DESIGN
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
-from pipeline.objective.camera_lidar.score import Level, Terms
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 
 __all__ = ["DT", "FOCAL", "ClockProfile", "profile_clock", "s_per_metre"]
 
@@ -49,7 +49,7 @@ def s_per_metre(terms: Terms, state: AlignmentState) -> float:
 def profile_clock(
     terms: Terms,
     state: AlignmentState,
-    level: Level,
+    level: KernelSettings,
     prior: Prior,
     config: SolveConfig,
     held: Bool[np.ndarray, " 8"],
@@ -102,7 +102,7 @@ def _top(value: Float[np.ndarray, "S N"]) -> Float[np.ndarray, " S"]:
 
 
 def _frame_scores(
-    terms: Terms, state: AlignmentState, level: Level, prior: Prior, config: SolveConfig
+    terms: Terms, state: AlignmentState, level: KernelSettings, prior: Prior, config: SolveConfig
 ) -> Float[np.ndarray, " F"]:
     """Score of each frame, mean over a ball in which it is rough, and its share of the prior."""
     ball = DESIGN * np.where(_FIXED, 0.0, scales(terms, level))

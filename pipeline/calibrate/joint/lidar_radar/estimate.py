@@ -41,7 +41,7 @@ from pipeline.objective.radar.registration import normal_equations, registration
 from pipeline.objective.radar.vehicle_boxes import vehicle_boxes
 from schemas.observations import Observation
 
-__all__ = ["estimate_lidar_radar", "lidar_radar_cost"]
+__all__ = ["estimate_lidar_radar"]
 
 _FEWEST_FRAMES = 5
 _MANY_FRAMES = 60  # from here on half of them find the basin
@@ -141,22 +141,6 @@ def estimate_lidar_radar(
     parts = [problem.of_frames(np.arange(k, frames.count, 2)) for k in (0, 1)]
     halves = [finish(part, settled.state, settled.held)[0] for part in parts]
     return _conclude(problem, settled, [best, _rival(ends, costs)], halves, rejected)
-
-
-def lidar_radar_cost(
-    observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"], dt_s: float = 0.0
-) -> Float[np.ndarray, " F"]:
-    """Cost of each frame at a pose for held-out verdicts: minus mean log likelihood of static detections.
-
-    Fixed sigmas, nothing fitted, wide in elevation. NaN where a frame has no static detections or no lidar map, or a
-    radar velocity that the odometry contradicts. The detections are picked alike at every pose.
-    """
-    out = np.full(len(observations), np.nan)
-    frames = registration_frames(observations, T_lidar_radar, np.random.default_rng(0))
-    if frames.count:
-        out[frames.frame] = normal_equations(frames, T_lidar_radar, dt_s, _VERDICT_SIGMA, 0.0, OUTLIER).cost
-    out[contradicts_odometry(observations)] = np.nan
-    return out
 
 
 def _believed(observations: Sequence[Observation]) -> list[Observation]:
