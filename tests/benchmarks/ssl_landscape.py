@@ -28,7 +28,7 @@ from pipeline.geometry.se3 import exp_so3
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.sample.frame_sample import About, make_row
-from pipeline.learn.train.losses import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
+from pipeline.learn.train.frame_objective import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
 from pipeline.learn.train.settings import LossConfig
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows

@@ -22,14 +22,14 @@ from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.geometry.spherical import camera_direction_angles, to_spherical
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.learn.batches.collate import collate
+from pipeline.learn.network.class_matcher import NEUTRAL, ClassMatcher
 from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
-from pipeline.learn.network.matching import NEUTRAL, ClassMatcher
-from pipeline.learn.network.occupancy import OccupancyMatcher
+from pipeline.learn.network.occupancy_matcher import OccupancyMatcher
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.network.views import render
 from pipeline.learn.sample.frame_sample import About, SampleRejectedError, make_row
 from pipeline.learn.sample.grid import Grid
-from pipeline.learn.train.distillation import class_of_points
+from pipeline.learn.train.semantics_loss import class_of_points
 from pipeline.objective.differentiable.poses import transform_points
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows

@@ -8,7 +8,7 @@ import pytest
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.compiled_rendering import FrameSensors
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
-from pipeline.learn.network.networks import build_network
+from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.layout import NetworkConfig
 
 GOAL_MS = 60.0

@@ -17,8 +17,8 @@ from pipeline.learn.batches.collate import collate
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.compiled_rendering import frame_sensors, render_frame
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.inputs import NetworkInputs, sensor_inputs
-from pipeline.learn.network.networks import build_network
 from pipeline.learn.network.views import render
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.sample.grid import Grid

@@ -8,7 +8,7 @@ import torch
 
 from jobs.cli import main
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
-from pipeline.learn.network.networks import build_network
+from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.checkpoints import BEST, LAST, save_checkpoint

@@ -8,14 +8,14 @@ import torch
 
 from pipeline.geometry.se3 import exp_se3, exp_so3
 from pipeline.geometry.spherical import camera_direction_angles, to_spherical
+from pipeline.learn.network.class_matcher import NEUTRAL, ClassMatcher
 from pipeline.learn.network.least_squares import (
     angular_jacobian,
     inverse_spd,
     small_rotation_vector,
     spherical_jacobian,
 )
-from pipeline.learn.network.matching import NEUTRAL, ClassMatcher
-from pipeline.learn.network.occupancy import OccupancyMatcher
+from pipeline.learn.network.occupancy_matcher import OccupancyMatcher
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
 

@@ -10,13 +10,13 @@ import torch
 from pipeline.extrinsics.estimates import Prior
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.collate import collate
+from pipeline.learn.network.calibration_network import build_network, refine
 from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
-from pipeline.learn.network.networks import build_network, refine
 from pipeline.learn.network.views import render
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import GRAPH_INPUTS, PAIRS, NetworkConfig
-from pipeline.learn.train.distillation import class_of_points, semantics_loss
+from pipeline.learn.train.semantics_loss import class_of_points, semantics_loss
 from pipeline.objective.differentiable.poses import transform_points
 from schemas.training import UNKNOWN_CLASS
 from tests.makers import solve_scenes, training_lakes

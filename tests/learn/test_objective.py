@@ -6,7 +6,7 @@ import torch
 
 from pipeline.geometry import se3
 from pipeline.learn.train.augment import random_guess, turned_view
-from pipeline.learn.train.losses import PAIR_OF_TERM, frame_objective, weighted
+from pipeline.learn.train.frame_objective import PAIR_OF_TERM, frame_objective, weighted
 from pipeline.learn.train.running_mean import Consensus, doubt_loss, twist_between
 from pipeline.learn.train.settings import PAIRS_OF, AugmentConfig, LossConfig
 from pipeline.objective.differentiable.poses import exp_se3, exp_so3, pose, transform_points

@@ -16,7 +16,7 @@ import torch
 from jobs.train import parse_duration
 from pipeline.errors import ConfigError, ContractError
 from pipeline.extrinsics.prior import read_prior
-from pipeline.learn.network.networks import build_network
+from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.checkpoints import load_checkpoint, save_checkpoint

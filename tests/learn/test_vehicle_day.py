@@ -16,7 +16,7 @@ from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
 from pipeline.learn.infer.vehicle_day import FrameAnswer, single_frame_solution, solve_by_networks
-from pipeline.learn.network.networks import build_network
+from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.store.partitions import Lake, Partition

@@ -2,7 +2,7 @@
 
 The graph is what depends on weights: sensors rendered through a guess in, corrections out (`RenderedView` names the
 inputs). Rendering stays outside, in compiled code. `camera_log_likelihood` is an output so that a caller can cut the
-graph there and encode the camera once for several refinements (`inference.py` does).
+graph there and encode the camera once for several refinements (`infer/single_frame.py` does).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.jit._trace import TracerWarning
 
-from pipeline.learn.network.networks import CalibrationNetwork
+from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.views import RenderedView
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import (

@@ -1,4 +1,4 @@
-"""One frame's sensors through a guess without torch: what `views.render` does, compiled, for inference."""
+"""One frame's sensors through a guess without torch: what `network.views.render` does, compiled, for inference."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _EDGE, _GROUND = LIDAR_FEATURES.index("edge"), LIDAR_FEATURES.index("ground")
 
 @dataclass(frozen=True, eq=False)
 class FrameSensors:
-    """One frame of `inputs.SensorInputs`, without the padding."""
+    """One frame of `network.inputs.SensorInputs`, without the padding."""
 
     camera: Float32[np.ndarray, "4 H W"]
     lidar_xyz_m: Float32[np.ndarray, "N 3"]
@@ -47,7 +47,7 @@ class FrameSensors:
 
 
 def frame_sensors(row: TrainingRow, grid: Grid) -> FrameSensors:
-    """Inputs from a row of table `training` (see `samples.make_row`), whose grid contains the network's.
+    """Inputs from a row of table `training` (see `frame_sample.make_row`), whose grid contains the network's.
 
     Raises:
         ValueError: cells of another size, or a grid that does not contain the network's.
@@ -117,7 +117,7 @@ def render_frame(
 def compiled_nearest_points(
     points_camera: Float[np.ndarray, "N 3"], valid: Bool[np.ndarray, " N"], grid: Grid
 ) -> Int32[np.ndarray, " HW"]:
-    """Index of the nearest point in each cell (row by row), -1 where there is none; as `rendering.nearest_points`."""
+    """Index of the nearest point in each cell (row by row), -1 in empty cells (`network.rendering.nearest_points`)."""
     out = np.full(grid.height * grid.width, -1, np.int32)
     limits = np.radians([grid.top_deg, grid.left_deg, grid.cell_deg]).astype(np.float32)
     points = np.ascontiguousarray(points_camera, dtype=np.float32)
@@ -160,7 +160,7 @@ def _painted(points_camera: np.ndarray, features: np.ndarray, grid: Grid) -> np.
 
 
 def _heights(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """As `inputs.heights`."""
+    """As `network.inputs.heights`."""
     if np.linalg.norm(plane[:3]) > 0.5:
         height = xyz @ plane[:3].astype(np.float32) + np.float32(plane[3])
     else:
@@ -179,7 +179,7 @@ def _in_view(points_camera: np.ndarray, grid: Grid) -> Bool[np.ndarray, " N"]:
 
 @lru_cache(maxsize=4)
 def _importance(count: int) -> Float32[np.ndarray, " N"]:
-    """As in `views`: a fixed irregular number in 0..1 per row."""
+    """As in `network.views`: a fixed irregular number in 0..1 per row."""
     return ((np.arange(count, dtype=np.int64) * 2654435761) % 65536).astype(np.float32) / np.float32(65536)
 
 

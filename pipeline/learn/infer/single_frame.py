@@ -123,7 +123,7 @@ class SingleFrameCalibrator:
     def _corrected(
         self, corrections: Float[np.ndarray, "3 4 4"], guess: tuple[np.ndarray, np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Corrected camera_lidar, camera_radar and lidar_radar (as `networks.compose`)."""
+        """Corrected camera_lidar, camera_radar and lidar_radar (as `calibration_network.compose`)."""
         camera_lidar = _rigid(corrections[0] @ guess[0])
         lidar_radar = _rigid(corrections[2] @ guess[2])
         base = camera_lidar @ lidar_radar if self.config.composed else guess[1]

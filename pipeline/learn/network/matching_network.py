@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
+from pipeline.learn.network.class_matcher import FLOOR, NEUTRAL, ClassMatcher, Match
 from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder, PointEncoder
-from pipeline.learn.network.matching import FLOOR, NEUTRAL, ClassMatcher, Match
-from pipeline.learn.network.occupancy import OccupancyMatch, OccupancyMatcher
+from pipeline.learn.network.occupancy_matcher import OccupancyMatch, OccupancyMatcher
 from pipeline.learn.network.outputs import CoreOutputs, Heads, pose_of_twist
 from pipeline.learn.network.rendering import grid_cells, sphere
 from pipeline.learn.network.views import RenderedView

@@ -51,7 +51,7 @@ EDGE_BONUS, OBJECT_BONUS = 1.0 + 2.0**-19, 0.5 + 2.0**-18
 GROUND_WEIGHT = 0.3  # ground is most of the points, and its classes are the least sharp
 MARGIN_DEG = 8.0  # beyond the grid's border: for guesses that are wrong
 
-# Inputs of the exported graph in order: the fields of `views.RenderedView`.
+# Inputs of the exported graph in order: the fields of `network.views.RenderedView`.
 GRAPH_INPUTS = (
     "camera", "lidar_grid", "radar_grid", "points_camera", "point_weight", "objects", "object_weight",
     "radar_lidar", "radar_camera", "radar_features", "radar_valid", "radar_has_elevation",

@@ -9,21 +9,18 @@ Source: paper section 4.5.4 for the recipe.
 from __future__ import annotations
 
 import json
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 import torch
 
 from pipeline.errors import ContractError
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.loader import load_split
-from pipeline.learn.batches.source import frames_at
+from pipeline.learn.train.batch_loss import Passes, batch_loss
+from pipeline.learn.train.batch_stream import frames_at
 from pipeline.learn.train.checkpoints import BEST, save_checkpoint
 from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.processes import Processes, joined
@@ -31,11 +28,11 @@ from pipeline.learn.train.run_state import RunState, begin_run
 from pipeline.learn.train.running_mean import Consensus
 from pipeline.learn.train.schedule import cosine_rate
 from pipeline.learn.train.settings import TrainConfig
-from pipeline.learn.train.step import Passes, batch_loss
+from pipeline.learn.train.stop_signals import stop_signals
 from pipeline.results import Progress, silent
 from pipeline.store.partitions import Lake
 
-__all__ = ["TrainRequest", "TrainResult", "told_to_stop", "train"]
+__all__ = ["TrainRequest", "TrainResult", "train"]
 
 _VALIDATION_SEED = 977  # the guesses of validation are the same every time
 
@@ -87,7 +84,7 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
     request.out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         processes = stack.enter_context(joined(request.device))
-        told = stack.enter_context(told_to_stop())
+        told = stack.enter_context(stop_signals())
         run = begin_run(
             request.data,
             request.out,
@@ -211,22 +208,3 @@ def _generator(seed: int, step: int, rank: int) -> torch.Generator:
     """The step's own random numbers: nothing to save, nothing that depends on what came before."""
     # Odd multipliers keep neighbouring steps and ranks apart.
     return torch.Generator().manual_seed((seed * 1_000_003 + step * 8_191 + rank * 131) % 2**63)
-
-
-@contextmanager
-def told_to_stop() -> Iterator[list[int]]:
-    """A list that SIGTERM and SIGINT add their number to, instead of ending the process in the middle of a step."""
-    told: list[int] = []
-    if threading.current_thread() is not threading.main_thread():  # Ray's workers: signals are not theirs
-        yield told
-        return
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        told.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield told
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

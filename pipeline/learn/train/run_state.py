@@ -12,17 +12,17 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from pipeline.errors import ConfigError, ContractError
-from pipeline.learn.batches.source import BatchStream, batch_stream
-from pipeline.learn.network.networks import CalibrationNetwork, build_network
+from pipeline.learn.network.calibration_network import CalibrationNetwork, build_network
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.acceleration import accelerate
+from pipeline.learn.train.batch_loss import Passes
+from pipeline.learn.train.batch_stream import BatchStream, batch_stream
 from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
 from pipeline.learn.train.processes import Processes
 from pipeline.learn.train.running_mean import Consensus
 from pipeline.learn.train.schedule import DivergenceGuard
 from pipeline.learn.train.settings import TrainConfig
-from pipeline.learn.train.step import Passes
 
 __all__ = ["RunState", "begin_run", "network_of_run"]
 

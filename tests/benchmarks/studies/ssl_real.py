@@ -25,10 +25,10 @@ from pipeline.geometry.se3 import perturb_exactly
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.loader import load_split
-from pipeline.learn.batches.source import frames_at
+from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.inputs import NetworkInputs, sensor_inputs
-from pipeline.learn.network.networks import CalibrationNetwork
-from pipeline.learn.train.losses import frame_objective, weighted
+from pipeline.learn.train.batch_stream import frames_at
+from pipeline.learn.train.frame_objective import frame_objective, weighted
 from pipeline.learn.train.run_state import network_of_run
 from pipeline.learn.train.settings import LossConfig
 from pipeline.store.partitions import Lake

@@ -24,8 +24,8 @@ from pipeline.learn.perception.lidar_semantics.network import SweepNetwork, buil
 from pipeline.learn.perception.lidar_semantics.samples import SweepImages
 from pipeline.learn.train.checkpoints import LAST, load_checkpoint, save_checkpoint
 from pipeline.learn.train.metrics import MetricsLog
-from pipeline.learn.train.run import told_to_stop
 from pipeline.learn.train.schedule import DivergenceGuard, cosine_rate
+from pipeline.learn.train.stop_signals import stop_signals
 from pipeline.results import Progress, silent
 
 __all__ = [
@@ -142,7 +142,7 @@ def train_sweeps(
     normal, weight = normal_of(train), _weights(train.label)
     began = saved = time.monotonic()
     status = "done"
-    with told_to_stop() as told, closing(MetricsLog(out, run.step, events=False)) as log:
+    with stop_signals() as told, closing(MetricsLog(out, run.step, events=False)) as log:
         while run.step < config.steps:
             if told or (time_limit_s is not None and time.monotonic() - began >= time_limit_s):
                 status = "stopped" if told else "time_limit"

@@ -22,8 +22,8 @@ from pipeline.learn.perception.radar_drivable.network import DrivableNetwork, bu
 from pipeline.learn.perception.radar_drivable.samples import FREE, UNKNOWN, DrivableSamples
 from pipeline.learn.train.checkpoints import LAST, load_checkpoint, save_checkpoint
 from pipeline.learn.train.metrics import MetricsLog
-from pipeline.learn.train.run import told_to_stop
 from pipeline.learn.train.schedule import DivergenceGuard, cosine_rate
+from pipeline.learn.train.stop_signals import stop_signals
 from pipeline.results import Progress, silent
 
 __all__ = [
@@ -88,7 +88,7 @@ def train_drivable(
     began = saved = time.monotonic()
     step = _resume(out / LAST, network, optimiser, guard, config, key)
     status = "done"
-    with told_to_stop() as told, closing(MetricsLog(out, step, events=False)) as log:
+    with stop_signals() as told, closing(MetricsLog(out, step, events=False)) as log:
         while step < config.steps:
             if told or (time_limit_s is not None and time.monotonic() - began >= time_limit_s):
                 status = "stopped" if told else "time_limit"

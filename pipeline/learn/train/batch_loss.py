@@ -9,14 +9,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
-from pipeline.learn.network.networks import CalibrationNetwork
 from pipeline.learn.network.outputs import Predictions
 from pipeline.learn.sample.layout import PAIRS
 from pipeline.learn.train.augment import Guess, random_guess, turned_view
-from pipeline.learn.train.distillation import semantics_loss
-from pipeline.learn.train.losses import frame_objective, weighted
+from pipeline.learn.train.frame_objective import frame_objective, weighted
 from pipeline.learn.train.running_mean import Consensus, doubt_loss
+from pipeline.learn.train.semantics_loss import semantics_loss
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
 from pipeline.objective.differentiable.poses import pose, transform_points
 

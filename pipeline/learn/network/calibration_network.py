@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-from pipeline.learn.network.concat import ConcatCore
+from pipeline.learn.network.concat_network import ConcatCore
 from pipeline.learn.network.inputs import NetworkInputs
 from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.outputs import CoreOutputs, Predictions
