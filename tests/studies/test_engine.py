@@ -2,7 +2,9 @@
 
 import json
 from argparse import Namespace
+from concurrent.futures import Future
 from dataclasses import asdict, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,15 +13,18 @@ from pipeline.config import SolveConfig, load_fleet
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3, inverse, log_so3, transform_points
 from tests.benchmarks.recovery import changed_radar
-from tests.benchmarks.studies import engine
+from tests.benchmarks.studies import engine, table1
 from tests.benchmarks.studies.ablation import _settings, setting_of
+from tests.benchmarks.studies.commits import is_same_code
 from tests.benchmarks.studies.days import SETS, Day, DaySpec
 from tests.benchmarks.studies.engine import Run, key_of, prior_of, read_results, run_study, spoiled
+from tests.benchmarks.studies.looks import heading, look, read_looks
 from tests.benchmarks.studies.verdict import _derived, _simulated, fault_of
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 SPEC = DaySpec(7, "urban")
+MEASURED = [prefix + q for prefix in ("", "prior_") for q in ("az_deg", "el_deg", "range_m")]
 TRUTH = {
     "T_camera_lidar": T_CAMERA_LIDAR.tolist(),
     "T_lidar_radar": T_LIDAR_RADAR.tolist(),
@@ -104,30 +109,44 @@ def test_few_frames_are_spread_over_the_day(day):
         spoiled(day.rows, "rain")
 
 
-def test_a_study_goes_on_where_it_stopped(tmp_path, monkeypatch, capsys):
-    class Inline:
-        def __init__(self, *_args, **_kwargs): ...
-        def __enter__(self):
-            return self
+class Inline:
+    """A pool that works at once, in this process."""
 
-        def __exit__(self, *_error): ...
-        def submit(self, work, *args):
-            from concurrent.futures import Future
+    def __init__(self, *_args, **_kwargs): ...
+    def __enter__(self):
+        return self
 
-            future = Future()
-            future.set_result(work(*args))
-            return future
+    def __exit__(self, *_error): ...
+    def submit(self, work, *args):
+        future = Future()
+        future.set_result(work(*args))
+        return future
 
-    calls = []
+
+@pytest.fixture
+def calls(monkeypatch, tmp_path) -> list[Run]:
+    """The runs that a study did not find done; its code is commit aaa, and nobody has looked at anything yet."""
+    made = []
 
     def work(run, _root):
-        calls.append(run)
+        made.append(run)
         return {"cpu_s": 0.1, "pairs": {}, "refused": "nothing"}
 
     monkeypatch.setattr(engine, "ProcessPoolExecutor", Inline)
     monkeypatch.setattr(engine, "_work", work)
+    monkeypatch.setattr(engine, "commit_now", lambda: "aaa")
+    monkeypatch.setattr(engine, "look", partial(look, record=tmp_path / "seeds.toml"))
+    return made
+
+
+def study_args(tmp_path, **changes) -> Namespace:
+    plain = {"out": tmp_path / "r.jsonl", "limit": None, "workers": 1, "root": tmp_path, "tuning": False}
+    return Namespace(**(plain | {"accept_commits": []} | changes))
+
+
+def test_a_study_goes_on_where_it_stopped(tmp_path, calls, capsys):
     runs = [Run(SPEC, seed=k, solve={"terms": ["edges", "static"]}) for k in range(3)]
-    args = Namespace(out=tmp_path / "r.jsonl", limit=2, workers=1, root=tmp_path, tuning=False)
+    args = study_args(tmp_path, limit=2)
     run_study(runs, args, lambda results: f"{len(results)} lines")
     assert len(calls) == 2
     args.limit = None
@@ -138,6 +157,93 @@ def test_a_study_goes_on_where_it_stopped(tmp_path, monkeypatch, capsys):
     assert all(line["commit"] and line["date"] for line in lines)
     assert "3 of 3 runs" in args.out.with_suffix(".md").read_text()
     assert "3 lines" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("accepted", "again"), [([], 2), (["aaa"], 0), (["all"], 0), (["ccc"], 2)])
+def test_lines_of_other_code_count_only_where_a_person_accepts_them(
+    tmp_path, calls, monkeypatch, accepted, again
+):
+    runs = [Run(SPEC, seed=k) for k in range(2)]
+    run_study(runs, study_args(tmp_path), lambda _: "")
+    calls.clear()
+    monkeypatch.setattr(engine, "commit_now", lambda: "bbb")
+    counted = []
+    run_study(
+        runs, study_args(tmp_path, accept_commits=accepted), lambda results: counted.append(results) or ""
+    )
+    assert len(calls) == again
+    assert [r["commit"] for r in counted[0]] == ["bbb" if again else "aaa"] * 2
+
+
+@pytest.mark.usefixtures("calls")
+def test_a_table_says_first_look_until_other_code_has_looked_at_its_seeds(tmp_path, monkeypatch):
+    day = DaySpec(4000, "urban")
+    heads = []
+    for commit in ("aaa", "aaa", "bbb"):
+        monkeypatch.setattr(engine, "commit_now", lambda commit=commit: commit)
+        run_study([Run(day), Run(day, seed=len(heads))], study_args(tmp_path), lambda _: "")
+        heads.append((tmp_path / "r.md").read_text().splitlines()[0])
+    assert heads[0] == heads[1] == "First look: days of seeds 4000"
+    assert heads[2] == "Second look (first by commit aaa): days of seeds 4000"
+    record = tmp_path / "seeds.toml"
+    assert [e.commit for e in read_looks(record)] == ["aaa", "bbb"]
+
+
+def test_seeds_that_were_seen_are_never_called_fresh(tmp_path):
+    def line(seed, commit="bbb"):
+        return {"day": {"seed": seed}, "commit": commit}
+
+    record = tmp_path / "seeds.toml"
+    record.write_text('[[look]]\nstudy = "x"\nseeds = "300-310, 320"\ncommit = "aaa"\ndate = "2026-01-01"\n')
+    assert "First" not in heading([line(305), line(310), line(320)], record)
+    assert heading([line(311)], record) == "First look: days of seeds 311"
+    assert heading([line(0), line(110)], record) == (
+        "Seen throughout (the real day): days of seeds 0; Tuning seeds: days of seeds 110"
+    )
+    assert "First" not in heading([line(311, "bbb+")], record)
+
+
+def test_the_committed_record_of_looks_can_be_read_and_knows_the_test_days_of_the_first_release():
+    assert all(set(range(200, 210)) & e.seeds for e in read_looks()[:1])
+    assert not any(
+        e.seeds & {d.seed for name in ("dev", "dev-bad") for d in SETS[name]} for e in read_looks()
+    )
+
+
+def test_code_is_the_same_where_nothing_that_decides_results_differs():
+    assert is_same_code("abc", "abc")
+    assert not is_same_code("abc+", "abc+")  # nobody knows what a changed working tree held
+    assert not is_same_code("0000000", "1111111")
+    assert not is_same_code("unknown", "unknown")
+
+
+def test_every_row_of_the_table_has_a_name_of_its_own_and_its_runs_find_it():
+    for row in table1.ROWS:
+        (run,) = table1.runs_of([row], [SPEC])
+        assert table1.row_name(run) == row.name
+    keys = {run.key for run in table1.runs_of(table1.ROWS, SETS["table1"])}
+    assert len(keys) == len(table1.ROWS) * len(SETS["table1"])
+
+
+def test_rows_with_learned_areas_are_left_out_with_a_reason_where_there_is_no_model(tmp_path, capsys):
+    assert not any(row.spoil for row in table1.rows_for(tmp_path))
+    assert "boresight train-radar-drivable" in capsys.readouterr().out
+    model = tmp_path / engine.DRIVABLE_MODEL
+    model.parent.mkdir()
+    model.touch()
+    assert table1.rows_for(tmp_path) == list(table1.ROWS)
+
+
+def test_rows_of_one_method_do_not_mix():
+    lines = [
+        {"row": row, "method": "joint-optimisation", "day": {"seed": s, "environment": "urban"}, "cpu_s": 1.0}
+        | {"pairs": {"camera_lidar": {"status": "held"} | dict.fromkeys(MEASURED, value)}}
+        for row, value in ((table1.ROWS[1].name, 1.0), (table1.ROWS[2].name, 2.0))
+        for s in (1, 2)
+    ]
+    text = table1.summary(lines)
+    assert f"| {table1.ROWS[1].name} | camera_lidar | 2 | 1.000 +- 0.000 |" in text
+    assert f"| {table1.ROWS[2].name} | camera_lidar | 2 | 2.000 +- 0.000 |" in text
 
 
 def test_a_calibration_is_measured_against_truth_pair_by_pair(day):

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import subprocess
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,8 +29,9 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
 from schemas.calibrations import PAIRS
 from schemas.observations import OBSERVATIONS, Observation
+from tests.benchmarks.studies.commits import commit_now
 
-__all__ = ["REAL", "SETS", "Day", "DaySpec", "adopt_day", "commit_now", "generate_day", "load_day"]
+__all__ = ["REAL", "SETS", "Day", "DaySpec", "adopt_day", "generate_day", "load_day"]
 
 VEHICLE, DATE = "vehicle-1", "2026-03-02"
 _FINISHED = "done.json"
@@ -132,16 +132,6 @@ def load_day(spec: DaySpec, root: Path) -> Day:
         load_fleet(folder / "fleet.toml"),
         {name: note.get(name, "unknown") for name in ("simulated_by", "perceived_by")},
     )
-
-
-def commit_now() -> str:
-    """The commit, with a + where the working tree differs from it in what decides results."""
-    head = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
-    )
-    diff = ["git", "diff", "--quiet", "HEAD", "--", "pipeline", "schemas"]
-    changed = subprocess.run(diff, capture_output=True, check=False)
-    return (head.stdout.strip() or "unknown") + ("+" if changed.returncode else "")
 
 
 def _both(first: int, count: int, **fields: object) -> list[DaySpec]:

@@ -1,7 +1,8 @@
 """The engine of all studies: runs that are not yet in the JSON Lines file, on days perceived before, one line each.
 
 A study is a list of `Run`s and a summary. A run names a day, how its prior is made, the method and changes of the
-configuration; its key is all of that, so a study that was stopped goes on where it stood.
+configuration; its key is all of that, so a study that was stopped goes on where it stood. A line counts only where the
+same code made it (`--accept-commits` lets others count), and every table says whether its seeds were seen before.
 """
 
 from __future__ import annotations
@@ -33,22 +34,27 @@ from pipeline.perceive.models.radar_drivable import RadarDrivable
 from pipeline.store.partitions import Partition
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
-from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, commit_now, load_day
+from tests.benchmarks.studies.commits import accept_argument, commit_now, is_accepted
+from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, load_day
+from tests.benchmarks.studies.looks import look
 from tests.benchmarks.studies.metrics import measure, transform_of
 
 __all__ = [
     "DRIVABLE_MODEL",
+    "RESULTS",
     "Run",
     "calibrate_once",
     "learned_drivable",
     "prior_of",
     "read_results",
+    "results_of",
     "run_study",
     "study_arguments",
 ]
 
 # The default sigmas of `rigs.*.prior` in fleet.toml: what a user has who says nothing.
 ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M = 2.0, 0.05
+RESULTS = Path("tests/benchmarks/results")
 DRIVABLE_MODEL = Path("radar_drivable") / "radar_drivable.toml"  # under the days' folder
 _DIAGNOSTICS = {
     "confidence",
@@ -190,6 +196,7 @@ def run_study(
     runs: Sequence[Run],
     args: argparse.Namespace,
     summary: Callable[[list[dict[str, Any]]], str],
+    row_of: Callable[[Run], str] | None = None,
 ) -> None:
     """Run what is missing, a line per run as it finishes; then print the summary and write it beside the lines.
 
@@ -197,10 +204,12 @@ def run_study(
         runs: all runs of the study.
         args: what `study_arguments` parsed.
         summary: Markdown of the results of `runs`.
+        row_of: name of the table's row that a run belongs to, kept as `row` in its line; none without it.
     """
-    done = {key_of(r) for r in read_results(args.out)}
+    now = commit_now()
+    done = results_of(runs, args, now)
     todo = [r for r in runs if r.key not in done][: args.limit]
-    about = {"commit": commit_now(), "date": time.strftime("%Y-%m-%d")}
+    about = {"commit": now, "date": time.strftime("%Y-%m-%d")}
     args.out.parent.mkdir(parents=True, exist_ok=True)
     print(f"{len(runs)} runs, {len(todo)} to do", flush=True)
     with (
@@ -210,32 +219,44 @@ def run_study(
         jobs = {pool.submit(_work, run, args.root): run for run in todo}
         for number, job in enumerate(as_completed(jobs), 1):
             run = jobs[job]
-            if (
-                job.exception() is not None
-            ):  # the others need not wait; this one is missing until it is run again
-                print(f"{number}/{len(todo)} FAILED {run.day.name}: {job.exception()!r}", flush=True)
+            if (err := job.exception()) is not None:
+                # The others need not wait; this one is missing until it is run again.
+                print(f"{number}/{len(todo)} FAILED {run.day.name}: {err!r}", flush=True)
                 continue
-            result = {**asdict(run), **about, **job.result()}
+            result = {**asdict(run), **({"row": row_of(run)} if row_of else {}), **about, **job.result()}
             if not args.tuning:
                 result = _small(result)
             out.write(json.dumps(result) + "\n")
             out.flush()
             print(f"{number}/{len(todo)} {_line(result)}", flush=True)
-    wanted = {r.key for r in runs}
-    results = [r for r in read_results(args.out) if key_of(r) in wanted]
+    results = list(results_of(runs, args, now).values())
     if not results:
         return
-    commits = {name: _all_of(results, name) for name in ("commit", "simulated_by", "perceived_by")}
-    seeds = sorted({r["day"]["seed"] for r in results})
-    dates = sorted({r["date"] for r in results})
-    head = (
-        f"{len(results)} of {len(runs)} runs; calibrated by commit {commits['commit']}, perceived by "
-        f"{commits['perceived_by']}, simulated by {commits['simulated_by']}; {', '.join(dates)}; "
-        f"days of seeds {seeds[0]}-{seeds[-1]}\n"
-    )
-    text = f"{head}\n{summary(results)}\n"
+    text = f"{_heading(results, len(runs), args.out.stem)}\n\n{summary(results)}\n"
     args.out.with_suffix(".md").write_text(text)
     print(text)
+
+
+def results_of(
+    runs: Sequence[Run], args: argparse.Namespace, now: str, path: Path | None = None
+) -> dict[str, dict[str, Any]]:
+    """Newest line of each run in `args.out` (or `path`) that this code made or a person accepts, by key."""
+    wanted = {r.key for r in runs}
+    lines = {
+        key_of(r): r
+        for r in read_results(path or args.out)
+        if is_accepted(r["commit"], now, args.accept_commits)
+    }
+    return {key: line for key, line in lines.items() if key in wanted}
+
+
+def _heading(results: Sequence[dict[str, Any]], asked: int, study: str) -> str:
+    """How much was run, whether its seeds were seen before, by which commits and when."""
+    names = {"calibrated": "commit", "perceived": "perceived_by", "simulated": "simulated_by"}
+    commits = "; ".join(f"{what} by commit {_all_of(results, name)}" for what, name in names.items())
+    return (
+        f"{look(study, results)}\n\n{len(results)} of {asked} runs on {_all_of(results, 'date')}; {commits}"
+    )
 
 
 def _all_of(results: Sequence[dict[str, Any]], name: str) -> str:
@@ -253,7 +274,8 @@ def study_arguments(description: str, name: str) -> argparse.ArgumentParser:
     parser.add_argument(
         "--tuning", action="store_true", help="tuning seeds (below 200) in place of test seeds"
     )
-    parser.add_argument("--out", type=Path, default=Path(f"tests/benchmarks/results/{name}.jsonl"))
+    accept_argument(parser)
+    parser.add_argument("--out", type=Path, default=RESULTS / f"{name}.jsonl")
     return parser
 
 

@@ -33,7 +33,7 @@ from pipeline.learn.train.run_state import network_of_run
 from pipeline.learn.train.settings import LossConfig
 from pipeline.store.partitions import Lake
 from schemas.calibrations import PAIRS
-from tests.benchmarks.studies.days import commit_now
+from tests.benchmarks.studies.commits import commit_now
 
 __all__ = ["alignment", "answers", "measured", "starts", "table"]
 

@@ -22,12 +22,12 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.studies.days import commit_now
+from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.engine import _quiet, read_results
 from tests.benchmarks.studies.ssl_days import ModelSet, Where, fleet_days, open_day, table1_days
 from tests.benchmarks.studies.ssl_measures import ITERATIONS, STARTS, measure_day, measure_frames
 from tests.benchmarks.studies.ssl_tables import abrupt_table, frames_table, rows_of, sigma_table
-from tests.benchmarks.studies.table1 import METHODS, errors_table, verdicts_table
+from tests.benchmarks.studies.table1 import ROWS, errors_table, row_of, verdicts_table
 
 __all__ = ["Task", "heading", "run_tasks", "summary"]
 
@@ -110,9 +110,9 @@ def summary(results: list[dict[str, Any]], others: list[dict[str, Any]]) -> str:
     days = [r for r in results if r["part"] in {"days", "polish"}]
     parts = []
     if days:
-        methods = [*(m for m in METHODS if any(r["method"] == m for r in others)), *rows_of(days)]
-        parts += [errors_table([*others, *days], e, methods) for e in _ENVIRONMENTS if _any(days, e)]
-        parts += [verdicts_table([*others, *days], methods), sigma_table(days)]
+        rows = [*(row.name for row in ROWS if any(row_of(r) == row.name for r in others)), *rows_of(days)]
+        parts += [errors_table([*others, *days], e, rows) for e in _ENVIRONMENTS if _any(days, e)]
+        parts += [verdicts_table([*others, *days], rows), sigma_table(days)]
     if frames := [r for r in results if r["part"] == "frames"]:
         parts.append(frames_table(frames))
     if abrupt := [r for r in results if r["part"] == "abrupt"]:

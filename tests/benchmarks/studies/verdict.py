@@ -27,8 +27,9 @@ from typing import Any
 import numpy as np
 
 from schemas.calibrations import PAIRS
+from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.days import SETS, DaySpec
-from tests.benchmarks.studies.engine import Run, read_results, run_study, study_arguments
+from tests.benchmarks.studies.engine import Run, results_of, run_study, study_arguments
 from tests.benchmarks.studies.metrics import AZIMUTH_ELEVATION_DOF, LIMITS_DEG, share, within
 
 DERIVED = ("focal:0.03", "focal:-0.03", "centre:20", "few:1", "hidden prior")
@@ -43,9 +44,8 @@ def main() -> None:
     bad = SETS["dev-bad" if args.tuning else "verdict"]
     runs = [*(_simulated(day) for day in bad), *_derived(good, 2 if args.tuning else 15)]
     known = args.coverage or args.out.with_name("dev_coverage.jsonl" if args.tuning else "coverage.jsonl")
-    run_study(
-        runs, args, lambda results: summary([*read_results(known), *results], args.out.with_suffix(".csv"))
-    )
+    of_good_days = results_of([Run(day, seed=day.seed) for day in good], args, commit_now(), known).values()
+    run_study(runs, args, lambda results: summary([*of_good_days, *results], args.out.with_suffix(".csv")))
 
 
 def _simulated(day: DaySpec) -> Run:

@@ -1,0 +1,103 @@
+"""Which test seeds were looked at, when and by which code: results/seeds.toml, one entry per look.
+
+A number on test seeds is honest once: whoever sees it may change the code because of it. So a table is a first look
+only where the code that made it is the code that looked at its seeds first; all that comes later is a second look, and
+says so. Tuning seeds (below 200) are for looking.
+"""
+
+from __future__ import annotations
+
+import time
+import tomllib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tests.benchmarks.studies.commits import is_same_code
+
+__all__ = ["RECORD", "Look", "heading", "look", "read_looks"]
+
+RECORD = Path(__file__).parents[1] / "results" / "seeds.toml"
+_REAL, _FIRST_TEST_SEED = 0, 200
+
+
+@dataclass(frozen=True)
+class Look:
+    """Somebody saw what this code makes of these days."""
+
+    study: str
+    seeds: frozenset[int]
+    commit: str
+
+
+def read_looks(record: Path = RECORD) -> list[Look]:
+    """All looks, the oldest first; none where there is no file."""
+    if not record.exists():
+        return []
+    entries = tomllib.loads(record.read_text()).get("look", [])
+    return [Look(e["study"], _seeds_of(e["seeds"]), e["commit"]) for e in entries]
+
+
+def look(study: str, results: Sequence[dict[str, Any]], record: Path = RECORD) -> str:
+    """Note down that the test seeds of these result lines are seen now; returns the `heading` of their table."""
+    known = read_looks(record)
+    for commit in dict.fromkeys(r["commit"] for r in results):
+        seen = [e.seeds for e in known if e.commit == commit and e.study == study]
+        new = {s for s in _seeds(results, commit) if s >= _FIRST_TEST_SEED}.difference(*seen)
+        if new:
+            with record.open("a") as file:
+                file.write(
+                    f'\n[[look]]\nstudy = "{study}"\nseeds = "{_ranges(new)}"\ncommit = "{commit}"\n'
+                    f'date = "{time.strftime("%Y-%m-%d")}"\n'
+                )
+    return heading(results, record)
+
+
+def heading(results: Sequence[dict[str, Any]], record: Path = RECORD) -> str:
+    """Say of the seeds of result lines whether this is a first look at them.
+
+    Args:
+        results: lines with `commit` and `day.seed`.
+        record: looks so far, these lines' own among them.
+    """
+    known = read_looks(record)
+    said: dict[str, set[int]] = {}
+    for commit in dict.fromkeys(r["commit"] for r in results):
+        for seed in _seeds(results, commit):
+            said.setdefault(_freshness(seed, commit, known), set()).add(seed)
+    return "; ".join(f"{what}: days of seeds {_ranges(seeds)}" for what, seeds in said.items())
+
+
+def _freshness(seed: int, commit: str, known: Sequence[Look]) -> str:
+    if seed == _REAL:
+        return "Seen throughout (the real day)"
+    if seed < _FIRST_TEST_SEED:
+        return "Tuning seeds"
+    if "+" in commit:
+        return "Made by uncommitted code (not to be stated)"
+    first = next((e for e in known if seed in e.seeds), None)
+    if first is None or is_same_code(first.commit, commit):
+        return "First look"
+    return f"Second look (first by commit {first.commit})"
+
+
+def _seeds(results: Iterable[dict[str, Any]], commit: str) -> list[int]:
+    return sorted({r["day"]["seed"] for r in results if r["commit"] == commit})
+
+
+def _seeds_of(text: str) -> frozenset[int]:
+    """Seeds of "200-209, 300": both ends belong to a range."""
+    ends = [[int(v) for v in part.split("-")] for part in text.split(",")]
+    return frozenset(seed for e in ends for seed in range(e[0], e[-1] + 1))
+
+
+def _ranges(seeds: Iterable[int]) -> str:
+    """Shortest text that `_seeds_of` reads back."""
+    runs: list[list[int]] = []
+    for seed in sorted(seeds):
+        if runs and seed == runs[-1][-1] + 1:
+            runs[-1] = [runs[-1][0], seed]
+        else:
+            runs.append([seed])
+    return ", ".join("-".join(map(str, run)) for run in runs)
