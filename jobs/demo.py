@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jobs.extras import needs
+
 if TYPE_CHECKING:
     from pipeline.results import Progress
     from pipeline.simulate.fleet import FleetSpec
@@ -17,15 +19,25 @@ __all__ = ["demo"]
 # What is compared with the truth at the end: the night's method, and the shipped network.
 _NETWORK = "joint-ssl"
 # The radar of the second vehicle is knocked before the third day: 1.2 deg is what a kerb or a car wash does.
-_FAULTS = "vehicle-2:2:radar:yaw:1.2"
-_VEHICLES, _DAYS = 3, 4
+_KNOCK = "vehicle-2:2:radar:yaw:1.2"
 
 
-def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = None, seed: int = 1) -> int:
-    """Simulate three vehicles for four days, knock a radar, find it again, and write the report.
+@needs("simulate")
+def demo(
+    *,
+    out: Path = Path("demo"),
+    vehicles: int = 3,
+    days: int = 4,
+    frames: int = 60,
+    workers: int | None = None,
+    seed: int = 1,
+) -> int:
+    """Simulate vehicles for some days, knock a radar, find it again, and write the report.
 
     Args:
         out: folder for logs, truth, lake and report; what is up to date there is not made again.
+        vehicles: how many; the radar of the second one is knocked.
+        days: how many; the knock comes before the third.
         frames: camera-lidar-radar trios per vehicle and day.
         workers: processes at a time; default: one per CPU that this process may use.
         seed: another seed is another fleet.
@@ -42,25 +54,27 @@ def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = No
     from pipeline.store.partitions import Lake
 
     began = time.monotonic()
-    base = FleetSpec(vehicles=_VEHICLES, days=_DAYS, frames=frames, seed=seed, container="mixed")
-    days = day_names(base.first_day, base.days)
-    spec = FleetSpec(**(vars(base) | {"faults": parse_faults(_FAULTS, days)}))
+    base = FleetSpec(vehicles=vehicles, days=days, frames=frames, seed=seed, container="mixed")
+    dates = day_names(base.first_day, days)
+    knocks = _KNOCK if vehicles > 1 and days > 2 else ""
+    spec = FleetSpec(**(vars(base) | {"faults": parse_faults(knocks, dates)}))
     workers = workers or usable_cpus()
-    _say(f"[bold]1/3[/]  {_VEHICLES} vehicles drive for {_DAYS} days; before day 3 someone bumps a radar")
+    bump = "; before day 3 someone bumps a radar" if knocks else ""
+    _say(f"[bold]1/3[/]  vehicles: {vehicles}, days: {days}{bump}")
     _simulate(spec, out, workers)
     fleet_file = out / "fleet.toml"
     night = Night(load_fleet(fleet_file), fleet_file, Lake.at(out / "lake"))
     _say("[bold]2/3[/]  the night: ingest, perceive, calibrate every vehicle-day")
-    work = find_vehicle_days(str(out / "logs" / "{vehicle}" / "{day}" / "*"), days[0], days[-1])
+    work = find_vehicle_days(str(out / "logs" / "{vehicle}" / "{day}" / "*"), dates[0], dates[-1])
     outcomes = watch_night(night, work, "process", workers)
     # The same last day by the network that comes with Boresight: it looks at single frames, without semantics.
-    last_day = [w for w in work if w.partition.day == days[-1]]
+    last_day = [w for w in work if w.partition.day == dates[-1]]
     outcomes += watch_night(replace(night, method=_NETWORK), last_day, "process", workers)
     _say("[bold]3/3[/]  the audit: which sensor moved, and since when")
     truth = read_truth(out / "truth")
     findings, pages = close_night(night, None, out / "report" / "fleet.html", truth)
-    errors = print_comparison(night.lake, night.method, truth, days[-1], findings)
-    errors += print_methods(night.lake, (night.method, _NETWORK), truth, days[-1])[_NETWORK]
+    errors = print_comparison(night.lake, night.method, truth, dates[-1], findings)
+    errors += print_methods(night.lake, (night.method, _NETWORK), truth, dates[-1])[_NETWORK]
     (out / "comparison.json").write_text(json.dumps(errors, indent=1) + "\n")
     code = exit_code([o.status for o in outcomes])
     seconds = time.monotonic() - began
@@ -72,7 +86,7 @@ def demo(*, out: Path = Path("demo"), frames: int = 60, workers: int | None = No
         seconds=round(seconds, 1),
         vehicle_days=len(work),
         moved=moved_sensors(findings),
-        knocked=[{"vehicle": f.vehicle, "sensor": f.sensor, "since": days[f.day]} for f in spec.faults],
+        knocked=[{"vehicle": f.vehicle, "sensor": f.sensor, "since": dates[f.day]} for f in spec.faults],
         comparison=out / "comparison.json",
     )
     return code

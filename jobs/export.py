@@ -38,6 +38,9 @@ def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
         raise ConfigError("command line", "run", "onnx needs --run FOLDER, as `boresight train` left it")
     if out.suffix != ".onnx":
         raise ConfigError("command line", "out", f"{out} must end in .onnx")
+    from jobs.extras import require
+
+    require("train")
     from pipeline.learn.export.model_card import card_of_run
     from pipeline.learn.export.onnx_file import export_onnx
     from pipeline.learn.train.run_state import network_of_run

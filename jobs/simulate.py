@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from jobs.extras import needs
+
 if TYPE_CHECKING:
     from pipeline.simulate.fleet import FleetSpec
 
 __all__ = ["simulate"]
 
 
+@needs("simulate")
 def simulate(
     *,
     out: Path,

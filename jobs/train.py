@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from jobs.extras import needs
+
 if TYPE_CHECKING:
     from pipeline.learn.train.run import TrainRequest
     from pipeline.learn.train.settings import TrainConfig
@@ -14,6 +16,7 @@ __all__ = ["parse_duration", "train"]
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
+@needs("train")
 def train(
     *,
     data: str,

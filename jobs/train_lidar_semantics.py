@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jobs.extras import needs
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["train_lidar_semantics"]
 
 
+@needs("train")
 def train_lidar_semantics(
     *,
     fleet: Path,

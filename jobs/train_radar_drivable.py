@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jobs.extras import needs
+
 if TYPE_CHECKING:
     from pipeline.config import FleetConfig
     from pipeline.learn.perception.radar_drivable.samples import DrivableSamples
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["train_radar_drivable"]
 
 
+@needs("train")
 def train_radar_drivable(
     *,
     fleet: Path,

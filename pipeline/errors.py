@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["BoresightError", "ConfigError", "ContractError", "LogError", "ModelError", "SolveError"]
+__all__ = [
+    "BoresightError",
+    "ConfigError",
+    "ContractError",
+    "LogError",
+    "MissingExtraError",
+    "ModelError",
+    "SolveError",
+]
 
 
 class BoresightError(Exception):
@@ -48,6 +56,18 @@ class ContractError(BoresightError):
     def __init__(self, path: str, problem: str) -> None:
         self.path, self.problem = path, problem
         super().__init__(f"{path}: {problem}")
+
+
+class MissingExtraError(BoresightError):
+    """A command needs `module`, which a plain `pip install boresight` leaves out: `extra` brings it."""
+
+    exit_code = 2
+
+    def __init__(self, extra: str, module: str) -> None:
+        self.extra, self.module = extra, module
+        super().__init__(
+            f"needs {module}, which comes with the extra [{extra}]: pip install 'boresight[{extra}]'"
+        )
 
 
 class ModelError(BoresightError):

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from pipeline.errors import BoresightError, ConfigError, ContractError
+from pipeline.errors import BoresightError, ConfigError, ContractError, MissingExtraError
 from pipeline.learn.train.run import TrainRequest, TrainResult, train
 from pipeline.learn.train.settings import TrainConfig
 
@@ -22,7 +22,8 @@ def train_on_ray(request: TrainRequest, config: TrainConfig, workers: int) -> Tr
     """Train with Ray Train's workers; `out` and `data` must be where every worker can reach them.
 
     Raises:
-        ConfigError: Ray is not installed, or `workers` is below 1.
+        ConfigError: `workers` is below 1.
+        MissingExtraError: Ray is not installed.
         BoresightError: what `train` raised in a worker.
         ContractError: a worker failed otherwise, or was lost.
     """
@@ -32,9 +33,7 @@ def train_on_ray(request: TrainRequest, config: TrainConfig, workers: int) -> Tr
         from ray.train import RunConfig, ScalingConfig, TrainingFailedError  # noqa: PLC0415 - an extra
         from ray.train.torch import TorchTrainer  # noqa: PLC0415
     except ImportError as err:
-        raise ConfigError(
-            "command line", "ray-workers", "needs the extra: pip install 'boresight[ray]'"
-        ) from err
+        raise MissingExtraError("ray", "ray") from err
     # Workers run elsewhere: what is relative here is another place there.
     request = replace(request, out=request.out.absolute(), data=_absolute(request.data))
     request.out.mkdir(parents=True, exist_ok=True)

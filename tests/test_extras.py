@@ -1,0 +1,143 @@
+"""A plain install holds what the night needs; other commands name the extra that they lack."""
+
+import ast
+import json
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from jobs.cli import COMMANDS
+
+REPO = Path(__file__).resolve().parent.parent
+PACKAGES = ("jobs", "pipeline", "schemas")
+PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
+DISTRIBUTION_OF = {"cv2": "opencv-python-headless"}  # where the import name differs
+# Commands beyond the night, and the extra that each needs.
+NEEDS = {
+    "demo": "simulate",
+    "simulate": "simulate",
+    "train": "train",
+    "train-radar-drivable": "train",
+    "train-lidar-semantics": "train",
+    "export": "train",
+}
+# Each as a person would call it; the folders need not exist, since the extra is asked for first.
+CALLS = {
+    "demo": ["demo"],
+    "simulate": ["simulate", "--out", "logs"],
+    "train": ["train", "--data", "lake", "--out", "run"],
+    "train-radar-drivable": ["train-radar-drivable", "--fleet", "f.toml", "--lake", "lake", "--out", "run"],
+    "train-lidar-semantics": ["train-lidar-semantics", "--fleet", "f.toml", "--lake", "lake", "--out", "run"],
+    "export": ["export", "onnx", "--out", "a.onnx", "--run", "."],
+}
+
+
+def declared(*extras):
+    """Import names of what `pip install boresight[extras]` asks for."""
+    wanted = [*PROJECT["dependencies"], *(d for e in extras for d in PROJECT["optional-dependencies"][e])]
+    names = {d.split("=")[0].split("[")[0] for d in wanted}
+    called = {distribution: name for name, distribution in DISTRIBUTION_OF.items()}
+    return {called.get(n, n.replace("-", "_")) for n in names}
+
+
+@cache
+def imports_of(module):
+    """What a module of ours imports, at its top, inside functions, or by an import path in a string."""
+    path = REPO.joinpath(*module.split("."))
+    path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    if not path.is_file():
+        return frozenset()  # a name inside a module
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {node.module, *(f"{node.module}.{a.name}" for a in node.names)}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and ":" in node.value:
+            target = node.value.partition(":")[0]
+            found |= {target} if target.startswith("pipeline.") and " " not in target else set()
+    return frozenset(found)
+
+
+@cache
+def reached(command):
+    """Our modules that a command may import, and the packages of others that those import."""
+    ours, others, waiting = set(), set(), [COMMANDS[command][0].partition(":")[0]]
+    while waiting:
+        name = waiting.pop()
+        top = name.split(".")[0]
+        if top not in PACKAGES:
+            others |= {top} - set(sys.stdlib_module_names)
+        elif name not in ours:
+            ours.add(name)
+            waiting += [name.rpartition(".")[0]] if "." in name else []
+            waiting += imports_of(name)
+    return ours, others
+
+
+def test_the_walk_reaches_every_stage_and_method():
+    ours, others = reached("nightly")
+    calibrate = {"joint.solve", "tracking.solve", "paper.joint_optimisation"}
+    rooms = {
+        "ingest.deskew",
+        "perceive.models.session",
+        "learn.infer.single_frame",
+        "audit.charts",
+        "report.day",
+    }
+    assert {f"pipeline.{m}" for m in rooms | {f"calibrate.{c}" for c in calibrate}} <= ours
+    assert {"numpy", "onnxruntime"} <= others
+    assert "torch" in reached("train")[1]
+    assert "embreex" in reached("demo")[1]
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if c not in NEEDS])
+def test_a_plain_install_holds_all_that_a_command_of_the_night_may_import(command):
+    assert reached(command)[1] <= declared()
+
+
+@pytest.mark.parametrize("command", NEEDS)
+def test_an_extra_holds_all_else_that_its_commands_may_import(command):
+    # `train --ray-workers` names an extra of its own.
+    assert reached(command)[1] - declared(NEEDS[command]) <= ({"ray"} if "train" in command else set())
+
+
+def test_nothing_is_declared_that_nothing_imports():
+    imported = set().union(*(reached(command)[1] for command in COMMANDS))
+    declared_for_users = declared("simulate", "train", "ray") - {"boresight"}
+    assert declared_for_users - imported == {"tensorboard"}  # imported by torch.utils.tensorboard
+
+
+@pytest.fixture(scope="module")
+def ends_without_extras(tmp_path_factory):
+    """How each call ends where no extra is installed: exit code and what stderr says."""
+    code = (
+        "import io, json, sys; from contextlib import redirect_stderr, redirect_stdout;"
+        "sys.modules |= dict.fromkeys(['embreex', 'torch', 'ray', 'tensorboard']);"
+        "from jobs.cli import main\n"
+        "for name, call in json.loads(sys.argv[1]).items():\n"
+        "    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as said:\n"
+        "        ended = main(call)\n"
+        "    print(json.dumps([name, ended, said.getvalue()]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, json.dumps(CALLS)],
+        cwd=tmp_path_factory.mktemp("empty"),
+        env={"PYTHONPATH": str(REPO), "PATH": ""},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return {name: (ended, said) for name, ended, said in map(json.loads, done.stdout.splitlines())}
+
+
+@pytest.mark.parametrize("command", NEEDS)
+def test_a_command_without_its_extra_says_in_one_line_how_to_have_it(command, ends_without_extras):
+    ended, said = ends_without_extras[command]
+    assert ended == 2
+    assert len(said.splitlines()) == 1
+    assert f"pip install 'boresight[{NEEDS[command]}]'" in said
