@@ -50,17 +50,16 @@ def calibrate(
         )
     config = load_fleet(fleet)
     if polish:
-        config = config.model_copy(update={"solve": config.solve.model_copy(update={"polish": True})})
+        config = config.changed(solve={"polish": True})
     partition, tables, moved = Partition(vehicle, day), Lake.at(lake), parse_perturb(perturb)
     if frame is not None:
         ssl = "joint-ssl" if method == "joint" else method
-        return _calibrate_frame(config, fleet, tables, partition, frame, ssl, moved, seed, page)
-    return _calibrate_day(config, fleet, tables, partition, method, moved, seed)
+        return _calibrate_frame(config, tables, partition, frame, ssl, moved, seed, page)
+    return _calibrate_day(config, tables, partition, method, moved, seed)
 
 
 def _calibrate_day(
     config: FleetConfig,
-    fleet: Path,
     lake: Lake,
     partition: Partition,
     method: str,
@@ -80,7 +79,6 @@ def _calibrate_day(
             perturb=perturb,
             seed=seed,
             progress=progress,
-            fleet_file=fleet,
         )
     print_summary(
         "calibrate",
@@ -98,7 +96,6 @@ def _calibrate_day(
 
 def _calibrate_frame(
     config: FleetConfig,
-    fleet: Path,
     lake: Lake,
     partition: Partition,
     frame: int,
@@ -111,9 +108,7 @@ def _calibrate_frame(
     from jobs.terminal.summary import print_summary
     from pipeline.calibrate.networks import calibrate_frame
 
-    found = calibrate_frame(
-        partition, config, lake, frame, method=method, perturb=perturb, seed=seed, fleet_file=fleet
-    )
+    found = calibrate_frame(partition, config, lake, frame, method=method, perturb=perturb, seed=seed)
     if page is not None:
         from pipeline.report.frame import write_frame_page
 

@@ -39,7 +39,7 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log")
     with progress_reporter("check") as progress:
-        report = check_logs(logs, config.rigs[name], config.ingest, str(fleet), progress)
+        report = check_logs(logs, config.rigs[name], config, progress)
     if json:
         print_json(asdict(report))
     else:

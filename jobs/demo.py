@@ -62,8 +62,7 @@ def demo(
     bump = "; before day 3 someone bumps a radar" if knocks else ""
     _say(f"[bold]1/3[/]  vehicles: {vehicles}, days: {days}{bump}")
     _simulate(spec, out, workers)
-    fleet_file = out / "fleet.toml"
-    night = Night(load_fleet(fleet_file), fleet_file, Lake.at(out / "lake"))
+    night = Night(load_fleet(out / "fleet.toml"), Lake.at(out / "lake"))
     _say("[bold]2/3[/]  the night: ingest, perceive, calibrate every vehicle-day")
     work = find_vehicle_days(str(out / "logs" / "{vehicle}" / "{day}" / "*"), dates[0], dates[-1])
     outcomes = watch_night(night, work, "process", workers)

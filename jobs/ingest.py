@@ -29,7 +29,7 @@ def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
         raise ConfigError("command line", "LOG", "name at least one log of the day")
     config = load_fleet(fleet)
     with progress_reporter(f"ingest {vehicle} {day}") as progress:
-        result = ingest_day(logs, Partition(vehicle, day), config, Lake.at(lake), progress, str(fleet))
+        result = ingest_day(logs, Partition(vehicle, day), config, Lake.at(lake), progress)
     fields = asdict(result)
     print_summary("ingest", fields.pop("status"), **fields)
     return exit_code([result.status])

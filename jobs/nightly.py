@@ -51,7 +51,7 @@ def nightly(
 
     config = load_fleet(fleet)
     tables = Lake.at(lake)
-    night = Night(config, fleet, tables, method or config.audit.method, seed)
+    night = Night(config, tables, method or config.audit.method, seed)
     days = find_vehicle_days(logs, from_day, to_day)
     outcomes = watch_night(night, days, executor, workers)
     page = report or tables.root / "report" / "fleet.html"

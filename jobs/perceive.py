@@ -25,7 +25,7 @@ def perceive(*, fleet: Path, lake: str, vehicle: str, day: str) -> int:
 
     config = load_fleet(fleet)
     with progress_reporter(f"perceive {vehicle} {day}") as progress:
-        result = perceive_day(Partition(vehicle, day), config, Lake.at(lake), progress, fleet)
+        result = perceive_day(Partition(vehicle, day), config, Lake.at(lake), progress)
     fields = asdict(result)
     print_summary("perceive", fields.pop("status"), **fields)
     return exit_code([result.status])

@@ -46,8 +46,8 @@ def prepare(
     from pipeline.store.partitions import Lake
 
     config, tables = load_fleet(fleet), Lake.at(lake)
-    days = _days(config, tables, fleet, from_day, to_day, vehicles)
-    results = _run(_plan(config, tables, fleet, days), executor, workers)
+    days = _days(config, tables, from_day, to_day, vehicles)
+    results = _run(_plan(config, tables, days), executor, workers)
     with progress_reporter("inventory") as progress:
         progress(0, 0, "compare views")
         inventory = take_inventory(tables, config.prepare.duplicate_bits)
@@ -72,7 +72,6 @@ def prepare(
 def _days(
     config: FleetConfig,
     lake: Lake,
-    fleet: Path,
     from_day: str | None,
     to_day: str | None,
     vehicles: Sequence[str] | None,
@@ -85,7 +84,7 @@ def _days(
     for name, day in (("--from", from_day), ("--to", to_day)):
         check_day(name, day)
     for vehicle in vehicles or ():
-        config.rig_of(vehicle, file=str(fleet))
+        config.rig_of(vehicle)
     wanted = set(vehicles or config.vehicles)
     days = [
         p
@@ -99,7 +98,7 @@ def _days(
     return days
 
 
-def _plan(config: FleetConfig, lake: Lake, fleet: Path, days: Sequence[Partition]) -> list[PrepareWork]:
+def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> list[PrepareWork]:
     """Look over all days and divide them; each worker gets the keys of its own day."""
     from jobs.terminal.summary import progress_reporter
     from pipeline.learn.prepare.fleet import PrepareWork
@@ -118,7 +117,7 @@ def _plan(config: FleetConfig, lake: Lake, fleet: Path, days: Sequence[Partition
         day = survey.partition
         keys = {k for place in set(survey.place) for k in Unit(day.vehicle, day.day, place).keys(plan.by)}
         own = SplitPlan(plan.by, {k: plan.sides[k] for k in keys & plan.sides.keys()})
-        work.append(PrepareWork(day, config, fleet, lake, own))
+        work.append(PrepareWork(day, config, lake, own))
     return work
 
 

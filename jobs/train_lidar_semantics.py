@@ -70,7 +70,7 @@ def train_lidar_semantics(
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
     config = SweepTraining(steps, batch_size, learning_rate, seed=seed)
-    days = _days(load_fleet(fleet), fleet, Lake.at(lake))
+    days = _days(load_fleet(fleet), Lake.at(lake))
     layout = _layout(days, Lake.at(lake), rows, columns)
     train, held_out, data = _samples(days, Lake.at(lake), layout, frames_per_day)
     torch.set_num_threads(threads)
@@ -85,9 +85,7 @@ def train_lidar_semantics(
     return 128 + result.signal if result.signal else 0
 
 
-def _days(
-    config: FleetConfig, fleet_file: Path, lake: Lake
-) -> list[tuple[Partition, list[Observation], np.ndarray, bool]]:
+def _days(config: FleetConfig, lake: Lake) -> list[tuple[Partition, list[Observation], np.ndarray, bool]]:
     """Days with their observations, T_camera_lidar, and whether it was accepted."""
     from pipeline.errors import ContractError
     from pipeline.extrinsics.prior import read_prior
@@ -110,8 +108,8 @@ def _days(
         rows = read_rows(lake, OBSERVATIONS, partition, Observation)
         known = accepted.get((partition.vehicle, partition.day))
         if known is None:
-            prior = config.rig_of(partition.vehicle, file=str(fleet_file)).prior
-            days.append((partition, rows, read_prior(rows, prior, fleet_file).T_camera_lidar, False))
+            prior = read_prior(rows, config, partition.vehicle)
+            days.append((partition, rows, prior.T_camera_lidar, False))
         else:
             days.append((partition, rows, known, True))
     return days

@@ -59,7 +59,7 @@ def train_radar_drivable(
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
     config = DrivableTraining(steps, batch_size, learning_rate, seed=seed)
-    train, held_out, data = _samples(load_fleet(fleet), fleet, Lake.at(lake), frames_per_day)
+    train, held_out, data = _samples(load_fleet(fleet), Lake.at(lake), frames_per_day)
     torch.set_num_threads(threads)
     with progress_reporter(f"train {out.name}") as progress:
         network, result = train_drivable(train, held_out, out, config, limit, progress)
@@ -73,7 +73,7 @@ def train_radar_drivable(
 
 
 def _samples(
-    config: FleetConfig, fleet_file: Path, lake: Lake, per_day: int
+    config: FleetConfig, lake: Lake, per_day: int
 ) -> tuple[DrivableSamples, DrivableSamples, dict[str, int]]:
     """Samples to learn from, held-out samples, and their numbers."""
     import numpy as np
@@ -87,7 +87,7 @@ def _samples(
         raise ContractError(
             str(lake.root), "no observations of a vehicle in fleet.toml: run `boresight perceive`"
         )
-    parts = [_samples_of_day(config, fleet_file, lake, day, per_day) for day in days]
+    parts = [_samples_of_day(config, lake, day, per_day) for day in days]
     if len(parts) == 1:
         # Neighbouring scans are alike: a tenth between the two sides belongs to neither.
         rows, total = np.arange(len(parts[0])), len(parts[0])
@@ -102,15 +102,12 @@ def _samples(
     )
 
 
-def _samples_of_day(
-    config: FleetConfig, fleet_file: Path, lake: Lake, day: Partition, per_day: int
-) -> DrivableSamples:
+def _samples_of_day(config: FleetConfig, lake: Lake, day: Partition, per_day: int) -> DrivableSamples:
     from pipeline.extrinsics.prior import read_prior
     from pipeline.learn.perception.radar_drivable.samples import day_samples
     from pipeline.store.tables import read_rows
     from schemas.observations import OBSERVATIONS, Observation
 
     rows = read_rows(lake, OBSERVATIONS, day, Observation)
-    prior = config.rig_of(day.vehicle, file=str(fleet_file)).prior
-    T_lidar_radar = read_prior(rows, prior, fleet_file).T_lidar_radar
+    T_lidar_radar = read_prior(rows, config, day.vehicle).T_lidar_radar
     return day_samples(rows, T_lidar_radar, per_day)

@@ -6,9 +6,9 @@ import hashlib
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from pipeline.errors import ConfigError
 
@@ -47,6 +47,9 @@ TERMS: tuple[Term, ...] = get_args(Term)
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+_Kind = TypeVar("_Kind", bound=_Section)
 
 
 class TopicSemantics(_Section):
@@ -305,7 +308,7 @@ class AuditConfig(_Section):
 
 
 class FleetConfig(_Section):
-    """The whole of fleet.toml."""
+    """The whole of fleet.toml, and which file it was read from: paths in it are relative to that file."""
 
     fleet: FleetSection
     rigs: dict[str, Rig]
@@ -319,6 +322,7 @@ class FleetConfig(_Section):
     prepare: PrepareConfig = PrepareConfig()
     learn: LearnConfig = LearnConfig()
     audit: AuditConfig = AuditConfig()
+    _file: Path = PrivateAttr(default=Path("fleet.toml"))  # no value of the file: never dumped, never hashed
 
     @model_validator(mode="after")
     def _vehicles_name_known_rigs(self) -> FleetConfig:
@@ -329,12 +333,45 @@ class FleetConfig(_Section):
                 )
         return self
 
-    def rig_of(self, vehicle: str, *, file: str = "fleet.toml") -> Rig:
+    @property
+    def file(self) -> Path:
+        """The file that this was read from; "fleet.toml" of the working folder where it came from no file."""
+        return self._file
+
+    def path_of(self, name: str) -> Path:
+        """A path that the file names: relative to the file's folder unless absolute."""
+        return self._file.parent / name
+
+    def read_from(self, file: Path) -> FleetConfig:
+        """The same configuration as if it had been read from another file."""
+        copy = self.model_copy()
+        copy._file = file  # noqa: SLF001 - a copy of this very class
+        return copy
+
+    def changed(self, **sections: dict[str, Any]) -> FleetConfig:
+        """With other values in some sections, validated like those of a file; the file stays.
+
+        Args:
+            sections: as `select={"frames": 16}`; keys that are not named keep their value.
+
+        Raises:
+            ConfigError: no such section or key, or an impossible value; the message names the key.
+        """
+        new: dict[str, Any] = {}
+        for name, values in sections.items():
+            section = getattr(self, name, None)
+            if not isinstance(section, _Section):
+                raise ConfigError(str(self._file), name, "no such section")
+            # Not through a dump: it would leave out what is no part of a work key (`exclude`).
+            kept = {key: getattr(section, key) for key in type(section).model_fields}
+            new[name] = _validated(type(section), kept | values, self._file, name)
+        return self.model_copy(update=new)
+
+    def rig_of(self, vehicle: str) -> Rig:
         """The rig of a vehicle; ConfigError where the vehicle is not in the file."""
         if vehicle not in self.vehicles:
-            raise ConfigError(
-                file, f"vehicles.{vehicle}", f"unknown vehicle; the file has {sorted(self.vehicles)}"
-            )
+            problem = f"unknown vehicle; the file has {sorted(self.vehicles)}"
+            raise ConfigError(str(self._file), f"vehicles.{vehicle}", problem)
         return self.rigs[self.vehicles[vehicle].rig]
 
 
@@ -350,13 +387,19 @@ def load_fleet(path: Path) -> FleetConfig:
         raise ConfigError(str(path), "", "no such file") from err
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as err:
         raise ConfigError(str(path), "", f"not a TOML file: {err}") from err
+    return _validated(FleetConfig, raw, path).read_from(path)
+
+
+def _validated(kind: type[_Kind], values: dict[str, Any], file: Path, *above: str) -> _Kind:
+    """A section of a file; `above` names the sections that it lies in."""
     try:
-        return FleetConfig.model_validate(raw)
+        return kind.model_validate(values)
     except ValidationError as err:
-        problems = err.errors(include_url=False)
-        key = ".".join(str(part) for part in problems[0]["loc"])
-        text = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems)
-        raise ConfigError(str(path), key, text) from err
+        problems = [
+            (".".join(map(str, (*above, *p["loc"]))), p["msg"]) for p in err.errors(include_url=False)
+        ]
+        text = "; ".join(f"{key}: {said}" for key, said in problems)
+        raise ConfigError(str(file), problems[0][0], text) from err
 
 
 def config_hash(*sections: BaseModel | dict[str, Any]) -> str:

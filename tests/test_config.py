@@ -1,3 +1,6 @@
+import pickle
+from pathlib import Path
+
 import pytest
 
 from pipeline.config import PriorConfig, config_hash, load_fleet
@@ -79,3 +82,38 @@ def test_configuration_cannot_be_changed_after_loading(tmp_path):
     fleet = load(tmp_path, GOOD)
     with pytest.raises(ValueError, match="frozen"):
         fleet.ingest.sync_gate_s = 1.0
+
+
+def test_a_configuration_knows_its_file_through_copies_changes_and_other_processes(tmp_path):
+    fleet = load(tmp_path, GOOD)
+    ways = [
+        fleet,
+        fleet.model_copy(update={"solve": fleet.solve}),
+        fleet.changed(solve={"seed": 3}),
+        pickle.loads(pickle.dumps(fleet)),
+    ]
+    for known in ways:
+        assert known.file == tmp_path / "fleet.toml"
+        assert known.path_of("prior.json") == tmp_path / "prior.json"
+        assert known.path_of("/etc/prior.json") == Path("/etc/prior.json")
+        with pytest.raises(ConfigError) as caught:
+            known.rig_of("tram")
+        assert caught.value.file == str(tmp_path / "fleet.toml")
+
+
+def test_where_a_file_lies_is_no_part_of_any_hash(tmp_path):
+    fleet = load(tmp_path, GOOD)
+    assert config_hash(fleet) == config_hash(fleet.read_from(Path("/elsewhere/fleet.toml")))
+
+
+def test_changed_sections_are_validated_and_keep_what_dumps_leave_out(tmp_path):
+    semantics = 'semantics = { source = "onnx", segmenter = "seg.toml" }'
+    fleet = load(tmp_path, GOOD.replace('points = "/lidar/points"', f'points = "/lidar/points"\n{semantics}'))
+    changed = fleet.changed(solve={"seed": 3}, select={"frames": 7})
+    assert (changed.solve.seed, changed.select.frames, changed.ingest) == (3, 7, fleet.ingest)
+    assert changed.rig_of("car-1").lidar.semantics is fleet.rig_of("car-1").lidar.semantics is not None
+    assert fleet.solve.seed == 0
+    for wrong, key in (({"solve": {"colour": 1}}, "solve.colour"), ({"paint": {"red": 1}}, "paint")):
+        with pytest.raises(ConfigError) as caught:
+            fleet.changed(**wrong)
+        assert caught.value.key == key

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -38,9 +37,7 @@ class FrameCalibration:
     solution: Solution
 
 
-def ssl_key(
-    method: str, partition: Partition, fleet: FleetConfig, lake: Lake, fleet_file: Path
-) -> dict[str, str]:
+def ssl_key(method: str, partition: Partition, fleet: FleetConfig, lake: Lake) -> dict[str, str]:
     """What a network's answer depends on besides the observations, for the work key.
 
     Raises:
@@ -48,13 +45,13 @@ def ssl_key(
     """
     frames = read_manifest(lake, FRAMES, partition)
     return {
-        "models": models_key(model_files(method, fleet.learn, fleet_file)),
+        "models": models_key(model_files(method, fleet)),
         "learn": config_hash(fleet.learn, fleet.prepare),
         "frames": frames.work_key if frames else "",
     }
 
 
-def ssl_solver(method: str, partition: Partition, fleet: FleetConfig, lake: Lake, fleet_file: Path) -> Solver:
+def ssl_solver(method: str, partition: Partition, fleet: FleetConfig, lake: Lake) -> Solver:
     """The method as a solver: networks are opened and frames read when it is called."""
 
     def solve(
@@ -73,7 +70,7 @@ def ssl_solver(method: str, partition: Partition, fleet: FleetConfig, lake: Lake
         solution = solve_by_networks(
             observations,
             prior,
-            networks=open_networks(model_files(method, fleet.learn, fleet_file), fleet.learn, fleet.prepare),
+            networks=open_networks(model_files(method, fleet), fleet.learn, fleet.prepare),
             frames=_frames_of(lake, partition),
             method=method,
             seed=seed,
@@ -96,7 +93,6 @@ def calibrate_frame(
     method: str = "joint-ssl",
     perturb: tuple[float, float] | None = None,
     seed: int | None = None,
-    fleet_file: Path = Path("fleet.toml"),
 ) -> FrameCalibration:
     """Calibrate from one frame, as after an abrupt change. Nothing is recorded: nothing can judge one frame.
 
@@ -108,7 +104,6 @@ def calibrate_frame(
         method: an SSL method.
         perturb: as in `calibrate_day`.
         seed: None = `solve.seed`.
-        fleet_file: file that paths are relative to.
 
     Raises:
         ConfigError: no such frame, or a method that needs more than one.
@@ -119,10 +114,10 @@ def calibrate_frame(
             "command line", "--frame", f"{method} needs many frames; choose joint-ssl or pairwise-ssl"
         )
     seed = fleet.solve.seed if seed is None else seed
-    rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
+    fleet.rig_of(partition.vehicle)
     row, observation = _one_observation(lake, partition, frame)
-    prior = perturbed(read_prior([observation], rig.prior, fleet_file), perturb, seed)
-    networks = open_networks(model_files(method, fleet.learn, fleet_file), fleet.learn, fleet.prepare)
+    prior = perturbed(read_prior([observation], fleet, partition.vehicle), perturb, seed)
+    networks = open_networks(model_files(method, fleet), fleet.learn, fleet.prepare)
     shown = next(_frames_of(lake, partition)([row]))
     solution = single_frame_solution(shown, observation, prior, networks=networks, method=method, seed=seed)
     return FrameCalibration(shown, observation, prior, solution)

@@ -7,7 +7,6 @@ record.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,7 +48,6 @@ def calibrate_day(
     perturb: tuple[float, float] | None = None,
     seed: int | None = None,
     progress: Progress = silent,
-    fleet_file: Path = Path("fleet.toml"),
 ) -> StageResult:
     """Calibrate a vehicle-day and add its records, unless the same work is recorded already.
 
@@ -63,7 +61,6 @@ def calibrate_day(
             prior's sigmas are then no smaller than these two numbers.
         seed: of everything random; None = `solve.seed`.
         progress: told how far it is.
-        fleet_file: file that a prior's path is relative to.
 
     Returns:
         Counts of accepted, held and refused pairs in `kept`; status "refused" where all pairs are.
@@ -72,9 +69,9 @@ def calibrate_day(
         ConfigError: no such vehicle or method, or an impossible prior file.
     """
     seed = fleet.solve.seed if seed is None else seed
-    rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
-    solver, settings = _method(method, partition, fleet, lake, fleet_file)
-    settings |= {"perturb": perturb, "seed": seed, "prior_file": prior_key(rig.prior, fleet_file)}
+    rig = fleet.rig_of(partition.vehicle)
+    solver, settings = _method(method, partition, fleet, lake)
+    settings |= {"perturb": perturb, "seed": seed, "prior_file": prior_key(fleet, partition.vehicle)}
     observations = read_manifest(lake, OBSERVATIONS, partition)
     inputs = [observations.work_key] if observations else []
     resolved = config_hash(fleet.select, fleet.trigger, fleet.solve, fleet.verify, rig.prior, settings)
@@ -87,7 +84,7 @@ def calibrate_day(
     rows: list[Observation] = []
     try:
         rows = _observations(lake, partition)
-        prior = perturbed(read_prior(rows, rig.prior, fleet_file), perturb, seed)
+        prior = perturbed(read_prior(rows, fleet, partition.vehicle), perturb, seed)
         records = calibrate_observations(rows, prior, fleet, about, progress, solver)
     except SolveError as err:
         records = refused_records(about, err.reason, len(rows), prior)
@@ -153,15 +150,15 @@ def calibrate_observations(
 
 
 def _method(
-    method: str, partition: Partition, fleet: FleetConfig, lake: Lake, fleet_file: Path
+    method: str, partition: Partition, fleet: FleetConfig, lake: Lake
 ) -> tuple[Solver, dict[str, Any]]:
     """The method's solver, and what its answer depends on besides observations and configuration."""
     if method not in SSL_METHODS:
         return solver_of(method), {"method": method}
     from pipeline.calibrate.networks import ssl_key, ssl_solver  # noqa: PLC0415 - brings onnxruntime
 
-    settings = {"method": method} | ssl_key(method, partition, fleet, lake, fleet_file)
-    return ssl_solver(method, partition, fleet, lake, fleet_file), settings
+    settings = {"method": method} | ssl_key(method, partition, fleet, lake)
+    return ssl_solver(method, partition, fleet, lake), settings
 
 
 def _to_calibrate(method: str, fired: Mapping[str, Sequence[str]], when: str) -> list[str]:

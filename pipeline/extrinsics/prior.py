@@ -11,31 +11,40 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.config import PriorConfig
+from pipeline.config import FleetConfig, PriorConfig
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import from_quaternion, inverse, log_se3, perturb_exactly
 from schemas.observations import Observation
 
-__all__ = ["perturbed", "prior_key", "read_prior", "read_transforms"]
+__all__ = ["logged_prior", "perturbed", "prior_key", "read_prior", "read_transforms"]
 
 _QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
 _SAME = 1e-6  # rad and m: tf_static repeats numbers, it does not measure
 
 
-def read_prior(observations: Sequence[Observation], config: PriorConfig, fleet_file: Path) -> Prior:
-    """The prior as configured.
+def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle: str) -> Prior:
+    """The prior of a vehicle as its rig says: logged, or from a file.
 
     Raises:
         SolveError: no frame carries a tf_static prior, or it changes over the day.
-        ConfigError: the prior file cannot be read.
+        ConfigError: unknown vehicle, or the prior file cannot be read.
     """
-    sigmas = np.radians(config.rotation_sigma_deg), config.translation_sigma_m
-    if config.source == "file":
-        assert config.file is not None, "the configuration was validated"
-        transforms = read_transforms(fleet_file.parent / config.file)
-        return Prior(transforms["camera_lidar"], transforms["lidar_radar"], *sigmas)
-    return Prior(_logged(observations, "camera_lidar"), _logged(observations, "lidar_radar"), *sigmas)
+    config = fleet.rig_of(vehicle).prior
+    if config.file is None:
+        return logged_prior(observations, config)
+    transforms = read_transforms(fleet.path_of(config.file))
+    return Prior(transforms["camera_lidar"], transforms["lidar_radar"], *_sigmas(config))
+
+
+def logged_prior(observations: Sequence[Observation], config: PriorConfig) -> Prior:
+    """The prior that the logs carry (tf_static), as far to be trusted as the configuration says.
+
+    Raises:
+        SolveError: no frame carries one, or it changes over the day.
+    """
+    transforms = _logged(observations, "camera_lidar"), _logged(observations, "lidar_radar")
+    return Prior(*transforms, *_sigmas(config))
 
 
 def perturbed(prior: Prior, perturb: tuple[float, float] | None, seed: int) -> Prior:
@@ -59,15 +68,16 @@ def perturbed(prior: Prior, perturb: tuple[float, float] | None, seed: int) -> P
     )
 
 
-def prior_key(config: PriorConfig, fleet_file: Path) -> str:
+def prior_key(fleet: FleetConfig, vehicle: str) -> str:
     """Hash of the prior file's content for the work key; empty where the prior is logged."""
-    if config.file is None:
+    file = fleet.rig_of(vehicle).prior.file
+    if file is None:
         return ""
-    path = fleet_file.parent / config.file
+    path = fleet.path_of(file)
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     except OSError as err:
-        raise ConfigError(str(fleet_file), "prior.file", f"cannot read {path}: {err.strerror}") from err
+        raise ConfigError(str(fleet.file), "prior.file", f"cannot read {path}: {err.strerror}") from err
 
 
 def read_transforms(path: Path) -> dict[str, Float[np.ndarray, "4 4"]]:
@@ -94,6 +104,11 @@ def read_transforms(path: Path) -> dict[str, Float[np.ndarray, "4 4"]]:
     if not isinstance(content, dict):
         raise ConfigError(str(path), "", "holds no object")
     return _transforms(path, content)
+
+
+def _sigmas(config: PriorConfig) -> tuple[float, float]:
+    """Of rotation [rad] and translation [m]."""
+    return float(np.radians(config.rotation_sigma_deg)), config.translation_sigma_m
 
 
 def _transforms(path: Path, entry: dict[str, object]) -> dict[str, np.ndarray]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from pipeline.config import FleetConfig
 from pipeline.errors import BoresightError
@@ -31,7 +30,6 @@ class Night:
     """What all vehicle-days of a night share."""
 
     fleet: FleetConfig
-    fleet_file: Path
     lake: Lake
     method: str = "joint"
     seed: int | None = None
@@ -69,7 +67,7 @@ def run_night(
     """
     known = [d for d in days if d.partition.vehicle in night.fleet.vehicles]
     for unknown in (d.partition for d in days if d not in known):
-        reason = f"{night.fleet_file} has no vehicle {unknown.vehicle!r}"
+        reason = f"{night.fleet.file} has no vehicle {unknown.vehicle!r}"
         yield DayOutcome(unknown.vehicle, unknown.day, "refused", reason)
     jobs = [(night, day) for day in known]
     with closing(EXECUTORS[executor](_run_job, jobs, workers, watch)) as results:
@@ -82,9 +80,9 @@ def run_vehicle_day(night: Night, work: VehicleDay, progress: Progress) -> DayOu
     partition, done = work.partition, list[StageResult]()
     shared = (partition, night.fleet, night.lake)
     for stage, arguments, options in (
-        (INGEST, (work.logs, *shared), {"fleet_file": str(night.fleet_file)}),
-        (PERCEIVE, shared, {"fleet_file": night.fleet_file}),
-        (CALIBRATE, shared, {"fleet_file": night.fleet_file, "method": night.method, "seed": night.seed}),
+        (INGEST, (work.logs, *shared), {}),
+        (PERCEIVE, shared, {}),
+        (CALIBRATE, shared, {"method": night.method, "seed": night.seed}),
     ):
         try:
             done.append(stage.load()(*arguments, progress=_named(stage, progress), **options))

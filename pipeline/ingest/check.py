@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.config import IngestConfig, OnnxSemantics, Rig
+from pipeline.config import FleetConfig, IngestConfig, OnnxSemantics, Rig
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected
@@ -70,8 +70,7 @@ class CheckReport:
 def check_logs(
     logs: Sequence[Path],
     rig: Rig,
-    config: IngestConfig,
-    fleet_file: str = "fleet.toml",
+    fleet: FleetConfig,
     progress: Progress = silent,
 ) -> CheckReport:
     """Look at logs without writing anything.
@@ -85,8 +84,8 @@ def check_logs(
     progress(0, 0, "reading the index")
     index = index_logs(logs, rig, survey=True)
     try:
-        trios, rejected = pick_trios(index, config)
-        builder = FrameBuilder(index, rig, config, read_file_prior(rig, fleet_file))
+        trios, rejected = pick_trios(index, fleet.ingest)
+        builder = FrameBuilder(index, rig, fleet.ingest, read_file_prior(rig, fleet))
         frames: list[Frame] = []
         picked = np.unique(np.linspace(0, max(len(trios) - 1, 0), _SAMPLE).round().astype(int))
         for done, i in enumerate(picked if trios else [], 1):
@@ -108,7 +107,7 @@ def check_logs(
         verdicts=verdicts,
         evidence=evidence,
         topics=topics,
-        sync=_sync(index, len(trios), config),
+        sync=_sync(index, len(trios), fleet.ingest),
         frame_ids=frame_ids,
         has_point_time=any(f.lidar_time_s is not None for f in frames),
         has_odometry=any(f.ego_speed_mps is not None for f in frames),

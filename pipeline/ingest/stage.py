@@ -50,7 +50,6 @@ def ingest_day(
     fleet: FleetConfig,
     lake: Lake,
     progress: Progress = silent,
-    fleet_file: str = "fleet.toml",
 ) -> StageResult:
     """Write the partition of `frames` that the logs give; "cached" where the same inputs gave it before.
 
@@ -65,16 +64,15 @@ def ingest_day(
         fleet: the whole configuration.
         lake: where to write.
         progress: told of frames done and total.
-        fleet_file: path of fleet.toml, for messages and as the folder of a prior file.
 
     Raises:
         ConfigError: unknown vehicle, a log that does not exist, an unusable prior file.
     """
-    rig = fleet.rig_of(partition.vehicle, file=fleet_file)
+    rig = fleet.rig_of(partition.vehicle)
     missing = [str(p) for p in logs if not p.exists()]
     if missing:
         raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
-    file_prior = read_file_prior(rig, fleet_file)
+    file_prior = read_file_prior(rig, fleet)
     inputs = sorted(content_identity(p) for p in logs)
     prior_key = {} if file_prior is None else {"prior": [T.tolist() for T in file_prior]}
     key = work_key("ingest", CODE_VERSION, config_hash(fleet.ingest, rig, prior_key), inputs)
@@ -148,7 +146,7 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], gate_s: float) ->
     return _shorten([what, *index.problems])
 
 
-def read_file_prior(rig: Rig, fleet_file: str) -> tuple[np.ndarray, np.ndarray] | None:
+def read_file_prior(rig: Rig, fleet: FleetConfig) -> tuple[np.ndarray, np.ndarray] | None:
     """T_camera_lidar and T_lidar_radar of a prior file, None where the prior comes from /tf_static.
 
     Raises:
@@ -156,7 +154,7 @@ def read_file_prior(rig: Rig, fleet_file: str) -> tuple[np.ndarray, np.ndarray] 
     """
     if rig.prior.file is None:
         return None
-    transforms = read_transforms(Path(fleet_file).parent / rig.prior.file)
+    transforms = read_transforms(fleet.path_of(rig.prior.file))
     return transforms["camera_lidar"], transforms["lidar_radar"]
 
 

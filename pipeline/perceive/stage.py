@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,7 +58,6 @@ def perceive_day(
     fleet: FleetConfig,
     lake: Lake,
     progress: Progress = silent,
-    fleet_file: Path = Path("fleet.toml"),
 ) -> StageResult:
     """Perceive all frames of a vehicle-day and replace its partition of observations.
 
@@ -71,14 +69,14 @@ def perceive_day(
         ContractError: the day has no frames yet.
         ModelError: a model does not do what its manifest says.
     """
-    rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
+    rig = fleet.rig_of(partition.vehicle)
     frames = read_manifest(lake, FRAMES, partition)
     if frames is None:
         folder = lake.folder(FRAMES.name, partition)
         raise ContractError(str(folder), "no frames of this vehicle and day: run `boresight ingest` first")
-    source, semantics_key = _source(rig.camera.semantics, fleet.perceive, fleet_file)
-    drivable = _drivable(rig.radar, fleet_file)
-    points = _points(rig.lidar, fleet_file)
+    source, semantics_key = _source(rig.camera.semantics, fleet)
+    drivable = _drivable(rig.radar, fleet)
+    points = _points(rig.lidar, fleet)
     for model in (drivable, points):
         semantics_key |= {} if model is None else model.provenance
     key = work_key("perceive", CODE_VERSION, config_hash(fleet.perceive, semantics_key), [frames.work_key])
@@ -169,15 +167,15 @@ class _Sweep:
 
 
 def _source(
-    wanted: TopicSemantics | OnnxSemantics, config: PerceiveConfig, fleet_file: Path
+    wanted: TopicSemantics | OnnxSemantics, fleet: FleetConfig
 ) -> tuple[SemanticsSource, dict[str, Any]]:
     """Where semantics come from, and what of it belongs into the work key."""
     if isinstance(wanted, TopicSemantics):
-        return TopicSource(wanted, config), {"source": "topics", "label_set": wanted.label_set}
+        return TopicSource(wanted, fleet.perceive), {"source": "topics", "label_set": wanted.label_set}
     # onnxruntime loads only where it is used.
     from pipeline.perceive.models.source import ModelSource  # noqa: PLC0415
 
-    models = ModelSource.load(wanted, config, fleet_file)
+    models = ModelSource.load(wanted, fleet)
     return models, {"source": "onnx", **models.provenance}
 
 
@@ -261,20 +259,20 @@ def _perceive_radar(
     return columns, motion, state
 
 
-def _drivable(radar: RadarTopics, fleet_file: Path) -> DrivableSource | None:
+def _drivable(radar: RadarTopics, fleet: FleetConfig) -> DrivableSource | None:
     if radar.drivable is None:
         return None
     from pipeline.perceive.models.radar_drivable import RadarDrivable  # noqa: PLC0415 - as in _source
 
-    return RadarDrivable.load(radar.drivable, fleet_file)
+    return RadarDrivable.load(radar.drivable, fleet)
 
 
-def _points(lidar: LidarTopics, fleet_file: Path) -> PointSource | None:
+def _points(lidar: LidarTopics, fleet: FleetConfig) -> PointSource | None:
     if lidar.semantics is None:
         return None
     from pipeline.perceive.models.range_image import RangeImageSegmenter  # noqa: PLC0415 - as in _source
 
-    return RangeImageSegmenter.load(lidar.semantics, fleet_file)
+    return RangeImageSegmenter.load(lidar.semantics, fleet)
 
 
 def _scan(frame: Frame, motion: RadarMotion) -> Scan:

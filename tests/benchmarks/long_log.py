@@ -28,7 +28,7 @@ if stage == "ingest":
     result = ingest_day(sorted((folder / "logs").rglob("*.mcap")), day, fleet, lake)
 else:
     from pipeline.perceive.stage import perceive_day
-    result = perceive_day(day, fleet, lake, fleet_file=folder / "fleet.toml")
+    result = perceive_day(day, fleet, lake)
 # Not ru_maxrss: a child inherits its parent's.
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
 print(result.rows, int(peak.split()[1]) // 1024, round(time.process_time(), 1))

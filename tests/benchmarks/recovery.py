@@ -33,7 +33,7 @@ import numpy as np
 
 from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.stage import calibrate_observations
-from pipeline.config import FleetConfig, load_fleet
+from pipeline.config import load_fleet
 from pipeline.errors import SolveError
 from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.changes import change_between, change_covariance
@@ -90,12 +90,10 @@ def run_once(
     fleet = load_fleet(fleet_file)
     partition = Partition(vehicle, day)
     rows = read_rows(Lake.at(lake), OBSERVATIONS, partition, Observation)
-    given = read_prior(rows, fleet.rig_of(vehicle).prior, fleet_file)
+    given = read_prior(rows, fleet, vehicle)
     rotation_deg, translation_m = (float(v) for v in start.split(","))
     prior = perturbed(given, (rotation_deg, translation_m), seed)
-    plain = fleet.model_dump(mode="json")
-    plain["solve"] |= search_range(("exact", rotation_deg, translation_m))
-    fleet = FleetConfig.model_validate(plain)
+    fleet = fleet.changed(solve=search_range(("exact", rotation_deg, translation_m)))
     chosen = _part(rows, part)
     began = time.process_time()
     result: dict[str, Any] = {"method": method, "start": start, "seed": seed, "part": part, "pairs": {}}

@@ -62,7 +62,7 @@ def day_batch(
     config = load_fleet(fleet)
     observations = read_rows(lake, OBSERVATIONS, partition, Observation)
     logged = {f.frame_index: f for f in read_rows(lake, FRAMES, partition, Frame)}
-    reference = prior or read_prior(observations, config.rig_of(partition.vehicle).prior, fleet)
+    reference = prior or read_prior(observations, config, partition.vehicle)
     if frames is not None and frames < len(observations):
         observations = [observations[i] for i in np.linspace(0, len(observations) - 1, frames).astype(int)]
     about = About(partition.vehicle, partition.day, "rig", "train", "place", "unknown")

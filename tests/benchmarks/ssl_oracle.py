@@ -78,7 +78,7 @@ def load(folder: Path, frames: int, cell_deg: float):
     lake, partition = Lake.at(str(folder / "lake")), Partition(vehicle, day)
     sensors = {f.frame_index: f for f in read_rows(lake, FRAMES, partition, Frame)}
     found = read_rows(lake, OBSERVATIONS, partition, Observation)
-    prior = read_prior(found, config.rig_of(vehicle).prior, folder / "fleet.toml")
+    prior = read_prior(found, config, vehicle)
     rows = []
     for n in np.linspace(0, len(found) - 1, frames).astype(int):
         about = About(vehicle, day, "paper", "train", "0", "unknown")

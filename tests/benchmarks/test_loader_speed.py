@@ -47,7 +47,7 @@ def decode_per_sample(lake, fleet):
         )
         rows = []
         for frame, observation in zip(frames, observations, strict=True):
-            prior = read_prior([observation], fleet.rig_of(partition.vehicle).prior, None)
+            prior = read_prior([observation], fleet, partition.vehicle)
             rows.append(make_row(frame, observation, prior, about, fleet.prepare))
             if len(rows) == BATCH:
                 yield collate(rows)

@@ -186,17 +186,15 @@ def test_a_prior_file_is_read_beside_fleet_toml_and_its_content_is_part_of_the_w
     content = '{"T_camera_lidar": %s, "T_lidar_radar": %s}'
     path = tmp_path / "prior.json"
     path.write_text(content % (T_CAMERA_LIDAR.tolist(), T_LIDAR_RADAR.tolist()))
-    toml = tmp_path / "fleet.toml"
-    first = calibrate_day(DAY, fleet, lake, method="pairwise-optimisation", fleet_file=toml)
+    fleet = fleet.read_from(tmp_path / "fleet.toml")
+    first = calibrate_day(DAY, fleet, lake, method="pairwise-optimisation")
     assert first.status == "done"
     path.write_text(content % (T_CAMERA_LIDAR.tolist(), np.eye(4).tolist()))
-    assert (
-        calibrate_day(DAY, fleet, lake, method="pairwise-optimisation", fleet_file=toml).work_key
-        != first.work_key
-    )
+    again = calibrate_day(DAY, fleet, lake, method="pairwise-optimisation")
+    assert again.work_key != first.work_key
     path.write_text('{"T_camera_lidar": [[1, 0], [0, 1]]}')
     with pytest.raises(ConfigError, match="T_camera_lidar: is no 4x4"):
-        calibrate_day(DAY, fleet, lake, method="pairwise-optimisation", fleet_file=toml)
+        calibrate_day(DAY, fleet, lake, method="pairwise-optimisation")
 
 
 def test_without_a_trigger_the_prior_stays(tmp_path, day):

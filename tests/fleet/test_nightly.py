@@ -79,7 +79,7 @@ class StagesThatSay:
 
 @pytest.fixture
 def night(tmp_path):
-    return Night(FLEET, tmp_path / "fleet.toml", Lake.at(tmp_path / "lake"))
+    return Night(FLEET, Lake.at(tmp_path / "lake"))
 
 
 def outcomes(night, vehicles=("car",), watch=lambda *_: None):

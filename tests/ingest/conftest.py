@@ -43,7 +43,8 @@ def run_ingest(tmp_path):
 
     def run(*logs: Path, fleet: FleetConfig | None = None, name: str = "lake", file: str = "fleet.toml"):
         lake, day = Lake.at(tmp_path / name), Partition("car", "2023-11-14")
-        result = ingest_day(list(logs), day, fleet or written_logs.fleet_config(), lake, fleet_file=file)
+        config = (fleet or written_logs.fleet_config()).read_from(Path(file))
+        result = ingest_day(list(logs), day, config, lake)
         frames = read_rows(lake, FRAMES, day, Frame) if result.rows else []
         return result, frames
 

@@ -83,7 +83,7 @@ def test_the_speed_of_the_car_shows_in_a_scan_even_where_doppler_wraps(speed, pe
 
 def report_on(kit, tmp_path, drive, **fleet):
     config = kit.fleet(ingest={"min_lidar_points": 500}, **fleet)
-    return check_logs([drive.mcap(tmp_path / "a.mcap")], config.rigs["default"], config.ingest)
+    return check_logs([drive.mcap(tmp_path / "a.mcap")], config.rigs["default"], config)
 
 
 def test_a_complete_drive_is_fit_and_its_facts_are_right(kit, tmp_path):
@@ -139,8 +139,8 @@ def test_a_camera_frame_that_is_not_optical_is_noticed(kit, tmp_path):
 def test_unusable_logs_are_a_no_and_missing_ones_a_mistake(kit, tmp_path):
     config = kit.fleet()
     (tmp_path / "a.mcap").write_bytes(b"nothing")
-    report = check_logs([tmp_path / "a.mcap"], config.rigs["default"], config.ingest)
+    report = check_logs([tmp_path / "a.mcap"], config.rigs["default"], config)
     assert report.answer == "no"
     assert report.problems
     with pytest.raises(ConfigError, match="no such file"):
-        check_logs([tmp_path / "none.mcap"], config.rigs["default"], config.ingest)
+        check_logs([tmp_path / "none.mcap"], config.rigs["default"], config)

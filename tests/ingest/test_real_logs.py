@@ -108,13 +108,13 @@ def test_the_prior_is_the_calibration_that_the_logs_carry(real_logs, lake):
 def test_check_finds_the_day_fit_and_notices_a_wrong_doppler_sign(logs):
     fleet = load_fleet(CONFIG)
     rig = fleet.rigs["default"]
-    report = check_logs(logs, rig, fleet.ingest)
+    report = check_logs(logs, rig, fleet)
     assert report.answer == "yes"
     assert report.evidence.frames == 187
     assert 0.5 < report.evidence.moving_share < 0.95
     assert report.evidence.doppler_doubt == ""
     assert {v.verdict for v in report.verdicts if v.pair == "camera_lidar"} == {"yes", "weak"}
     wrong = rig.model_copy(update={"radar": rig.radar.model_copy(update={"doppler_positive": "receding"})})
-    assert 'probably "approaching"' in check_logs(logs[:1], wrong, fleet.ingest).evidence.doppler_doubt
+    assert 'probably "approaching"' in check_logs(logs[:1], wrong, fleet).evidence.doppler_doubt
     short = rig.model_copy(update={"radar": rig.radar.model_copy(update={"doppler_period_mps": 5.0})})
-    assert "doppler_period_mps = 5" in check_logs(logs[:1], short, fleet.ingest).evidence.doppler_doubt
+    assert "doppler_period_mps = 5" in check_logs(logs[:1], short, fleet).evidence.doppler_doubt

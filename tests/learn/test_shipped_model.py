@@ -37,7 +37,7 @@ def test_its_card_says_what_it_comes_from_and_what_it_cannot_do():
 
 
 def test_a_fleet_that_names_no_network_gets_it(day):
-    assert model_files("joint-ssl", day.fleet.learn, day.fleet_file) == {"joint": MODEL}
+    assert model_files("joint-ssl", day.fleet) == {"joint": MODEL}
 
 
 def test_one_frame_puts_sensors_right_that_were_knocked_by_five_degrees(day):
@@ -46,7 +46,7 @@ def test_one_frame_puts_sensors_right_that_were_knocked_by_five_degrees(day):
     for o in day.observations:
         found = calibrate_frame(
             day.partition, day.fleet, day.lake, o.frame_index, method="joint-ssl",
-            perturb=(5.0, 0.05), seed=o.frame_index, fleet_file=day.fleet_file,
+            perturb=(5.0, 0.05), seed=o.frame_index,
         )  # fmt: skip
         before.append([off(day, pair, found.prior.of(pair)) for pair in PAIRS])
         after.append([off(day, pair, found.solution.pairs[pair].T) for pair in PAIRS])

@@ -49,7 +49,7 @@ def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
     day = simulated_day(folder, frames=10)
     frames = {f.frame_index: f for f in read_rows(day.lake, FRAMES, day.partition, Frame)}
-    prior = read_prior(day.observations, day.fleet.rig_of("vehicle-1").prior, day.fleet_file)
+    prior = read_prior(day.observations, day.fleet, "vehicle-1")
     about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
     rows = [make_row(frames[o.frame_index], o, prior, about, day.fleet.prepare) for o in day.observations]
     rows = [replace(row, split="train" if i < len(rows) - 2 else "val") for i, row in enumerate(rows)]

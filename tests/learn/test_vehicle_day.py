@@ -234,7 +234,7 @@ def test_another_model_is_other_work(lake, tmp_path):
     from pipeline.config import load_fleet
 
     fleet = load_fleet(lake / "fleet.toml")
-    files = model_files("joint-ssl", fleet.learn, lake / "fleet.toml")
+    files = model_files("joint-ssl", fleet)
     assert files == {"joint": lake / "joint.onnx"}
     other = tmp_path / "joint.onnx"
     other.write_bytes((lake / "camera_lidar.onnx").read_bytes())
@@ -255,7 +255,7 @@ def test_a_card_may_say_by_what_all_answers_are_off_alike(lake, tmp_path):
     from pipeline.config import load_fleet
 
     fleet = load_fleet(lake / "fleet.toml")
-    files = model_files("joint-ssl", fleet.learn, lake / "fleet.toml")
+    files = model_files("joint-ssl", fleet)
     assert open_networks(files, fleet.learn, fleet.prepare)[0].bias_sigma == {}
     told = with_bias(
         files["joint"], tmp_path / "told.onnx", {"lidar_radar": [0.3, 0.2, 0.1, 0.03, 0.02, 0.01]}
@@ -279,9 +279,9 @@ def test_a_card_may_say_by_what_all_answers_are_off_alike(lake, tmp_path):
 
 def test_a_missing_model_names_its_key(lake, tmp_path):
     fleet = training_lakes.fleet_of(["a"])
-    broken = fleet.model_copy(update={"learn": fleet.learn.model_copy(update={"model": "nowhere.onnx"})})
+    broken = fleet.changed(learn={"model": "nowhere.onnx"}).read_from(lake / "fleet.toml")
     with pytest.raises(ConfigError, match=r"learn\.model: .*nowhere.onnx does not exist"):
-        calibrate_day(DAY, broken, Lake.at(tmp_path), method="joint-ssl", fleet_file=lake / "fleet.toml")
+        calibrate_day(DAY, broken, Lake.at(tmp_path), method="joint-ssl")
 
 
 def test_a_day_without_frames_is_refused_not_crashed(lake, tmp_path):
@@ -289,9 +289,6 @@ def test_a_day_without_frames_is_refused_not_crashed(lake, tmp_path):
 
     training_lakes.fill(Lake.at(tmp_path), "a", "2026-01-01", 24)
     (Lake.at(tmp_path).folder("frames", DAY) / "part-0.parquet").unlink()
-    result = calibrate_day(
-        DAY, load_fleet(lake / "fleet.toml"), Lake.at(tmp_path), method="joint-ssl",
-        fleet_file=lake / "fleet.toml",
-    )  # fmt: skip
+    result = calibrate_day(DAY, load_fleet(lake / "fleet.toml"), Lake.at(tmp_path), method="joint-ssl")
     assert result.status == "refused"
     assert "no frames of this day" in result.reason

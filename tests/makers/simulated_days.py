@@ -55,8 +55,8 @@ def perceived(
 ) -> SimulatedDay:
     """Ingest and perceive logs; the truth is read where the folder has one."""
     config = load_fleet(fleet_file)
-    ingest_day(logs, partition, config, lake, fleet_file=str(fleet_file))
-    perceive_day(partition, config, lake, fleet_file=fleet_file)
+    ingest_day(logs, partition, config, lake)
+    perceive_day(partition, config, lake)
     path = folder / "truth" / partition.vehicle / f"{partition.day}.json"
     told = json.loads(path.read_text()) if path.exists() else {}
     truth = {

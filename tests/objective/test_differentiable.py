@@ -59,7 +59,7 @@ def real(real_logs, tmp_path_factory):
     text = (Path(__file__).parent.parent / "end_to_end" / "astyx.toml").read_text()
     fleet.write_text(f"{text}\n[ingest]\nmax_frames = 6\n")
     day = perceived(fleet, Lake.at(folder / "lake"), Partition("astyx-1", "2019-01-14"), [log], folder)
-    prior = read_prior(day.observations, day.fleet.rig_of("astyx-1").prior, fleet)
+    prior = read_prior(day.observations, day.fleet, "astyx-1")
     return day.observations, {pair: prior.of(pair) for pair in PAIRS}
 
 

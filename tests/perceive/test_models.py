@@ -10,13 +10,14 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))  # importlib mode knows no siblings
 from onnx_models import save_constant, save_segmenter, write_manifest
 
-from pipeline.config import OnnxSemantics, PerceiveConfig
+from pipeline.config import OnnxSemantics, load_fleet
 from pipeline.errors import ModelError
 from pipeline.perceive.models.detector import Candidates, Detector, decode_head, suppress
 from pipeline.perceive.models.manifest import InputSpec, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
 from pipeline.perceive.models.session import Fit, fit_image
 from pipeline.perceive.models.source import ModelSource
+from tests.makers.fleet_files import fleet_toml
 
 COLOURS = [[0.2, 0.2, 0.2], [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]]  # RGB of ADE20K wall, building, sky
 FITS = ("letterbox_top_left", "letterbox_centre", "stretch")
@@ -242,7 +243,10 @@ def test_both_models_together_give_a_frames_semantics(tmp_path, made_frame):
     segmenter(tmp_path)
     detector(tmp_path, rows_of(BOXES, [2, 0, 0], [0.9, 0.8, 0.2], [1.0, 1.0, 1.0]), "yolov5")
     wanted = OnnxSemantics(source="onnx", segmenter="seg.toml", detector="det.toml")
-    source = ModelSource.load(wanted, PerceiveConfig(detection_min_score=0.5), tmp_path / "fleet.toml")
+    (tmp_path / "fleet.toml").write_text(
+        fleet_toml("car-1", sections="[perceive]\ndetection_min_score = 0.5")
+    )
+    source = ModelSource.load(wanted, load_fleet(tmp_path / "fleet.toml"))
     frame = made_frame()
     found = source.read(frame)
     assert found.labels.shape == (frame.image_height_px // 2, frame.image_width_px // 2)
@@ -251,7 +255,6 @@ def test_both_models_together_give_a_frames_semantics(tmp_path, made_frame):
 
 
 def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, made_frame):
-    from pipeline.config import load_fleet
     from pipeline.perceive.stage import perceive_day
     from pipeline.store.partitions import Lake, Partition
     from pipeline.store.tables import read_rows, write_partition
@@ -277,15 +280,15 @@ def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, ma
         }
         writer.append([replace(made_frame(i), **bare) for i in range(2)])
         writer.describe(kept={}, rejected={})
-    first = perceive_day(day, load_fleet(toml), lake, fleet_file=toml)
+    first = perceive_day(day, load_fleet(toml), lake)
     assert (first.status, first.rows) == ("done", 2)
     assert [o.road_user_classes for o in read_rows(lake, OBSERVATIONS, day, Observation)] == [
         ["car"],
         ["car"],
     ]
-    assert perceive_day(day, load_fleet(toml), lake, fleet_file=toml).status == "cached"
+    assert perceive_day(day, load_fleet(toml), lake).status == "cached"
     detector(tmp_path, rows_of(BOXES[:1], [0], [0.9], [1.0]), "yolov5")
-    again = perceive_day(day, load_fleet(toml), lake, fleet_file=toml)
+    again = perceive_day(day, load_fleet(toml), lake)
     assert again.status == "done"
     assert [o.road_user_classes for o in read_rows(lake, OBSERVATIONS, day, Observation)] == [
         ["person"],

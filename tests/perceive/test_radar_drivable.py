@@ -1,6 +1,7 @@
 """A network in place of the geometric drivable area: the whole way from training to the column, and its faults."""
 
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,13 +25,12 @@ DAY = Partition("car-1", "2026-03-02")
 COLUMNS = {"radar_drivable_azimuth_rad", "radar_drivable_range_m"}
 
 
-def fleet(**radar):
+def fleet(file="fleet.toml", **radar):
     semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
     camera = {"image": "/i", "info": "/c", "semantics": semantics}
     rig = {"camera": camera, "lidar": {"points": "/p"}, "radar": {"points": "/r"} | radar}
-    return FleetConfig.model_validate(
-        {"fleet": {"name": "made"}, "rigs": {"default": rig}, "vehicles": {"car-1": {}}}
-    )
+    values = {"fleet": {"name": "made"}, "rigs": {"default": rig}, "vehicles": {"car-1": {}}}
+    return FleetConfig.model_validate(values).read_from(Path(file))
 
 
 MODEL = {"drivable": {"source": "onnx", "model": "radar_drivable.toml"}}
@@ -53,13 +53,13 @@ def rows(lake):
 def test_a_network_taught_by_a_days_lidar_tells_the_days_radar_where_the_road_is(lake, tmp_path):
     torch.set_num_threads(1)
     file = tmp_path / "fleet.toml"
-    geometric_key = perceive_day(DAY, fleet(), lake, fleet_file=file).work_key
+    geometric_key = perceive_day(DAY, fleet(file), lake).work_key
     before = rows(lake)
     samples = day_samples(before, np.eye(4), 8)
     training = DrivableTraining(steps=30, batch_size=4, width=8)
     network, _ = train_drivable(samples, samples, tmp_path / "run", training)
     export_drivable(network, tmp_path, {})
-    result = perceive_day(DAY, fleet(**MODEL), lake, fleet_file=file)
+    result = perceive_day(DAY, fleet(file, **MODEL), lake)
     assert result.status == "done"  # not taken from the cache of the geometric one
     assert result.work_key != geometric_key
     after = rows(lake)
@@ -74,8 +74,8 @@ def test_a_network_taught_by_a_days_lidar_tells_the_days_radar_where_the_road_is
     for a, b in zip(before, after, strict=True):
         for name in {f.name for f in fields(Observation)} - COLUMNS:
             assert np.array_equal(getattr(a, name), getattr(b, name)), name
-    assert perceive_day(DAY, fleet(**MODEL), lake, fleet_file=file).status == "cached"
-    assert perceive_day(DAY, fleet(), lake, fleet_file=file).work_key == geometric_key
+    assert perceive_day(DAY, fleet(file, **MODEL), lake).status == "cached"
+    assert perceive_day(DAY, fleet(file), lake).work_key == geometric_key
     for a, b in zip(before, rows(lake), strict=True):
         assert all(np.array_equal(getattr(a, name), getattr(b, name)) for name in COLUMNS)
 
@@ -119,4 +119,4 @@ def test_a_manifest_that_does_not_fit_is_told_by_its_key(before, after, told, tm
 
 def test_no_manifest_is_a_plain_error(tmp_path, lake):
     with pytest.raises(ModelError, match="no such manifest"):
-        perceive_day(DAY, fleet(**MODEL), lake, fleet_file=tmp_path / "fleet.toml")
+        perceive_day(DAY, fleet(tmp_path / "fleet.toml", **MODEL), lake)

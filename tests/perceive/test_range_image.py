@@ -408,7 +408,7 @@ def fleet(folder, semantics=""):
 
 
 def perceived(toml, lake):
-    result = perceive_day(DAY, load_fleet(toml), lake, fleet_file=toml)
+    result = perceive_day(DAY, load_fleet(toml), lake)
     return result, read_rows(lake, OBSERVATIONS, DAY, Observation)
 
 
@@ -456,7 +456,7 @@ def test_a_day_without_a_model_is_what_it_was_and_models_need_no_new_ingest(tmp_
     plain, told = load_fleet(fleet(tmp_path)), load_fleet(fleet(tmp_path, MODEL))
     assert told.rigs["default"].lidar.semantics.segmenter == "seg.toml"
     assert config_hash(plain.rigs["default"]) == config_hash(told.rigs["default"])
-    assert FleetConfig.model_validate(plain.model_dump(mode="json")) == plain
+    assert FleetConfig.model_validate(plain.model_dump(mode="json")).read_from(plain.file) == plain
     assert plain.model_dump(mode="json")["rigs"]["default"]["lidar"] == {"points": "/lidar/points"}
 
 

@@ -1,7 +1,6 @@
 """The stage: frames in, observations out; faults are counted, and the same work is not done twice."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -160,7 +159,7 @@ def test_a_day_without_frames_and_an_unknown_vehicle_are_named(lake):
     with pytest.raises(ContractError, match="ingest"):
         perceive_day(Partition("car-1", "2026-03-03"), fleet(), lake)
     with pytest.raises(ConfigError, match="car-2"):
-        perceive_day(Partition("car-2", DAY.day), fleet(), lake, fleet_file=Path("fleet.toml"))
+        perceive_day(Partition("car-2", DAY.day), fleet(), lake)
 
 
 def test_progress_counts_every_frame(lake):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 
-from pipeline.config import LearnConfig, PrepareConfig
+from pipeline.config import FleetConfig, LearnConfig, PrepareConfig
 from pipeline.errors import ConfigError, ModelError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.learn.infer.compiled_rendering import FrameSensors, frame_sensors
@@ -33,12 +33,13 @@ SHIPPED = Path(__file__).parent.parent / "models"
 _NOBODY = About("", "", "", "", "", "")
 
 
-def model_files(method: str, config: LearnConfig, fleet_file: Path) -> dict[str, Path]:
+def model_files(method: str, fleet: FleetConfig) -> dict[str, Path]:
     """Files of a method's networks by what they estimate: those of fleet.toml, else those that are shipped.
 
     Raises:
         ConfigError: a file is missing; the message says which key names another.
     """
+    config = fleet.learn
     if method == "joint-ssl":
         named: Mapping[str, str | None] = {"joint": config.model}
         keys = {"joint": "learn.model"}
@@ -47,10 +48,10 @@ def model_files(method: str, config: LearnConfig, fleet_file: Path) -> dict[str,
         keys = {pair: f"learn.pairwise_models.{pair}" for pair in PAIRS}
     files = {}
     for name, given in named.items():
-        files[name] = SHIPPED / f"{name}.onnx" if given is None else fleet_file.parent / given
+        files[name] = SHIPPED / f"{name}.onnx" if given is None else fleet.path_of(given)
         if not files[name].is_file():
             said = f"{files[name]} does not exist" if given else "no such network is shipped"
-            raise ConfigError(str(fleet_file), keys[name], f"{said}; train one with `boresight train`")
+            raise ConfigError(str(fleet.file), keys[name], f"{said}; train one with `boresight train`")
     return files
 
 

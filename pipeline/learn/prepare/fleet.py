@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from pipeline.config import FleetConfig
 from pipeline.errors import BoresightError
@@ -21,7 +20,6 @@ class PrepareWork:
 
     partition: Partition
     fleet: FleetConfig
-    fleet_file: Path
     lake: Lake
     plan: SplitPlan
 
@@ -29,7 +27,7 @@ class PrepareWork:
 def run_prepare(work: PrepareWork, progress: Progress) -> StageResult:
     """`prepare_day` whose errors are results: one day's trouble never stops the others."""
     try:
-        return prepare_day(work.partition, work.fleet, work.lake, work.plan, progress, work.fleet_file)
+        return prepare_day(work.partition, work.fleet, work.lake, work.plan, progress)
     except (BoresightError, OSError) as err:
         vehicle, day = work.partition.vehicle, work.partition.day
         return StageResult("prepare", vehicle, day, "failed", "", reason=str(err))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -55,7 +54,6 @@ def prepare_day(
     lake: Lake,
     plan: SplitPlan,
     progress: Progress = silent,
-    fleet_file: Path = Path("fleet.toml"),
 ) -> StageResult:
     """Write the samples of a vehicle-day as the plan divides them; `cached` where nothing changed.
 
@@ -64,11 +62,11 @@ def prepare_day(
         ConfigError: the vehicle or its prior file is not as fleet.toml says.
     """
     config = fleet.prepare
-    rig = fleet.rig_of(partition.vehicle, file=str(fleet_file))
+    rig = fleet.rig_of(partition.vehicle)
     inputs = [_manifest(lake, schema, partition).work_key for schema in (FRAMES, OBSERVATIONS)]
     survey = survey_day(partition, lake, config)
     sides, rejected = _sides(survey, plan, config)
-    settings = {"prior_file": prior_key(rig.prior, fleet_file), "sides": [s or "" for s in sides]}
+    settings = {"prior_file": prior_key(fleet, partition.vehicle), "sides": [s or "" for s in sides]}
     key = work_key("prepare", CODE_VERSION, config_hash(config, rig.prior, settings), inputs)
     done = read_manifest(lake, TRAINING, partition)
     if done is not None and done.work_key == key:
@@ -77,7 +75,7 @@ def prepare_day(
     with write_partition(lake, TRAINING, partition, key, CODE_VERSION, inputs) as writer:
         about = _about(survey, fleet.vehicles[partition.vehicle].rig, sides)
         rows: list[TrainingRow] = []
-        samples = _samples(lake, partition, about, fleet, fleet_file, rejected)
+        samples = _samples(lake, partition, about, fleet, rejected)
         for seen, row in enumerate(samples, 1):
             progress(seen, len(about), "prepare")
             if row is None:
@@ -114,7 +112,6 @@ def _samples(
     partition: Partition,
     about: Mapping[int, About],
     fleet: FleetConfig,
-    fleet_file: Path,
     rejected: Counter[str],
 ) -> Iterator[TrainingRow | None]:
     """The row of each wanted frame in order, None (counted in `rejected`) where it is no sample."""
@@ -124,7 +121,7 @@ def _samples(
     frames = itertools.chain.from_iterable(iterate_rows(lake, FRAMES, partition, Frame, rows=sorted(about)))
     observation = next(observations)
     try:
-        prior = read_prior([observation], fleet.rig_of(partition.vehicle).prior, fleet_file)
+        prior = read_prior([observation], fleet, partition.vehicle)
     except SolveError:
         rejected[SampleReason.NO_PRIOR.value] += len(about)
         return

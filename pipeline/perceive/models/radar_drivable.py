@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipeline.config import OnnxDrivable
+from pipeline.config import FleetConfig, OnnxDrivable
 from pipeline.errors import ModelError
 from pipeline.geometry.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, grid_layout, sector_of
 from pipeline.perceive.drivable import FreeSector
@@ -60,13 +60,13 @@ class RadarDrivable:
         self.provenance: dict[str, Any] = {"radar_drivable": manifest.sha256}
 
     @classmethod
-    def load(cls, wanted: OnnxDrivable, fleet_file: Path) -> RadarDrivable:
+    def load(cls, wanted: OnnxDrivable, fleet: FleetConfig) -> RadarDrivable:
         """The model that fleet.toml names; its path is relative to it.
 
         Raises:
             ModelError: see the constructor.
         """
-        return cls(fleet_file.parent / wanted.model)
+        return cls(fleet.path_of(wanted.model))
 
     def probability(self, scan: Scan) -> Float[np.ndarray, "A R"]:
         """How likely each cell is drivable; the scan is remembered for those that follow.

@@ -35,7 +35,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pipeline.config import OnnxPointSemantics
+from pipeline.config import FleetConfig, OnnxPointSemantics
 from pipeline.errors import ModelError
 from pipeline.geometry.range_image import EMPTY, channels_of, project, vote_of_neighbours
 from pipeline.perceive.ground import PointKind
@@ -150,13 +150,13 @@ class RangeImageSegmenter:
         self.provenance: dict[str, Any] = {"lidar_segmenter": told | {"remission_scale": remission_scale}}
 
     @classmethod
-    def load(cls, wanted: OnnxPointSemantics, fleet_file: Path) -> RangeImageSegmenter:
+    def load(cls, wanted: OnnxPointSemantics, fleet: FleetConfig) -> RangeImageSegmenter:
         """The model that fleet.toml names; its path is relative to it.
 
         Raises:
             ModelError: see the constructor.
         """
-        return cls(fleet_file.parent / wanted.segmenter, wanted.remission_scale)
+        return cls(fleet.path_of(wanted.segmenter), wanted.remission_scale)
 
     def kinds(
         self, xyz_m: Float32[np.ndarray, "N 3"], intensity: Float32[np.ndarray, " N"] | None

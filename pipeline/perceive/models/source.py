@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-from pipeline.config import OnnxSemantics, PerceiveConfig
+from pipeline.config import FleetConfig, OnnxSemantics, PerceiveConfig
 from pipeline.perceive.camera import CameraSemantics, decode_colour, label_size
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import Manifest, load_manifest
@@ -26,15 +25,15 @@ class ModelSource:
         }
 
     @classmethod
-    def load(cls, wanted: OnnxSemantics, config: PerceiveConfig, fleet_file: Path) -> ModelSource:
+    def load(cls, wanted: OnnxSemantics, fleet: FleetConfig) -> ModelSource:
         """Load the models that fleet.toml names; their paths are relative to it.
 
         Raises:
             ModelError: a manifest or model is missing, wrong, or not the one that its hash says.
         """
-        folder = fleet_file.parent
-        segmenter = load_manifest(folder / wanted.segmenter, "segment")
-        return cls(segmenter, load_manifest(folder / wanted.detector, "detect"), config)
+        segmenter = load_manifest(fleet.path_of(wanted.segmenter), "segment")
+        detector = load_manifest(fleet.path_of(wanted.detector), "detect")
+        return cls(segmenter, detector, fleet.perceive)
 
     def read(self, frame: Frame) -> CameraSemantics:
         """Run both models on the frame's image.

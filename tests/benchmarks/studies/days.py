@@ -87,8 +87,8 @@ def generate_day(spec: DaySpec, root: Path, *, images: bool = False) -> Path:
     fleet, lake, partition = folder / "fleet.toml", Lake.at(folder / "lake"), Partition(VEHICLE, DATE)
     config = load_fleet(fleet)
     logs = sorted((folder / "logs" / VEHICLE / DATE).iterdir())
-    ingest_day(logs, partition, config, lake, fleet_file=str(fleet))
-    result = perceive_day(partition, config, lake, fleet_file=fleet)
+    ingest_day(logs, partition, config, lake)
+    result = perceive_day(partition, config, lake)
     shutil.rmtree(folder / "logs")
     if not images:
         shutil.rmtree(folder / "lake" / "frames")
@@ -101,7 +101,7 @@ def generate_day(spec: DaySpec, root: Path, *, images: bool = False) -> Path:
 def adopt_day(fleet_file: Path, lake: str, partition: Partition, root: Path) -> Path:
     """Put a perceived real day among the generated ones; its logged calibration is the reference."""
     rows = read_rows(Lake.at(lake), OBSERVATIONS, partition, Observation)
-    given = read_prior(rows, load_fleet(fleet_file).rig_of(partition.vehicle).prior, fleet_file)
+    given = read_prior(rows, load_fleet(fleet_file), partition.vehicle)
     folder = root / REAL.name
     shutil.rmtree(folder, ignore_errors=True)
     truth = folder / "truth" / partition.vehicle / f"{partition.day}.json"

@@ -26,7 +26,7 @@ from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import FleetConfig, PriorConfig, SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
-from pipeline.extrinsics.prior import perturbed, read_prior
+from pipeline.extrinsics.prior import logged_prior, perturbed
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.geometry.targets import loop_errors
 from pipeline.learn.perception.radar_drivable.samples import scan_of
@@ -106,7 +106,7 @@ def prior_of(day: Day, how: tuple[str, float, float], seed: int) -> Prior:
         moved = perturbed(true, (deg, shift_m), seed)
         return moved if kind == "exact" else Prior(moved.T_camera_lidar, moved.T_lidar_radar, *default)
     if kind == "logged":
-        logged = read_prior(day.rows, PriorConfig(), Path("fleet.toml"))
+        logged = logged_prior(day.rows, PriorConfig())
         return Prior(logged.T_camera_lidar, logged.T_lidar_radar, *stated)
     rng = np.random.default_rng([seed, 7])
     drawn = [
@@ -286,10 +286,7 @@ def read_results(path: Path) -> list[dict[str, Any]]:
 
 def _configured(fleet: FleetConfig, run: Run) -> FleetConfig:
     """The day's configuration with the run's changes, validated like a file's."""
-    plain = fleet.model_dump(mode="json")
-    plain["solve"] |= search_range(run.prior) | run.solve
-    plain["select"] |= run.select
-    return FleetConfig.model_validate(plain)
+    return fleet.changed(solve=search_range(run.prior) | run.solve, select=run.select)
 
 
 def learned_drivable(rows: Sequence[Observation], model: Path) -> list[Observation]:

@@ -174,10 +174,8 @@ class ModelSet:
 
     def configured(self, fleet: FleetConfig, iterations: int = 3) -> FleetConfig:
         """A configuration that names these files."""
-        plain = fleet.model_dump(mode="json")
-        plain["learn"] |= {"iterations": iterations}
         if self.method == "joint-ssl":
-            plain["learn"]["model"] = str(self.files[0])
+            files: dict[str, object] = {"model": str(self.files[0])}
         else:
-            plain["learn"]["pairwise_models"] = {p: str(f) for p, f in self.by_name.items()}
-        return FleetConfig.model_validate(plain)
+            files = {"pairwise_models": {p: str(f) for p, f in self.by_name.items()}}
+        return fleet.changed(learn={"iterations": iterations} | files)

@@ -53,8 +53,8 @@ def make_fleet_day(number: int, root: Path) -> None:
     shutil.rmtree(logs, ignore_errors=True)
     simulate_vehicle_day(FLEET, number, number, root)
     config = load_fleet(fleet)
-    ingest_day(sorted(logs.iterdir()), partition, config, lake, fleet_file=str(fleet))
-    result = perceive_day(partition, config, lake, fleet_file=fleet)
+    ingest_day(sorted(logs.iterdir()), partition, config, lake)
+    result = perceive_day(partition, config, lake)
     shutil.rmtree(logs)
     done.parent.mkdir(parents=True, exist_ok=True)
     done.write_text(

@@ -99,12 +99,10 @@ def measure_day(
     """The product's records of the day, from Table 1's prior, against the truth; `frames` thins the day."""
     how = ("exact", *STARTS["prior"])
     prior = day.prior(*STARTS["prior"], seed=day.where.seed)
-    plain = models.configured(day.fleet, iterations).model_dump(mode="json")
-    plain["solve"] |= search_range(how) | {"polish": polish}
-    fleet = type(day.fleet).model_validate(plain)
+    fleet = models.configured(day.fleet, iterations).changed(solve=search_range(how) | {"polish": polish})
     rows = spoiled(day.rows, f"few:{frames}" if frames else "")
     about = Inputs(day.partition, models.method, "study", day.where.seed, ())
-    solver = ssl_solver(models.method, day.partition, fleet, day.lake, day.fleet_file)
+    solver = ssl_solver(models.method, day.partition, fleet, day.lake)
     began = time.process_time()
     try:
         records = calibrate_observations(rows, prior, fleet, about, solver=solver)
