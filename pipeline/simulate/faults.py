@@ -20,7 +20,7 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3
 from pipeline.simulate.sensors.rigs import Mounting
 
-__all__ = ["KINDS", "DayFaults", "Fault", "faults_on", "parse_faults", "shaken"]
+__all__ = ["KINDS", "DayFaults", "Fault", "faults_on", "misread", "parse_faults", "shaken"]
 
 _AXES: Final = {"roll": 0, "pitch": 1, "yaw": 2, "x": 0, "y": 1, "z": 2}
 _DAY_ONLY: Final = ("missing", "swap", "intrinsics", "labels", "night", "few")
@@ -126,4 +126,4 @@ def misread(camera: Camera, factor: float) -> Camera:
     """The camera as its log describes it where the logged focal length is wrong by a factor."""
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= factor
-    return Camera(camera.model, K, camera.D, camera.width_px, camera.height_px)
+    return replace(camera, K=K)

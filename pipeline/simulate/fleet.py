@@ -19,7 +19,7 @@ from pipeline.errors import ConfigError
 from pipeline.results import Progress, silent
 from pipeline.simulate.faults import DayFaults, Fault, faults_on, shaken
 from pipeline.simulate.logs.fleet_toml import fleet_toml
-from pipeline.simulate.logs.recording import FIRST_FRAME_S, record_drive
+from pipeline.simulate.logs.recording import FIRST_FRAME_S, Setup, record_drive
 from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log
 from pipeline.simulate.sensors.rigs import Mounting, mounting_of, rig_named
 from pipeline.simulate.sensors.semantics import SemanticsSpec
@@ -164,6 +164,7 @@ def simulate_vehicle_day(
     name, day_name = vehicle_names(spec)[vehicle], day_names(spec.first_day, spec.days)[day]
     today, mounting = faults_on(spec.faults, name, day), mounting_on(spec, vehicle, day)
     folder, drives, done = out / "logs" / name / day_name, [], 0
+    setup = Setup(rig_named(spec.rig), mounting, spec.semantics, today)
     shares = _shares(today.frames or spec.frames, spec.drives)
     for i, frames in enumerate(shares):
         drive = drive_of(spec, vehicle, day, i, frames)
@@ -174,20 +175,8 @@ def simulate_vehicle_day(
         def tick(n: int, base: int = done) -> None:
             progress(base + n, spec.frames, f"{name} {day_name}")
 
-        with open_log(path, container) as (messages, put):
-            record_drive(
-                messages,
-                put,
-                World(drive),
-                rig_named(spec.rig),
-                mounting,
-                spec.semantics,
-                today,
-                frames,
-                spec.rate_hz,
-                rng,
-                tick,
-            )
+        with open_log(path, container) as log:
+            record_drive(log, World(drive), setup, frames, spec.rate_hz, rng, tick)
         done += frames
         drives.append(
             {"log": path.name, "frames": frames}

@@ -19,9 +19,8 @@ from jaxtyping import Float
 
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.results import Progress, silent
-from pipeline.simulate.faults import DayFaults
 from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, vehicle_names
-from pipeline.simulate.logs.recording import nominal_poses, trio
+from pipeline.simulate.logs.recording import Setup, nominal_poses, trio
 from pipeline.simulate.logs.writers import TOPICS, open_log
 from pipeline.simulate.sensors.frames import Scene, SimulatedFrame, frame_of
 from pipeline.simulate.sensors.rigs import Mounting, rig_named
@@ -60,13 +59,14 @@ def simulate_reflectors(
     def at(t_s: float) -> int:
         return start_ns + round(t_s * 1e9)
 
-    with open_log(folder / f"{day_name}.mcap", "mcap") as (messages, put):
-        put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), nominal_poses(mounting)))
+    setup = Setup(rig, mounting, spec.semantics)
+    with open_log(folder / f"{day_name}.mcap", "mcap") as log:
+        log.put(TOPICS["tf"], at(0.0), log.messages.transforms(at(0.0), nominal_poses(mounting)))
         for k in range(frames):
             frame = frame_of(moment, scene, rig, mounting, 1.0 + k / _RATE_HZ, rng, spec.semantics)
-            items = trio(messages, frame, rig, mounting, DayFaults(), at, rng)
+            items = trio(log.messages, frame, setup, at, rng)
             for time_ns, topic, message in sorted(items, key=lambda p: p[0]):
-                put(topic, time_ns, message)
+                log.put(topic, time_ns, message)
             seen.append(replace(frame, jpeg=b"", labels_png=b"", true_labels=np.zeros((0, 0), np.uint8)))
             progress(k + 1, frames, f"{name} {day_name} reflectors")
     path = folder / f"{day_name}.json"
@@ -126,26 +126,8 @@ def _picks(
     pixels, _ = m.camera.project(transform_points(T_camera_vehicle, REFLECTORS_VEHICLE))
     lidar = transform_points(T_lidar_vehicle, REFLECTORS_VEHICLE)
     radar = transform_points(inverse(m.T_vehicle_radar), REFLECTORS_VEHICLE)
-    step = m.camera.width_px / 1824  # half a pixel of the full camera
-    pixel_sd, lidar_sd = 0.5 * max(step, 0.5), _LIDAR_PICK_SIGMA_M
-    targets = []
-    for i in range(len(REFLECTORS_VEHICLE)):
-        pixel, point = pixels[i] + rng.normal(0, pixel_sd, 2), lidar[i] + rng.normal(0, lidar_sd, 3)
-        detections = _radar_picks(frames, radar[i])
-        targets.append(
-            {
-                "pixel": pixel.tolist(),
-                "lidar_m": point.tolist(),
-                "radar_m": detections.mean(axis=0).tolist(),
-                # A person marks a standing scene once in image and cloud; the radar's detections dance.
-                "spread": {
-                    "pixel": [pixel_sd] * 2,
-                    "lidar_m": [lidar_sd] * 3,
-                    "radar_m": detections.std(axis=0).tolist(),
-                },
-                "frames": {"pixel": 1, "lidar_m": 1, "radar_m": len(detections)},
-            }
-        )
+    positions = zip(pixels, lidar, radar, strict=True)
+    targets = [_target(frames, *position, m.camera.width_px, rng) for position in positions]
     return {
         "vehicle": vehicle,
         "day": day,
@@ -166,6 +148,33 @@ def _picks(
             "camera_K": m.camera.K.tolist(),
             **{key: T.tolist() for key, T in m.truth().items()},
         },
+    }
+
+
+def _target(
+    frames: list[SimulatedFrame],
+    pixel: Float[np.ndarray, " 2"],
+    lidar_m: Float[np.ndarray, " 3"],
+    radar_m: Float[np.ndarray, " 3"],
+    width_px: int,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """One reflector as picked, given where each sensor should see it."""
+    step = width_px / 1824  # half a pixel of the full camera
+    pixel_sd, lidar_sd = 0.5 * max(step, 0.5), _LIDAR_PICK_SIGMA_M
+    picked_pixel, picked_lidar = pixel + rng.normal(0, pixel_sd, 2), lidar_m + rng.normal(0, lidar_sd, 3)
+    detections = _radar_picks(frames, radar_m)
+    return {
+        "pixel": picked_pixel.tolist(),
+        "lidar_m": picked_lidar.tolist(),
+        "radar_m": detections.mean(axis=0).tolist(),
+        # A person marks a standing scene once in image and cloud; the radar's detections dance.
+        "spread": {
+            "pixel": [pixel_sd] * 2,
+            "lidar_m": [lidar_sd] * 3,
+            "radar_m": detections.std(axis=0).tolist(),
+        },
+        "frames": {"pixel": 1, "lidar_m": 1, "radar_m": len(detections)},
     }
 
 

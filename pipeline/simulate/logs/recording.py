@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import cv2
@@ -11,65 +12,88 @@ import numpy as np
 from pipeline.geometry.se3 import from_rotation_translation
 from pipeline.simulate.faults import DayFaults, misread
 from pipeline.simulate.logs.messages import Messages
-from pipeline.simulate.logs.writers import TOPICS, Put
+from pipeline.simulate.logs.writers import TOPICS, OpenLog
 from pipeline.simulate.sensors.frames import SimulatedFrame, frame_of, scene_of
 from pipeline.simulate.sensors.rigs import Mounting, RigSpec
 from pipeline.simulate.sensors.semantics import SemanticsSpec, encode_png
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
-__all__ = ["FIRST_FRAME_S", "nominal_poses", "record_drive", "trio"]
+__all__ = ["FIRST_FRAME_S", "Setup", "nominal_poses", "record_drive", "trio"]
 
 _ODOMETRY_HZ: Final = 20.0
 FIRST_FRAME_S: Final = 1.0  # a drive's log begins this long before its first frame
 
 
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """A vehicle on one day: its rig, where the sensors really are, how well networks label, what is wrong."""
+
+    rig: RigSpec
+    mounting: Mounting
+    semantics: SemanticsSpec
+    faults: DayFaults = field(default_factory=DayFaults)
+
+
 def record_drive(
-    messages: Messages,
-    put: Put,
+    log: OpenLog,
     world: World,
-    rig: RigSpec,
-    mounting: Mounting,
-    semantics: SemanticsSpec,
-    today: DayFaults,
+    setup: Setup,
     frames: int,
     rate_hz: float,
     rng: np.random.Generator,
     tick: Callable[[int], None],
 ) -> None:
-    """Write one drive; `tick` is told the number of frames written."""
-    drive = world.drive
+    """Write one drive.
+
+    Args:
+        log: open for writing.
+        world: of the drive.
+        setup: the vehicle that drives through it.
+        frames: trios to write.
+        rate_hz: trios per second.
+        rng: noise.
+        tick: told the number of frames written, after each.
+    """
+    drive, messages = world.drive, log.messages
 
     def at(t_s: float) -> int:
         return drive.start_ns + round(t_s * 1e9)
 
     odometry = _odometry(drive, rng)
-    put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), nominal_poses(mounting)))
+    log.put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), nominal_poses(setup.mounting)))
     scene = scene_of(drive)
-    semantics = _night(semantics) if today.night else semantics
+    semantics = _night(setup.semantics) if setup.faults.night else setup.semantics
     for k in range(frames):
         stamp = FIRST_FRAME_S + k / rate_hz + rng.uniform(0, 0.02)
-        moment = world.moment(stamp - rig.lidar.sweep_s / 2)
-        frame = frame_of(moment, scene, rig, mounting, stamp, rng, semantics)
-        pending = trio(messages, frame, rig, mounting, today, at, rng)
+        moment = world.moment(stamp - setup.rig.lidar.sweep_s / 2)
+        frame = frame_of(moment, scene, setup.rig, setup.mounting, stamp, rng, semantics)
+        pending = trio(messages, frame, setup, at, rng)
         while odometry and odometry[0][0] <= stamp + 0.1:
             t, T, speed, yaw_rate = odometry.pop(0)
             pending.append((at(t), TOPICS["odometry"], messages.odometry(at(t), T, speed, yaw_rate)))
         for time_ns, topic, message in sorted(pending, key=lambda p: p[0]):
-            put(topic, time_ns, message)
+            log.put(topic, time_ns, message)
         tick(k + 1)
 
 
 def trio(
     messages: Messages,
     frame: SimulatedFrame,
-    rig: RigSpec,
-    mounting: Mounting,
-    today: DayFaults,
+    setup: Setup,
     at: Callable[[float], int],
     rng: np.random.Generator,
 ) -> list[tuple[int, str, Any]]:
-    """The messages of one frame: (log time, topic, message)."""
+    """The messages of one frame: (log time [ns], topic, message).
+
+    Args:
+        messages: makes them.
+        frame: what the sensors deliver.
+        setup: rig and faults of the day.
+        at: stamp [ns] of a time of the drive [s].
+        rng: exchanges classes where the day's labels are permuted.
+    """
+    today, rig = setup.faults, setup.rig
     camera, lidar, radar = at(frame.camera_stamp_s), at(frame.lidar_stamp_s), at(frame.radar_stamp_s)
     sweep, scan = frame.sweep, frame.scan
     sign = np.float32(-1.0 if rig.radar.doppler_positive == "approaching" else 1.0)
@@ -80,7 +104,7 @@ def trio(
     lidar_topic, radar_topic = TOPICS["lidar"], TOPICS["radar"]
     if today.swapped:
         lidar_topic, radar_topic = radar_topic, lidar_topic
-    info = misread(mounting.nominal_camera, today.focal_factor)
+    info = misread(setup.mounting.nominal_camera, today.focal_factor)
     labels = _permuted(frame.labels_png, rng) if today.labels_permuted else frame.labels_png
     sent = {
         "camera": [
@@ -111,9 +135,14 @@ def _permuted(png: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _night(spec: SemanticsSpec) -> SemanticsSpec:
-    """Networks trained by day, at night."""
-    return SemanticsSpec(
-        3 * spec.boundary_px, spec.swell, 0.35, 0.5, 3 * spec.box_jitter, 3 * spec.false_boxes
+    """What networks that learned by day make of the night: outlines three times as loose, half of the boxes missed."""
+    return replace(
+        spec,
+        boundary_px=3 * spec.boundary_px,
+        confusion=0.35,
+        miss=0.5,
+        box_jitter=3 * spec.box_jitter,
+        false_boxes=3 * spec.false_boxes,
     )
 
 

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Writer as Bag2Writer
 
 from pipeline.simulate.logs.messages import Messages
 
-__all__ = ["CONTAINERS", "TOPICS", "log_name", "open_log"]
+__all__ = ["CONTAINERS", "TOPICS", "OpenLog", "log_name", "open_log"]
 
 TOPICS: Final = {
     "tf": "/tf_static",
@@ -29,8 +29,12 @@ TOPICS: Final = {
 }
 CONTAINERS: Final = ("mcap", "ros1", "db3")
 
-# put(topic, stamp_ns, message)
-Put = Callable[[str, int, Any], None]
+
+class OpenLog(NamedTuple):
+    """A log open for writing: makes its messages, and writes them by put(topic, stamp_ns, message)."""
+
+    messages: Messages
+    put: Callable[[str, int, Any], None]
 
 
 def log_name(stem: str, container: str) -> str:
@@ -39,27 +43,24 @@ def log_name(stem: str, container: str) -> str:
 
 
 @contextmanager
-def open_log(path: Path, container: str) -> Iterator[tuple[Messages, Put]]:
-    """Open a log for writing; yields the message factory and `put`.
-
-    It appears under its name, in place of an old one, only when it is whole.
-    """
-    aside = path.parent / f".partial-{path.name}"
-    shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir(parents=True)
+def open_log(path: Path, container: str) -> Iterator[OpenLog]:
+    """A log that appears under its name, in place of an old one, when the block has ended without an error."""
+    partial = path.parent / f".partial-{path.name}"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
     opener = {"mcap": _mcap, "ros1": _ros1, "db3": _db3}[container]
     try:
-        with opener(aside / path.name) as pair:
-            yield pair
+        with opener(partial / path.name) as log:
+            yield log
         if path.is_dir():
             shutil.rmtree(path)
-        (aside / path.name).replace(path)
+        (partial / path.name).replace(path)
     finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextmanager
-def _mcap(path: Path) -> Iterator[tuple[Messages, Put]]:
+def _mcap(path: Path) -> Iterator[OpenLog]:
     messages = Messages(2)
     channels: dict[str, int] = {}
     with path.open("wb") as file:
@@ -78,12 +79,12 @@ def _mcap(path: Path) -> Iterator[tuple[Messages, Put]]:
                 channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=messages.serialised(message)
             )
 
-        yield messages, put
+        yield OpenLog(messages, put)
         writer.finish()
 
 
 @contextmanager
-def _ros1(path: Path) -> Iterator[tuple[Messages, Put]]:
+def _ros1(path: Path) -> Iterator[OpenLog]:
     messages = Messages(1)
     connections: dict[str, Any] = {}
     writer = Bag1Writer(path)
@@ -98,11 +99,11 @@ def _ros1(path: Path) -> Iterator[tuple[Messages, Put]]:
                 )
             writer.write(connections[topic], stamp_ns, messages.serialised(message))
 
-        yield messages, put
+        yield OpenLog(messages, put)
 
 
 @contextmanager
-def _db3(path: Path) -> Iterator[tuple[Messages, Put]]:
+def _db3(path: Path) -> Iterator[OpenLog]:
     messages = Messages(2)
     connections: dict[str, Any] = {}
     with Bag2Writer(path, version=9) as writer:
@@ -114,4 +115,4 @@ def _db3(path: Path) -> Iterator[tuple[Messages, Put]]:
                 )
             writer.write(connections[topic], stamp_ns, messages.serialised(message))
 
-        yield messages, put
+        yield OpenLog(messages, put)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -68,46 +69,59 @@ def _wheels(
             )
 
 
-def _car(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
+@dataclass(frozen=True)
+class _CarShape:
+    """Sizes of a car [m]: half length and width, heights of roof and belt line, x of the cabin's rear end."""
+
+    half: float
+    w: float
+    height: float
+    belt: float
+    bonnet: float
+    tail: float
+    estate: bool
+
+
+def _car_shape(rng: np.random.Generator) -> _CarShape:
     length, width, height = rng.uniform(3.8, 4.9), rng.uniform(1.70, 1.90), rng.uniform(1.40, 1.66)
-    half, w = length / 2, width / 2
-    estate = rng.random() < 0.5
-    belt, sill = 0.60 * height, 0.20
+    half, estate = length / 2, rng.random() < 0.5
     bonnet = rng.uniform(0.85, 1.15)
-    low = (-half, half, -w, w, sill)
-    shoulder = (-half + 0.06, half - 0.12, -w + 0.02, w - 0.02, 0.44 * height)
-    b.frustum(low, shoulder, "car_paint", colour)
     tail = -half + (0.10 if estate else rng.uniform(0.45, 0.65))
-    deck = (-half + 0.10, half - 0.35, -w + 0.06, w - 0.06, belt)
+    return _CarShape(half, width / 2, height, 0.60 * height, bonnet, tail, estate)
+
+
+def _car(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
+    shape = _car_shape(rng)
+    half, w = shape.half, shape.w
+    low = (-half, half, -w, w, 0.20)
+    shoulder = (-half + 0.06, half - 0.12, -w + 0.02, w - 0.02, 0.44 * shape.height)
+    deck = (-half + 0.10, half - 0.35, -w + 0.06, w - 0.06, shape.belt)
+    b.frustum(low, shoulder, "car_paint", colour)
     b.frustum(shoulder, deck, "car_paint", colour)
-    foot = (tail, half - bonnet, -w + 0.07, w - 0.07, belt)
-    roof = (tail + (0.25 if estate else 0.45), half - bonnet - 0.75, -w + 0.24, w - 0.24, height)
-    b.frustum(
-        foot,
-        roof,
-        {
-            "front": "car_glass",
-            "rear": "car_glass",
-            "left": "car_glass",
-            "right": "car_glass",
-            "top": "car_paint",
-        },
-        colour,
-    )
+    _car_cabin(b, shape, colour)
+    _wheels(b, (-half + 0.80, half - 0.82), w + 0.01, 0.32, "car_tyre", "car_rim")
+    _car_lamps(b, shape)
+
+
+def _car_cabin(b: MeshBuilder, shape: _CarShape, colour: Colour) -> None:
+    half, w, height, belt = shape.half, shape.w, shape.height, shape.belt
+    foot = (shape.tail, half - shape.bonnet, -w + 0.07, w - 0.07, belt)
+    rear, front = shape.tail + (0.25 if shape.estate else 0.45), half - shape.bonnet - 0.75
+    roof = (rear, front, -w + 0.24, w - 0.24, height)
+    faces = dict.fromkeys(("front", "rear", "left", "right"), "car_glass") | {"top": "car_paint"}
+    b.frustum(foot, roof, faces, colour)
     for side in (-1, 1):  # pillars stand a little outside the glass
         for x in (0.30, 0.62):
-            f = foot[0] + x * (foot[1] - foot[0])
-            r = roof[0] + x * (roof[1] - roof[0])
-            b.tube(
-                np.array([f, side * (w - 0.07), belt]),
-                np.array([r, side * (w - 0.24), height]),
-                0.045,
-                "car_paint",
-                4,
-                colour,
-            )
-        b.box((half - bonnet + 0.15, side * (w + 0.07), belt + 0.06), (0.12, 0.16, 0.13), "car_paint", colour)
-    _wheels(b, (-half + 0.80, half - 0.82), w + 0.01, 0.32, "car_tyre", "car_rim")
+            low = np.array([foot[0] + x * (foot[1] - foot[0]), side * (w - 0.07), belt])
+            high = np.array([roof[0] + x * (roof[1] - roof[0]), side * (w - 0.24), height])
+            b.tube(low, high, 0.045, "car_paint", 4, colour)
+        mirror = (half - shape.bonnet + 0.15, side * (w + 0.07), belt + 0.06)
+        b.box(mirror, (0.12, 0.16, 0.13), "car_paint", colour)
+
+
+def _car_lamps(b: MeshBuilder, shape: _CarShape) -> None:
+    """Lamps, number plates and the grille."""
+    half, w, height = shape.half, shape.w, shape.height
     for side in (-1, 1):
         b.box((half - 0.06, side * (w - 0.24), 0.40 * height), (0.14, 0.36, 0.14), "car_lamp")
         b.box((-half + 0.05, side * (w - 0.20), 0.47 * height), (0.10, 0.34, 0.16), "car_tail")

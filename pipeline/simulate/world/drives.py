@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Protocol, runtime_checkable
+from typing import Final, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -159,6 +159,21 @@ class Parked:
         return np.zeros((len(t_s), 3)), np.zeros((len(t_s), 3))
 
 
+class _Profile(NamedTuple):
+    """Arc length, lateral offset and slope dd/ds of our way over time."""
+
+    t_s: np.ndarray
+    s_m: np.ndarray
+    d_m: np.ndarray
+    slope: np.ndarray
+
+
+def _smoothed(values: np.ndarray, half: int) -> np.ndarray:
+    """Moving average of 2 half + 1 values with a Hann window; the ends are held."""
+    window = np.hanning(2 * half + 1)
+    return np.convolve(np.pad(values, half, mode="edge"), window / window.sum(), mode="valid")
+
+
 @dataclass(frozen=True)
 class EgoMotion:
     """How our vehicle moves along its road, from time 0 to `duration_s`."""
@@ -169,9 +184,19 @@ class EgoMotion:
     duration_s: float
 
     @cached_property
-    def _profile(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _profile(self) -> _Profile:
         rng = np.random.default_rng([self.seed, 13])
         t = np.arange(-10.0, self.duration_s + 10.0, _STEP_S)
+        s = np.cumsum(self._speed(t, rng)) * _STEP_S
+        s += 30.0 - np.interp(0.0, t, s)
+        d = self._offset(s, rng)
+        ds, dd = np.gradient(s), np.gradient(d)
+        rolling = ds > 0.3 * _STEP_S  # slower, the wheels keep the direction that they had
+        slope = np.interp(t, t[rolling], dd[rolling] / ds[rolling])
+        return _Profile(t, s, d, _smoothed(slope, 25))
+
+    def _speed(self, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Speed [m/s] at times."""
         urban = self.layout.environment == "urban"
         mean, swing = (10.0, 2.6) if urban else (27.0, 3.0)
         speed = np.full_like(t, mean * rng.uniform(0.85, 1.15))
@@ -185,44 +210,35 @@ class EgoMotion:
             period = rng.uniform(45, 70)
             phase = (t + rng.uniform(0, period)) % period / period
             speed *= np.clip(np.abs(phase - 0.5) * 12 - 0.75, 0.0, 1.0) ** 0.8
-        speed = np.maximum(speed, 0.0)
-        kernel = np.hanning(101) / np.hanning(101).sum()
-        speed = np.convolve(np.pad(speed, 50, mode="edge"), kernel, mode="valid")
-        s = np.cumsum(speed) * _STEP_S
-        s += 30.0 - np.interp(0.0, t, s)
-        d = np.full_like(t, self.layout.lanes_own[0])
+        return _smoothed(np.maximum(speed, 0.0), 50)
+
+    def _offset(self, s: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Lateral offset [m] at arc lengths: we wander inside the lane and now and then change it."""
+        lanes = self.layout.lanes_own
+        d = np.full_like(s, lanes[0])
         for period in (17.0, 7.0):
             d += 0.16 * rng.uniform(0.3, 1) * np.sin(2 * np.pi * s / (period * 12) + rng.uniform(0, 6.28))
-        if len(self.layout.lanes_own) > 1:  # one lane change and back per cycle
-            shift = self.layout.lanes_own[1] - self.layout.lanes_own[0]
+        if len(lanes) > 1:  # one lane change and back per cycle
+            shift = lanes[1] - lanes[0]
             cycle = (s / rng.uniform(500, 900) + rng.uniform()) % 1.0
             d += (
                 shift
                 * (np.clip((cycle - 0.45) / 0.08, 0, 1) - np.clip((cycle - 0.85) / 0.08, 0, 1))
                 * (rng.random() < 0.5)
             )
-        d = np.convolve(np.pad(d, 100, mode="edge"), np.hanning(201) / np.hanning(201).sum(), mode="valid")
-        ds, dd = np.gradient(s), np.gradient(d)
-        rolling = ds > 0.3 * _STEP_S  # slower, the wheels keep the direction that they had
-        slope = np.interp(t, t[rolling], dd[rolling] / ds[rolling])
-        return (
-            t,
-            s,
-            d,
-            np.convolve(np.pad(slope, 25, mode="edge"), np.hanning(51) / np.hanning(51).sum(), mode="valid"),
-        )
+        return _smoothed(d, 100)
 
     def arc(self, t_s: float) -> float:
         """Arc length [m] at a time."""
-        return float(np.interp(t_s, self._profile[0], self._profile[1]))
+        return float(np.interp(t_s, self._profile.t_s, self._profile.s_m))
 
     def _arcs(self, t_s: np.ndarray) -> np.ndarray:
-        return np.interp(t_s, self._profile[0], self._profile[1])
+        return np.interp(t_s, self._profile.t_s, self._profile.s_m)
 
     def poses(self, t_s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4 4"]:
         """T_map_vehicle at times; the body pitches and rolls on its springs."""
         here = self._ground(t_s)
-        slope = np.interp(t_s, self._profile[0], self._profile[3])
+        slope = np.interp(t_s, self._profile.t_s, self._profile.slope)
         s = self._arcs(t_s)
         heading = self.road.centre(s)[3] + np.arctan(slope)
         z = self.road.centre(np.stack([s - 1.3, s + 1.3]))[2]
@@ -237,7 +253,7 @@ class EgoMotion:
     def _ground(self, t_s: np.ndarray) -> np.ndarray:
         s = self._arcs(t_s)
         return self.road.to_map(
-            np.stack([s, np.interp(t_s, self._profile[0], self._profile[2]), np.zeros_like(s)], -1)
+            np.stack([s, np.interp(t_s, self._profile.t_s, self._profile.d_m), np.zeros_like(s)], -1)
         )
 
     def velocities(

@@ -1,7 +1,7 @@
 """What surfaces are made of: label, colour, texture, lidar reflectivity, radar strength.
 
 Labels are Cityscapes train ids. Reflectivity is the fraction of lidar light (905 nm) that comes back from a frontal
-hit; retro-reflectors exceed 1 (asphalt .1-.2, concrete .3, grass .4-.6 in the near infrared).
+hit; retro-reflectors exceed 1 (asphalt 0.1-0.2, concrete 0.3, grass 0.4-0.6 in the near infrared).
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.simulate.world.actors import VARIANTS
-from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.drives import Drive, RoadLayout
 
 __all__ = ["Actor", "actors_at"]
 
@@ -47,6 +47,17 @@ class _Stream:
     height_m: float = 0.0
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where along the road somebody is, and how fast; the speed is along the road, negative = oncoming."""
+
+    s_m: float
+    d_m: float
+    speed_mps: float
+    h_m: float = 0.0
+    yaw_rad: float = 0.0
+
+
 def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (_BEHIND_M, _AHEAD_M)) -> list[Actor]:
     """Road users from `within_m[0]` behind us to `within_m[1]` ahead."""
     here = drive.ego.arc(t_s)
@@ -58,50 +69,33 @@ def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (_BEHIND
 
 def _streams(drive: Drive) -> list[_Stream]:
     rng = np.random.default_rng([drive.seed, 21])
-    layout, streams = drive.layout, []
-    if drive.environment == "highway":
-        for i, d in enumerate(layout.lanes_own):
-            slow = d == min(layout.lanes_own)
-            kinds = ("truck", "truck", "car", "van") if slow else ("car", "car", "car", "van")
-            if i:  # our own lane has leaders
-                streams.append(
-                    _Stream(
-                        i,
-                        d,
-                        rng.uniform(21, 25) if slow else rng.uniform(27, 36),
-                        rng.uniform(24, 36),
-                        0.75,
-                        kinds,
-                    )
-                )
-        for i, d in enumerate(layout.lanes_oncoming):
-            streams.append(
-                _Stream(
-                    10 + i, d, -rng.uniform(24, 35), rng.uniform(26, 42), 0.65, ("car", "car", "van", "truck")
-                )
-            )
-        return streams
-    for i, d in enumerate(layout.lanes_own[1:], 1):
-        streams.append(
-            _Stream(i, d, rng.uniform(7, 13), rng.uniform(18, 28), 0.7, ("car", "car", "car", "van", "bus"))
-        )
+    return (_highway_streams if drive.environment == "highway" else _urban_streams)(drive.layout, rng)
+
+
+def _highway_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stream]:
+    streams = []
+    for i, d in enumerate(layout.lanes_own[1:], 1):  # our own lane has leaders
+        slow = d == min(layout.lanes_own)
+        kinds = ("truck", "truck", "car", "van") if slow else ("car", "car", "car", "van")
+        speed = rng.uniform(21, 25) if slow else rng.uniform(27, 36)
+        streams.append(_Stream(i, d, speed, rng.uniform(24, 36), 0.75, kinds))
+    oncoming = ("car", "car", "van", "truck")
     for i, d in enumerate(layout.lanes_oncoming):
-        streams.append(
-            _Stream(
-                10 + i,
-                d,
-                -rng.uniform(7, 13),
-                rng.uniform(20, 32),
-                0.7,
-                ("car", "car", "van", "truck", "bus"),
-            )
-        )
+        streams.append(_Stream(10 + i, d, -rng.uniform(24, 35), rng.uniform(26, 42), 0.65, oncoming))
+    return streams
+
+
+def _urban_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stream]:
+    streams = []
+    own, oncoming = ("car", "car", "car", "van", "bus"), ("car", "car", "van", "truck", "bus")
+    for i, d in enumerate(layout.lanes_own[1:], 1):  # our own lane has leaders
+        streams.append(_Stream(i, d, rng.uniform(7, 13), rng.uniform(18, 28), 0.7, own))
+    for i, d in enumerate(layout.lanes_oncoming):
+        streams.append(_Stream(10 + i, d, -rng.uniform(7, 13), rng.uniform(20, 32), 0.7, oncoming))
     edge = -layout.right_edge
-    for i, (side, speed) in enumerate(((-1, 1.3), (-1, -1.2), (1, -1.4), (1, 1.1))):
-        d = side * (edge + 1.0 + 0.8 * (i % 2))
-        streams.append(
-            _Stream(20 + i, d, speed * rng.uniform(0.8, 1.2), rng.uniform(12, 22), 0.5, ("pedestrian",), 0.12)
-        )
+    for i, (side, walk) in enumerate(((-1, 1.3), (-1, -1.2), (1, -1.4), (1, 1.1))):
+        d, speed = side * (edge + 1.0 + 0.8 * (i % 2)), walk * rng.uniform(0.8, 1.2)
+        streams.append(_Stream(20 + i, d, speed, rng.uniform(12, 22), 0.5, ("pedestrian",), 0.12))
     kerb = edge - layout.parking_m
     streams.append(_Stream(30, -(kerb - 0.45), rng.uniform(4.0, 5.5), 45.0, 0.55, ("cyclist",)))
     streams.append(_Stream(31, kerb - 0.45, -rng.uniform(4.0, 5.5), 55.0, 0.55, ("cyclist",)))
@@ -140,7 +134,7 @@ def _members(
             variant = variant // 4 * 4 + int(t_s * 2.2 + k) % 4
         yaw = 0.0 if stream.speed_mps > 0 else np.pi
         key = 1 + ((stream.number + 1) * 100_003 + k * 7919) % 1_000_000
-        actors.append(_actor(drive, key, kind, variant, s, d, stream.height_m, speed, yaw))
+        actors.append(_actor(drive, key, kind, variant, _Place(s, d, speed, stream.height_m, yaw)))
     return actors
 
 
@@ -160,18 +154,15 @@ def _leaders(drive: Drive, t_s: float, here_m: float, within_m: tuple[float, flo
             if -within_m[0] <= s - here_m <= within_m[1]:
                 speed = (drive.ego.arc(t + 0.05) - drive.ego.arc(t - 0.05)) / 0.1
                 d = drive.layout.lanes_own[0] + float(rng.uniform(-0.2, 0.2))
-                actors.append(
-                    _actor(drive, 900_000 + 10 * (sign + 1) + i, kind, variant, s, d, 0.0, speed, 0.0)
-                )
+                key = 900_000 + 10 * (sign + 1) + i
+                actors.append(_actor(drive, key, kind, variant, _Place(s, d, speed)))
     return actors
 
 
-def _actor(
-    drive: Drive, key: int, kind: str, variant: int, s: float, d: float, h: float, speed: float, yaw: float
-) -> Actor:
-    T = drive.road.pose(s, d, h, yaw)
-    ahead = drive.road.to_map(np.array([[s - 0.5, d, h], [s + 0.5, d, h]]))
-    return Actor(key, kind, variant, T, speed * (ahead[1] - ahead[0]))
+def _actor(drive: Drive, key: int, kind: str, variant: int, at: _Place) -> Actor:
+    T = drive.road.pose(at.s_m, at.d_m, at.h_m, at.yaw_rad)
+    ahead = drive.road.to_map(np.array([[at.s_m - 0.5, at.d_m, at.h_m], [at.s_m + 0.5, at.d_m, at.h_m]]))
+    return Actor(key, kind, variant, T, at.speed_mps * (ahead[1] - ahead[0]))
 
 
 def _apart(actors: list[Actor], T_map_vehicle: Float[np.ndarray, "4 4"]) -> list[Actor]:
