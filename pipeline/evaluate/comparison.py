@@ -11,10 +11,10 @@ from jaxtyping import Float
 from pipeline.geometry.se3 import from_quaternion, inverse, log_se3
 from pipeline.geometry.targets import (
     DEFAULT_TARGETS,
-    Doubt,
+    PickUncertainty,
     Picks,
-    doubt_of_loop,
-    doubt_of_picks,
+    loop_error_sigma,
+    error_sigma_at_picks,
     errors_at_targets,
     errors_of_picks,
     loop_errors,
@@ -89,11 +89,11 @@ def compare(
             found = {pair: errors_at_targets(pair, of[pair], truth[pair]) for pair in PAIRS}
         return found | {"loop": loop_errors(of, DEFAULT_TARGETS if picks is None else picks.lidar_m)}
 
-    def doubts(doubt: Doubt | None) -> dict[str, np.ndarray]:
-        if picks is None or doubt is None:
+    def pick_sigmas(uncertainty: PickUncertainty | None) -> dict[str, np.ndarray]:
+        if picks is None or uncertainty is None:
             return {}
-        found = {pair: doubt_of_picks(pair, T[pair], picks, doubt) for pair in PAIRS}
-        return found | {"loop": doubt_of_loop(T, picks, doubt)}
+        found = {pair: error_sigma_at_picks(pair, T[pair], picks, uncertainty) for pair in PAIRS}
+        return found | {"loop": loop_error_sigma(T, picks, uncertainty)}
 
     first = run["camera_lidar"]
     return Comparison(
@@ -106,8 +106,8 @@ def compare(
         if truth
         else np.zeros(0),
         _independent_loop(run),
-        doubts(picks.spread if picks else None),
-        doubts(picks.sigma if picks else None),
+        pick_sigmas(picks.spread if picks else None),
+        pick_sigmas(picks.sigma if picks else None),
     )
 
 

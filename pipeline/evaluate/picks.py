@@ -27,7 +27,7 @@ import numpy as np
 from pipeline.errors import ConfigError
 from pipeline.evaluate.reflectors import Echoes, Found, find_in_lidar, find_in_radar
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.targets import Doubt, Picks
+from pipeline.geometry.targets import PickUncertainty, Picks
 
 __all__ = ["ReflectorFile", "find_again", "read_reflectors"]
 
@@ -78,8 +78,8 @@ def read_reflectors(path: Path) -> ReflectorFile:
         at["lidar_m"],
         at["radar_m"],
         camera,
-        spread=Doubt(*(spread[key] for key in _KEYS)) if known else None,
-        sigma=Doubt(*(error[key] for key in _KEYS)) if known else None,
+        spread=PickUncertainty(*(spread[key] for key in _KEYS)) if known else None,
+        sigma=PickUncertainty(*(error[key] for key in _KEYS)) if known else None,
     )
     names = ("camera pixels", "lidar", "radar")
     counts = [f"{name}: picked, {_count(frames[key])}" for name, key in zip(names, _KEYS, strict=True)]
@@ -142,8 +142,8 @@ def _moved(picks: Picks, sensor: str, found: Sequence[Found | None]) -> Picks:
     return replace(picks, **changes)
 
 
-def _none(picks: Picks) -> Doubt:
-    return Doubt(np.zeros_like(picks.pixels), np.zeros_like(picks.lidar_m), np.zeros_like(picks.radar_m))
+def _none(picks: Picks) -> PickUncertainty:
+    return PickUncertainty(np.zeros_like(picks.pixels), np.zeros_like(picks.lidar_m), np.zeros_like(picks.radar_m))
 
 
 def _each(targets: list[dict[str, Any]], group: str, key: str, default: np.ndarray) -> np.ndarray:

@@ -19,10 +19,10 @@ from pipeline.geometry.spherical import camera_direction_angles, from_spherical,
 
 __all__ = [
     "DEFAULT_TARGETS",
-    "Doubt",
+    "PickUncertainty",
     "Picks",
-    "doubt_of_loop",
-    "doubt_of_picks",
+    "loop_error_sigma",
+    "error_sigma_at_picks",
     "errors_at_targets",
     "errors_of_picks",
     "loop_errors",
@@ -35,7 +35,7 @@ DEFAULT_TARGETS = from_spherical(
 
 
 @dataclass(frozen=True, eq=False)
-class Doubt:
+class PickUncertainty:
     """Standard deviation of picked positions, per coordinate."""
 
     pixels: np.ndarray  # N 2
@@ -51,8 +51,8 @@ class Picks:
     lidar_m: np.ndarray  # N 3
     radar_m: np.ndarray  # N 3
     camera: Camera
-    spread: Doubt | None = None  # of one frame's pick
-    sigma: Doubt | None = None  # of the positions: standard errors
+    spread: PickUncertainty | None = None  # of one frame's pick
+    sigma: PickUncertainty | None = None  # of the positions: standard errors
 
 
 def errors_at_targets(
@@ -82,35 +82,35 @@ def errors_of_picks(pair: str, T: Float[np.ndarray, "4 4"], picks: Picks) -> Flo
     return np.array([error[0], error[1], np.nan])
 
 
-def doubt_of_picks(
-    pair: str, T: Float[np.ndarray, "4 4"], picks: Picks, doubt: Doubt
+def error_sigma_at_picks(
+    pair: str, T: Float[np.ndarray, "4 4"], picks: Picks, uncertainty: PickUncertainty
 ) -> Float[np.ndarray, " 3"]:
-    """One sigma that doubtful picks leave in a reflector's azimuth, elevation [rad] and range [m] error.
+    """Sigma of a reflector's error that comes from the picks alone: azimuth, elevation [rad] and range [m].
 
     Root mean square over the reflectors, first order; range is NaN for camera pairs. T turns the child's axes into
     the parent's, which any estimate does well enough.
     """
     radar = pair == "lidar_radar"
     angles = to_spherical if radar else camera_direction_angles
-    child = (picks.lidar_m, doubt.lidar_m) if pair == "camera_lidar" else (picks.radar_m, doubt.radar_m)
+    child = (picks.lidar_m, uncertainty.lidar_m) if pair == "camera_lidar" else (picks.radar_m, uncertainty.radar_m)
     square = _propagated(lambda p: angles(transform_points(T, p)), *child)
     if radar:
-        square = square + _propagated(to_spherical, picks.lidar_m, doubt.lidar_m)
+        square = square + _propagated(to_spherical, picks.lidar_m, uncertainty.lidar_m)
         return np.sqrt(square.mean(axis=0))
     square = square + _propagated(
-        lambda p: camera_direction_angles(picks.camera.unproject(p)), picks.pixels, doubt.pixels
+        lambda p: camera_direction_angles(picks.camera.unproject(p)), picks.pixels, uncertainty.pixels
     )
     return np.array([*np.sqrt(square.mean(axis=0)), np.nan])
 
 
-def doubt_of_loop(
-    transforms: Mapping[str, Float[np.ndarray, "4 4"]], picks: Picks, doubt: Doubt
+def loop_error_sigma(
+    transforms: Mapping[str, Float[np.ndarray, "4 4"]], picks: Picks, uncertainty: PickUncertainty
 ) -> Float[np.ndarray, " 3"]:
-    """The same for the loop: next to nothing, for it compares a lidar point with itself."""
+    """The same for the loop: nearly 0, because the loop compares a lidar point with itself."""
     loop = transforms["lidar_radar"] @ inverse(transforms["camera_radar"]) @ transforms["camera_lidar"]
     return np.sqrt(
         _propagated(
-            lambda p: to_spherical(transform_points(loop, p)) - to_spherical(p), picks.lidar_m, doubt.lidar_m
+            lambda p: to_spherical(transform_points(loop, p)) - to_spherical(p), picks.lidar_m, uncertainty.lidar_m
         ).mean(axis=0)
     )
 

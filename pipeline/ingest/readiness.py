@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 __all__ = ["DofVerdict", "Evidence", "judge", "overall"]
 
-# 30 frames give camera-lidar within .1 deg and lidar-radar yaw within .15 deg on real logs, 10 twice that.
+# 30 frames give camera-lidar within 0.1 deg and lidar-radar yaw within 0.15 deg on real logs, 10 twice that.
 _ENOUGH_FRAMES, _FEW_FRAMES = 30, 10
 _MOVING_SHARE = 0.2  # time offsets show only where the car moves
 _DENSE_RINGS = 32  # below, reflectivity on the road has to carry pitch

@@ -18,10 +18,10 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_so3, inverse, transform_points
 from pipeline.geometry.targets import (
     DEFAULT_TARGETS,
-    Doubt,
+    PickUncertainty,
     Picks,
-    doubt_of_loop,
-    doubt_of_picks,
+    loop_error_sigma,
+    error_sigma_at_picks,
     errors_at_targets,
     errors_of_picks,
     loop_errors,
@@ -197,24 +197,24 @@ def test_the_parquet_table_says_the_same_as_the_markdown():
     assert {r["table"] for r in content if r["environment"] != "all"} == {"Extended data table 1"}
 
 
-def doubtful_picks(pixel=0.0, lidar=0.0, radar=0.0):
+def uncertain_picks(pixel=0.0, lidar=0.0, radar=0.0):
     sizes = zip((2, 3, 3), (pixel, lidar, radar), strict=True)
-    doubt = Doubt(*(np.full((3, n), sd) for n, sd in sizes))
-    return replace(picks_of(), spread=doubt, sigma=doubt), doubt
+    uncertainty = PickUncertainty(*(np.full((3, n), sd) for n, sd in sizes))
+    return replace(picks_of(), spread=uncertainty, sigma=uncertainty), uncertainty
 
 
 @pytest.mark.parametrize("pair", PAIRS)
 def test_the_truths_own_sigma_is_the_scatter_that_its_picks_make(pair):
-    picks, doubt = doubtful_picks(0.8, 0.03, 0.1)
+    picks, uncertainty = uncertain_picks(0.8, 0.03, 0.1)
     rng = np.random.default_rng(4)
     of_each = []
     for k in range(3):
         pixels, lidar, radar = (
             at[k] + sd[k] * rng.standard_normal((20_000, len(at[k])))
             for at, sd in (
-                (picks.pixels, doubt.pixels),
-                (picks.lidar_m, doubt.lidar_m),
-                (picks.radar_m, doubt.radar_m),
+                (picks.pixels, uncertainty.pixels),
+                (picks.lidar_m, uncertainty.lidar_m),
+                (picks.radar_m, uncertainty.radar_m),
             )
         )
         # The mean absolute value of a normal variable is sqrt(2 / pi) of its sigma.
@@ -222,19 +222,19 @@ def test_the_truths_own_sigma_is_the_scatter_that_its_picks_make(pair):
             errors_of_picks(pair, TRUTH[pair], Picks(pixels, lidar, radar, CAMERA)) * np.sqrt(np.pi / 2)
         )
     expected = np.sqrt(np.mean(np.square(of_each), axis=0))
-    found = doubt_of_picks(pair, TRUTH[pair], picks, doubt)
+    found = error_sigma_at_picks(pair, TRUTH[pair], picks, uncertainty)
     wanted = slice(3 if pair == "lidar_radar" else 2)
     np.testing.assert_allclose(found[wanted], expected[wanted], rtol=0.03)
 
 
 def test_a_loop_hardly_cares_where_its_points_were_picked():
-    picks, doubt = doubtful_picks(lidar=0.1)
+    picks, uncertainty = uncertain_picks(lidar=0.1)
     opened = TRUTH | {"lidar_radar": turned(T_LIDAR_RADAR, 2, 0.3)}
-    assert np.degrees(doubt_of_loop(opened, picks, doubt)[:2]).max() < 0.01
+    assert np.degrees(loop_error_sigma(opened, picks, uncertainty)[:2]).max() < 0.01
 
 
 def test_a_table_from_picks_states_what_the_truth_is_worth():
-    comparisons = compared_runs(doubtful_picks(radar=0.1)[0])
+    comparisons = compared_runs(uncertain_picks(radar=0.1)[0])
     text = as_markdown(table_rows(comparisons), comparisons)["Table 1"]
     line = next(x for x in text.splitlines() if x.startswith("| (truth: 1 sigma"))
     lidar_radar = [float(v) for v in line.split("|")[6].split("/")]

@@ -3,8 +3,9 @@ import pytest
 
 from pipeline.simulate.logs.recording import _odometry
 from pipeline.simulate.world.casting import World
+from pipeline.simulate.world.chunk import CHUNK_M
 from pipeline.simulate.world.drives import Drive
-from pipeline.simulate.world.scenes import CHUNK_M, chunk_mesh
+from pipeline.simulate.world.scenery import chunk_mesh
 from pipeline.simulate.world.traffic import actors_at
 
 

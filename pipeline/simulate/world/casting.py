@@ -17,10 +17,11 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float
 
 from pipeline.simulate.world.actors import VARIANTS, actor_mesh
+from pipeline.simulate.world.chunk import CHUNK_M
 from pipeline.simulate.world.drives import Drive
 from pipeline.simulate.world.loops import near as rays_near
 from pipeline.simulate.world.meshes import Mesh, join
-from pipeline.simulate.world.scenes import CHUNK_M, chunk_mesh
+from pipeline.simulate.world.scenery import chunk_mesh
 from pipeline.simulate.world.traffic import Actor, actors_at
 
 __all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "shadow_map", "standing_of"]

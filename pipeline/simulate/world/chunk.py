@@ -1,0 +1,73 @@
+"""A piece of the standing world while it is built: what bends with the road, and what is placed as it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.meshes import Colour, Mesh, MeshBuilder, placed
+
+__all__ = ["CHUNK_M", "Chunk", "Span"]
+
+CHUNK_M: Final = 40.0
+Span = tuple[float, float]
+
+
+@dataclass
+class Chunk:
+    """Two ways of adding: `along` bends with the road (corners are s, d, h), `rigid` is placed as it is."""
+
+    drive: Drive
+    index: int
+    rng: np.random.Generator
+    along: MeshBuilder = field(default_factory=MeshBuilder)
+    rigid: list[Mesh] = field(default_factory=list)
+
+    @property
+    def s0(self) -> float:
+        """Where the chunk begins."""
+        return self.index * CHUNK_M
+
+    def strip(self, d: Span, h: Span, name: str, step: float = 5.0, tint: Colour = (1, 1, 1)) -> None:
+        """Add a band along the whole chunk, d rising."""
+        self.band((self.s0, self.s0 + CHUNK_M), d, h, name, step, tint)
+
+    def band(self, s: Span, d: Span, h: Span, name: str, step: float = 5.0, tint: Colour = (1, 1, 1)) -> None:
+        """Add a band of a material along the road, in pieces of about `step` [m] that bend with it.
+
+        Args:
+            s: arc lengths between which it lies.
+            d: offsets of its two sides, to the left of the centre line.
+            h: heights of its two sides; a band that rises more than it is wide has its texture upright.
+            name: material.
+            step: length of a piece.
+            tint: factor of the albedo.
+        """
+        ends = np.linspace(s[0], s[1], max(2, round((s[1] - s[0]) / step) + 1))
+        n = len(ends) - 1
+        corners = np.empty((n, 4, 3))
+        for corner, (along, side) in enumerate(
+            ((ends[:-1], 0), (ends[1:], 0), (ends[1:], 1), (ends[:-1], 1))
+        ):
+            corners[:, corner] = np.stack([along, np.full(n, d[side]), np.full(n, h[side])], 1)
+        upright = abs(h[1] - h[0]) > abs(d[1] - d[0])
+        self.along.quads(corners, name, tint, corners[..., [0, 2]] if upright else corners[..., :2])
+
+    def wall(self, s: Span, d: float, h: Span, name: str, tint: Colour = (1, 1, 1)) -> None:
+        """Add an upright band."""
+        self.band(s, (d, d), h, name, 10.0, tint)
+
+    def put(
+        self, mesh: Mesh, s: float, d: float, h: float = 0.0, yaw: float = 0.0, instance: int | None = None
+    ) -> None:
+        """Place a rigid mesh."""
+        self.rigid.append(placed(mesh, self.drive.road.pose(s, d, h, yaw), instance))
+
+    def every(self, step: float, jitter: float = 0.0, chance: float = 1.0) -> list[float]:
+        """Places along the chunk on a grid that goes on in the next chunk."""
+        first = int(np.ceil(self.s0 / step))
+        grid = [k * step for k in range(first, int(np.ceil((self.s0 + CHUNK_M) / step)))]
+        return [float(s + self.rng.uniform(-jitter, jitter)) for s in grid if self.rng.random() < chance]

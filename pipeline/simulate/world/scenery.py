@@ -1,0 +1,27 @@
+"""The standing world along a road, made chunk by chunk, so that a drive of any length needs no memory."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.simulate.world.chunk import Chunk
+from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.meshes import Mesh, join
+from pipeline.simulate.world.motorway import add_motorway
+from pipeline.simulate.world.road_surface import add_asphalt
+from pipeline.simulate.world.street import add_street
+
+__all__ = ["chunk_mesh"]
+
+
+def chunk_mesh(drive: Drive, index: int) -> Mesh:
+    """The standing world between arc lengths `index * CHUNK_M` and `(index + 1) * CHUNK_M`, in the map."""
+    chunk = Chunk(drive, index, np.random.default_rng([drive.seed, 31, index + 1000]))
+    add_asphalt(chunk)
+    if drive.environment == "highway":
+        add_motorway(chunk)
+    else:
+        add_street(chunk)
+    flat = chunk.along.mesh()
+    bent = drive.road.to_map(flat.corners.astype(np.float64)).astype(np.float32)
+    return join([Mesh(bent, flat.material, flat.tint, flat.uv, flat.instance), *chunk.rigid])
