@@ -17,8 +17,8 @@ from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.learn.infer.onnx_networks import SSL_METHODS, model_files, models_key, open_networks
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
 from pipeline.results import Progress
-from pipeline.store.columns import read_columns
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.row_groups import read_columns
 from pipeline.store.tables import iterate_rows, read_manifest
 from schemas.calibrations import PAIRS
 from schemas.frames import FRAMES, Frame

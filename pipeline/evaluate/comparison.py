@@ -11,12 +11,12 @@ from jaxtyping import Float
 from pipeline.geometry.se3 import from_quaternion, inverse, log_se3
 from pipeline.geometry.targets import (
     DEFAULT_TARGETS,
-    PickUncertainty,
     Picks,
-    loop_error_sigma,
+    PickUncertainty,
     error_sigma_at_picks,
     errors_at_targets,
     errors_of_picks,
+    loop_error_sigma,
     loop_errors,
 )
 from schemas.calibrations import PAIRS, CalibrationRecord

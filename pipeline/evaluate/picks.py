@@ -27,7 +27,7 @@ import numpy as np
 from pipeline.errors import ConfigError
 from pipeline.evaluate.reflectors import Echoes, Found, find_in_lidar, find_in_radar
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.targets import PickUncertainty, Picks
+from pipeline.geometry.targets import Picks, PickUncertainty
 
 __all__ = ["ReflectorFile", "find_again", "read_reflectors"]
 
@@ -143,7 +143,9 @@ def _moved(picks: Picks, sensor: str, found: Sequence[Found | None]) -> Picks:
 
 
 def _none(picks: Picks) -> PickUncertainty:
-    return PickUncertainty(np.zeros_like(picks.pixels), np.zeros_like(picks.lidar_m), np.zeros_like(picks.radar_m))
+    return PickUncertainty(
+        np.zeros_like(picks.pixels), np.zeros_like(picks.lidar_m), np.zeros_like(picks.radar_m)
+    )
 
 
 def _each(targets: list[dict[str, Any]], group: str, key: str, default: np.ndarray) -> np.ndarray:

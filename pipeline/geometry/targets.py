@@ -21,10 +21,10 @@ __all__ = [
     "DEFAULT_TARGETS",
     "PickUncertainty",
     "Picks",
-    "loop_error_sigma",
     "error_sigma_at_picks",
     "errors_at_targets",
     "errors_of_picks",
+    "loop_error_sigma",
     "loop_errors",
 ]
 
@@ -92,7 +92,11 @@ def error_sigma_at_picks(
     """
     radar = pair == "lidar_radar"
     angles = to_spherical if radar else camera_direction_angles
-    child = (picks.lidar_m, uncertainty.lidar_m) if pair == "camera_lidar" else (picks.radar_m, uncertainty.radar_m)
+    child = (
+        (picks.lidar_m, uncertainty.lidar_m)
+        if pair == "camera_lidar"
+        else (picks.radar_m, uncertainty.radar_m)
+    )
     square = _propagated(lambda p: angles(transform_points(T, p)), *child)
     if radar:
         square = square + _propagated(to_spherical, picks.lidar_m, uncertainty.lidar_m)
@@ -110,7 +114,9 @@ def loop_error_sigma(
     loop = transforms["lidar_radar"] @ inverse(transforms["camera_radar"]) @ transforms["camera_lidar"]
     return np.sqrt(
         _propagated(
-            lambda p: to_spherical(transform_points(loop, p)) - to_spherical(p), picks.lidar_m, uncertainty.lidar_m
+            lambda p: to_spherical(transform_points(loop, p)) - to_spherical(p),
+            picks.lidar_m,
+            uncertainty.lidar_m,
         ).mean(axis=0)
     )
 

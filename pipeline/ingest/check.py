@@ -140,7 +140,7 @@ def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:
         return float(np.mean(flags)) if flags else 0.0
 
     uses_models = isinstance(rig.camera.semantics, OnnxSemantics)
-    moving, doubt = _motion(frames, rig)
+    moving, problem = _motion(frames, rig)
     rings = max((len(np.unique(f.lidar_ring)) for f in frames if f.lidar_ring is not None), default=0)
     return Evidence(
         frames=usable,
@@ -154,12 +154,12 @@ def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:
         rings=rings,
         elevation_share=share([f.radar_has_elevation for f in frames]),
         moving_share=moving,
-        doppler_doubt=doubt,
+        doppler_problem=problem,
     )
 
 
 def _motion(frames: list[Frame], rig: Rig) -> tuple[float | None, str]:
-    """Share of frames in which the car moves, by odometry or else Doppler, and doubts about the Doppler."""
+    """Share of frames in which the car moves, by odometry or else Doppler, and what is wrong with the Doppler."""
     period = rig.radar.doppler_period_mps
     fits = []
     for f in frames:
@@ -171,10 +171,10 @@ def _motion(frames: list[Frame], rig: Rig) -> tuple[float | None, str]:
     fitted = speeds if len(speeds) >= len(frames) / 2 else np.zeros(0)
     known = odometry if len(odometry) else fitted
     moving = float(np.mean(np.abs(known) > _MOVING_MPS)) if len(known) else None
-    return moving, _doppler_doubt(frames, speeds, rig)
+    return moving, _doppler_problem(frames, speeds, rig)
 
 
-def _doppler_doubt(frames: list[Frame], speeds: Float[np.ndarray, " N"], rig: Rig) -> str:
+def _doppler_problem(frames: list[Frame], speeds: Float[np.ndarray, " N"], rig: Rig) -> str:
     period = rig.radar.doppler_period_mps
     spans = [float(np.ptp(f.radar_range_rate_mps)) for f in frames]
     if period is not None and spans and max(spans) > 1.05 * period:

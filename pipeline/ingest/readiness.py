@@ -24,7 +24,7 @@ class Evidence:
     rings: int
     elevation_share: float
     moving_share: float | None
-    doppler_doubt: str = ""
+    doppler_problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def _pitch_needs(e: Evidence) -> _Needs:
 
 
 def _radar_needs(e: Evidence) -> _Needs:
-    return [("weak", e.doppler_doubt)] if e.doppler_doubt else []
+    return [("weak", e.doppler_problem)] if e.doppler_problem else []
 
 
 def _elevation_needs(e: Evidence) -> _Needs:

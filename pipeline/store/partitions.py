@@ -46,7 +46,7 @@ class Partition:
 
 @dataclass(frozen=True)
 class Lake:
-    """The root of the tables: a folder (an object store comes behind the same four methods)."""
+    """The root of the tables: a folder (an object store comes behind the same methods)."""
 
     root: Path
 
@@ -60,6 +60,10 @@ class Lake:
     def folder(self, table: str, partition: Partition) -> Path:
         """The folder of one partition of one table."""
         return self.root / table / partition.folder
+
+    def file(self, table: str, partition: Partition) -> Path:
+        """The file of a partition that is replaced as a whole (records have names of their own)."""
+        return self.folder(table, partition) / "part-0.parquet"
 
     def partitions(self, table: str, vehicle: str | None = None, day: str | None = None) -> list[Partition]:
         """Partitions of a table that hold at least one file, in order; only those of a vehicle or day if given."""

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import ContractError
-from pipeline.store.atomic_write import new_file_aside
+from pipeline.store.atomic_write import atomic_write
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
@@ -31,7 +31,6 @@ __all__ = [
 
 Row = TypeVar("Row")
 _KEY = b"boresight"
-_PARTITION_FILE = "part-0.parquet"
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Manifest:
 
 
 class PartitionWriter:
-    """Streams rows of one partition into a file aside; nothing is visible until the block ends without an error."""
+    """Streams rows of one partition into a temporary file; nothing is visible until the block ends without an error."""
 
     def __init__(self, writer: pq.ParquetWriter, schema: TableSchema) -> None:
         self._writer, self._schema = writer, schema
@@ -77,9 +76,8 @@ def write_partition(
     code_version: str,
     inputs: Iterable[str] = (),
 ) -> Iterator[PartitionWriter]:
-    """Replace one partition as a whole: write aside, flush to disk, rename. On an error the old file stays."""
-    folder = lake.folder(schema.name, partition)
-    with _replacing(folder, folder / _PARTITION_FILE, schema) as parquet:
+    """Replace one partition as a whole, atomically; on an error the old file stays."""
+    with _replacing(lake.file(schema.name, partition), schema) as parquet:
         writer = PartitionWriter(parquet, schema)
         yield writer
         manifest = Manifest(
@@ -99,9 +97,8 @@ def write_records(
     inputs: Iterable[str] = (),
 ) -> Path:  # fmt: skip
     """Add one record file named after its work key; the same work writes the same file again."""
-    folder = lake.folder(schema.name, partition)
-    path = folder / f"{work_key}.parquet"
-    with _replacing(folder, path, schema) as parquet:
+    path = lake.folder(schema.name, partition) / f"{work_key}.parquet"
+    with _replacing(path, schema) as parquet:
         parquet.write_table(to_table(rows, schema))
         manifest = Manifest(schema.name, schema.version, work_key, code_version, list(inputs), len(rows))
         parquet.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
@@ -110,7 +107,7 @@ def write_records(
 
 def read_manifest(lake: Lake, schema: TableSchema, partition: Partition) -> Manifest | None:
     """Manifest of a partition, None where there is no such partition."""
-    path = lake.folder(schema.name, partition) / _PARTITION_FILE
+    path = lake.file(schema.name, partition)
     return _manifest(path, schema) if path.exists() else None
 
 
@@ -131,7 +128,7 @@ def iterate_rows(
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
     """
-    path = lake.folder(schema.name, partition) / _PARTITION_FILE
+    path = lake.file(schema.name, partition)
     if not path.exists():
         raise ContractError(
             str(path), f"table {schema.name} has no partition for {partition.vehicle} on {partition.day}"
@@ -171,10 +168,10 @@ def read_records(
 
 
 @contextmanager
-def _replacing(folder: Path, path: Path, schema: TableSchema) -> Iterator[pq.ParquetWriter]:
-    folder.mkdir(parents=True, exist_ok=True)
+def _replacing(path: Path, schema: TableSchema) -> Iterator[pq.ParquetWriter]:
+    path.parent.mkdir(parents=True, exist_ok=True)
     with (
-        new_file_aside(path) as stream,
+        atomic_write(path) as stream,
         pq.ParquetWriter(stream, schema.arrow_schema(), **_writer_options(schema)) as parquet,
     ):
         yield parquet

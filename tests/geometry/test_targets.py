@@ -18,12 +18,12 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_so3, inverse, transform_points
 from pipeline.geometry.targets import (
     DEFAULT_TARGETS,
-    PickUncertainty,
     Picks,
-    loop_error_sigma,
+    PickUncertainty,
     error_sigma_at_picks,
     errors_at_targets,
     errors_of_picks,
+    loop_error_sigma,
     loop_errors,
 )
 from pipeline.store.partitions import Partition

@@ -61,7 +61,7 @@ def test_weak_evidence_is_called_weak_with_its_reason():
     blind = verdict(changed(has_intensity=False), "camera_lidar", "pitch")
     assert blind.verdict == "weak"
     assert verdict(changed(has_intensity=False, rings=64), "camera_lidar", "pitch").verdict == "yes"
-    assert verdict(changed(doppler_doubt="odd"), "lidar_radar", "yaw, x and y").reasons == ["odd"]
+    assert verdict(changed(doppler_problem="odd"), "lidar_radar", "yaw, x and y").reasons == ["odd"]
 
 
 @settings(max_examples=40, deadline=None)
@@ -122,9 +122,9 @@ def test_a_planar_radar_a_missing_field_and_a_wrong_sign_are_noticed(kit, tmp_pa
     assert report.answer == "no"
     assert any("x, y, z, doppler, power" in p for p in report.problems)
     report = report_on(kit, tmp_path, drive, radar={"doppler_positive": "receding"})
-    assert 'probably "approaching"' in report.evidence.doppler_doubt
+    assert 'probably "approaching"' in report.evidence.doppler_problem
     report = report_on(kit, tmp_path, drive, radar={"doppler_period_mps": 2.0})
-    assert "doppler_period_mps = 2" in report.evidence.doppler_doubt
+    assert "doppler_period_mps = 2" in report.evidence.doppler_problem
 
 
 def test_a_camera_frame_that_is_not_optical_is_noticed(kit, tmp_path):

@@ -112,9 +112,9 @@ def test_check_finds_the_day_fit_and_notices_a_wrong_doppler_sign(logs):
     assert report.answer == "yes"
     assert report.evidence.frames == 187
     assert 0.5 < report.evidence.moving_share < 0.95
-    assert report.evidence.doppler_doubt == ""
+    assert report.evidence.doppler_problem == ""
     assert {v.verdict for v in report.verdicts if v.pair == "camera_lidar"} == {"yes", "weak"}
     wrong = rig.model_copy(update={"radar": rig.radar.model_copy(update={"doppler_positive": "receding"})})
-    assert 'probably "approaching"' in check_logs(logs[:1], wrong, fleet).evidence.doppler_doubt
+    assert 'probably "approaching"' in check_logs(logs[:1], wrong, fleet).evidence.doppler_problem
     short = rig.model_copy(update={"radar": rig.radar.model_copy(update={"doppler_period_mps": 5.0})})
-    assert "doppler_period_mps = 5" in check_logs(logs[:1], short, fleet).evidence.doppler_doubt
+    assert "doppler_period_mps = 5" in check_logs(logs[:1], short, fleet).evidence.doppler_problem

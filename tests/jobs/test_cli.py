@@ -121,8 +121,8 @@ from pathlib import Path
 from jobs import cli
 
 def export(what: str, *, out: Path) -> int:
-    from pipeline.store.atomic_write import new_file_aside
-    with new_file_aside(out / "x.parquet") as stream:
+    from pipeline.store.atomic_write import atomic_write
+    with atomic_write(out / "x.parquet") as stream:
         stream.write(b"half")
         stream.flush()
         (out / "begun").touch()

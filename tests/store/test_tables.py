@@ -1,4 +1,3 @@
-import importlib.util
 import json
 import multiprocessing
 import os
@@ -28,14 +27,10 @@ from pipeline.store.tables import (
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.frames import FRAMES, Frame
+from tests.makers.table_rows import ROW_TYPES, make_row, same
 
-HERE = Path(__file__).resolve().parent
+REPO = Path(__file__).resolve().parents[2]
 DAY = Partition("car", "2026-03-02")
-
-spec = importlib.util.spec_from_file_location("rows_for_tests", HERE / "rows_for_tests.py")
-rows_for_tests = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(rows_for_tests)
-make_row, same, ROW_TYPES = rows_for_tests.make_row, rows_for_tests.same, rows_for_tests.ROW_TYPES
 
 
 @pytest.fixture
@@ -237,7 +232,8 @@ def assert_whole(lake):
 
 def test_a_writer_killed_at_any_moment_never_leaves_a_bad_read(lake, rng):
     server = subprocess.Popen(
-        [sys.executable, str(HERE / "writer_to_kill.py"), str(lake.root)],
+        [sys.executable, "-m", "tests.store.writer_to_kill", str(lake.root)],
+        cwd=REPO,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -248,7 +244,7 @@ def test_a_writer_killed_at_any_moment_never_leaves_a_bad_read(lake, rng):
         leftovers = kills = 0
         # On a busy machine a write takes longer: there, kills go on and come later until both kinds were seen.
         while kills < 60 or (min(len(generations), leftovers) <= 5 and kills < 600):
-            delay = 0.5 if kills == 0 else rng.uniform(0.0, 0.12 * (1 + kills // 60))
+            delay = rng.uniform(0.0, 0.12 * (1 + kills // 60))
             kills += 1
             server.stdin.write(f"{delay}\n")
             server.stdin.flush()

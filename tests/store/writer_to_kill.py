@@ -4,17 +4,14 @@ import os
 import signal
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-from rows_for_tests import make_row
 
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_partition, write_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.frames import FRAMES
+from tests.makers.table_rows import make_row
 
 
 def make_rows():
@@ -23,21 +20,26 @@ def make_rows():
     return frames, make_row("calibrations", rng)
 
 
-def write_for_ever(lake, generation, rows, record):
+def write_generation(lake, generation, rows, record):
     partition = Partition("car", "2026-03-02")
+    with write_partition(lake, FRAMES, partition, f"key-{generation}", "0") as writer:
+        for first in range(0, 12, 3):
+            for row in rows:
+                object.__setattr__(row, "drive", generation)
+            writer.append(rows[first : first + 3])
+    write_records(lake, CALIBRATIONS, partition, [record] * 3, f"key-{generation}", "0")
+
+
+def write_for_ever(lake, generation, rows, record):
     while True:
         generation += 1
-        with write_partition(lake, FRAMES, partition, f"key-{generation}", "0") as writer:
-            for first in range(0, 12, 3):
-                for row in rows:
-                    object.__setattr__(row, "drive", generation)
-                writer.append(rows[first : first + 3])
-        write_records(lake, CALIBRATIONS, partition, [record] * 3, f"key-{generation}", "0")
+        write_generation(lake, generation, rows, record)
 
 
 def main():
     lake = Lake.at(sys.argv[1])
     rows, record = make_rows()
+    write_generation(lake, 0, rows, record)  # on a busy machine the first kill may come before a whole write
     print("ready", flush=True)
     for turn, line in enumerate(sys.stdin):
         child = os.fork()

@@ -19,8 +19,8 @@ from pipeline.errors import ContractError
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.prepare.inventory import read_leaks
-from pipeline.store.columns import RowGroup, read_columns, read_group, row_groups
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.row_groups import RowGroup, read_columns, read_group, row_groups
 from pipeline.store.tables import read_manifest
 from schemas.training import TRAINING, TrainingRow
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.store.atomic_write import new_file_aside
-from pipeline.store.columns import read_columns
+from pipeline.store.atomic_write import atomic_write
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.row_groups import read_columns
 from pipeline.store.tables import read_manifest
 from schemas.training import SPLITS, TRAINING
 
@@ -91,7 +91,7 @@ def write_inventory(lake: Lake, inventory: Inventory, about: dict[str, Any]) -> 
     path = lake.root / TRAINING.name / MANIFEST_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     content = about | inventory.__dict__
-    with new_file_aside(path) as stream:
+    with atomic_write(path) as stream:
         stream.write((json.dumps(content, indent=2, sort_keys=True) + "\n").encode())
     return path
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from pipeline.config import PrepareConfig
 from pipeline.learn.prepare.split import SplitPlan, Unit, environment_of_speeds, plan_split
-from pipeline.store.columns import read_columns
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.row_groups import read_columns
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS
 

@@ -1,14 +1,9 @@
 """Models behind manifests: heads, letterboxes, alignment of logits, and errors that name manifest and key."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))  # importlib mode knows no siblings
-from onnx_models import save_constant, save_segmenter, write_manifest
 
 from pipeline.config import OnnxSemantics, load_fleet
 from pipeline.errors import ModelError
@@ -18,6 +13,7 @@ from pipeline.perceive.models.segmenter import Segmenter
 from pipeline.perceive.models.session import Fit, fit_image
 from pipeline.perceive.models.source import ModelSource
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.onnx_models import save_constant, save_segmenter, write_manifest
 
 COLOURS = [[0.2, 0.2, 0.2], [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]]  # RGB of ADE20K wall, building, sky
 FITS = ("letterbox_top_left", "letterbox_centre", "stretch")

@@ -18,7 +18,6 @@ from schemas.columns import TableSchema
 __all__ = ["RowGroup", "read_columns", "read_group", "row_groups"]
 
 Row = TypeVar("Row")
-_PARTITION_FILE = "part-0.parquet"
 
 
 @dataclass(frozen=True, order=True)
@@ -59,7 +58,7 @@ def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[
     Raises:
         ContractError: the partition is gone, or not of this schema.
     """
-    path = lake.folder(schema.name, group.partition) / _PARTITION_FILE
+    path = lake.file(schema.name, group.partition)
     try:
         with pq.ParquetFile(path) as file:
             return from_table(file.read_row_group(group.index), schema, row_type)
@@ -68,7 +67,7 @@ def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[
 
 
 def _checked(lake: Lake, schema: TableSchema, partition: Partition) -> Path:
-    path = lake.folder(schema.name, partition) / _PARTITION_FILE
+    path = lake.file(schema.name, partition)
     if read_manifest(lake, schema, partition) is None:
         raise ContractError(str(path), f"table {schema.name} has no such partition")
     return path

@@ -1,16 +1,11 @@
 """Lidar semantics by range images: projection, votes of neighbours, models and their faults, and whole days."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-
-sys.path.insert(0, str(Path(__file__).parent))  # importlib mode knows no siblings
-from onnx_models import write_manifest
 
 from pipeline.config import FleetConfig, config_hash, load_fleet
 from pipeline.errors import ConfigError, ModelError
@@ -23,6 +18,7 @@ from pipeline.store.tables import read_rows, write_partition
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.onnx_models import write_manifest
 
 DAY = Partition("car-1", "2026-03-02")
 SIZE, UP, DOWN = (32, 360), 10.0, -22.0  # 1 deg x 1 deg

@@ -1,0 +1,37 @@
+"""Ego motion between odometry messages, and none where there is none."""
+
+import numpy as np
+import pytest
+
+from pipeline.ingest.messages.odometry import EgoTrack
+
+START = 1_700_000_000 * 10**9
+
+
+def odometry(kit, track, t, yaw):
+    track.add(START + int(t * 1e9), kit.Kit().odometry(0, 10 * t, yaw, 10 + t, 0.1 * t))
+
+
+def test_ego_motion_is_interpolated_between_messages_and_through_half_a_turn(kit):
+    track = EgoTrack()
+    for t in (0.2, 0.0, 0.1):  # reordered
+        odometry(kit, track, t, np.pi - 0.05 + t)
+    state = track.at(START + 50_000_000)
+    assert state.speed_mps == pytest.approx(10.05)
+    assert state.yaw_rate_radps == pytest.approx(0.005)
+    np.testing.assert_allclose(state.T_odom_vehicle[:3, 3], [0.5, 0, 0], atol=1e-12)
+    yaw = np.arctan2(state.T_odom_vehicle[1, 0], state.T_odom_vehicle[0, 0])
+    assert abs(yaw) == pytest.approx(np.pi)
+    assert track.at(START + 100_000_000).speed_mps == pytest.approx(10.1)
+
+
+def test_ego_motion_is_not_made_up_outside_or_across_a_gap(kit):
+    track = EgoTrack()
+    assert track.at(START) is None
+    for t in (0.0, 0.1, 0.9):
+        odometry(kit, track, t, 0.0)
+    assert track.at(START - 1) is None
+    assert track.at(START + 900_000_001) is None
+    assert track.at(START + 500_000_000) is None
+    assert track.at(START + 50_000_000) is not None
+    assert not track.add(START, kit.Kit().odometry(0, np.nan, 0, 0, 0))
