@@ -17,7 +17,7 @@ _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
 @needs("train")
-def train(
+def train(  # options of the command: as many as a user may set
     *,
     data: str,
     out: Path,

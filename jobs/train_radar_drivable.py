@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from jobs.extras import needs
-
-if TYPE_CHECKING:
-    from pipeline.config import FleetConfig
-    from pipeline.learn.perception.radar_drivable.samples import DrivableSamples
-    from pipeline.store.partitions import Lake, Partition
 
 __all__ = ["train_radar_drivable"]
 
 
 @needs("train")
-def train_radar_drivable(
+def train_radar_drivable(  # options of the command: as many as a user may set
     *,
     fleet: Path,
     lake: str,
@@ -53,61 +47,22 @@ def train_radar_drivable(
     from jobs.terminal.summary import print_summary, progress_reporter
     from jobs.train import parse_duration
     from pipeline.config import load_fleet
+    from pipeline.learn.perception.radar_drivable.days import drivable_samples
     from pipeline.learn.perception.radar_drivable.export import export_drivable
     from pipeline.learn.perception.radar_drivable.training import DrivableTraining, train_drivable
     from pipeline.store.partitions import Lake
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
     config = DrivableTraining(steps, batch_size, learning_rate, seed=seed)
-    train, held_out, data = _samples(load_fleet(fleet), Lake.at(lake), frames_per_day)
+    train, held_out, data = drivable_samples(load_fleet(fleet), Lake.at(lake), frames_per_day)
     torch.set_num_threads(threads)
     with progress_reporter(f"train {out.name}") as progress:
         network, result = train_drivable(train, held_out, out, config, limit, progress)
     outputs: list[Path] = []
     if result.status == "done":
-        card = {"data": data, "training": asdict(config), "iou_held_out": result.iou}
+        card = {"data": data, "training": asdict(config), "iou_held_out": result.scores}
         outputs = [export_drivable(network, out, card)]
-    fields = asdict(result)
-    print_summary("train-radar-drivable", fields.pop("status"), out=out, outputs=outputs, **data, **fields)
+    fields = data | asdict(result)
+    fields["iou"] = fields.pop("scores")
+    print_summary("train-radar-drivable", fields.pop("status"), out=out, outputs=outputs, **fields)
     return 128 + result.signal if result.signal else 0
-
-
-def _samples(
-    config: FleetConfig, lake: Lake, per_day: int
-) -> tuple[DrivableSamples, DrivableSamples, dict[str, int]]:
-    """Samples to learn from, held-out samples, and their numbers."""
-    import numpy as np
-
-    from pipeline.errors import ContractError
-    from pipeline.learn.perception.radar_drivable.samples import joined
-    from schemas.observations import OBSERVATIONS
-
-    days = [p for p in lake.partitions(OBSERVATIONS.name) if p.vehicle in config.vehicles]
-    if not days:
-        raise ContractError(
-            str(lake.root), "no observations of a vehicle in fleet.toml: run `boresight perceive`"
-        )
-    parts = [_samples_of_day(config, lake, day, per_day) for day in days]
-    if len(parts) == 1:
-        # Neighbouring scans are alike: a tenth between the two sides belongs to neither.
-        rows, total = np.arange(len(parts[0])), len(parts[0])
-        train, held_out = parts[0].at(rows[: int(0.7 * total)]), parts[0].at(rows[int(0.8 * total) :])
-    else:
-        train = joined([p for i, p in enumerate(parts) if i % 5 != 1])
-        held_out = joined([p for i, p in enumerate(parts) if i % 5 == 1])
-    return (
-        train,
-        held_out,
-        {"vehicle_days": len(days), "samples": len(train), "held_out_samples": len(held_out)},
-    )
-
-
-def _samples_of_day(config: FleetConfig, lake: Lake, day: Partition, per_day: int) -> DrivableSamples:
-    from pipeline.extrinsics.prior import read_prior
-    from pipeline.learn.perception.radar_drivable.samples import day_samples
-    from pipeline.store.tables import read_rows
-    from schemas.observations import OBSERVATIONS, Observation
-
-    rows = read_rows(lake, OBSERVATIONS, day, Observation)
-    T_lidar_radar = read_prior(rows, config, day.vehicle).T_lidar_radar
-    return day_samples(rows, T_lidar_radar, per_day)

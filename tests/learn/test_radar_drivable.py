@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.config import load_fleet
 from pipeline.errors import ConfigError, ContractError
 from pipeline.geometry.radar_grid import cell_centres, sector_mask, sector_of
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.learn.perception.radar_drivable.days import samples_of_day
 from pipeline.learn.perception.radar_drivable.network import build_drivable_network
 from pipeline.learn.perception.radar_drivable.samples import BLOCKED, FREE, UNKNOWN, day_samples, label_grid
 from pipeline.learn.perception.radar_drivable.training import DrivableTraining, area_iou, train_drivable
@@ -101,8 +103,8 @@ def test_the_network_beats_geometry_and_the_best_guess_on_roads_that_it_has_not_
     train, held_out = samples
     _, result = train_drivable(train, held_out, tmp_path, DrivableTraining(steps=160, batch_size=4, width=12))
     assert result.status == "done"
-    assert result.iou["network"] > result.iou["geometric"] + 0.2
-    assert result.iou["network"] > result.iou["constant"] + 0.2
+    assert result.scores["network"] > result.scores["geometric"] + 0.2
+    assert result.scores["network"] > result.scores["constant"] + 0.2
 
 
 def test_a_stopped_run_goes_on_to_the_same_weights(samples, tmp_path):
@@ -149,9 +151,6 @@ def test_the_network_is_small_and_cells_without_label_do_not_count():
 
 
 def test_the_job_labels_by_the_logged_prior_trains_and_leaves_model_manifest_and_card(tmp_path):
-    from jobs.train_radar_drivable import _samples_of_day
-    from pipeline.config import load_fleet
-
     fleet = tmp_path / "fleet.toml"
     fleet.write_text(fleet_toml("a", "b"))
     turned = turn_left(4.0)
@@ -162,7 +161,7 @@ def test_the_job_labels_by_the_logged_prior_trains_and_leaves_model_manifest_and
         with write_partition(lake, OBSERVATIONS, Partition(vehicle, "2026-01-01"), vehicle, "test") as writer:
             writer.append(rows)
             writer.describe(kept={}, rejected={})
-        found = _samples_of_day(load_fleet(fleet), fleet, lake, Partition(vehicle, "2026-01-01"), 9)
+        found = samples_of_day(load_fleet(fleet), lake, Partition(vehicle, "2026-01-01"), 9)
         assert np.array_equal(found.label, np.stack([label_grid(o, prior) for o in rows]))
         labels.append(found.label)
     assert not np.array_equal(*labels)  # labels follow what is logged, right or wrong

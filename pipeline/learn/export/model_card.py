@@ -1,4 +1,4 @@
-"""What a model's card says of the run that it comes from: data, seeds, time, results, limits."""
+"""A model's card: what it says of the run that it comes from, and its two files, JSON and Markdown."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipeline.errors import ConfigError
 from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint
 from pipeline.learn.train.metrics import read_metrics
 
-__all__ = ["LIMITS", "card_of_run"]
+__all__ = ["LIMITS", "card_of_run", "write_card"]
 
 LIMITS = (
     "Trained without ground truth: answers inherit the losses' biases, which no average over the fleet takes out.",
@@ -52,6 +52,24 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
         "limits": list(LIMITS),
         "training": config,
     } | _notes(notes)
+
+
+def write_card(model: Path, card: dict[str, Any]) -> None:
+    """Write the card beside the model's file, as .json for programs and .md for people."""
+    model.with_suffix(".json").write_text(json.dumps(card, indent=2, default=str) + "\n")
+    model.with_suffix(".md").write_text(_markdown(card))
+
+
+def _markdown(card: dict[str, Any]) -> str:
+    lines = [f"# Model card of {card['file']}", ""]
+    for key, value in card.items():
+        if isinstance(value, dict):
+            lines += [f"## {key.replace('_', ' ')}", "", *(f"- {k}: {v}" for k, v in value.items()), ""]
+        elif isinstance(value, (list, tuple)):
+            lines += [f"## {key.replace('_', ' ')}", "", *(f"- {v}" for v in value), ""]
+        else:
+            lines += [f"- {key.replace('_', ' ')}: {value}", ""]
+    return "\n".join(lines)
 
 
 def _notes(path: Path | None) -> dict[str, Any]:

@@ -8,7 +8,6 @@ graph there and encode the camera once for several refinements (`infer/single_fr
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ from typing import Any
 import onnx
 import torch
 from torch import Tensor, nn
-from torch.jit._trace import TracerWarning
 
+from pipeline.learn.export.model_card import write_card
+from pipeline.learn.export.tracing import trace_to_onnx
 from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.views import RenderedView
 from pipeline.learn.sample.grid import Grid
@@ -35,9 +35,7 @@ from pipeline.learn.sample.layout import (
 from schemas.training import GRID_CLASSES
 from schemas.versions import CODE_VERSION
 
-__all__ = ["OPSET", "card_markdown", "export_onnx"]
-
-OPSET = 18
+__all__ = ["export_onnx"]
 
 
 class _Graph(nn.Module):
@@ -71,26 +69,17 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
         ["corrections", "log_variance"] if len(outputs) == 2 else [LIKELIHOOD, "corrections", "log_variance"]
     )
     out.parent.mkdir(parents=True, exist_ok=True)
-    aside = out.with_suffix(".part")
-    with warnings.catch_warnings():
-        # The tracing exporter is all that these graphs need; the newer one wants onnxscript, one more dependency.
-        warnings.filterwarnings("ignore", category=DeprecationWarning)
-        warnings.filterwarnings("ignore", category=TracerWarning)
-        warnings.filterwarnings("ignore", message=".*Constant folding.*")
-        torch.onnx.export(
-            graph, examples, str(aside), dynamo=False, opset_version=OPSET,
-            input_names=list(GRAPH_INPUTS), output_names=names,
-        )  # fmt: skip
-    model = onnx.load(str(aside))
+    unfinished = out.with_suffix(".part")
+    model = trace_to_onnx(graph, examples, unfinished, GRAPH_INPUTS, names)
     _shorten_names(model, {*GRAPH_INPUTS, *names})
     metadata = _metadata(network.config, card or {})
     for key, value in metadata.items():
         entry = model.metadata_props.add()
         entry.key, entry.value = key, value
     onnx.checker.check_model(model)
-    onnx.save(model, str(aside))
-    aside.replace(out)
-    _write_card(out, network, metadata, card or {})
+    onnx.save(model, str(unfinished))
+    unfinished.replace(out)
+    write_card(out, _card_of(out, network, metadata, card or {}))
     return out
 
 
@@ -152,10 +141,10 @@ def _metadata(config: NetworkConfig, card: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def _write_card(
+def _card_of(
     out: Path, network: CalibrationNetwork, metadata: dict[str, str], card: dict[str, Any]
-) -> None:
-    plain = {
+) -> dict[str, Any]:
+    return {
         "file": out.name,
         "bytes": out.stat().st_size,
         "parameters": sum(p.numel() for p in network.parameters()),
@@ -165,18 +154,3 @@ def _write_card(
         "code_version": CODE_VERSION,
         **card,
     }
-    out.with_suffix(".json").write_text(json.dumps(plain, indent=2, default=str) + "\n")
-    out.with_suffix(".md").write_text(card_markdown(plain))
-
-
-def card_markdown(plain: dict[str, Any]) -> str:
-    """A card for people."""
-    lines = [f"# Model card of {plain['file']}", ""]
-    for key, value in plain.items():
-        if isinstance(value, dict):
-            lines += [f"## {key.replace('_', ' ')}", "", *(f"- {k}: {v}" for k, v in value.items()), ""]
-        elif isinstance(value, (list, tuple)):
-            lines += [f"## {key.replace('_', ' ')}", "", *(f"- {v}" for v in value), ""]
-        else:
-            lines += [f"- {key.replace('_', ' ')}: {value}", ""]
-    return "\n".join(lines)
