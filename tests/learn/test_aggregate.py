@@ -60,7 +60,7 @@ def test_what_all_answers_are_off_by_alike_is_found_where_the_truth_is_known():
         np.array([*np.radians([0.1, -0.2, 0.3]), 0.05, -0.02, 0.03]),
     )
     answers = day(rng, np.zeros((6, 6)), x, noise=NOISE / 5)
-    S = aggregate._sight_of_twist(answers.T_centre)
+    S = aggregate._bearing_of_twist(answers.T_centre)
     biased = replace(answers, answer=answers.answer + np.linalg.solve(S, bias))
     found = aggregate.shared_bias(biased, exp_se3(x) @ answers.T_centre)
     assert np.degrees(found[:3]) == pytest.approx(np.degrees(bias[:3]), abs=0.05)
@@ -172,7 +172,7 @@ def test_the_covariance_covers_also_where_frames_of_a_drive_err_alike():
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(aggregate.BIAS_SIGMA, "camera_lidar", (0.0,) * 6)
         for _ in range(40):
-            x = rng.normal(size=6) * PRIOR_SD * 0.5  # the centre is where scouts point, not the prior
+            x = rng.normal(size=6) * PRIOR_SD * 0.5  # the centre is the pilot frames' mean, not the prior
             x_prior = x + rng.normal(size=6) * PRIOR_SD
             found = estimate(day(rng, gain, x, block_sd=0.5), rng, x_prior=x_prior)
             error = off(found, x)
@@ -196,9 +196,9 @@ def test_one_frame_is_worth_its_own_stated_sigma():
 def test_what_a_flat_radar_says_of_elevations_is_not_believed():
     rng = np.random.default_rng(7)
     x = PRIOR_SD * 0.3
-    blind = np.array([1, 1, 0, 0, 0, 1], bool)
-    found = estimate(day(rng, np.zeros((6, 6)), x), rng, x_prior=np.zeros(6), blind=blind)
-    assert not found.observable[blind].any()
+    flat = np.array([1, 1, 0, 0, 0, 1], bool)
+    found = estimate(day(rng, np.zeros((6, 6)), x), rng, x_prior=np.zeros(6), unobservable=flat)
+    assert not found.observable[flat].any()
     assert found.observable[2]
     assert np.abs(off(found, np.zeros(6))[:2]).max() < 1e-3  # roll and pitch of the prior, to second order
     assert np.abs(off(found, x)[2]) < np.radians(0.12)

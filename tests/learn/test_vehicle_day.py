@@ -14,8 +14,9 @@ from pipeline.errors import ConfigError, ModelError, SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.learn.export.onnx_file import export_onnx
+from pipeline.learn.infer.frame_network import FrameAnswer
 from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
-from pipeline.learn.infer.vehicle_day import FrameAnswer, single_frame_solution, solve_by_networks
+from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
 from pipeline.learn.sample.layout import NetworkConfig
@@ -103,7 +104,7 @@ def test_an_oracle_is_followed_to_the_truth_within_its_sigmas(frames):
     assert solution.doubts == {pair: [] for pair in PAIRS}
 
 
-def test_scouts_walk_until_the_network_is_within_reach(frames):
+def test_the_guess_is_iterated_until_the_network_is_within_reach(frames):
     """A network that corrects at most 2 deg at once, 5 deg away."""
     far = replace(prior_off(np.radians(5)), rotation_sigma_rad=np.radians(5))
     solution = solve(frames, [Oracle(reach_rad=np.radians(2))], far)
@@ -142,7 +143,7 @@ def test_frames_that_show_too_little_are_counted_and_too_few_refuse_the_day(fram
         solve(frames, [Oracle(blind_frames=range(35))], prior_off(0.01))
 
 
-def test_a_day_whose_halves_differ_is_doubted(frames):
+def test_a_day_whose_halves_differ_fails_a_check(frames):
     class Moved(Oracle):
         def answer(self, sensors, guess):
             said = super().answer(sensors, guess)

@@ -1,19 +1,20 @@
 """From a network's answers on single frames to one pair's estimate with an honest covariance.
 
-A network that has learned nothing repeats its guess, and all its answers agree. So no frame is asked at the same guess:
-guesses are scattered on purpose, and a robust regression separates what answers owe to the frame from what they owe to
-the guess:
+A network that has learned nothing returns its guess, and then all answers to one guess agree. So every frame gets a
+guess of its own: guesses are scattered on purpose, and a robust regression separates what the answers owe to the frame
+from what they owe to the guess:
 
     answer_i = H x + (1 - H) guess_i + noise_i,
 
-about a common centre, x the truth's. H is what the network determines, degree of freedom by degree of freedom and in
-combination. The day's answer is then the linear-Gaussian update of the prior by the measurement H x: where H is 0 the
-prior stays, value and sigma.
+with x the true pose; all poses are twists about a common centre. H is the gain: 1 where the network determines a
+degree of freedom, 0 where it repeats its guess. The day's estimate is the linear-Gaussian update of the prior by the
+measurement H x; where H is 0 the prior stays, value and sigma.
 
-x, guesses and answers are (sight, translation): the turn that would move what stands 15 to 40 m ahead as the twist
-does, and the twist's translation. Who aligns two pictures by a wrong translation turns the pose by shift over
-distance, and yet sees things where they are: sight does not depend on the guessed translation, so H is nearly diagonal
-and hardly anything has to be learned from few noisy frames. A prior's translation that stays takes its rotation along.
+The regression works on (bearing rotation, translation) in place of (rotation, translation). The bearing rotation of a
+twist is the rotation that, by least squares, turns the directions to points 15 to 40 m ahead as the twist does. A
+network that aligns directions makes up for a wrong translation by a rotation of about shift over distance; its bearing
+rotation is right all the same. So H is nearly diagonal in these coordinates, and few noisy frames suffice for it.
+Where the translation keeps its prior, the rotation follows from both.
 """
 
 from __future__ import annotations
@@ -32,24 +33,24 @@ __all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "shared_bias"
 OBSERVABLE = 0.5  # the day at least halved the variance, as in all methods
 _RESAMPLES = 200
 _ROUNDS = 12  # of re-weighting
-# Who repeats four fifths of a guess, or drives it further off, is not listened to: what is left, divided by a fifth and
-# less, would be an opinion made of how the guess was repeated.
-_LEAST_GAIN = 0.2
-_FARTHEST_SIGMAS = 3.0
-_NOTHING = 1e6  # variance of an answer that means nothing
+_LEAST_GAIN = 0.2  # ignore a degree of freedom with a gain below it: dividing by the gain amplifies noise
+_FARTHEST_SIGMAS = 3.0  # of the prior: how far from it guesses may be centred
+_IGNORED = 1e6  # variance [rad^2, m^2] of a degree of freedom that is ignored
 _TUKEY = 4.7  # robust sigmas from which on an answer does not count
-# Gains before any frame is seen are 0 give or take 1 of a degree of freedom's own guess, and give or take a tenth of
-# another's, where a radian counts as much as a shift of a usual distance. Without that a radar's roll, which no day
-# tells, leaks into its elevation by gains that are noise.
+# Prior of the regression's coefficients: mean 0, standard deviation 1 for a degree of freedom's own guess and 0.1 for
+# the guess of another one, a radian counted as a shift of _DISTANCE_M. Without it, noise in the coefficients carries a
+# radar's roll, which no day determines, into its elevation.
 _DISTANCE_M = 15.0
 _UNIT = np.array([1.0] * 3 + [_DISTANCE_M] * 3)
 _OWN_GAIN, _OTHER_GAIN = 1.0, 0.1
-# Directions [deg] and distances [m] of what sight is about, in the child's frame: what all three sensors see.
+# Directions [deg] and distances [m] of the points that define the bearing rotation, in the child's frame: where all
+# three sensors see.
 _SEEN_AZIMUTH_DEG, _SEEN_ELEVATION_DEG = (-25.0, -12.0, 0.0, 12.0, 25.0), (-6.0, 0.0, 3.0)
 _SEEN_M = (15.0, 25.0, 40.0)
-# What averaging does not lower: where a network's answers differ from H x on every frame alike. Sight and translation
-# in parent axes: a camera's are (elevation, azimuth, roll), a lidar's (roll, elevation, azimuth). Of networks that
-# nobody measured (`OnnxNetwork.bias_sigma`) no translation is believed: some put lidars .3 m too far ahead.
+# Sigma of a network's bias, which averaging over frames does not lower: (bearing rotation [rad], translation [m]) in
+# parent axes, a camera's (elevation, azimuth, roll), a lidar's (roll, elevation, azimuth). These hold for networks
+# whose bias was not measured (see `OnnxNetwork.bias_sigma`). Their translations are not used: some such networks put
+# the lidar 0.3 m too far ahead.
 BIAS_SIGMA: dict[str, tuple[float, ...]] = {
     "camera_lidar": (*np.radians([0.06, 0.05, 0.1]), 0.4, 0.4, 0.4),
     "camera_radar": (*np.radians([0.2, 0.1, 0.5]), 0.4, 0.4, 0.4),
@@ -67,7 +68,9 @@ class Answers:
     variance: Float[np.ndarray, "N 6"]  # as the network predicts it
     block: Int[np.ndarray, " N"]  # frames of one block see the same things
     frames: int  # different ones among the N
-    bias_sigma: Float[np.ndarray, " 6"] | None = None  # (sight, translation); None: BIAS_SIGMA of the pair
+    bias_sigma: Float[np.ndarray, " 6"] | None = (
+        None  # (bearing rotation, translation); None: BIAS_SIGMA of the pair
+    )
 
 
 def twists_about(
@@ -83,7 +86,7 @@ def day_estimate(
     T_prior: Float[np.ndarray, "4 4"],
     prior_covariance: Float[np.ndarray, "6 6"],
     rng: np.random.Generator,
-    blind: Bool[np.ndarray, " 6"] | None = None,
+    unobservable: Bool[np.ndarray, " 6"] | None = None,
 ) -> PairEstimate:
     """The pair's transform and covariance from the prior and all answers.
 
@@ -93,10 +96,11 @@ def day_estimate(
         T_prior: the prior.
         prior_covariance: its covariance, left perturbation.
         rng: draws the bootstrap's blocks.
-        blind: degrees of freedom whose answers mean nothing, whatever the network says: a flat radar's elevations.
+        unobservable: degrees of freedom that the sensors cannot tell, whatever the network answers: those of elevation
+            with a radar that measures none.
     """
-    S = _sight_of_twist(answers.T_centre)
-    twist_of_sight = np.linalg.inv(S)
+    S = _bearing_of_twist(answers.T_centre)
+    twist_of_bearing = np.linalg.inv(S)
     answers = replace(answers, guess=answers.guess @ S.T, answer=answers.answer @ S.T)
     fit = _robust_regression(answers)
     draws = _bootstrap(answers, fit, rng)
@@ -104,20 +108,22 @@ def day_estimate(
     m0 = S @ log_se3(T_prior @ inverse(answers.T_centre))
     P = S @ prior_covariance @ S.T
     H = np.eye(6) - gain
-    deaf = np.diag(H) < _LEAST_GAIN
-    spread = _spread(pair, answers, draws, deaf if blind is None else deaf | blind)
+    ignored = np.diag(H) < _LEAST_GAIN
+    if unobservable is not None:
+        ignored |= unobservable
+    spread = _spread(pair, answers, draws, ignored)
     gain_variance = draws[:, 1:].transpose(0, 2, 1).var(axis=0)
     x, covariance, R = m0, P, spread
     for _ in range(3):
-        # H is known only so well: what that costs depends on how far the truth may lie from the centre.
+        # Errors of H count by how far the truth may lie from the centre.
         R = spread + np.diag(gain_variance @ (np.diag(covariance) + x * x))
         x, covariance = _update(m0, P, H, R, mean)
-    left = np.diag(twist_of_sight @ covariance @ twist_of_sight.T)
+    left = np.diag(twist_of_bearing @ covariance @ twist_of_bearing.T)
     observability = np.clip(1 - left / np.diag(prior_covariance), 0.0, 1.0)
     observable = observability >= OBSERVABLE
     if not observable.all():
         x, covariance = _update(m0, P, H, R, mean, keep=~observable)
-    x, covariance = twist_of_sight @ x, twist_of_sight @ covariance @ twist_of_sight.T
+    x, covariance = twist_of_bearing @ x, twist_of_bearing @ covariance @ twist_of_bearing.T
     return PairEstimate(
         pair,
         exp_se3(x) @ answers.T_centre,
@@ -130,8 +136,8 @@ def day_estimate(
 
 
 def shared_bias(answers: Answers, T_true: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 6"]:
-    """By what all answers differ from H x where x is known: what `bias_sigma` should allow for ([rad], [m])."""
-    S = _sight_of_twist(answers.T_centre)
+    """What `bias_sigma` should cover, measured against the truth: (bearing rotation [rad], translation [m])."""
+    S = _bearing_of_twist(answers.T_centre)
     fit = _robust_regression(replace(answers, guess=answers.guess @ S.T, answer=answers.answer @ S.T))
     H = np.eye(6) - fit.coefficients[1:].T
     return np.asarray(fit.coefficients[0] - H @ S @ log_se3(T_true @ inverse(answers.T_centre)))
@@ -140,15 +146,15 @@ def shared_bias(answers: Answers, T_true: Float[np.ndarray, "4 4"]) -> Float[np.
 def mean_answer(
     answers: Answers, T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Where the answers point on the whole, whatever they owe to their guesses; 3 prior sigmas from it at most."""
+    """The answers' mean without what they owe to their guesses; at most 3 prior sigmas from the prior."""
     fit = _robust_regression(answers)
     from_prior = log_se3(exp_se3(fit.coefficients[0]) @ answers.T_centre @ inverse(T_prior))
     limit = _FARTHEST_SIGMAS * np.sqrt(np.diag(prior_covariance))
     return exp_se3(np.clip(from_prior, -limit, limit)) @ T_prior
 
 
-def _sight_of_twist(T_centre: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
-    """(sight, translation) of a small twist: sight is the turn that moves directions as the twist does, at best."""
+def _bearing_of_twist(T_centre: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+    """Matrix from a small twist to (bearing rotation, translation); see the module's docstring."""
     azimuth, elevation, distance = np.meshgrid(
         np.radians(_SEEN_AZIMUTH_DEG), np.radians(_SEEN_ELEVATION_DEG), _SEEN_M, indexing="ij"
     )
@@ -163,13 +169,13 @@ def _sight_of_twist(T_centre: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 
     return S
 
 
-def _spread(pair: str, answers: Answers, draws: np.ndarray, blind: np.ndarray) -> Float[np.ndarray, "6 6"]:
-    """Covariance of the mean answer: what blocks say, no less than the network says itself, and the bias."""
+def _spread(pair: str, answers: Answers, draws: np.ndarray, ignored: np.ndarray) -> Float[np.ndarray, "6 6"]:
+    """Covariance of the mean answer: of the bootstrap, but no less than the network predicts, plus the bias."""
     spread = np.cov(draws[:, 0].T)
-    claimed = np.median(answers.variance, axis=0) / answers.frames
+    predicted = np.median(answers.variance, axis=0) / answers.frames
     bias = BIAS_SIGMA[pair] if answers.bias_sigma is None else answers.bias_sigma
-    spread += np.diag(np.maximum(claimed - np.diag(spread), 0.0) + np.square(bias))
-    return np.asarray(spread + np.diag(np.where(blind, _NOTHING, 0.0)))
+    spread += np.diag(np.maximum(predicted - np.diag(spread), 0.0) + np.square(bias))
+    return np.asarray(spread + np.diag(np.where(ignored, _IGNORED, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,11 +186,10 @@ class _Fit:
 
 
 def _robust_regression(answers: Answers) -> _Fit:
-    """Weights from predicted variances, and Tukey's from the residuals, until they settle."""
+    """Least squares, re-weighted by the predicted variances and by Tukey's function of the residuals."""
     relative = answers.variance / np.median(answers.variance, axis=0)
-    trust = 1 / np.clip(
-        relative, 0.2, 20.0
-    )  # networks overstate their confidence more often than their doubt
+    # Networks understate their variance more often than they overstate it: the lower limit is the tighter one.
+    trust = 1 / np.clip(relative, 0.2, 20.0)
     weight = trust.copy()
     scatter = answers.answer.std(axis=0) + 1e-9
     for _ in range(_ROUNDS):
@@ -235,7 +240,7 @@ def _update(
     z: np.ndarray,
     keep: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Kalman's update; rows of `keep` stay as they are and are considered with the sigma that they have (Schmidt)."""
+    """Kalman update of mean and covariance; rows of `keep` are considered, not updated (Schmidt-Kalman)."""
     S = H @ P @ H.T + R
     K = np.linalg.solve(S, H @ P).T
     if keep is not None:
@@ -245,7 +250,7 @@ def _update(
 
 
 def _diagnostics(fit: _Fit, gain: np.ndarray, answers: Answers) -> dict[str, float]:
-    """What one frame scatters by, what a turned guess leaves behind, and how many answers counted for nothing."""
+    """Scatter of one frame's answers, the share of a guess that answers repeat, and how many answers are outliers."""
     turned = np.diag(gain)[:3]
     return {
         "frame_scatter_deg": float(np.degrees(np.linalg.norm(fit.scatter[:3]))),

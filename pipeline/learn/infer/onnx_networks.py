@@ -1,4 +1,4 @@
-"""Exported networks as the vehicle-day asks them: which files, and frames made ready for them."""
+"""Exported networks for a vehicle-day: which files, and frames prepared for them."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pipeline.config import FleetConfig, LearnConfig, PrepareConfig
 from pipeline.errors import ConfigError, ModelError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.learn.infer.compiled_rendering import FrameSensors, frame_sensors
+from pipeline.learn.infer.frame_network import FrameAnswer
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
-from pipeline.learn.infer.vehicle_day import FrameAnswer
 from pipeline.learn.sample.frame_sample import About, sensor_row
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS as ROWS
@@ -89,7 +89,7 @@ class OnnxNetwork:
 
     @property
     def bias_sigma(self) -> Mapping[str, np.ndarray]:
-        """What all its answers may be off by alike, (sight [rad], translation [m]), measured as its card says."""
+        """Sigma of the bias that all answers share, (bearing rotation [rad], translation [m]), by the file's card."""
         return self._bias_sigma
 
     @property
@@ -99,11 +99,11 @@ class OnnxNetwork:
 
     @property
     def composed(self) -> bool:
-        """Whether its camera_radar stands on the product of the other two."""
+        """Whether it composes camera_radar of the other two pairs before it corrects it."""
         return self._calibrator.config.composed
 
     def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> FrameSensors:
-        """The frame as the network sees it; no semantics are looked at.
+        """The frame as the network takes it; semantics are not used.
 
         Raises:
             SampleRejectedError: the frame shows too little.
@@ -131,7 +131,7 @@ class OnnxNetwork:
 
 @dataclass(eq=False)
 class _LastRow:
-    """The last frame's row: three pairwise networks look at the same one."""
+    """The last frame's row: three pairwise networks use the same one."""
 
     key: tuple[int, int, PrepareConfig] | None = None
     row: TrainingRow | None = None
@@ -151,8 +151,8 @@ def _bias_of_card(path: Path, card: str) -> dict[str, np.ndarray]:
         ModelError: something else stands there.
     """
     try:
-        told = json.loads(card).get("bias_sigma", {})
-        found = {pair: np.array(values, np.float64) for pair, values in told.items()}
+        given = json.loads(card).get("bias_sigma", {})
+        found = {pair: np.array(values, np.float64) for pair, values in given.items()}
     except (AttributeError, TypeError, ValueError) as err:
         raise ModelError(str(path), f"bias_sigma of its card is unreadable: {err}") from err
     for pair, values in found.items():

@@ -1,11 +1,11 @@
-"""A vehicle-day by networks: ask them on every frame at scattered guesses, go where they point, and average."""
+"""A vehicle-day by networks: iterate the guess on pilot frames, ask about all frames near it, average the answers."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,74 +14,29 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from pipeline.learn.infer.aggregate import Answers, day_estimate, mean_answer, twists_about
+from pipeline.learn.infer.frame_network import FrameNetwork, FrameSource
 from pipeline.learn.sample.frame_sample import SampleRejectedError
 from pipeline.results import Progress, silent
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = [
-    "FrameAnswer",
-    "FrameNetwork",
-    "FrameSource",
-    "day_answers",
-    "single_frame_solution",
-    "solve_by_networks",
-]
+__all__ = ["day_answers", "single_frame_solution", "solve_by_networks"]
 
-# Guesses are scattered by this much (sd per axis): several times what one frame's answer scatters by.
+# Guesses are scattered by this much (standard deviation per axis): several times the scatter of one frame's answers.
 _SCATTER_RAD, _SCATTER_M = np.radians(0.4), 0.03
-_SCOUTS = 24  # frames that find out where to ask all of them
-_SCOUT_ROUNDS, _SETTLED_RAD = 3, np.radians(0.3)
+_PILOT_FRAMES = 24  # on which the guess is iterated before all frames are asked about
+_PILOT_ROUNDS, _CONVERGED_RAD = 3, np.radians(0.3)
 _MIN_FRAMES, _MAX_FRAMES = 8, 160
-_BLOCKS = 8
-_GUESSES_OF_ONE_FRAME, _FEWEST_GUESSES = 16, 8
-_HALVES_SIGMAS = 4.0
-# Degrees of freedom that only elevations tell: of a radar that measures none nothing is known about them.
-_ELEVATION = {
+_BLOCKS = 8  # of the bootstrap, at least
+_GUESSES_OF_ONE_FRAME, _FEWEST_GUESSES = 16, 8  # a regression on fewer answers has no scatter
+_HALVES_SIGMAS = 4.0  # beyond it two halves of a day disagree
+# Degrees of freedom that only elevations tell: unobservable with a radar that measures none.
+_BY_ELEVATION = {
     "camera_lidar": np.zeros(6, bool),
     "camera_radar": np.array([1, 0, 1, 0, 1, 0], bool),
     "lidar_radar": np.array([1, 1, 0, 0, 0, 1], bool),
 }
-
-# frames(indices) yields the frames of a day with these frame_index, in order.
-FrameSource = Callable[[Sequence[int]], Iterator[Frame]]
-
-
-@dataclass(frozen=True, eq=False)
-class FrameAnswer:
-    """What a network says of one frame, for the pairs that it estimates."""
-
-    T: Mapping[str, np.ndarray]
-    variance: Mapping[str, np.ndarray]  # of a twist on the left: rad^2, m^2
-
-
-@runtime_checkable
-class FrameNetwork(Protocol):
-    """A network as the day sees it."""
-
-    @property
-    def pairs(self) -> tuple[str, ...]:
-        """Pairs that it estimates."""
-        ...
-
-    @property
-    def composed(self) -> bool:
-        """True where its camera_radar stands on the product of the other two."""
-        ...
-
-    @property
-    def bias_sigma(self) -> Mapping[str, np.ndarray]:
-        """By pair, what all its answers may be off by alike; pairs are missing where nobody measured it."""
-        ...
-
-    def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> Any:
-        """What `answer` needs of a frame; SampleRejectedError where it shows too little."""
-        ...
-
-    def answer(self, sensors: Any, guess: Mapping[str, np.ndarray]) -> FrameAnswer:
-        """Transforms from one frame, started at a guess for every pair."""
-        ...
 
 
 def solve_by_networks(
@@ -98,14 +53,14 @@ def solve_by_networks(
     """Estimate all triggered pairs; the others keep the prior.
 
     Args:
-        observations: selected frames per pair; all of them are asked about all pairs.
+        observations: selected frames per pair; each is used for all pairs.
         prior: start, and what stays where the networks know nothing.
-        networks: of which each pair has one.
+        networks: together they estimate each pair once.
         frames: the day's frames.
         method: name of the solution.
         seed: of guesses and bootstrap.
         triggered: pairs to estimate.
-        progress: told about every frame.
+        progress: called for every frame.
 
     Raises:
         SolveError: too few frames can be shown to the networks.
@@ -115,12 +70,12 @@ def solve_by_networks(
     estimates = {
         pair: replace(_estimate(pair, found[pair], asked, rng), frames_rejected=dict(rejected))
         if pair in triggered
-        else _kept(pair, prior)
+        else _unchanged(pair, prior)
         for pair in PAIRS
     }
     doubts = {pair: _halves_disagree(pair, found[pair], asked, rng) for pair in triggered}
     if any(n.composed for n in networks) or len(triggered) < len(PAIRS):
-        return Solution(method, estimates, doubts=doubts)  # a loop that closes by construction shows nothing
+        return Solution(method, estimates, doubts=doubts)  # a loop that closes by construction is no evidence
     rotation_rad, translation_m = _loop(estimates)
     return Solution(method, estimates, rotation_rad, translation_m, doubts)
 
@@ -134,7 +89,7 @@ def single_frame_solution(
     method: str,
     seed: int,
 ) -> Solution:
-    """The same from one frame: its answers at many guesses, with the sigma that the network itself states.
+    """The same from one frame: its answers at many guesses, with no less than the variance that the network predicts.
 
     Raises:
         SolveError: the frame cannot be shown to the networks.
@@ -145,24 +100,24 @@ def single_frame_solution(
         raise SolveError(f"frame {frame.frame_index}: {rejection.reason.value}") from rejection
     asked = _Asked(networks, prior, [sensors], [observation])
     rng = np.random.default_rng([seed, 7])
-    centre = _scouted(asked, {pair: prior.of(pair) for pair in PAIRS}, rng)
+    centre = _pilot_centre(asked, rng)
     found = _ask(asked, [0] * _GUESSES_OF_ONE_FRAME, centre, rng, lambda _: None)
     return Solution(method, {pair: _estimate(pair, found[pair], asked, rng) for pair in PAIRS})
 
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """Frames as the networks see them."""
+    """A day's frames, ready for the networks."""
 
     networks: Sequence[FrameNetwork]
     prior: Prior
     sensors: list[list[Any]]  # by frame, by network
     observations: list[Observation]
 
-    def blind(self, pair: str) -> Bool[np.ndarray, " 6"]:
-        """What no frame of the day can tell."""
-        seen = any(o.radar_has_elevation for o in self.observations)
-        return np.zeros(6, bool) if seen else _ELEVATION[pair]
+    def unobservable(self, pair: str) -> Bool[np.ndarray, " 6"]:
+        """Degrees of freedom that no frame of the day can determine."""
+        measured = any(o.radar_has_elevation for o in self.observations)
+        return np.zeros(6, bool) if measured else _BY_ELEVATION[pair]
 
 
 def day_answers(
@@ -173,7 +128,7 @@ def day_answers(
     frames: FrameSource,
     seed: int,
 ) -> dict[str, Answers]:
-    """What `solve_by_networks` makes its estimates of: each pair's answers at scattered guesses.
+    """Each pair's answers at scattered guesses, from which `solve_by_networks` estimates.
 
     Raises:
         SolveError: too few frames can be shown to the networks.
@@ -189,13 +144,13 @@ def _asked_day(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[_Asked, dict[str, Answers], Counter[str]]:
-    """Show all frames, walk to where they point, ask them there; with the frames left out, by reason."""
+    """Prepare all frames, iterate the guess on pilot frames, ask about all; also counts rejected frames by reason."""
     chosen = _chosen(observations)
     rejected: Counter[str] = Counter()
     asked = _Asked(networks, prior, [], [])
     total = len(chosen)
     for done, frame in enumerate(frames([o.frame_index for o in chosen])):
-        progress(done, 2 * total, "see frames")
+        progress(done, 2 * total, "prepare frames")
         try:
             asked.sensors.append([n.sensors(frame, chosen[done], prior) for n in networks])
             asked.observations.append(chosen[done])
@@ -206,7 +161,7 @@ def _asked_day(
         raise SolveError(
             f"too few frames for a network: {len(asked.sensors)} of {total} ({why or 'short day'})"
         )
-    centre = _scouted(asked, {pair: prior.of(pair) for pair in PAIRS}, rng)
+    centre = _pilot_centre(asked, rng)
     everything = range(len(asked.sensors))
     found = _ask(asked, everything, centre, rng, lambda i: progress(total + i, 2 * total, "ask networks"))
     return asked, found, rejected
@@ -220,18 +175,18 @@ def _chosen(observations: Mapping[str, Sequence[Observation]]) -> list[Observati
     return [ordered[i] for i in kept]
 
 
-def _scouted(asked: _Asked, centre: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Go where a few frames point, until they point here: answers are best when asked near the truth."""
-    count = len(asked.sensors)
-    rows: list[int] = np.unique(np.linspace(0, count - 1, min(count, _SCOUTS)).astype(int)).tolist()
+def _pilot_centre(asked: _Asked, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Iterate the guess on pilot frames until it moves less than 0.3 deg: answers are best near the truth."""
+    count, prior = len(asked.sensors), asked.prior
+    centre = {pair: prior.of(pair) for pair in PAIRS}
+    rows: list[int] = np.unique(np.linspace(0, count - 1, min(count, _PILOT_FRAMES)).astype(int)).tolist()
     rows *= -(-_FEWEST_GUESSES // len(rows))
-    for _ in range(_SCOUT_ROUNDS):
+    for _ in range(_PILOT_ROUNDS):
         found = _ask(asked, rows, centre, rng, lambda _: None)
-        prior = asked.prior
         moved = {p: mean_answer(found[p], prior.of(p), prior.covariance(p)) for p in PAIRS}
-        way = max(float(rotation_angle_rad(moved[p] @ inverse(centre[p]))) for p in PAIRS)
+        turned_rad = max(float(rotation_angle_rad(moved[p] @ inverse(centre[p]))) for p in PAIRS)
         centre = moved
-        if way < _SETTLED_RAD:
+        if turned_rad < _CONVERGED_RAD:
             break
     return centre
 
@@ -241,7 +196,7 @@ def _ask(
     rows: Sequence[int],
     centre: Mapping[str, np.ndarray],
     rng: np.random.Generator,
-    told: Callable[[int], None],
+    watch: Callable[[int], None],
 ) -> dict[str, Answers]:
     """Answers of all networks on these frames, each at its own guess about the centre."""
     offsets = _scattered(len(rows), rng)
@@ -250,12 +205,12 @@ def _ask(
     answers: dict[str, list[np.ndarray]] = {pair: [] for pair in PAIRS}
     variances: dict[str, list[np.ndarray]] = {pair: [] for pair in PAIRS}
     for i, row in enumerate(rows):
-        told(i)
+        watch(i)
         for network, sensors in zip(asked.networks, asked.sensors[row], strict=True):
-            said = network.answer(sensors, guesses[i])
+            answer = network.answer(sensors, guesses[i])
             for pair in network.pairs:
-                answers[pair].append(said.T[pair])
-                variances[pair].append(said.variance[pair])
+                answers[pair].append(answer.T[pair])
+                variances[pair].append(answer.variance[pair])
     block = _blocks([asked.observations[row].drive for row in rows])
     bias = {pair: n.bias_sigma[pair] for n in asked.networks for pair in n.pairs if pair in n.bias_sigma}
     return {
@@ -273,7 +228,7 @@ def _ask(
 
 
 def _scattered(count: int, rng: np.random.Generator) -> Float[np.ndarray, "N 3 6"]:
-    """Twists by row and pair whose mean is 0: what the guesses do to the answers must not pass for a shift."""
+    """Twists by row and pair with mean 0, so that the effect of the guesses on the answers is no offset."""
     sd = np.array([_SCATTER_RAD] * 3 + [_SCATTER_M] * 3)
     offsets = rng.normal(size=(count, len(PAIRS), 6)).clip(-2, 2) * sd
     return np.asarray(offsets - offsets.mean(axis=0))
@@ -282,7 +237,7 @@ def _scattered(count: int, rng: np.random.Generator) -> Float[np.ndarray, "N 3 6
 def _guess(
     centre: Mapping[str, np.ndarray], offsets: Float[np.ndarray, "3 6"], *, composed: bool
 ) -> dict[str, np.ndarray]:
-    """A guess for every pair; they need not close the loop, unless the network makes camera_radar of the others."""
+    """A guess for every pair; the loop need not close, unless the network composes camera_radar of the others."""
     guess = {pair: exp_se3(offsets[k]) @ centre[pair] for k, pair in enumerate(PAIRS)}
     if composed:
         guess["camera_radar"] = guess["camera_lidar"] @ guess["lidar_radar"]
@@ -298,16 +253,16 @@ def _blocks(drives: Sequence[int]) -> Int[np.ndarray, " N"]:
 
 def _estimate(pair: str, answers: Answers, asked: _Asked, rng: np.random.Generator) -> PairEstimate:
     prior = asked.prior
-    return day_estimate(pair, answers, prior.of(pair), prior.covariance(pair), rng, asked.blind(pair))
+    return day_estimate(pair, answers, prior.of(pair), prior.covariance(pair), rng, asked.unobservable(pair))
 
 
-def _kept(pair: str, prior: Prior) -> PairEstimate:
+def _unchanged(pair: str, prior: Prior) -> PairEstimate:
     nothing = np.zeros(6)
     return PairEstimate(pair, prior.of(pair), prior.covariance(pair), nothing, nothing.astype(bool), 0)
 
 
 def _halves_disagree(pair: str, answers: Answers, asked: _Asked, rng: np.random.Generator) -> list[str]:
-    """Every other block by itself must say the same."""
+    """The reason, if estimates from the odd and from the even blocks differ by more than their sigmas allow."""
     odd = np.unique(answers.block, return_inverse=True)[1].ravel() % 2 == 1
     halves = [_estimate(pair, _part(answers, rows), asked, rng) for rows in (odd, ~odd)]
     apart = log_se3(halves[0].T @ inverse(halves[1].T))
@@ -332,6 +287,6 @@ def _part(answers: Answers, rows: np.ndarray) -> Answers:
 
 
 def _loop(estimates: Mapping[str, PairEstimate]) -> tuple[float, float]:
-    """Angle [rad] and shift [m] by which three independent estimates miss each other."""
+    """Rotation angle [rad] and translation [m] of the loop of three independent estimates."""
     T = estimates["camera_lidar"].T @ estimates["lidar_radar"].T @ inverse(estimates["camera_radar"].T)
     return float(rotation_angle_rad(T)), float(np.linalg.norm(T[:3, 3]))

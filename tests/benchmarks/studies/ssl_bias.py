@@ -3,8 +3,8 @@
     python -m tests.benchmarks.studies.ssl_bias --root SSL/fleet --models matching=joint.onnx
 
 Root mean squares over the vehicles of the training fleet that no network learned from, a day each, from Table 1's
-prior; (sight, translation) as in `pipeline/learn/infer/aggregate.py`: three angles [deg], three shifts [m]. Days
-of Table 1 stay unseen. Pairwise networks are measured by the same command.
+prior; (bearing rotation, translation) as in `pipeline/learn/infer/aggregate.py`: three angles [deg], three shifts [m].
+Days of Table 1 stay unseen. Pairwise networks are measured by the same command.
 """
 
 from __future__ import annotations
