@@ -147,9 +147,7 @@ def check_edges(rows, truth):
     projection = camera_projection([terms.maps.camera] * len(rows), torch.float64)
     still = np.zeros((len(e.xyz_m), 2), np.float32)
     for t, at in zip(T, terms.poses(Alignments.of_poses(T)), strict=True):
-        kernel = edge_residuals(
-            terms.camera, terms.maps.offsets, e.xyz_m, e.side, e.start, at, np.float32(1.0), still
-        )
+        kernel = edge_residuals(terms.camera, terms.maps.offsets, e, at, np.float32(1.0), still)
         uv, valid = projection.project(transform_points(torch.tensor(t), points))
         uv.requires_grad_()
         residual, found = edge_residuals_px(torch.tensor(terms.maps.offsets), uv, valid & present, side)

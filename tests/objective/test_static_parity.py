@@ -14,7 +14,12 @@ import torch
 from pipeline.geometry import se3
 from pipeline.objective.differentiable.paper import padded
 from pipeline.objective.differentiable.poses import exp_se3, inverse, transform_points
-from pipeline.objective.differentiable.static import elevation_limits, static_cost, tells_elevation
+from pipeline.objective.differentiable.static import (
+    StaticFrames,
+    elevation_limits,
+    static_cost,
+    tells_elevation,
+)
 from pipeline.objective.radar.registration import (
     BOUNCE_PRIOR,
     RANGE_M,
@@ -50,9 +55,8 @@ def cost_of(T, inputs, **how):
     """The torch term with all detections and points; whose elevation counts is asked at the same poses."""
     radar, present, lidar, lidar_present, plane, has_elevation, limits = inputs
     tells = tells_elevation(T, radar, has_elevation, limits)
-    return static_cost(
-        T, radar, present, lidar, lidar_present, plane, tells, detections=ALL, points=ALL, **how
-    )
+    frames = StaticFrames(radar, present, lidar, lidar_present, plane, tells)
+    return static_cost(T, frames, detections=ALL, points=ALL, **how)
 
 
 def kernels_frames(rows, T, limits_rad):

@@ -22,7 +22,12 @@ from pipeline.objective.differentiable.lookup import nearest_pixel
 from pipeline.objective.differentiable.paper import smooth_iou
 from pipeline.objective.differentiable.poses import inverse, loop_loss, transform_points
 from pipeline.objective.differentiable.projection import GridProjection
-from pipeline.objective.differentiable.static import elevation_limits, static_cost, tells_elevation
+from pipeline.objective.differentiable.static import (
+    StaticFrames,
+    elevation_limits,
+    static_cost,
+    tells_elevation,
+)
 from pipeline.objective.differentiable.terms import (
     DEG,
     GridMaps,
@@ -118,10 +123,11 @@ class FrameObjective:
     def _lidar_radar(self, T: Tensor) -> dict[str, Tensor]:
         b = self.batch
         lidar, still = _at_lag(b, b.lidar_xyz_m, b.radar_lag_s), b.radar_valid & (b.radar_motion == 0)
+        frames = StaticFrames(
+            b.radar_xyz_m, still, lidar, b.lidar_valid, b.ground_plane, self.radar_tells_elevation
+        )
         return {
-            "static": static_cost(
-                T, b.radar_xyz_m, still, lidar, b.lidar_valid, b.ground_plane, self.radar_tells_elevation
-            ),
+            "static": static_cost(T, frames),
             "tracks_lidar": track_cluster_cost(T, self.tracks, b.cluster_centre_m, b.cluster_valid),
             "drivable": self._drivable(T),
         }

@@ -13,8 +13,10 @@ from typing import no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import Float32, Int8, Int64, UInt8
+from jaxtyping import Float32, Float64, Int8, UInt8
 
+from pipeline.objective.camera_lidar.kernel_settings import CHANCE_BINS, KernelSettings
+from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.projection_loops import (
     most_points,
     project_point,
@@ -22,59 +24,104 @@ from pipeline.objective.camera_lidar.projection_loops import (
     project_with_jacobian,
 )
 
-__all__ = ["CHANCE_BINS", "chance_of", "edge_gradients", "edge_residuals", "edge_scores", "fit_match_share"]
+__all__ = ["chance_of", "edge_gradients", "edge_residuals", "edge_scores", "fit_match_share"]
 
-CHANCE_BINS = 128
 _FEWEST_OF_KIND = 40  # fewer tell no share from chance
 
 
 def edge_scores(
     camera: Float32[np.ndarray, " 18"],
     offsets: Int8[np.ndarray, "F 4 H W"],
-    points: Float32[np.ndarray, "N 3"],
-    side: UInt8[np.ndarray, " N"],
-    kind: UInt8[np.ndarray, " N"],
-    gap_rad: Float32[np.ndarray, " N"],
-    start: Int64[np.ndarray, " G"],
+    edges: Points,
     poses: Float32[np.ndarray, "P F 12"],
     focal: Float32[np.ndarray, " P"],
-    match: Float32[np.ndarray, " K"],
-    chance: Float32[np.ndarray, "K B"],
-    sigma_px: float,
+    settings: KernelSettings,
 ) -> Float32[np.ndarray, "P F"]:
     """Log likelihood ratio of each frame at each pose; points outside the image count 0.
 
     Args:
         camera: `camera_parameters` at label size.
         offsets: `boundary_offsets` of each frame.
-        points: jumps of all frames, lidar frame; those of frame f are start[f]:start[f+1].
-        side: direction class of each jump.
-        kind: statistical class of each jump: those that match alike.
-        gap_rad: angle between its two beams; widens its kernel by the sd of an even distribution over it.
-        start: F + 1 offsets.
+        edges: depth jumps of all frames. The angle between a jump's two beams, `gap_rad`, widens its kernel by the
+            standard deviation of an even distribution over it.
         poses: rows of the 3x4 transform into the camera, per pose and frame (frames differ by time offset
             times speed).
         focal: focal length in units of the camera's, by pose.
-        match: share of jumps that match, by kind.
-        chance: density of |r| at random places [1/px], by kind, in bins of one pixel.
-        sigma_px: scale of the kernel (1 + (r/s)^2)^-2.
+        settings: scale of the kernel (1 + (r/s)^2)^-2, share of matching jumps and chance density by kind.
     """
-    width_px = np.hypot(np.float32(sigma_px), gap_rad * camera[1] * np.float32(1 / np.sqrt(12)))
+    width_px = np.hypot(
+        np.float32(settings.sigma_px), edges.gap_rad * camera[1] * np.float32(1 / np.sqrt(12))
+    )
     # 2/pi makes (1 + x^2)^-2 a density
-    gain = match[:, None] * np.float32(2 / np.pi) / chance
+    gain = settings.match[:, None] * np.float32(2 / np.pi) / settings.chance
     return _edge_loop(
         camera,
         offsets,
-        np.ascontiguousarray(points.T),
-        side,
-        kind,
+        np.ascontiguousarray(edges.xyz_m.T),
+        edges.side,
+        edges.kind,
         1 / width_px,
-        start,
+        edges.start,
         poses,
         focal,
-        1 - match,
+        1 - settings.match,
         gain,
     )
+
+
+def edge_gradients(
+    camera: Float32[np.ndarray, " 18"],
+    offsets: Int8[np.ndarray, "F 4 H W"],
+    edges: Points,
+    poses: Float64[np.ndarray, "F 12"],
+    focal: float,
+    velocity: Float64[np.ndarray, "F 3"],
+    settings: KernelSettings,
+) -> tuple[Float64[np.ndarray, "F 8"], Float64[np.ndarray, "F 8 8"]]:
+    """Gradient of each frame's score at ONE pose, and its information.
+
+    By left perturbation of T_camera_lidar (rotation [rad], translation [m]), time offset [s] and focal scale. The
+    information is Gauss-Newton's: residuals weighted by how likely they are matches (iterated re-weighting).
+
+    Args:
+        camera: as for `edge_scores`.
+        offsets: as for `edge_scores`.
+        edges: as for `edge_scores`.
+        poses: rows of the 3x4 transform by frame.
+        focal: focal length in units of the camera's.
+        velocity: own velocity of each frame in camera axes [m/s].
+        settings: as for `edge_scores`.
+    """
+    return _gradient_loop(
+        camera,
+        offsets,
+        edges.xyz_m,
+        edges.side,
+        edges.kind,
+        edges.gap_rad,
+        edges.start,
+        poses,
+        focal,
+        velocity,
+        settings.match,
+        settings.chance,
+        settings.sigma_px,
+    )
+
+
+def edge_residuals(
+    camera: Float32[np.ndarray, " 18"],
+    offsets: Int8[np.ndarray, "F 4 H W"],
+    edges: Points,
+    poses: Float32[np.ndarray, "F 12"],
+    focal: np.float32,
+    shift_px: Float32[np.ndarray, "N 2"],
+) -> Float32[np.ndarray, " N"]:
+    """Signed distance [px] of each jump, moved by `shift_px`, to its boundary at ONE pose.
+
+    NaN outside the image, 127 where no boundary is in reach.
+    """
+    return _residual_loop(camera, offsets, edges.xyz_m, edges.side, edges.start, poses, focal, shift_px)
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
@@ -129,7 +176,7 @@ def _edge_loop(
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
-def edge_gradients(
+def _gradient_loop(
     camera: np.ndarray,
     offsets: np.ndarray,
     points: np.ndarray,
@@ -144,12 +191,7 @@ def edge_gradients(
     chance: np.ndarray,
     sigma_px: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient [F, 8] of each frame's score and its information [F, 8, 8].
-
-    By rotation, translation, time offset and focal scale.
-    Left perturbation of T_camera_lidar; `poses` [F, 12] and `velocity` [F, 3] (camera axes, m/s) at the pose. The
-    information is Gauss-Newton's: residuals weighted by how likely they are matches (iterated re-weighting).
-    """
+    """Sums over each frame's points of weighted gradients and their outer products."""
     frames = poses.shape[0]
     height, width = offsets.shape[2], offsets.shape[3]
     gradient, information = np.zeros((frames, 8)), np.zeros((frames, 8, 8))
@@ -194,7 +236,7 @@ def edge_gradients(
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
-def edge_residuals(
+def _residual_loop(
     camera: np.ndarray,
     offsets: np.ndarray,
     points: np.ndarray,
@@ -204,10 +246,7 @@ def edge_residuals(
     focal: float,
     shift_px: np.ndarray,
 ) -> np.ndarray:
-    """Signed distance [px] of each jump, moved by `shift_px` [N, 2], to its boundary.
-
-    NaN outside the image, 127 where no boundary is in reach.
-    """
+    """The loop of `edge_residuals`."""
     height, width = offsets.shape[2], offsets.shape[3]
     out = np.full(points.shape[0], np.nan, np.float32)
     for f in range(start.shape[0] - 1):

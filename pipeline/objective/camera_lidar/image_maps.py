@@ -152,7 +152,7 @@ def contrast_levels(
 ) -> Int8[np.ndarray, "L H W"]:
     """Blurred road contrast, int8 [L, H, W]: zero mean and unit spread along each row of the road, 0 outside.
 
-    Normalised by row, because contrast grows towards the horizon and would pull every point there.
+    Normalised by row, because contrast grows towards the horizon and would attract every point there.
     """
     out = np.zeros((len(blurs_px), *contrast.shape), np.int8)
     rows = np.flatnonzero(is_road.sum(1) >= _MIN_ROAD_PX_IN_ROW)

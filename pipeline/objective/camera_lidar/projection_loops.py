@@ -1,4 +1,8 @@
-"""Projection inside compiled loops: one camera model as a flat parameter vector."""
+"""Projection inside the compiled loops of the camera-lidar score: one camera model as a flat parameter vector.
+
+The paper's cost maps project in loops of their own (`paper.cost_map_loops`): tangential distortion is folded into their
+maps, and projection and lookup are one loop.
+"""
 
 from __future__ import annotations
 
@@ -147,6 +151,7 @@ def project_with_jacobian(
     c: np.ndarray, x: float, y: float, z: float
 ) -> tuple[float, float, bool, float, float, float, float, float, float]:
     """(u, v, valid, du/dx, du/dy, du/dz, dv/dx, dv/dy, dv/dz) in double precision."""
+    # Long: one branch per camera model, and a call per branch would pass a dozen scalars.
     u, v, valid = project_point(c, x, y, z)
     if not valid:
         return 0.0, 0.0, False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

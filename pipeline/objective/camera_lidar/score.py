@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from pipeline.objective.camera_lidar.edges import (
-    CHANCE_BINS,
     chance_of,
     edge_gradients,
     edge_residuals,
@@ -23,6 +22,7 @@ from pipeline.objective.camera_lidar.edges import (
     fit_match_share,
 )
 from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP, CameraMaps, prepare_maps
+from pipeline.objective.camera_lidar.kernel_settings import KernelSettings
 from pipeline.objective.camera_lidar.mutual_information import class_information
 from pipeline.objective.camera_lidar.points import (
     CLASSES,
@@ -42,26 +42,6 @@ __all__ = ["CONTRAST_BLURS_PX", "Alignments", "KernelSettings", "Terms", "lidar_
 
 CONTRAST_BLURS_PX = (6.0, 3.0, 1.5)
 _CHANCE_SHIFT_PX = 60.0  # far enough to be elsewhere, near enough to see the same scene
-# Chance density of an edge's distance before the data has been asked: boundaries every hundred pixels.
-_EVEN_CHANCE = np.full((EDGE_KINDS, CHANCE_BINS), 1 / 100, np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class KernelSettings:
-    """How sharply the terms look: kernel scale, contrast level, mixture shares, weights."""
-
-    sigma_px: float
-    contrast_level: int
-    match: np.ndarray  # share of matching edges by kind
-    chance: np.ndarray
-    delta: float = 0.4  # contrast that marked points see more than the road, in standard deviations
-    edge_weight: float = 1.0
-    marking_weight: float = 1.0
-
-    @staticmethod
-    def wide(sigma_px: float, contrast_level: int, match: float = 0.25) -> KernelSettings:
-        """A level that presumes nothing of the data."""
-        return KernelSettings(sigma_px, contrast_level, np.full(EDGE_KINDS, match, np.float32), _EVEN_CHANCE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +92,7 @@ class Terms:
         return replace(self, edges=kept[0], markings=kept[1])
 
     def sharp(self, max_gap_px: float) -> Terms:
-        """Without the edges whose interval is wider than `max_gap_px`: those make the basin, not the accuracy."""
+        """Without the edges whose interval is wider than `max_gap_px`: these find the basin, but blur the optimum."""
         narrow = self.edges.gap_rad * self.camera[1] <= max_gap_px
         return replace(self, edges=self.edges.chosen(narrow))
 
@@ -126,7 +106,7 @@ class Terms:
         return replace(self, edges=edges, markings=markings)
 
     def at_most(self, points: int, rng: np.random.Generator) -> Terms:
-        """With at most about so many edges, and markings, drawn at random."""
+        """With about this many edges, and markings, at most, drawn at random."""
         share = [min(1.0, points / max(len(p.xyz_m), 1)) for p in (self.edges, self.markings)]
         edges, markings = (
             p if s >= 1.0 else p.chosen(rng.random(len(p.xyz_m)) < s)
@@ -155,50 +135,37 @@ class Terms:
     def poses(self, at: Alignments) -> Float32[np.ndarray, "P F 12"]:
         """Rows of the transform from each frame's lidar points to its image [P, F, 12].
 
-        The image shows the lidar clock's time `-dt` (stamp_camera = stamp_lidar + dt). The car was then dt
-        earlier on its way, so what stands still lay dt times the own velocity further ahead: p' =
+        By the lidar's clock the image was taken dt before its stamp (stamp_camera = stamp_lidar + dt). The car was then
+        dt earlier on its way, so what stands still lay dt times the own velocity further ahead: p' =
         Rz(yaw_rate dt) (p + v dt).
         """
         R, t = at.T_camera_lidar[:, :3, :3], at.T_camera_lidar[:, :3, 3]
         return _moving_poses(R, t, at.dt_s, self.velocity_lidar, self.yaw_rate)
 
-    def edge_score(self, at: Alignments, level: KernelSettings) -> Float32[np.ndarray, "P F"]:
+    def edge_score(self, at: Alignments, settings: KernelSettings) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the edges."""
-        e, maps = self.edges, self.maps
-        return edge_scores(
-            self.camera,
-            maps.offsets,
-            e.xyz_m,
-            e.side,
-            e.kind,
-            e.gap_rad,
-            e.start,
-            self.poses(at),
-            at.focal.astype(np.float32),
-            level.match,
-            level.chance,
-            level.sigma_px,
-        )
+        focal = at.focal.astype(np.float32)
+        return edge_scores(self.camera, self.maps.offsets, self.edges, self.poses(at), focal, settings)
 
-    def edge_excess(self, at: Alignments, level: KernelSettings) -> Float[np.ndarray, "P F"]:
+    def edge_excess(self, at: Alignments, settings: KernelSettings) -> Float[np.ndarray, "P F"]:
         """Edge score minus what the same edges score when the image is shifted: 0 for a pose that matches by chance.
 
-        So poses that see different numbers of edges compare: those that turn them out of view win nothing.
+        This makes poses comparable that see different numbers of edges: turning edges out of view gains nothing.
         """
         shifted = np.zeros((len(at.dt_s), self.frames))
         shifts = [(u, v) for u in (-47.0, -31.0, 29.0, 43.0) for v in (-37.0, 0.0, 41.0)]
         for u, v in shifts:
             camera = self.camera.copy()
             camera[3:5] += np.float32(u), np.float32(v)
-            shifted += replace(self, camera=camera).edge_score(at, level)
-        return self.edge_score(at, level) - shifted / len(shifts)
+            shifted += replace(self, camera=camera).edge_score(at, settings)
+        return self.edge_score(at, settings) - shifted / len(shifts)
 
-    def marking_score(self, at: Alignments, level: KernelSettings) -> Float32[np.ndarray, "P F"]:
+    def marking_score(self, at: Alignments, settings: KernelSettings) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the markings."""
-        m, contrast = self.markings, self.maps.contrast[level.contrast_level]
+        m, contrast = self.markings, self.maps.contrast[settings.contrast_level]
         focal = at.focal.astype(np.float32)
         return marking_scores(
-            self.camera, contrast, m.xyz_m, _weights(m, level), m.start, self.poses(at), focal
+            self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, self.poses(at), focal
         )
 
     def class_information(self, at: Alignments) -> Float[np.ndarray, " P"]:
@@ -208,17 +175,17 @@ class Terms:
             self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, self.poses(at), CLASSES
         )
 
-    def score(self, at: Alignments, level: KernelSettings) -> Float[np.ndarray, "P F"]:
+    def score(self, at: Alignments, settings: KernelSettings) -> Float[np.ndarray, "P F"]:
         """Score of each frame at each alignment; higher is better."""
         score = np.zeros((len(at.dt_s), self.frames))
-        if level.edge_weight > 0:
-            score += level.edge_weight * self.edge_score(at, level)
-        if level.marking_weight > 0:
-            score += level.marking_weight * self.marking_score(at, level)
+        if settings.edge_weight > 0:
+            score += settings.edge_weight * self.edge_score(at, settings)
+        if settings.marking_weight > 0:
+            score += settings.marking_weight * self.marking_score(at, settings)
         return score
 
     def gradient(
-        self, at: Alignments, level: KernelSettings
+        self, at: Alignments, settings: KernelSettings
     ) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
         """Gradient of each frame's score at ONE alignment, and its information (positive semidefinite).
 
@@ -226,49 +193,37 @@ class Terms:
         """
         poses = self.poses(at)[0].astype(np.float64)
         velocity = self.velocity_lidar @ at.T_camera_lidar[0, :3, :3].T
-        focal, e, m = float(at.focal[0]), self.edges, self.markings
+        focal, m = float(at.focal[0]), self.markings
         g_edges, I_edges = edge_gradients(
-            self.camera,
-            self.maps.offsets,
-            e.xyz_m,
-            e.side,
-            e.kind,
-            e.gap_rad,
-            e.start,
-            poses,
-            focal,
-            velocity,
-            level.match,
-            level.chance,
-            level.sigma_px,
+            self.camera, self.maps.offsets, self.edges, poses, focal, velocity, settings
         )
-        contrast = self.maps.contrast[level.contrast_level]
+        contrast = self.maps.contrast[settings.contrast_level]
         g_marks, I_marks = marking_gradients(
-            self.camera, contrast, m.xyz_m, _weights(m, level), m.start, poses, focal, velocity
+            self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, poses, focal, velocity
         )
-        a, b = level.edge_weight, level.marking_weight
+        a, b = settings.edge_weight, settings.marking_weight
         return a * g_edges + b * g_marks, a * I_edges + b * I_marks
 
-    def mean_match(self, level: KernelSettings) -> Float[np.ndarray, " 4"]:
+    def mean_match(self, settings: KernelSettings) -> Float[np.ndarray, " 4"]:
         """Share of matching edges by direction, over the edges that there are."""
-        share = level.match[self.edges.kind]
+        share = settings.match[self.edges.kind]
         counts = np.bincount(self.edges.side, minlength=4)
         return np.bincount(self.edges.side, share, minlength=4) / np.maximum(counts, 1)
 
-    def fitted(self, at: Alignments, level: KernelSettings, rng: np.random.Generator) -> KernelSettings:
-        """The level with the mixture shares, chance densities and contrast that the data shows at ONE alignment."""
+    def fitted(self, at: Alignments, settings: KernelSettings, rng: np.random.Generator) -> KernelSettings:
+        """The settings with the mixture shares, chance densities and contrast that the data shows at ONE alignment."""
         poses, focal = self.poses(at)[0], np.float32(at.focal[0])
         e, m, offsets = self.edges, self.markings, self.maps.offsets
         still = np.zeros((len(e.xyz_m), 2), np.float32)
         elsewhere = rng.uniform(-_CHANCE_SHIFT_PX, _CHANCE_SHIFT_PX, still.shape).astype(np.float32)
-        at_chance = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses, focal, elsewhere)
-        here = edge_residuals(self.camera, offsets, e.xyz_m, e.side, e.start, poses, focal, still)
+        at_chance = edge_residuals(self.camera, offsets, e, poses, focal, elsewhere)
+        here = edge_residuals(self.camera, offsets, e, poses, focal, still)
         chance = chance_of(at_chance, e.kind, EDGE_KINDS)
-        sigma = np.hypot(level.sigma_px, e.gap_rad * self.camera[1] / np.sqrt(12))
+        sigma = np.hypot(settings.sigma_px, e.gap_rad * self.camera[1] / np.sqrt(12))
         match = fit_match_share(here, e.kind, sigma, chance)
-        unit = replace(level, delta=1.0)
+        unit = replace(settings, delta=1.0)
         delta = float(np.clip(self.marking_score(at, unit).sum() / max(len(m.xyz_m), 1), 0.0, 1.0))
-        return replace(level, match=match, chance=chance, delta=delta)
+        return replace(settings, match=match, chance=chance, delta=delta)
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
@@ -291,8 +246,8 @@ def _moving_poses(
     return out
 
 
-def _weights(markings: Points, level: KernelSettings) -> np.ndarray:
-    return np.full(len(markings.xyz_m), level.delta * CONTRAST_STEP, np.float32)
+def _weights(markings: Points, settings: KernelSettings) -> np.ndarray:
+    return np.full(len(markings.xyz_m), settings.delta * CONTRAST_STEP, np.float32)
 
 
 def lidar_velocities(

@@ -1,12 +1,14 @@
-"""Static radar detections against lidar points in torch: the log likelihood that `registration` climbs, at zero lag.
+"""Static radar detections against lidar points in torch: the likelihood that `registration` maximises, at no time lag.
 
 The same neighbours (within three sigmas of azimuth and range), the same ground bounce, the same elevations that count;
-frames are thinned first, for every detection is held against every point.
+frames are thinned first, because every detection is compared with every point.
 
 Source: `pipeline.objective.radar.registration`, which has the reasons, and whose constants are used here.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,7 +25,7 @@ from pipeline.objective.radar.registration import (
 )
 from pipeline.objective.radar.registration_loops import CUT
 
-__all__ = ["elevation_limits", "static_cost", "tells_elevation"]
+__all__ = ["StaticFrames", "elevation_limits", "static_cost", "tells_elevation"]
 
 _DETECTIONS, _POINTS = 96, 768  # of a frame at most: every pair of them is weighed
 _LEAST_HEIGHT_M = 0.3  # what is lower mirrors onto itself
@@ -31,14 +33,22 @@ _STEEPEST_RAD = 1.5
 _NEVER = -1e4  # log weight of what is no partner
 
 
+@dataclass(frozen=True, eq=False)
+class StaticFrames:
+    """What F frames show of standing things."""
+
+    radar: Float[Tensor, "F M 3"]  # detections, radar frame
+    radar_present: Bool[Tensor, "F M"]  # which of them stand still
+    lidar: Float[Tensor, "F N 3"]  # points of the sweep, lidar frame, ground kept
+    lidar_present: Bool[Tensor, "F N"]  # which rows are points
+    plane: Float[Tensor, "F 4"]  # ground, n.p + d = 0 in the lidar frame; zeros = none
+    # Whose elevations count, from `tells_elevation`; the others are compared in azimuth and range alone.
+    tells: Bool[Tensor, "*batch #F M"]
+
+
 def static_cost(
     T_lidar_radar: Float[Tensor, "*batch #F 4 4"],
-    radar: Float[Tensor, "F M 3"],
-    radar_present: Bool[Tensor, "F M"],
-    lidar: Float[Tensor, "F N 3"],
-    lidar_present: Bool[Tensor, "F N"],
-    plane: Float[Tensor, "F 4"],
-    tells: Bool[Tensor, "*batch #F M"],
+    frames: StaticFrames,
     *,
     widen: float = 1.0,
     outlier: float = 1.0,
@@ -50,12 +60,7 @@ def static_cost(
 
     Args:
         T_lidar_radar: poses.
-        radar: detections, radar frame.
-        radar_present: which of them are static ones.
-        lidar: points of the sweep, ground kept.
-        lidar_present: which rows are points.
-        plane: ground, n.p + d = 0 in the lidar frame; zeros = none.
-        tells: whose elevations count, from `tells_elevation`; the others are held against azimuth and range alone.
+        frames: detections and points.
         widen: factor of the sigmas; wider ones make a wider basin.
         outlier: weight of "no lidar point", in units of one lidar point at distance 0.
         bounce_prior: prior probability of a detection by way of the ground.
@@ -63,14 +68,15 @@ def static_cost(
         points: most lidar points of a frame; more are strided.
     """
     # Rows are in no order that matters once they are strided: each stands for its neighbours.
-    thin, sparse = -(-radar.shape[1] // detections), -(-lidar.shape[1] // points)
-    radar, radar_present, tells = radar[:, ::thin], radar_present[:, ::thin], tells[..., ::thin, None]
-    lidar, lidar_present = lidar[:, ::sparse], lidar_present[:, ::sparse]
+    thin, sparse = -(-frames.radar.shape[1] // detections), -(-frames.lidar.shape[1] // points)
+    radar, radar_present = frames.radar[:, ::thin], frames.radar_present[:, ::thin]
+    tells = frames.tells[..., ::thin, None]
+    lidar, lidar_present = frames.lidar[:, ::sparse], frames.lidar_present[:, ::sparse]
     sigma = torch.tensor(SIGMA_START * widen, dtype=radar.dtype, device=radar.device)
     T_radar_lidar = inverse(T_lidar_radar)
     measured = _spherical(radar) / sigma
     seen = _spherical(transform_points(T_radar_lidar, lidar)) / sigma
-    plane = plane.to(lidar.dtype)
+    plane = frames.plane.to(lidar.dtype)
     height = (lidar * plane[:, None, :3]).sum(-1) + plane[:, None, 3]
     mirrored = lidar - 2 * height[..., None] * plane[:, None, :3]
     below = _spherical(transform_points(T_radar_lidar, mirrored))[..., 1] / sigma[1]
@@ -97,8 +103,8 @@ def tells_elevation(
 ) -> Bool[Tensor, "*batch F M"]:
     """Detections whose elevation can be compared with the lidar's: others would be matched to the edge of its view.
 
-    The registration asks this anew at every pose, and steps as if the answer stayed. What is minimised by its value
-    should ask once: each detection that a turn moves out of the limits costs less there.
+    The registration decides this anew at every pose and takes the decision as constant in its step. A minimiser of the
+    value should decide once: a rotation that moves detections out of the limits would lower the cost by itself.
 
     Args:
         T_lidar_radar: poses.
@@ -119,9 +125,10 @@ def tells_elevation(
 def elevation_limits(
     lidar: Float[Tensor, "F N 3"], lidar_present: Bool[Tensor, "F N"]
 ) -> Float[Tensor, "F 2"]:
-    """Lowest and highest elevation [rad] of each frame's points, a few stray ones aside.
+    """Lowest and highest elevation [rad] of each frame's points, without a few stray ones.
 
-    The estimator takes a day's; one street shows less of the lidar's view, and fewer elevations count.
+    The estimator takes the limits of a whole day; a single frame shows less of the lidar's view, and fewer elevations
+    count.
     """
     angle = torch.atan2(lidar[..., 2], lidar[..., :2].norm(dim=-1))
     away = torch.full_like(angle, torch.inf)

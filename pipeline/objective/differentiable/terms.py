@@ -37,14 +37,14 @@ CLASS_CLAMP_DEG = (
 )  # the paper loss's robust scale: there its cost is four fifths of all
 _CLASS_TAU_DEG = 0.1  # of the soft choice of a cluster's class
 EDGE_CLAMP_DEG = 4.0  # evidence: convex to +-4 deg
-# Most jumps match no boundary. What they add to a wide cost biases it (roll by .3, yaw by .15 deg on a simulated
-# highway); sharp kernels of the shape that `objective.edges` uses halve that, a little of the wide one leads to them.
+# Most jumps match no boundary. What they add to a wide cost biases it (roll by 0.3, yaw by 0.15 deg on a simulated
+# highway). Sharp kernels of the shape that `camera_lidar.edges` uses halve that; a share of the wide one leads to them.
 _EDGE_SCALES_DEG = (0.3, 1.0)
 _EDGE_FAR_WEIGHT = 0.25
 DETECTION_TAU_DEG, DETECTION_CLAMP_DEG = 0.5, 8.0
 CLUSTER_TAU_M, CLUSTER_CLAMP_M = 0.3, 5.0
-# Elevation counts by what a radar's is worth beside its azimuth; ground bounce biases it as well.
-_ELEVATION_WORTH = float(SIGMA_START[0] / SIGMA_START[1])
+# Weight of elevation: azimuth sigma over elevation sigma of a radar; ground bounce biases elevations as well.
+_ELEVATION_WEIGHT = float(SIGMA_START[0] / SIGMA_START[1])
 DISTANCE_STEP_DEG, OFFSET_STEP_DEG = 0.1, 0.05  # of the stored maps
 
 
@@ -172,13 +172,13 @@ class RadarTracks:
 
         Args:
             flat: distance of every track to every target in azimuth or in the plane, squared.
-            upwards: in elevation or height, signed; counts by what a radar's elevation is worth.
+            upwards: in elevation or height, signed; weighted by how precise a radar's elevation is beside its azimuth.
             target_present: which targets there are.
             tau: of the soft minimum, in units of the distances.
             clamp: largest distance.
         """
-        worth = _ELEVATION_WORTH * self.has_elevation.to(upwards.dtype)[:, None, None]
-        distance = safe_sqrt(flat + (worth * upwards).square())
+        weight = _ELEVATION_WEIGHT * self.has_elevation.to(upwards.dtype)[:, None, None]
+        distance = safe_sqrt(flat + (weight * upwards).square())
         clamped = soft_clamp(distance, clamp).masked_fill(~target_present[:, None], 2 * clamp)
         return masked_mean(soft_minimum(clamped, tau), self.present) * target_present.any(-1)
 

@@ -56,7 +56,7 @@ def safely_in_view(
 
     The paper's lidar and radar see less than its camera, so all of their points must fall into the image.
     Where a sensor sees more (a 360 deg lidar), only points that stay in view when the prior is off by the
-    margin may be asked to; else the out-of-view penalty pulls the pose.
+    margin may be asked to; else the out-of-view penalty biases the pose.
     """
     uv, valid = camera.project(points_camera)
     size = np.array([camera.width_px, camera.height_px])

@@ -4,10 +4,10 @@ Each static detection is drawn from one of the lidar points near it (or their mi
 nothing): weights are Gaussian in azimuth, elevation and range with the radar's own sigmas. The ground stays in the map.
 A static lidar point p appears at `q = T_radar_lidar p - v tau - w x q tau` to a radar that looks `tau` later, where
 `tau = stamp_radar + dt - stamp_lidar` and v is the radar's own velocity; so dt is an unknown wherever the car moves,
-and so is a constant added to all ranges, which wide fields of view tell from a shift.
+and so is a constant added to all ranges, which a wide field of view distinguishes from a translation.
 
-Normal equations come apart into (azimuth, range) and elevation: on sparse lidars elevation is worth little, whatever
-its residuals say (points collapse onto the lidar's rings), and the caller weighs it.
+Normal equations are kept apart for (azimuth, range) and for elevation, and the caller weighs the latter: on sparse
+lidars elevation says little although its residuals are small, because points collapse onto the lidar's rings.
 
 Source: Granger & Pennec 2002, "Multi-scale EM-ICP"; Louis 1982 for the information that uncertain assignment leaves.
 """
@@ -140,21 +140,8 @@ def registration_frames(
             continue
         radar.append(static)
         lidar.append(near)
-        plane = o.ground_plane if o.ground_plane is not None else np.zeros(4)
-        # Angular rates about the vertical are alike in all frames of the car.
-        rows.append(
-            (
-                plane,
-                o.ground_plane is not None,
-                o.radar_has_elevation,
-                o.radar_velocity_mps,
-                o.ego_yaw_rate_radps or 0.0,
-                (o.radar_stamp_ns - o.stamp_ns) * 1e-9,
-                o.drive,
-                index,
-            )
-        )
-    columns = list(zip(*rows, strict=True)) if rows else [[]] * 8
+        rows.append(_frame_columns(o, index))
+    columns = list(zip(*rows, strict=True)) if rows else [()] * 8
     (radar_m, radar_first), (lidar_m, lidar_first) = _pack(radar), _pack(lidar)
     return RegistrationFrames(
         radar_m,
@@ -211,7 +198,7 @@ def normal_equations(
         frames.plane,
         frames.has_plane,
         frames.has_elevation,
-        _told_elevations(frames.lidar_elevation_rad, float(sigma[1])),
+        _comparable_elevations(frames.lidar_elevation_rad, float(sigma[1])),
         np.asarray(sigma, np.float64),
         outlier,
         bounce_prior,
@@ -240,14 +227,28 @@ def updated_sigma(
     equations: NormalEquations, sigma: Float[np.ndarray, " 3"], bounce_prior: float
 ) -> tuple[Float[np.ndarray, " 3"], float]:
     """Sigmas and bounce probability that the assigned residuals show, within what radars do (one EM step)."""
-    # EM shrinks slowly what began wide (every lidar point within reach is a partner): twice its step, in logarithms.
+    # EM shrinks wide sigmas slowly (every lidar point within reach is a partner): take twice its step in logarithms.
     shown = sigma * np.maximum(equations.second_moment, 1e-6)
     bounce = float(np.clip(equations.bounced, 0.01, _BOUNCE_MOST)) if bounce_prior > 0 else 0.0
     return np.clip(shown, _SIGMA_LEAST, _SIGMA_MOST), bounce
 
 
+def _frame_columns(o: Observation, index: int) -> tuple[object, ...]:
+    """What `RegistrationFrames` holds of one frame beside its points, in its order: plane to frame."""
+    return (
+        o.ground_plane if o.ground_plane is not None else np.zeros(4),
+        o.ground_plane is not None,
+        o.radar_has_elevation,
+        o.radar_velocity_mps,
+        o.ego_yaw_rate_radps or 0.0,  # about the vertical, alike at every place of the car
+        (o.radar_stamp_ns - o.stamp_ns) * 1e-9,
+        o.drive,
+        index,
+    )
+
+
 def _elevation_limits(observations: Sequence[Observation]) -> np.ndarray:
-    """Lowest and highest elevation [rad] of lidar maps, a few stray points aside."""
+    """Lowest and highest elevation [rad] of lidar maps, without a few stray points."""
     low, high = [], []
     for o in observations:
         p = o.lidar_map_xyz_m
@@ -256,14 +257,14 @@ def _elevation_limits(observations: Sequence[Observation]) -> np.ndarray:
             few = np.partition(angle, (len(p) // STRAY, len(p) - 1 - len(p) // STRAY))
             low.append(few[len(p) // STRAY])
             high.append(few[-1 - len(p) // STRAY])
-    # No single street shows all of the field of view.
+    # The extremes over the frames: no single street shows all of the field of view.
     return np.array([min(low), max(high)], np.float64) if low else np.array([-1.5, 1.5])
 
 
-def _told_elevations(limits_rad: np.ndarray, sigma_rad: float) -> np.ndarray:
+def _comparable_elevations(limits_rad: np.ndarray, sigma_rad: float) -> np.ndarray:
     """Tangents of the elevations between which a detection's elevation can be compared with the lidar's.
 
-    What stands out of the lidar's view would be matched to its edge, always from the same side.
+    What lies outside the lidar's field of view would be matched to its edge, always from the same side: a bias.
     """
     margin = VIEW_MARGIN_RAD + min(2 * sigma_rad, 0.25 * float(limits_rad[1] - limits_rad[0]))
     return np.tan(np.clip(limits_rad + np.array([margin, -margin]), -1.5, 1.5))

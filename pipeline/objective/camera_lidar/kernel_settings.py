@@ -1,0 +1,33 @@
+"""Kernel settings of the camera-lidar score: how sharp it is, and what it presumes of matches and chance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.objective.camera_lidar.points import EDGE_KINDS
+
+__all__ = ["CHANCE_BINS", "KernelSettings"]
+
+CHANCE_BINS = 128
+# Chance density of an edge's distance before the data has been asked: boundaries every hundred pixels.
+_EVEN_CHANCE = np.full((EDGE_KINDS, CHANCE_BINS), 1 / 100, np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class KernelSettings:
+    """Kernel scale, contrast map, mixture shares and weights of the score's terms."""
+
+    sigma_px: float  # scale of the edges' kernel, pixels of the label image
+    contrast_level: int  # index into CONTRAST_BLURS_PX: which blur of the road contrast the markings see
+    match: np.ndarray  # share of matching edges by kind
+    chance: np.ndarray  # K B: density of |r| at random places [1/px], by kind, in bins of one pixel
+    delta: float = 0.4  # contrast that marked points see more than the road, in standard deviations
+    edge_weight: float = 1.0
+    marking_weight: float = 1.0
+
+    @staticmethod
+    def wide(sigma_px: float, contrast_level: int, match: float = 0.25) -> KernelSettings:
+        """Settings that presume nothing of the data: one share of matches and even chance for all kinds of edges."""
+        return KernelSettings(sigma_px, contrast_level, np.full(EDGE_KINDS, match, np.float32), _EVEN_CHANCE)
