@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.verify.failed_checks import loop_sigmas
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim, target_sigmas
-from pipeline.calibrate.verify.verdict import Verdict, loop_sigmas
+from pipeline.calibrate.verify.verdict import Verdict
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import to_quaternion
@@ -82,7 +83,7 @@ def record_of(
         reason=verdict.reason,
         score=verdict.score,
         determined=list(verdict.determined),
-        limit_rad=judged.claims["azimuth"].limit,
+        limit_rad=judged.claims["azimuth"].limit_rad,
         frames_used=estimate.frames_used,
         frames_rejected=_add(selection.rejected[pair], estimate.frames_rejected),
         environment=environment_of(observations),
@@ -202,19 +203,19 @@ def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
 
 
 def _claim_numbers(judged: Judged) -> dict[str, float]:
-    """Score, what is vouched for, what held-out frames would change and what is left unknown with them."""
-    vouched = judged.verdict.determined
+    """Score, which directions are certified, what held-out frames would change and the sigma that they leave."""
+    certified = judged.verdict.determined
     return {
         "confidence": judged.verdict.score,
-        "vouched_az": float("azimuth" in vouched),
-        "vouched_el": float("elevation" in vouched),
+        "vouched_az": float("azimuth" in certified),
+        "vouched_el": float("elevation" in certified),
     } | {
         f"holdout_{name}_{what}_rad": value
         for name, claim in judged.claims.items()
         for what, value in (
-            ("shift", claim.shift),
-            ("shift_sigma", claim.shift_sigma),
-            ("remaining_sigma", claim.remaining),
+            ("shift", claim.shift_rad),
+            ("shift_sigma", claim.shift_sigma_rad),
+            ("remaining_sigma", claim.remaining_sigma_rad),
         )
     }
 

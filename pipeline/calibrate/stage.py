@@ -12,16 +12,18 @@ from typing import Any
 import numpy as np
 
 from pipeline.calibrate.methods import COMPOSED, PAPER_METHODS, UNTHINNED, Solver, solver_of
+from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.calibrate.paper.sandwich import blocks_of
 from pipeline.calibrate.records import Inputs, Judged, record_of, refused_records
 from pipeline.calibrate.select.frames import Selection, select_frames
 from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
-from pipeline.calibrate.verify.held_out_score import alignment_of
+from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
+from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
-from pipeline.calibrate.verify.held_out_update import second_opinion
+from pipeline.calibrate.verify.held_out_update import held_out_update
+from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
-from pipeline.calibrate.verify.verdict import Limits, heading_doubts, judge, loop_doubts
+from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.config import FleetConfig, config_hash
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
@@ -188,26 +190,28 @@ def _judge_all(
     active: Sequence[str],
 ) -> dict[str, Judged]:
     """Verdict and evidence of each pair; pairs that a method composes come after their factors."""
-    doubts = loop_doubts(solution)
-    limits = Limits(*search_range(prior, fleet.solve))
+    limits, search = VerdictLimits(), search_range(prior, fleet.solve)
     composed = COMPOSED.get(solution.method, ())
-    against = _contradictions(solution, composed)
+    failed = _contradictions(solution, composed)
     limit_rad = float(np.radians(fleet.verify.camera_lidar_limit_deg))
-    against["camera_lidar"] = heading_doubts(solution, prior, observations, limit_rad)
+    failed["camera_lidar"] = heading_failures(solution, prior, observations, limit_rad, limits)
     found: dict[str, Judged] = {}
     for pair in sorted(PAIRS, key=lambda p: p in composed):
         estimate = solution.pairs[pair]
-        held = [observations[i] for i in selection.holdout[pair]] if pair in active else []
-        test, claims = _heard(estimate, held, prior, fleet)
+        held_out = [observations[i] for i in selection.holdout[pair]] if pair in active else []
+        test, claims = _held_out_evidence(estimate, held_out, prior, fleet, limits)
+        checks = [
+            *solution.failed_checks.get(pair, []),
+            *failed.get(pair, []),
+            *loop_failures(solution, limits),
+        ]
         verdict = judge(
             estimate,
-            prior.of(pair),
-            prior.covariance(pair),
-            test,
-            claims,
-            [*solution.doubts.get(pair, []), *against.get(pair, []), *doubts],
+            prior,
+            Evidence(test, claims, checks),
+            search,
             limits,
-            calibrated=pair in active,
+            triggered=pair in active,
             factors=tuple(f.verdict for f in found.values()) if pair in composed else (),
         )
         found[pair] = Judged(verdict, test, claims)
@@ -215,37 +219,42 @@ def _judge_all(
 
 
 def _contradictions(solution: Solution, composed: Sequence[str]) -> dict[str, list[str]]:
-    """Doubts that only a composed pair has are about its factors: two sensors contradict the third one's registration.
+    """Checks that only a composed pair failed speak against a factor: two sensors contradict the third's registration.
 
-    Camera and lidar know their pose ten times better than either knows the radar's, so the radar's pair is doubted.
+    Camera and lidar know their pose ten times better than either knows the radar's, so lidar-radar is held.
     """
     factors = [p for p in PAIRS if p not in composed]
-    known = {doubt for p in factors for doubt in solution.doubts.get(p, [])}
-    own = [doubt for p in composed for doubt in solution.doubts.get(p, []) if doubt not in known]
+    known = {check for p in factors for check in solution.failed_checks.get(p, [])}
+    own = [check for p in composed for check in solution.failed_checks.get(p, []) if check not in known]
     return {"lidar_radar": own} if own else {}
 
 
-def _heard(
-    estimate: PairEstimate, held: Sequence[Observation], prior: Prior, fleet: FleetConfig
+def _held_out_evidence(
+    estimate: PairEstimate,
+    held_out: Sequence[Observation],
+    prior: Prior,
+    fleet: FleetConfig,
+    limits: VerdictLimits,
 ) -> tuple[HeldOutTest | None, dict[str, Claim]]:
-    """What held-out frames say: prior against result, and where their own optimum lies."""
+    """Held-out frames at the prior and at the result, and what they leave to claim."""
     pair, verify = estimate.pair, fleet.verify
     limit_deg = verify.camera_lidar_limit_deg if pair == "camera_lidar" else verify.radar_limit_deg
-    test = opinion = None
-    if held:
-        ask = alignment_of(estimate, held, prior, fleet.solve)
-        blocks = blocks_of(held)
-        test = paired_test(ask.cost(prior.of(pair)), ask.cost(estimate.T), blocks)
-        covariance = np.diag([*np.zeros(6), *ask.extra_variance])
+    test = update = None
+    if held_out:
+        score = held_out_score(estimate, held_out, prior, fleet.solve)
+        blocks = scene_blocks(held_out)
+        test = paired_test(score.cost(prior.of(pair)), score.cost(estimate.T), blocks)
+        covariance = np.diag([*np.zeros(6), *score.extra_variance])
         covariance[:6, :6] = estimate.covariance
-        opinion = second_opinion(ask.slopes, covariance, ask.bias, blocks)
+        update = held_out_update(score.derivatives, covariance, score.bias, blocks, limits)
     claims = claims_of(
         pair,
         estimate.T,
         estimate.covariance,
-        opinion,
+        update,
         float(np.radians(limit_deg)),
         verify.confidence,
+        limits.held_out_contradiction_sigmas,
     )
     return test, claims
 

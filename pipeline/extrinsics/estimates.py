@@ -1,4 +1,4 @@
-"""What a calibration method is given and what it returns: shared by solve, learn and verify."""
+"""What a calibration method is given and what it returns; shared by `calibrate` and `learn`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["PairEstimate", "Prior", "Solution"]
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is believed before the day: two transforms, the third composed, with isotropic sigmas per transform."""
+    """What is known before the day: two transforms, the third composed of them, each with isotropic sigmas."""
 
     T_camera_lidar: np.ndarray
     T_lidar_radar: np.ndarray
@@ -39,7 +39,7 @@ class Prior:
         base = np.diag([self.rotation_sigma_rad**2] * 3 + [self.translation_sigma_m**2] * 3)
         if pair != "camera_radar":
             return base
-        # Each prior is isotropic about its own sensor: only rotate the second one into camera axes, no lever arm.
+        # Each prior is isotropic about its own sensor: the second one is only rotated into camera axes, no lever arm.
         A = adjoint(self.T_camera_lidar).copy()
         A[3:, :3] = 0
         return base + A @ base @ A.T
@@ -47,13 +47,16 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class PairEstimate:
-    """One pair's result: T, its 6x6 covariance (left perturbation, rad and m), and what the day determined."""
+    """One pair's result: T, its covariance, and which degrees of freedom the day determined.
+
+    Degrees of freedom: rotation vector about the parent's axes [rad], then position of the child's origin [m].
+    """
 
     pair: str
-    T: np.ndarray
-    covariance: np.ndarray
-    observability: np.ndarray  # 6, 0..1
-    observable: np.ndarray  # 6, bool
+    T: np.ndarray  # 4 4
+    covariance: np.ndarray  # 6 6, of the left perturbation exp(xi) T [rad, m]
+    observability: np.ndarray  # 6, share 0..1 of the prior's variance that the day removed
+    observable: np.ndarray  # 6, bool; the others keep the prior
     frames_used: int
     frames_rejected: dict[str, int] = field(default_factory=dict)
     time_offset_s: float | None = None  # stamp_parent = stamp_child + dt
@@ -64,15 +67,15 @@ class PairEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """All three pairs, and the loop of three independent pair estimates where the method made them.
+    """All three pairs, and how far the loop of three independent estimates is open, where the method made three.
 
-    The loop's angle counts the rotations that were determined apart; its translation is None where none was, as in
-    `joint`, whose camera-radar estimate without the lidar takes its position from the prior.
+    The loop's angle counts the rotations that were estimated independently; its translation is None where none was, as
+    in `joint`, whose camera-radar estimate without the lidar takes its position from the prior.
     """
 
     method: str
     pairs: dict[str, PairEstimate]
     loop_rotation_rad: float | None = None
     loop_translation_m: float | None = None
-    # By pair, reasons found while solving for not trusting it: restarts or halves disagree, the camera contradicts.
-    doubts: dict[str, list[str]] = field(default_factory=dict)
+    # By pair, checks that failed while solving, in words: restarts or halves disagree, camera contradicts radar.
+    failed_checks: dict[str, list[str]] = field(default_factory=dict)

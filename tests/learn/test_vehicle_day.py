@@ -101,7 +101,7 @@ def test_an_oracle_is_followed_to_the_truth_within_its_sigmas(frames):
         assert estimate.observable[:3].all()
     assert np.abs(errors_deg(solution)["camera_lidar"]).max() < 0.12
     assert np.degrees(solution.loop_rotation_rad) < 0.4
-    assert solution.doubts == {pair: [] for pair in PAIRS}
+    assert solution.failed_checks == {pair: [] for pair in PAIRS}
 
 
 def test_the_guess_is_iterated_until_the_network_is_within_reach(frames):
@@ -151,7 +151,7 @@ def test_a_day_whose_halves_differ_fails_a_check(frames):
             return replace(said, T={pair: step @ T for pair, T in said.T.items()})
 
     solution = solve(frames, [Moved()], prior_off(0.01))
-    assert "halves" in solution.doubts["camera_lidar"][0]
+    assert "halves" in solution.failed_checks["camera_lidar"][0]
 
 
 def test_a_flat_radar_keeps_its_elevations(frames):

@@ -60,7 +60,7 @@ def solve_joint(
         The solution; a pair that the day cannot determine keeps its prior, with a doubt that says why.
     """
     prior, config = _without_terms(prior, config)
-    doubts: dict[str, list[str]] = {pair: [] for pair in PAIRS}
+    failed: dict[str, list[str]] = {pair: [] for pair in PAIRS}
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
     progress(0, 3, "camera-lidar")
     camera_lidar, aligned = _kept("camera_lidar", prior), None
@@ -71,7 +71,7 @@ def solve_joint(
             aligned = align_camera_lidar(observations["camera_lidar"], prior, config, rng)
             T_camera_lidar, covariance = aligned.T_camera_lidar, aligned.covariance
         except SolveError as err:
-            doubts["camera_lidar"].append(err.reason)
+            failed["camera_lidar"].append(err.reason)
     progress(1, 3, "lidar-radar")
     lidar_radar = _kept("lidar_radar", prior)
     if "lidar_radar" in wanted:
@@ -85,7 +85,7 @@ def solve_joint(
                 covariance_camera_lidar=covariance,
             )
         except SolveError as err:
-            doubts["lidar_radar"].append(err.reason)
+            failed["lidar_radar"].append(err.reason)
     if aligned is not None:
         camera_lidar = settle_camera_lidar(aligned, rng, heading=_heading(lidar_radar))
     progress(2, 3, "camera-radar")
@@ -93,12 +93,12 @@ def solve_joint(
         observations["camera_radar"], prior, config, np.random.default_rng([seed, 2])
     )
     camera_radar, loop_rad, open_loop = compose_pairs(camera_lidar, lidar_radar, alone, prior)
-    doubts["camera_lidar"] += _camera_lidar_doubts(camera_lidar)
-    doubts["lidar_radar"] += _lidar_radar_doubts(lidar_radar)
-    doubts["camera_radar"] += [*doubts["camera_lidar"], *doubts["lidar_radar"], *open_loop]
+    failed["camera_lidar"] += _camera_lidar_failures(camera_lidar)
+    failed["lidar_radar"] += _lidar_radar_failures(lidar_radar)
+    failed["camera_radar"] += [*failed["camera_lidar"], *failed["lidar_radar"], *open_loop]
     pairs = {"camera_lidar": camera_lidar, "camera_radar": camera_radar, "lidar_radar": lidar_radar}
     progress(3, 3, "done")
-    return Solution("joint", pairs, loop_rad, None, {pair: why for pair, why in doubts.items() if why})
+    return Solution("joint", pairs, loop_rad, None, {pair: why for pair, why in failed.items() if why})
 
 
 def compose_pairs(
@@ -108,7 +108,7 @@ def compose_pairs(
 
     Returns:
         The composed estimate; the loop's angle over the rotations that `alone` determined (None where it determined
-        none; its translation is the prior's, so no translation is compared); doubts where that angle is beyond sigma.
+        none; its translation is the prior's, so no translation is compared); failed where that angle is beyond sigma.
     """
     T = camera_lidar.T @ lidar_radar.T
     covariance = compose_covariance(camera_lidar.T, camera_lidar.covariance, lidar_radar.covariance)
@@ -116,7 +116,7 @@ def compose_pairs(
     difference = log_so3((T @ inverse(alone.T))[:3, :3])
     sigma = np.sqrt(np.diag(covariance)[:3] + np.diag(alone.covariance)[:3])
     known = alone.observable[:3]
-    doubts = [
+    failed = [
         f"without the lidar {name} turns by {np.degrees(d):+.2f} deg against the loop, sigma {np.degrees(s):.2f} deg"
         for name, d, s, k in zip(("pitch", "yaw", "roll"), -difference, sigma, known, strict=True)
         if k and abs(d) > _SIGMAS * s
@@ -142,7 +142,7 @@ def compose_pairs(
             "loop: camera-radar without the lidar, rotations only (its translation is the prior's)",
         ],
     )
-    return estimate, loop_rad, doubts
+    return estimate, loop_rad, failed
 
 
 def _composed_observability(
@@ -178,7 +178,7 @@ def _time_offset(camera_lidar: PairEstimate, lidar_radar: PairEstimate) -> tuple
     )
 
 
-def _camera_lidar_doubts(estimate: PairEstimate) -> list[str]:
+def _camera_lidar_failures(estimate: PairEstimate) -> list[str]:
     """A best end that no other restart came near may be one of several optima: its sigma knows only its own."""
     apart_deg = estimate.diagnostics.get("restart_rotation_spread_deg", 0.0)
     if apart_deg <= np.degrees(SAME_ROTATION_RAD):
@@ -186,12 +186,12 @@ def _camera_lidar_doubts(estimate: PairEstimate) -> list[str]:
     return [f"no restart vouches for the optimum: the nearest other end is {apart_deg:.1f} deg away"]
 
 
-def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:
+def _lidar_radar_failures(estimate: PairEstimate) -> list[str]:
     """Restarts, halves, and the registration against the camera's boxes."""
     d = estimate.diagnostics
-    doubts: list[str] = []
+    failed: list[str] = []
     if not d:
-        return doubts
+        return failed
     sigma = np.sqrt(np.diag(estimate.covariance))
     # Restarts end where finishing begins: only what would be another basin counts, and only in what is claimed.
     for k, name, key, least in (
@@ -200,7 +200,7 @@ def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:
         (4, "y", "restarts_ty_m", _RESTART_SHIFT_M),
     ):
         if estimate.observable[k] and abs(d[key]) > max(least, _SIGMAS * sigma[k]):
-            doubts.append(f"restarts disagree in {name} by {_size(k, d[key])}")
+            failed.append(f"restarts disagree in {name} by {_size(k, d[key])}")
     # Two halves differ by twice the error of the whole, if their errors are independent.
     for k, (name, key) in enumerate(
         zip(
@@ -210,14 +210,14 @@ def _lidar_radar_doubts(estimate: PairEstimate) -> list[str]:
         )
     ):
         if estimate.observable[k] and abs(d[f"halves_{key}"]) > _SIGMAS * 2 * sigma[k]:
-            doubts.append(f"disjoint halves disagree in {name} by {_size(k, d[f'halves_{key}'])}")
+            failed.append(f"disjoint halves disagree in {name} by {_size(k, d[f'halves_{key}'])}")
     for k, name in ((0, "roll"), (1, "pitch")):
         offset, floor = d[f"registration_{name}_offset_rad"], d[f"registration_{name}_sigma_rad"]
         if estimate.observable[k] and abs(offset) > _SIGMAS * np.hypot(floor, sigma[k]):
-            doubts.append(
+            failed.append(
                 f"the registration would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
             )
-    return doubts
+    return failed
 
 
 def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfig]:

@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float, Int64
 __all__ = [
     "OBSERVABLE",
     "Posterior",
-    "blocks_of",
     "bootstrap_covariance",
     "held_covariance",
     "posterior",
@@ -26,7 +25,6 @@ __all__ = [
     "spread_to_covariance",
 ]
 
-_FEWEST_BLOCKS = 8  # with fewer, a bootstrap says nothing about its own tails
 OBSERVABLE = 0.5  # the day at least halved the variance
 
 
@@ -37,28 +35,6 @@ class Posterior:
     covariance: Float[np.ndarray, "6 6"]
     observability: Float[np.ndarray, " 6"]
     observable: Bool[np.ndarray, " 6"]
-
-
-def blocks_of(drive: Int64[np.ndarray, " F"], most: int = 24) -> Int64[np.ndarray, " F"]:
-    """Block number of each frame: drives as they are, long ones cut, short neighbours joined.
-
-    Args:
-        drive: drive of each frame, in order of time.
-        most: about so many blocks; at least 8 where there are as many frames.
-    """
-    F = len(drive)
-    if F == 0:
-        return np.zeros(0, np.int64)
-    size = max(1, F // max(most, _FEWEST_BLOCKS))
-    block = np.zeros(F, np.int64)
-    number, filled = 0, 0
-    for f in range(1, F):
-        filled += 1
-        # End a full block where the drive ends, or anyway at twice its size.
-        if filled >= size and (drive[f] != drive[f - 1] or filled >= 2 * size):
-            number, filled = number + 1, 0
-        block[f] = number
-    return block
 
 
 def bootstrap_covariance(

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from pipeline.calibrate.paper.minimise import minimise, poses_about
 from pipeline.calibrate.paper.pairwise import (
     PairProblem,
-    border_doubts,
+    border_failures,
     estimate_of,
     loop_size,
     pair_problem,
@@ -71,7 +71,7 @@ def solve_joint_optimisation(
             half = search_of(config).half_widths(1)
             own = replace(found, x=x, at_border=bool(np.any(np.abs(x) > 0.98 * half)))
             pairs[pair] = estimate_of(problems[pair], poses_about(prior.of(pair), x[None])[0], prior, own)
-    return Solution("joint-optimisation", pairs, *loop_size(pairs), doubts=border_doubts(pairs))
+    return Solution("joint-optimisation", pairs, *loop_size(pairs), failed_checks=border_failures(pairs))
 
 
 def joint_costs(

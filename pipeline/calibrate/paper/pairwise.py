@@ -22,8 +22,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.numerics.bias_floors import PAPER_BIAS
+from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.paper.minimise import Minimum, Search, minimise, poses_about
-from pipeline.calibrate.paper.sandwich import BIAS_FLOOR, blocks_of, sandwich_covariance
+from pipeline.calibrate.paper.sandwich import sandwich_covariance
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import rotation_angle_rad
@@ -81,7 +83,7 @@ def pair_problem(
         loss = camera_radar_loss(observations, T, margin)
     else:
         loss = lidar_radar_loss(observations)
-    return PairProblem(pair, T, loss.frame_losses, loss.informative, blocks_of(observations))
+    return PairProblem(pair, T, loss.frame_losses, loss.informative, scene_blocks(observations))
 
 
 def solve_pairwise(
@@ -111,7 +113,7 @@ def solve_pairwise(
         T = prior.of(pair) if minimum is None else poses_about(problem.T_prior, minimum.x[None])[0]
         pairs[pair] = estimate_of(problem, T, prior, minimum)
     progress(len(PAIRS), len(PAIRS), "done")
-    return Solution("pairwise-optimisation", pairs, *loop_size(pairs), doubts=border_doubts(pairs))
+    return Solution("pairwise-optimisation", pairs, *loop_size(pairs), failed_checks=border_failures(pairs))
 
 
 def solve_pair(problem: PairProblem, config: SolveConfig, rng: np.random.Generator) -> Minimum:
@@ -152,7 +154,7 @@ def estimate_of(
         T,
         problem.blocks[problem.informative],
         base,
-        BIAS_FLOOR[problem.pair],
+        PAPER_BIAS[problem.pair],
     )
     return replace(
         blank,
@@ -170,8 +172,8 @@ def loop_size(pairs: Mapping[str, PairEstimate]) -> tuple[float, float]:
     return float(rotation_angle_rad(loop)), float(np.linalg.norm(loop[:3, 3]))
 
 
-def border_doubts(pairs: Mapping[str, PairEstimate]) -> dict[str, list[str]]:
-    """A minimum at the border of the search box is none."""
+def border_failures(pairs: Mapping[str, PairEstimate]) -> dict[str, list[str]]:
+    """A minimum at the border of the search box is none: the loss may fall further outside."""
     return {
         pair: ["the minimum lies at the border of the search range"]
         for pair, estimate in pairs.items()

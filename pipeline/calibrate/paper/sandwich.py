@@ -8,23 +8,15 @@ losses are biased (their minimum lies below the truth's value): a floor measured
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.geometry.se3 import exp_se3
-from schemas.observations import Observation
 
-__all__ = ["BIAS_FLOOR", "blocks_of", "sandwich_covariance"]
+__all__ = ["sandwich_covariance"]
 
-# Largest RMS over axes of the paper's losses at their minimum, 100 simulated frames a day, 4 days (method
-# evidence, section 2): rotation [rad], translation [m].
-BIAS_FLOOR = {
-    "camera_lidar": (np.radians(0.33), 0.06),
-    "camera_radar": (np.radians(0.56), 0.11),
-    "lidar_radar": (np.radians(0.88), 0.32),
-}
 _STEP = np.array([np.radians(0.2)] * 3 + [0.04] * 3)
 
 
@@ -61,14 +53,6 @@ def sandwich_covariance(
     covariance = (covariance + covariance.T) / 2
     observability = np.clip(1 - np.diag(covariance) / np.diag(prior_covariance), 0, 1)
     return covariance, observability
-
-
-def blocks_of(observations: Sequence[Observation], at_least: int = 8) -> Int[np.ndarray, " F"]:
-    """Block of each frame: its drive; equal stretches of time where the day has fewer drives than `at_least`."""
-    drives = np.array([o.drive for o in observations])
-    if len(np.unique(drives)) >= at_least:
-        return drives
-    return np.arange(len(observations)) * at_least // max(len(observations), 1)
 
 
 def _curvature(

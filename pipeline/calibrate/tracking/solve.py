@@ -103,7 +103,7 @@ def solve_tracking(
     sensors = _tracked(frames, prior)
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
     pairs: dict[str, PairEstimate] = {}
-    doubts: dict[str, list[str]] = {pair: [] for pair in PAIRS}
+    failed_checks: dict[str, list[str]] = {pair: [] for pair in PAIRS}
     for k, pair in enumerate(("camera_lidar", "lidar_radar")):
         progress(1 + k, 3, pair)
         pairs[pair] = _kept(pair, prior)
@@ -117,17 +117,21 @@ def solve_tracking(
                 pair, sensors[pair], prior, np.random.default_rng([seed, k]), frames=rows
             )
         except SolveError as err:
-            doubts[pair].append(err.reason)
-    failed = [pair for pair in pairs if pair in wanted and doubts[pair]]
+            failed_checks[pair].append(err.reason)
+    failed = [pair for pair in pairs if pair in wanted and failed_checks[pair]]
     if failed and len(failed) == len(wanted & set(pairs)):
         raise SolveError(
-            "; ".join(f"{_SENSOR[pair]} against lidar: {why}" for pair in failed for why in doubts[pair])
+            "; ".join(
+                f"{_SENSOR[pair]} against lidar: {why}" for pair in failed for why in failed_checks[pair]
+            )
         )
     pairs["camera_radar"] = _composed(pairs["camera_lidar"], pairs["lidar_radar"], prior)
-    doubts["camera_radar"] = [*doubts["camera_lidar"], *doubts["lidar_radar"]]
+    failed_checks["camera_radar"] = [*failed_checks["camera_lidar"], *failed_checks["lidar_radar"]]
     progress(3, 3, "done")
     return Solution(
-        "tracking", {p: pairs[p] for p in PAIRS}, doubts={p: why for p, why in doubts.items() if why}
+        "tracking",
+        {p: pairs[p] for p in PAIRS},
+        failed_checks={p: why for p, why in failed_checks.items() if why},
     )
 
 

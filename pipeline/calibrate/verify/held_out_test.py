@@ -1,4 +1,4 @@
-"""Alignment on held-out frames at the prior and at the result: a paired test over blocks of frames."""
+"""Alignment of held-out frames at the prior and at the result: a paired test over blocks of frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["HeldOutTest", "paired_test"]
 
 @dataclass(frozen=True)
 class HeldOutTest:
-    """Mean cost before and after over the frames that can tell, and how sure the difference is."""
+    """Mean cost at the prior and at the result, over frames that have both, and how sure the difference is."""
 
     before: float
     after: float
@@ -23,10 +23,10 @@ class HeldOutTest:
 
     @property
     def z(self) -> float:
-        """How sure after - before is, as a normal deviate: negative = better aligned, 0 where nothing changed.
+        """Significance of after - before as a normal deviate: negative = better aligned, 0 where nothing changed.
 
-        Student's t with one degree of freedom less than blocks, carried over to the normal of the same probability:
-        two blocks that agree by chance are no 30-sigma proof. Within +-8.
+        Student's t with one degree of freedom less than blocks, converted to the normal deviate of the same
+        probability: two blocks that agree by chance are no 30-sigma proof. Within +-8.
         """
         difference = self.after - self.before
         if difference == 0:
@@ -42,7 +42,7 @@ def paired_test(
     """Compare the costs of the same frames at two calibrations.
 
     Frames with a cost that is not finite at either calibration are left out. The standard error treats
-    blocks, not frames, as independent; with a single block, frames have to do.
+    blocks, not frames, as independent; with a single block, frames do.
 
     Args:
         before: cost of each frame at the prior (lower is better).

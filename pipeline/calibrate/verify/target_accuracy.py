@@ -1,10 +1,9 @@
 """What a record may claim: how far off targets 15 to 40 m away can be, and how sure that is.
 
-An error of the pose matters by where it puts things. Azimuth and elevation at the targets of
-`pipeline.geometry.targets` are linear in the pose, so its covariance gives their sigmas, with every
-correlation and every unknown that the day left to the prior. A direction is vouched for where, by all evidence, its
-error stays within what the purpose bears
-with the probability asked for.
+What an error of the pose costs depends on where it puts things. Azimuth and elevation at the targets of
+`pipeline.geometry.targets` are linear in the pose, so its covariance gives their sigmas, with every correlation and
+every degree of freedom that the day left to the prior. A direction is certified where its error stays, by the
+covariance and by the held-out frames, within the limit of `[verify]` with the probability asked for there.
 """
 
 from __future__ import annotations
@@ -16,7 +15,8 @@ from jaxtyping import Float
 from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
-from pipeline.calibrate.verify.held_out_update import SecondOpinion
+from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
+from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.geometry.se3 import exp_se3, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, to_spherical, wrap_angle
 from pipeline.geometry.targets import DEFAULT_TARGETS
@@ -24,47 +24,50 @@ from pipeline.geometry.targets import DEFAULT_TARGETS
 __all__ = ["DIRECTIONS", "Claim", "claims_of", "target_jacobian", "target_sigmas"]
 
 DIRECTIONS = ("azimuth", "elevation")
-_STEP = 1e-5  # rad and m
+_STEP = 1e-5  # of central differences [rad and m]
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One direction at the targets, root mean square over them [rad]."""
+    """Error of one direction at the targets, root mean square over them."""
 
-    sigma: float  # of the estimate, from its covariance
-    shift: float  # by how much held-out frames would move it
-    shift_sigma: float  # of that shift, if estimate and held-out frames are as good as they say
-    remaining: float  # sigma left with both
-    limit: float  # what the purpose bears
-    confidence: float  # probability that it has to have
+    sigma_rad: float  # of the estimate, from its covariance
+    shift_rad: float  # by how much held-out frames would move it
+    shift_sigma_rad: float  # of that shift, if both covariances are right
+    remaining_sigma_rad: float  # of the estimate updated by the held-out frames
+    limit_rad: float  # largest error that the purpose allows
+    confidence: float  # probability with which the error must stay within the limit
+    contradiction_sigmas: float = VerdictLimits.held_out_contradiction_sigmas
 
     @property
-    def reach(self) -> float:
-        """The error is smaller than this with the probability asked for [rad].
+    def bound_rad(self) -> float:
+        """The error is smaller than this with the probability asked for.
 
-        By the estimate's own sigma, where held-out frames do not contradict it, or by both together, shift and all:
-        whichever says more.
+        Of two bounds the smaller: by the estimate's own sigma, where held-out frames do not contradict it, and by the
+        updated estimate's sigma with the shift counted as error.
         """
-        own = _quantile(0.0, self.sigma, self.confidence) if self.agreement >= 0 else np.inf
-        return min(own, _quantile(self.shift, self.remaining, self.confidence))
+        own = _quantile(0.0, self.sigma_rad, self.confidence) if self.agreement >= 0 else np.inf
+        return min(own, _quantile(self.shift_rad, self.remaining_sigma_rad, self.confidence))
 
     @property
     def margin(self) -> float:
-        """1 = far inside the limit, 0 = at it, negative = not vouched for."""
-        return 1 - self.reach / self.limit
+        """1 = far inside the limit, 0 = at it, negative = not certified."""
+        return 1 - self.bound_rad / self.limit_rad
 
     @property
     def agreement(self) -> float:
-        """1 = held-out frames agree, 0 = they would move the estimate by three of that shift's sigmas."""
-        return 1 - self.shift / (3 * self.shift_sigma) if self.shift_sigma > 0 else 1.0
+        """1 = held-out frames agree, 0 = they would move the estimate by as many sigmas as contradict it."""
+        if self.shift_sigma_rad <= 0:
+            return 1.0
+        return 1 - self.shift_rad / (self.contradiction_sigmas * self.shift_sigma_rad)
 
 
 def _quantile(shift: float, sigma: float, probability: float) -> float:
-    """Of the absolute value of a normal deviate about `shift`."""
+    """Quantile of |x| for a normal x of mean `shift` and standard deviation `sigma`."""
     if sigma == 0:
         return shift
     m, tail = shift / sigma, 1 - probability
-    # Between one tail (all of the doubt lies on the side that the shift shows) and two (no shift at all).
+    # Between one tail (all of it on the side of the shift) and two (no shift at all).
     low, high = m + float(ndtri(1 - tail)), m + float(ndtri(1 - tail / 2))
     return sigma * float(brentq(lambda x: ndtr(m - x) + ndtr(-m - x) - tail, low - 1e-9, high + 1e-9))
 
@@ -94,33 +97,38 @@ def claims_of(
     pair: str,
     T: Float[np.ndarray, "4 4"],
     covariance: Float[np.ndarray, "6 6"],
-    opinion: SecondOpinion | None,
+    update: HeldOutUpdate | None,
     limit_rad: float,
     confidence: float,
+    contradiction_sigmas: float = VerdictLimits.held_out_contradiction_sigmas,
 ) -> dict[str, Claim]:
-    """What can be claimed of each direction.
+    """What can be claimed of each direction, by name.
 
     Args:
         pair: which one.
         T: the estimate.
         covariance: of its left perturbation.
-        opinion: what held-out frames say of it; None where they say nothing.
-        limit_rad: what the purpose bears.
+        update: of the estimate by held-out frames; None where they say nothing.
+        limit_rad: largest error that the purpose allows.
         confidence: probability with which an error has to stay within it.
+        contradiction_sigmas: sigmas of the shift from which held-out frames contradict the estimate.
     """
     own = target_sigmas(pair, T, covariance)
     claims = {}
     for d, name in enumerate(DIRECTIONS):
-        if opinion is None:
-            claims[name] = Claim(float(own[d]), 0.0, 0.0, float(own[d]), limit_rad, confidence)
-            continue
-        J = target_jacobian(pair, T)[d]
-        moved, remaining, bias = (
-            float(np.sqrt(np.einsum("ni,ij,nj->n", J, C, J).mean()))
-            for C in (opinion.shift_covariance, opinion.covariance, opinion.bias)
+        sigma = float(own[d])
+        if update is None:
+            shift, shift_sigma, remaining = 0.0, 0.0, sigma
+        else:
+            J = target_jacobian(pair, T)[d]
+            shift_sigma, updated, bias = (
+                float(np.sqrt(np.einsum("ni,ij,nj->n", J, C, J).mean()))
+                for C in (update.shift_covariance, update.covariance, update.bias)
+            )
+            # Held-out frames miss what the method misses: nothing becomes surer by them than their common bias.
+            remaining = min(sigma, max(updated, bias))
+            shift = float(np.sqrt(np.mean((J @ update.shift) ** 2)))
+        claims[name] = Claim(
+            sigma, shift, shift_sigma, remaining, limit_rad, confidence, contradiction_sigmas
         )
-        # Held-out frames have the method's own blind spots: they make nothing surer than their bias lets them.
-        remaining = min(float(own[d]), max(remaining, bias))
-        shift = float(np.sqrt(np.mean((J @ opinion.shift) ** 2)))
-        claims[name] = Claim(float(own[d]), shift, moved, remaining, limit_rad, confidence)
     return claims

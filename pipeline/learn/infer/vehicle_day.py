@@ -73,11 +73,12 @@ def solve_by_networks(
         else _unchanged(pair, prior)
         for pair in PAIRS
     }
-    doubts = {pair: _halves_disagree(pair, found[pair], asked, rng) for pair in triggered}
+    failed = {pair: _halves_disagree(pair, found[pair], asked, rng) for pair in triggered}
     if any(n.composed for n in networks) or len(triggered) < len(PAIRS):
-        return Solution(method, estimates, doubts=doubts)  # a loop that closes by construction is no evidence
+        # A loop that closes by construction is no evidence.
+        return Solution(method, estimates, failed_checks=failed)
     rotation_rad, translation_m = _loop(estimates)
-    return Solution(method, estimates, rotation_rad, translation_m, doubts)
+    return Solution(method, estimates, rotation_rad, translation_m, failed)
 
 
 def single_frame_solution(

@@ -71,17 +71,17 @@ def test_what_one_factor_leaves_to_the_prior_rests_on_it_in_the_composed_pair_to
 
 
 def test_only_rotations_that_camera_and_radar_alone_determine_are_compared():
-    _, loop_rad, doubts = compose_pairs(camera_lidar(), lidar_radar(), alone(), PRIOR)
-    assert doubts == []  # roll is off by half a radian, but was not determined
+    _, loop_rad, failed = compose_pairs(camera_lidar(), lidar_radar(), alone(), PRIOR)
+    assert failed == []  # roll is off by half a radian, but was not determined
     assert loop_rad < np.radians(8)
-    _, nothing, doubts = compose_pairs(camera_lidar(), lidar_radar(), alone(observable=(False,) * 6), PRIOR)
+    _, nothing, failed = compose_pairs(camera_lidar(), lidar_radar(), alone(observable=(False,) * 6), PRIOR)
     assert nothing is None
-    assert doubts == []
+    assert failed == []
 
 
-def test_a_camera_that_contradicts_the_loop_is_a_doubt():
+def test_a_camera_that_contradicts_the_loop_fails_a_check():
     T = exp_se3(np.array([0, np.radians(2.0), 0, 0, 0, 0])) @ T_CAMERA_LIDAR @ T_LIDAR_RADAR
-    found, loop_rad, doubts = compose_pairs(
+    found, loop_rad, failed = compose_pairs(
         camera_lidar(),
         lidar_radar(),
         estimate("camera_radar", T, (True, True, True, False, False, False)),
@@ -89,31 +89,31 @@ def test_a_camera_that_contradicts_the_loop_is_a_doubt():
     )
     assert loop_rad == pytest.approx(np.radians(2.0), rel=1e-3)
     assert found.diagnostics["alone_ry_rad"] == pytest.approx(np.radians(2.0), rel=1e-3)
-    assert len(doubts) == 1
-    assert "yaw" in doubts[0]
+    assert len(failed) == 1
+    assert "yaw" in failed[0]
 
 
-def test_pairs_that_cannot_be_solved_keep_the_prior_with_a_doubt():
+def test_pairs_that_cannot_be_solved_keep_the_prior_and_fail_a_check():
     day = street_day(3)
     solution = solve_joint(dict.fromkeys(PAIRS, day), PRIOR, SolveConfig(), seed=0)
     for pair in ("camera_lidar", "lidar_radar"):
         assert np.array_equal(solution.pairs[pair].T, PRIOR.of(pair))
         assert not solution.pairs[pair].observable.any()
-        assert solution.doubts[pair]
+        assert solution.failed_checks[pair]
     assert np.allclose(solution.pairs["camera_radar"].T, PRIOR.T_camera_radar)
-    assert len(solution.doubts["camera_radar"]) >= 2
+    assert len(solution.failed_checks["camera_radar"]) >= 2
 
 
-def test_a_camera_lidar_end_that_no_restart_came_near_is_a_doubt_about_both_camera_pairs(monkeypatch):
-    for apart_deg, doubted in ((0.1, False), (2.6, True)):
+def test_a_camera_lidar_end_that_no_restart_came_near_fails_a_check_of_both_camera_pairs(monkeypatch):
+    for apart_deg, fails in ((0.1, False), (2.6, True)):
         found = replace(camera_lidar(), diagnostics={"restart_rotation_spread_deg": apart_deg})
         aligned = SimpleNamespace(T_camera_lidar=found.T, covariance=found.covariance)
         monkeypatch.setattr("pipeline.calibrate.joint.solve.align_camera_lidar", lambda *_, a=aligned: a)
         monkeypatch.setattr("pipeline.calibrate.joint.solve.settle_camera_lidar", lambda *_, e=found, **__: e)
         solution = solve_joint(dict.fromkeys(PAIRS, street_day(3)), PRIOR, SolveConfig(), seed=0)
         for pair in ("camera_lidar", "camera_radar"):
-            assert any("no restart" in why for why in solution.doubts.get(pair, [])) == doubted
-        assert not any("no restart" in why for why in solution.doubts["lidar_radar"])
+            assert any("no restart" in why for why in solution.failed_checks.get(pair, [])) == fails
+        assert not any("no restart" in why for why in solution.failed_checks["lidar_radar"])
 
 
 def test_an_untriggered_camera_lidar_stays_at_the_prior_and_its_boxes_are_not_trusted():

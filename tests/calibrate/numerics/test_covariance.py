@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.numerics.covariance import (
-    blocks_of,
     bootstrap_covariance,
     held_covariance,
     posterior,
     response,
     spread_to_covariance,
 )
+from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 
 
 def linear_day(rng, frames=200, shared=0.0, sigma=1.0):
@@ -38,7 +38,7 @@ def test_errors_shared_by_a_drive_widen_the_covariance_and_cover_the_truth():
     for seed in range(120):
         rng = np.random.default_rng(seed)
         estimate, H, g, drive = linear_day(rng, shared=0.5)
-        covariance = bootstrap_covariance(H, g, np.zeros((2, 2)), blocks_of(drive), rng)
+        covariance = bootstrap_covariance(H, g, np.zeros((2, 2)), bootstrap_blocks(drive), rng)
         z.append(estimate[0] / np.sqrt(covariance[0, 0]))
         naive.append(estimate[0] / np.sqrt(np.linalg.inv(H.sum(0))[0, 0]))
     assert np.std(naive) > 1.7
@@ -81,7 +81,7 @@ def test_the_larger_of_two_covariances_contains_both():
     "drive", [np.zeros(100, int), np.arange(100), np.repeat(np.arange(5), [3, 50, 7, 20, 20])]
 )
 def test_blocks_are_runs_of_frames_of_similar_size(drive):
-    block = blocks_of(drive)
+    block = bootstrap_blocks(drive)
     assert np.all(np.diff(block) >= 0)
     assert np.all(np.diff(block) <= 1)
     assert 8 <= block.max() + 1 <= 30
@@ -89,7 +89,7 @@ def test_blocks_are_runs_of_frames_of_similar_size(drive):
 
 
 def test_no_frames_have_no_blocks():
-    assert len(blocks_of(np.zeros(0, int))) == 0
+    assert len(bootstrap_blocks(np.zeros(0, int))) == 0
 
 
 def test_an_unobservable_dof_keeps_the_prior_sigma_and_says_so():
@@ -111,7 +111,7 @@ def test_the_bias_floor_is_never_undercut():
     assert np.all(np.sqrt(np.diag(after.covariance)) >= floor)
 
 
-def test_parameters_that_follow_a_held_one_inherit_its_doubt_and_cover_the_truth():
+def test_parameters_that_follow_a_held_one_inherit_its_uncertainty_and_cover_the_truth():
     held, prior_variance = np.array([False, True]), np.array([100.0, 0.04])
     z, deaf = [], []
     for seed in range(150):

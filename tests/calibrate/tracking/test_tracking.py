@@ -318,7 +318,7 @@ PRIOR = Prior(
 def test_a_day_of_moving_cars_turns_all_three_pairs_towards_the_truth(day):
     truth = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, 1.0, 1.0)
     solution = solve(day, PRIOR)
-    assert solution.doubts == {}
+    assert solution.failed_checks == {}
     for pair, axes in (("camera_lidar", [0, 1]), ("lidar_radar", [1, 2]), ("camera_radar", [0, 1])):
         before = error_deg(PRIOR.of(pair), truth.of(pair))[axes]
         after = error_deg(solution.pairs[pair].T, truth.of(pair))[axes]
@@ -362,7 +362,7 @@ def test_a_day_on_which_nothing_moves_is_refused_and_says_so():
 def test_a_camera_that_sees_nobody_leaves_the_radar_calibrated(day):
     blind = [replace(o, road_user_boxes_px=np.zeros((0, 4), np.float32), road_user_classes=[]) for o in day]
     solution = solve(blind, PRIOR)
-    assert "too few moving objects" in solution.doubts["camera_lidar"][0]
+    assert "too few moving objects" in solution.failed_checks["camera_lidar"][0]
     assert solution.pairs["camera_lidar"].frames_used == 0
     assert np.array_equal(solution.pairs["camera_lidar"].T, PRIOR.T_camera_lidar)
     assert solution.pairs["lidar_radar"].frames_used == 16

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.verify.held_out_score import alignment_of
-from pipeline.calibrate.verify.held_out_update import second_opinion
+from pipeline.calibrate.verify.held_out_score import held_out_score
+from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.target_accuracy import claims_of
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
@@ -39,10 +39,10 @@ def turned(T, axis, degrees):
 
 
 def claims(estimate, day, prior):
-    ask = alignment_of(estimate, day, prior, SolveConfig())
-    covariance = np.diag([*SIGMA**2, *ask.extra_variance])
-    opinion = second_opinion(ask.slopes, covariance, ask.bias, np.arange(len(day)) // 2)
-    return claims_of(estimate.pair, estimate.T, estimate.covariance, opinion, LIMIT, 0.995)
+    score = held_out_score(estimate, day, prior, SolveConfig())
+    covariance = np.diag([*SIGMA**2, *score.extra_variance])
+    update = held_out_update(score.derivatives, covariance, score.bias, np.arange(len(day)) // 2)
+    return claims_of(estimate.pair, estimate.T, estimate.covariance, update, LIMIT, 0.995)
 
 
 @pytest.fixture(scope="module", params=[SPARSE, DENSE], ids=["16 rings", "dense"])
@@ -72,30 +72,34 @@ def test_registration_contradicts_a_degree_of_yaw_and_leaves_elevation_alone(str
     off = claims(result("lidar_radar", turned(T_LIDAR_RADAR, 2, 1.0), DT_S), street, prior)
     assert off["azimuth"].agreement < 0
     tilted = claims(result("lidar_radar", turned(T_LIDAR_RADAR, 1, 2.0), DT_S), street, prior)
-    assert tilted["elevation"].shift < np.radians(0.05)  # its elevations are no judge
-    assert tilted["elevation"].remaining == pytest.approx(tilted["elevation"].sigma, rel=0.02)
+    assert tilted["elevation"].shift_rad < np.radians(0.05)  # its elevations are not scored
+    assert tilted["elevation"].remaining_sigma_rad == pytest.approx(tilted["elevation"].sigma_rad, rel=0.02)
 
 
-def test_costs_compare_what_the_radar_can_tell_and_nothing_else(street):
+def test_costs_compare_azimuth_and_range_of_the_radar_and_nothing_else(street):
     prior = Prior(np.eye(4), T_LIDAR_RADAR, np.radians(2), 0.1)
-    ask = alignment_of(result("lidar_radar", T_LIDAR_RADAR, DT_S), street, prior, SolveConfig())
-    best = np.nanmean(ask.cost(T_LIDAR_RADAR))
-    np.testing.assert_allclose(ask.cost(turned(T_LIDAR_RADAR, 1, 3.0)), ask.cost(T_LIDAR_RADAR), rtol=1e-3)
+    score = held_out_score(result("lidar_radar", T_LIDAR_RADAR, DT_S), street, prior, SolveConfig())
+    best = np.nanmean(score.cost(T_LIDAR_RADAR))
+    np.testing.assert_allclose(
+        score.cost(turned(T_LIDAR_RADAR, 1, 3.0)), score.cost(T_LIDAR_RADAR), rtol=1e-3
+    )
     for yaw in (-1.0, 1.0):
-        assert np.nanmean(ask.cost(turned(T_LIDAR_RADAR, 2, yaw))) > best
+        assert np.nanmean(score.cost(turned(T_LIDAR_RADAR, 2, yaw))) > best
 
 
 def test_camera_lidar_costs_prefer_the_truth(traced):
     wrong = turned(T_TRUE, 1, 2.0)
     prior = Prior(wrong, np.eye(4), np.radians(2), 0.1)
-    ask = alignment_of(result("camera_lidar", T_TRUE, 0.0), traced, prior, SolveConfig())
-    assert ask.cost(T_TRUE).sum() < ask.cost(wrong).sum()
-    blind = [replace(o, lidar_edge_xyz_m=np.zeros((0, 3), np.float32), lidar_edge_side=np.zeros(0, np.uint8),
+    score = held_out_score(result("camera_lidar", T_TRUE, 0.0), traced, prior, SolveConfig())
+    assert score.cost(T_TRUE).sum() < score.cost(wrong).sum()
+    without_points = [replace(o, lidar_edge_xyz_m=np.zeros((0, 3), np.float32), lidar_edge_side=np.zeros(0, np.uint8),
                      lidar_edge_jump_m=np.zeros(0, np.float32), lidar_edge_gap_rad=np.zeros(0, np.float32),
                      lidar_edge_points=np.zeros(0, np.int32), marking_xyz_m=np.zeros((0, 3), np.float32),
                      marking_z=np.zeros(0, np.float32)) if i == 0 else o
              for i, o in enumerate(traced)]  # fmt: skip
-    cost = alignment_of(result("camera_lidar", T_TRUE, 0.0), blind, prior, SolveConfig()).cost(T_TRUE)
+    cost = held_out_score(result("camera_lidar", T_TRUE, 0.0), without_points, prior, SolveConfig()).cost(
+        T_TRUE
+    )
     assert np.isnan(cost[0])
     assert np.isfinite(cost[1:]).all()
     assert np.degrees(np.linalg.norm(log_so3(wrong[:3, :3] @ T_TRUE[:3, :3].T))) == pytest.approx(2.0)

@@ -1,10 +1,10 @@
-"""What may be claimed at the targets, and the second opinion of held-out frames: laws, coverage, contradiction."""
+"""What may be claimed at the targets, and the held-out update: laws, coverage, contradiction."""
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pipeline.calibrate.verify.held_out_update import second_opinion
+from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.target_accuracy import (
     DIRECTIONS,
     Claim,
@@ -40,24 +40,24 @@ def test_a_turn_about_the_vertical_is_azimuth_and_roll_is_hardly_anything():
     assert roll.max() < 0.15
 
 
-def test_the_reach_is_the_quantile_of_the_absolute_error():
+def test_the_bound_is_the_quantile_of_the_absolute_error():
     for shift, sigma, confidence in (
         (0.0, 0.1, 0.995),
         (0.05, 0.1, 0.995),
         (1.0, 0.1, 0.995),
         (0.02, 0.1, 0.9),
     ):
-        reach = Claim(9.0, shift, 9.0, sigma, 0.2, confidence).reach
-        inside = norm.cdf(reach, shift, sigma) - norm.cdf(-reach, shift, sigma)
+        bound = Claim(9.0, shift, 9.0, sigma, 0.2, confidence).bound_rad
+        inside = norm.cdf(bound, shift, sigma) - norm.cdf(-bound, shift, sigma)
         assert inside == pytest.approx(confidence, abs=1e-9)
 
 
 def test_the_own_sigma_is_enough_until_held_out_frames_contradict_it():
     agreed = Claim(0.05, 0.1, 0.05, 0.045, 0.2, 0.995)
-    assert agreed.reach == pytest.approx(0.05 * norm.ppf(0.9975))
+    assert agreed.bound_rad == pytest.approx(0.05 * norm.ppf(0.9975))
     contradicted = Claim(0.05, 0.1, 0.03, 0.045, 0.2, 0.995)
     assert contradicted.agreement < 0
-    assert contradicted.reach > 0.2 > agreed.reach
+    assert contradicted.bound_rad > 0.2 > agreed.bound_rad
 
 
 def quadratic_frames(truth, blocks, rng, scatter=1.0, information=400.0):
@@ -68,31 +68,31 @@ def quadratic_frames(truth, blocks, rng, scatter=1.0, information=400.0):
     shared = rng.normal(size=(blocks.max() + 1, 8)) * scatter * np.sqrt(information / (blocks.max() + 1))
     noise = shared[blocks] / np.bincount(blocks)[blocks][:, None] / scale
 
-    def slopes(step, width):
+    def derivatives(step, width):
         del width
         return noise - np.einsum("fij,j->fi", H, step - truth), H
 
-    return slopes
+    return derivatives
 
 
 COVARIANCE = np.diag([*SIGMA**2, 0.005**2, 0.003**2])
 BIAS = np.zeros(8)
 
 
-def opinions(count, scatter=1.0, off=0.0, blocks=12):
-    """Second opinions on results whose errors are as their covariance says, and then `off` [rad] more in yaw."""
+def updates(count, scatter=1.0, off=0.0, blocks=12):
+    """Held-out updates of results whose errors are as their covariance says, and then `off` [rad] more in yaw."""
     rng = np.random.default_rng(3)
     block = np.repeat(np.arange(blocks), 3)
     for _ in range(count):
         error = rng.normal(size=8) * np.sqrt(np.diag(COVARIANCE)) + off * np.eye(8)[2]
-        found = second_opinion(quadratic_frames(-error, block, rng, scatter), COVARIANCE, BIAS, block)
+        found = held_out_update(quadratic_frames(-error, block, rng, scatter), COVARIANCE, BIAS, block)
         yield error, found
 
 
 @pytest.mark.parametrize("scatter", [1.0, 4.0])
-def test_a_second_opinion_is_right_about_its_own_sigma_however_much_scenes_scatter(scatter):
+def test_a_held_out_update_is_right_about_its_own_sigma_however_much_scenes_scatter(scatter):
     remaining, shifts = [], []
-    for error, found in opinions(150, scatter):
+    for error, found in updates(150, scatter):
         remaining.append((error[:6] + found.shift)[2] / np.sqrt(found.covariance[2, 2]))
         shifts.append(found.shift[2] / np.sqrt(found.shift_covariance[2, 2]))
     assert 0.75 < np.std(remaining) < 1.15
@@ -102,22 +102,22 @@ def test_a_second_opinion_is_right_about_its_own_sigma_however_much_scenes_scatt
 
 def test_a_result_that_is_off_by_many_sigmas_is_contradicted():
     agreements = []
-    for _, found in opinions(40, off=np.radians(0.5)):
+    for _, found in updates(40, off=np.radians(0.5)):
         claim = claims_of("lidar_radar", np.eye(4), COVARIANCE[:6, :6], found, np.radians(0.4), 0.995)
         agreements.append(claim["azimuth"].agreement)
     assert np.mean(np.array(agreements) < 0) > 0.95
 
 
-def test_frames_that_say_nothing_change_nothing_and_two_scenes_are_no_opinion():
+def test_frames_that_say_nothing_change_nothing_and_two_scenes_are_too_few():
     rng = np.random.default_rng(0)
     block = np.repeat(np.arange(6), 2)
-    found = second_opinion(
+    found = held_out_update(
         quadratic_frames(np.zeros(8), block, rng, information=1e-6), COVARIANCE, BIAS, block
     )
     np.testing.assert_allclose(found.covariance, COVARIANCE[:6, :6], rtol=1e-3)
     assert np.all(np.abs(found.shift) < 1e-3 * SIGMA)
     two = np.repeat([0, 1], 6)
-    assert second_opinion(quadratic_frames(np.zeros(8), two, rng), COVARIANCE, BIAS, two) is None
+    assert held_out_update(quadratic_frames(np.zeros(8), two, rng), COVARIANCE, BIAS, two) is None
 
 
 def test_held_out_frames_make_nothing_surer_than_their_own_bias():
@@ -125,18 +125,18 @@ def test_held_out_frames_make_nothing_surer_than_their_own_bias():
     block = np.repeat(np.arange(12), 3)
     bias = np.array([0, 0, np.radians(0.2), 0, 0, 0, 0, 0])
     wide = COVARIANCE * 100
-    found = second_opinion(quadratic_frames(np.zeros(8), block, rng, information=1e6), wide, bias, block)
+    found = held_out_update(quadratic_frames(np.zeros(8), block, rng, information=1e6), wide, bias, block)
     claim = claims_of("lidar_radar", np.eye(4), wide[:6, :6], found, np.radians(0.4), 0.995)["azimuth"]
-    assert np.degrees(claim.remaining) == pytest.approx(0.2, abs=0.02)
+    assert np.degrees(claim.remaining_sigma_rad) == pytest.approx(0.2, abs=0.02)
     sharp = COVARIANCE / 100
-    found = second_opinion(quadratic_frames(np.zeros(8), block, rng), sharp, bias, block)
+    found = held_out_update(quadratic_frames(np.zeros(8), block, rng), sharp, bias, block)
     claim = claims_of("lidar_radar", np.eye(4), sharp[:6, :6], found, np.radians(0.4), 0.995)["azimuth"]
-    assert claim.remaining == claim.sigma  # and nothing less sure than it was
+    assert claim.remaining_sigma_rad == claim.sigma_rad  # and nothing less sure than it was
 
 
-def test_without_an_opinion_the_covariance_alone_is_claimed():
+def test_without_held_out_frames_the_covariance_alone_is_claimed():
     claims = claims_of("camera_lidar", T_CAMERA, COVARIANCE[:6, :6], None, np.radians(0.2), 0.995)
     assert tuple(claims) == DIRECTIONS
     own = target_sigmas("camera_lidar", T_CAMERA, COVARIANCE[:6, :6])
-    assert [c.remaining for c in claims.values()] == pytest.approx(list(own))
+    assert [c.remaining_sigma_rad for c in claims.values()] == pytest.approx(list(own))
     assert all(c.agreement == 1 for c in claims.values())

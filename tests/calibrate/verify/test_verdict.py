@@ -1,20 +1,23 @@
-"""Held-out frames decide, doubts hold, and nothing worse than the prior passes."""
+"""Held-out frames decide, failed checks hold, and nothing worse than the prior passes."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pipeline.calibrate.numerics.search_range import SearchRange
+from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
+from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
-from pipeline.calibrate.verify.verdict import Limits, heading_doubts, judge, loop_doubts, moved
+from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation
 from tests.makers.solve_scenes import make_day
 
 PRIOR = Prior(np.eye(4), np.eye(4), np.radians(2), 0.05)
 SIGMA = np.array([np.radians(0.1)] * 3 + [0.02] * 3)
-LIMITS = Limits(np.radians(6), 0.3)
+SEARCH = SearchRange(np.radians(6), 0.3)
 BETTER = HeldOutTest(1.0, 0.8, 0.02, 20, 10)
 SAME = HeldOutTest(1.0, 0.99, 0.02, 20, 10)
 WORSE = HeldOutTest(1.0, 1.1, 0.02, 20, 10)
@@ -31,9 +34,8 @@ def estimate(rotation_deg=0.0, shift_m=0.0, pair="camera_lidar", observable=None
 SURE = {name: Claim(0.001, 0.0, 0.001, 0.001, np.radians(0.2), 0.995) for name in DIRECTIONS}
 
 
-def verdict(result, test, doubts=(), claims=SURE, **changes):
-    prior = PRIOR.covariance("camera_lidar")
-    return judge(result, np.eye(4), prior, test, claims, doubts, LIMITS, **changes)
+def verdict(result, test, failed=(), claims=SURE, limits=None, **changes):
+    return judge(result, PRIOR, Evidence(test, claims, failed), SEARCH, limits or VerdictLimits(), **changes)
 
 
 def test_a_better_alignment_is_accepted_without_remark():
@@ -62,9 +64,9 @@ def test_a_dof_that_the_day_did_not_determine_may_not_hold_but_is_named():
     assert (found.status, found.reason) == ("accepted", "not determined by the day: ry")
 
 
-def test_doubts_hold_and_are_repeated():
+def test_failed_checks_hold_and_are_repeated():
     found = verdict(
-        estimate(1.5), BETTER, doubts=["restarts disagree by 0.8 deg", "the camera contradicts radar roll"]
+        estimate(1.5), BETTER, failed=["restarts disagree by 0.8 deg", "the camera contradicts radar roll"]
     )
     assert found.status == "held"
     assert found.reason == "restarts disagree by 0.8 deg; the camera contradicts radar roll"
@@ -113,7 +115,7 @@ def test_a_composed_pair_is_as_good_as_its_factors():
     assert verdict(estimate(0.2), WORSE, factors=[good, good]).status == "accepted"
 
 
-def test_a_radar_answers_only_for_the_moves_that_held_out_frames_can_tell():
+def test_a_radar_answers_only_for_the_moves_that_held_out_frames_score():
     tilted = estimate(1.0, pair="lidar_radar")  # pitch
     assert verdict(tilted, SAME).status == "accepted"
     turned = replace(tilted, T=from_rotation_translation(exp_so3(np.array([0, 0, 0.02])), np.zeros(3)))
@@ -131,12 +133,12 @@ def test_what_the_purpose_needs_more_exactly_than_it_is_known_is_held():
     assert found.reason == "azimuth is known to 0.30 deg (1 sigma), not within 0.20 deg at 99.5 %"
 
 
-def test_a_radar_is_accepted_for_its_azimuth_and_says_that_elevation_is_not_vouched_for():
+def test_a_radar_is_accepted_for_its_azimuth_and_says_that_elevation_is_not_certified():
     claims = SURE | {"elevation": claim(0.5)}
     assert verdict(estimate(1.5), BETTER, claims=claims).status == "held"
     found = verdict(estimate(1.5, pair="lidar_radar"), BETTER, claims=claims)
     assert (found.status, found.determined) == ("accepted", ("azimuth",))
-    assert "elevation not vouched for: known to 0.50 deg" in found.reason
+    assert "elevation not certified: known to 0.50 deg" in found.reason
 
 
 def test_held_out_frames_that_lie_elsewhere_by_more_than_their_sigma_hold():
@@ -154,7 +156,7 @@ def test_the_score_is_the_smallest_margin_and_ranks():
     ]
     assert scores == sorted(scores, reverse=True)
     assert scores[1] > 0 > scores[2]
-    assert verdict(estimate(1.5), BETTER, doubts=["x"]).score < 0
+    assert verdict(estimate(1.5), BETTER, failed=["x"]).score < 0
     weak = verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(0.06)})
     strong = verdict(estimate(1.0), BETTER)
     assert verdict(estimate(1.0), BETTER, factors=[weak, strong]).score == weak.score
@@ -163,19 +165,31 @@ def test_the_score_is_the_smallest_margin_and_ranks():
 def test_too_few_frames_are_refused():
     found = verdict(replace(estimate(1.0), frames_used=3), BETTER)
     assert (found.status, found.reason) == ("refused", "too few frames: 3, needs 8")
-    why = verdict(replace(estimate(1.0), frames_used=0), BETTER, doubts=["hardly any depth edges"]).reason
+    why = verdict(replace(estimate(1.0), frames_used=0), BETTER, failed=["hardly any depth edges"]).reason
     assert why == "hardly any depth edges; too few frames: 0, needs 8"
 
 
 def test_an_untriggered_pair_keeps_the_prior():
-    assert verdict(estimate(0.0), SAME, calibrated=False).reason == "not triggered: the prior stays"
+    assert verdict(estimate(0.0), SAME, triggered=False).reason == "not triggered: the prior stays"
 
 
-def test_moved_measures_turn_and_shift_apart():
-    T = from_rotation_translation(exp_so3(np.array([0.1, 0, 0])), np.array([1.0, 2, 3]))
-    np.testing.assert_allclose(
-        moved(T, from_rotation_translation(np.eye(3), np.ones(3))), [0.1, 0, 0, 0, 1, 2]
-    )
+@pytest.mark.parametrize(
+    ("change", "turn_deg", "after", "words"),
+    [
+        ({"max_move_prior_sigmas": 0.5}, 1.5, 0.8, "prior sigmas"),
+        ({"worse_alignment_z": 0.5}, 0.2, 1.02, "align worse"),
+        ({"better_alignment_z": 3.0}, 1.5, 0.95, "align no better"),
+        ({"prior_agreement_sigmas": 1.0}, 0.2, 0.99, "align no better"),
+        ({"min_fit_frames": 51}, 1.5, 0.8, "needs 51"),
+        ({"min_held_out_frames": 21}, 1.5, 0.8, "needs 21"),
+    ],
+)
+def test_each_limit_of_the_verdict_decides(change, turn_deg, after, words):
+    test = replace(BETTER, after=after)
+    assert verdict(estimate(turn_deg), test).status == "accepted"
+    strict = verdict(estimate(turn_deg), test, limits=VerdictLimits(**change))
+    assert strict.status != "accepted"
+    assert words in strict.reason
 
 
 def solution(open_by):
@@ -184,27 +198,27 @@ def solution(open_by):
     return Solution("joint", pairs, angle, shift)
 
 
-def test_a_loop_within_its_sigma_raises_no_doubt():
-    assert loop_doubts(solution((np.radians(0.3), 0.05))) == []
+def test_a_loop_within_its_sigma_fails_no_check():
+    assert loop_failures(solution((np.radians(0.3), 0.05))) == []
 
 
-def test_a_loop_beyond_three_sigma_is_a_doubt():
-    assert "open by 2.00 deg" in loop_doubts(solution((np.radians(2), 0.05)))[0]
-    assert "open by 0.500 m" in loop_doubts(solution((0.0, 0.5)))[0]
+def test_a_loop_beyond_three_sigma_fails_the_check():
+    assert "open by 2.00 deg" in loop_failures(solution((np.radians(2), 0.05)))[0]
+    assert "open by 0.500 m" in loop_failures(solution((0.0, 0.5)))[0]
 
 
-def test_a_method_without_independent_pairs_has_no_loop_to_doubt():
-    assert loop_doubts(solution((None, None))) == []
+def test_a_method_without_independent_pairs_has_no_loop_to_check():
+    assert loop_failures(solution((None, None))) == []
 
 
-def test_loop_doubts_come_at_their_rate_when_the_sigmas_are_right():
+def test_loop_failures_come_at_their_rate_when_the_sigmas_are_right():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(400):
         cl, lr, cr = (exp_se3(rng.normal(size=6) * SIGMA) for _ in range(3))
         loop = cl @ lr @ np.linalg.inv(cr)
         angle = float(np.arccos(np.clip((np.trace(loop[:3, :3]) - 1) / 2, -1, 1)))
-        hits += bool(loop_doubts(solution((angle, float(np.linalg.norm(loop[:3, 3]))))))
+        hits += bool(loop_failures(solution((angle, float(np.linalg.norm(loop[:3, 3]))))))
     assert hits <= 4
 
 
@@ -231,7 +245,7 @@ def test_paired_test_is_rarely_fooled_by_noise():
     assert np.mean(np.abs(z) > 1.64) == pytest.approx(0.10, abs=0.05)
 
 
-def test_paired_test_leaves_out_frames_that_cannot_tell():
+def test_paired_test_leaves_out_frames_without_both_costs():
     found = paired_test(np.array([1.0, np.nan, 2, 3]), np.array([0.0, 1, np.nan, 2]), np.arange(4))
     assert (found.before, found.after, found.frames) == (2.0, 1.0, 2)
     assert paired_test(np.full(3, np.nan), np.ones(3), np.arange(3)) is None
@@ -250,19 +264,21 @@ def test_nothing_changed_is_neither_better_nor_worse():
     assert paired_test(np.ones(5), np.ones(5), np.arange(5)).z == 0
 
 
-def test_a_radar_that_turned_beyond_its_prior_casts_doubt_on_what_was_solved_along_its_heading():
+def test_a_radar_that_turned_beyond_its_prior_holds_what_was_solved_along_its_heading():
     day = make_day(5, ego_speed_mps=30.0)
     limit = np.radians(0.2)
 
-    def doubts(turn_deg, dt_s):
+    def failures(turn_deg, dt_s):
         T = from_rotation_translation(exp_so3(np.array([0, 0, np.radians(turn_deg)])), np.zeros(3))
         pairs = {
             "camera_lidar": replace(estimate(), time_offset_s=dt_s),
             "lidar_radar": replace(estimate(pair="lidar_radar"), T=T),
         }
-        return heading_doubts(Solution("joint", pairs), PRIOR, day, limit)
+        return heading_failures(Solution("joint", pairs), PRIOR, day, limit)
 
-    assert "turns by 9.0 deg: 0.09 m aside" in doubts(9.0, 0.02)[0]
-    assert doubts(9.0, 0.0) == []  # nothing was moved
-    assert doubts(9.0, None) == []
-    assert doubts(2.0, 0.02) == []  # within the prior's sigma: the covariance's business
+    (sentence,) = failures(9.0, 0.02)
+    assert "heading off by 9.0 deg" in sentence
+    assert "up to 0.09 m lateral error" in sentence
+    assert failures(9.0, 0.0) == []  # nothing was moved
+    assert failures(9.0, None) == []
+    assert failures(2.0, 0.02) == []  # within the prior's sigma: the covariance's business

@@ -28,7 +28,8 @@ from pipeline.calibrate.joint.camera_lidar.time_offset import (
     profile_clock,
     s_per_metre,
 )
-from pipeline.calibrate.numerics.covariance import OBSERVABLE, blocks_of, held_covariance, response
+from pipeline.calibrate.numerics.covariance import OBSERVABLE, held_covariance, response
+from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_jacobian
@@ -135,7 +136,7 @@ def measured(
     # After `weighted`, the scatter of the frames' gradients is the curvature, without its roughness
     # (Bartlett's identity).
     information = gradient[:, :, None] * gradient[:, None, :]
-    block = blocks_of(np.array(day.drives), day.config.bootstrap_blocks)
+    block = bootstrap_blocks(np.array(day.drives), day.config.bootstrap_blocks)
     covariance = held_covariance(
         information,
         -gradient,

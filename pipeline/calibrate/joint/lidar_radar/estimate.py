@@ -31,7 +31,8 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import (
 )
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.search import FREE, anneal, finish, last_step, scan
-from pipeline.calibrate.numerics.covariance import OBSERVABLE, blocks_of, held_covariance
+from pipeline.calibrate.numerics.covariance import OBSERVABLE, held_covariance
+from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior
@@ -190,7 +191,7 @@ def _settle(
     rng: np.random.Generator,
 ) -> _Settled:
     """Solve, hold what the day did not determine, and solve again until nothing more has to be held."""
-    block = blocks_of(np.array([o.drive for o in problem.observations]), config.bootstrap_blocks)
+    block = bootstrap_blocks(np.array([o.drive for o in problem.observations]), config.bootstrap_blocks)
     before = np.append(np.diag(problem.prior.covariance("lidar_radar")), problem.dt_sigma_s**2)
     held, observability = FREE.copy(), np.ones(DT + 1)
     while True:

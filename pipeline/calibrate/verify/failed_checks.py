@@ -1,0 +1,87 @@
+"""Checks of a solution as a whole, which no single pair can make: does the loop close, was the heading right?
+
+Each returns sentences for `judge`, one per failed check; none where all is well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.extrinsics.estimates import Prior, Solution
+from pipeline.geometry.changes import change_between
+from pipeline.geometry.se3 import adjoint, inverse
+from pipeline.geometry.targets import DEFAULT_TARGETS
+from schemas.observations import Observation
+
+__all__ = ["heading_failures", "loop_failures", "loop_sigmas"]
+
+
+def loop_failures(solution: Solution, limits: VerdictLimits | None = None) -> list[str]:
+    """A loop of independent estimates that does not close within its sigma: an error of any pair, so all fail."""
+    limits = limits or VerdictLimits()
+    found = loop_sigmas(solution)
+    if found is None or solution.loop_rotation_rad is None or solution.loop_translation_m is None:
+        return []
+    rotation, translation = found
+    failed = []
+    if solution.loop_rotation_rad > limits.max_loop_sigmas * rotation:
+        open_deg, sigma_deg = np.degrees(solution.loop_rotation_rad), np.degrees(rotation)
+        failed.append(f"the loop is open by {open_deg:.2f} deg, its sigma is {sigma_deg:.2f} deg")
+    if solution.loop_translation_m > limits.max_loop_sigmas * translation:
+        failed.append(
+            f"the loop is open by {solution.loop_translation_m:.3f} m, its sigma is {translation:.3f} m"
+        )
+    return failed
+
+
+def heading_failures(
+    solution: Solution,
+    prior: Prior,
+    observations: Sequence[Observation],
+    limit_rad: float,
+    limits: VerdictLimits | None = None,
+) -> list[str]:
+    """Camera-lidar solved along a heading that lidar-radar then turned.
+
+    A camera's time offset moves the cloud along the car's heading, which the radar's prior mounting gives. Where
+    lidar-radar turns the radar by many of the prior's sigmas, that heading was wrong, and camera-lidar is off to the
+    side by time offset times speed times the turn.
+
+    Args:
+        solution: with camera-lidar and lidar-radar.
+        prior: whose T_lidar_radar gave the heading.
+        observations: for the car's speed.
+        limit_rad: largest error that camera-lidar may have at the targets.
+        limits: from where on the heading is wrong, and what share of `limit_rad` that may cost; None = the defaults.
+    """
+    limits = limits or VerdictLimits()
+    dt_s = solution.pairs["camera_lidar"].time_offset_s or 0.0
+    turn = abs(float(change_between(prior.T_lidar_radar, solution.pairs["lidar_radar"].T)[2]))
+    speeds = [abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None]
+    if not speeds or turn < limits.heading_change_prior_sigmas * prior.rotation_sigma_rad:
+        return []
+    lateral_m = turn * abs(dt_s) * float(np.mean(speeds))
+    rad_per_metre = float(np.sqrt(np.mean(1 / np.sum(DEFAULT_TARGETS**2, axis=1))))
+    if lateral_m * rad_per_metre < limits.max_heading_error_share * limit_rad:
+        return []
+    off = f"assumed heading off by {np.degrees(turn):.1f} deg by lidar-radar"
+    return [f"{off}: up to {lateral_m:.2f} m lateral error through the camera's time offset"]
+
+
+def loop_sigmas(solution: Solution) -> tuple[float, float] | None:
+    """Sigma of the loop's angle [rad] and translation [m] where all three pairs were estimated independently."""
+    if solution.loop_rotation_rad is None or solution.loop_translation_m is None:
+        return None
+    covariance = _loop_covariance(solution)
+    return float(np.sqrt(np.trace(covariance[:3, :3]))), float(np.sqrt(np.trace(covariance[3:, 3:])))
+
+
+def _loop_covariance(solution: Solution) -> np.ndarray:
+    """Of T_camera_lidar T_lidar_radar T_radar_camera (6 6), with independent factors (first order)."""
+    cl, lr, cr = (solution.pairs[p] for p in ("camera_lidar", "lidar_radar", "camera_radar"))
+    A = adjoint(cl.T)
+    B = adjoint(cl.T @ lr.T @ inverse(cr.T))
+    return cl.covariance + A @ lr.covariance @ A.T + B @ cr.covariance @ B.T
