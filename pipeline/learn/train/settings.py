@@ -1,6 +1,6 @@
 """train.toml as frozen values: what is trained, how long and how; unknown keys and impossible values are errors.
 
-The defaults are the paper's recipe where it gives one: Adam (.9, .999), batch 4, cosine from 3e-4 to 3e-7.
+The defaults are the paper's recipe where it gives one: Adam (0.9, 0.999), batch 4, cosine from 3e-4 to 3e-7.
 """
 
 from __future__ import annotations
