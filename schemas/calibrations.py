@@ -43,7 +43,7 @@ CALIBRATIONS = TableSchema(
         scalar(
             "observability",
             "list<float64>",
-            "per DoF: 1 - posterior/prior variance along it, 0 = the day said nothing, 1 = all",
+            "per DoF: 1 - posterior/prior variance along it; 0 = the day adds nothing to the prior",
             nullable=True,
         ),
         scalar(
@@ -69,9 +69,10 @@ CALIBRATIONS = TableSchema(
         scalar(
             "determined",
             "list<string>",
-            "of azimuth and elevation at targets 15 to 40 m away: what lies within limit_rad, as sure as asked",
+            "of azimuth and elevation at targets 15 to 40 m away: those whose error is below limit_rad with "
+            "probability verify.confidence",
         ),
-        scalar("limit_rad", "float64", "the largest error that the purpose bears", nullable=True),
+        scalar("limit_rad", "float64", "the largest error that the calibration's use allows", nullable=True),
         scalar(
             "azimuth_sigma_rad", "float64", "sigma of a target's azimuth, from the covariance", nullable=True
         ),
@@ -102,7 +103,10 @@ CALIBRATIONS = TableSchema(
             nullable=True,
         ),
         scalar(
-            "loop_rotation_sigma_rad", "float64", "sigma that the pairs promise for the angle", nullable=True
+            "loop_rotation_sigma_rad",
+            "float64",
+            "sigma of the angle as the pairs' covariances predict it",
+            nullable=True,
         ),
         scalar("loop_translation_sigma_m", "float64", "and for the translation", nullable=True),
         scalar("environment", "string", "highway, urban, mixed or unknown"),
@@ -114,7 +118,9 @@ CALIBRATIONS = TableSchema(
         ),
         scalar("time_offset_sigma_s", "float64", "its sigma", nullable=True),
         scalar("notes", "list<string>", "what else a reader should know"),
-        scalar("assumptions", "list<string>", "what was taken as known, and what that is worth"),
+        scalar(
+            "assumptions", "list<string>", "what was taken as known, and what an error of it would change"
+        ),
         scalar("drive_missing", "list<string>", "what the day did not show: what to drive next time"),
         scalar(
             "diagnostics",

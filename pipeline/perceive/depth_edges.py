@@ -152,10 +152,8 @@ def _between_rings(
     """Jumps between a clustered point and the beam of the next ring above or below it."""
     starts = np.searchsorted(row, np.arange(row.max() + 2))
     found = []
-    for side, up in (
-        (EDGE_BELOW, 1),
-        (EDGE_ABOVE, -1),
-    ):  # the foreground lies below what the ring above it sees
+    # The foreground lies below what the ring above it sees.
+    for side, up in ((EDGE_BELOW, 1), (EDGE_ABOVE, -1)):
         parts = [
             _jumps_to_row(
                 aer,

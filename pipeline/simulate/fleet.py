@@ -122,9 +122,8 @@ def simulate_fleet(
                     v, d = jobs[job]
                     logs, done = logs + job.result(), done + spec.frames
                     progress(done, total, f"{vehicles[v]} {days[d]}")
-            except (
-                BaseException
-            ):  # stopped or failed: days not begun yet need not be, nor those that were begun
+            except BaseException:
+                # Stopped or failed: days not begun yet need not be, nor those that were begun.
                 pool.shutdown(wait=False, cancel_futures=True)
                 for worker in set(active_children()) - others:
                     worker.terminate()

@@ -22,8 +22,8 @@ from pipeline.results import Progress, silent
 from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, vehicle_names
 from pipeline.simulate.logs.recording import Setup, nominal_poses, trio
 from pipeline.simulate.logs.writers import TOPICS, open_log
-from pipeline.simulate.sensors.frames import Scene, SimulatedFrame, frame_of
 from pipeline.simulate.sensors.rigs import Mounting, rig_named
+from pipeline.simulate.sensors.simulated_frame import Scene, SimulatedFrame, frame_of
 from pipeline.simulate.world.casting import Moment, standing_of
 from pipeline.simulate.world.drives import Parked
 from pipeline.simulate.world.meshes import Mesh, MeshBuilder, Number

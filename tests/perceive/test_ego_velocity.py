@@ -77,9 +77,8 @@ def test_an_unambiguous_radar_without_elevation_gives_the_same_velocity():
 
 def test_odometry_limits_the_search():
     rng = np.random.default_rng(5)
-    xyz, rate, _ = scan(
-        rng, np.array([6.0, 0.0, 0.0]), points=60, fov_deg=4.0
-    )  # too narrow to lift the ambiguity
+    # Too narrow to lift the ambiguity.
+    xyz, rate, _ = scan(rng, np.array([6.0, 0.0, 0.0]), points=60, fov_deg=4.0)
     for hint in (6.3, 16.0, 27.0):
         found = radar_motion(xyz, wrapped(rate), None, PERIOD_MPS, hint, True, CONFIG, rng)
         assert abs(found.velocity_mps[0] - hint) < 2.5

@@ -10,9 +10,9 @@ from rosbags.rosbag1 import Reader as Bag1
 from rosbags.rosbag2 import Reader as Bag2
 
 from pipeline.simulate.logs.messages import Messages
-from pipeline.simulate.sensors.frames import Scene, SimulatedFrame, frame_of, scene_of
 from pipeline.simulate.sensors.rigs import Mounting, RigSpec, mounting_of, rig_named
 from pipeline.simulate.sensors.semantics import SemanticsSpec
+from pipeline.simulate.sensors.simulated_frame import Scene, SimulatedFrame, frame_of, scene_of
 from pipeline.simulate.world.casting import Moment, World
 from pipeline.simulate.world.drives import Drive
 

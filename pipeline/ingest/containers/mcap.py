@@ -28,9 +28,8 @@ __all__ = ["McapLog"]
 _MAGIC_SIZE = 8
 _RECORD = struct.Struct("<BQ")  # opcode, content length
 _MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
-_CHUNK = struct.Struct(
-    "<QQQII"
-)  # start and end time, uncompressed size and CRC, length of the compression's name
+# Start and end time, uncompressed size and CRC, length of the compression's name.
+_CHUNK = struct.Struct("<QQQII")
 _FOOTER_SIZE = _RECORD.size + 20
 _MAX_CHUNK_BYTES = 1 << 30  # a larger claim is a damaged length, not a chunk
 _LAST_OPCODE = max(Opcode)
@@ -47,9 +46,8 @@ class McapLog:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, ChannelRecord] = {}
         self._resolved: dict[int, Channel] = {}
-        self._trusted = (
-            False  # the summary's checksum was right: its schemas and channels win over the data section's
-        )
+        # True where the summary's checksum is right: its schemas and channels win over the data section's.
+        self._trusted = False
         self._chunk_starts = self._read_summary()
 
     def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:

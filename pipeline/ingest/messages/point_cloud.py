@@ -25,14 +25,11 @@ _TIME = (
     "timestampOffset",
     "point_time_offset",
 )
-_MIN_RANGE_M = (
-    0.05  # drivers write (0, 0, 0) for a beam without return; no sensor sees its own housing this near
-)
+# Drivers write (0, 0, 0) for a beam without return; no sensor sees its own housing this near.
+_MIN_RANGE_M = 0.05
 _LONGEST_SWEEP_S = 1.0
-_DATE_S, _DATE_NS = (
-    1e6,
-    10**15,
-)  # 12 days after 1970, in seconds and nanoseconds: no sweep is that long, no date that early
+# 12 days after 1970, in seconds and nanoseconds: no sweep is that long, no date that early.
+_DATE_S, _DATE_NS = 1e6, 10**15
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from pipeline.geometry.se3 import from_rotation_translation
 from pipeline.simulate.faults import DayFaults, misread
 from pipeline.simulate.logs.messages import Messages
 from pipeline.simulate.logs.writers import TOPICS, OpenLog
-from pipeline.simulate.sensors.frames import SimulatedFrame, frame_of, scene_of
 from pipeline.simulate.sensors.rigs import Mounting, RigSpec
 from pipeline.simulate.sensors.semantics import SemanticsSpec, encode_png
+from pipeline.simulate.sensors.simulated_frame import SimulatedFrame, frame_of, scene_of
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 

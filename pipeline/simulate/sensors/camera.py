@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from pipeline.geometry.cameras import Camera
+from pipeline.simulate.sensors.pixels import upsampled
+from pipeline.simulate.sensors.shading import Light, Materials, Shadows, Sight, Surfaces, developed, shade
 from pipeline.simulate.world.casting import Moment
-from pipeline.simulate.world.loops import developed, shade, upsampled
 from pipeline.simulate.world.materials import TABLE
 
 __all__ = ["View", "encode_jpeg", "render", "view_of"]
@@ -71,32 +72,15 @@ def render(
     mesh, shadows = moment.mesh, moment.standing.shadows
     # Sun and sky add up to about 1 on a white surface facing the sun; at night only a street-lamp glow is left.
     sun_light, sky_light, sky_radiance = (0.01, 0.06, 0.006) if night else (0.95, 0.42, 1.0)
-    blobs = np.array(
+    patches = np.array(
         [_footprint(a.T_map_actor, moment.standing.origin, a.kind) for a in moment.actors], np.float32
     ).reshape(-1, 8)
     image = shade(
-        view.full,
-        view.rays_map,
-        view.origin,
-        mesh.corners,
-        moment.normals,
-        mesh.material,
-        mesh.tint,
-        mesh.uv,
-        TABLE.albedo,
-        TABLE.texture,
-        TABLE.glass,
-        TABLE.glow,
-        TABLE.label,
-        sun.astype(np.float32),
-        sun_light,
-        sky_light,
-        sky_radiance,
-        shadows.light,
-        shadows.s0,
-        shadows.d0,
-        shadows.cell_m,
-        blobs,
+        Sight(view.full, view.rays_map, view.origin),
+        Surfaces(mesh.corners, moment.normals, mesh.material, mesh.tint, mesh.uv),
+        Materials(TABLE.albedo, TABLE.texture, TABLE.glass, TABLE.glow, TABLE.label),
+        Light(sun.astype(np.float32), sun_light, sky_light, sky_radiance),
+        Shadows(shadows.light, shadows.s0, shadows.d0, shadows.cell_m, patches),
     )
     exposure = 1.55 * rng.uniform(0.9, 1.12) * (3.2 if night else 1.0)
     return _exposed(image, exposure, 7.0 if night else 2.2, rng)

@@ -13,8 +13,8 @@ from pipeline.geometry.spherical import from_spherical
 from pipeline.simulate.sensors.rigs import LidarSpec
 from pipeline.simulate.world.casting import Hits, Moment
 from pipeline.simulate.world.drives import Motion
-from pipeline.simulate.world.loops import textures
 from pipeline.simulate.world.materials import LABELS, TABLE
+from pipeline.simulate.world.textures import textures
 
 __all__ = ["Sweep", "sweep_lidar"]
 

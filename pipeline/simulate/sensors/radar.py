@@ -6,8 +6,9 @@ Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Lo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, no_type_check
 
+import numba
 import numpy as np
 from jaxtyping import Float
 
@@ -16,7 +17,6 @@ from pipeline.geometry.spherical import from_spherical, to_spherical
 from pipeline.simulate.sensors.rigs import RadarSpec
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Motion
-from pipeline.simulate.world.loops import unsuppressed
 from pipeline.simulate.world.materials import LABELS, TABLE, material
 
 __all__ = ["RadarErrors", "Scan", "scan_radar"]
@@ -197,8 +197,21 @@ def _peaks(cells: _Cells, size: np.ndarray) -> _Cells:
     """Local maxima: of two detections closer than the resolution in all four dimensions, the weaker one is not seen."""
     strongest = np.argsort(-cells.snr)
     x = (np.concatenate([cells.aer, cells.rate[:, None]], 1) / size)[strongest]
-    keep = strongest[unsuppressed(x)]
+    keep = strongest[_unsuppressed(x)]
     return _Cells(cells.aer[keep], cells.rate[keep], cells.snr[keep], cells.ground[keep], cells.moving[keep])
+
+
+@no_type_check
+@numba.njit(cache=True)  # `no_type_check` keeps the tests' shape checks out of compiled code
+def _unsuppressed(x: np.ndarray) -> np.ndarray:
+    """True for echoes, the strongest first, that no kept one stands before within a resolution cell in each axis."""
+    keep = np.ones(len(x), np.bool_)
+    for i in range(len(x)):
+        if keep[i]:
+            for j in range(i + 1, len(x)):
+                if np.all(np.abs(x[i] - x[j]) < 1.0):
+                    keep[j] = False
+    return keep
 
 
 def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:

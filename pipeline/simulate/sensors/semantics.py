@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
+from pipeline.simulate.sensors.pixels import extents
 from pipeline.simulate.world.casting import Moment
-from pipeline.simulate.world.loops import extents
 from pipeline.simulate.world.materials import LABELS, TABLE
 
 __all__ = ["Box", "SemanticsSpec", "boxes_of", "encode_png", "label_image", "noisy_boxes", "noisy_labels"]

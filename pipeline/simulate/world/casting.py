@@ -19,8 +19,8 @@ from jaxtyping import Float
 from pipeline.simulate.world.actors import VARIANTS, actor_mesh
 from pipeline.simulate.world.chunk import CHUNK_M
 from pipeline.simulate.world.drives import Drive
-from pipeline.simulate.world.loops import near as rays_near
 from pipeline.simulate.world.meshes import Mesh, join
+from pipeline.simulate.world.ray_selection import rays_near
 from pipeline.simulate.world.scenery import chunk_mesh
 from pipeline.simulate.world.traffic import Actor, actors_at
 
@@ -208,9 +208,8 @@ def _may_be_seen(centre: np.ndarray, reach_m: float, axis: np.ndarray, cosine: f
 def _scene(mesh: Mesh) -> EmbreeScene:
     scene = EmbreeScene()
     corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), np.float32)
-    TriangleMesh(
-        scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-    )  # belongs to the scene
+    # The scene keeps the mesh.
+    TriangleMesh(scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
     return scene
 
 

@@ -22,9 +22,9 @@ from pipeline.perceive.ground import PointKind, find_ground
 from pipeline.perceive.models.range_image import RangeImageSegmenter
 from pipeline.simulate.fleet import drive_of, mounting_on
 from pipeline.simulate.logs.recording import FIRST_FRAME_S
-from pipeline.simulate.sensors.frames import scene_of
 from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.simulate.sensors.simulated_frame import scene_of
 from pipeline.simulate.world.casting import World
 from tests.benchmarks.studies.ssl_fleet import FLEET
 

@@ -1,146 +1,70 @@
-"""The compiled loops of the simulator: textures, shading, rays near a body, boxes of what is visible, peaks.
-
-Scalar code for numba; arguments are those of the functions that call them.
-"""
+"""Colour of each pixel: texture, sun, sky, shadows, mirrors, haze, and what the sensor makes of it; compiled."""
 # numba infers the types of the arguments; `no_type_check` keeps the tests' shape checks out of compiled code.
-# ruff: noqa: ANN001, ANN201, ANN202, C901, D103, PLR0911, PLR0915, PLR1714
+# ruff: noqa: ANN001, ANN201, ANN202, C901, PLR0915, PLR1714
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
 
 from __future__ import annotations
 
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numba
 import numpy as np
 
-__all__ = [
-    "developed",
-    "extents",
-    "near",
-    "shade",
-    "texture",
-    "textures",
-    "unsuppressed",
-    "upsampled",
-    "value_noise",
-]
+from pipeline.simulate.world.textures import texture, value_noise
 
-_jit = numba.njit(cache=True)
+__all__ = ["Light", "Materials", "Shadows", "Sight", "Surfaces", "developed", "shade"]
+
 _fast = numba.njit(cache=True, fastmath=True)
 
 
-@no_type_check
-@_fast
-def _lattice(ix, iy):
-    """Reproducible number in [0, 1) of an integer lattice point (integer hash after Wang 2007)."""
-    h = (ix * 374761393 + iy * 668265263) & 0xFFFFFFFF
-    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
-    return ((h ^ (h >> 16)) & 0xFFFF) / 65536.0
+class Sight(NamedTuple):
+    """What each pixel sees: triangle H W (-1 = sky), direction H W 3 in the map, where all rays begin [m]."""
+
+    seen: np.ndarray
+    rays: np.ndarray
+    origin: np.ndarray
 
 
-@no_type_check
-@_fast
-def value_noise(x, y):
-    """Smooth noise in [0, 1) with features of size 1."""
-    fx, fy = np.floor(x), np.floor(y)
-    ix, iy = int(fx), int(fy)
-    a, b = x - fx, y - fy
-    a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
-    top = _lattice(ix, iy) * (1 - a) + _lattice(ix + 1, iy) * a
-    low = _lattice(ix, iy + 1) * (1 - a) + _lattice(ix + 1, iy + 1) * a
-    return top * (1 - b) + low * b
+class Surfaces(NamedTuple):
+    """T triangles: corners T 3 3 [m], unit normals T 3, material T, tint T 3, surface coordinates T 3 2 [m]."""
+
+    corners: np.ndarray
+    normals: np.ndarray
+    material: np.ndarray
+    tint: np.ndarray
+    uv: np.ndarray
 
 
-@no_type_check
-@_jit
-def texture(kind, u, v):
-    """(gain of the albedo, share of glass) of a texture at surface coordinates u, v [m]."""
-    if kind == 1:  # asphalt: aggregate, wear, stains
-        wear = value_noise(u * 0.13 + 7.0, v * 0.9)
-        return 0.72 + 0.22 * wear + 0.22 * value_noise(u * 0.6, v * 0.6) + 0.16 * value_noise(
-            u * 9.0, v * 9.0
-        ), 0.0
-    if kind == 2:  # grass
-        return 0.55 + 0.5 * value_noise(u * 0.5, v * 0.5) + 0.5 * value_noise(u * 5.0, v * 5.0), 0.0
-    if kind == 3:  # foliage: dark gaps between leaves
-        n = 0.6 * value_noise(u * 3.0, v * 3.0) + 0.4 * value_noise(u * 9.0, v * 9.0)
-        return 0.25 + 1.5 * n, 0.0
-    if kind == 4:  # facade: bays of 2.7 m, storeys of 3 m
-        bay, storey = u / 2.7 - np.floor(u / 2.7), v / 3.0 - np.floor(v / 3.0)
-        if 0.27 < bay < 0.73 and 0.30 < storey < 0.80:
-            frame = bay < 0.31 or bay > 0.69 or storey < 0.33 or storey > 0.77 or 0.49 < bay < 0.51
-            return (1.5, 0.0) if frame else (0.16, 0.55)
-        ledge = 0.82 if storey > 0.96 else 1.0
-        return ledge * (
-            0.86 + 0.2 * value_noise(u * 0.7, v * 0.7) + 0.08 * value_noise(u * 8.0, v * 8.0)
-        ), 0.0
-    if kind == 5:  # paving stones of 40 cm
-        a, b = u / 0.4 - np.floor(u / 0.4), v / 0.4 - np.floor(v / 0.4)
-        stone = 0.86 + 0.24 * _lattice(int(np.floor(u / 0.4)), int(np.floor(v / 0.4)))
-        return (0.65 if a < 0.05 or b < 0.05 else stone), 0.0
-    if kind == 6:  # boards of 16 cm
-        a = u / 0.16 - np.floor(u / 0.16)
-        return (0.45 if a < 0.12 else 0.8 + 0.3 * _lattice(int(np.floor(u / 0.16)), 3)), 0.0
-    if kind == 7:
-        return 0.85 + 0.2 * value_noise(u * 1.3, v * 1.3) + 0.1 * value_noise(u * 7.0, v * 7.0), 0.0
-    if kind == 8:  # road paint: worn, tyre marks
-        return 0.62 + 0.45 * value_noise(u * 1.1, v * 2.3) - 0.25 * (
-            value_noise(u * 6.0, v * 6.0) > 0.78
-        ), 0.0
-    return 1.0, 0.0
+class Materials(NamedTuple):
+    """Columns of the table of materials that the eye sees."""
+
+    albedo: np.ndarray
+    texture: np.ndarray
+    glass: np.ndarray
+    glow: np.ndarray
+    label: np.ndarray
 
 
-@no_type_check
-@_jit
-def textures(kinds, uv):
-    """`texture` of many surface points."""
-    gain, glass = np.empty(len(kinds)), np.empty(len(kinds))
-    for i in range(len(kinds)):
-        gain[i], glass[i] = texture(kinds[i], uv[i, 0], uv[i, 1])
-    return gain, glass
+class Light(NamedTuple):
+    """Direction to the sun in the map; irradiance of a surface that faces it, of the sky; brightness of the sky."""
+
+    sun: np.ndarray
+    sun_light: float
+    sky_light: float
+    sky_gain: float
 
 
-@no_type_check
-@_jit
-def near(origins, directions, delay, centre, velocity, radius, limit):
-    """Rays that pass within `radius` of a moving point, before what they have hit already."""
-    out = np.empty(len(directions), np.int64)
-    n = 0
-    for i in range(len(directions)):
-        x = centre[0] + velocity[0] * delay[i] - origins[i, 0]
-        y = centre[1] + velocity[1] * delay[i] - origins[i, 1]
-        z = centre[2] + velocity[2] * delay[i] - origins[i, 2]
-        along = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
-        if (
-            along > -radius
-            and x * x + y * y + z * z - along * along < radius * radius
-            and along - radius < limit[i]
-        ):
-            out[n] = i
-            n += 1
-    return out[:n]
+class Shadows(NamedTuple):
+    """Sunlight on the ground by arc length and offset (0 = shadow), and the patches under road users, B 8.
 
+    A patch: x, y [m], cosine and sine of its heading, half length, half width, height of the ground [m], unused.
+    """
 
-@no_type_check
-@_jit
-def upsampled(coarse, surface, height, width):
-    """Triangles at full size, and flat indices of pixels where the half-size neighbourhood is not of one surface."""
-    h, w = coarse.shape
-    out = np.empty((height, width), np.int32)
-    unsure = np.empty(height * width, np.int64)
-    n = 0
-    for v in range(height):
-        i = min(v // 2, h - 1)
-        i2 = min(max(i + (1 if v % 2 else -1), 0), h - 1)
-        for u in range(width):
-            j = min(u // 2, w - 1)
-            j2 = min(max(j + (1 if u % 2 else -1), 0), w - 1)
-            out[v, u] = coarse[i, j]
-            a = surface[coarse[i, j]]
-            if a != surface[coarse[i2, j]] or a != surface[coarse[i, j2]] or a != surface[coarse[i2, j2]]:
-                unsure[n] = v * width + u
-                n += 1
-    return out, unsure[:n]
+    sunlit: np.ndarray
+    s0_m: float
+    d0_m: float
+    cell_m: float
+    patches: np.ndarray
 
 
 @no_type_check
@@ -165,31 +89,14 @@ def _sky(x, y, z, sx, sy, sz):
 
 @no_type_check
 @_fast
-def shade(
-    seen,
-    rays,
-    origin,
-    corners,
-    normals,
-    material,
-    tint,
-    uv,
-    albedo,
-    kind,
-    glass,
-    glow,
-    label,
-    sun,
-    sun_light,
-    sky_light,
-    sky_gain,
-    light,
-    s0,
-    d0,
-    cell,
-    blobs,
-):
-    """Linear RGB of each pixel."""
+def shade(sight, surfaces, materials, light, shadows):
+    """Linear RGB of each pixel, float32, H W 3."""
+    # One long body, for some thirty scalars of a pixel pass from each of its steps to the next.
+    seen, rays, origin = sight
+    corners, normals, material, tint, uv = surfaces
+    albedo, kind, glass, glow, label = materials
+    sun, sun_light, sky_light, sky_gain = light
+    sunlit, s0, d0, cell, blobs = shadows
     height, width = seen.shape
     out = np.empty((height, width, 3), np.float32)
     for i in range(height):
@@ -233,10 +140,10 @@ def shade(
             lab = label[m]
             if lab == 0 or lab == 1 or lab == 9:
                 a, b2 = int((su - s0) / cell), int((sv - d0) / cell)
-                if 0 <= a < light.shape[0] - 1 and 0 <= b2 < light.shape[1] - 1:
+                if 0 <= a < sunlit.shape[0] - 1 and 0 <= b2 < sunlit.shape[1] - 1:
                     fa, fb = (su - s0) / cell - a, (sv - d0) / cell - b2
-                    shade = (light[a, b2] * (1 - fa) + light[a + 1, b2] * fa) * (1 - fb) + (
-                        light[a, b2 + 1] * (1 - fa) + light[a + 1, b2 + 1] * fa
+                    shade = (sunlit[a, b2] * (1 - fa) + sunlit[a + 1, b2] * fa) * (1 - fb) + (
+                        sunlit[a, b2 + 1] * (1 - fa) + sunlit[a + 1, b2 + 1] * fa
                     ) * fb
                 hx, hy, hz = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
                 for q in range(len(blobs)):
@@ -286,6 +193,7 @@ def shade(
 @no_type_check
 @_fast
 def developed(linear, exposure, grain, noise, curve):
+    """8-bit BGR of a linear RGB image: vignetting, gamma by a table of 4097 values, noise."""
     h, w, _ = linear.shape
     out = np.empty((h, w, 3), np.uint8)
     for i in range(h):
@@ -299,33 +207,3 @@ def developed(linear, exposure, grain, noise, curve):
                 value += grain[i, j, c] * noise * (1.35 - value / 255.0)
                 out[i, j, 2 - c] = min(max(value, 0.0), 255.0)
     return out
-
-
-@no_type_check
-@_jit
-def extents(coarse, group, groups):
-    """(x0, y0, x1, y1, pixels) of each group of triangles."""
-    out = np.empty((groups, 5), np.int64)
-    out[:, :2], out[:, 2:] = 1 << 30, -1
-    out[:, 4] = 0
-    h, w = coarse.shape
-    for i in range(h):
-        for j in range(w):
-            k = coarse[i, j]
-            if k >= 0 and group[k] >= 0:
-                o = out[group[k]]
-                o[0], o[1], o[2], o[3] = min(o[0], j), min(o[1], i), max(o[2], j), max(o[3], i)
-                o[4] += 1
-    return out
-
-
-@no_type_check
-@_jit
-def unsuppressed(x):
-    keep = np.ones(len(x), np.bool_)
-    for i in range(len(x)):
-        if keep[i]:
-            for j in range(i + 1, len(x)):
-                if np.all(np.abs(x[i] - x[j]) < 1.0):
-                    keep[j] = False
-    return keep
