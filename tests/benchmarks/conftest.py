@@ -3,6 +3,9 @@
     make bench           compares with baseline.json
     make bench-accept    writes what was measured into it: the only way that its values change
 
+What is measured goes to results/speed.json as well (times and sizes too, which no baseline holds): the lines that
+documents quote; `make bench-accept` alone writes it.
+
 A ratio's `noise` says what the same code scatters by on a shared machine; worse than the baseline by more is a
 regression. `goal` is what it ought to be, and only printed: an unmet goal is not hidden, and does not turn red.
 """
@@ -15,6 +18,8 @@ from pathlib import Path
 import pytest
 
 BASELINE = Path(__file__).parent / "baseline.json"
+SPEED = Path(__file__).parent / "results" / "speed.json"
+_PLAIN = pytest.StashKey[dict[str, dict[str, object]]]()
 _MEASURED = pytest.StashKey[dict[str, float]]()
 
 
@@ -26,6 +31,7 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     config.stash[_MEASURED] = {}
+    config.stash[_PLAIN] = {}
 
 
 @pytest.fixture
@@ -46,11 +52,23 @@ def gate(request):
     return compare
 
 
+@pytest.fixture
+def record(request):
+    """Keep a measured time, size or ratio for results/speed.json; nothing is compared."""
+
+    def keep(name, value, what, goal=None):
+        request.config.stash[_PLAIN][name] = {"value": float(f"{value:.3g}"), "what": what, "goal": goal}
+
+    return keep
+
+
 def pytest_terminal_summary(terminalreporter, config):
-    measured = config.stash[_MEASURED]
+    measured, plain = config.stash[_MEASURED], config.stash[_PLAIN]
+    content = json.loads(BASELINE.read_text())
+    if config.getoption("--accept-baseline"):
+        _write_speed(content["machine"], content["metrics"], measured, plain)
     if not measured:
         return
-    content = json.loads(BASELINE.read_text())
     terminalreporter.section("measured against the baseline")
     for line in _table(content, measured):
         terminalreporter.write_line(line)
@@ -60,6 +78,22 @@ def pytest_terminal_summary(terminalreporter, config):
         content |= {"date": time.strftime("%Y-%m-%d"), "commit": _commit()}
         BASELINE.write_text(json.dumps(content, indent=1) + "\n")
         terminalreporter.write_line(f"accepted into {BASELINE}")
+
+
+def _write_speed(machine, metrics, measured, plain):
+    """Lines of this run over those of earlier ones: one file of benchmarks may be run alone."""
+    lines = json.loads(SPEED.read_text())["lines"] if SPEED.exists() else {}
+    about = {"commit": _commit(), "date": time.strftime("%Y-%m-%d")}
+    gated = {
+        name: {
+            "value": float(f"{value:.3g}"),
+            "what": metrics[name]["what"],
+            "goal": metrics[name].get("goal"),
+        }
+        for name, value in measured.items()
+    }
+    lines |= {name: line | about for name, line in (gated | plain).items()}
+    SPEED.write_text(json.dumps({"machine": machine, "lines": lines}, indent=1) + "\n")
 
 
 def _worse_by(known, value):

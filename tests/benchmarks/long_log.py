@@ -14,6 +14,8 @@ import sys
 import time
 from pathlib import Path
 
+from tests.benchmarks.studies.commits import commit_now
+
 RATE_HZ = 2.0
 GOAL_MB = 1500
 _STAGE = """
@@ -51,6 +53,7 @@ def main() -> None:
         subprocess.run([sys.executable, "-m", "jobs.cli", *command], check=True)
     result = {
         "date": time.strftime("%Y-%m-%d"),
+        "commit": commit_now(),
         "minutes": args.minutes,
         "frames": frames,
         "goal_mb": GOAL_MB,

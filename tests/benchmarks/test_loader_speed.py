@@ -63,7 +63,7 @@ def cpu_s_per_frame(batches, count):
     return (time.process_time() - began) / frames
 
 
-def test_the_loader_is_many_times_faster_than_decoding_each_sample(lake):
+def test_the_loader_is_many_times_faster_than_decoding_each_sample(lake, record):
     fleet = usual_fleet()
     next(decode_per_sample(lake, fleet))  # compiles
     ratios = []
@@ -74,4 +74,7 @@ def test_the_loader_is_many_times_faster_than_decoding_each_sample(lake):
         slow = cpu_s_per_frame(decode_per_sample(lake, fleet), 8)
         ratios.append(slow / fast)
         print(f"loader {fast * 1e3:.2f} ms, decoding {slow * 1e3:.1f} ms a frame: {slow / fast:.0f} x")
+    record(
+        "loader_vs_decoding", np.median(ratios), "CPU time of a decode-per-sample loop / of the loader", GOAL
+    )
     assert np.median(ratios) >= GOAL

@@ -2,7 +2,7 @@
 
 A number on test seeds is honest once: whoever sees it may change the code because of it. So a table is a first look
 only where the code that made it is the code that looked at its seeds first; all that comes later is a second look, and
-says so. Tuning seeds (below 200) are for looking.
+says so. Tuning seeds are for looking.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from tests.benchmarks.studies.commits import is_same_code
 __all__ = ["RECORD", "Look", "heading", "look", "read_looks"]
 
 RECORD = Path(__file__).parents[1] / "results" / "seeds.toml"
-_REAL, _FIRST_TEST_SEED = 0, 200
+_REAL = 0
+# Below 200: the days of days.py for tuning. From 1000: the fleet that networks learn from (ssl_fleet.py).
+_TUNING = frozenset([*range(1, 200), *range(1000, 1100)])
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ def look(study: str, results: Sequence[dict[str, Any]], record: Path = RECORD) -
     known = read_looks(record)
     for commit in dict.fromkeys(r["commit"] for r in results):
         seen = [e.seeds for e in known if e.commit == commit and e.study == study]
-        new = {s for s in _seeds(results, commit) if s >= _FIRST_TEST_SEED}.difference(*seen)
+        new = set(_seeds(results, commit)).difference(_TUNING, {_REAL}, *seen)
         if new:
             with record.open("a") as file:
                 file.write(
@@ -72,7 +74,7 @@ def heading(results: Sequence[dict[str, Any]], record: Path = RECORD) -> str:
 def _freshness(seed: int, commit: str, known: Sequence[Look]) -> str:
     if seed == _REAL:
         return "Seen throughout (the real day)"
-    if seed < _FIRST_TEST_SEED:
+    if seed in _TUNING:
         return "Tuning seeds"
     if "+" in commit:
         return "Made by uncommitted code (not to be stated)"

@@ -118,7 +118,7 @@ def main() -> None:
     ]
     results = run_tasks(tasks, args.out, args.workers)
     if results:
-        text = f"{heading(results, tasks)}\n\n{summary(results)}\n"
+        text = f"{heading(results, tasks, args.out.stem)}\n\n{summary(results)}\n"
         args.out.with_suffix(".md").write_text(text)
         print(text)
 

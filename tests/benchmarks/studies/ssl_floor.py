@@ -9,6 +9,8 @@ can be on average. No method that believes the prior's translation is better tha
 from __future__ import annotations
 
 import argparse
+import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,9 @@ from scipy.optimize import minimize
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.geometry.targets import errors_at_targets
 from schemas.calibrations import PAIRS
+from tests.benchmarks.studies.commits import commit_now
+from tests.benchmarks.studies.engine import RESULTS
+from tests.benchmarks.studies.looks import look
 from tests.benchmarks.studies.ssl_days import open_day, table1_days
 from tests.benchmarks.studies.ssl_measures import STARTS
 
@@ -35,21 +40,26 @@ def best_turn_errors(pair: str, T_prior: np.ndarray, T_true: np.ndarray) -> tupl
 
 
 def main() -> None:
-    """Print the means over the days."""
+    """Print the means over the days, and write them."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--root", type=Path, required=True, help="folder of ssl_fleet.py: table1")
+    parser.add_argument("--out", type=Path, default=RESULTS / "ssl_floor.json")
     args = parser.parse_args()
     rows: dict[str, list[tuple[float, float, float]]] = {pair: [] for pair in PAIRS}
-    for where in table1_days(args.root):
+    places, now = table1_days(args.root), commit_now()
+    for where in places:
         day = open_day(where)
         prior = day.prior(*STARTS["prior"], seed=where.seed)
         for pair in PAIRS:
             rows[pair].append(best_turn_errors(pair, prior.of(pair), day.true_of(pair)))
-    for pair, found in rows.items():
-        azimuth, elevation, range_m = np.mean(found, axis=0)
-        print(f"{pair}: {np.degrees(azimuth):.3f} / {np.degrees(elevation):.3f} deg / {range_m:.3f} m")
+    means = {pair: np.mean(found, axis=0) * [*np.degrees([1, 1]), 1] for pair, found in rows.items()}
+    seeds = look(args.out.stem, [{"day": {"seed": where.seed}, "commit": now} for where in places])
+    result = {"date": time.strftime("%Y-%m-%d"), "commit": now, "seeds": seeds, "az_el_deg_range_m": {}}
+    result["az_el_deg_range_m"] = {pair: [round(float(v), 4) for v in mean] for pair, mean in means.items()}
+    args.out.write_text(json.dumps(result, indent=1) + "\n")
+    print(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from typing import Any
 
 from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.engine import _quiet, read_results
+from tests.benchmarks.studies.looks import look
 from tests.benchmarks.studies.ssl_days import ModelSet, Where, fleet_days, open_day, table1_days
 from tests.benchmarks.studies.ssl_measures import ITERATIONS, STARTS, measure_day, measure_frames
 from tests.benchmarks.studies.ssl_tables import abrupt_table, frames_table, rows_of, sigma_table
@@ -97,12 +98,13 @@ def run_tasks(tasks: Sequence[Task], out: Path, workers: int = 1) -> list[dict[s
     return [r for r in read_results(out) if r["key"] in wanted]
 
 
-def heading(results: Sequence[dict[str, Any]], tasks: Sequence[Task]) -> str:
-    """What was measured, at which commits, of which files."""
+def heading(results: Sequence[dict[str, Any]], tasks: Sequence[Task], study: str) -> str:
+    """Whether the days were seen before, what was measured, at which commits, of which files."""
     commits, dates = (", ".join(sorted({r[k] for r in results})) for k in ("commit", "date"))
     models = ", ".join(dict.fromkeys(f"{t.models.row} = {t.models.key}" for t in tasks))
     asked = f"{len(results)} of {len(tasks)}" if tasks else f"{len(results)}"
-    return f"{asked} measurements; commit {commits}; {dates}; {models}".removesuffix("; ")
+    measured = f"{asked} measurements; commit {commits}; {dates}; {models}".removesuffix("; ")
+    return f"{look(study, results)}\n\n{measured}"
 
 
 def summary(results: list[dict[str, Any]], others: list[dict[str, Any]]) -> str:
@@ -145,7 +147,7 @@ def main() -> None:
     if not results:
         return
     others = [] if args.tuning else read_results(_RESULTS / "table1.jsonl")
-    text = f"{heading(results, tasks)}\n\n{summary(results, others)}\n"
+    text = f"{heading(results, tasks, args.out.stem)}\n\n{summary(results, others)}\n"
     args.out.with_suffix(".md").write_text(text)
     print(text)
 
