@@ -1,4 +1,4 @@
-"""Lidar semantics by range images: projection, votes of neighbours, models and their faults, and whole days."""
+"""Lidar semantics by range-image models: their labels, their faults, and whole days."""
 
 from dataclasses import replace
 
@@ -9,8 +9,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from pipeline.config import FleetConfig, config_hash, load_fleet
 from pipeline.errors import ConfigError, ModelError
-from pipeline.geometry.range_image import EMPTY, channels_of, project, vote_of_neighbours
-from pipeline.perceive.ground import PointKind, find_ground, height_over
+from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
 from pipeline.perceive.stage import perceive_day
 from pipeline.store.partitions import Lake, Partition
@@ -19,25 +18,11 @@ from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.onnx_models import write_manifest
+from tests.makers.range_scenes import DOWN, SIZE, UP, points_of
 
 DAY = Partition("car-1", "2026-03-02")
-SIZE, UP, DOWN = (32, 360), 10.0, -22.0  # 1 deg x 1 deg
-KNN = {"neighbours": 5, "search": 5, "sigma_px": 1.0, "cutoff_m": 1.0}
 LABELS = list(POINT_LABEL_SETS["semantickitti"])
-CAR, ROAD, SIDEWALK, BUILDING = (LABELS.index(name) for name in ("car", "road", "sidewalk", "building"))
-
-
-def points_of(rows, columns, range_m):
-    """Points through the centres of pixels."""
-    elevation = np.radians(UP - (np.asarray(rows) + 0.5))
-    azimuth = np.radians(180 - (np.asarray(columns) + 0.5))
-    rays = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    return (np.stack(rays, -1) * np.asarray(range_m)[..., None]).reshape(-1, 3).astype(np.float32)
-
-
-def full_image(range_m=10.0):
-    rows, columns = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
-    return points_of(rows, columns, np.broadcast_to(range_m, SIZE))
+ROAD, SIDEWALK, BUILDING = (LABELS.index(name) for name in ("road", "sidewalk", "building"))
 
 
 def save_linear(path, rules, *, size=SIZE, window=1, classes=20, channels=5):
@@ -82,137 +67,6 @@ def manifest(folder, rules=STREET, *, given=None, name="seg", **graph):
     } | (given or {})  # fmt: skip
     output = {"layout": "logits", "label_set": "semantickitti"}
     return write_manifest(folder / f"{name}.toml", folder / f"{name}.onnx", "segment_points", spec, output)
-
-
-# projection
-
-
-def test_points_through_pixel_centres_fall_into_their_pixels():
-    points = full_image()
-    image = project(points, SIZE, UP, DOWN)
-    rows, columns = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
-    assert image.inside.all()
-    assert np.array_equal(image.row, rows.ravel())
-    assert np.array_equal(image.column, columns.ravel())
-    assert np.array_equal(image.point.ravel(), np.arange(len(points)))
-    assert image.range_m == pytest.approx(10.0)
-
-
-def test_left_of_the_vehicle_is_left_in_the_image_and_above_is_above():
-    points = np.array([[9, 0.1, 0], [0.1, 9, 0], [0.1, -9, 0], [9, 0.1, 1]], np.float32)
-    image = project(points, SIZE, UP, DOWN)
-    ahead, left, right, high = zip(image.row, image.column, strict=True)
-    assert left[1] < ahead[1] < right[1]
-    assert ahead[1] == SIZE[1] // 2 - 1
-    assert high[0] < ahead[0]
-
-
-def test_of_points_in_one_pixel_the_nearest_is_drawn_whatever_their_order():
-    ranges = np.array([30.0, 5.0, 12.0])
-    for order in ([0, 1, 2], [2, 1, 0], [1, 0, 2]):
-        image = project(points_of([9] * 3, [44] * 3, ranges[order]), SIZE, UP, DOWN)
-        assert image.range_m[9, 44] == pytest.approx(5.0)
-        assert order[image.point[9, 44]] == 1
-        assert np.sum(image.point != EMPTY) == 1
-
-
-def test_channels_are_the_drawn_points_and_minus_one_elsewhere():
-    points = points_of([3, 3, 20], [7, 7, 300], [8.0, 40.0, 15.0])
-    remission = np.array([0.1, 0.2, 0.3], np.float32)
-    channels = channels_of(project(points, SIZE, UP, DOWN), points, remission)
-    assert channels[:, 3, 7] == pytest.approx([8.0, *points[0], 0.1], abs=1e-5)
-    assert channels[:, 20, 300] == pytest.approx([15.0, *points[2], 0.3], abs=1e-5)
-    assert np.sum(channels != -1) == 10
-
-
-def test_points_beyond_the_field_of_view_are_neither_drawn_nor_labelled():
-    points = points_of([-0.8, -5, 32.3, 10], [7, 8, 9, 10], [8.0] * 4)
-    image = project(points, SIZE, UP, DOWN)
-    assert image.inside.tolist() == [True, False, False, True]
-    assert np.sum(image.point != EMPTY) == 2
-    labels = vote_of_neighbours(image, np.full(SIZE, ROAD), 20, **KNN)
-    assert labels.tolist() == [ROAD, 0, 0, ROAD]
-
-
-# votes
-
-
-def brute_vote(image, labels, n):
-    """One point's label, pixel by pixel: the definition."""
-    offsets = [(i, j) for i in range(-2, 3) for j in range(-2, 3)]
-    gauss = {o: np.exp(-(o[0] ** 2 + o[1] ** 2) / 2) for o in offsets}
-    total = sum(gauss.values())
-    found = []
-    for i, j in offsets:
-        row, column = image.row[n] + i, (image.column[n] + j) % SIZE[1]
-        if 0 <= row < SIZE[0] and image.point[row, column] != EMPTY:
-            difference = abs(image.range_m[row, column] - image.point_range_m[n])
-            distance = 0.0 if (i, j) == (0, 0) else difference * (1 - gauss[i, j] / total)
-            found.append((distance, labels[row, column]))
-    votes = np.zeros(20)
-    for distance, label in sorted(found, key=lambda f: f[0])[:5]:
-        votes[label] += distance <= 1.0
-    votes[0] = 0
-    return int(np.argmax(votes))
-
-
-def test_votes_are_those_of_the_definition():
-    rng = np.random.default_rng(3)
-    count = 9000
-    rows, columns = rng.integers(0, SIZE[0], count), rng.integers(0, SIZE[1], count)
-    points = points_of(rows, columns, rng.uniform(4, 9, count))
-    image = project(points, SIZE, UP, DOWN)
-    labels = rng.integers(0, 5, SIZE)
-    found = vote_of_neighbours(image, labels, 20, **KNN)
-    some = rng.choice(count, 800, replace=False)
-    assert found[some].tolist() == [brute_vote(image, labels, n) for n in some]
-
-
-def test_an_image_of_one_label_gives_every_point_that_label():
-    rng = np.random.default_rng(4)
-    points = points_of(rng.uniform(0, 31, 3000), rng.uniform(0, 359, 3000), rng.uniform(3, 60, 3000))
-    found = vote_of_neighbours(project(points, SIZE, UP, DOWN), np.full(SIZE, 7), 20, **KNN)
-    assert set(found) == {7}
-
-
-def test_a_wall_behind_a_pole_does_not_take_the_poles_label():
-    wall = full_image(20.0)
-    pole = points_of(np.arange(32), np.full(32, 100), np.full(32, 8.0))
-    points = np.concatenate([wall, pole])
-    image = project(points, SIZE, UP, DOWN)
-    labels = np.where(image.range_m < 10, 18, BUILDING)
-    assert np.all(labels[:, 100] == 18)  # the pixels show nothing of the wall there
-    found = vote_of_neighbours(image, labels, 20, **KNN)
-    assert np.all(found[: len(wall)] == BUILDING)
-    assert np.all(found[len(wall) :][2:-2] == 18)
-
-
-def test_a_pixel_beyond_the_cutoff_has_no_vote():
-    alone = points_of([10], [50], [9.0])
-    crowd = points_of([9, 10, 10, 11], [50, 49, 51, 50], [10.5] * 4)
-    labels = np.full(SIZE, ROAD)
-    labels[10, 50] = CAR
-    image = project(np.concatenate([alone, crowd]), SIZE, UP, DOWN)
-    assert vote_of_neighbours(image, labels, 20, **KNN)[0] == CAR
-    assert vote_of_neighbours(image, labels, 20, **KNN | {"cutoff_m": 2.0})[0] == ROAD
-
-
-def test_unlabelled_wins_only_where_nothing_else_votes():
-    image = project(points_of([10, 10, 25], [50, 51, 50], [9.0, 9.1, 9.0]), SIZE, UP, DOWN)
-    labels = np.zeros(SIZE, np.int64)
-    labels[10, 51] = ROAD
-    assert vote_of_neighbours(image, labels, 20, **KNN).tolist() == [ROAD, ROAD, 0]
-
-
-def test_turning_the_lidar_by_whole_columns_changes_no_label():
-    rng = np.random.default_rng(5)
-    rows, columns = rng.integers(0, SIZE[0], 6000), rng.integers(0, SIZE[1], 6000)
-    range_m, labels = rng.uniform(4, 9, 6000), rng.integers(1, 6, SIZE)
-    found = vote_of_neighbours(project(points_of(rows, columns, range_m), SIZE, UP, DOWN), labels, 20, **KNN)
-    turned = project(points_of(rows, (columns + 77) % SIZE[1], range_m), SIZE, UP, DOWN)
-    again = vote_of_neighbours(turned, np.roll(labels, 77, axis=1), 20, **KNN)
-    # Votes tie in range to the last float32 bit now and then, nowhere else.
-    assert np.mean(found == again) > 0.999
 
 
 # models
@@ -306,92 +160,6 @@ def test_models_of_another_shape_than_their_manifest_are_refused(tmp_path):
     broken = RangeImageSegmenter(manifest(tmp_path, {ROAD: (NONE, NONE, np.nan)}))
     with pytest.raises(ModelError, match="not finite"):
         broken.kinds(points_of([10], [50], [9.0]), None)
-
-
-# ground
-
-
-def street(rng, count=30000):
-    """A road of |y| < 4 m, sidewalks level with it to 8 m, and a low flat-bed trailer's side on the road."""
-    x, y = rng.uniform(-30, 30, count), rng.uniform(-8, 8, count)
-    # Smooth: RANSAC takes the lowest point of each cell, and so lies some sigmas of roughness low.
-    road = np.column_stack([x, y, rng.normal(-1.7, 0.003, count)])
-    trailer = rng.uniform([12.0, -1.0, -1.68], [12.4, 1.0, -1.45], (600, 3))
-    points = np.concatenate([road, trailer]).astype(np.float32)
-    kind = np.where(np.abs(points[:, 1]) < 4, PointKind.ROAD, PointKind.FLAT).astype(np.uint8)
-    kind[count:] = PointKind.ROAD_USER
-    return points, kind
-
-
-def test_the_drivable_area_ends_where_the_models_road_does():
-    rng = np.random.default_rng(7)
-    points, kind = street(rng)
-    plain, told = (find_ground(points, 0.15, np.random.default_rng(0), k) for k in (None, kind))
-    assert np.abs(plain.drivable_xyz_m[:, 1]).max() > 7  # geometry cannot tell a level sidewalk
-    assert np.abs(told.drivable_xyz_m[:, 1]).max() <= 4
-    seen = np.hypot(points[:, 0], points[:, 1]) > 2.6
-    assert np.mean(told.is_ground[(kind == PointKind.FLAT) & seen]) > 0.99
-    assert not (told.is_road & ~(told.is_ground & (kind == PointKind.ROAD))).any()
-    assert np.mean(told.is_road[(kind == PointKind.ROAD) & seen]) > 0.99
-    assert told.plane[3] == pytest.approx(1.7, abs=0.01)
-
-
-def test_road_users_are_no_ground_and_block_however_low_they_are():
-    rng = np.random.default_rng(8)
-    points, kind = street(rng)
-    plain, told = (find_ground(points, 0.15, np.random.default_rng(0), k) for k in (None, kind))
-    user = kind == PointKind.ROAD_USER
-    assert np.mean(plain.is_ground[user]) > 0.5
-    assert not told.is_ground[user].any()
-    behind = lambda found: np.sum((found[:, 0] > 14) & (np.abs(found[:, 1]) < 1))  # noqa: E731
-    assert behind(plain.drivable_xyz_m) > 20
-    assert behind(told.drivable_xyz_m) == 0
-
-
-def test_ransac_drops_what_the_model_took_for_road():
-    rng = np.random.default_rng(9)
-    points, kind = street(rng)
-    wall = rng.uniform([5, 3.0, -1.0], [25, 3.4, 1.0], (4000, 3)).astype(np.float32)
-    points = np.concatenate([points, wall])
-    kind = np.append(kind, np.full(4000, PointKind.ROAD, np.uint8))
-    found = find_ground(points, 0.15, np.random.default_rng(0), kind)
-    assert found.plane[3] == pytest.approx(1.7, abs=0.02)
-    assert found.plane[2] > np.cos(np.radians(0.5))
-    assert not (found.is_ground | found.is_road)[-4000:].any()
-
-
-def test_geometry_decides_on_points_that_the_model_does_not_know():
-    rng = np.random.default_rng(10)
-    points, kind = street(rng)
-    far = np.abs(points[:, 1]) > 6
-    kind[far] = PointKind.UNKNOWN
-    found = find_ground(points, 0.15, np.random.default_rng(0), kind)
-    assert np.mean(found.is_ground[far]) > 0.95
-    assert not found.is_road[far].any()
-    assert np.abs(height_over(found.plane, points[far])).max() < 0.2
-
-
-def test_the_surface_does_not_climb_what_the_model_knows_for_an_object():
-    points, kind = street(np.random.default_rng(12))
-    hedge = (points[:, 0] > 10) & (points[:, 0] < 20)  # rises like a hill, across the whole street
-    points[hedge, 2] += 0.05 * (points[hedge, 0] - 10)
-    kind[hedge] = PointKind.OTHER
-    beyond = (points[:, 0] > 20) & (points[:, 0] < 26) & (np.abs(points[:, 1]) < 4)
-    plain, told = (find_ground(points, 0.15, np.random.default_rng(0), k) for k in (None, kind))
-    assert np.mean(plain.is_ground[hedge]) > 0.5
-    assert not told.is_ground[hedge].any()
-    assert np.mean(plain.is_ground[beyond]) < 0.5
-    assert np.mean(told.is_ground[beyond]) > 0.99
-
-
-def test_too_little_road_gives_no_plane_and_no_drivable_area_but_keeps_the_models_ground():
-    points, kind = street(np.random.default_rng(11))
-    kind[kind == PointKind.ROAD] = PointKind.OTHER
-    found = find_ground(points, 0.15, np.random.default_rng(0), kind)
-    assert found.plane is None
-    assert len(found.drivable_xyz_m) == 0
-    seen = np.hypot(points[:, 0], points[:, 1]) > 2.6
-    assert np.array_equal(found.is_ground[seen], kind[seen] == PointKind.FLAT)
 
 
 # days
