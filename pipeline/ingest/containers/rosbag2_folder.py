@@ -58,7 +58,7 @@ class FolderLog:
 
 
 class CompressedLog:
-    """LogReader of a file that rosbag2 compressed as a whole (.zstd), unpacked into a temporary file while it is open."""
+    """LogReader of a file that rosbag2 compressed as a whole (.zstd); a temporary file holds its content while open."""
 
     def __init__(self, path: Path, cache: ChunkCache) -> None:
         self.path = path
