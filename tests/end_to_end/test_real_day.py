@@ -1,0 +1,57 @@
+"""The real vehicle-day from its logs to records: `joint` finds the given calibration again, to the README's bounds."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.stage import calibrate_observations
+from pipeline.config import load_fleet
+from pipeline.extrinsics.prior import perturbed, read_prior
+from pipeline.geometry.targets import errors_at_targets
+from pipeline.store.partitions import Lake, Partition
+from tests.benchmarks.studies.metrics import transform_of
+from tests.makers.simulated_days import perceived
+
+pytestmark = [pytest.mark.real_logs, pytest.mark.slow]
+FLEET = Path(__file__).parent / "astyx.toml"
+DAY = Partition("astyx-1", "2019-01-14")
+START = (2.0, 0.1)  # deg and m that both transforms are off by
+SEED = 0
+
+
+@pytest.fixture(scope="module")
+def errors(real_logs, tmp_path_factory) -> dict[str, tuple[float, float, float]]:
+    """Azimuth, elevation [deg] and range [m] between `joint` and the given calibration, pair by pair.
+
+    Everything is ingested and perceived; every second frame is calibrated, which is half of the time.
+    """
+    folder = tmp_path_factory.mktemp("real")
+    logs = sorted(real_logs.glob("astyx-1_*"))
+    rows = perceived(FLEET, Lake.at(folder / "lake"), DAY, logs, folder).observations
+    assert len(rows) == 187
+    fleet = load_fleet(FLEET)
+    given = read_prior(rows, fleet, DAY.vehicle)
+    records = calibrate_observations(
+        rows[::2], perturbed(given, START, SEED), fleet, Inputs(DAY, "joint", "test", SEED, ())
+    )
+    found = {}
+    for record in records:
+        T = transform_of(record)
+        assert T is not None, record.reason
+        azimuth, elevation, range_m = errors_at_targets(record.pair, T, given.of(record.pair))
+        found[record.pair] = (float(np.degrees(azimuth)), float(np.degrees(elevation)), float(range_m))
+    return found
+
+
+def test_camera_lidar_comes_back_to_the_given_calibration(errors):
+    azimuth_deg, elevation_deg, _ = errors["camera_lidar"]
+    assert azimuth_deg <= 0.15
+    assert elevation_deg <= 0.20
+
+
+def test_radar_azimuth_and_range_come_back_to_the_given_calibration(errors):
+    assert errors["lidar_radar"][0] <= 0.35
+    assert errors["camera_radar"][0] <= 0.35
+    assert errors["lidar_radar"][2] <= 0.10

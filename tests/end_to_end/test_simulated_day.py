@@ -1,0 +1,36 @@
+"""From the simulator through logs, ingest and perceive to `joint`: the result is near the truth, not only plausible."""
+
+import pytest
+
+from tests.benchmarks.studies.days import Day, DaySpec
+from tests.benchmarks.studies.engine import Run, calibrate_once
+from tests.makers.simulated_days import simulated_day
+
+SPEC = DaySpec(150, "urban", 32, "demo")
+# Measured on this tuning day: 0.033 / 0.015, 0.036 / 0.103, 0.025 / 0.124 deg, 0.018 m of lidar-radar range. The bounds
+# are three to five times as much: room for other rounding, none for a lost basin or a swapped frame.
+BOUNDS_DEG = {"camera_lidar": (0.12, 0.08), "camera_radar": (0.15, 0.40), "lidar_radar": (0.12, 0.40)}
+RANGE_M = 0.10
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    """The demo's rig, 32 frames, both transforms started exactly 2 deg and 0.1 m off."""
+    folder = tmp_path_factory.mktemp("day")
+    made = simulated_day(folder, frames=SPEC.frames, environment=SPEC.environment, seed=SPEC.seed)
+    day = Day(SPEC, made.observations, made.told, made.fleet, {})
+    return calibrate_once(Run(SPEC, prior=("exact", 2.0, 0.1), seed=SPEC.seed), day)["pairs"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", BOUNDS_DEG)
+def test_a_simulated_day_is_calibrated_to_its_truth(pairs, pair):
+    azimuth_deg, elevation_deg = BOUNDS_DEG[pair]
+    assert pairs[pair]["az_deg"] <= azimuth_deg
+    assert pairs[pair]["el_deg"] <= elevation_deg
+    assert pairs[pair]["prior_az_deg"] > 2 * azimuth_deg or pairs[pair]["prior_el_deg"] > 2 * elevation_deg
+
+
+@pytest.mark.slow
+def test_the_range_between_lidar_and_radar_is_right(pairs):
+    assert pairs["lidar_radar"]["range_m"] <= RANGE_M
