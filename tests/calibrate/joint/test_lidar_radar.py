@@ -62,17 +62,6 @@ def test_wrong_priors_lead_to_the_truth(day, rotation_deg, shift_m):
         assert abs(found.time_offset_s - DT_S) < 3 * found.time_offset_sigma_s
 
 
-def test_errors_have_the_spread_that_the_covariance_says():
-    z = []
-    for seed in range(8):
-        found = solve(street_day(24, seed=100 + seed), prior_off_by(1.5, 0.04, seed), seed=seed)
-        pose = error_of(found)[:5] / np.sqrt(np.diag(found.covariance))[:5]
-        z.append([*pose, (found.time_offset_s - DT_S) / found.time_offset_sigma_s])
-    assert np.all(np.abs(z) < 3.5)
-    # Bias floors stand for what these scenes do not have, so errors may be smaller, never larger.
-    assert np.sqrt(np.mean(np.square(z))) < 1.3
-
-
 def test_the_same_seed_gives_the_same_numbers(day):
     a, b = (solve(day[:12], prior_off_by(2, 0.1), seed=3) for _ in range(2))
     assert np.array_equal(a.T, b.T)
