@@ -29,31 +29,34 @@ def audit(
         method: method of the audited records; default: audit.method.
         report: also write the fleet page, and a page per vehicle-day beside it.
     """
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.audit.stage import audit_fleet
+    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from pipeline.config import load_fleet
+    from pipeline.stages import AUDIT, REPORT
     from pipeline.store.partitions import Lake
+    from pipeline.work import Task, Window
 
     config = load_fleet(fleet)
     tables = Lake.at(lake)
     with progress_reporter("audit") as progress:
-        findings = audit_fleet(tables, config, from_day, to_day, method, progress)
+        task = Task(config, tables, Window(from_day, to_day), method, progress=progress)
+        outcome = AUDIT.run(task)
+    findings = outcome.records
     statuses = [f.status for f in findings]
     counts = {s: statuses.count(s) for s in ("RED", "YELLOW", "GREEN", "UNKNOWN")}
     moved = sorted({(f.vehicle, f.moved_sensor, f.start_day) for f in findings if f.moved_sensor})
     outputs = []
     if report is not None:
-        from pipeline.report.stage import write_fleet_report
+        from pipeline.report.stage import Pages
 
-        outputs = write_fleet_report(tables, config, report, method=method)
+        outputs = REPORT.run(Task(config, tables, Window(), method, given=Pages(report))).outputs
     print_summary(
         "audit",
-        "done" if findings else "refused",
-        reason="" if findings else "no calibration record in the window",
+        outcome.status,
+        reason=outcome.reason,
         vehicles=len({f.vehicle for f in findings}),
         charts=counts,
         moved=[{"vehicle": v, "sensor": s, "since": d} for v, s, d in moved],
         report=report,
         outputs=outputs,
     )
-    return 0 if findings else 3
+    return exit_code([outcome.status])

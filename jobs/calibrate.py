@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipeline.config import FleetConfig
-    from pipeline.store.partitions import Lake, Partition
+    from pipeline.work import Task
 
 __all__ = ["calibrate", "parse_pair", "parse_perturb"]
 
@@ -40,75 +39,58 @@ def calibrate(
         page: HTML page of that frame, before and after.
         polish: let the optimiser finish from the networks' answer, as solve.polish in fleet.toml.
     """
+    from dataclasses import replace
+
+    from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake, Partition
+    from pipeline.work import Task
 
     if page is not None and frame is None:
         raise ConfigError(
             "command line", "page", "is of one frame: name it by --frame (days: boresight report)"
         )
+    method_named(method)
     config = load_fleet(fleet)
     if polish:
         config = config.changed(solve={"polish": True})
-    partition, tables, moved = Partition(vehicle, day), Lake.at(lake), parse_perturb(perturb)
-    if frame is not None:
-        ssl = "joint-ssl" if method == "joint" else method
-        return _calibrate_frame(config, tables, partition, frame, ssl, moved, seed, page)
-    return _calibrate_day(config, tables, partition, method, moved, seed)
+    task = Task(config, Lake.at(lake), Partition(vehicle, day), method, seed, parse_perturb(perturb))
+    if frame is None:
+        return _calibrate_day(task)
+    return _calibrate_frame(replace(task, method="joint-ssl") if method == "joint" else task, frame, page)
 
 
-def _calibrate_day(
-    config: FleetConfig,
-    lake: Lake,
-    partition: Partition,
-    method: str,
-    perturb: tuple[float, float] | None,
-    seed: int | None,
-) -> int:
+def _calibrate_day(task: Task) -> int:
     """The day's records in the lake, their statuses in the summary."""
-    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
-    from pipeline.calibrate.stage import calibrate_day
+    from dataclasses import replace
 
-    with progress_reporter(f"calibrate {partition.vehicle} {partition.day}") as progress:
-        result = calibrate_day(
-            partition,
-            config,
-            lake,
-            method=method,
-            perturb=perturb,
-            seed=seed,
-            progress=progress,
-        )
+    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+    from pipeline.stages import CALIBRATE
+
+    with progress_reporter(f"calibrate {task.partition.vehicle} {task.partition.day}") as progress:
+        outcome = CALIBRATE.run(replace(task, progress=progress))
     print_summary(
         "calibrate",
-        result.status,
-        vehicle=partition.vehicle,
-        day=partition.day,
-        method=method,
-        pairs=result.kept,
-        reason=result.reason,
-        work_key=result.work_key,
-        outputs=result.outputs,
+        outcome.status,
+        vehicle=outcome.vehicle,
+        day=outcome.day,
+        method=task.method,
+        pairs=outcome.kept,
+        reason=outcome.reason,
+        work_key=outcome.work_key,
+        outputs=outcome.outputs,
     )
-    return exit_code([result.status, *(status for status, pairs in result.kept.items() if pairs)])
+    return exit_code([outcome.status, *(status for status, pairs in outcome.kept.items() if pairs)])
 
 
-def _calibrate_frame(
-    config: FleetConfig,
-    lake: Lake,
-    partition: Partition,
-    frame: int,
-    method: str,
-    perturb: tuple[float, float] | None,
-    seed: int | None,
-    page: Path | None,
-) -> int:
+def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
     """One frame's transforms in the summary, and its page where one is wanted."""
     from jobs.terminal.summary import print_summary
     from pipeline.calibrate.networks import calibrate_frame
 
-    found = calibrate_frame(partition, config, lake, frame, method=method, perturb=perturb, seed=seed)
+    found = calibrate_frame(task, frame)
+    partition = task.partition
     if page is not None:
         from pipeline.report.frame import write_frame_page
 
@@ -129,7 +111,7 @@ def _calibrate_frame(
         "done",
         vehicle=partition.vehicle,
         day=partition.day,
-        method=method,
+        method=task.method,
         frame_index=found.frame.frame_index,
         stamp_ns=found.frame.stamp_ns,
         page=page,

@@ -17,19 +17,18 @@ def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
         vehicle: vehicle id, as in fleet.toml.
         day: YYYY-MM-DD.
     """
-    from dataclasses import asdict
-
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
-    from pipeline.ingest.stage import ingest_day
+    from pipeline.stages import INGEST
     from pipeline.store.partitions import Lake, Partition
+    from pipeline.work import Task
 
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the day")
     config = load_fleet(fleet)
     with progress_reporter(f"ingest {vehicle} {day}") as progress:
-        result = ingest_day(logs, Partition(vehicle, day), config, Lake.at(lake), progress)
-    fields = asdict(result)
-    print_summary("ingest", fields.pop("status"), **fields)
-    return exit_code([result.status])
+        task = Task(config, Lake.at(lake), Partition(vehicle, day), logs=logs, progress=progress)
+        outcome = INGEST.run(task)
+    print_summary("ingest", outcome.status, **outcome.counts())
+    return exit_code([outcome.status])

@@ -44,6 +44,7 @@ def nightly(
         report: HTML page of the fleet; default: report/fleet.html inside the lake.
     """
     from jobs.terminal.summary import exit_code, print_summary
+    from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.fleet.nightly import Night
     from pipeline.fleet.pattern import find_vehicle_days
@@ -51,7 +52,7 @@ def nightly(
 
     config = load_fleet(fleet)
     tables = Lake.at(lake)
-    night = Night(config, tables, method or config.audit.method, seed)
+    night = Night(config, tables, method_named(method or config.audit.method).name, seed)
     days = find_vehicle_days(logs, from_day, to_day)
     outcomes = watch_night(night, days, executor, workers)
     page = report or tables.root / "report" / "fleet.html"
@@ -96,16 +97,20 @@ def close_night(
     However few days the night was about, the charts look back over `audit.window_days`.
     """
     from jobs.terminal.summary import progress_reporter
+    from pipeline.report.stage import Pages
     from pipeline.stages import AUDIT, REPORT
+    from pipeline.work import Task, Window
 
     with progress_reporter("audit") as progress:
-        findings = AUDIT.load()(night.lake, night.fleet, None, to_day, night.method, progress)
+        task = Task(night.fleet, night.lake, Window(None, to_day), night.method, progress=progress)
+        findings = list(AUDIT.run(task).records)
     if not findings:
         return [], []
     with progress_reporter("report") as progress:
         progress(0, 0, "pages")
-        pages = REPORT.load()(night.lake, night.fleet, report, method=night.method, truth=truth)
-    return findings, [str(p) for p in pages]
+        task = Task(night.fleet, night.lake, Window(), night.method, given=Pages(report, truth))
+        pages = REPORT.run(task).outputs
+    return findings, pages
 
 
 def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:

@@ -16,16 +16,14 @@ def perceive(*, fleet: Path, lake: str, vehicle: str, day: str) -> int:
         vehicle: vehicle id, as in fleet.toml.
         day: YYYY-MM-DD.
     """
-    from dataclasses import asdict
-
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from pipeline.config import load_fleet
-    from pipeline.perceive.stage import perceive_day
+    from pipeline.stages import PERCEIVE
     from pipeline.store.partitions import Lake, Partition
+    from pipeline.work import Task
 
     config = load_fleet(fleet)
     with progress_reporter(f"perceive {vehicle} {day}") as progress:
-        result = perceive_day(Partition(vehicle, day), config, Lake.at(lake), progress)
-    fields = asdict(result)
-    print_summary("perceive", fields.pop("status"), **fields)
-    return exit_code([result.status])
+        outcome = PERCEIVE.run(Task(config, Lake.at(lake), Partition(vehicle, day), progress=progress))
+    print_summary("perceive", outcome.status, **outcome.counts())
+    return exit_code([outcome.status])

@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.config import FleetConfig
-    from pipeline.learn.prepare.fleet import PrepareWork
     from pipeline.learn.prepare.inventory import Inventory
-    from pipeline.results import StageResult
+    from pipeline.results import Outcome
     from pipeline.store.partitions import Lake, Partition
+    from pipeline.work import Task
 
 __all__ = ["prepare"]
 
@@ -98,13 +98,13 @@ def _days(
     return days
 
 
-def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> list[PrepareWork]:
+def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> list[Task]:
     """Look over all days and divide them; each worker gets the keys of its own day."""
     from jobs.terminal.summary import progress_reporter
-    from pipeline.learn.prepare.fleet import PrepareWork
     from pipeline.learn.prepare.split import SplitPlan, Unit
     from pipeline.learn.prepare.stage import decided_sides
     from pipeline.learn.prepare.survey import plan_days, survey_day
+    from pipeline.work import Task
 
     surveys = []
     with progress_reporter("survey") as progress:
@@ -117,34 +117,37 @@ def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> list[Pr
         day = survey.partition
         keys = {k for place in set(survey.place) for k in Unit(day.vehicle, day.day, place).keys(plan.by)}
         own = SplitPlan(plan.by, {k: plan.sides[k] for k in keys & plan.sides.keys()})
-        work.append(PrepareWork(day, config, lake, own))
+        work.append(Task(config, lake, day, given=own))
     return work
 
 
-def _run(work: Sequence[PrepareWork], executor: str, workers: int | None) -> list[StageResult]:
+def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outcome]:
     """All days, in view of whoever watches."""
     from contextlib import closing
+    from functools import partial
 
     from jobs.nightly import usable_cpus
     from jobs.terminal.summary import progress_reporter
     from pipeline.errors import ConfigError
     from pipeline.fleet.executor import EXECUTORS
-    from pipeline.learn.prepare.fleet import run_prepare
-    from pipeline.results import StageResult
+    from pipeline.results import Outcome
+    from pipeline.runner import try_stage
+    from pipeline.stages import PREPARE
 
     if workers is not None and workers < 1:
         raise ConfigError("command line", "--workers", f"{workers} is less than one")
-    results: list[StageResult] = []
+    results: list[Outcome] = []
     with progress_reporter("prepare") as progress:
 
         def watch(index: int, done: int, total: int, what: str) -> None:
             day = work[index].partition
             progress(len(results), len(work), f"{day.vehicle} {day.day}: {what} {done}/{total}")
 
-        with closing(EXECUTORS[executor](run_prepare, work, workers or usable_cpus(), watch)) as finished:
+        prepare_day = partial(try_stage, PREPARE)
+        with closing(EXECUTORS[executor](prepare_day, work, workers or usable_cpus(), watch)) as finished:
             for end in finished:
                 day = end.item.partition
-                lost = StageResult("prepare", day.vehicle, day.day, "failed", "", reason=end.error)
+                lost = Outcome("prepare", day.vehicle, day.day, "failed", "", reason=end.error)
                 results.append(end.value or lost)
     return results
 
@@ -166,9 +169,7 @@ def _empty_sides(config: FleetConfig, inventory: Inventory) -> list[str]:
     return [side for side, share in wanted.items() if share > 0 and not inventory.frames[side]]
 
 
-def _problems(
-    config: FleetConfig, results: Sequence[StageResult], inventory: Inventory
-) -> list[dict[str, str]]:
+def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Inventory) -> list[dict[str, str]]:
     found = [
         {"vehicle": r.vehicle, "day": r.day, "status": r.status, "reason": r.reason}
         for r in results

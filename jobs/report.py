@@ -31,18 +31,16 @@ def report(
     from jobs.terminal.summary import print_summary
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
-    from pipeline.report.stage import write_day_page, write_fleet_report
+    from pipeline.report.stage import Pages
     from pipeline.report.truth import read_truth
+    from pipeline.stages import REPORT
     from pipeline.store.partitions import Lake, Partition
+    from pipeline.work import Task, Window
 
     if (vehicle is None) != (day is None):
         raise ConfigError("command line", "vehicle, day", "a day's page needs both --vehicle and --day")
-    config = load_fleet(fleet)
-    tables = Lake.at(lake)
-    if vehicle is not None and day is not None:
-        outputs = [write_day_page(tables, Partition(vehicle, day), config, out, method)]
-    else:
-        known = read_truth(truth) if truth is not None else None
-        outputs = write_fleet_report(tables, config, out, method=method, truth=known)
-    print_summary("report", "done", report=out, outputs=outputs)
+    of = Partition(vehicle, day) if vehicle is not None and day is not None else Window()
+    pages = Pages(out, read_truth(truth) if truth is not None else None)
+    outcome = REPORT.run(Task(load_fleet(fleet), Lake.at(lake), of, method, given=pages))
+    print_summary("report", outcome.status, report=out, outputs=outcome.outputs)
     return 0

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
-__all__ = ["Progress", "StageResult", "silent"]
+__all__ = ["Outcome", "Progress", "silent"]
 
 # progress(done, total, what): total 0 = unknown. Stages call it often; the job decides what a person sees.
 Progress = Callable[[int, int, str], None]
@@ -16,10 +17,11 @@ def silent(done: int, total: int, what: str) -> None:
 
 
 @dataclass(frozen=True)
-class StageResult:
-    """Outcome of one stage on one vehicle-day.
+class Outcome:
+    """What became of one stage on one vehicle-day, or on the fleet (`vehicle` and `day` are empty then).
 
-    `status`: "done", "cached" (same work key, nothing to do), "refused" (recorded with a reason; the fleet goes on).
+    `status`: "done", "cached" (same work key, nothing to do), "refused" (recorded with a reason; the fleet goes on),
+    "failed" (an error; another try may help).
     """
 
     stage: str
@@ -32,3 +34,11 @@ class StageResult:
     rejected: dict[str, int] = field(default_factory=dict)
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
+    records: tuple[Any, ...] = field(
+        default=(), repr=False
+    )  # rows of a record table, those of a cached day too
+
+    def counts(self) -> dict[str, Any]:
+        """All but the status and the records, for a command's summary."""
+        left_out = ("status", "records")
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}

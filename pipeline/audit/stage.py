@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,65 +14,72 @@ from pipeline.audit.charts import Chart, ChartVerdict, pooled_scatter
 from pipeline.audit.vehicle import PairDays, VehicleVerdict, charts_of, judge_vehicle, limit_of
 from pipeline.config import FleetConfig, config_hash
 from pipeline.errors import ConfigError
-from pipeline.results import Progress, silent
+from pipeline.results import Progress
 from pipeline.store.current import current_records, transform_of
-from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.tables import read_records, write_records
+from pipeline.store.partitions import Partition, work_key
+from pipeline.store.tables import read_records
+from pipeline.work import Records, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, CalibrationRecord
-from schemas.drift import DRIFT, DriftFinding
+from schemas.drift import DriftFinding
 from schemas.versions import CODE_VERSION
 
-__all__ = ["audit_fleet"]
+__all__ = ["work"]
 
 
-def audit_fleet(
-    lake: Lake,
-    fleet: FleetConfig,
-    from_day: str | None = None,
-    to_day: str | None = None,
-    method: str | None = None,
-    progress: Progress = silent,
-) -> list[DriftFinding]:
-    """Judge every vehicle's charts, append the findings to table drift and return them.
+def work(task: Task) -> Work:
+    """Every vehicle's charts over the task's window, as findings that are added to table drift.
 
-    Args:
-        lake: holds table calibrations.
-        fleet: limits and false-alarm budget in `fleet.audit`; its vehicles are audited even where they have
-            no record.
-        from_day: first day of the window; None = `fleet.audit.window_days` before its end.
-        to_day: last day; None = the last day that any vehicle has a record for.
-        method: method of the records; None = `fleet.audit.method`.
-        progress: called once per vehicle.
-
-    Returns:
-        One finding per vehicle, pair and DoF, in that order; empty where the lake has no record in the
-        window.
+    The window ends with its last day (None = the last day that any vehicle has a record for) and begins with its first
+    (None = `audit.window_days` before its end). The configuration's vehicles are audited even where they have no
+    record. One finding per vehicle, pair and DoF, in that order; none where the lake has no record in the window.
 
     Raises:
         ConfigError: a day is no day, or the window is empty.
         ContractError: a record was written with another schema version.
     """
-    method = method or fleet.audit.method
+    assert isinstance(task.of, Window), "an audit looks at all vehicles"
+    fleet, method = task.fleet, task.method or task.fleet.audit.method
     records = current_records(
-        [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
+        [r for r in read_records(task.lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
     )
-    first, last = _window(records, from_day, to_day, fleet.audit.window_days)
+    first, last = _window(records, task.of.first, task.of.last, fleet.audit.window_days)
     by_vehicle: dict[str, list[CalibrationRecord]] = {v: [] for v in fleet.vehicles}
     for record in records:
         if first <= record.day <= last:
             by_vehicle.setdefault(record.vehicle, []).append(record)
+    settings = (fleet.audit, {"from": first, "to": last, "method": method})
+    return Work(
+        settings,
+        lambda run: _judged(fleet, by_vehicle, (first, last, method), run.progress),
+        inputs=tuple(sorted({r.work_key for rows in by_vehicle.values() for r in rows})),
+        tell=_told,
+        again=True,
+    )
+
+
+def _judged(
+    fleet: FleetConfig,
+    by_vehicle: Mapping[str, list[CalibrationRecord]],
+    window: tuple[str, str, str],
+    progress: Progress,
+) -> Generator[Records, None, None]:
+    """The findings of one vehicle after the other."""
     if not any(by_vehicle.values()):
-        return []
+        return
     factor = fleet.audit.held_sigma_factor
     days = {vehicle: _pairs(rows, factor) for vehicle, rows in by_vehicle.items()}
     scatter = _scatter(list(days.values()))
-    findings: list[DriftFinding] = []
     for done, vehicle in enumerate(sorted(by_vehicle)):
         progress(done, len(by_vehicle), vehicle)
         verdict = judge_vehicle(days[vehicle], scatter, fleet.audit)
-        findings += _write(lake, fleet, vehicle, by_vehicle[vehicle], verdict, (first, last, method))
+        yield _findings(fleet, vehicle, by_vehicle[vehicle], verdict, window)
     progress(len(by_vehicle), len(by_vehicle), "")
-    return findings
+
+
+def _told(findings: Sequence[DriftFinding]) -> Told:
+    counts = Counter(f.status for f in findings)
+    reason = "" if findings else "no calibration record in the window"
+    return Told(dict(counts), reason=reason, refused=not findings)
 
 
 def _window(
@@ -118,14 +126,13 @@ def _scatter(fleet_days: Sequence[dict[str, PairDays]]) -> dict[tuple[str, str],
     return {key: pooled_scatter(found) for key, found in charts.items()}
 
 
-def _write(
-    lake: Lake,
+def _findings(
     fleet: FleetConfig,
     vehicle: str,
     records: Sequence[CalibrationRecord],
     verdict: VehicleVerdict,
     window: tuple[str, str, str],
-) -> list[DriftFinding]:
+) -> Records:
     first, last, method = window
     inputs = sorted({r.work_key for r in records})
     config = config_hash(fleet.audit, {"from": first, "to": last, "method": method})
@@ -140,8 +147,7 @@ def _write(
                 limit_of(pair, dof, fleet.audit), key, inputs=inputs,
             )  # fmt: skip
             findings.append(_finding(base, chart, verdict.attribution))
-    write_records(lake, DRIFT, Partition(vehicle, last), findings, key, CODE_VERSION, inputs)
-    return findings
+    return Records(findings, Partition(vehicle, last), key, inputs)
 
 
 def _finding(base: DriftFinding, chart: ChartVerdict, moved: Attribution | None) -> DriftFinding:

@@ -1,37 +1,20 @@
-"""Calibration methods by name: import paths, resolved on use, so that torch loads only where it is needed."""
+"""Calibration methods: one line each. Import paths are resolved on use, so that networks load only where needed."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from pipeline.config import SolveConfig
 from pipeline.errors import ConfigError
 from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.results import Progress
-from schemas.calibrations import METHODS
+from pipeline.work import Task
 from schemas.observations import Observation
 
-__all__ = ["COMPOSED", "METHOD", "PAPER_METHODS", "UNTHINNED", "Solver", "solver_of"]
-
-METHOD: dict[str, str] = {
-    "joint": "pipeline.calibrate.joint.solve:solve_joint",
-    "tracking": "pipeline.calibrate.tracking.solve:solve_tracking",
-    "pairwise-optimisation": "pipeline.calibrate.paper.pairwise:solve_pairwise",
-    "joint-optimisation": "pipeline.calibrate.paper.joint_optimisation:solve_joint_optimisation",
-}
-# Pairs that a method composes of the other two instead of estimating them.
-COMPOSED: dict[str, tuple[str, ...]] = {
-    "joint": ("camera_radar",),
-    "tracking": ("camera_radar",),
-}
-# Methods that take the paper's frame conditions and judge by the paper's losses.
-PAPER_METHODS = ("pairwise-optimisation", "joint-optimisation")
-
-
-# Methods that follow objects from frame to frame: they take all frames that are not held out.
-UNTHINNED = ("tracking",)
+__all__ = ["METHODS", "Method", "Solver", "method_named"]
 
 
 @runtime_checkable
@@ -50,15 +33,84 @@ class Solver(Protocol):
     ) -> Solution: ...
 
 
-def solver_of(method: str) -> Solver:
-    """The function of a method.
+@dataclass(frozen=True)
+class Method:
+    """What sets a method apart.
+
+    Args:
+        name: on the command line and in records.
+        run: import path of its `Solver`; of `(method's name, task) -> Solver` where it needs images.
+        composed: pairs that it composes of the other two instead of estimating them.
+        frames: "selected" takes `select.frames` of a day; "all" takes all that are not held out, since it follows
+            objects from frame to frame.
+        paper_selection: takes the paper's frame conditions (section 4.5.1).
+        needs_images: looks at images and sweeps (table frames) by networks, and not at observations alone.
+        settings: import path of `(method's name, task) -> dict`: what else its answer depends on.
+    """
+
+    name: str
+    run: str
+    composed: tuple[str, ...] = ()
+    frames: Literal["selected", "all"] = "selected"
+    paper_selection: bool = False
+    needs_images: bool = False
+    settings: str | None = None
+
+    def solver(self) -> Solver:
+        """The solver of a method that looks at observations alone."""
+        assert not self.needs_images, f"{self.name} needs frames: ask `solver_of` a task"
+        solver: Solver = _resolved(self.run)
+        return solver
+
+    def solver_of(self, task: Task) -> Solver:
+        """The solver for one vehicle-day.
+
+        Raises:
+            ConfigError: a network that the method needs does not exist.
+        """
+        if not self.needs_images:
+            return self.solver()
+        solver: Solver = _resolved(self.run)(self.name, task)
+        return solver
+
+    def settings_of(self, task: Task) -> dict[str, Any]:
+        """What the answer depends on besides observations and the sections of fleet.toml, for the work key."""
+        return {} if self.settings is None else dict(_resolved(self.settings)(self.name, task))
+
+
+_NETWORKS, _FILES = "pipeline.calibrate.networks:ssl_solver", "pipeline.calibrate.networks:ssl_settings"
+METHODS = (
+    Method("joint", "pipeline.calibrate.joint.solve:solve_joint", composed=("camera_radar",)),
+    Method(
+        "tracking",
+        "pipeline.calibrate.tracking.solve:solve_tracking",
+        composed=("camera_radar",),
+        frames="all",
+    ),
+    Method("pairwise-optimisation", "pipeline.calibrate.paper.pairwise:solve_pairwise", paper_selection=True),
+    Method(
+        "joint-optimisation",
+        "pipeline.calibrate.paper.joint_optimisation:solve_joint_optimisation",
+        paper_selection=True,
+    ),
+    Method("pairwise-ssl", _NETWORKS, needs_images=True, settings=_FILES),
+    Method("joint-ssl", _NETWORKS, needs_images=True, settings=_FILES),
+)
+
+
+def method_named(name: str) -> Method:
+    """The method of a name.
 
     Raises:
-        ConfigError: no such method, or one that this version does not have yet.
+        ConfigError: no such method.
     """
-    if method not in METHOD:
-        known = "does not exist" if method not in METHODS else "is not in this version"
-        raise ConfigError("command line", "method", f"{method!r} {known}; choose from {', '.join(METHOD)}")
-    module, _, name = METHOD[method].partition(":")
-    solver: Solver = getattr(importlib.import_module(module), name)
-    return solver
+    for method in METHODS:
+        if method.name == name:
+            return method
+    known = ", ".join(m.name for m in METHODS)
+    raise ConfigError("command line", "method", f"{name!r} does not exist; choose from {known}")
+
+
+def _resolved(path: str) -> Any:
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)

@@ -9,22 +9,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.calibrate.joint.solve import solve_joint
-from pipeline.calibrate.methods import Solver
-from pipeline.config import FleetConfig, SolveConfig, config_hash
+from pipeline.calibrate.methods import METHODS, Solver, method_named
+from pipeline.config import SolveConfig, config_hash
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.extrinsics.prior import perturbed, read_prior
-from pipeline.learn.infer.onnx_networks import SSL_METHODS, model_files, models_key, open_networks
+from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
 from pipeline.results import Progress
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns
 from pipeline.store.tables import iterate_rows, read_manifest
+from pipeline.work import Task
 from schemas.calibrations import PAIRS
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 
-__all__ = ["SSL_METHODS", "FrameCalibration", "calibrate_frame", "ssl_key", "ssl_solver"]
+__all__ = ["FrameCalibration", "calibrate_frame", "ssl_settings", "ssl_solver"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,22 +38,21 @@ class FrameCalibration:
     solution: Solution
 
 
-def ssl_key(method: str, partition: Partition, fleet: FleetConfig, lake: Lake) -> dict[str, str]:
-    """What a network's answer depends on besides the observations, for the work key.
+def ssl_settings(method: str, task: Task) -> dict[str, str]:
+    """What a network's answer depends on besides frames and observations, for the work key.
 
     Raises:
         ConfigError: there is no such network.
     """
-    frames = read_manifest(lake, FRAMES, partition)
     return {
-        "models": models_key(model_files(method, fleet)),
-        "learn": config_hash(fleet.learn, fleet.prepare),
-        "frames": frames.work_key if frames else "",
+        "models": models_key(model_files(method, task.fleet)),
+        "learn": config_hash(task.fleet.learn, task.fleet.prepare),
     }
 
 
-def ssl_solver(method: str, partition: Partition, fleet: FleetConfig, lake: Lake) -> Solver:
-    """The method as a solver: networks are opened and frames read when it is called."""
+def ssl_solver(method: str, task: Task) -> Solver:
+    """The method as a solver of a vehicle-day: networks are opened and frames read when it is called."""
+    fleet, lake, partition = task.fleet, task.lake, task.partition
 
     def solve(
         observations: Mapping[str, Sequence[Observation]],
@@ -84,42 +84,30 @@ def ssl_solver(method: str, partition: Partition, fleet: FleetConfig, lake: Lake
     return solve
 
 
-def calibrate_frame(
-    partition: Partition,
-    fleet: FleetConfig,
-    lake: Lake,
-    frame: int,
-    *,
-    method: str = "joint-ssl",
-    perturb: tuple[float, float] | None = None,
-    seed: int | None = None,
-) -> FrameCalibration:
+def calibrate_frame(task: Task, frame: int) -> FrameCalibration:
     """Calibrate from one frame, as after an abrupt change. Nothing is recorded: nothing can judge one frame.
 
     Args:
-        partition: vehicle and day.
-        fleet: configuration.
-        lake: where frames and observations lie.
+        task: a vehicle-day with frames and observations; the method must look at images.
         frame: frame_index, or a stamp_ns.
-        method: an SSL method.
-        perturb: as in `calibrate_day`.
-        seed: None = `solve.seed`.
 
     Raises:
         ConfigError: no such frame, or a method that needs more than one.
         SolveError: the frame shows too little.
     """
-    if method not in SSL_METHODS:
-        raise ConfigError(
-            "command line", "--frame", f"{method} needs many frames; choose joint-ssl or pairwise-ssl"
-        )
-    seed = fleet.solve.seed if seed is None else seed
+    method, fleet, partition = method_named(task.method or "joint-ssl"), task.fleet, task.partition
+    if not method.needs_images:
+        known = " or ".join(m.name for m in METHODS if m.needs_images)
+        raise ConfigError("command line", "--frame", f"{method.name} needs many frames; choose {known}")
+    seed = fleet.solve.seed if task.seed is None else task.seed
     fleet.rig_of(partition.vehicle)
-    row, observation = _one_observation(lake, partition, frame)
-    prior = perturbed(read_prior([observation], fleet, partition.vehicle), perturb, seed)
-    networks = open_networks(model_files(method, fleet), fleet.learn, fleet.prepare)
-    shown = next(_frames_of(lake, partition)([row]))
-    solution = single_frame_solution(shown, observation, prior, networks=networks, method=method, seed=seed)
+    row, observation = _one_observation(task.lake, partition, frame)
+    prior = perturbed(read_prior([observation], fleet, partition.vehicle), task.perturb, seed)
+    networks = open_networks(model_files(method.name, fleet), fleet.learn, fleet.prepare)
+    shown = next(_frames_of(task.lake, partition)([row]))
+    solution = single_frame_solution(
+        shown, observation, prior, networks=networks, method=method.name, seed=seed
+    )
     return FrameCalibration(shown, observation, prior, solution)
 
 

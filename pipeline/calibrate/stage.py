@@ -6,12 +6,11 @@ record.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Generator, Mapping, Sequence
 
 import numpy as np
 
-from pipeline.calibrate.methods import COMPOSED, PAPER_METHODS, UNTHINNED, Solver, solver_of
+from pipeline.calibrate.methods import Method, Solver, method_named
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.calibrate.records import Inputs, Judged, record_of, refused_records
@@ -24,74 +23,82 @@ from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.calibrate.verify.verdict import Evidence, judge
-from pipeline.config import FleetConfig, config_hash
-from pipeline.errors import SolveError
+from pipeline.config import FleetConfig
+from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.extrinsics.prior import perturbed, prior_key, read_prior
-from pipeline.results import Progress, StageResult, silent
-from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.tables import read_manifest, read_records, read_rows, write_records
-from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from pipeline.results import Outcome, Progress, silent
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_manifest, read_rows
+from pipeline.work import Records, Run, Task, Told, Work
+from schemas.calibrations import PAIRS, STATUSES, CalibrationRecord
+from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
-from schemas.versions import CODE_VERSION
 
-__all__ = ["SSL_METHODS", "calibrate_day", "calibrate_observations"]
+__all__ = ["calibrate_observations", "work"]
 
-SSL_METHODS = ("pairwise-ssl", "joint-ssl")
 _TRIGGER_FRAMES = 40  # metrics are means over frames: more of them only cost time
 
 
-def calibrate_day(
-    partition: Partition,
-    fleet: FleetConfig,
-    lake: Lake,
-    *,
-    method: str = "joint",
-    perturb: tuple[float, float] | None = None,
-    seed: int | None = None,
-    progress: Progress = silent,
-) -> StageResult:
-    """Calibrate a vehicle-day and add its records, unless the same work is recorded already.
+def work(task: Task) -> Work:
+    """The records of a vehicle-day, one per pair.
 
-    Args:
-        partition: vehicle and day.
-        fleet: configuration.
-        lake: where observations lie and records go.
-        method: one of `pipeline.calibrate.methods.METHOD`, or of SSL_METHODS.
-        perturb: exact angle [deg] and shift [m] by which the prior is moved on purpose, for tests:
-            T_camera_lidar and T_lidar_radar independently, about a random axis and in a random direction. The
-            prior's sigmas are then no smaller than these two numbers.
-        seed: of everything random; None = `solve.seed`.
-        progress: told how far it is.
-
-    Returns:
-        Counts of accepted, held and refused pairs in `kept`; status "refused" where all pairs are.
+    A day that cannot be calibrated gets refused records with the reason. So does a day that another stage refused:
+    the task is given that stage's outcome, and the records say its reason.
 
     Raises:
-        ConfigError: no such vehicle or method, or an impossible prior file.
+        ConfigError: no such vehicle, method or network, or an impossible seed or prior file.
     """
-    seed = fleet.solve.seed if seed is None else seed
-    rig = fleet.rig_of(partition.vehicle)
-    solver, settings = _method(method, partition, fleet, lake)
-    settings |= {"perturb": perturb, "seed": seed, "prior_file": prior_key(fleet, partition.vehicle)}
-    observations = read_manifest(lake, OBSERVATIONS, partition)
-    inputs = [observations.work_key] if observations else []
-    resolved = config_hash(fleet.select, fleet.trigger, fleet.solve, fleet.verify, rig.prior, settings)
-    key = work_key("calibrate", CODE_VERSION, resolved, inputs)
-    about = Inputs(partition, method, key, seed, tuple(inputs))
-    recorded = _recorded(lake, partition, key)
-    if recorded:
-        return _result(about, recorded, "cached", lake)
-    prior: Prior | None = None
-    rows: list[Observation] = []
+    method, fleet = method_named(task.method or "joint"), task.fleet
+    seed = fleet.solve.seed if task.seed is None else task.seed
+    if seed < 0:
+        raise ConfigError("command line", "seed", f"{seed} is less than 0")
+    if task.given is not None:
+        return _refusal(task.given, task.partition, method, seed)
+    settings = {"method": method.name} | method.settings_of(task)
+    settings |= {
+        "perturb": task.perturb,
+        "seed": seed,
+        "prior_file": prior_key(fleet, task.partition.vehicle),
+    }
+    prior = fleet.rig_of(task.partition.vehicle).prior
+    tables = (FRAMES, OBSERVATIONS) if method.needs_images else (OBSERVATIONS,)
+    manifests = [read_manifest(task.lake, table, task.partition) for table in tables]
+
+    def rows(run: Run) -> Generator[Records, None, None]:
+        about = Inputs(task.partition, method.name, run.work_key, seed, run.inputs)
+        yield Records(_records(task, method, about, run.progress))
+
+    return Work(
+        (fleet.select, fleet.trigger, fleet.solve, fleet.verify, prior, settings),
+        rows,
+        inputs=tuple(m.work_key for m in manifests if m is not None),
+        tell=_told,
+    )
+
+
+def _records(task: Task, method: Method, about: Inputs, progress: Progress) -> list[CalibrationRecord]:
+    """Of a day that can be calibrated or not."""
+    fleet, prior, rows = task.fleet, None, list[Observation]()
     try:
-        rows = _observations(lake, partition)
-        prior = perturbed(read_prior(rows, fleet, partition.vehicle), perturb, seed)
-        records = calibrate_observations(rows, prior, fleet, about, progress, solver)
+        rows = _observations(task.lake, task.partition)
+        prior = perturbed(read_prior(rows, fleet, task.partition.vehicle), task.perturb, about.seed)
+        return calibrate_observations(rows, prior, fleet, about, progress, method.solver_of(task))
     except SolveError as err:
-        records = refused_records(about, err.reason, len(rows), prior)
-    write_records(lake, CALIBRATIONS, partition, records, key, CODE_VERSION, inputs)
-    return _result(about, records, "done", lake)
+        return refused_records(about, err.reason, len(rows), prior)
+
+
+def _refusal(refused: Outcome, partition: Partition, method: Method, seed: int) -> Work:
+    """Records of a day that never reached the solver, so that whoever reads the lake finds the reason."""
+    reason = f"{refused.stage}: {refused.reason}"
+
+    def rows(run: Run) -> Generator[Records, None, None]:
+        about = Inputs(partition, method.name, run.work_key, seed, run.inputs)
+        yield Records(refused_records(about, reason, 0, None))
+
+    inputs = (refused.work_key,) if refused.work_key else ()
+    # Recorded each time: an older record of a day that was not refused then must not pass for the current one.
+    return Work(({"refused": reason, "method": method.name},), rows, inputs, tell=_told, again=True)
 
 
 def calibrate_observations(
@@ -104,24 +111,25 @@ def calibrate_observations(
 ) -> list[CalibrationRecord]:
     """Select, trigger, solve, judge: the records of one day, without writing anything.
 
-    `solver` is for methods that need more than observations (`pipeline.calibrate.networks`); None = the method's own.
+    `solver` is for methods that need more than observations (`Method.needs_images`); None = the method's own.
 
     Raises:
         SolveError: the day cannot be calibrated.
     """
     progress(0, 4, "select frames")
-    select = fleet.select
-    if about.method in UNTHINNED:
+    method, select = method_named(about.method), fleet.select
+    if method.frames == "all":
         select = select.model_copy(update={"frames": max(len(observations), 1)})
-    paper, gate_s = about.method in PAPER_METHODS, fleet.ingest.sync_gate_s
-    selection = select_frames(observations, select, paper=paper, sync_gate_s=gate_s)
+    selection = select_frames(
+        observations, select, paper=method.paper_selection, sync_gate_s=fleet.ingest.sync_gate_s
+    )
     frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in PAIRS}
     sample = _spread(observations, selection)
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in PAIRS})
     fired = {pair: exceeded(before[pair], fleet.trigger) for pair in PAIRS}
-    active = _to_calibrate(about.method, fired, fleet.trigger.when)
+    active = _to_calibrate(method, fired, fleet.trigger.when)
     progress(1, 4, f"solve by {about.method}")
-    solution = (solver or solver_of(about.method))(
+    solution = (solver or method.solver())(
         frames,
         prior,
         fleet.solve,
@@ -151,25 +159,13 @@ def calibrate_observations(
     return records
 
 
-def _method(
-    method: str, partition: Partition, fleet: FleetConfig, lake: Lake
-) -> tuple[Solver, dict[str, Any]]:
-    """The method's solver, and what its answer depends on besides observations and configuration."""
-    if method not in SSL_METHODS:
-        return solver_of(method), {"method": method}
-    from pipeline.calibrate.networks import ssl_key, ssl_solver  # noqa: PLC0415 - brings onnxruntime
-
-    settings = {"method": method} | ssl_key(method, partition, fleet, lake)
-    return ssl_solver(method, partition, fleet, lake), settings
-
-
-def _to_calibrate(method: str, fired: Mapping[str, Sequence[str]], when: str) -> list[str]:
+def _to_calibrate(method: Method, fired: Mapping[str, Sequence[str]], when: str) -> list[str]:
     """Pairs to estimate and to judge: all, or those with a metric beyond its threshold.
 
     A composed pair is as good as its factors: where it is asked for, so are they.
     """
     wanted = {p for p in PAIRS if fired[p] or when == "always"}
-    composed = set(COMPOSED.get(method, ()))
+    composed = set(method.composed)
     if wanted & composed:
         wanted |= set(PAIRS) - composed
     return [p for p in PAIRS if p in wanted]
@@ -191,7 +187,7 @@ def _judge_all(
 ) -> dict[str, Judged]:
     """Verdict and evidence of each pair; pairs that a method composes come after their factors."""
     limits, search = VerdictLimits(), search_range(prior, fleet.solve)
-    composed = COMPOSED.get(solution.method, ())
+    composed = method_named(solution.method).composed
     failed = _contradictions(solution, composed)
     limit_rad = float(np.radians(fleet.verify.camera_lidar_limit_deg))
     failed["camera_lidar"] = heading_failures(solution, prior, observations, limit_rad, limits)
@@ -259,13 +255,6 @@ def _held_out_evidence(
     return test, claims
 
 
-def _recorded(lake: Lake, partition: Partition, key: str) -> list[CalibrationRecord]:
-    """What the same work has recorded already."""
-    vehicle, day = partition.vehicle, partition.day
-    records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day)
-    return [r for r in records if r.work_key == key]
-
-
 def _spread(observations: Sequence[Observation], selection: Selection) -> list[Observation]:
     """Frames that the triggers look at: those of the fit of all pairs, thinned."""
     rows = sorted(set().union(*selection.fit.values()))
@@ -273,19 +262,11 @@ def _spread(observations: Sequence[Observation], selection: Selection) -> list[O
     return [observations[rows[i]] for i in picked]
 
 
-def _result(about: Inputs, records: Sequence[CalibrationRecord], status: str, lake: Lake) -> StageResult:
-    counts = {s: sum(r.status == s for r in records) for s in ("accepted", "held", "refused")}
-    all_refused = counts["refused"] == len(records)
-    path = lake.folder(CALIBRATIONS.name, about.partition) / f"{about.work_key}.parquet"
-    return StageResult(
-        "calibrate",
-        about.partition.vehicle,
-        about.partition.day,
-        "refused" if all_refused and status == "done" else status,
-        about.work_key,
-        rows=len(records),
-        kept=counts,
-        rejected=dict(records[0].frames_rejected) if records else {},
-        reason="; ".join(f"{r.pair}: {r.reason}" for r in records if r.reason),
-        outputs=[str(path)],
+def _told(records: Sequence[CalibrationRecord]) -> Told:
+    counts = {status: sum(r.status == status for r in records) for status in STATUSES}
+    return Told(
+        counts,
+        dict(records[0].frames_rejected) if records else {},
+        "; ".join(f"{r.pair}: {r.reason}" for r in records if r.reason),
+        refused=counts["refused"] == len(records),
     )

@@ -9,18 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pipeline.config import FleetConfig
-from pipeline.errors import BoresightError
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
 from pipeline.fleet.pattern import VehicleDay
-from pipeline.results import Progress, StageResult
+from pipeline.results import Outcome, Progress
+from pipeline.runner import try_stage
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE, Stage
-from pipeline.store.current import current_records
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records
-from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from pipeline.work import Task
 
 __all__ = ["DayOutcome", "Night", "run_night", "run_vehicle_day"]
 
@@ -77,22 +75,16 @@ def run_night(
 
 def run_vehicle_day(night: Night, work: VehicleDay, progress: Progress) -> DayOutcome:
     """Ingest, perceive and calibrate one vehicle-day; a stage's refusal ends as a refused record."""
-    partition, done = work.partition, list[StageResult]()
-    shared = (partition, night.fleet, night.lake)
-    for stage, arguments, options in (
-        (INGEST, (work.logs, *shared), {}),
-        (PERCEIVE, shared, {}),
-        (CALIBRATE, shared, {"method": night.method, "seed": night.seed}),
-    ):
-        try:
-            done.append(stage.load()(*arguments, progress=_named(stage, progress), **options))
-        except (BoresightError, OSError) as err:
-            failed = StageResult(stage.name, partition.vehicle, partition.day, "failed", "", reason=str(err))
-            return _summarise(night, partition, [*done, failed])
-        if done[-1].status == "refused" and stage is not CALIBRATE:
-            _record_refusal(night, partition, done[-1])
+    partition, done = work.partition, list[Outcome]()
+    task = Task(night.fleet, night.lake, partition, night.method, night.seed, logs=tuple(work.logs))
+    for stage in (INGEST, PERCEIVE, CALIBRATE):
+        done.append(try_stage(stage, task, _named(stage, progress)))
+        if done[-1].status == "failed":
             break
-    return _summarise(night, partition, done)
+        if done[-1].status == "refused" and stage is not CALIBRATE:
+            CALIBRATE.run(replace(task, given=done[-1]))  # records the refusal
+            break
+    return _summarise(partition, done)
 
 
 def _run_job(job: tuple[Night, VehicleDay], progress: Progress) -> DayOutcome:
@@ -110,23 +102,8 @@ def _outcome(finished: Finished[tuple[Night, VehicleDay], DayOutcome]) -> DayOut
     return DayOutcome(partition.vehicle, partition.day, "failed", finished.error, trace=finished.trace)
 
 
-def _record_refusal(night: Night, partition: Partition, refused: StageResult) -> None:
-    """A record for a day that never reached the solver, so that whoever reads the lake finds the reason."""
-    from pipeline.calibrate.records import Inputs, refused_records  # noqa: PLC0415 - brings the solver
-    from pipeline.store.partitions import work_key  # noqa: PLC0415
-    from pipeline.store.tables import write_records  # noqa: PLC0415
-    from schemas.versions import CODE_VERSION  # noqa: PLC0415
-
-    seed = night.fleet.solve.seed if night.seed is None else night.seed
-    inputs = [refused.work_key] if refused.work_key else []
-    key = work_key("refusal", CODE_VERSION, f"{refused.stage}: {refused.reason}", [*inputs, night.method])
-    about = Inputs(partition, night.method, key, seed, tuple(inputs))
-    records = refused_records(about, f"{refused.stage}: {refused.reason}", 0, None)
-    write_records(night.lake, CALIBRATIONS, partition, records, key, CODE_VERSION, inputs)
-
-
-def _summarise(night: Night, partition: Partition, results: Sequence[StageResult]) -> DayOutcome:
-    pairs = _pairs(night, partition, results)
+def _summarise(partition: Partition, results: Sequence[Outcome]) -> DayOutcome:
+    pairs = {r.pair: r.status for r in results[-1].records if results[-1].stage == CALIBRATE.name}
     worst = next((r for r in results if r.status in ("failed", "refused")), None)
     verdicts = {s for s in ("held", "refused") if s in pairs.values()}
     if worst is not None:
@@ -144,14 +121,3 @@ def _summarise(night: Night, partition: Partition, results: Sequence[StageResult
         pairs,
         next((r.rows for r in results if r.stage == INGEST.name), 0),
     )
-
-
-def _pairs(night: Night, partition: Partition, results: Sequence[StageResult]) -> dict[str, str]:
-    """Status of the day's current record of each pair, where this night came as far as calibrate."""
-    if not results or results[-1].stage != CALIBRATE.name or results[-1].status == "failed":
-        return {}
-    found = read_records(
-        night.lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle, day=partition.day
-    )
-    key = results[-1].work_key
-    return {r.pair: r.status for r in current_records([r for r in found if r.work_key == key])}

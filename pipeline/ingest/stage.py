@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Generator, Iterator
 
 import numpy as np
 from jaxtyping import Int64
 
-from pipeline.config import FleetConfig, IngestConfig, Rig, config_hash
-from pipeline.errors import ConfigError, ContractError
+from pipeline.config import FleetConfig, IngestConfig, Rig
+from pipeline.errors import ConfigError
 from pipeline.extrinsics.prior import read_transforms
 from pipeline.ingest.containers.reader import content_identity
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected, Trio
 from pipeline.ingest.index import DayIndex, index_logs, topics_of
 from pipeline.ingest.sync import Rejection, match_nearest, match_trios, number_drives
-from pipeline.results import Progress, StageResult, silent
-from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.tables import Manifest, read_manifest, write_partition
-from schemas.frames import FRAMES, Frame
-from schemas.versions import CODE_VERSION
+from pipeline.results import Progress
+from pipeline.work import NothingUsable, Run, Task, Work
+from schemas.frames import Frame
 
-__all__ = ["ingest_day", "pick_trios", "read_file_prior"]
+__all__ = ["pick_trios", "read_file_prior", "work"]
 
-_CHUNK_BYTES = (
-    24 << 20
-)  # a row group: large enough to compress, small enough that a worker stays far below 2 GB
-_CHUNK_FRAMES = 16
 _PROBLEMS_SHOWN = 3
 _UNUSABLE = (
     Rejection.IMAGE_DAMAGED,
@@ -40,64 +33,51 @@ _UNUSABLE = (
 )
 
 
-class _NothingUsableError(Exception):
-    """Leaves the writer's block, so that nothing is written."""
+def work(task: Task) -> Work:
+    """The partition of `frames` that the task's logs give.
 
-
-def ingest_day(
-    logs: Sequence[Path],
-    partition: Partition,
-    fleet: FleetConfig,
-    lake: Lake,
-    progress: Progress = silent,
-) -> StageResult:
-    """Write the partition of `frames` that the logs give; "cached" where the same inputs gave it before.
-
-    A day without a single usable trio is "refused": nothing is written (an empty table would look like a day
-    that was looked at and gave nothing), a partition of earlier inputs stays, and the reason names topics and
-    what to do. `rejected` counts each sweep that became no frame under one Rejection, and damage, dropped
-    points and missing parts under names of their own.
-
-    Args:
-        logs: files or ROS 2 bag folders, in any order; recordings split by time or by sensor belong together.
-        partition: vehicle and day.
-        fleet: the whole configuration.
-        lake: where to write.
-        progress: told of frames done and total.
+    A day without a single usable trio is refused: nothing is written (an empty table would look like a day that was
+    looked at and gave nothing), a partition of earlier inputs stays, and the reason names topics and what to do.
+    `rejected` counts each sweep that became no frame under one Rejection, and damage, dropped points and missing
+    parts under names of their own.
 
     Raises:
         ConfigError: unknown vehicle, a log that does not exist, an unusable prior file.
     """
-    rig = fleet.rig_of(partition.vehicle)
-    missing = [str(p) for p in logs if not p.exists()]
+    rig = task.fleet.rig_of(task.partition.vehicle)
+    missing = [str(p) for p in task.logs if not p.exists()]
     if missing:
         raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
-    file_prior = read_file_prior(rig, fleet)
-    inputs = sorted(content_identity(p) for p in logs)
+    file_prior = read_file_prior(rig, task.fleet)
     prior_key = {} if file_prior is None else {"prior": [T.tolist() for T in file_prior]}
-    key = work_key("ingest", CODE_VERSION, config_hash(fleet.ingest, rig, prior_key), inputs)
-    manifest = _manifest(lake, partition)
-    if manifest is not None and manifest.work_key == key:
-        return _result("cached", lake, partition, key, manifest.rows, manifest.rejected)
-    progress(0, 0, "reading the index")
-    index = index_logs(logs, rig)
-    builder = FrameBuilder(index, rig, fleet.ingest, file_prior)
-    trios, rejected = pick_trios(index, fleet.ingest)
+    return Work(
+        (task.fleet.ingest, rig, prior_key),
+        lambda run: _rows(task, rig, file_prior, run),
+        inputs=tuple(sorted(content_identity(p) for p in task.logs)),
+    )
+
+
+def _rows(
+    task: Task, rig: Rig, file_prior: tuple[np.ndarray, np.ndarray] | None, run: Run
+) -> Generator[Frame, None, None]:
+    """The day's frames in order of time, one at a time."""
+    config = task.fleet.ingest
+    run.progress(0, 0, "reading the index")
+    index = index_logs(task.logs, rig)
     try:
-        with write_partition(lake, FRAMES, partition, key, CODE_VERSION, inputs) as writer:
-            for chunk in _chunks(_frames(trios, builder, index, rejected, progress)):
-                writer.append(chunk)
-            _require_rows(writer.rows)
-            counts = _all_counts(rejected, index, builder)
-            writer.describe(
-                kept={"frames": writer.rows}, rejected=counts, problems=index.problems, logs=index.log_names
-            )
-    except _NothingUsableError:
-        reason = refusal(index, rig, rejected, fleet.ingest.sync_gate_s)
-        return _result("refused", lake, partition, key, 0, _all_counts(rejected, index, builder), reason)
+        builder = FrameBuilder(index, rig, config, file_prior)
+        trios, rejected = pick_trios(index, config)
+        made = 0
+        for frame in _frames(trios, builder, index, rejected, run.progress):
+            made += 1
+            yield frame
+        run.rejected.update(_all_counts(rejected, index, builder))
+        if not made:
+            raise NothingUsable(refusal(index, rig, rejected, config.sync_gate_s))
+        run.extra |= {"problems": index.problems, "logs": index.log_names}
+        run.remarks = _shorten(index.problems)
     finally:
         index.close()
-    return _result("done", lake, partition, key, writer.rows, counts, _shorten(index.problems))
 
 
 def pick_trios(index: DayIndex, config: IngestConfig) -> tuple[list[Trio], Counter[str]]:
@@ -158,13 +138,6 @@ def read_file_prior(rig: Rig, fleet: FleetConfig) -> tuple[np.ndarray, np.ndarra
     return transforms["camera_lidar"], transforms["lidar_radar"]
 
 
-def _manifest(lake: Lake, partition: Partition) -> Manifest | None:
-    try:
-        return read_manifest(lake, FRAMES, partition)
-    except (ContractError, ValueError, OSError):
-        return None  # another version or a damaged file: made anew
-
-
 def _drives(index: DayIndex) -> Int64[np.ndarray, " N"]:
     """Drive of each sweep, by its place in the stream."""
     lidar = index.stream("lidar")
@@ -172,11 +145,6 @@ def _drives(index: DayIndex) -> Int64[np.ndarray, " N"]:
     drives = np.zeros(len(order), np.int64)
     drives[order] = number_drives([lidar.stamps[i] for i in order], [lidar.located[i].log for i in order])
     return drives
-
-
-def _require_rows(rows: int) -> None:
-    if not rows:
-        raise _NothingUsableError
 
 
 def _spread(count: int, limit: int | None) -> Int64[np.ndarray, " N"]:
@@ -200,44 +168,8 @@ def _frames(
         progress(done, len(trios), "frames")
 
 
-def _chunks(frames: Iterator[Frame]) -> Iterator[list[Frame]]:
-    chunk: list[Frame] = []
-    size = 0
-    for frame in frames:
-        chunk.append(frame)
-        size += len(frame.image) + 24 * len(frame.lidar_x_m)
-        if size >= _CHUNK_BYTES or len(chunk) >= _CHUNK_FRAMES:
-            yield chunk
-            chunk, size = [], 0
-    yield chunk
-
-
 def _all_counts(rejected: Counter[str], index: DayIndex, builder: FrameBuilder) -> dict[str, int]:
     return {str(k): int(v) for k, v in (rejected + index.damage + builder.counts).items() if v}
-
-
-def _result(
-    status: str,
-    lake: Lake,
-    partition: Partition,
-    key: str,
-    rows: int,
-    rejected: dict[str, int],
-    reason: str = "",
-) -> StageResult:
-    outputs = [str(lake.folder(FRAMES.name, partition))] if rows else []
-    return StageResult(
-        "ingest",
-        partition.vehicle,
-        partition.day,
-        status,
-        key,
-        rows,
-        {"frames": rows},
-        rejected,
-        reason,
-        outputs,
-    )
 
 
 def _shorten(problems: list[str]) -> str:

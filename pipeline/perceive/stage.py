@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,7 @@ from pipeline.config import (
     PerceiveConfig,
     RadarTopics,
     TopicSemantics,
-    config_hash,
 )
-from pipeline.errors import ContractError
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.radar_grid import Scan
 from pipeline.perceive.camera import SemanticsSource, TopicSource, decode_grey, encode_png
@@ -30,17 +29,15 @@ from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_unifo
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
 from pipeline.perceive.road_markings import lidar_markings, road_contrast
 from pipeline.perceive.tracks import EgoMotion, Tracks, TrackState, advance_tracks, measure_clusters
-from pipeline.results import Progress, StageResult, silent
-from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.tables import Manifest, iterate_rows, read_manifest, write_partition
+from pipeline.store.tables import iterate_rows
+from pipeline.work import Run, Task, Work
 from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
-from schemas.versions import CODE_VERSION
+from schemas.observations import Observation
 
-__all__ = ["perceive_day", "perceive_frame"]
+__all__ = ["perceive_frame", "work"]
 
 _MIN_LIDAR_POINTS = 100  # less shows neither ground nor objects
-_ROWS_PER_GROUP = 16
+_PerceiveFrame = Callable[..., tuple[Observation, TrackState]]
 _PRIOR_FIELDS = [
     f"prior_{pair}_{part}"
     for pair in ("camera_lidar", "lidar_radar")
@@ -53,58 +50,45 @@ _COPIED_FIELDS = [
 ]  # fmt: skip
 
 
-def perceive_day(
-    partition: Partition,
-    fleet: FleetConfig,
-    lake: Lake,
-    progress: Progress = silent,
-) -> StageResult:
-    """Perceive all frames of a vehicle-day and replace its partition of observations.
+def work(task: Task) -> Work:
+    """The partition of `observations` of a day's frames.
 
-    A frame that cannot be used is left out and counted by reason. Where none is left, the partition is empty
-    and the result "refused".
+    A frame that cannot be used is left out and counted by reason. Where none is left, the partition is empty and the
+    outcome "refused".
 
     Raises:
         ConfigError: the vehicle or a model manifest is not as fleet.toml says.
-        ContractError: the day has no frames yet.
         ModelError: a model does not do what its manifest says.
     """
-    rig = fleet.rig_of(partition.vehicle)
-    frames = read_manifest(lake, FRAMES, partition)
-    if frames is None:
-        folder = lake.folder(FRAMES.name, partition)
-        raise ContractError(str(folder), "no frames of this vehicle and day: run `boresight ingest` first")
-    source, semantics_key = _source(rig.camera.semantics, fleet)
-    drivable = _drivable(rig.radar, fleet)
-    points = _points(rig.lidar, fleet)
+    rig = task.fleet.rig_of(task.partition.vehicle)
+    source, semantics_key = _source(rig.camera.semantics, task.fleet)
+    drivable, points = _drivable(rig.radar, task.fleet), _points(rig.lidar, task.fleet)
     for model in (drivable, points):
         semantics_key |= {} if model is None else model.provenance
-    key = work_key("perceive", CODE_VERSION, config_hash(fleet.perceive, semantics_key), [frames.work_key])
-    done = read_manifest(lake, OBSERVATIONS, partition)
-    if done is not None and done.work_key == key:
-        return _result(lake, partition, done, "cached")
-    rejected: Counter[str] = Counter()
-    with write_partition(lake, OBSERVATIONS, partition, key, CODE_VERSION, [frames.work_key]) as writer:
-        state, seen, rows = TrackState.empty(), 0, []
-        for group in iterate_rows(lake, FRAMES, partition, Frame):
-            for frame in group:
-                try:
-                    observation, state = perceive_frame(
-                        frame, source, fleet.perceive, state, drivable, points
-                    )
-                    rows.append(observation)
-                except FrameRejectedError as rejection:
-                    rejected[rejection.reason.value] += 1
-                seen += 1
-                progress(seen, frames.rows, "perceive")
-                if len(rows) == _ROWS_PER_GROUP:
-                    writer.append(rows)
-                    rows = []
-        writer.append(rows)
-        writer.describe(kept={"frames": writer.rows}, rejected=dict(rejected))
-    written = read_manifest(lake, OBSERVATIONS, partition)
-    assert written is not None, "the partition was just written"
-    return _result(lake, partition, written, "done")
+    perceive = partial(
+        perceive_frame, source=source, config=task.fleet.perceive, drivable=drivable, points=points
+    )
+    return Work(
+        (task.fleet.perceive, semantics_key),
+        lambda run: _rows(task, perceive, run),
+        nothing="no usable frame",
+    )
+
+
+def _rows(task: Task, perceive: _PerceiveFrame, run: Run) -> Generator[Observation, None, None]:
+    """The day's observations, a row group of frames in memory at a time."""
+    total, state, seen = task.inputs[FRAMES.name].rows, TrackState.empty(), 0
+    for group in iterate_rows(task.lake, FRAMES, task.partition, Frame):
+        for frame in group:
+            observation: Observation | None = None
+            try:
+                observation, state = perceive(frame, tracks=state)
+            except FrameRejectedError as rejection:
+                run.rejected[rejection.reason.value] += 1
+            seen += 1
+            run.progress(seen, total, "perceive")
+            if observation is not None:
+                yield observation
 
 
 def perceive_frame(
@@ -325,23 +309,3 @@ def _ego_speed(frame: Frame, motion: RadarMotion) -> float | None:
         return frame.ego_speed_mps
     vx, vy = float(motion.velocity_mps[0]), float(motion.velocity_mps[1])
     return float(np.copysign(np.hypot(vx, vy), vx))
-
-
-def _result(lake: Lake, partition: Partition, manifest: Manifest, status: str) -> StageResult:
-    reason = ""
-    if manifest.rows == 0:
-        status = "refused"
-        counts = ", ".join(f"{n} {why}" for why, n in sorted(manifest.rejected.items()))
-        reason = f"no usable frame: {counts}" if counts else "the day has no frames"
-    return StageResult(
-        stage="perceive",
-        vehicle=partition.vehicle,
-        day=partition.day,
-        status=status,
-        work_key=manifest.work_key,
-        rows=manifest.rows,
-        kept=dict(manifest.kept),
-        rejected=dict(manifest.rejected),
-        reason=reason,
-        outputs=[str(lake.folder(OBSERVATIONS.name, partition))],
-    )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import datetime as dt
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -27,16 +28,41 @@ from pipeline.results import Progress, silent
 from pipeline.store.current import current_drift, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import iterate_rows, read_manifest, read_records
+from pipeline.work import Run, Task, Work
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 
-__all__ = ["write_day_page", "write_fleet_page", "write_fleet_report"]
+__all__ = ["Pages", "work", "write_day_page", "write_fleet_page", "write_fleet_report"]
 
 _SCENES = 3
 _FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 _CHARTS = 24  # vehicles without an alarm whose charts still go on the fleet page
+
+
+@dataclass(frozen=True)
+class Pages:
+    """What a task of this stage is given: the HTML file to write, and the truth of a simulated fleet."""
+
+    out: Path
+    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]] | None = None
+
+
+def work(task: Task) -> Work:
+    """The page of a vehicle-day, or those of the fleet with all its days, as `Pages` that the task is given says."""
+    pages: Pages = task.given
+    settings = ({"method": task.method or task.fleet.audit.method, "of": str(task.of)},)
+
+    def rows(run: Run) -> Generator[Path, None, None]:
+        if isinstance(task.of, Partition):
+            yield write_day_page(task.lake, task.of, task.fleet, pages.out, task.method)
+        else:
+            yield from write_fleet_report(
+                task.lake, task.fleet, pages.out, task.method, truth=pages.truth, progress=run.progress
+            )
+
+    return Work(settings, rows, inputs=())
 
 
 def write_day_page(

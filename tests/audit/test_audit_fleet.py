@@ -6,7 +6,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from pipeline.audit.stage import audit_fleet
 from pipeline.audit.vehicle import PairDays, judge_vehicle
 from pipeline.config import AuditConfig, FleetConfig
 from pipeline.errors import ConfigError
@@ -15,6 +14,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records, write_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
+from tests.makers.stages import audit_fleet
 
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])
 

@@ -26,10 +26,10 @@ from pipeline.store.partitions import Lake, Partition
 stage, folder, lake = sys.argv[1], Path(sys.argv[2]), Lake.at(sys.argv[3])
 fleet, day = load_fleet(folder / "fleet.toml"), Partition("vehicle-1", "2026-03-02")
 if stage == "ingest":
-    from pipeline.ingest.stage import ingest_day
+    from tests.makers.stages import ingest_day
     result = ingest_day(sorted((folder / "logs").rglob("*.mcap")), day, fleet, lake)
 else:
-    from pipeline.perceive.stage import perceive_day
+    from tests.makers.stages import perceive_day
     result = perceive_day(day, fleet, lake)
 # Not ru_maxrss: a child inherits its parent's.
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))

@@ -4,13 +4,11 @@ import time
 
 import pytest
 
-from pipeline.calibrate.stage import calibrate_day
 from pipeline.config import load_fleet
-from pipeline.ingest.stage import ingest_day
-from pipeline.perceive.stage import perceive_day
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
 from tests.benchmarks.kernel_workload import FRAMES, POINTS, naive_cpu_s
+from tests.makers.stages import calibrate_day, ingest_day, perceive_day
 
 SIMULATED_FRAMES = 40
 DAY = Partition("vehicle-1", "2026-03-02")

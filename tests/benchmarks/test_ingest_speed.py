@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from pipeline.ingest.stage import ingest_day
 from pipeline.store.partitions import Lake, Partition
+from tests.makers.stages import ingest_day
 from tests.makers.written_logs import (
     HEIGHT,
     IMAGE,
@@ -30,7 +30,7 @@ LIMIT = 1.6 * GOAL
 _MEASURE_MEMORY = """
 import sys
 from pathlib import Path
-from pipeline.ingest.stage import ingest_day
+from tests.makers.stages import ingest_day
 from pipeline.store.partitions import Lake, Partition
 from tests.makers.written_logs import fleet_config
 result = ingest_day([Path(sys.argv[1])], Partition("car", "2023-11-14"), fleet_config(), Lake.at(sys.argv[2]))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.records import environment_of
-from pipeline.calibrate.stage import calibrate_day
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion, rotation_angle_rad
@@ -15,6 +14,7 @@ from pipeline.store.tables import read_records, write_partition
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.observations import OBSERVATIONS
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day, prior_columns
+from tests.makers.stages import calibrate_day
 
 DAY = Partition("car 1", "2024-05-06")
 TOPICS = {

@@ -9,7 +9,7 @@ from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, LogError
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
-from pipeline.results import StageResult
+from pipeline.results import Outcome
 from pipeline.stages import Stage
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records, write_records
@@ -40,11 +40,13 @@ class StagesThatSay:
 
     def __init__(self, monkeypatch, lake, **answers):
         self.lake, self.answers, self.called = lake, answers, []
-        monkeypatch.setattr(Stage, "load", lambda stage: lambda *args, **kw: self.run(stage.name, args, kw))
+        real = Stage.run
+        # What a refused day's records are made by is no stage that a test dictates.
+        monkeypatch.setattr(Stage, "run", lambda s, task: real(s, task) if task.given else self.run(s, task))
 
-    def run(self, name, arguments, options):
-        options["progress"](0, 1, "begin")
-        return self.answer(name, next(a for a in arguments if isinstance(a, Partition)))
+    def run(self, stage, task):
+        task.progress(0, 1, "begin")
+        return self.answer(stage.name, task.partition)
 
     def answer(self, name, partition):
         self.called.append((name, partition.vehicle))
@@ -52,10 +54,10 @@ class StagesThatSay:
         if isinstance(answer, Exception):
             raise answer
         if name == "calibrate":
-            self.record(partition, answer)
             status = "cached" if answer == "cached" else "refused" if answer == "refused" else "done"
-            return StageResult(name, partition.vehicle, partition.day, status, "key")
-        return StageResult(name, partition.vehicle, partition.day, answer, "key", rows=7, reason="no frame")
+            rows = self.record(partition, answer)
+            return Outcome(name, partition.vehicle, partition.day, status, "key", records=tuple(rows))
+        return Outcome(name, partition.vehicle, partition.day, answer, "key", rows=7, reason="no frame")
 
     def record(self, partition, answer):
         statuses = {"held": ["accepted", "held", "accepted"], "refused": ["refused"] * 3}
@@ -75,6 +77,7 @@ class StagesThatSay:
             for pair, status in zip(PAIRS, statuses.get(answer, ["accepted"] * 3), strict=True)
         ]
         write_records(self.lake, CALIBRATIONS, partition, rows, "key", "0")
+        return rows
 
 
 @pytest.fixture

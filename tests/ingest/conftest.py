@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import pytest
 
 from pipeline.config import FleetConfig
-from pipeline.ingest.stage import ingest_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
 from schemas.frames import FRAMES, Frame
 from tests.makers import written_logs
+from tests.makers.stages import ingest_day
 
 
 @pytest.fixture(scope="session")

@@ -11,10 +11,10 @@ from rosbags.highlevel import AnyReader
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.ingest.check import check_logs
-from pipeline.ingest.stage import ingest_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import iterate_rows
 from schemas.frames import FRAMES, Frame
+from tests.makers.stages import ingest_day
 
 pytestmark = pytest.mark.real_logs
 CONFIG = Path(__file__).parent.parent / "end_to_end" / "astyx.toml"

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config import FleetConfig, load_fleet
-from pipeline.ingest.stage import ingest_day
-from pipeline.perceive.stage import perceive_day
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
 from schemas.observations import OBSERVATIONS, Observation
+from tests.makers.stages import ingest_day, perceive_day
 
 DATE = "2026-03-02"
 

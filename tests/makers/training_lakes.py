@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 
 from pipeline.config import FleetConfig
-from pipeline.learn.prepare.stage import decided_sides, prepare_day
+from pipeline.learn.prepare.stage import decided_sides
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_partition
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 from tests.makers import solve_scenes
+from tests.makers.stages import prepare_day
 
 TOPICS = {
     "camera": {

@@ -7,11 +7,11 @@ import pytest
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, ContractError
-from pipeline.perceive.stage import perceive_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_rows, write_partition
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
+from tests.makers.stages import perceive_day
 
 DAY = Partition("car-1", "2026-03-02")
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.audit.stage import audit_fleet
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.report.stage import write_day_page, write_fleet_page, write_fleet_report
@@ -18,6 +17,7 @@ from pipeline.report.truth import read_truth
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from tests.makers.stages import audit_fleet
 
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])
 

@@ -26,9 +26,8 @@ from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.training import TrainingRow
 
-__all__ = ["SHIPPED", "SSL_METHODS", "OnnxNetwork", "model_files", "models_key", "open_networks"]
+__all__ = ["SHIPPED", "OnnxNetwork", "model_files", "models_key", "open_networks"]
 
-SSL_METHODS = ("pairwise-ssl", "joint-ssl")
 SHIPPED = Path(__file__).parent.parent / "models"
 _NOBODY = About("", "", "", "", "", "")
 

@@ -1,36 +1,33 @@
 """Stage prepare: frames and observations of a vehicle-day to table `training`, a row group at a time.
 
 Whoever prepares a fleet looks over all its days first (`survey_day`: a few plain columns), divides them (`plan_days`)
-and then has each day written by whichever worker is free (`prepare_day`): no row depends on another day's.
+and then has each day written by whichever worker is free (`work`): no row depends on another day's.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Generator, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from pipeline.config import FleetConfig, PrepareConfig, config_hash
-from pipeline.errors import ContractError, SolveError
+from pipeline.config import PrepareConfig, config_hash
+from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import prior_key, read_prior
 from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import Survey, survey_day
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
-from pipeline.results import Progress, StageResult, silent
-from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.tables import Manifest, iterate_rows, read_manifest, write_partition
+from pipeline.store.partitions import Lake
+from pipeline.store.tables import iterate_rows, read_manifest
+from pipeline.work import Run, Task, Work
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.training import TRAINING, TrainingRow
-from schemas.versions import CODE_VERSION
 
-__all__ = ["decided_sides", "prepare_day"]
+__all__ = ["decided_sides", "work"]
 
-_ROWS_PER_GROUP = 16  # a group is read at once: 5-10 MB
 _SAME = 1e-6  # rad and m: logged priors repeat numbers, they do not measure
 
 
@@ -48,52 +45,34 @@ def decided_sides(lake: Lake, config: PrepareConfig) -> dict[tuple[str, str], st
     return sides
 
 
-def prepare_day(
-    partition: Partition,
-    fleet: FleetConfig,
-    lake: Lake,
-    plan: SplitPlan,
-    progress: Progress = silent,
-) -> StageResult:
-    """Write the samples of a vehicle-day as the plan divides them; `cached` where nothing changed.
+def work(task: Task) -> Work:
+    """The samples of a vehicle-day, divided as the plan says that the task is given (`SplitPlan`).
 
     Raises:
-        ContractError: the day has no frames or no observations yet.
         ConfigError: the vehicle or its prior file is not as fleet.toml says.
     """
-    config = fleet.prepare
-    rig = fleet.rig_of(partition.vehicle)
-    inputs = [_manifest(lake, schema, partition).work_key for schema in (FRAMES, OBSERVATIONS)]
-    survey = survey_day(partition, lake, config)
+    config, plan, vehicle = task.fleet.prepare, task.given, task.partition.vehicle
+    prior = task.fleet.rig_of(vehicle).prior
+    survey = survey_day(task.partition, task.lake, config)
     sides, rejected = _sides(survey, plan, config)
-    settings = {"prior_file": prior_key(fleet, partition.vehicle), "sides": [s or "" for s in sides]}
-    key = work_key("prepare", CODE_VERSION, config_hash(config, rig.prior, settings), inputs)
-    done = read_manifest(lake, TRAINING, partition)
-    if done is not None and done.work_key == key:
-        return _result(lake, partition, done, "cached")
-    counts: Counter[str] = Counter()
-    with write_partition(lake, TRAINING, partition, key, CODE_VERSION, inputs) as writer:
-        about = _about(survey, fleet.vehicles[partition.vehicle].rig, sides)
-        rows: list[TrainingRow] = []
-        samples = _samples(lake, partition, about, fleet, rejected)
-        for seen, row in enumerate(samples, 1):
-            progress(seen, len(about), "prepare")
-            if row is None:
-                continue
-            rows.append(row)
-            counts.update((row.split, f"{row.split} {row.environment}"))
-            if len(rows) == _ROWS_PER_GROUP:
-                writer.append(rows)
-                rows = []
-        writer.append(rows)
-        writer.describe(
-            kept={"frames": writer.rows, **counts},
-            rejected=dict(rejected),
-            split_rule=_split_rule(config),
-            sides=_sides_given(survey, plan),
-            grid={"step_deg": config.grid_step_deg, "shape": list(config.grid_shape)},
-        )
-    return _result(lake, partition, _manifest(lake, TRAINING, partition), "done")
+    settings = {"prior_file": prior_key(task.fleet, vehicle), "sides": [s or "" for s in sides]}
+    about = _about(survey, task.fleet.vehicles[vehicle].rig, sides)
+    extra = {
+        "split_rule": _split_rule(config),
+        "sides": _sides_given(survey, plan),
+        "grid": {"step_deg": config.grid_step_deg, "shape": list(config.grid_shape)},
+    }
+
+    def rows(run: Run) -> Generator[TrainingRow, None, None]:
+        run.rejected.update(rejected)
+        run.extra |= extra
+        for seen, row in enumerate(_samples(task, about, run.rejected), 1):
+            run.progress(seen, len(about), "prepare")
+            if row is not None:
+                run.kept.update((row.split, f"{row.split} {row.environment}"))
+                yield row
+
+    return Work((config, prior, settings), rows, nothing="no sample")
 
 
 def _about(survey: Survey, rig: str, sides: Sequence[str | None]) -> dict[int, About]:
@@ -107,16 +86,11 @@ def _about(survey: Survey, rig: str, sides: Sequence[str | None]) -> dict[int, A
     }
 
 
-def _samples(
-    lake: Lake,
-    partition: Partition,
-    about: Mapping[int, About],
-    fleet: FleetConfig,
-    rejected: Counter[str],
-) -> Iterator[TrainingRow | None]:
+def _samples(task: Task, about: Mapping[int, About], rejected: Counter[str]) -> Iterator[TrainingRow | None]:
     """The row of each wanted frame in order, None (counted in `rejected`) where it is no sample."""
     if not about:
         return
+    lake, partition, fleet = task.lake, task.partition, task.fleet
     observations = itertools.chain.from_iterable(iterate_rows(lake, OBSERVATIONS, partition, Observation))
     frames = itertools.chain.from_iterable(iterate_rows(lake, FRAMES, partition, Frame, rows=sorted(about)))
     observation = next(observations)
@@ -197,32 +171,3 @@ def _sides_given(survey: Survey, plan: SplitPlan) -> list[list[str]]:
 def _split_rule(config: PrepareConfig) -> str:
     names = ("split_by", "val_fraction", "test_fraction", "positions", "place_m", "place_s", "seed")
     return config_hash({name: getattr(config, name) for name in names})
-
-
-def _manifest(lake: Lake, schema: Any, partition: Partition) -> Manifest:
-    manifest = read_manifest(lake, schema, partition)
-    if manifest is None:
-        before = {"frames": "ingest", "observations": "perceive"}.get(schema.name, "prepare")
-        problem = f"no {schema.name} of this vehicle and day: run `boresight {before}` first"
-        raise ContractError(str(lake.folder(schema.name, partition)), problem)
-    return manifest
-
-
-def _result(lake: Lake, partition: Partition, manifest: Manifest, status: str) -> StageResult:
-    reason = ""
-    if manifest.rows == 0:
-        status = "refused"
-        counts = ", ".join(f"{n} {why}" for why, n in sorted(manifest.rejected.items()))
-        reason = f"no sample: {counts}" if counts else "the day has no frames"
-    return StageResult(
-        "prepare",
-        partition.vehicle,
-        partition.day,
-        status,
-        manifest.work_key,
-        rows=manifest.rows,
-        kept=dict(manifest.kept),
-        rejected=dict(manifest.rejected),
-        reason=reason,
-        outputs=[str(lake.folder(TRAINING.name, partition))],
-    )

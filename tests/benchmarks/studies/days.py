@@ -21,8 +21,6 @@ import numpy as np
 
 from pipeline.config import FleetConfig, load_fleet
 from pipeline.extrinsics.prior import read_prior
-from pipeline.ingest.stage import ingest_day
-from pipeline.perceive.stage import perceive_day
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
@@ -30,6 +28,7 @@ from pipeline.store.tables import read_rows
 from schemas.calibrations import PAIRS
 from schemas.observations import OBSERVATIONS, Observation
 from tests.benchmarks.studies.commits import commit_now
+from tests.makers.stages import ingest_day, perceive_day
 
 __all__ = ["REAL", "SETS", "Day", "DaySpec", "adopt_day", "generate_day", "load_day"]
 

@@ -17,13 +17,12 @@ import time
 from pathlib import Path
 
 from pipeline.config import load_fleet
-from pipeline.ingest.stage import ingest_day
-from pipeline.perceive.stage import perceive_day
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_vehicle_day, vehicle_names
 from pipeline.simulate.logs.fleet_toml import fleet_toml
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.store.partitions import Lake, Partition
 from tests.benchmarks.studies.days import SETS, generate_day
+from tests.makers.stages import ingest_day, perceive_day
 
 __all__ = ["FLEET", "make_fleet_day", "make_fleet_toml"]
 

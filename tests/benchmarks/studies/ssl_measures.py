@@ -18,6 +18,7 @@ from pipeline.geometry.targets import errors_at_targets, loop_errors
 from pipeline.learn.infer.onnx_networks import OnnxNetwork, open_networks
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.sample.frame_sample import SampleRejectedError
+from pipeline.work import Task
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation
@@ -102,7 +103,7 @@ def measure_day(
     fleet = models.configured(day.fleet, iterations).changed(solve=search_range(how) | {"polish": polish})
     rows = spoiled(day.rows, f"few:{frames}" if frames else "")
     about = Inputs(day.partition, models.method, "study", day.where.seed, ())
-    solver = ssl_solver(models.method, day.partition, fleet, day.lake)
+    solver = ssl_solver(models.method, Task(fleet, day.lake, day.partition))
     began = time.process_time()
     try:
         records = calibrate_observations(rows, prior, fleet, about, solver=solver)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.methods import solver_of
+from pipeline.calibrate.methods import method_named
 from pipeline.calibrate.tracking.association import associate, shared_sightings
 from pipeline.calibrate.tracking.bearings import Bearings, align_bearings, consistency
 from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow
@@ -332,7 +332,7 @@ def test_a_day_of_moving_cars_turns_all_three_pairs_towards_the_truth(day):
 def test_tracking_is_the_same_to_the_last_bit_whenever_it_is_asked_by_name(day):
     first, again = (
         solve(day, PRIOR),
-        solver_of("tracking")(
+        method_named("tracking").solver()(
             dict.fromkeys(PAIRS, day), PRIOR, SolveConfig(), seed=0, triggered=PAIRS, progress=lambda *_: None
         ),
     )

@@ -6,12 +6,12 @@ import torch
 
 from pipeline.errors import ContractError
 from pipeline.learn.batches.loader import TrainingLoader, load_split
-from pipeline.learn.prepare.stage import prepare_day
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Partition
 from pipeline.store.tables import read_rows
 from schemas.training import TRAINING, TrainingRow
 from tests.makers import training_lakes
+from tests.makers.stages import prepare_day
 
 VEHICLES = ("a", "b", "c", "d", "e", "f")
 

@@ -9,6 +9,7 @@ from pipeline.calibrate.networks import calibrate_frame
 from pipeline.config import LearnConfig, PrepareConfig
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.learn.infer.onnx_networks import SHIPPED, model_files, open_networks
+from pipeline.work import Task
 from schemas.calibrations import PAIRS
 from tests.makers.simulated_days import simulated_day
 
@@ -44,10 +45,8 @@ def test_one_frame_puts_sensors_right_that_were_knocked_by_five_degrees(day):
     """Median over frames, of a rig with half the lidar rows that it learned from."""
     before, after = [], []
     for o in day.observations:
-        found = calibrate_frame(
-            day.partition, day.fleet, day.lake, o.frame_index, method="joint-ssl",
-            perturb=(5.0, 0.05), seed=o.frame_index,
-        )  # fmt: skip
+        task = Task(day.fleet, day.lake, day.partition, "joint-ssl", o.frame_index, (5.0, 0.05))
+        found = calibrate_frame(task, o.frame_index)
         before.append([off(day, pair, found.prior.of(pair)) for pair in PAIRS])
         after.append([off(day, pair, found.solution.pairs[pair].T) for pair in PAIRS])
     before, after = np.median(np.degrees(before), axis=0), np.median(np.degrees(after), axis=0)

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from jobs.cli import main
-from pipeline.calibrate.stage import calibrate_day
 from pipeline.errors import ConfigError, ModelError, SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
@@ -26,6 +25,7 @@ from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.makers import training_lakes
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.makers.stages import calibrate_day
 
 TRUTH = {
     "camera_lidar": T_CAMERA_LIDAR,

@@ -251,11 +251,11 @@ def test_both_models_together_give_a_frames_semantics(tmp_path, made_frame):
 
 
 def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, made_frame):
-    from pipeline.perceive.stage import perceive_day
     from pipeline.store.partitions import Lake, Partition
     from pipeline.store.tables import read_rows, write_partition
     from schemas.frames import FRAMES
     from schemas.observations import OBSERVATIONS, Observation
+    from tests.makers.stages import perceive_day
 
     segmenter(tmp_path)
     detector(tmp_path, rows_of(BOXES[:1], [2], [0.9], [1.0]), "yolov5")

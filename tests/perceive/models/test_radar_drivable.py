@@ -15,11 +15,11 @@ from pipeline.learn.perception.radar_drivable.network import build_drivable_netw
 from pipeline.learn.perception.radar_drivable.samples import day_samples, scan_of
 from pipeline.learn.perception.radar_drivable.training import DrivableTraining, probabilities, train_drivable
 from pipeline.perceive.models.radar_drivable import RadarDrivable
-from pipeline.perceive.stage import perceive_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows, write_partition
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
+from tests.makers.stages import perceive_day
 
 DAY = Partition("car-1", "2026-03-02")
 COLUMNS = {"radar_drivable_azimuth_rad", "radar_drivable_range_m"}

@@ -11,7 +11,6 @@ from pipeline.config import FleetConfig, config_hash, load_fleet
 from pipeline.errors import ConfigError, ModelError
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
-from pipeline.perceive.stage import perceive_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows, write_partition
 from schemas.frames import FRAMES
@@ -19,6 +18,7 @@ from schemas.observations import OBSERVATIONS, Observation
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.onnx_models import write_manifest
 from tests.makers.range_scenes import DOWN, SIZE, UP, points_of
+from tests.makers.stages import perceive_day
 
 DAY = Partition("car-1", "2026-03-02")
 LABELS = list(POINT_LABEL_SETS["semantickitti"])

@@ -1,0 +1,209 @@
+"""Run a stage on a task: what every stage needs done around it, once.
+
+Work key, question whether the same work is done already, inputs, the stage itself, atomic commit, manifest with
+counts, outcome. Inline, in a pool of processes or elsewhere, this is what runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from dataclasses import fields, replace
+from typing import Any
+
+from pipeline.config import config_hash
+from pipeline.errors import BoresightError, ContractError
+from pipeline.results import Outcome, Progress
+from pipeline.stages import STAGES, Stage
+from pipeline.store.partitions import Partition, work_key
+from pipeline.store.tables import Manifest, read_manifest, read_records, write_partition, write_records
+from pipeline.work import NothingUsable, Records, Run, Task, Work
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.columns import TableSchema
+from schemas.drift import DRIFT, DriftFinding
+from schemas.versions import CODE_VERSION
+
+__all__ = ["run_stage", "try_stage"]
+
+# Tables of records: small, added to and never replaced. The others are replaced by whole partitions.
+_RECORD_ROWS: dict[str, type] = {CALIBRATIONS.name: CalibrationRecord, DRIFT.name: DriftFinding}
+# A row group: large enough to compress, small enough that a worker that holds one stays far below 2 GB.
+_GROUP_ROWS = 16
+_GROUP_BYTES = 24 << 20
+
+
+def run_stage(stage: Stage, task: Task) -> Outcome:
+    """Do what the task asks, unless the same work is done already.
+
+    The same code version, settings and inputs give the same work key, and a partition or record with that key is
+    not made again ("cached"). A stage that raises or is killed leaves what was written before as it was.
+
+    Raises:
+        ConfigError: unknown vehicle, or what the stage says of its configuration.
+        ContractError: a vehicle-day without what the stage reads; a row without what its table promises.
+    """
+    if isinstance(task.of, Partition):
+        task.fleet.rig_of(task.of.vehicle)
+    if stage.per_vehicle_day and stage.needs_inputs:
+        task = replace(task, inputs=_inputs(stage, task))
+    work = stage.load()(task)
+    known = tuple(m.work_key for m in task.inputs.values())
+    inputs = known if work.inputs is None else work.inputs
+    key = work_key(stage.name, CODE_VERSION, config_hash(*work.settings), list(inputs))
+    run = Run(key, inputs, task.progress)
+    if not stage.writes:
+        return _write_files(stage, task, work, run)
+    [schema] = stage.writes
+    if schema.name in _RECORD_ROWS:
+        return _add_records(stage, task, work, run, schema)
+    return _replace_partition(stage, task, work, run, schema)
+
+
+def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
+    """`run_stage` whose errors are outcomes: one vehicle-day's trouble never stops the others."""
+    try:
+        return stage.run(replace(task, progress=progress))
+    except (BoresightError, OSError) as err:
+        return _outcome(stage, task, "failed", "", reason=str(err))
+
+
+def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
+    """Manifests of all tables that the stage reads, in that order."""
+    found = {}
+    for schema in stage.reads:
+        manifest = read_manifest(task.lake, schema, task.partition)
+        if manifest is None:
+            maker = next(s.name for s in STAGES if schema in s.writes)
+            problem = f"no {schema.name} of this vehicle and day: run `boresight {maker}` first"
+            raise ContractError(str(task.lake.folder(schema.name, task.partition)), problem)
+        found[schema.name] = manifest
+    return found
+
+
+def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: TableSchema) -> Outcome:
+    """Stream the rows into the partition, which appears as a whole or not at all."""
+    done = _readable(task, schema)
+    if done is not None and done.work_key == run.work_key and not work.again:
+        return _partition_outcome(stage, task, work, "cached", done)
+    try:
+        with (
+            closing(work.rows(run)) as rows,
+            write_partition(task.lake, schema, task.partition, run.work_key, CODE_VERSION, run.inputs) as out,
+        ):
+            for group in _groups(rows):
+                out.append(group)
+            out.describe(kept={"frames": out.rows, **run.kept}, rejected=dict(run.rejected), **run.extra)
+    except NothingUsable as refusal:
+        counts = {"kept": {"frames": 0}, "rejected": dict(run.rejected)}
+        return _outcome(stage, task, "refused", run.work_key, reason=str(refusal), **counts)
+    written = read_manifest(task.lake, schema, task.partition)
+    assert written is not None, "the partition was just written"
+    return _partition_outcome(stage, task, work, "done", written, run.remarks)
+
+
+def _readable(task: Task, schema: TableSchema) -> Manifest | None:
+    """Manifest of the partition as it is; None where it is absent, of another version or damaged: made anew."""
+    try:
+        return read_manifest(task.lake, schema, task.partition)
+    except (ContractError, ValueError, OSError):
+        return None
+
+
+def _partition_outcome(
+    stage: Stage, task: Task, work: Work, status: str, manifest: Manifest, remarks: str = ""
+) -> Outcome:
+    reason = remarks
+    if manifest.rows == 0:
+        status = "refused"
+        counts = ", ".join(f"{n} {why}" for why, n in sorted(manifest.rejected.items()))
+        reason = f"{work.nothing}: {counts}" if counts else "the day has no frames"
+    return _outcome(
+        stage,
+        task,
+        status,
+        manifest.work_key,
+        rows=manifest.rows,
+        kept=dict(manifest.kept),
+        rejected=dict(manifest.rejected),
+        reason=reason,
+        outputs=[str(task.lake.folder(manifest.table, task.partition))],
+    )
+
+
+def _add_records(stage: Stage, task: Task, work: Work, run: Run, schema: TableSchema) -> Outcome:
+    """Add the records, each `Records` as one file that appears as a whole."""
+    recorded = [] if work.again else _recorded(task, run.work_key, schema)
+    if recorded:
+        path = task.lake.folder(schema.name, task.partition) / f"{run.work_key}.parquet"
+        return _record_outcome(stage, task, work, "cached", run.work_key, recorded, [str(path)])
+    written, paths = [], []
+    with closing(work.rows(run)) as batches:
+        for records in batches:
+            paths.append(_commit(task, schema, records, run))
+            written += records.rows
+    return _record_outcome(stage, task, work, "done", run.work_key, written, paths)
+
+
+def _commit(task: Task, schema: TableSchema, records: Records, run: Run) -> str:
+    partition = records.partition or task.partition
+    key = records.work_key or run.work_key
+    inputs = run.inputs if records.inputs is None else records.inputs
+    return str(write_records(task.lake, schema, partition, records.rows, key, CODE_VERSION, inputs))
+
+
+def _recorded(task: Task, key: str, schema: TableSchema) -> list[Any]:
+    """What the same work has recorded already."""
+    vehicle, day = task.partition.vehicle, task.partition.day
+    kind: type[Any] = _RECORD_ROWS[schema.name]
+    found = read_records(task.lake, schema, kind, vehicle=vehicle, day=day)
+    return [r for r in found if r.work_key == key]
+
+
+def _record_outcome(
+    stage: Stage, task: Task, work: Work, status: str, key: str, rows: list[Any], outputs: list[str]
+) -> Outcome:
+    told = work.tell(rows)
+    return _outcome(
+        stage,
+        task,
+        "refused" if told.refused and status == "done" else status,
+        key,
+        rows=len(rows),
+        kept=told.kept,
+        rejected=told.rejected,
+        reason=told.reason,
+        outputs=outputs,
+        records=tuple(rows),
+    )
+
+
+def _write_files(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
+    """A stage that writes no table: it writes each file atomically itself and yields the path."""
+    with closing(work.rows(run)) as paths:
+        outputs = [str(path) for path in paths]
+    return _outcome(stage, task, "done", run.work_key, outputs=outputs)
+
+
+def _outcome(stage: Stage, task: Task, status: str, key: str, **told: Any) -> Outcome:
+    of = task.of
+    where = (of.vehicle, of.day) if isinstance(of, Partition) else ("", "")
+    return Outcome(stage.name, *where, status, key, **told)
+
+
+def _groups(rows: Iterable[Any]) -> Iterator[list[Any]]:
+    """Rows by the row group; no more than one is held."""
+    group: list[Any] = []
+    size = 0
+    for row in rows:
+        group.append(row)
+        size += _bytes_of(row)
+        if size >= _GROUP_BYTES or len(group) >= _GROUP_ROWS:
+            yield group
+            group, size = [], 0
+    yield group
+
+
+def _bytes_of(row: Any) -> int:
+    """Memory of a row's arrays and blobs; the rest is small."""
+    values = (getattr(row, f.name) for f in fields(row))
+    return sum(len(v) if isinstance(v, bytes) else getattr(v, "nbytes", 0) for v in values)
