@@ -21,9 +21,16 @@ $(STAMP): pyproject.toml constraints.txt
 demo: setup ## synthetic fleet to HTML report, in minutes
 	$(BIN)/boresight demo --out demo || [ $$? -eq 3 ] # 3: done, and something was held, as it should be
 
-test: setup ## every test, with shapes and types of the annotations checked
+test: setup browser ## every test, with shapes and types of the annotations checked
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --durations 25 --ignore tests/benchmarks \
 		--jaxtyping-packages=schemas,pipeline,beartype.beartype
+
+# Page tests want Chromium. It is installed where that is allowed without asking, and nowhere else; tests without it are
+# named in the last lines of `make test`.
+browser:
+	@for name in chromium chromium-browser google-chrome; do command -v $$name >/dev/null && exit 0; done; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		apt-get update -qq && apt-get install -y -qq chromium fonts-dejavu-core; fi || true
 
 lint: setup ## style and types
 	$(BIN)/ruff check .
@@ -36,7 +43,10 @@ bench: setup ## speed and memory, measured as ratios against the committed basel
 bench-accept: setup ## the same, and writes what it measures into the baseline
 	$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks -p no:xdist -s --accept-baseline
 
+licenses: setup ## write THIRD_PARTY_LICENSES.md anew
+	$(BIN)/python -m tests.makers.third_party > THIRD_PARTY_LICENSES.md
+
 clean: ## remove what the other targets made
 	rm -rf .venv demo .pytest_cache .mypy_cache .ruff_cache
 
-.PHONY: help setup demo test lint bench bench-accept clean
+.PHONY: help setup demo test browser lint bench bench-accept licenses clean

@@ -1,6 +1,7 @@
 """Fixtures that several rooms share."""
 
 import os
+from collections import Counter
 from pathlib import Path
 
 # One thread per process: the suite may run on several workers, and nested thread pools starve small machines.
@@ -34,3 +35,14 @@ def real_detector() -> Path:
     if not path.is_file():
         pytest.skip("the real detector is not on this machine")
     return path
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say last, and without being asked, which tests were left out and how to have them."""
+    left_out: Counter[tuple[str, str]] = Counter()
+    for report in terminalreporter.stats.get("skipped", []):
+        reason = report.longrepr[2] if isinstance(report.longrepr, (tuple, list)) else str(report.longrepr)
+        left_out[report.nodeid.partition("::")[0], reason.removeprefix("Skipped: ")] += 1
+    for (file, reason), tests in sorted(left_out.items()):
+        terminalreporter.write_line(f"left out of {file}: {tests} ({reason})")

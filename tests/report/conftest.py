@@ -143,7 +143,7 @@ def _problem(event: dict[str, Any]) -> str:
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """A headless Chromium."""
     if CHROMIUM is None:
-        pytest.skip("no Chromium on this machine")
+        pytest.skip("no browser on this machine: apt-get install chromium")
     started = Browser(tmp_path_factory.mktemp("chromium"))
     yield started
     started.close()
