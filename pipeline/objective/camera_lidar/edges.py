@@ -1,10 +1,10 @@
 """Directed edges: depth jumps of the lidar against mask boundaries of the same direction.
 
-Each projected jump has a nearest boundary of its own direction class at the signed distance r along that
-boundary's axis. Only some jumps match (on real logs one in five is more than chance), so the score is not a
-sum of squares but the log likelihood ratio of the mixture `pi N(r; s) + (1 - pi) c(r)` against chance
-alone, c(r): how far boundaries lie from a random pixel. A class whose boundaries say nothing gets a small
-pi and loses its weight by itself.
+Each projected jump has a nearest boundary of its own direction class at the signed distance r along that boundary's
+axis. Only some jumps match (on real logs one in five more than by chance), so the score is not a sum of squares but the
+log likelihood ratio of a mixture, `pi k(r; s) + (1 - pi) c(r)`, against chance alone, `c(r)`: the density of distances
+from random pixels to their nearest boundary. k is the kernel (1 + (r/s)^2)^-2, normalised. The share of matches pi is
+estimated per kind of edge: a kind that matches no better than chance gets a small pi and so loses its weight.
 """
 
 from __future__ import annotations

@@ -28,9 +28,9 @@ from pipeline.objective.radar.registration_loops import CUT
 __all__ = ["StaticFrames", "elevation_limits", "static_cost", "tells_elevation"]
 
 _DETECTIONS, _POINTS = 96, 768  # of a frame at most: every pair of them is weighed
-_LEAST_HEIGHT_M = 0.3  # what is lower mirrors onto itself
+_LEAST_HEIGHT_M = 0.3  # a lower point is as good as its own mirror image
 _STEEPEST_RAD = 1.5
-_NEVER = -1e4  # log weight of what is no partner
+_NEVER = -1e4  # log weight of a point that the detection cannot have come from
 
 
 @dataclass(frozen=True, eq=False)

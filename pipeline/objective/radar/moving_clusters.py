@@ -1,7 +1,8 @@
 """Moving radar clusters against lidar object clusters, and against the centres of camera boxes, in azimuth.
 
 A moving cluster of detections is a road user; so is, nearly always, the lidar cluster at its place and the box at its
-azimuth. Only azimuth is compared: ranges differ by what the radar sees through (0.2-0.3 m), elevations by the bounce.
+azimuth. Only azimuth is compared: ranges differ, because the radar sees 0.2-0.3 m into objects, and elevations suffer
+from bounces off the ground.
 """
 
 from __future__ import annotations

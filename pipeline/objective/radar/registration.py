@@ -48,7 +48,7 @@ RANGE_M = (3.0, 60.0)  # over ground; nearer is the car's own clutter; farther t
 _RADAR_POINTS = 500  # per frame; more say the same again
 SIDE_RAD = 1.25
 STRAY = 200  # one in so many lidar points may lie outside the lidar's view
-VIEW_MARGIN_RAD = np.radians(1.0)  # half a wide radar's cell, less what its detections prefer
+VIEW_MARGIN_RAD = np.radians(1.0)  # about half the elevation cell of a wide-angle radar
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ def _lidar_in_radar(p0, p1, R, t, xyz, plane, motion, mirrors, sph, bounce_el):
             height = plane[0] * dx + plane[1] * dy + plane[2] * dz + h0
         for mirror in range(2):
             if mirror == 1:
-                if height < 0.3:  # metres; what is lower mirrors onto itself
+                if height < 0.3:  # metres; a lower point is as good as its own mirror image
                     bounce_el[k - p0] = 10.0
                     break
                 dx -= 2 * height * plane[0]

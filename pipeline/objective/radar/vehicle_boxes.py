@@ -1,8 +1,8 @@
 """Radar detections inside the camera's vehicle boxes: the term that gives a radar's roll and pitch.
 
-A box and the detections in its azimuths, at the range that its height suggests, are one vehicle. The elevation of these
-detections, turned into the camera, is the box's elevation up to a constant per class (returns lie under the box's
-centre). Roll shows as a slope of the difference over azimuth, so it owes nothing to that constant; pitch owes it all.
+Detections between the sides of a box, at the range that its height suggests, belong to that vehicle. Their elevation in
+the camera frame is the box's elevation up to a constant per class (returns lie below the box's centre). Roll appears as
+a slope of the difference over azimuth, whatever that constant is; pitch cannot be told from it.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def box_equations(
 ) -> tuple[Float[np.ndarray, "F P P"], Float[np.ndarray, "F P"], float]:
     """Per frame, information and gradient of the robust (Cauchy) elevation cost, and the residual's own sigma [rad].
 
-    The spread of the residuals themselves says what this radar's elevation is worth.
+    The spread of the residuals themselves is taken as the precision of this radar's elevations.
     """
     residual, J = elevation_residuals(pairs, T_camera_lidar, T_lidar_radar, bias_rad)
     P = J.shape[1]
