@@ -9,13 +9,14 @@ Source: evidence on performance, benchmark definition 7 (30 frames).
 import numpy as np
 import pytest
 
+from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.calibrate.joint.lidar_radar.normal_equations import OUTLIER
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.calibrate.paper.pairwise import solve_pairwise
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import perturb_exactly
-from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar.score import KernelSettings, lidar_velocities, prepare_terms
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
@@ -51,7 +52,7 @@ def test_a_joint_day_costs_a_fraction_of_scipy_on_numpy(day, gate):
     terms = terms.in_view(prior.T_camera_lidar, np.radians(2.0)).at_most(
         MOST_POINTS, np.random.default_rng(0)
     )
-    at, settings = Alignments.of_poses(prior.T_camera_lidar[None]), KernelSettings.wide(1.5, 2)
+    at, settings = AlignmentState(prior.T_camera_lidar).alone, KernelSettings.wide(1.5, 2)
     frames = registration_frames(rows, prior.T_lidar_radar, np.random.default_rng(0))
 
     def registration():

@@ -138,7 +138,7 @@ def test_score_is_best_at_the_true_pose_and_time_offset(terms):
 
 
 def test_positive_time_offset_moves_static_points_along_the_ego_motion(terms):
-    still = terms.poses(Alignments.of_poses(T_TRUE[None]))[0]
+    still = terms.poses(AlignmentState(T_TRUE).alone)[0]
     late = terms.poses(Alignments(T_TRUE[None], np.array([0.1]), np.ones(1)))[0]
     ahead_lidar = (late - still).reshape(-1, 3, 4)[:, :, 3] @ T_TRUE[:3, :3]
     np.testing.assert_allclose(ahead_lidar, 0.1 * terms.velocity_lidar, atol=1e-5)
@@ -150,7 +150,7 @@ def test_score_above_chance_prefers_the_truth_to_poses_that_turn_everything_out_
 
     def score(T):
         terms = prepare_terms(day, T, velocity, reach_rad=0.0).sharp(5.0)
-        at = Alignments.of_poses(T[None])
+        at = AlignmentState(T).alone
         return (terms.edge_excess(at, settings) + terms.marking_score(at, settings)).sum()
 
     truth = score(T_TRUE)

@@ -146,7 +146,7 @@ def check_edges(rows, truth):
     side[present] = torch.tensor(e.side.astype(np.int64))
     projection = camera_projection([terms.maps.camera] * len(rows), torch.float64)
     still = np.zeros((len(e.xyz_m), 2), np.float32)
-    for t, at in zip(T, terms.poses(Alignments.of_poses(T)), strict=True):
+    for t, at in zip(T, terms.poses(Alignments(T, np.zeros(len(T)), np.ones(len(T)))), strict=True):
         kernel = edge_residuals(terms.camera, terms.maps.offsets, e, at, np.float32(1.0), still)
         uv, valid = projection.project(transform_points(torch.tensor(t), points))
         uv.requires_grad_()

@@ -16,9 +16,9 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from pipeline.objective.camera_lidar.projection_loops import most_points, project_points
 
-__all__ = ["LABEL_CLASSES", "class_information"]
+__all__ = ["class_information"]
 
-LABEL_CLASSES = 20  # 19 Cityscapes classes and void
+_LABELS = 20  # 19 Cityscapes classes and void
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
@@ -39,7 +39,7 @@ def class_information(
     f4 = np.float32
     u_max, v_max = f4(width - 1), f4(height - 1)
     # Frames outside, poses inside: one frame's labels stay in the cache.
-    table = np.zeros((count, kinds, 20))
+    table = np.zeros((count, kinds, _LABELS))
     xyz = np.ascontiguousarray(points.T)
     us, vs = np.empty(most_points(start), np.float32), np.empty(most_points(start), np.float32)
     for f in range(frames):
@@ -48,7 +48,7 @@ def class_information(
             for i in range(start[f], start[f + 1]):
                 u, v = us[i - start[f]], vs[i - start[f]]
                 if u >= f4(0) and v >= f4(0) and u <= u_max and v <= v_max:
-                    table[p, kind[i], min(labels[f, int(v + f4(0.5)), int(u + f4(0.5))], 19)] += 1.0
+                    table[p, kind[i], min(labels[f, int(v + f4(0.5)), int(u + f4(0.5))], _LABELS - 1)] += 1.0
     for p in range(count):
         out[p] = _information(table[p]) / points.shape[0]
     return out

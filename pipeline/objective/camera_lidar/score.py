@@ -52,12 +52,6 @@ class Alignments:
     dt_s: np.ndarray
     focal: np.ndarray
 
-    @staticmethod
-    def of_poses(T_camera_lidar: Float[np.ndarray, "P 4 4"]) -> Alignments:
-        """Candidates without time offset and with the camera's own focal length."""
-        count = len(T_camera_lidar)
-        return Alignments(T_camera_lidar, np.zeros(count), np.ones(count))
-
 
 @dataclass(frozen=True, eq=False)
 class Terms:
