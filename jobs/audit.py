@@ -30,10 +30,12 @@ def audit(
         report: also write the fleet page, and a page per vehicle-day beside it.
     """
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from pipeline.config import load_fleet
     from pipeline.stages import AUDIT, REPORT
     from pipeline.store.partitions import Lake
     from pipeline.work import Task, Window
+    from schemas.drift import DRIFT_STATUSES
 
     config = load_fleet(fleet)
     tables = Lake.at(lake)
@@ -41,9 +43,7 @@ def audit(
         task = Task(config, tables, Window(from_day, to_day), method, progress=progress)
         outcome = AUDIT.run(task)
     findings = outcome.records
-    statuses = [f.status for f in findings]
-    counts = {s: statuses.count(s) for s in ("RED", "YELLOW", "GREEN", "UNKNOWN")}
-    moved = sorted({(f.vehicle, f.moved_sensor, f.start_day) for f in findings if f.moved_sensor})
+    charts = [f.status for f in findings]
     outputs = []
     if report is not None:
         from pipeline.report.stage import Pages
@@ -54,8 +54,9 @@ def audit(
         outcome.status,
         reason=outcome.reason,
         vehicles=len({f.vehicle for f in findings}),
-        charts=counts,
-        moved=[{"vehicle": v, "sensor": s, "since": d} for v, s, d in moved],
+        statuses=count_statuses(findings),
+        charts={s: charts.count(s) for s in DRIFT_STATUSES},
+        moved=moved_sensors(findings),
         report=report,
         outputs=outputs,
     )

@@ -42,9 +42,10 @@ def demo(
         workers: processes at a time; default: one per CPU that this process may use.
         seed: another seed is another fleet.
     """
-    from jobs.nightly import close_night, moved_sensors, usable_cpus, watch_night
+    from jobs.nightly import close_night, usable_cpus, watch_night
     from jobs.terminal.demo_table import print_comparison, print_methods
     from jobs.terminal.summary import exit_code, print_summary
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from pipeline.config import load_fleet
     from pipeline.fleet.nightly import Night
     from pipeline.fleet.pattern import find_vehicle_days
@@ -84,6 +85,7 @@ def demo(
         report=pages[0] if pages else None,
         seconds=round(seconds, 1),
         vehicle_days=len(work),
+        statuses=count_statuses(findings),
         moved=moved_sensors(findings),
         knocked=[{"vehicle": f.vehicle, "sensor": f.sensor, "since": dates[f.day]} for f in spec.faults],
         comparison=out / "comparison.json",

@@ -8,12 +8,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import numpy as np
-
-    from jobs.evaluation_page import Compared
-    from pipeline.evaluate.recording import ReflectorFiles
+    from pipeline.evaluate.runs import ComparedRun
     from pipeline.store.partitions import Lake
-    from schemas.calibrations import CalibrationRecord
 
 __all__ = ["evaluate"]
 
@@ -56,6 +52,7 @@ def evaluate(
     from jobs.calibrate import parse_pair
     from jobs.terminal.summary import print_summary
     from pipeline.evaluate.recording import ReflectorFiles
+    from pipeline.evaluate.runs import compare_runs
     from pipeline.evaluate.table import as_markdown, table_rows
     from pipeline.store.partitions import Lake
     from pipeline.store.tables import read_records
@@ -67,7 +64,7 @@ def evaluate(
     recording = (recording_lake or lake, recording_day) if recording_lake or recording_day else None
     files = ReflectorFiles(reflectors, recording)
     rotation_deg, translation_m = parse_pair(truth_sigma, "truth-sigma")
-    compared, counts = _compare_all(records, truth, files, (math.radians(rotation_deg), translation_m))
+    compared, counts = compare_runs(records, truth, files, (math.radians(rotation_deg), translation_m))
     notes = files.notes()
     comparisons = [c.comparison for c in compared]
     sys.stderr.write("\n".join(as_markdown(table_rows(comparisons), comparisons, notes).values()))
@@ -77,33 +74,6 @@ def evaluate(
         "evaluate", "done" if compared else "refused", runs=len(compared), **counts, positions=notes, out=out
     )
     return 0 if compared else 3
-
-
-def _compare_all(
-    records: Sequence[CalibrationRecord],
-    truth: Path | None,
-    files: ReflectorFiles,
-    truth_sigma: tuple[float, float],
-) -> tuple[list[Compared], dict[str, int]]:
-    """Every current run that has a truth, and how many have none or no result."""
-    from jobs.evaluation_page import Compared
-    from pipeline.evaluate.comparison import compare, current_runs
-
-    compared, counts = [], {"refused_runs": 0, "runs_without_truth": 0}
-    for run in current_runs(records):
-        first = next(iter(run.values()))
-        known = None if truth is None else _truth_of(truth, first)
-        file = files.of(first.vehicle, first.day)
-        if known is None and file is None:
-            counts["runs_without_truth"] += 1
-            continue
-        picks = file.picks if file else None
-        comparison = compare(run, known, picks, truth_sigma)
-        if comparison is None:
-            counts["refused_runs"] += 1
-        else:
-            compared.append(Compared(run, known, picks, comparison))
-    return compared, counts
 
 
 def _check(truth: Path | None, reflectors: Path | None, recording: str | None, out: Path | None) -> None:
@@ -119,9 +89,9 @@ def _check(truth: Path | None, reflectors: Path | None, recording: str | None, o
         raise ConfigError("command line", "out", f"{out.name} is neither a folder nor one of {kinds}")
 
 
-def _write(out: Path, compared: Sequence[Compared], notes: Sequence[str], lake: Lake) -> None:
-    from jobs.evaluation_page import page_of
+def _write(out: Path, compared: Sequence[ComparedRun], notes: Sequence[str], lake: Lake) -> None:
     from pipeline.evaluate.table import as_markdown, as_parquet, table_rows
+    from pipeline.report.evaluated import page_of_runs
     from pipeline.report.page import write_page
 
     comparisons = [c.comparison for c in compared]
@@ -132,7 +102,7 @@ def _write(out: Path, compared: Sequence[Compared], notes: Sequence[str], lake: 
     if kind == ".parquet":
         out.write_bytes(as_parquet(rows, notes))
     elif kind == ".html":
-        write_page(out, page_of(lake, compared, texts))
+        write_page(out, page_of_runs(lake, compared, texts))
     elif kind == ".md":
         out.write_text("\n".join(texts.values()))
     else:
@@ -140,13 +110,4 @@ def _write(out: Path, compared: Sequence[Compared], notes: Sequence[str], lake: 
         for title, text in texts.items():
             (out / f"{title.lower().replace(' data', '').replace(' ', '_')}.md").write_text(text)
         (out / "table_1.parquet").write_bytes(as_parquet(rows, notes))
-        write_page(out / "table_1.html", page_of(lake, compared, texts))
-
-
-def _truth_of(truth: Path, record: CalibrationRecord) -> dict[str, np.ndarray] | None:
-    from pipeline.extrinsics.prior import read_transforms
-
-    path = truth / record.vehicle / f"{record.day}.json" if truth.is_dir() else truth
-    if truth.is_dir() and not path.exists():
-        return None
-    return read_transforms(path)
+        write_page(out / "table_1.html", page_of_runs(lake, compared, texts))

@@ -44,6 +44,7 @@ def nightly(
         report: HTML page of the fleet; default: report/fleet.html inside the lake.
     """
     from jobs.terminal.summary import exit_code, print_summary
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.fleet.nightly import Night
@@ -64,6 +65,7 @@ def nightly(
         vehicle_days=len(outcomes),
         **{s: sum(o.status == s for o in outcomes) for s in ("done", "cached", "held", "refused", "failed")},
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
+        statuses=count_statuses(findings),
         moved=moved_sensors(findings),
         report=pages[0] if pages else None,
     )
@@ -111,12 +113,6 @@ def close_night(
         task = Task(night.fleet, night.lake, Window(), night.method, given=Pages(report, truth))
         pages = REPORT.run(task).outputs
     return findings, pages
-
-
-def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
-    """Which sensor of which vehicle moved, and since when, without repetition."""
-    moved = sorted({(f.vehicle, f.moved_sensor, f.start_day or "") for f in findings if f.moved_sensor})
-    return [{"vehicle": v, "sensor": s, "since": d or None} for v, s, d in moved]
 
 
 def usable_cpus() -> int:

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
 
 __all__ = ["show"]
 
-_PIPE_WIDTH = 200
 Table = Literal["calibrations", "drift", "frames", "observations"]
 
 
@@ -48,7 +47,9 @@ def show(
 
         print_json(rows, indent=2)
     elif rows:
-        _print_table(table, rows)
+        from jobs.terminal.record_tables import print_table
+
+        print_table(table, rows)
     else:
         sys.stdout.write(f"{table}: nothing of this choice in {lake}\n")
     return 0
@@ -87,78 +88,3 @@ def _partitions(lake: Lake, table: Table, vehicle: str | None, day: str | None) 
             if manifest is not None:
                 rows.append({"vehicle": partition.vehicle, "day": partition.day} | asdict(manifest))
     return rows
-
-
-def _print_table(table: Table, rows: list[dict[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.table import Table as RichTable
-
-    cells = {"calibrations": _calibration_cells, "drift": _drift_cells}.get(table, _partition_cells)
-    lines = [cells(row) for row in rows]
-    view = RichTable(title=f"{table}: {len(rows)} row{'' if len(rows) == 1 else 's'}", title_justify="left")
-    for name in lines[0]:
-        # Numbers and names never break; only the words at the end of a line may.
-        view.add_column(name, no_wrap=name not in ("reason", "rejected"))
-    colours = {"accepted": "green", "held": "yellow", "refused": "red"}
-    colours |= {"GREEN": "green", "YELLOW": "yellow", "RED": "red", "UNKNOWN": "dim"}
-    for line in lines:
-        view.add_row(*(f"[{colours[c]}]{c}[/]" if c in colours else c for c in line.values()))
-    # Into a pipe or file nothing needs to fit a window.
-    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH).print(view)
-
-
-def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
-    import numpy as np
-
-    sigma = np.full(6, np.nan) if row["covariance"] is None else np.sqrt(np.diag(row["covariance"]))
-    seen = row["observable"] or [False] * 6
-    degrees = " ".join(_sigma(s, o, 3) for s, o in zip(np.degrees(sigma[:3]), seen[:3], strict=True))
-    metres = " ".join(_sigma(s, o, 3) for s, o in zip(sigma[3:], seen[3:], strict=True))
-    return {
-        "vehicle": row["vehicle"],
-        "day": row["day"],
-        "method": row["method"],
-        "pair": row["pair"],
-        "status": row["status"],
-        "sigma rx ry rz [deg]": degrees,
-        "sigma tx ty tz [m]": metres,
-        "frames": str(row["frames_used"]),
-        "reason": row["reason"],
-    }
-
-
-def _sigma(sigma: float, observable: bool, digits: int) -> str:
-    return f"{sigma:.{digits}f}" if observable else "  -  "
-
-
-def _drift_cells(row: dict[str, Any]) -> dict[str, str]:
-    import math
-
-    is_rotation = row["dof"].startswith("r")
-    scale, unit = (180 / math.pi, "deg") if is_rotation else (1.0, "m")
-    size = ""
-    if row["magnitude"] is not None:
-        size = f"{row['magnitude'] * scale:+.3f} ± {row['magnitude_sigma'] * scale:.3f} {unit}"
-    return {
-        "vehicle": row["vehicle"],
-        "day": row["day"],
-        "pair": row["pair"],
-        "dof": row["dof"],
-        "status": row["status"],
-        "change": size,
-        "limit": f"{row['limit'] * scale:.3g} {unit}",
-        "since": row["start_day"] or "",
-        "moved": row["moved_sensor"] or "",
-        "reason": row["reason"],
-    }
-
-
-def _partition_cells(row: dict[str, Any]) -> dict[str, str]:
-    counts = ", ".join(f"{count} {why}" for why, count in row["rejected"].items())
-    return {
-        "vehicle": row["vehicle"],
-        "day": row["day"],
-        "rows": str(row["rows"]),
-        "work key": row["work_key"],
-        "rejected": counts,
-    }

@@ -1,14 +1,20 @@
-"""Table `drift`: what the control charts say of each vehicle, pair and DoF. Append-only, a row per chart and audit."""
+"""Table `drift`: what the control charts say of each vehicle, pair and DoF. Append-only, a row per chart and audit.
+
+The verdict on the vehicle as a whole stands in every one of its rows (`vehicle_*`), as the audit decided it; whoever
+shows it reads it from there and decides nothing anew.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from schemas.columns import TableSchema, scalar
 
-__all__ = ["DRIFT", "DRIFT_STATUSES", "DriftFinding"]
+__all__ = ["DRIFT", "DRIFT_STATUSES", "DriftFinding", "VehicleStatus", "status_of"]
 
-DRIFT_STATUSES = ("GREEN", "YELLOW", "RED", "UNKNOWN")
+# What a person should look at first comes first; lists of vehicles are in this order.
+DRIFT_STATUSES = ("RED", "YELLOW", "UNKNOWN", "GREEN")
 
 DRIFT = TableSchema(
     "drift",
@@ -22,7 +28,8 @@ DRIFT = TableSchema(
         scalar(
             "status",
             "string",
-            "GREEN, YELLOW (a change below the limit that matters, or not yet sure), RED, UNKNOWN (too little data)",
+            "of this chart: GREEN, YELLOW (a change below the limit that matters, or not yet sure), RED, UNKNOWN (too "
+            "little data); of the vehicle: vehicle_status",
         ),
         scalar("reason", "string", "in words"),
         scalar("days_used", "int64", "day estimates on the chart"),
@@ -56,6 +63,21 @@ DRIFT = TableSchema(
         scalar("moved_motion_sigma", "list<float64>", "their sigmas", nullable=True),
         scalar("work_key", "string", "hash of code version, config, inputs"),
         scalar("inputs", "list<string>", "work keys of the records on the chart"),
+        scalar(
+            "vehicle_status",
+            "string",
+            "of the vehicle as a whole, the same in all its rows of one audit: RED or YELLOW where a chart is, GREEN "
+            "where a turn of any sensor would have shown, else UNKNOWN; null in rows of releases before 0.4",
+            nullable=True,
+        ),
+        scalar(
+            "vehicle_sensor",
+            "string",
+            "camera, lidar or radar: the sensor that moved; null where none did or it is not clear which",
+            nullable=True,
+        ),
+        scalar("vehicle_since", "string", "first day after the vehicle's clearest change", nullable=True),
+        scalar("vehicle_reason", "string", "why the vehicle has this status, in words", nullable=True),
     ),
 )
 
@@ -87,3 +109,33 @@ class DriftFinding:
     moved_motion: list[float] | None = None
     moved_motion_sigma: list[float] | None = None
     inputs: list[str] = field(default_factory=list)
+    vehicle_status: str | None = None
+    vehicle_sensor: str | None = None
+    vehicle_since: str | None = None
+    vehicle_reason: str | None = None
+
+
+@dataclass(frozen=True)
+class VehicleStatus:
+    """The audit's verdict on one vehicle: columns `vehicle_*` of its rows."""
+
+    status: str
+    reason: str
+    sensor: str | None = None
+    since: str | None = None
+
+
+def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
+    """The stored verdict on a vehicle; UNKNOWN, with the reason, where no audit has stored one.
+
+    Args:
+        findings: current rows of one vehicle and method.
+    """
+    if not findings:
+        return VehicleStatus("UNKNOWN", "no audit yet")
+    first = findings[0]
+    if first.vehicle_status is None:
+        return VehicleStatus("UNKNOWN", "audited by an older release, which stored no status: audit again")
+    return VehicleStatus(
+        first.vehicle_status, first.vehicle_reason or "", first.vehicle_sensor, first.vehicle_since
+    )

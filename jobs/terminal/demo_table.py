@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jobs.terminal.record_tables import STATUS_STYLES
+from jobs.terminal.vehicle_status import status_lines
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -18,7 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["print_comparison", "print_methods"]
 
 _WIDTH = 124  # of the table; a narrower terminal wraps lines, which reads better than cut names
-_STATUS = {"accepted": "[green]accepted[/]", "held": "[yellow]held[/]", "refused": "[yellow]refused[/]"}
 
 
 def print_comparison(
@@ -46,8 +48,8 @@ def print_comparison(
             table.add_row(*row)
     console.print(table)
     for record in (r for r in found if r.status == "refused"):
-        console.print(f"[yellow]refused[/]  {record.vehicle} {record.pair}: {record.reason}")
-    for line in _drift_lines(findings):
+        console.print(f"{_styled(record.status)}  {record.vehicle} {record.pair}: {record.reason}")
+    for line in status_lines(findings):
         console.print(line)
     return errors
 
@@ -155,13 +157,13 @@ def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
 
     T, T_prior = transform_of(record), prior_of(record)
     if T is None or T_prior is None or record.covariance is None:
-        return [[record.vehicle, record.pair, _STATUS[record.status]]]
+        return [[record.vehicle, record.pair, _styled(record.status)]]
     true, estimate = change_between(T_prior, T_true), change_between(T_prior, T)
     sigma = np.sqrt(np.diag(change_covariance(T, record.covariance)))
     seen = record.observable or [True] * 6
     rows = []
     for first, unit, scale, digits in ((0, "deg", np.degrees(1), 2), (3, "cm", 100.0, 1)):
-        head = [record.vehicle, record.pair, _STATUS[record.status]] if first == 0 else [""] * 3
+        head = [record.vehicle, record.pair, _styled(record.status)] if first == 0 else [""] * 3
         cells = [f"turn {unit}" if first == 0 else f"shift {unit}"]
         for i in range(first, first + 3):
             shown = f"{estimate[i] * scale:+.{digits}f} ± {sigma[i] * scale:.{digits}f}"
@@ -195,18 +197,5 @@ def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _drift_lines(findings: Sequence[DriftFinding]) -> list[str]:
-    """One line per vehicle: what moved, or that nothing did."""
-    lines = []
-    colours = {"RED": "bold red", "YELLOW": "yellow", "GREEN": "green", "UNKNOWN": "dim"}
-    for vehicle in sorted({f.vehicle for f in findings}):
-        own = [f for f in findings if f.vehicle == vehicle]
-        worst = min(own, key=lambda f: list(colours).index(f.status))
-        moved = next((f for f in own if f.moved_sensor), None)
-        text = (
-            f"the {moved.moved_sensor} moved, first seen on {moved.start_day}: {moved.reason}"
-            if moved
-            else {"GREEN": "nothing moved", "UNKNOWN": worst.reason}.get(worst.status, worst.reason)
-        )
-        lines.append(f"[{colours[worst.status]}]{worst.status:8}[/] {vehicle}  {text}")
-    return lines
+def _styled(status: str) -> str:
+    return f"[{STATUS_STYLES[status]}]{status}[/]"

@@ -35,7 +35,7 @@ _START_DROP = 6.0
 # Twice the log-likelihood by which a lasting change must beat "one day stands out", and a slow drift a
 # step: odds of 20.
 _CLEAR_ODDS = 6.0
-_BLIND_SIGMAS = 2.0  # a chart sees a change that is at least this many sigmas of its best-placed split
+_VISIBLE_SIGMAS = 2.0  # a chart shows a change that is at least this many sigmas of its best-placed split
 _LASTING = "a lasting change of a size that matters"
 _SUSPECT_SIGMAS = 3.0  # from here to the alarm threshold a chart is neither green nor an alarm
 _MIN_SCATTER_DAYS = 6  # successive differences below which their spread says nothing
@@ -178,7 +178,7 @@ def judge_chart(
         return ChartVerdict("UNKNOWN", f"{_count(days)} of data", days, None, None, None, None)
     z = step_scan(chart)
     statistic, threshold = float(np.max(np.abs(z))), alarm_threshold(chart.sigma, false_alarm_probability)
-    visible = _BLIND_SIGMAS * float(np.min(_step_sizes(chart)[1]))
+    visible = _VISIBLE_SIGMAS * float(np.min(_step_sizes(chart)[1]))
     if statistic > threshold:
         change = _describe(chart, z)
         status, reason = _alarm_status(chart, z, change, limit)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import datetime as dt
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from pipeline.audit.attribution import Attribution
-from pipeline.audit.charts import Chart, ChartVerdict, pooled_scatter
-from pipeline.audit.vehicle import PairDays, VehicleVerdict, charts_of, judge_vehicle, limit_of
+from pipeline.audit.charts import Chart, pooled_scatter
+from pipeline.audit.findings import VehicleAudit, vehicle_findings
+from pipeline.audit.vehicle import PairDays, VehicleVerdict, charts_of, judge_vehicle
 from pipeline.config import FleetConfig, config_hash
 from pipeline.errors import ConfigError
 from pipeline.results import Progress
@@ -19,7 +18,7 @@ from pipeline.store.current import current_records, transform_of
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.tables import read_records
 from pipeline.work import Records, Task, Told, Window, Work
-from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DriftFinding
 from schemas.versions import CODE_VERSION
 
@@ -137,58 +136,7 @@ def _findings(
     inputs = sorted({r.work_key for r in records})
     config = config_hash(fleet.audit, {"from": first, "to": last, "method": method})
     key = work_key("audit", CODE_VERSION, config, inputs)
-    findings = []
-    for pair in PAIRS:
-        for dof in DOF_NAMES:
-            chart = verdict.charts.get((pair, dof)) or _no_data(records, pair)
-            chart = _with_last_day(chart, records, pair)
-            base = DriftFinding(
-                vehicle, last, method, pair, dof, chart.status, chart.reason, chart.days_used,
-                limit_of(pair, dof, fleet.audit), key, inputs=inputs,
-            )  # fmt: skip
-            findings.append(_finding(base, chart, verdict.attribution))
-    return Records(findings, Partition(vehicle, last), key, inputs)
-
-
-def _finding(base: DriftFinding, chart: ChartVerdict, moved: Attribution | None) -> DriftFinding:
-    fields = dict(base.__dict__) | {"statistic": chart.statistic, "threshold": chart.threshold}
-    change = chart.change
-    if change is not None:
-        fields |= {
-            "start_day": _iso(change.day),
-            "start_day_earliest": _iso(change.earliest),
-            "start_day_latest": _iso(change.latest),
-            "kind": change.kind,
-            "magnitude": change.size,
-            "magnitude_sigma": change.size_sigma,
-        }
-        if moved is not None:
-            fields["reason"] = f"{chart.reason}; {moved.explanation}"
-            if moved.sensor is not None:
-                fields |= {
-                    "moved_sensor": moved.sensor,
-                    "moved_probability": moved.probability[moved.sensor],
-                    "moved_motion": moved.motion.tolist(),
-                    "moved_motion_sigma": np.sqrt(np.diag(moved.covariance)).tolist(),
-                }
-    return DriftFinding(**fields)
-
-
-def _with_last_day(chart: ChartVerdict, records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:
-    """Say so where the vehicle drove on after the last estimate of a pair."""
-    days = [r.day for r in records if r.pair == pair and r.status != "refused"]
-    last = max((r.day for r in records), default="")
-    if not days or max(days) == last:
-        return chart
-    return replace(chart, reason=f"{chart.reason}; no estimate after {max(days)}")
-
-
-def _no_data(records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:
-    found = [r.status for r in records if r.pair == pair]
-    counts = ", ".join(f"{found.count(s)} {s}" for s in ("held", "refused") if s in found)
-    reason = f"no estimate in the window ({counts})" if counts else "no record in the window"
-    return ChartVerdict("UNKNOWN", reason, 0, None, None, None, None)
-
-
-def _iso(ordinal: int) -> str:
-    return dt.date.fromordinal(ordinal).isoformat()
+    audit = VehicleAudit(vehicle, last, method, key, inputs)
+    return Records(
+        vehicle_findings(audit, records, verdict, fleet.audit), Partition(vehicle, last), key, inputs
+    )

@@ -78,15 +78,14 @@ def judge_vehicle(
     """
     charts = {(pair, dof): c for pair, days in pairs.items() for dof, c in charts_of(days).items()}
     live = sum(len(c.day) > 1 for c in charts.values())
-    # An audit is one vehicle-night: its expected number of alarms stays within the budget whatever the
-    # nights share,
-    # because expectations add; Bonferroni over the charts because those share errors too.
+    # An audit is one vehicle-night: its expected number of alarms stays within the budget whatever the nights
+    # share, because expectations add; Bonferroni over the charts, because those share errors too.
     probability = config.false_alarms_per_1000_vehicle_days / 1000 / max(live, 1)
     verdicts = {}
     for key, chart in charts.items():
         scaled = Chart(chart.day, chart.value, chart.sigma * scatter.get(key, 1.0), chart.accepted)
         verdict = judge_chart(scaled, limit_of(*key, config), probability, config.baseline_days)
-        verdicts[key] = _explain_blindness(verdict, len(pairs[key[0]].day))
+        verdicts[key] = _name_undetermined_days(verdict, len(pairs[key[0]].day))
     if not any(v.change for v in verdicts.values()):
         return VehicleVerdict(verdicts, None)
     scaled_pairs = {pair: _scaled(days, pair, scatter) for pair, days in pairs.items()}
@@ -94,7 +93,7 @@ def judge_vehicle(
     return VehicleVerdict(verdicts, _attribute(verdicts, scaled_pairs))
 
 
-def _explain_blindness(verdict: ChartVerdict, days: int) -> ChartVerdict:
+def _name_undetermined_days(verdict: ChartVerdict, days: int) -> ChartVerdict:
     if verdict.status != "UNKNOWN" or verdict.days_used >= days:
         return verdict
     reason = f"determined on {verdict.days_used} of {days} days: {verdict.reason}"

@@ -12,9 +12,9 @@ from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.report.words import PAIR_TITLES, dof_title, motion_in_words, scaled, unit_of
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
-from schemas.drift import DriftFinding
+from schemas.drift import DriftFinding, status_of
 
-__all__ = ["DofRow", "PairView", "answer_for", "drift_sentence", "pair_view", "sigmas_of"]
+__all__ = ["DofRow", "PairView", "answer_for", "clearest_alarm", "pair_view", "sigmas_of", "status_sentence"]
 
 _SAID_BY_THE_AXES = "not determined by the day"  # the page lists those axes by name
 _ADVICE = {
@@ -61,7 +61,7 @@ class PairView:
     rejected: list[tuple[str, int]]
     time_offset: str
     loop: str
-    vouched: str
+    certified: str
     notes: list[str]
     assumptions: list[str]
     missing: list[str]
@@ -111,7 +111,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
         rejected=sorted(record.frames_rejected.items(), key=lambda kv: -kv[1]),
         time_offset=_time_offset(record),
         loop=_loop(record),
-        vouched=_vouched(record),
+        certified=_certified(record),
         notes=[note for note in record.notes if not note.startswith(_SAID_BY_THE_AXES)],
         assumptions=list(record.assumptions),
         missing=list(record.drive_missing),
@@ -119,8 +119,8 @@ def pair_view(record: CalibrationRecord) -> PairView:
     )
 
 
-def _vouched(record: CalibrationRecord) -> str:
-    """What an accepted record vouches for, and its score; empty where it was never judged."""
+def _certified(record: CalibrationRecord) -> str:
+    """Directions that an accepted record certifies, and its score; empty where it was never judged."""
     if record.score is None or record.limit_rad is None:
         return ""
     what = f"{' and '.join(record.determined)} within {np.degrees(record.limit_rad):.2g} deg at 15 to 40 m"
@@ -137,17 +137,17 @@ def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFind
     """
     accepted = [v.title for v in views if v.status == "accepted"]
     other = [v.title for v in views if v.status != "accepted"]
-    moved = next((f for f in findings if f.moved_sensor and f.status == "RED"), None)
-    sensor = moved.moved_sensor if moved else None
-    touched = [t for t in (v.title for v in views) if sensor in t.split("-")]
-    if moved is not None and (moved.start_day or "") > day and set(touched) & set(accepted):
+    stored = status_of(findings)
+    sensor = stored.sensor if stored.status == "RED" else None
+    touched = [v.title for v in views if sensor in v.title.split("-")]
+    if (stored.since or "") > day and set(touched) & set(accepted):
         left = [t for t in accepted if t not in touched]
         still = f" Only {', '.join(left)} still holds." if left else ""
-        return "bad", f"Not any more. The {sensor} moved on {moved.start_day}, after this day.{still}"
+        return "bad", f"Not any more. The {sensor} moved on {stored.since}, after this day.{still}"
     unsafe = [t for t in other if t in touched]
-    if moved is not None and unsafe:
+    if unsafe:
         first = f"Only {', '.join(accepted)} may be used." if accepted else "No."
-        why = f"the {sensor} moved on {moved.start_day}, and this day's numbers were not accepted"
+        why = f"the {sensor} moved on {stored.since}, and this day's numbers were not accepted"
         return "bad", f"{first} Nothing is safe for {', '.join(unsafe)}: {why}."
     if not accepted:
         return "bad", "No. Nothing was accepted: keep the transforms that the car has."
@@ -156,33 +156,23 @@ def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFind
     return "partly", f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."
 
 
-def drift_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
-    """Status and sentence on the vehicle's drift, from the current findings."""
-    alarms = [f for f in findings if f.status in ("RED", "YELLOW")]
-    if not findings:
-        return "UNKNOWN", "No audit yet."
-    if not alarms:
-        return _quiet_sentence(findings)
-    status = "RED" if any(f.status == "RED" for f in alarms) else "YELLOW"
-    best = max(alarms, key=lambda f: (f.status == "RED", f.moved_sensor is not None, f.statistic or 0.0))
-    if best.moved_sensor is None:
-        charts = ", ".join(f"{PAIR_TITLES[f.pair]} {f.dof}" for f in alarms[:4])
-        return status, f"Something changed on {best.start_day} ({charts}): {best.reason}."
-    motion = motion_in_words(best.moved_sensor, best.moved_motion or [], best.moved_motion_sigma or [])
-    kind = "moved on" if best.kind == "step" else "has been drifting since"
-    return status, f"The {best.moved_sensor} {kind} {best.start_day}: {motion}."
+def status_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
+    """The vehicle's stored status, and its reason as a sentence, with the sensor's motion where one moved."""
+    stored = status_of(findings)
+    sentence = f"{stored.reason[:1].upper()}{stored.reason[1:]}."
+    moved = clearest_alarm(findings)
+    if moved is None or moved.moved_sensor is None:
+        return stored.status, sentence
+    motion = motion_in_words(moved.moved_sensor, moved.moved_motion or [], moved.moved_motion_sigma or [])
+    return stored.status, f"{sentence} Its motion: {motion}."
 
 
-def _quiet_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
-    """GREEN only where a turn of either sensor against the lidar would have shown; else it is not known yet."""
-    green = [f for f in findings if f.status == "GREEN"]
-    turns = {f.pair for f in green if f.dof.startswith("r")}
-    count = f"{len(green)} of {len(findings)} charts would show a change that matters"
-    if "camera_lidar" in turns and turns & {"lidar_radar", "camera_radar"}:
-        return "GREEN", f"No sensor moved ({count})."
-    if any(f.days_used > 1 for f in findings):
-        return "UNKNOWN", f"No change seen, but the days so far could hide one that matters ({count})."
-    return "UNKNOWN", "Too little data to say whether a sensor moved."
+def clearest_alarm(findings: Sequence[DriftFinding]) -> DriftFinding | None:
+    """The chart on which the vehicle's stored status rests; None where no sensor moved."""
+    stored = status_of(findings)
+    wanted = (stored.status, stored.sensor, stored.since)
+    rests_on = [f for f in findings if stored.since and (f.status, f.moved_sensor, f.start_day) == wanted]
+    return max(rests_on, key=lambda f: (f.statistic or 0.0) / (f.threshold or 1.0), default=None)
 
 
 def _dof_rows(

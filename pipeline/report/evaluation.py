@@ -51,7 +51,7 @@ class EvaluatedRun:
     method: str
     errors: dict[str, Float[np.ndarray, " 3"]]
     prior_errors: dict[str, Float[np.ndarray, " 3"]]
-    # Lidar coordinates [m]: the reflectors, and the radar's sight of them carried over by prior and result.
+    # Lidar coordinates [m]: the reflectors, and the radar's measurement of them carried over by prior and result.
     reflectors_m: Float[np.ndarray, "K 3"]
     by_prior_m: Float[np.ndarray, "K 3"]
     by_result_m: Float[np.ndarray, "K 3"]
@@ -156,7 +156,7 @@ def _tooltip(run: EvaluatedRun, what: str, error: np.ndarray) -> str:
 
 
 def _setup(run: EvaluatedRun) -> Markup:
-    """The controlled setup from above: reflectors as triangles, the radar's sight of them as circles (figure 2b)."""
+    """The controlled setup from above: reflectors as triangles, their radar measurements as circles (figure 2b)."""
     plot = Plot(60.0, 16.0, 520.0, 430.0, (-15.0, 15.0), (0.0, _AHEAD_M))
     plot.frame(
         [(float(x), f"{-x:g}") for x in range(-15, 16, 5)], [(float(y), f"{y:g}") for y in range(0, 51, 10)]

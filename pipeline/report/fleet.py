@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.report.day import drift_sentence
+from pipeline.report.day import clearest_alarm, status_sentence
 from pipeline.report.figures import DriftPanel
 from pipeline.report.words import PAIR_TITLES, motion_in_words, with_sigma
 from pipeline.store.current import transform_of
 from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
-from schemas.drift import DriftFinding
+from schemas.drift import DRIFT_STATUSES, DriftFinding, status_of
 
 __all__ = [
     "DayCell",
@@ -70,46 +70,41 @@ def vehicle_rows(
     links: Mapping[tuple[str, str], str],
 ) -> list[VehicleRow]:
     """The table vehicles x days, alarmed vehicles first."""
-    order = {"RED": 0, "YELLOW": 1, "UNKNOWN": 2, "GREEN": 3}
+    found = _by_vehicle(findings)
     rows = []
-    for vehicle in sorted({r.vehicle for r in records} | {f.vehicle for f in findings}):
-        status, sentence = drift_sentence([f for f in findings if f.vehicle == vehicle])
+    for vehicle in sorted({r.vehicle for r in records} | set(found)):
+        status, sentence = status_sentence(found.get(vehicle, []))
         cells = [_cell(records, vehicle, day, links.get((vehicle, day), "")) for day in days]
         rows.append(VehicleRow(vehicle, status, sentence, cells))
-    return sorted(rows, key=lambda r: (order[r.status], r.vehicle))
+    return sorted(rows, key=lambda r: (DRIFT_STATUSES.index(r.status), r.vehicle))
 
 
 def finding_views(findings: Sequence[DriftFinding]) -> list[FindingView]:
     """What changed, vehicle by vehicle: RED before YELLOW."""
     views = []
-    for vehicle in sorted({f.vehicle for f in findings}):
-        alarms = [f for f in findings if f.vehicle == vehicle and f.status in ("RED", "YELLOW")]
-        if alarms:
-            views.append(_finding_view(vehicle, alarms))
-    return sorted(views, key=lambda v: (v.status != "RED", v.vehicle))
+    for vehicle, own in _by_vehicle(findings).items():
+        clearest = clearest_alarm(own)
+        if clearest is not None:
+            views.append(_finding_view(vehicle, clearest, own))
+    return sorted(views, key=lambda v: (DRIFT_STATUSES.index(v.status), v.vehicle))
 
 
 def headline_for(findings: Sequence[DriftFinding], views: Sequence[FindingView]) -> tuple[str, str]:
-    """(RED, YELLOW, GREEN or UNKNOWN; the page's first sentence)."""
-    vehicles = len({f.vehicle for f in findings})
-    if not vehicles:
+    """(the most urgent status in the fleet; the page's first sentence)."""
+    statuses = [status_of(own).status for own in _by_vehicle(findings).values()]
+    vehicles = _count(len(statuses), "vehicle")
+    if not statuses:
         return "UNKNOWN", "No audit yet: run boresight audit."
-    if not views:
-        quiet = {
-            v: drift_sentence([f for f in findings if f.vehicle == v])[0]
-            for v in {f.vehicle for f in findings}
-        }
-        unsure = sum(status != "GREEN" for status in quiet.values())
-        if not unsure:
-            return "GREEN", f"No sensor moved on {_count(vehicles, 'vehicle')}."
-        where = f"on {unsure} of {_count(vehicles, 'vehicle')}"
-        return "UNKNOWN", f"No change seen, but {where} the days so far could hide one that matters."
-    red = [v for v in views if v.status == "RED"]
-    named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in (red or views)[:3]]
+    worst = min(statuses, key=DRIFT_STATUSES.index)
+    if worst == "GREEN":
+        return worst, f"No sensor moved on {vehicles}."
+    if worst == "UNKNOWN":
+        where = f"on {statuses.count(worst)} of {vehicles}"
+        return worst, f"No change seen, but {where} the days so far could hide one that matters."
+    named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in views if v.status == worst][:3]
     more = "" if len(views) <= 3 else f" and {len(views) - 3} more"
-    verb = "A sensor moved" if red else "Something may have moved"
-    status = "RED" if red else "YELLOW"
-    return status, f"{verb} on {len(views)} of {_count(vehicles, 'vehicle')}: {'; '.join(named)}{more}."
+    verb = "A sensor moved" if worst == "RED" else "Something may have moved"
+    return worst, f"{verb} on {len(views)} of {vehicles}: {'; '.join(named)}{more}."
 
 
 def drift_panels(
@@ -173,26 +168,30 @@ def _cell(records: Sequence[CalibrationRecord], vehicle: str, day: str, link: st
     return DayCell(day, worst, worst, link)
 
 
-def _finding_view(vehicle: str, alarms: Sequence[DriftFinding]) -> FindingView:
-    status = "RED" if any(f.status == "RED" for f in alarms) else "YELLOW"
-    best = max(alarms, key=lambda f: (f.moved_sensor is not None, f.status == "RED", f.statistic or 0.0))
-    interval = (
-        ""
-        if best.start_day_earliest == best.start_day_latest
-        else f" ({best.start_day_earliest} to {best.start_day_latest})"
-    )
-    motion = best.reason
-    if best.moved_sensor is not None:
-        motion = motion_in_words(best.moved_sensor, best.moved_motion or [], best.moved_motion_sigma or [])
+def _by_vehicle(findings: Sequence[DriftFinding]) -> dict[str, list[DriftFinding]]:
+    found: dict[str, list[DriftFinding]] = {}
+    for finding in findings:
+        found.setdefault(finding.vehicle, []).append(finding)
+    return found
+
+
+def _finding_view(vehicle: str, clearest: DriftFinding, own: Sequence[DriftFinding]) -> FindingView:
+    earliest, latest = clearest.start_day_earliest, clearest.start_day_latest
+    motion = clearest.reason
+    if clearest.moved_sensor is not None:
+        motion = motion_in_words(
+            clearest.moved_sensor, clearest.moved_motion or [], clearest.moved_motion_sigma or []
+        )
+    alarms = sorted((f for f in own if f.start_day), key=lambda f: -(f.statistic or 0.0))
     return FindingView(
         vehicle,
-        status,
-        best.moved_sensor or "not clear which",
-        f"{best.start_day}{interval}",
-        best.kind or "",
+        clearest.status,
+        clearest.moved_sensor or "not clear which",
+        f"{clearest.start_day}" + ("" if earliest == latest else f" ({earliest} to {latest})"),
+        clearest.kind or "",
         motion,
-        _sure(best),
-        [_chart_words(f) for f in sorted(alarms, key=lambda f: -(f.statistic or 0.0))],
+        _sure(clearest),
+        [_chart_words(f) for f in alarms],
     )
 
 

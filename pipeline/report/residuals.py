@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import transform_points
-from pipeline.report.clocks import Clocks, as_stamped
 from pipeline.report.overlays import Extrinsics
+from pipeline.report.time_offsets import TimeOffsets, as_stamped
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["MEASURES", "at_pixels", "boundary_distance_px", "frame_residuals"]
@@ -36,18 +36,18 @@ _MIN_POINTS = 5  # shares of fewer say nothing
 
 
 def frame_residuals(
-    observations: Sequence[Observation], states: Sequence[Extrinsics], clocks: Sequence[Clocks] = ()
+    observations: Sequence[Observation], states: Sequence[Extrinsics], offsets: Sequence[TimeOffsets] = ()
 ) -> list[dict[str, Float[np.ndarray, " F"]]]:
     """Measure per state, pair and frame, as MEASURES says; NaN where a frame has too little to tell.
 
-    `clocks` are the states' time offsets; without them all are 0.
+    `offsets` are the states' time offsets; without them all are 0.
     """
-    clocks = clocks or [Clocks()] * len(states)
+    offsets = offsets or [TimeOffsets()] * len(states)
     values = np.full((len(states), len(MEASURES), len(observations)), np.nan)
     for f, observation in enumerate(observations):
         boundary = boundary_distance_px(observation)
-        for s, (unmoved, clock) in enumerate(zip(states, clocks, strict=True)):
-            state = as_stamped(unmoved, observation, clock)
+        for s, (unmoved, offset) in enumerate(zip(states, offsets, strict=True)):
+            state = as_stamped(unmoved, observation, offset)
             values[s, :, f] = (
                 _on_silhouette(observation, boundary, state.T_camera_lidar),
                 _in_boxes(observation, state.T_camera_radar),

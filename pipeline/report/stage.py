@@ -14,8 +14,7 @@ import numpy as np
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
-from pipeline.report.clocks import Clocks, as_stamped, clocks_of
-from pipeline.report.day import PairView, answer_for, drift_sentence, pair_view, sigmas_of
+from pipeline.report.day import PairView, answer_for, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import drift_figure, residual_figure, sigma_figure
 from pipeline.report.fleet import drift_panels, finding_views, headline_for, vehicle_rows
 from pipeline.report.overlays import Extrinsics, Scene
@@ -23,6 +22,7 @@ from pipeline.report.page import render, write_page
 from pipeline.report.pictures import scene_pictures
 from pipeline.report.residuals import frame_residuals
 from pipeline.report.scenes import choose_frames
+from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
 from pipeline.report.truth import truth_rows, truth_summary
 from pipeline.results import Progress, silent
 from pipeline.store.current import current_drift, current_records, prior_of, transform_of
@@ -93,8 +93,8 @@ def write_day_page(
     views = [pair_view(records[p]) for p in PAIRS if p in records]
     before, after = _states(records)
     labels = ("prior", _after_label(views))
-    clocks = clocks_of(records)
-    pictures, residual_svg, no_pictures = _pictures(lake, partition, before, after, labels, clocks)
+    offsets = time_offsets_of(records)
+    pictures, residual_svg, no_pictures = _pictures(lake, partition, before, after, labels, offsets)
     html = render(
         "day.html",
         vehicle=partition.vehicle,
@@ -104,12 +104,12 @@ def write_day_page(
         method=method,
         environment=next(iter(records.values())).environment,
         answer=answer_for(views, partition.day, findings),
-        drift=drift_sentence(findings),
+        drift=status_sentence(findings),
         pairs=views,
         labels=labels,
         scenes=pictures,
         no_pictures=no_pictures,
-        clocks=clocks.in_words(),
+        offsets=offsets.in_words(),
         sigma_svg=_sigma_svg(records),
         residual_svg=residual_svg,
         provenance=_provenance(list(records.values())),
@@ -242,7 +242,7 @@ def _pictures(
     before: Extrinsics | None,
     after: Extrinsics | None,
     labels: tuple[str, str],
-    clocks: Clocks,
+    offsets: TimeOffsets,
 ) -> tuple[list[Any], Any, str]:
     """Pictures, residuals, and why there are none; `after` is drawn with the day's time offsets, `before` had none."""
     if before is None or after is None:
@@ -254,13 +254,13 @@ def _pictures(
         return [], "", "no frame of the day could be used"
     some = np.unique(np.linspace(0, len(observations) - 1, _FRAMES_LOOKED_AT).astype(int))
     spread = [observations[i] for i in some]
-    residuals = residual_figure(*frame_residuals(spread, (before, after), (Clocks(), clocks)))
+    residuals = residual_figure(*frame_residuals(spread, (before, after), (TimeOffsets(), offsets)))
     chosen = [spread[i] for i in choose_frames(spread, after.T_camera_lidar, _SCENES)]
     rows = [o.frame_index for o in chosen]
     frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
     scenes = [Scene(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
     pictures = [
-        scene_pictures([s], before, as_stamped(after, s.observation, clocks), labels)[0] for s in scenes
+        scene_pictures([s], before, as_stamped(after, s.observation, offsets), labels)[0] for s in scenes
     ]
     return pictures, residuals, "no frame of the day could be drawn"
 

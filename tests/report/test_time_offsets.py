@@ -1,11 +1,11 @@
-"""Time offsets in pictures: what stands still lies where it is, at any speed, in any turn, with either clock wrong."""
+"""Time offsets in pictures: what stands still lies where it is, at any speed, in any turn, with either offset wrong."""
 
 import numpy as np
 import pytest
 
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, transform_points
-from pipeline.report.clocks import Clocks, as_stamped, clocks_of
 from pipeline.report.residuals import frame_residuals
+from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.observations import Observation
 from tests.report.test_pictures import GOOD, T_CL, T_LR, _scene
@@ -34,7 +34,7 @@ def _seen_by_lidar(t_s, speed_mps, yaw_rate_radps):
 def test_a_standing_post_lies_on_itself_in_image_and_sweep(speed_mps, yaw_rate_radps, offset_s):
     """All three carry the stamp 0. stamp_camera = stamp_lidar + dt: the image is of the lidar's time -dt, and the
     sweep is of the radar's time -dt, so that the radar looks at the lidar's time +dt."""
-    state = as_stamped(GOOD, _driving(speed_mps, yaw_rate_radps), Clocks(offset_s, offset_s))
+    state = as_stamped(GOOD, _driving(speed_mps, yaw_rate_radps), TimeOffsets(offset_s, offset_s))
     sweep = _seen_by_lidar(0.0, speed_mps, yaw_rate_radps)
     in_image = transform_points(T_CL, _seen_by_lidar(-offset_s, speed_mps, yaw_rate_radps))
     np.testing.assert_allclose(transform_points(state.T_camera_lidar, sweep), in_image, atol=5e-3)
@@ -44,15 +44,18 @@ def test_a_standing_post_lies_on_itself_in_image_and_sweep(speed_mps, yaw_rate_r
 
 def test_the_way_follows_the_heading_that_the_radar_shows():
     sideways = as_stamped(
-        GOOD, _driving(10.0, 0.0, radar_velocity_mps=np.array([0.0, 9.0, 0.4])), Clocks(0.1)
+        GOOD, _driving(10.0, 0.0, radar_velocity_mps=np.array([0.0, 9.0, 0.4])), TimeOffsets(0.1)
     )
     moved = inverse(T_CL) @ sideways.T_camera_lidar
     np.testing.assert_allclose(moved[:3, 3], [0.0, 1.0, 0.0], atol=1e-9)
 
 
 def test_without_offsets_or_speed_nothing_moves():
-    for observation, clocks in ((_driving(20.0, 0.2), Clocks()), (_driving(None, None), Clocks(0.05, 0.05))):
-        state = as_stamped(GOOD, observation, clocks)
+    for observation, offsets in (
+        (_driving(20.0, 0.2), TimeOffsets()),
+        (_driving(None, None), TimeOffsets(0.05, 0.05)),
+    ):
+        state = as_stamped(GOOD, observation, offsets)
         np.testing.assert_allclose(state.T_camera_lidar, GOOD.T_camera_lidar, atol=1e-12)
         np.testing.assert_allclose(state.T_lidar_radar, GOOD.T_lidar_radar, atol=1e-12)
 
@@ -61,7 +64,7 @@ def test_edges_meet_their_silhouettes_again_once_the_offset_is_known():
     still = _driving(20.0, 0.0)
     later = np.array([2.0, 0.0, 0.0], np.float32)  # the sweep is a tenth of a second after the image
     late = Observation(**(vars(still) | {"lidar_edge_xyz_m": still.lidar_edge_xyz_m - later}))
-    without, with_clock = frame_residuals([late], (GOOD, GOOD), (Clocks(), Clocks(0.1)))
+    without, with_clock = frame_residuals([late], (GOOD, GOOD), (TimeOffsets(), TimeOffsets(0.1)))
     assert with_clock["camera_lidar"][0] > 90 > without["camera_lidar"][0]
 
 
@@ -72,6 +75,6 @@ def test_a_run_gives_the_offsets_that_it_estimated_and_says_them():
         )
         for (pair, (parent, child)), s in zip(FRAMES_OF_PAIR.items(), (0.0281, None, None), strict=True)
     }
-    assert clocks_of(run) == Clocks(0.0281, 0.0)
-    assert clocks_of(run).in_words() == "camera +28 ms"
-    assert Clocks().in_words() == ""
+    assert time_offsets_of(run) == TimeOffsets(0.0281, 0.0)
+    assert time_offsets_of(run).in_words() == "camera +28 ms"
+    assert TimeOffsets().in_words() == ""

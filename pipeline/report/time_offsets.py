@@ -16,11 +16,11 @@ from pipeline.report.overlays import Extrinsics
 from schemas.calibrations import CalibrationRecord
 from schemas.observations import Observation
 
-__all__ = ["Clocks", "as_stamped", "clocks_of"]
+__all__ = ["TimeOffsets", "as_stamped", "time_offsets_of"]
 
 
 @dataclass(frozen=True)
-class Clocks:
+class TimeOffsets:
     """What to add to a stamp of the child to have it on the parent's clock [s]."""
 
     camera_lidar_s: float = 0.0
@@ -32,19 +32,19 @@ class Clocks:
         return ", ".join(f"{sensor} {1e3 * dt_s:+.0f} ms" for sensor, dt_s in known if dt_s)
 
 
-def clocks_of(records: Mapping[str, CalibrationRecord]) -> Clocks:
+def time_offsets_of(records: Mapping[str, CalibrationRecord]) -> TimeOffsets:
     """The estimated offsets of a run, by pair; 0 where a method or a day gave none, as the prior assumes."""
     offset_s = {pair: r.time_offset_s for pair, r in records.items() if r.time_offset_s is not None}
-    return Clocks(offset_s.get("camera_lidar", 0.0), offset_s.get("lidar_radar", 0.0))
+    return TimeOffsets(offset_s.get("camera_lidar", 0.0), offset_s.get("lidar_radar", 0.0))
 
 
-def as_stamped(state: Extrinsics, observation: Observation, clocks: Clocks) -> Extrinsics:
+def as_stamped(state: Extrinsics, observation: Observation, offsets: TimeOffsets) -> Extrinsics:
     """Transforms between data of one frame, for what stands still: the poses and the car's own way over the offsets.
 
     T_camera_radar stays as it is: it draws moving clusters only, whose way is their own.
     """
     v, yaw_rate = _velocity_lidar(state, observation), observation.ego_yaw_rate_radps or 0.0
-    to_image, to_sweep = (_way(v, yaw_rate, dt_s) for dt_s in (clocks.camera_lidar_s, clocks.lidar_radar_s))
+    to_image, to_sweep = (_way(v, yaw_rate, dt_s) for dt_s in (offsets.camera_lidar_s, offsets.lidar_radar_s))
     return Extrinsics(state.T_camera_lidar @ to_image, state.T_camera_radar, to_sweep @ state.T_lidar_radar)
 
 

@@ -1,0 +1,95 @@
+"""Rows of a lake's tables for people: one line each, numbers in degrees and metres, statuses in colour."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+__all__ = ["STATUS_STYLES", "print_table"]
+
+STATUS_STYLES = {
+    "accepted": "green",
+    "held": "yellow",
+    "refused": "red",
+    "GREEN": "green",
+    "YELLOW": "yellow",
+    "RED": "bold red",
+    "UNKNOWN": "dim",
+}
+_PIPE_WIDTH = 200  # characters; into a pipe or file nothing needs to fit a window
+
+
+def print_table(table: str, rows: list[dict[str, Any]]) -> None:
+    """Print rows of calibrations, drift, frames or observations, named as their columns; at least one row."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    cells = {"calibrations": _calibration_cells, "drift": _drift_cells}.get(table, _partition_cells)
+    lines = [cells(row) for row in rows]
+    view = Table(title=f"{table}: {len(rows)} row{'' if len(rows) == 1 else 's'}", title_justify="left")
+    for name in lines[0]:
+        # Numbers and names never break; only the words at the end of a line may.
+        view.add_column(Text(name), no_wrap=name not in ("reason", "rejected"))
+    for line in lines:
+        # Text, not str: names from logs may hold square brackets, which rich would read as styles.
+        view.add_row(*(Text(c, STATUS_STYLES.get(c, "")) for c in line.values()))
+    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH).print(view)
+
+
+def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
+    import numpy as np
+
+    sigma = np.full(6, np.nan) if row["covariance"] is None else np.sqrt(np.diag(row["covariance"]))
+    seen = row["observable"] or [False] * 6
+    degrees = " ".join(_sigma(s, o, 3) for s, o in zip(np.degrees(sigma[:3]), seen[:3], strict=True))
+    metres = " ".join(_sigma(s, o, 3) for s, o in zip(sigma[3:], seen[3:], strict=True))
+    return {
+        "vehicle": row["vehicle"],
+        "day": row["day"],
+        "method": row["method"],
+        "pair": row["pair"],
+        "status": row["status"],
+        "sigma rx ry rz [deg]": degrees,
+        "sigma tx ty tz [m]": metres,
+        "frames": str(row["frames_used"]),
+        "reason": row["reason"],
+    }
+
+
+def _sigma(sigma: float, observable: bool, digits: int) -> str:
+    return f"{sigma:.{digits}f}" if observable else "  -  "
+
+
+def _drift_cells(row: dict[str, Any]) -> dict[str, str]:
+    import math
+
+    is_rotation = row["dof"].startswith("r")
+    scale, unit = (180 / math.pi, "deg") if is_rotation else (1.0, "m")
+    size = ""
+    if row["magnitude"] is not None:
+        size = f"{row['magnitude'] * scale:+.3f} ± {row['magnitude_sigma'] * scale:.3f} {unit}"
+    return {
+        "vehicle": row["vehicle"],
+        "vehicle is": row["vehicle_status"] or "",
+        "day": row["day"],
+        "pair": row["pair"],
+        "dof": row["dof"],
+        "chart": row["status"],
+        "change": size,
+        "limit": f"{row['limit'] * scale:.3g} {unit}",
+        "since": row["start_day"] or "",
+        "moved": row["moved_sensor"] or "",
+        "reason": row["reason"],
+    }
+
+
+def _partition_cells(row: dict[str, Any]) -> dict[str, str]:
+    counts = ", ".join(f"{count} {why}" for why, count in row["rejected"].items())
+    return {
+        "vehicle": row["vehicle"],
+        "day": row["day"],
+        "rows": str(row["rows"]),
+        "work key": row["work_key"],
+        "rejected": counts,
+    }

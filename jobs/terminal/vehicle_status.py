@@ -1,0 +1,43 @@
+"""What commands say of each vehicle: the status that the audit decided and stored, and which sensor moved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from jobs.terminal.record_tables import STATUS_STYLES
+from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, status_of
+
+__all__ = ["count_statuses", "moved_sensors", "status_lines"]
+
+
+def status_lines(findings: Sequence[DriftFinding]) -> list[str]:
+    """A line per vehicle, by name: its status and why, in rich's markup."""
+    from rich.markup import escape
+
+    return [
+        f"[{STATUS_STYLES[stored.status]}]{stored.status:8}[/] {escape(vehicle)}  {escape(stored.reason)}"
+        for vehicle, stored in _statuses(findings).items()
+    ]
+
+
+def count_statuses(findings: Sequence[DriftFinding]) -> dict[str, int]:
+    """Number of vehicles by status, the most urgent status first."""
+    found = [stored.status for stored in _statuses(findings).values()]
+    return {status: found.count(status) for status in DRIFT_STATUSES}
+
+
+def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
+    """Which sensor of which vehicle moved, and since when."""
+    return [
+        {"vehicle": vehicle, "sensor": stored.sensor, "since": stored.since}
+        for vehicle, stored in _statuses(findings).items()
+        if stored.sensor
+    ]
+
+
+def _statuses(findings: Sequence[DriftFinding]) -> dict[str, VehicleStatus]:
+    rows: dict[str, list[DriftFinding]] = {}
+    for finding in findings:
+        rows.setdefault(finding.vehicle, []).append(finding)
+    return {vehicle: status_of(rows[vehicle]) for vehicle in sorted(rows)}

@@ -1,0 +1,110 @@
+"""Verdicts to rows of table drift: one per pair and DoF, the status of the vehicle in each."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.audit.attribution import Attribution
+from pipeline.audit.charts import ChartVerdict
+from pipeline.audit.status import decide_status
+from pipeline.audit.vehicle import VehicleVerdict, limit_of
+from pipeline.config import AuditConfig
+from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.drift import DriftFinding
+
+__all__ = ["VehicleAudit", "vehicle_findings"]
+
+
+@dataclass(frozen=True)
+class VehicleAudit:
+    """What the rows of one audit of one vehicle have in common; fields are columns of `drift`."""
+
+    vehicle: str
+    day: str
+    method: str
+    work_key: str
+    inputs: list[str]
+
+
+def vehicle_findings(
+    audit: VehicleAudit, records: Sequence[CalibrationRecord], verdict: VehicleVerdict, config: AuditConfig
+) -> list[DriftFinding]:
+    """Rows in order of pair and DoF; a DoF without a chart says why it has none.
+
+    Args:
+        audit: what all rows have in common.
+        records: the vehicle's current records of the window, in order of day.
+        verdict: on its charts.
+        config: limits.
+    """
+    findings = []
+    for pair in PAIRS:
+        for dof in DOF_NAMES:
+            chart = verdict.charts.get((pair, dof)) or _without_data(records, pair)
+            chart = _with_last_day(chart, records, pair)
+            base = DriftFinding(
+                audit.vehicle, audit.day, audit.method, pair, dof, chart.status, chart.reason, chart.days_used,
+                limit_of(pair, dof, config), audit.work_key, chart.statistic, chart.threshold, inputs=audit.inputs,
+            )  # fmt: skip
+            findings.append(replace(base, **_change_columns(chart, verdict.attribution)))
+    status = decide_status(findings)
+    return [
+        replace(
+            f,
+            vehicle_status=status.status,
+            vehicle_sensor=status.sensor,
+            vehicle_since=status.since,
+            vehicle_reason=status.reason,
+        )
+        for f in findings
+    ]
+
+
+def _change_columns(chart: ChartVerdict, moved: Attribution | None) -> dict[str, Any]:
+    """Columns of a chart with an alarm; none for another."""
+    change = chart.change
+    if change is None:
+        return {}
+    columns: dict[str, Any] = {
+        "start_day": _iso(change.day),
+        "start_day_earliest": _iso(change.earliest),
+        "start_day_latest": _iso(change.latest),
+        "kind": change.kind,
+        "magnitude": change.size,
+        "magnitude_sigma": change.size_sigma,
+    }
+    if moved is None:
+        return columns
+    if moved.sensor is None:
+        return columns | {"reason": f"{chart.reason}; {moved.explanation}"}
+    return columns | {
+        "moved_sensor": moved.sensor,
+        "moved_probability": moved.probability[moved.sensor],
+        "moved_motion": moved.motion.tolist(),
+        "moved_motion_sigma": np.sqrt(np.diag(moved.covariance)).tolist(),
+    }
+
+
+def _with_last_day(chart: ChartVerdict, records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:
+    """Say so where the vehicle drove on after the last estimate of a pair."""
+    days = [r.day for r in records if r.pair == pair and r.status != "refused"]
+    last = max((r.day for r in records), default="")
+    if not days or max(days) == last:
+        return chart
+    return replace(chart, reason=f"{chart.reason}; no estimate after {max(days)}")
+
+
+def _without_data(records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:
+    found = [r.status for r in records if r.pair == pair]
+    counts = ", ".join(f"{found.count(s)} {s}" for s in ("held", "refused") if s in found)
+    reason = f"no estimate in the window ({counts})" if counts else "no record in the window"
+    return ChartVerdict("UNKNOWN", reason, 0, None, None, None, None)
+
+
+def _iso(ordinal: int) -> str:
+    return dt.date.fromordinal(ordinal).isoformat()

@@ -1,0 +1,64 @@
+"""All runs of a lake beside what is known of their vehicles: a truth, or picked reflectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.evaluate.comparison import Comparison, compare, current_runs
+from pipeline.evaluate.recording import ReflectorFiles
+from pipeline.extrinsics.prior import read_transforms
+from pipeline.geometry.targets import Picks
+from schemas.calibrations import CalibrationRecord
+
+__all__ = ["ComparedRun", "compare_runs"]
+
+
+class ComparedRun(NamedTuple):
+    """One run (records by pair), what it was compared with, and the result."""
+
+    run: dict[str, CalibrationRecord]
+    truth: dict[str, np.ndarray] | None
+    picks: Picks | None
+    comparison: Comparison
+
+
+def compare_runs(
+    records: Sequence[CalibrationRecord],
+    truth: Path | None,
+    files: ReflectorFiles,
+    truth_sigma: tuple[float, float],
+) -> tuple[list[ComparedRun], dict[str, int]]:
+    """Every current run that has a truth, and how many have none or no result.
+
+    Args:
+        records: of any vehicles, days and methods.
+        truth: JSON with transforms, or a folder with VEHICLE/DAY.json; None where `files` hold reflectors.
+        files: reflector positions.
+        truth_sigma: how well the truth is known, per axis: rotation [rad], translation [m].
+    """
+    compared, counts = [], {"refused_runs": 0, "runs_without_truth": 0}
+    for run in current_runs(records):
+        first = next(iter(run.values()))
+        known = None if truth is None else _truth_of(truth, first)
+        file = files.of(first.vehicle, first.day)
+        if known is None and file is None:
+            counts["runs_without_truth"] += 1
+            continue
+        picks = file.picks if file else None
+        comparison = compare(run, known, picks, truth_sigma)
+        if comparison is None:
+            counts["refused_runs"] += 1
+        else:
+            compared.append(ComparedRun(run, known, picks, comparison))
+    return compared, counts
+
+
+def _truth_of(truth: Path, record: CalibrationRecord) -> dict[str, np.ndarray] | None:
+    path = truth / record.vehicle / f"{record.day}.json" if truth.is_dir() else truth
+    if truth.is_dir() and not path.exists():
+        return None
+    return read_transforms(path)

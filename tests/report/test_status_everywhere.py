@@ -1,0 +1,113 @@
+"""A vehicle's status is the audit's: the table, the pages, the terminal and `show` all say the same."""
+
+import json
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rich.text import Text
+
+from jobs.show import show
+from jobs.terminal.vehicle_status import count_statuses, moved_sensors, status_lines
+from pipeline.audit.stage import audit_fleet
+from pipeline.report.stage import write_day_page, write_fleet_page
+from pipeline.store.current import current_drift
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_records
+from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding, status_of
+from tests.report.test_pages import KNOCK, _config, _store
+
+# The knock of "yellow" is seen on one day only; "unknown" drove too little; "blind" never saw its radar turn.
+EXPECTED = {"red": "RED", "yellow": "YELLOW", "green": "GREEN", "unknown": "UNKNOWN", "blind": "UNKNOWN"}
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory: pytest.TempPathFactory, maker: ModuleType) -> Lake:
+    """An audited fleet with all four statuses."""
+    lake, rng = Lake.at(tmp_path_factory.mktemp("statuses") / "lake"), np.random.default_rng(3)
+    for vehicle, days, first in (("red", 6, 3), ("yellow", 6, 5), ("green", 6, 99), ("unknown", 2, 99)):
+        motion = lambda d, first=first: {"radar": KNOCK} if d >= first else {}  # noqa: E731
+        _store(lake, maker.vehicle_records(vehicle, days, rng, motion=motion))
+    blind = maker.vehicle_records("blind", 6, rng)
+    _store(lake, [replace(r, observable=[True, True, False, True, True, True]) if r.pair == "lidar_radar"
+                  else replace(r, observable=[True, False, False, True, True, True]) if r.pair == "camera_radar"
+                  else r for r in blind])  # fmt: skip
+    audit_fleet(lake, _config())
+    return lake
+
+
+def stored(lake: Lake) -> dict[str, list[DriftFinding]]:
+    findings = current_drift(read_records(lake, DRIFT, DriftFinding))
+    return {v: [f for f in findings if f.vehicle == v] for v in EXPECTED}
+
+
+def test_the_fleet_has_all_four_statuses_and_each_row_carries_its_vehicle_s(lake: Lake) -> None:
+    assert {v: status_of(rows).status for v, rows in stored(lake).items()} == EXPECTED
+    assert set(EXPECTED.values()) == set(DRIFT_STATUSES)
+    for rows in stored(lake).values():
+        assert len(rows) == 18
+        assert (
+            len({(f.vehicle_status, f.vehicle_sensor, f.vehicle_since, f.vehicle_reason) for f in rows}) == 1
+        )
+    assert (status_of(stored(lake)["red"]).sensor, status_of(stored(lake)["red"]).since) == (
+        "radar",
+        "2026-03-04",
+    )
+
+
+def test_terminal_page_and_show_say_of_every_vehicle_what_the_table_says(
+    lake: Lake, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
+    in_table = dict(re.findall(r'<tr><td>(\w+)</td><td class="status (\w+)">', page))
+    on_charts = dict(re.findall(r'id="charts-(\w+)".*?<span class="pill (\w+)">', page))
+    rows = [f for own in stored(lake).values() for f in own]
+    on_terminal = {
+        (words := Text.from_markup(line).plain.split())[1]: words[0] for line in status_lines(rows)
+    }
+    assert show("drift", lake=str(lake.root), current=True, json=True) == 0
+    shown = {r["vehicle"]: r["vehicle_status"] for r in json.loads(capsys.readouterr().out)}
+    on_days = {}
+    for vehicle in EXPECTED:
+        day = write_day_page(
+            lake, Partition(vehicle, "2026-03-02"), _config(), tmp_path / "day.html"
+        ).read_text()
+        on_days[vehicle] = re.search(r'<span class="pill (\w+)">\1</span>', day)[1]
+    for said in (in_table, on_charts, on_terminal, shown, on_days):
+        assert said == EXPECTED
+
+
+def test_page_and_terminal_give_the_stored_reason(lake: Lake, tmp_path: Path) -> None:
+    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
+    rows = [f for own in stored(lake).values() for f in own]
+    terminal = [Text.from_markup(line).plain for line in status_lines(rows)]
+    for vehicle, own in stored(lake).items():
+        reason = status_of(own).reason
+        assert any(line.split()[1] == vehicle and line.endswith(reason) for line in terminal)
+        assert reason[1:] in page
+
+
+def test_the_summary_counts_vehicles_and_names_each_moved_sensor_once(lake: Lake) -> None:
+    rows = [f for own in stored(lake).values() for f in own]
+    assert count_statuses(rows) == {"RED": 1, "YELLOW": 1, "UNKNOWN": 2, "GREEN": 1}
+    assert {"vehicle": "red", "sensor": "radar", "since": "2026-03-04"} in moved_sensors(rows)
+    assert len({m["vehicle"] for m in moved_sensors(rows)}) == len(moved_sensors(rows))
+
+
+def test_records_of_a_release_that_stored_no_status_stay_readable(lake: Lake, tmp_path: Path) -> None:
+    path = next(lake.root.glob("drift/vehicle=red/*/*.parquet"))
+    manifest = {k: v for k, v in pq.read_metadata(path).metadata.items() if k != b"ARROW:schema"}
+    table = pq.read_table(path, partitioning=None).replace_schema_metadata(manifest)
+    added = [f.name for f in fields(DriftFinding) if f.name.startswith("vehicle_")]
+    assert len(added) == 4
+    older = tmp_path / "lake" / path.relative_to(lake.root)
+    older.parent.mkdir(parents=True)
+    pq.write_table(table.drop_columns(added), older)
+    rows = read_records(Lake.at(tmp_path / "lake"), DRIFT, DriftFinding)
+    assert len(rows) == 18
+    assert any(f.status == "RED" for f in rows)
+    assert "audit again" in status_of(rows).reason
