@@ -6,13 +6,17 @@ import json
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jobs.extras import needs
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.fleet.nightly import DayOutcome, Night
     from pipeline.results import Progress
     from pipeline.simulate.fleet import FleetSpec
+    from schemas.drift import DriftFinding
 
 __all__ = ["demo"]
 
@@ -42,54 +46,75 @@ def demo(
         workers: processes at a time; default: one per CPU that this process may use.
         seed: another seed is another fleet.
     """
-    from jobs.nightly import close_night, usable_cpus, watch_night
+    from jobs.nightly import close_night, usable_cpus
     from jobs.terminal.demo_table import print_comparison, print_methods
-    from jobs.terminal.summary import exit_code, print_summary
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from pipeline.config import load_fleet
     from pipeline.fleet.nightly import Night
-    from pipeline.fleet.pattern import find_vehicle_days
     from pipeline.report.truth import read_truth
-    from pipeline.simulate.faults import parse_faults
-    from pipeline.simulate.fleet import FleetSpec, day_names
     from pipeline.store.partitions import Lake
 
     began = time.monotonic()
-    base = FleetSpec(vehicles=vehicles, days=days, frames=frames, seed=seed, container="mixed")
-    dates = day_names(base.first_day, days)
-    knocks = _KNOCK if vehicles > 1 and days > 2 else ""
-    spec = FleetSpec(**(vars(base) | {"faults": parse_faults(knocks, dates)}))
-    workers = workers or usable_cpus()
-    bump = "; before day 3 someone bumps a radar" if knocks else ""
+    spec, dates = _plan(vehicles, days, frames, seed)
+    bump = "; before day 3 someone bumps a radar" if spec.faults else ""
     _say(f"[bold]1/3[/]  vehicles: {vehicles}, days: {days}{bump}")
-    _simulate(spec, out, workers)
+    _simulate(spec, out, workers or usable_cpus())
     night = Night(load_fleet(out / "fleet.toml"), Lake.at(out / "lake"))
     _say("[bold]2/3[/]  the night: ingest, perceive, calibrate every vehicle-day")
-    work = find_vehicle_days(str(out / "logs" / "{vehicle}" / "{day}" / "*"), dates[0], dates[-1])
-    outcomes = watch_night(night, work, "process", workers)
-    # The same last day by the network that comes with Boresight: it looks at single frames, without semantics.
-    last_day = [w for w in work if w.partition.day == dates[-1]]
-    outcomes += watch_night(replace(night, method=_NETWORK), last_day, "process", workers)
+    outcomes = _calibrate(night, out / "logs", dates, workers or usable_cpus())
     _say("[bold]3/3[/]  the audit: which sensor moved, and since when")
     truth = read_truth(out / "truth")
     findings, pages = close_night(night, None, out / "report" / "fleet.html", truth)
     errors = print_comparison(night.lake, night.method, truth, dates[-1], findings)
     errors += print_methods(night.lake, (night.method, _NETWORK), truth, dates[-1])[_NETWORK]
     (out / "comparison.json").write_text(json.dumps(errors, indent=1) + "\n")
-    code = exit_code([o.status for o in outcomes])
-    seconds = time.monotonic() - began
-    _say(f"\n[bold]{pages[0] if pages else 'no report'}[/]  open it in a browser ({seconds:.0f} s in all)")
-    print_summary(
-        "demo",
-        {0: "done", 1: "failed", 3: "held"}[code],
+    knocked = [{"vehicle": f.vehicle, "sensor": f.sensor, "since": dates[f.day]} for f in spec.faults]
+    return _summarise(
+        [o.status for o in outcomes],
+        findings,
         report=pages[0] if pages else None,
-        seconds=round(seconds, 1),
-        vehicle_days=len(work),
-        statuses=count_statuses(findings),
-        moved=moved_sensors(findings),
-        knocked=[{"vehicle": f.vehicle, "sensor": f.sensor, "since": dates[f.day]} for f in spec.faults],
+        seconds=round(time.monotonic() - began, 1),
+        vehicle_days=vehicles * days,
+        knocked=knocked,
         comparison=out / "comparison.json",
     )
+
+
+def _plan(vehicles: int, days: int, frames: int, seed: int) -> tuple[FleetSpec, list[str]]:
+    """The fleet to simulate, with its knock, and its days."""
+    from pipeline.simulate.faults import parse_faults
+    from pipeline.simulate.fleet import FleetSpec, day_names
+
+    base = FleetSpec(vehicles=vehicles, days=days, frames=frames, seed=seed, container="mixed")
+    dates = day_names(base.first_day, days)
+    knocks = _KNOCK if vehicles > 1 and days > 2 else ""
+    return FleetSpec(**(vars(base) | {"faults": parse_faults(knocks, dates)})), dates
+
+
+def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int) -> list[DayOutcome]:
+    """Every vehicle-day by the night's method, and the last day by the network too."""
+    from jobs.nightly import watch_night
+    from pipeline.fleet.pattern import find_vehicle_days
+
+    work = find_vehicle_days(str(logs / "{vehicle}" / "{day}" / "*"), dates[0], dates[-1])
+    # The network looks at single frames, without semantics.
+    last_day = [w for w in work if w.partition.day == dates[-1]]
+    by_network = replace(night, method=_NETWORK)
+    return [
+        *watch_night(night, work, "process", workers),
+        *watch_night(by_network, last_day, "process", workers),
+    ]
+
+
+def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told: Any) -> int:
+    """Print where the report lies and the last line; returns the exit code."""
+    from jobs.terminal.summary import exit_code, print_summary
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+
+    code = exit_code(statuses)
+    page = told["report"] or "no report"
+    _say(f"\n[bold]{page}[/]  open it in a browser ({told['seconds']:.0f} s in all)")
+    audited = {"statuses": count_statuses(findings), "moved": moved_sensors(findings)}
+    print_summary("demo", {0: "done", 1: "failed", 3: "held"}[code], **told, **audited)
     return code
 
 

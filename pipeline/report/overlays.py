@@ -25,6 +25,8 @@ __all__ = [
     "close_up",
     "decode_image",
     "front_view",
+    "lidar_view",
+    "lidar_window",
     "whole_view",
 ]
 
@@ -95,6 +97,35 @@ def whole_view(scene: Scene, state: Extrinsics, label: str) -> Image:
     _tag(image, label, (14, 34))
     _colour_bar(image)
     return image
+
+
+def lidar_view(scene: Scene, state: Extrinsics, window: Window, label: str) -> Image:
+    """The window of the whole view that `lidar_window` names, with label and colour bar."""
+    image = _drawn(scene, state)
+    scale = image.shape[1] / scene.frame.image_width_px
+    width, height = (round(v * scale) for v in window.size_px)
+    x0, y0 = window.corner_px(scene.frame.image_width_px, scene.frame.image_height_px)
+    left, top = round(x0 * scale), round(y0 * scale)
+    part = np.ascontiguousarray(image[top : top + height, left : left + width])
+    part = cv2.resize(part, (_CANVAS_PX, round(_CANVAS_PX * height / width)), interpolation=cv2.INTER_CUBIC)
+    _tag(part, label, (14, 34))
+    _colour_bar(part)
+    return part
+
+
+def lidar_window(scene: Scene, state: Extrinsics, margin: float = 0.08) -> Window:
+    """What the lidar sees of the image: all but its outermost hundredths, and a margin (a share of its size).
+
+    The whole image where the lidar sees none of it.
+    """
+    camera = camera_of(scene.frame)
+    uv, _ = _project(camera, state.T_camera_lidar, scene.frame.lidar_xyz_m)
+    if not len(uv):
+        uv = np.array([[0.0, 0.0], [camera.width_px, camera.height_px]])
+    low, high = np.percentile(uv, (1, 99), axis=0)
+    size = np.minimum((1 + 2 * margin) * (high - low), (camera.width_px, camera.height_px))
+    centre = (low + high) / 2
+    return Window((float(centre[0]), float(centre[1])), (max(1, round(size[0])), max(1, round(size[1]))))
 
 
 def close_up(scene: Scene, state: Extrinsics, window: Window, zoom: int) -> Image:

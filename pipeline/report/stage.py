@@ -14,30 +14,34 @@ import numpy as np
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
+from pipeline.report.animation import write_animation
 from pipeline.report.day import PairView, answer_for, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import drift_figure, residual_figure, sigma_figure
 from pipeline.report.fleet import drift_panels, finding_views, headline_for, vehicle_rows
-from pipeline.report.overlays import Extrinsics, Scene
+from pipeline.report.overlays import Extrinsics
 from pipeline.report.page import render, write_page
 from pipeline.report.pictures import scene_pictures
+from pipeline.report.reading import (
+    day_records,
+    drift_of,
+    fleet_records,
+    has_frames,
+    scenes_among,
+    spread_observations,
+    states_of,
+)
 from pipeline.report.residuals import frame_residuals
-from pipeline.report.scenes import choose_frames
 from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
 from pipeline.report.truth import truth_rows, truth_summary
 from pipeline.results import Progress, silent
-from pipeline.store.current import current_drift, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows, read_manifest, read_records
 from pipeline.work import Run, Task, Work
-from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, CalibrationRecord
-from schemas.drift import DRIFT, DriftFinding
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.drift import DriftFinding
 
-__all__ = ["Pages", "work", "write_day_page", "write_fleet_page", "write_fleet_report"]
+__all__ = ["Pages", "work", "write_day_animation", "write_day_page", "write_fleet_page", "write_fleet_report"]
 
 _SCENES = 3
-_FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 _CHARTS = 24  # vehicles without an alarm whose charts still go on the fleet page
 
 
@@ -88,10 +92,10 @@ def write_day_page(
         ConfigError: the day has no record of the method.
     """
     method = method or fleet.audit.method
-    records = _day_records(lake, partition, method)
-    findings = _drift(lake, method, partition.vehicle)
+    records = day_records(lake, partition, method)
+    findings = drift_of(lake, method, partition.vehicle)
     views = [pair_view(records[p]) for p in PAIRS if p in records]
-    before, after = _states(records)
+    before, after = states_of(records) or (None, None)
     labels = ("prior", _after_label(views))
     offsets = time_offsets_of(records)
     pictures, residual_svg, no_pictures = _pictures(lake, partition, before, after, labels, offsets)
@@ -117,6 +121,33 @@ def write_day_page(
     return write_page(out, html)
 
 
+def write_day_animation(
+    lake: Lake, partition: Partition, fleet: FleetConfig, out: Path, method: str | None = None
+) -> Path:
+    """Write the day's richest frame as a moving picture: lidar and radar swept from the prior to the result.
+
+    Args:
+        lake: holds calibrations, observations and frames.
+        partition: the vehicle-day.
+        fleet: names the default method.
+        out: .webp (smaller) or .gif.
+        method: None = `fleet.audit.method`.
+
+    Raises:
+        ConfigError: the day has no record of the method, nothing to draw, or `out` has another suffix.
+    """
+    records = day_records(lake, partition, method or fleet.audit.method)
+    states = states_of(records)
+    spread = spread_observations(lake, partition) if has_frames(lake, partition) else []
+    if states is None or not spread:
+        problem = f"{partition.vehicle} has no frame with a prior on {partition.day}"
+        raise ConfigError("command line", "animate", problem)
+    before, after = states
+    scene = scenes_among(lake, partition, spread, after.T_camera_lidar, 1)[0]
+    stamped = as_stamped(after, scene.observation, time_offsets_of(records))
+    return write_animation(out, scene, before, stamped)
+
+
 def write_fleet_page(
     lake: Lake,
     fleet: FleetConfig,
@@ -137,8 +168,8 @@ def write_fleet_page(
         links: day pages by (vehicle, day), relative to `out`.
     """
     method = method or fleet.audit.method
-    records = _fleet_records(lake, method, fleet.audit.window_days)
-    findings = _drift(lake, method)
+    records = fleet_records(lake, method, fleet.audit.window_days)
+    findings = drift_of(lake, method)
     days = sorted({r.day for r in records})
     views = finding_views(findings)
     rows = vehicle_rows(records, findings, days, links or {})
@@ -178,7 +209,7 @@ def write_fleet_report(
     """Write the fleet page and, in a folder beside it, the page of every vehicle-day; the fleet page comes first."""
     method = method or fleet.audit.method
     partitions = sorted(
-        {Partition(r.vehicle, r.day) for r in _fleet_records(lake, method, fleet.audit.window_days)}
+        {Partition(r.vehicle, r.day) for r in fleet_records(lake, method, fleet.audit.window_days)}
     )
     folder = out.parent / f"{out.stem}_days"
     links, pages = {}, []
@@ -189,44 +220,6 @@ def write_fleet_report(
         pages.append(write_day_page(lake, partition, fleet, path, method, fleet_link=f"../{quote(out.name)}"))
         links[(partition.vehicle, partition.day)] = f"{quote(folder.name)}/{quote(name)}"
     return [write_fleet_page(lake, fleet, out, method, truth=truth, links=links), *pages]
-
-
-def _day_records(lake: Lake, partition: Partition, method: str) -> dict[str, CalibrationRecord]:
-    found = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle, day=partition.day)
-    records = {r.pair: r for r in current_records([r for r in found if r.method == method])}
-    if not records:
-        known = sorted({r.method for r in found})
-        problem = (
-            f"{partition.vehicle} has no {method} record on {partition.day}; the lake has {known or 'none'}"
-        )
-        raise ConfigError("command line", "day", problem)
-    return records
-
-
-def _fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:
-    """Current records of the last `window_days` days, as an audit sees them."""
-    records = [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
-    if not records:
-        return []
-    last = dt.date.fromisoformat(max(r.day for r in records))
-    first = (last - dt.timedelta(days=window_days - 1)).isoformat()
-    return current_records([r for r in records if r.day >= first])
-
-
-def _drift(lake: Lake, method: str, vehicle: str | None = None) -> list[DriftFinding]:
-    findings = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle)
-    return current_drift([f for f in findings if f.method == method])
-
-
-def _states(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics | None, Extrinsics | None]:
-    """Extrinsics at the prior and at the result; a pair without a result stays at its prior."""
-    prior = {p: prior_of(r) for p, r in records.items()}
-    result = {p: transform_of(r) for p, r in records.items()}
-    before = {p: T for p, T in prior.items() if T is not None}
-    after = before | {p: T for p, T in result.items() if T is not None}
-    if any(set(PAIRS) - set(state) for state in (before, after)):
-        return None, None
-    return tuple(Extrinsics(s["camera_lidar"], s["camera_radar"], s["lidar_radar"]) for s in (before, after))  # type: ignore[return-value]
 
 
 def _after_label(views: Sequence[PairView]) -> str:
@@ -247,18 +240,13 @@ def _pictures(
     """Pictures, residuals, and why there are none; `after` is drawn with the day's time offsets, `before` had none."""
     if before is None or after is None:
         return [], "", "the records carry no prior"
-    if any(read_manifest(lake, t, partition) is None for t in (FRAMES, OBSERVATIONS)):
+    if not has_frames(lake, partition):
         return [], "", "the lake no longer has the day's frames and observations"
-    observations = [o for chunk in iterate_rows(lake, OBSERVATIONS, partition, Observation) for o in chunk]
-    if not observations:
+    spread = spread_observations(lake, partition)
+    if not spread:
         return [], "", "no frame of the day could be used"
-    some = np.unique(np.linspace(0, len(observations) - 1, _FRAMES_LOOKED_AT).astype(int))
-    spread = [observations[i] for i in some]
     residuals = residual_figure(*frame_residuals(spread, (before, after), (TimeOffsets(), offsets)))
-    chosen = [spread[i] for i in choose_frames(spread, after.T_camera_lidar, _SCENES)]
-    rows = [o.frame_index for o in chosen]
-    frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
-    scenes = [Scene(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
+    scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, _SCENES)
     pictures = [
         scene_pictures([s], before, as_stamped(after, s.observation, offsets), labels)[0] for s in scenes
     ]

@@ -1,0 +1,110 @@
+"""What pages read from a lake: records, findings, and the frames that are worth a picture."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.report.overlays import Extrinsics, Scene
+from pipeline.report.scenes import choose_frames
+from pipeline.store.current import current_drift, current_records, prior_of, transform_of
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import iterate_rows, read_manifest, read_records
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.drift import DRIFT, DriftFinding
+from schemas.frames import FRAMES, Frame
+from schemas.observations import OBSERVATIONS, Observation
+
+__all__ = [
+    "day_records",
+    "drift_of",
+    "fleet_records",
+    "has_frames",
+    "scenes_among",
+    "spread_observations",
+    "states_of",
+]
+
+_FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
+
+
+def day_records(lake: Lake, partition: Partition, method: str) -> dict[str, CalibrationRecord]:
+    """Current records of a vehicle-day by pair.
+
+    Raises:
+        ConfigError: the day has no record of the method.
+    """
+    found = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle, day=partition.day)
+    records = {r.pair: r for r in current_records([r for r in found if r.method == method])}
+    if not records:
+        known = sorted({r.method for r in found})
+        problem = (
+            f"{partition.vehicle} has no {method} record on {partition.day}; the lake has {known or 'none'}"
+        )
+        raise ConfigError("command line", "day", problem)
+    return records
+
+
+def fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:
+    """Current records of the last `window_days` days, as an audit sees them."""
+    records = [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
+    if not records:
+        return []
+    last = dt.date.fromisoformat(max(r.day for r in records))
+    first = (last - dt.timedelta(days=window_days - 1)).isoformat()
+    return current_records([r for r in records if r.day >= first])
+
+
+def drift_of(lake: Lake, method: str, vehicle: str | None = None) -> list[DriftFinding]:
+    """Current findings of one vehicle, or of all."""
+    findings = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle)
+    return current_drift([f for f in findings if f.method == method])
+
+
+def states_of(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics, Extrinsics] | None:
+    """Extrinsics at the prior and at the result; a pair without a result stays at its prior.
+
+    None where a pair has neither.
+    """
+    prior = {p: prior_of(r) for p, r in records.items()}
+    result = {p: transform_of(r) for p, r in records.items()}
+    before = {p: T for p, T in prior.items() if T is not None}
+    after = before | {p: T for p, T in result.items() if T is not None}
+    if set(PAIRS) - set(before):
+        return None
+    return _extrinsics(before), _extrinsics(after)
+
+
+def has_frames(lake: Lake, partition: Partition) -> bool:
+    """Whether the lake still holds what pictures are drawn from."""
+    return all(read_manifest(lake, table, partition) is not None for table in (FRAMES, OBSERVATIONS))
+
+
+def spread_observations(lake: Lake, partition: Partition) -> list[Observation]:
+    """Up to 60 observations, evenly spread over the day."""
+    found = [o for chunk in iterate_rows(lake, OBSERVATIONS, partition, Observation) for o in chunk]
+    if not found:
+        return []
+    some = np.unique(np.linspace(0, len(found) - 1, _FRAMES_LOOKED_AT).astype(int))
+    return [found[i] for i in some]
+
+
+def scenes_among(
+    lake: Lake,
+    partition: Partition,
+    observations: Sequence[Observation],
+    T_camera_lidar: np.ndarray,
+    count: int,
+) -> list[Scene]:
+    """Frames with much to see, spread over the given observations, read from the lake."""
+    chosen = [observations[i] for i in choose_frames(observations, T_camera_lidar, count)]
+    rows = [o.frame_index for o in chosen]
+    frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
+    return [Scene(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
+
+
+def _extrinsics(pairs: Mapping[str, np.ndarray]) -> Extrinsics:
+    return Extrinsics(pairs["camera_lidar"], pairs["camera_radar"], pairs["lidar_radar"])
