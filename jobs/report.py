@@ -16,6 +16,7 @@ def report(
     day: str | None = None,
     method: str | None = None,
     truth: Path | None = None,
+    picture: Path | None = None,
 ) -> int:
     """Write self-contained HTML: one day with --vehicle and --day, else the fleet with all its days.
 
@@ -27,11 +28,13 @@ def report(
         day: YYYY-MM-DD.
         method: method of the records; default: audit.method.
         truth: JSON with the true extrinsics of a simulated fleet, shown beside the estimates.
+        picture: also write the day's richest frame to a file: .jpg or .png is a still, its left half at the prior, its
+            right half at the result; .webp or .gif moves from one to the other. Needs --vehicle and --day.
     """
     from jobs.terminal.summary import print_summary
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
-    from pipeline.report.stage import Pages
+    from pipeline.report.stage import Pages, write_day_picture
     from pipeline.report.truth import read_truth
     from pipeline.stages import REPORT
     from pipeline.store.partitions import Lake, Partition
@@ -39,8 +42,14 @@ def report(
 
     if (vehicle is None) != (day is None):
         raise ConfigError("command line", "vehicle, day", "a day's page needs both --vehicle and --day")
+    if picture is not None and day is None:
+        raise ConfigError("command line", "picture", "a picture is of one day: give --vehicle and --day")
+    config, tables = load_fleet(fleet), Lake.at(lake)
     of = Partition(vehicle, day) if vehicle is not None and day is not None else Window()
     pages = Pages(out, read_truth(truth) if truth is not None else None)
-    outcome = REPORT.run(Task(load_fleet(fleet), Lake.at(lake), of, method, given=pages))
-    print_summary("report", outcome.status, report=out, outputs=outcome.outputs)
+    outcome = REPORT.run(Task(config, tables, of, method, given=pages))
+    outputs = [*outcome.outputs]
+    if picture is not None and isinstance(of, Partition):
+        outputs.append(str(write_day_picture(tables, of, config, picture, method)))
+    print_summary("report", outcome.status, report=out, outputs=outputs)
     return 0

@@ -14,12 +14,12 @@ import numpy as np
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
-from pipeline.report.animation import write_animation
 from pipeline.report.day import PairView, answer_for, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import drift_figure, residual_figure, sigma_figure
 from pipeline.report.fleet import drift_panels, finding_views, headline_for, vehicle_rows
 from pipeline.report.overlays import Extrinsics
 from pipeline.report.page import render, write_page
+from pipeline.report.picture_file import write_picture
 from pipeline.report.pictures import scene_pictures
 from pipeline.report.reading import (
     day_records,
@@ -39,7 +39,7 @@ from pipeline.work import Run, Task, Work
 from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
 from schemas.drift import DriftFinding
 
-__all__ = ["Pages", "work", "write_day_animation", "write_day_page", "write_fleet_page", "write_fleet_report"]
+__all__ = ["Pages", "work", "write_day_page", "write_day_picture", "write_fleet_page", "write_fleet_report"]
 
 _SCENES = 3
 _CHARTS = 24  # vehicles without an alarm whose charts still go on the fleet page
@@ -121,16 +121,16 @@ def write_day_page(
     return write_page(out, html)
 
 
-def write_day_animation(
+def write_day_picture(
     lake: Lake, partition: Partition, fleet: FleetConfig, out: Path, method: str | None = None
 ) -> Path:
-    """Write the day's richest frame as a moving picture: lidar and radar swept from the prior to the result.
+    """Write the day's richest frame as a picture: a still of prior and result, or one that moves between them.
 
     Args:
         lake: holds calibrations, observations and frames.
         partition: the vehicle-day.
         fleet: names the default method.
-        out: .webp (smaller) or .gif.
+        out: .jpg or .png: still; .webp (smaller) or .gif: moving.
         method: None = `fleet.audit.method`.
 
     Raises:
@@ -141,11 +141,12 @@ def write_day_animation(
     spread = spread_observations(lake, partition) if has_frames(lake, partition) else []
     if states is None or not spread:
         problem = f"{partition.vehicle} has no frame with a prior on {partition.day}"
-        raise ConfigError("command line", "animate", problem)
+        raise ConfigError("command line", "picture", problem)
     before, after = states
     scene = scenes_among(lake, partition, spread, after.T_camera_lidar, 1)[0]
     stamped = as_stamped(after, scene.observation, time_offsets_of(records))
-    return write_animation(out, scene, before, stamped)
+    labels = ("prior", _after_label([pair_view(r) for r in records.values()]))
+    return write_picture(out, scene, before, stamped, labels)
 
 
 def write_fleet_page(

@@ -13,12 +13,12 @@ from rich.text import Text
 
 from jobs.show import show
 from jobs.terminal.vehicle_status import count_statuses, moved_sensors, status_lines
-from pipeline.audit.stage import audit_fleet
 from pipeline.report.stage import write_day_page, write_fleet_page
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records
 from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding, status_of
+from tests.makers.stages import audit_fleet
 from tests.report.test_pages import KNOCK, _config, _store
 
 # The knock of "yellow" is seen on one day only; "unknown" drove too little; "blind" never saw its radar turn.

@@ -1,4 +1,4 @@
-"""The moving picture: begins at the prior, ends at the result, and goes straight from one to the other."""
+"""The picture file: a still shows both states; a moving one begins at the prior and ends at the result."""
 
 import cv2
 import numpy as np
@@ -6,9 +6,11 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import inverse, rotation_angle_rad
-from pipeline.report.animation import between, write_animation
-from pipeline.report.overlays import lidar_window
+from pipeline.report.overlays import front_view, lidar_window
+from pipeline.report.picture_file import between, write_picture
 from tests.report.test_pictures import GOOD, WIDTH, _scene, _turned
+
+LABELS = ("prior", "calibrated")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
@@ -26,7 +28,7 @@ def test_each_pair_turns_by_the_share_of_its_whole_turn(share):
 
 @pytest.mark.parametrize("suffix", [".webp", ".gif"])
 def test_a_browser_s_formats_are_written_and_play_for_ever(tmp_path, suffix):
-    path = write_animation(tmp_path / "new" / f"sweep{suffix}", _scene(), _turned(3.0), GOOD)
+    path = write_picture(tmp_path / "new" / f"sweep{suffix}", _scene(), _turned(3.0), GOOD, LABELS)
     played, animation = cv2.imreadanimation(str(path))
     assert played
     assert animation.loop_count == 0
@@ -35,6 +37,16 @@ def test_a_browser_s_formats_are_written_and_play_for_ever(tmp_path, suffix):
     first, last = animation.frames[0].astype(int), animation.frames[-1].astype(int)
     assert first.shape[1] <= 1000
     assert np.abs(first - last).max() > 100  # the dots lie elsewhere
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_still_is_the_page_s_front_view(tmp_path, suffix):
+    path = write_picture(tmp_path / f"still{suffix}", _scene(), _turned(3.0), GOOD, LABELS)
+    found, drawn = (
+        cv2.imread(str(path)).astype(int),
+        front_view(_scene(), _turned(3.0), GOOD, LABELS).astype(int),
+    )
+    assert np.abs(found - drawn).mean() < 3.0  # what JPEG loses
 
 
 def test_the_window_holds_what_the_lidar_sees():
@@ -49,4 +61,4 @@ def test_the_window_holds_what_the_lidar_sees():
 
 def test_another_format_is_refused_by_name(tmp_path):
     with pytest.raises(ConfigError, match="sweep"):
-        write_animation(tmp_path / "sweep.mp4", _scene(), GOOD, GOOD)
+        write_picture(tmp_path / "sweep.mp4", _scene(), GOOD, GOOD, LABELS)

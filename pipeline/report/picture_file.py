@@ -1,4 +1,4 @@
-"""A moving picture of one frame: the sensors' data slide from where the prior puts them to where the result does."""
+"""A picture of one frame as a file: a still with the prior in its left half, or one that moves from prior to result."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from jaxtyping import Float, UInt8
 
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
-from pipeline.report.overlays import Extrinsics, Scene, Window, lidar_view, lidar_window
+from pipeline.report.overlays import Extrinsics, Scene, Window, front_view, lidar_view, lidar_window
 
-__all__ = ["between", "write_animation"]
+__all__ = ["between", "write_picture"]
 
 _WIDTH_PX = 960
 _STEPS = 16
 _STEP_MS, _FIRST_MS, _LAST_MS = 70, 1200, 2200  # long enough at both ends to look around
 # Of 100; dots stay sharp, and a sweep of a 1.8 Mpx camera stays below 1.5 MB.
 _WEBP_QUALITY = 50
-_QUALITY = {".webp": (cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY), ".gif": ()}
+_MOVING = {".webp": (cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY), ".gif": ()}
+_STILL = {".jpg": (cv2.IMWRITE_JPEG_QUALITY, 85), ".png": ()}
 
 
 def between(before: Extrinsics, after: Extrinsics, share: float) -> Extrinsics:
@@ -28,33 +29,44 @@ def between(before: Extrinsics, after: Extrinsics, share: float) -> Extrinsics:
     return Extrinsics(*(exp_se3(share * log_se3(T @ inverse(T_before))) @ T_before for T_before, T in pairs))
 
 
-def write_animation(out: Path, scene: Scene, before: Extrinsics, after: Extrinsics) -> Path:
-    """Write the scene's camera image with lidar and moving radar, swept from `before` to `after`, then over again.
+def write_picture(
+    out: Path, scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]
+) -> Path:
+    """Write the scene's camera image with lidar and moving radar in it, at two states.
 
     Args:
-        out: file to write, .webp or .gif; its folder is made.
+        out: .jpg or .png: a still, its left half at `before`, its right half at `after`; .webp or .gif: a picture that
+            moves from `before` to `after`, then over again. Its folder is made.
         scene: the frame.
-        before: first picture.
-        after: last picture, which stays the longest.
+        before: as far as the prior knows.
+        after: as far as the result knows.
+        labels: names of both states.
 
     Raises:
         ConfigError: another suffix.
     """
     kind = out.suffix.lower()
-    if kind not in _QUALITY:
-        raise ConfigError(
-            "command line", "animate", f"{out.name} ends neither in {' nor in '.join(_QUALITY)}"
-        )
-    # Starts and ends slowly, so that the eye can follow a silhouette.
-    shares = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, _STEPS))
-    animation = cv2.Animation()
-    window = lidar_window(scene, after)
-    animation.frames = [_drawn(scene, between(before, after, float(s)), after, window) for s in shares]
-    animation.durations = np.array([_FIRST_MS, *[_STEP_MS] * (_STEPS - 2), _LAST_MS], np.int32)
+    if kind not in _MOVING | _STILL:
+        known = ", ".join(_STILL | _MOVING)
+        raise ConfigError("command line", "picture", f"{out.name} ends in none of {known}")
     out.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwriteanimation(str(out), animation, _QUALITY[kind]):
+    if kind in _STILL:
+        written = cv2.imwrite(str(out), front_view(scene, before, after, labels), _STILL[kind])
+    else:
+        written = cv2.imwriteanimation(str(out), _animation(scene, before, after), _MOVING[kind])
+    if not written:
         raise OSError(f"{out} could not be written")
     return out
+
+
+def _animation(scene: Scene, before: Extrinsics, after: Extrinsics) -> cv2.Animation:
+    # Starts and ends slowly, so that the eye can follow a silhouette.
+    shares = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, _STEPS))
+    window = lidar_window(scene, after)
+    animation = cv2.Animation()
+    animation.frames = [_drawn(scene, between(before, after, float(s)), after, window) for s in shares]
+    animation.durations = np.array([_FIRST_MS, *[_STEP_MS] * (_STEPS - 2), _LAST_MS], np.int32)
+    return animation
 
 
 def _drawn(scene: Scene, state: Extrinsics, after: Extrinsics, window: Window) -> UInt8[np.ndarray, "H W 3"]:
