@@ -1,1 +1,1 @@
-"""Method `joint`: the best direct optimisation here."""
+"""Method `joint`: camera-lidar and lidar-radar by direct optimisation, camera-radar composed of them."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.joint.lidar_radar.normal_equations import tempered
-from pipeline.calibrate.numerics.covariance import held_covariance, posterior
+from pipeline.calibrate.numerics.covariance import covariance_with_fixed, posterior
 from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
@@ -79,7 +79,9 @@ def estimate_camera_radar(
         T = from_rotation_translation(exp_so3(step[:3]) @ T[:3, :3], T0[:3, 3])
         bias = bias + step[6:]
     block = bootstrap_blocks(np.array([o.drive for o in observations]), config.bootstrap_blocks)
-    covariance = held_covariance(H, g, before, H.sum(0) + np.diag(1 / before), _HELD, block, rng)[:6, :6]
+    covariance = covariance_with_fixed(H, g, before, H.sum(0) + np.diag(1 / before), _HELD, block, rng)[
+        :6, :6
+    ]
     # Left perturbations about the camera carry the radar along; these were turns about the radar.
     J = np.linalg.inv(change_jacobian(T))
     after = posterior(covariance, prior_covariance, _BIAS_FLOOR)

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar, settle_camera_lidar
+from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar, analyse_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.initialise import SAME_ROTATION_RAD
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
@@ -87,7 +87,7 @@ def solve_joint(
         except SolveError as err:
             failed["lidar_radar"].append(err.reason)
     if aligned is not None:
-        camera_lidar = settle_camera_lidar(aligned, rng, heading=_heading(lidar_radar))
+        camera_lidar = analyse_camera_lidar(aligned, rng, heading=_heading(lidar_radar))
     progress(2, 3, "camera-radar")
     alone = estimate_camera_radar(
         observations["camera_radar"], prior, config, np.random.default_rng([seed, 2])

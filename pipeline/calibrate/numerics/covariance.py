@@ -19,7 +19,7 @@ __all__ = [
     "OBSERVABLE",
     "Posterior",
     "bootstrap_covariance",
-    "held_covariance",
+    "covariance_with_fixed",
     "posterior",
     "response",
     "spread_to_covariance",
@@ -84,7 +84,7 @@ def response(
     return out
 
 
-def held_covariance(
+def covariance_with_fixed(
     information: Float[np.ndarray, "F P P"],
     score: Float[np.ndarray, "F P"],
     prior_variance: Float[np.ndarray, " P"],

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar, estimate_camera_lidar
-from pipeline.calibrate.joint.camera_lidar.observability import clock_variance
-from pipeline.calibrate.joint.camera_lidar.time_offset import ClockProfile, s_per_metre
+from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
+from pipeline.calibrate.joint.camera_lidar.time_offset import TimeOffsetProfile, s_per_metre
 from pipeline.calibrate.numerics.differential_evolution import evolve
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
@@ -26,7 +26,7 @@ def prior_off_by(degrees, metres, seed):
 @pytest.mark.parametrize(
     ("rig", "frames", "dt_s"),
     [(SPARSE, 16, 0.03), (DENSE, 8, -0.02), (DENSE, 8, 0.08)],
-    ids=["16 rings", "dense", "dense, a clock far off"],
+    ids=["16 rings", "dense", "dense, a time offset far off"],
 )
 def test_pose_and_time_offset_are_recovered_from_four_degrees(rig, frames, dt_s):
     day = traced_day(rig, frames, seed=1, dt_s=dt_s)
@@ -53,7 +53,7 @@ def prior_along_the_axis(sigma_m):
     return Prior(T, np.eye(4), float(np.radians(2.0)), sigma_m)
 
 
-def test_what_the_day_cannot_determine_stays_at_the_prior_with_its_sigma_and_the_clock_says_so():
+def test_what_the_day_cannot_determine_stays_at_the_prior_with_its_sigma_and_the_time_offset_says_so():
     day = traced_day(SPARSE, 12, seed=1, dt_s=0.03)
     for sigma_m in (0.02, 0.1):
         prior = prior_along_the_axis(sigma_m)
@@ -70,16 +70,16 @@ def test_what_the_day_cannot_determine_stays_at_the_prior_with_its_sigma_and_the
         assert abs(e.time_offset_s - 0.03) < 3 * e.time_offset_sigma_s
 
 
-def test_the_less_is_known_along_the_axis_the_less_is_known_of_the_clock():
+def test_the_less_is_known_along_the_axis_the_less_is_known_of_the_time_offset():
     # A car that stands dt later looks as if it stood further on.
     day = traced_day(SPARSE, 6, seed=3)
     begun = align_camera_lidar(day, prior_off_by(1.0, 0.03, 2), SolveConfig(), np.random.default_rng(5))
-    clock = ClockProfile(begun.state, 1e-6)
+    timed = TimeOffsetProfile(begun.state, 1e-6)
     little, much = (
-        clock_variance(replace(begun.day, tz_variance=m**2), begun.state, begun.level, clock)
+        time_offset_variance(replace(begun.problem, tz_variance=m**2), begun.state, begun.kernel, timed)
         for m in (0.02, 0.1)
     )
-    share = s_per_metre(begun.day.terms, begun.state) * 0.1
+    share = s_per_metre(begun.problem.terms, begun.state) * 0.1
     assert 0.5 * share**2 < much - little < share**2
 
 

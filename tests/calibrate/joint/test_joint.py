@@ -109,7 +109,9 @@ def test_a_camera_lidar_end_that_no_restart_came_near_fails_a_check_of_both_came
         found = replace(camera_lidar(), diagnostics={"restart_rotation_spread_deg": apart_deg})
         aligned = SimpleNamespace(T_camera_lidar=found.T, covariance=found.covariance)
         monkeypatch.setattr("pipeline.calibrate.joint.solve.align_camera_lidar", lambda *_, a=aligned: a)
-        monkeypatch.setattr("pipeline.calibrate.joint.solve.settle_camera_lidar", lambda *_, e=found, **__: e)
+        monkeypatch.setattr(
+            "pipeline.calibrate.joint.solve.analyse_camera_lidar", lambda *_, e=found, **__: e
+        )
         solution = solve_joint(dict.fromkeys(PAIRS, street_day(3)), PRIOR, SolveConfig(), seed=0)
         for pair in ("camera_lidar", "camera_radar"):
             assert any("no restart" in why for why in solution.failed_checks.get(pair, [])) == fails

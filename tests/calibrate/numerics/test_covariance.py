@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.calibrate.numerics.covariance import (
     bootstrap_covariance,
-    held_covariance,
+    covariance_with_fixed,
     posterior,
     response,
     spread_to_covariance,
@@ -123,7 +123,7 @@ def test_parameters_that_follow_a_held_one_inherit_its_uncertainty_and_cover_the
         estimate = np.array([A[:, 0] @ y / (A[:, 0] @ A[:, 0]), 0.0])
         H, g = A[:, :, None] * A[:, None, :], A * (A @ estimate - y)[:, None]
         curvature = H.sum(0) + np.diag(1 / prior_variance)
-        covariance = held_covariance(H, g, prior_variance, curvature, held, np.arange(200) // 5, rng)
+        covariance = covariance_with_fixed(H, g, prior_variance, curvature, held, np.arange(200) // 5, rng)
         assert covariance[1, 1] == pytest.approx(prior_variance[1])
         assert covariance[0, 1] < 0
         z.append((estimate[0] - truth[0]) / np.sqrt(covariance[0, 0]))

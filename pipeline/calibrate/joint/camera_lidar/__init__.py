@@ -1,1 +1,1 @@
-"""Camera-lidar half of method `joint`: initialise, refine, what the day determines."""
+"""Camera-lidar half of method `joint`: initial pose, local refinement, observability analysis."""

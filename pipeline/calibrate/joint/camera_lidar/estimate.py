@@ -1,11 +1,11 @@
 """Camera-lidar half of method `joint`: T_camera_lidar and the camera's time offset from a day of observations.
 
-A small differential evolution finds the basin (wide kernels, few points, restarts), annealed response
-surfaces find the optimum, and the frames' own curvatures and gradients say how sure it is. Weights of the
-terms come from the data: the share of matching edges, the contrast under markings, and how much a term's
-gradient scatters from frame to frame against what its curvature promises (composite likelihood: Varin,
-Reid, Firth 2011, section 2.3). A degree of freedom that the day does not determine is then held at the prior and
-the others solved again; their covariance includes what the prior leaves open in it.
+A small differential evolution finds the basin (wide kernels, few points, restarts), annealed response surfaces find the
+optimum, and the frames' own curvatures and gradients say how sure it is. Weights of the terms come from the data: the
+share of matching edges, the contrast under markings, and the scatter of a term's gradient from frame to frame compared
+with its curvature (composite likelihood: Varin, Reid, Firth 2011, section 2.3). A degree of freedom that the day does
+not determine is then fixed at the prior and the others are solved again; their covariance includes what the prior
+leaves open in it.
 """
 
 from __future__ import annotations
@@ -16,17 +16,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.joint.camera_lidar.heading_bias import sweep_s_per_rad
+from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, sweep_s_per_rad
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
-from pipeline.calibrate.joint.camera_lidar.observability import IS_TZ, Day, Found, determined, measured
-from pipeline.calibrate.joint.camera_lidar.refine import (
-    FOCAL_SIGMA,
-    NOTHING,
-    AlignmentState,
-    climb,
-    weighted,
+from pipeline.calibrate.joint.camera_lidar.observability import (
+    IS_TZ,
+    CameraLidarProblem,
+    ObservabilityAnalysis,
+    analyse_observability,
+    covariance_and_observability,
 )
+from pipeline.calibrate.joint.camera_lidar.refine import NONE_FIXED, AlignmentState, Scored, refine, weighted
+from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, s_per_metre
+from pipeline.calibrate.numerics.bias_floors import FOCAL_SIGMA, HEADING_SIGMA_RAD, MAX_GAP_PX
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
@@ -40,30 +42,27 @@ __all__ = [
     "Aligned",
     "AlignmentState",
     "align_camera_lidar",
+    "analyse_camera_lidar",
     "estimate_camera_lidar",
-    "settle_camera_lidar",
 ]
 
 _FEWEST_FRAMES = 5
-_THIN_POINTS, _FINE_POINTS = 8000, 18000  # of edges, and of markings; more say the same again
+_FEWEST_EDGES = 20  # per frame
 _MARGIN_RAD = np.radians(2.0)  # points further out of view than this stay out of it
-# Kernel widths [label px] and contrast levels, from wide to sharp.
-_LADDER = ((4.0, 0), (2.5, 1), (1.5, 2))
-_MAX_GAP_PX = 5.0  # edges whose interval is wider (16 rings: 30 px) are for the basin only
 _NEAR_PRIOR_M = 0.25
-_HEADING_SIGMA_RAD = np.radians(0.3)  # of velocities that a caller knows
+_UNKNOWN_SHARE = 0.7  # of the prior's sigma: from there on the day's speeds did not determine the time offset
 
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """An alignment good to a tenth of a degree: where `settle_camera_lidar` goes on, maybe with better velocities."""
+    """An alignment good to a tenth of a degree: `analyse_camera_lidar` goes on from it, maybe with better velocities."""
 
-    day: Day
+    problem: CameraLidarProblem
     frames: list[Observation]
     rejected: dict[str, int]
     basin: Basin
     state: AlignmentState
-    level: KernelSettings
+    kernel: KernelSettings
 
     @property
     def T_camera_lidar(self) -> Float[np.ndarray, "4 4"]:
@@ -73,9 +72,9 @@ class Aligned:
     @property
     def covariance(self) -> Float[np.ndarray, "6 6"]:
         """Of the pose, by left perturbation."""
-        chart = measured(self.day, self.state, self.level, IS_TZ)[0][:6, :6]
+        of_changes = covariance_and_observability(self.problem, self.state, self.kernel, IS_TZ)[0][:6, :6]
         to_left = np.linalg.inv(change_jacobian(self.state.T_camera_lidar))
-        return to_left @ chart @ to_left.T
+        return to_left @ of_changes @ to_left.T
 
 
 def estimate_camera_lidar(
@@ -100,7 +99,7 @@ def estimate_camera_lidar(
         SolveError: too few frames, or nothing to align in them.
     """
     aligned = align_camera_lidar(observations, prior, config, rng, velocity_lidar=velocity_lidar)
-    return settle_camera_lidar(aligned, rng)
+    return analyse_camera_lidar(aligned, rng)
 
 
 def align_camera_lidar(
@@ -111,84 +110,92 @@ def align_camera_lidar(
     *,
     velocity_lidar: Float[np.ndarray, "F 3"] | None = None,
 ) -> Aligned:
-    """Find the basin and climb it, from wide kernels to sharp ones; arguments as of `estimate_camera_lidar`."""
+    """Find the basin and refine in it, from wide kernels to sharp ones; arguments as of `estimate_camera_lidar`."""
     used, rejected = _usable(observations)
-    heading_sigma = _HEADING_SIGMA_RAD
+    heading_sigma = HEADING_SIGMA_RAD
     if velocity_lidar is None:
         velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar)
         heading_sigma = float(np.hypot(heading_sigma, prior.rotation_sigma_rad))
     if len(used) < _FEWEST_FRAMES:
         raise SolveError(f"camera-lidar needs {_FEWEST_FRAMES} frames of one camera, the day has {len(used)}")
     frames = [observations[i] for i in used]
-    reach = search_range(prior, config)[0] + _MARGIN_RAD
-    terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar[used], reach_rad=reach)
-    terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
-    if "edges" in config.terms and len(terms.edges.xyz_m) < 20 * len(used):
-        raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
+    terms = _terms(frames, velocity_lidar[used], prior, config)
 
-    first = KernelSettings.wide(*_LADDER[0])
-    sharp = terms.sharp(_MAX_GAP_PX)
-    thin = sharp.at_most(_THIN_POINTS, rng)
-    basin = find_basin(terms, thin, first, prior, config, rng)
-    sharp = sharp.in_view(basin.state.T_camera_lidar, _MARGIN_RAD).at_most(_FINE_POINTS, rng)
-    # Wide kernels are biased along the optical axis: where the prior is better than that, enter the valley there.
+    first = KernelSettings.wide(*SCHEDULE.kernels[0])
+    sharp = terms.sharp(MAX_GAP_PX)
+    thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config)
+    basin = find_basin(terms, thin, rng)
+    sharp = sharp.in_view(basin.state.T_camera_lidar, _MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
+    # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
     near = prior.translation_sigma_m <= _NEAR_PRIOR_M
-    held = IS_TZ if near else NOTHING
+    fixed = IS_TZ if near else NONE_FIXED
     state = _at_prior_tz(basin.state, prior, terms) if near else basin.state
-    state = climb(thin, state, first, prior, config, steps=8, held=held)
-    for sigma_px, contrast in _LADDER[1:]:
-        level = weighted(
-            sharp, state, sharp.fitted(state.alone, KernelSettings.wide(sigma_px, contrast), rng)
-        )
-        state = climb(sharp, state, level, prior, config, steps=4, held=held)
-    day = Day(
+    state = refine(thin, state, steps=SCHEDULE.first_steps, fixed=fixed)
+    kernel = first
+    for sigma_px, contrast in SCHEDULE.kernels[1:]:
+        fitted = sharp.fitted(state.alone, KernelSettings.wide(sigma_px, contrast), rng)
+        kernel = weighted(sharp, state, fitted)
+        scored = Scored(sharp, kernel, prior, config)
+        state = refine(scored, state, steps=SCHEDULE.sharper_steps, fixed=fixed)
+    problem = CameraLidarProblem(
         sharp,
         prior,
         config,
         [o.drive for o in frames],
         int(rng.integers(2**32)),
         prior.translation_sigma_m**2,
-        heading_sigma,
-        sweep_s_per_rad(frames),
+        MotionSigmas(heading_sigma, sweep_s_per_rad(frames)),
     )
-    return Aligned(day, frames, rejected, basin, state, level)
+    return Aligned(problem, frames, rejected, basin, state, kernel)
 
 
-def settle_camera_lidar(
+def analyse_camera_lidar(
     aligned: Aligned,
     rng: np.random.Generator,
     *,
     heading: tuple[Float[np.ndarray, "4 4"], float] | None = None,
 ) -> PairEstimate:
-    """The estimate: tz, the clock, what the day determines, how surely.
+    """The estimate: tz, the time offset, what the day determines and how surely.
 
     Args:
         aligned: where to begin.
-        rng: of the chance densities and the clock's points.
+        rng: of the chance densities and the points of the time offset's profile.
         heading: T_lidar_radar that turns the radar's Doppler velocities into lidar axes, and its sigma of yaw [rad];
             by default the velocities stay those of `aligned`.
     """
-    day = aligned.day
+    problem = aligned.problem
     if heading is not None:
         velocity = lidar_velocities(aligned.frames, heading[0])
-        day = replace(
-            day,
-            terms=replace(day.terms, velocity_lidar=velocity),
-            heading_sigma_rad=float(np.hypot(_HEADING_SIGMA_RAD, heading[1])),
+        sigma = float(np.hypot(HEADING_SIGMA_RAD, heading[1]))
+        problem = replace(
+            problem,
+            terms=replace(problem.terms, velocity_lidar=velocity),
+            motion=replace(problem.motion, heading_rad=sigma),
         )
-    found = determined(day, aligned.state, aligned.level, rng)
-    halves = [
-        climb(
-            day.terms.of_frames(np.arange(k, day.terms.frames, 2)), found.state, found.level, found.prior,
-            day.config, steps=3, held=found.held | (np.arange(8) == FOCAL),
-        )
-        for k in (0, 1)
-    ]  # fmt: skip
-    diagnostics = _diagnostics(day.terms, found, aligned.basin, halves)
-    return _conclude(found, day.config, len(aligned.frames), aligned.rejected, diagnostics)
+    analysis = analyse_observability(problem, aligned.state, aligned.kernel, rng)
+    fixed = analysis.fixed | (np.arange(8) == FOCAL)
+    scored = Scored(problem.terms, analysis.kernel, analysis.prior, problem.config)
+    halves = []
+    for k in (0, 1):
+        half = replace(scored, terms=problem.terms.of_frames(np.arange(k, problem.terms.frames, 2)))
+        halves.append(refine(half, analysis.state, steps=SCHEDULE.half_steps, fixed=fixed))
+    diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves)
+    return _conclude(analysis, problem.config, len(aligned.frames), aligned.rejected, diagnostics)
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
+
+
+def _terms(
+    frames: Sequence[Observation], velocity_lidar: np.ndarray, prior: Prior, config: SolveConfig
+) -> Terms:
+    """The terms that the config asks for, with all points that the search range can bring into view."""
+    reach = search_range(prior, config).rotation_rad + _MARGIN_RAD
+    terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar, reach_rad=reach)
+    terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
+    if "edges" in config.terms and len(terms.edges.xyz_m) < _FEWEST_EDGES * len(frames):
+        raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
+    return terms
 
 
 def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, int]]:
@@ -205,20 +212,20 @@ def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, i
 
 
 def _at_prior_tz(state: AlignmentState, prior: Prior, terms: Terms) -> AlignmentState:
-    """The state with the prior's tz, and the clock that keeps what the car passes where it was."""
+    """Reset tz to the prior; adjust dt so that static points keep their pixels."""
     shift_m = float(state.T_camera_lidar[2, 3] - prior.T_camera_lidar[2, 3])
-    return replace(state, dt_s=state.dt_s + s_per_metre(terms, state) * shift_m).held(prior, IS_TZ)
+    return replace(state, dt_s=state.dt_s + s_per_metre(terms, state) * shift_m).with_fixed(prior, IS_TZ)
 
 
 def _diagnostics(
     terms: Terms,
-    found: Found,
+    analysis: ObservabilityAnalysis,
     basin: Basin,
     halves: list[AlignmentState],
 ) -> dict[str, float]:
     """Numbers behind the verdict."""
     apart = difference(halves[0], halves[1])
-    level, profile = found.level, found.profile
+    kernel, profile = analysis.kernel, analysis.profile
     return {
         "restarts": float(basin.restarts),
         "restart_rotation_spread_deg": float(np.degrees(basin.rotation_spread_rad)),
@@ -228,45 +235,45 @@ def _diagnostics(
         **{f"halves_{n}_m": float(abs(apart[3 + i])) for i, n in enumerate(("tx", "ty", "tz"))},
         "halves_dt_s": float(abs(apart[6])),
         **{
-            f"edge_match_share_{n}": float(terms.mean_match(level)[i])
+            f"edge_match_share_{n}": float(terms.mean_match(kernel)[i])
             for i, n in enumerate(("left", "right", "above", "below"))
         },
         "tz_bias_m": profile.bias_m,
         "tz_kinds_apart_m": profile.kinds_apart_m,
         "tz_kinds_sigma_m": profile.kinds_sigma_m,
-        "focal_scale": found.state.focal,
-        "edge_weight": level.edge_weight,
-        "marking_contrast_sd": level.delta,
-        "marking_weight": level.marking_weight,
+        "focal_scale": analysis.state.focal,
+        "edge_weight": kernel.edge_weight,
+        "marking_contrast_sd": kernel.delta,
+        "marking_weight": kernel.marking_weight,
         "edges_per_frame": len(terms.edges.xyz_m) / terms.frames,
         "markings_per_frame": len(terms.markings.xyz_m) / terms.frames,
     }
 
 
 def _conclude(
-    found: Found,
+    analysis: ObservabilityAnalysis,
     config: SolveConfig,
     frames: int,
     rejected: dict[str, int],
     diagnostics: dict[str, float],
 ) -> PairEstimate:
     """The estimate, its covariance by left perturbation, notes."""
-    dt_sigma = float(np.sqrt(found.covariance[6, 6]))
+    dt_sigma = float(np.sqrt(analysis.covariance[6, 6]))
     notes = [
-        f"focal length {found.state.focal - 1:+.2%} off the log's, where {FOCAL_SIGMA:.1%} was expected (1 sigma)"
+        f"focal length {analysis.state.focal - 1:+.2%} off the log's, where {FOCAL_SIGMA:.1%} was expected (1 sigma)"
     ]
-    if dt_sigma > 0.7 * config.time_offset_sigma_s:
+    if dt_sigma > _UNKNOWN_SHARE * config.time_offset_sigma_s:
         notes.append("camera time offset: the day's speeds do not determine it")
-    to_left = np.linalg.inv(change_jacobian(found.state.T_camera_lidar))
+    to_left = np.linalg.inv(change_jacobian(analysis.state.T_camera_lidar))
     return PairEstimate(
         "camera_lidar",
-        found.state.T_camera_lidar,
-        to_left @ found.covariance[:6, :6] @ to_left.T,
-        found.observability,
-        found.observability >= OBSERVABLE,
+        analysis.state.T_camera_lidar,
+        to_left @ analysis.covariance[:6, :6] @ to_left.T,
+        analysis.observability,
+        analysis.observability >= OBSERVABLE,
         frames_used=frames,
         frames_rejected=rejected,
-        time_offset_s=found.state.dt_s,
+        time_offset_s=analysis.state.dt_s,
         time_offset_sigma_s=dt_sigma,
         diagnostics=diagnostics,
         notes=notes,

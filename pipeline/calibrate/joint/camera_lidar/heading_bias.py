@@ -1,9 +1,9 @@
-"""What an unknown direction of travel in the lidar's axes does to T_camera_lidar: a bias that more frames do not lower.
+"""How a wrong heading of the car in the lidar's axes biases T_camera_lidar: an error that more frames do not lower.
 
-A sweep takes a tenth of a second; de-skewing moves its points along the car's velocity, as the prior's mounting has
-it. A mounting that is off by a degree then lifts one side of the sweep and lowers the other, in proportion to speed:
-on highways that is a tenth of a degree of roll, in edges and markings alike. The camera's time offset moves the cloud
-along the same velocity, whose heading comes from the radar and its prior.
+A sweep takes a tenth of a second; de-skewing moves its points along the car's velocity, whose direction in lidar axes
+follows from the prior's mounting. A mounting that is off by a degree then lifts one side of the sweep and lowers the
+other, in proportion to speed: on highways that is a tenth of a degree of roll, in edges and markings alike. The
+camera's time offset moves the cloud along the same velocity, whose heading comes from the radar and its prior.
 
 Source: Schmidt 1966 (parameters that are considered, not solved for).
 """
@@ -11,77 +11,81 @@ Source: Schmidt 1966 (parameters that are considered, not solved for).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
+from pipeline.calibrate.numerics.bias_floors import MOUNTING_SIGMA_RAD, SWEEP_S
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from schemas.observations import Observation
 
-__all__ = ["motion_biases", "sweep_s_per_rad"]
+__all__ = ["MotionSigmas", "motion_biases", "sweep_s_per_rad"]
 
-_SWEEP_S = 0.1  # rotating and scanning lidars alike run at 10 Hz
-# Roll's errors on simulated days of seeds 110 to 145, most of them of this kind, were two thirds of what 1 deg says.
-_MOUNT_SIGMA_RAD = np.radians(0.6)
-_STAMP_SIGMA_S = _SWEEP_S / np.sqrt(12)  # a sweep's stamp may be of its begin, middle or end
+_STAMP_SIGMA_S = SWEEP_S / np.sqrt(12)  # a sweep's stamp may be of its begin, middle or end
+
+
+@dataclass(frozen=True)
+class MotionSigmas:
+    """How surely the car's motion is known in the lidar's axes, and how long a sweep takes."""
+
+    heading_rad: float  # one sigma of the velocities that the terms have
+    s_per_rad: float  # time of a sweep per azimuth
 
 
 def sweep_s_per_rad(observations: Sequence[Observation]) -> float:
-    """Time that a sweep takes per radian of azimuth, from the azimuths that there are."""
+    """Time [s/rad] that a sweep takes per azimuth, from the azimuths that occur."""
     cloud = np.concatenate([o.lidar_map_xyz_m[::20] for o in observations[:20]])
     if len(cloud) < 10:
-        return _SWEEP_S / (2 * np.pi)
+        return SWEEP_S / (2 * np.pi)
     low, high = np.percentile(np.arctan2(cloud[:, 1], cloud[:, 0]), (0.5, 99.5))
-    return float(_SWEEP_S / max(high - low, 0.5))
+    return float(SWEEP_S / max(high - low, 0.5))
 
 
 def motion_biases(
     terms: Terms,
     state: AlignmentState,
-    level: KernelSettings,
+    kernel: KernelSettings,
     curvature: Float[np.ndarray, "8 8"],
-    held: Bool[np.ndarray, " 8"],
-    heading_sigma_rad: float,
-    s_per_rad: float,
+    fixed: Bool[np.ndarray, " 8"],
+    sigmas: MotionSigmas,
 ) -> Float[np.ndarray, "5 8"]:
-    """One sigma of each unknown of the motion, as moves of the solution (chart of `changed`).
+    """How far one sigma of each unknown of the motion moves the solution (coordinates of `changed`).
 
-    Heading of the velocities; yaw and pitch of the mounting, once by azimuth and once by the sweep's mean time.
+    Rows: heading of the velocities; yaw and pitch of the mounting, each by azimuth and by the sweep's mean time.
 
     Args:
         terms: points and velocities.
         state: the solution.
-        level: of the gradients.
-        curvature: of the cost, in the chart of `changed`.
-        held: what does not follow.
-        heading_sigma_rad: of the velocities that `terms` has.
-        s_per_rad: time of a sweep per azimuth.
+        kernel: of the gradients.
+        curvature: of the cost, in the coordinates of `changed`.
+        fixed: unknowns that do not follow.
+        sigmas: of the heading, and a sweep's duration.
     """
     across = terms.velocity_lidar @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     up = np.linalg.norm(terms.velocity_lidar, axis=1)[:, None] * np.array([0.0, 0.0, 1.0])
-    turned = replace(terms, velocity_lidar=terms.velocity_lidar + heading_sigma_rad * across)
+    turned = replace(terms, velocity_lidar=terms.velocity_lidar + sigmas.heading_rad * across)
     skewed = [
-        _skewed(terms, _MOUNT_SIGMA_RAD * along, slope, constant)
+        _skewed(terms, MOUNTING_SIGMA_RAD * along, per_rad, constant)
         for along in (across, up)
-        for slope, constant in ((s_per_rad, 0.0), (0.0, _STAMP_SIGMA_S))
+        for per_rad, constant in ((sigmas.s_per_rad, 0.0), (0.0, _STAMP_SIGMA_S))
     ]
-    before = _slope(terms, state, level)
+    before = _gradient(terms, state, kernel)
     to_left = np.eye(8)
     to_left[:6, :6] = np.linalg.inv(change_jacobian(state.T_camera_lidar))
-    out, free = np.zeros((5, 8)), ~held
+    out, free = np.zeros((5, 8)), ~fixed
     for row, other in zip(out, (turned, *skewed), strict=True):
-        change = to_left.T @ (_slope(other, state, level) - before)
+        change = to_left.T @ (_gradient(other, state, kernel) - before)
         row[free] = np.linalg.solve(curvature[np.ix_(free, free)], change[free])
     return out
 
 
-def _slope(terms: Terms, state: AlignmentState, level: KernelSettings) -> Float[np.ndarray, " 8"]:
+def _gradient(terms: Terms, state: AlignmentState, kernel: KernelSettings) -> Float[np.ndarray, " 8"]:
     """Gradient of the score by left perturbation, time offset, focal scale."""
-    return terms.gradient(state.alone, level)[0].sum(0)
+    return terms.gradient(state.alone, kernel)[0].sum(0)
 
 
 def _skewed(terms: Terms, velocity: Float[np.ndarray, "F 3"], s_per_rad: float, s: float) -> Terms:

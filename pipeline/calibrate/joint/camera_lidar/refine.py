@@ -1,4 +1,4 @@
-"""The camera-lidar score's ascent: a state of pose, clock and focal length, and annealed response surfaces up to it."""
+"""Local refinement of the camera-lidar score: the unknowns as a state, annealed response surfaces that improve it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.calibrate.numerics.bias_floors import FOCAL_SIGMA, TYPICAL_RANGE_M, TYPICAL_SPEED_MPS
 from pipeline.calibrate.numerics.response_surface import DESIGN, at_least, fit_quadratics
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
@@ -14,29 +15,27 @@ from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, l
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
 
 __all__ = [
-    "FOCAL_SIGMA",
-    "NOTHING",
+    "NONE_FIXED",
     "AlignmentState",
-    "climb",
+    "Scored",
     "derivatives",
     "prior_value",
+    "refine",
     "scales",
     "weighted",
 ]
 
-# Typical distance of what edges and markings lie on: turns a width in pixels into metres.
-_TYPICAL_RANGE_M = 12.0
-_TYPICAL_SPEED_MPS = 8.0
-# Intrinsics are known to about this; free within it, so that the pose along the optical axis is not surer
-# than they are.
-FOCAL_SIGMA = 0.003
-_ARRIVED = 0.05  # a step of this share of the ball changes nothing that matters
-NOTHING = np.zeros(8, bool)  # held
+_SURFACE_SIZE = 1.8  # radius of the response surface in kernel widths: the score is rough below one
+_SHRINK = 0.75  # of that radius, after a step that stays within it
+_CONVERGED = 0.05  # a step of this share of the radius changes nothing that matters
+_LEAST_PREDICTED = 0.5  # share of the curvature that the gradients' scatter predicts
+_WEIGHTS = (0.02, 1.0)  # range of a term's weight
+NONE_FIXED = np.zeros(8, bool)
 
 
 @dataclass(frozen=True, eq=False)
 class AlignmentState:
-    """A pose, its time offset and focal scale."""
+    """A pose, its time offset [s] and focal scale."""
 
     T_camera_lidar: np.ndarray
     dt_s: float = 0.0
@@ -51,7 +50,7 @@ class AlignmentState:
     def changed(self, x: Float[np.ndarray, "P 8"]) -> Alignments:
         """Candidates at changes (rotation about the camera's axes, shift of the lidar's origin, dt, focal scale).
 
-        The chart of the record: what the day cannot determine must stay put in it, whatever else moves.
+        The coordinates of the record: what the day cannot determine keeps its value in them, whatever else moves.
         """
         R = exp_so3(x[:, :3]) @ self.T_camera_lidar[:3, :3]
         T = from_rotation_translation(R, self.T_camera_lidar[:3, 3] + x[:, 3:6])
@@ -62,11 +61,11 @@ class AlignmentState:
         at = self.changed(x[None])
         return AlignmentState(at.T_camera_lidar[0], float(at.dt_s[0]), float(at.focal[0]))
 
-    def held(self, prior: Prior, held: Bool[np.ndarray, " 8"]) -> AlignmentState:
-        """The state with some degrees of freedom of its pose back at the prior."""
+    def with_fixed(self, prior: Prior, fixed: Bool[np.ndarray, " 8"]) -> AlignmentState:
+        """The state with the fixed degrees of freedom of its pose back at the prior."""
         turn = log_so3(self.T_camera_lidar[:3, :3] @ prior.T_camera_lidar[:3, :3].T)
-        R = exp_so3(np.where(held[:3], 0.0, turn)) @ prior.T_camera_lidar[:3, :3]
-        t = np.where(held[3:6], prior.T_camera_lidar[:3, 3], self.T_camera_lidar[:3, 3])
+        R = exp_so3(np.where(fixed[:3], 0.0, turn)) @ prior.T_camera_lidar[:3, :3]
+        t = np.where(fixed[3:6], prior.T_camera_lidar[:3, 3], self.T_camera_lidar[:3, 3])
         return replace(self, T_camera_lidar=from_rotation_translation(R, t))
 
     @property
@@ -75,96 +74,97 @@ class AlignmentState:
         return self.moved(np.zeros((1, 8)))
 
 
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """What a refinement maximises: the terms' score at a kernel plus the prior's log density."""
+
+    terms: Terms
+    kernel: KernelSettings
+    prior: Prior
+    config: SolveConfig
+
+
 def prior_value(at: Alignments, prior: Prior, config: SolveConfig) -> Float[np.ndarray, " P"]:
     """Log density of the prior, up to a constant."""
     turn = log_so3(at.T_camera_lidar[:, :3, :3] @ prior.T_camera_lidar[:3, :3].T) / prior.rotation_sigma_rad
     shift = (at.T_camera_lidar[:, :3, 3] - prior.T_camera_lidar[:3, 3]) / prior.translation_sigma_m
-    clock = (at.dt_s / config.time_offset_sigma_s) ** 2 + ((at.focal - 1) / FOCAL_SIGMA) ** 2
-    return -0.5 * ((turn**2).sum(1) + (shift**2).sum(1) + clock)
+    others = (at.dt_s / config.time_offset_sigma_s) ** 2 + ((at.focal - 1) / FOCAL_SIGMA) ** 2
+    return -0.5 * ((turn**2).sum(1) + (shift**2).sum(1) + others)
 
 
-def scales(terms: Terms, level: KernelSettings) -> Float[np.ndarray, " 8"]:
-    """Step per DoF that moves typical points by about one kernel width."""
-    angle = level.sigma_px / float(terms.camera[1])
-    shift = angle * _TYPICAL_RANGE_M
-    return np.array([angle] * 3 + [shift] * 3 + [shift / _TYPICAL_SPEED_MPS, FOCAL_SIGMA])
+def scales(terms: Terms, kernel: KernelSettings) -> Float[np.ndarray, " 8"]:
+    """Step per degree of freedom that moves typical points by about one kernel width."""
+    angle = kernel.sigma_px / float(terms.camera[1])
+    shift = angle * TYPICAL_RANGE_M
+    return np.array([angle] * 3 + [shift] * 3 + [shift / TYPICAL_SPEED_MPS, FOCAL_SIGMA])
 
 
-def climb(
-    terms: Terms,
-    state: AlignmentState,
-    level: KernelSettings,
-    prior: Prior,
-    config: SolveConfig,
-    *,
-    steps: int,
-    held: Bool[np.ndarray, " 8"] = NOTHING,
+def refine(
+    scored: Scored, state: AlignmentState, *, steps: int, fixed: Bool[np.ndarray, " 8"] = NONE_FIXED
 ) -> AlignmentState:
-    """Maximise by response surfaces: the score is rough at the scale of a pixel, and a quadratic over a ball is not.
+    """Maximise by Newton steps on response surfaces, for the score is rough at the scale of a pixel.
 
-    At most `steps`, for valleys are long: fast cars hardly tell tz from the clock.
-
-    What is `held` stays at the prior.
+    Args:
+        scored: what is maximised.
+        state: start.
+        steps: at most so many: valleys are long, as fast cars hardly tell tz from the time offset.
+        fixed: degrees of freedom that stay; those of the pose at the prior.
     """
-    scale = 1.8 * scales(terms, level)
-    free = np.flatnonzero(~held)
-    state = state.held(prior, held)
+    scale = _SURFACE_SIZE * scales(scored.terms, scored.kernel)
+    free = np.flatnonzero(~fixed)
+    state = state.with_fixed(scored.prior, fixed)
     for _ in range(steps):
-        slope, curvature = _surface(terms, state, level, prior, config, scale)
+        gradient, curvature = _surface(scored, state, scale)
         step = np.zeros(8)
-        step[free] = np.linalg.solve(curvature[np.ix_(free, free)], slope[free])
+        step[free] = np.linalg.solve(curvature[np.ix_(free, free)], gradient[free])
         length = float(np.linalg.norm(step))
-        state = state.stepped(step / max(length, 1.0) * scale).held(prior, held)
-        if length < _ARRIVED:
+        state = state.stepped(step / max(length, 1.0) * scale).with_fixed(scored.prior, fixed)
+        if length < _CONVERGED:
             break
         if length < 1.0:
-            scale = scale * 0.75
+            scale = scale * _SHRINK
     return state
 
 
 def _surface(
-    terms: Terms,
-    state: AlignmentState,
-    level: KernelSettings,
-    prior: Prior,
-    config: SolveConfig,
-    scale: Float[np.ndarray, " 8"],
+    scored: Scored, state: AlignmentState, scale: Float[np.ndarray, " 8"]
 ) -> tuple[Float[np.ndarray, " 8"], Float[np.ndarray, "8 8"]]:
-    """Slope and curvature (positive definite) of score and prior over a ball of `scale`, in units of it.
+    """Gradient and curvature (positive definite) of score and prior over a ball of radius `scale`, in units of it.
 
-    At least half the curvature that the frames' gradients promise by their scatter (Fisher scoring): a direction
-    that the roughness makes flat or convex would send a Newton step anywhere. About their mean: what frames agree on
-    is way still to go, not curvature, and steps shortened by it left clocks where they began.
+    The curvature is at least half of what the scatter of the frames' gradients predicts (Fisher scoring): in a
+    direction that roughness makes flat or convex, a Newton step could end anywhere. The scatter is taken about the
+    mean: a mean that differs from zero is distance still to go, not curvature; counted as such, it shortened steps so
+    much that time offsets stayed where they began.
     """
     at = state.changed(DESIGN * scale)
-    gradient, H = fit_quadratics(terms.score(at, level))
-    (before,), (H_prior,) = fit_quadratics(prior_value(at, prior, config)[:, None])
+    gradient, H = fit_quadratics(scored.terms.score(at, scored.kernel))
+    (prior_gradient,), (prior_H,) = fit_quadratics(prior_value(at, scored.prior, scored.config)[:, None])
     apart = gradient - gradient.mean(0)
-    promised = apart.T @ apart - H_prior
-    least = 0.5 * promised + 1e-9 * np.trace(promised) * np.eye(8)
-    return gradient.sum(0) + before, at_least(-H.sum(0) - H_prior, least)
+    predicted = apart.T @ apart - prior_H
+    least = _LEAST_PREDICTED * predicted + 1e-9 * np.trace(predicted) * np.eye(8)
+    return gradient.sum(0) + prior_gradient, at_least(-H.sum(0) - prior_H, least)
 
 
 def derivatives(
-    terms: Terms, state: AlignmentState, level: KernelSettings, scale: Float[np.ndarray, " 8"]
+    terms: Terms, state: AlignmentState, kernel: KernelSettings, scale: Float[np.ndarray, " 8"]
 ) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
-    """Gradient and Hessian of each frame's score over a ball of `scale`, in units of `scale`."""
-    return fit_quadratics(terms.score(state.changed(DESIGN * scale), level))
+    """Gradient and Hessian of each frame's score over a ball of radius `scale`, in units of `scale`."""
+    return fit_quadratics(terms.score(state.changed(DESIGN * scale), kernel))
 
 
-def weighted(terms: Terms, state: AlignmentState, level: KernelSettings) -> KernelSettings:
-    """Scale each term so that its curvature equals the scatter of its gradient over frames.
+def weighted(terms: Terms, state: AlignmentState, kernel: KernelSettings) -> KernelSettings:
+    """Weight each term so that its curvature equals the scatter of its gradient over frames.
 
-    Points of one frame err together (one mask boundary, one lane line), so a sum of log likelihood ratios
-    promises too much, and by another factor for each term.
+    Points of one frame err together (one mask boundary, one lane line), so the curvature of a sum of log likelihood
+    ratios is too large, by another factor for each term.
     """
-    scale = scales(terms, level)
+    scale = scales(terms, kernel)
     weights = []
     for edges, markings in ((1.0, 0.0), (0.0, 1.0)):
         gradient, H = derivatives(
-            terms, state, replace(level, edge_weight=edges, marking_weight=markings), scale
+            terms, state, replace(kernel, edge_weight=edges, marking_weight=markings), scale
         )
         scatter = float(((gradient - gradient.mean(0)) ** 2).sum())
         curvature = -float(np.trace(H.sum(0)))
-        weights.append(float(np.clip(curvature / scatter, 0.02, 1.0)) if scatter > 1e-9 else 0.0)
-    return replace(level, edge_weight=weights[0], marking_weight=weights[1])
+        weights.append(float(np.clip(curvature / scatter, *_WEIGHTS)) if scatter > 1e-9 else 0.0)
+    return replace(kernel, edge_weight=weights[0], marking_weight=weights[1])

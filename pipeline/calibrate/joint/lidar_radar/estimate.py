@@ -31,7 +31,7 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import (
 )
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.search import FREE, anneal, finish, last_step, scan
-from pipeline.calibrate.numerics.covariance import OBSERVABLE, held_covariance
+from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
 from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
@@ -205,7 +205,7 @@ def _settle(
         curvature = information.sum(0) + linear.pull
         variance = 1 / np.diag(linear.pull)
         variance[: DT + 1] = np.where(held[: DT + 1], before, variance[: DT + 1])
-        full = held_covariance(information, linear.g, variance, curvature, held, block, rng)
+        full = covariance_with_fixed(information, linear.g, variance, curvature, held, block, rng)
         full[:2, :2] += _camera_share(problem, covariance_camera_lidar) * ~(held[:2, None] | held[:2])
         free = ~held[: DT + 1]
         bias = np.where(free, [*_BIAS_FLOOR**2, _DT_FLOOR_S**2 + _crawl(linear, state, held) ** 2], 0.0)

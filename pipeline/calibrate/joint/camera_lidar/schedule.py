@@ -1,0 +1,57 @@
+"""How camera-lidar is solved: kernel widths, steps and points of each stage, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["SCHEDULE", "Schedule"]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Effort of each stage, in the order in which they run. Steps are local refinements, at most so many."""
+
+    # Kernel width [label px] and contrast level, from wide to sharp.
+    kernels: tuple[tuple[float, int], ...] = ((4.0, 0), (2.5, 1), (1.5, 2))
+
+    # Basin: restarts of a differential evolution at a coarse kernel, each refined at the first kernel above.
+    coarse_kernel: tuple[float, int] = (10.0, 0)
+    coarse_match: float = 0.1  # share of matching edges that the coarse kernel presumes
+    restarts: int = 2
+    max_restarts: int = 6
+    restart_steps: int = 10
+    # Candidates, generations and points of the evolution: in a box of 6 deg about the prior ...
+    narrow_evolution: tuple[int, int, int] = (48, 36, 6000)
+    # ... and in one beyond wide_box_deg, as of 20 or 30.
+    wide_evolution: tuple[int, int, int] = (64, 70, 9000)
+    wide_box_deg: float = 9.0
+
+    # Points of edges, and of markings: with wide kernels, with sharp ones, and for the time offset's profile, which is
+    # sharp. More say the same again.
+    wide_points: int = 8000
+    sharp_points: int = 18000
+    time_offset_points: int = 9000
+
+    # Alignment.
+    first_steps: int = 8
+    sharper_steps: int = 4
+
+    # Observability analysis: before and after the terms are weighted anew.
+    steps_before_weights: int = 2
+    steps_after_weights: int = 3
+
+    # Profiles: steps of the other unknowns at each value of tz or time offset, and before the time offset's first.
+    profile_steps: int = 1
+    profile_start_steps: int = 2
+    tz_values_per_side: int = 3
+    tz_span_m: float = 0.36  # to each side
+    time_offset_step_m: float = 0.2  # of way driven, ...
+    time_offset_max_step_s: float = 0.012  # ... and at most
+    time_offset_reach_s: float = 0.05
+    time_offset_resamples: int = 200
+
+    # Disjoint halves, from the solution of the whole.
+    half_steps: int = 3
+
+
+SCHEDULE = Schedule()
