@@ -1,17 +1,24 @@
 """Camera-radar without the lidar: moving clusters against boxes in azimuth, detections in boxes in elevation.
 
-Its translation stays at the prior (angles of far objects say nothing of it). Method `joint` composes camera-radar
-from the other two; this estimate is what that composition is checked against.
+Its translation stays at the prior (angles of far objects hardly depend on it). Method `joint` composes camera-radar
+from the other two pairs; this independent estimate is what that composition is checked against.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.joint.lidar_radar.normal_equations import tempered
+from pipeline.calibrate.numerics.bias_floors import (
+    BOX_ELEVATION_GATES_RAD,
+    BOX_ROLL_FLOOR_CAMERA_RAD,
+    CAMERA_RADAR_BIAS,
+    PRIOR_CONTRADICTION_SIGMAS,
+)
 from pipeline.calibrate.numerics.covariance import covariance_with_fixed, posterior
 from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
@@ -37,16 +44,46 @@ from schemas.observations import Observation
 
 __all__ = ["camera_radar_cost", "estimate_camera_radar"]
 
-_SCAN_STEP_RAD = np.radians(0.5)
-_GATES_RAD = np.radians([4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0])
-_ELEVATION_GATE_RAD = np.radians([12.0, 7.0])
 _MATCH_RAD = np.radians(1.0)  # half a car at 40 m
-# Boxes of cars seen from behind and aside are not centred on where radars see them; constants of elevation.
-_BIAS_FLOOR = np.array([np.radians(0.3), np.radians(0.25), np.radians(0.1), 0.0, 0.0, 0.0])
-# Roll by boxes was 1.0 deg RMS off on nine simulated days whose boxes promised .5.
-_BOX_FLOOR = np.radians(np.array([0.0, 0.0, 1.2, 0.0, 0.0, 0.0, *[0.0] * len(BOX_CLASSES)]))
-_HELD = np.arange(6 + len(BOX_CLASSES)) // 3 == 1  # the position: angles of far objects say little of it
-_CONTRADICTED = 2.5  # prior sigmas from which data that say otherwise are believed
+_BOX_FLOOR = np.array([0.0, 0.0, BOX_ROLL_FLOOR_CAMERA_RAD, 0.0, 0.0, 0.0, *[0.0] * len(BOX_CLASSES)])
+_FIXED = np.arange(6 + len(BOX_CLASSES)) // 3 == 1  # the position: angles of far objects hardly depend on it
+
+
+@dataclass(frozen=True)
+class _Schedule:
+    """Scan about the camera's vertical, then one Newton step per gate."""
+
+    scan_step_deg: float = 0.5
+    scan_reach: float = 1.2  # times the search range
+    scan_prior: float = 2.0  # clusters that a turn at the end of the range must match more than none
+    azimuth_gates_deg: tuple[float, ...] = (4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0)
+    steps_at_first_box_gate: int = 4
+    max_step: float = 0.05  # rad
+
+
+_SCHEDULE = _Schedule()
+_AZIMUTH_GATES_RAD = np.radians(_SCHEDULE.azimuth_gates_deg)
+_SCAN_STEP_RAD = np.radians(_SCHEDULE.scan_step_deg)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What camera and radar both see in the day's frames."""
+
+    observations: Sequence[Observation]
+    clusters: MovingClusters
+    boxes: VehicleBoxes
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations by (turn about the radar, shift, box biases), and what came with them."""
+
+    H: np.ndarray  # F P P
+    g: np.ndarray  # F P
+    box_sigma_rad: float
+    azimuth_sigma_rad: float
+    boxes: int
 
 
 def estimate_camera_radar(
@@ -60,37 +97,22 @@ def estimate_camera_radar(
         config: search range, resampling.
         rng: resamples.
     """
-    clusters, boxes_seen = moving_clusters(observations), vehicle_boxes(observations)
-    T0 = prior.T_camera_radar
+    seen = _Seen(observations, moving_clusters(observations), vehicle_boxes(observations))
     prior_covariance = prior.covariance("camera_radar")
     before = np.append(np.diag(prior_covariance), np.full(len(BOX_CLASSES), BIAS_SIGMA_RAD**2))
-    T, bias = _scan_azimuth(clusters, T0, config), np.zeros(len(BOX_CLASSES))
-    for k, gate in enumerate(_GATES_RAD):
-        H, g, box_sigma, azimuth_sigma, boxes = _equations(
-            clusters, boxes_seen, observations, T, bias, gate, k
-        )
-        x = np.concatenate([log_so3(T[:3, :3] @ T0[:3, :3].T), np.zeros(3), bias])
-        # A prior that the data contradict by many sigmas loses weight (Cauchy); an axis that they don't see keeps it.
-        pull = np.diag(1 / before / (1 + x**2 / before / _CONTRADICTED**2))
-        step = np.zeros(len(x))
-        at = np.ix_(~_HELD, ~_HELD)
-        step[~_HELD] = -np.linalg.solve((H.sum(0) + pull)[at], (g.sum(0) + pull @ x)[~_HELD])
-        step *= min(1.0, 0.05 / max(float(np.abs(step).max()), 1e-9))
-        T = from_rotation_translation(exp_so3(step[:3]) @ T[:3, :3], T0[:3, 3])
-        bias = bias + step[6:]
+    T, last = _solve(seen, prior.T_camera_radar, before, config)
     block = bootstrap_blocks(np.array([o.drive for o in observations]), config.bootstrap_blocks)
-    covariance = covariance_with_fixed(H, g, before, H.sum(0) + np.diag(1 / before), _HELD, block, rng)[
-        :6, :6
-    ]
+    information = last.H.sum(0) + np.diag(1 / before)
+    covariance = covariance_with_fixed(last.H, last.g, before, information, _FIXED, block, rng)[:6, :6]
     # Left perturbations about the camera carry the radar along; these were turns about the radar.
     J = np.linalg.inv(change_jacobian(T))
-    after = posterior(covariance, prior_covariance, _BIAS_FLOOR)
-    seen = len(np.unique(clusters.frame))
+    after = posterior(covariance, prior_covariance, CAMERA_RADAR_BIAS)
+    frames = len(np.unique(seen.clusters.frame))
     diagnostics = {
-        "box_sigma_rad": box_sigma,
-        "azimuth_sigma_rad": azimuth_sigma,
-        "boxes": float(boxes),
-        "moving_clusters": float(clusters.count),
+        "box_sigma_rad": last.box_sigma_rad,
+        "azimuth_sigma_rad": last.azimuth_sigma_rad,
+        "boxes": float(last.boxes),
+        "moving_clusters": float(seen.clusters.count),
     }
     return PairEstimate(
         "camera_radar",
@@ -98,17 +120,38 @@ def estimate_camera_radar(
         J @ after.covariance @ J.T,
         after.observability,
         after.observable,
-        seen,
-        {"no moving cluster": len(observations) - seen},
+        frames,
+        {"no moving cluster": len(observations) - frames},
         diagnostics={k: v for k, v in diagnostics.items() if np.isfinite(v)},
         notes=["translation stays at the prior"],
     )
 
 
+def _solve(
+    seen: _Seen, T0: np.ndarray, before: np.ndarray, config: SolveConfig
+) -> tuple[np.ndarray, _Equations]:
+    """The pose after all gates, and the equations at the last one."""
+    T, bias = _scan_azimuth(seen.clusters, T0, config), np.zeros(len(BOX_CLASSES))
+    for k in range(len(_AZIMUTH_GATES_RAD)):
+        equations = _equations(seen, T, bias, k)
+        x = np.concatenate([log_so3(T[:3, :3] @ T0[:3, :3].T), np.zeros(3), bias])
+        # A prior that the data contradict by many sigmas loses weight (Cauchy); along an axis that they do not
+        # determine, it keeps it.
+        weight = np.diag(1 / before / (1 + x**2 / before / PRIOR_CONTRADICTION_SIGMAS**2))
+        step = np.zeros(len(x))
+        at = np.ix_(~_FIXED, ~_FIXED)
+        gradient = equations.g.sum(0) + weight @ x
+        step[~_FIXED] = -np.linalg.solve((equations.H.sum(0) + weight)[at], gradient[~_FIXED])
+        step *= min(1.0, _SCHEDULE.max_step / max(float(np.abs(step).max()), 1e-9))
+        T = from_rotation_translation(exp_so3(step[:3]) @ T[:3, :3], T0[:3, 3])
+        bias = bias + step[6:]
+    return T, equations
+
+
 def camera_radar_cost(
     observations: Sequence[Observation], T_camera_radar: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, " F"]:
-    """Cost of each frame at a pose for held-out verdicts: robust azimuth distance of moving clusters to boxes, 0..1.
+    """Cost of each held-out frame at a pose: robust azimuth distance of moving clusters to boxes, 0..1.
 
     Clusters in the camera's view count, those without any box within 3 deg as 1. NaN where a frame has none or no
     boxes.
@@ -128,7 +171,7 @@ def camera_radar_cost(
 
 def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig) -> np.ndarray:
     """The turn about the camera's vertical under which most moving clusters meet a box, near turns first."""
-    reach = np.radians(1.2 * config.search_rotation_deg)
+    reach = np.radians(_SCHEDULE.scan_reach * config.search_rotation_deg)
     turns = np.arange(-np.ceil(reach / _SCAN_STEP_RAD), np.ceil(reach / _SCAN_STEP_RAD) + 1) * _SCAN_STEP_RAD
     poses = [
         from_rotation_translation(exp_so3(np.array([0.0, a, 0.0])) @ T0[:3, :3], T0[:3, 3]) for a in turns
@@ -136,37 +179,32 @@ def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig)
     scores = []
     for T, turn in zip(poses, turns, strict=True):
         residual, _, _ = camera_azimuth_residuals(clusters, T, 3 * _MATCH_RAD)
-        # The search box as a weak prior: chance matches must not carry an estimate away where nothing moves.
-        scores.append(float(np.sum(1 / (1 + (residual / _MATCH_RAD) ** 2))) - 2.0 * (turn / reach) ** 2)
+        # The search box as a weak prior: chance matches must not decide where nothing moves.
+        prior = _SCHEDULE.scan_prior * (turn / reach) ** 2
+        scores.append(float(np.sum(1 / (1 + (residual / _MATCH_RAD) ** 2))) - prior)
     return poses[int(np.argmax(scores))]
 
 
-def _equations(
-    clusters: MovingClusters,
-    boxes: VehicleBoxes,
-    observations: Sequence[Observation],
-    T: np.ndarray,
-    bias: np.ndarray,
-    gate: float,
-    step: int,
-) -> tuple[np.ndarray, np.ndarray, float, float, int]:
-    F = len(observations)
-    pairs = box_pairs(observations, boxes, T, float(_ELEVATION_GATE_RAD[min(step // 4, 1)]))
+def _equations(seen: _Seen, T: np.ndarray, bias: np.ndarray, step: int) -> _Equations:
+    """Equations of boxes and moving clusters at a pose; `step` chooses the gates."""
+    F = len(seen.observations)
+    gate = BOX_ELEVATION_GATES_RAD[min(step // _SCHEDULE.steps_at_first_box_gate, 1)]
+    pairs = box_pairs(seen.observations, seen.boxes, T, float(gate))
     # With the radar's own frame in the lidar's place, the left twist is that of T_camera_radar.
     Hb, gb, box_sigma = box_equations(pairs, np.eye(4), T, bias, F)
-    Ha, ga, azimuth_sigma = azimuth_equations_camera(clusters, T, float(gate))
+    Ha, ga, azimuth_sigma = azimuth_equations_camera(seen.clusters, T, float(_AZIMUTH_GATES_RAD[step]))
     about_radar = np.eye(Hb.shape[1])
     about_radar[:6, :6] = np.linalg.inv(change_jacobian(T))
-    # Azimuths say yaw: of roll and pitch they know only by the heights of clusters, which are guesses, as azimuths of
-    # boxes were chosen by the pose. Elevations in boxes say pitch and roll, and roll no better than the picked
-    # detections of a box.
+    # Azimuths determine yaw: on roll and pitch they depend only by the heights of clusters, which are guesses.
+    # Elevations in boxes determine pitch and roll, and roll no better than the choice of a box's detections allows; not
+    # yaw, for boxes were matched by azimuth at this pose.
     only_yaw, only_elevation = about_radar.copy(), about_radar.copy()
     only_yaw[:, [0, 2]], only_elevation[:, 1] = 0.0, 0.0
     Hb, gb = tempered(only_elevation.T @ Hb @ only_elevation, gb @ only_elevation, _BOX_FLOOR)
     A = only_yaw[:6, :6]
     Hb[:, :6, :6] += A.T @ Ha @ A
     gb[:, :6] += ga @ A
-    return Hb, gb, box_sigma, azimuth_sigma, pairs.count
+    return _Equations(Hb, gb, box_sigma, azimuth_sigma, pairs.count)
 
 
 def _in_view(

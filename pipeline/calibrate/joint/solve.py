@@ -1,11 +1,12 @@
-"""Method `joint`: camera-lidar, then lidar-radar with the camera's help, camera-radar composed; checked three ways.
-
-Camera-lidar is settled last: its clock moves the cloud along the car's way, which lidar-radar tells in lidar axes.
+"""Method `joint`: camera-lidar, then lidar-radar with the camera's help, camera-radar composed of the two.
 
 The hard loop `T_camera_radar = T_camera_lidar T_lidar_radar` leaves 12 unknowns. They are solved one pair after the
-other: the camera-lidar terms know their pose ten times better than any radar term could tell them, so a common last
-step moves nothing but noise. What a constructed loop cannot show is asked of estimates that were not used:
-camera-radar without the lidar, disjoint halves, restarts, and the registration's own opinion of roll and pitch.
+other: the camera-lidar terms determine their pose ten times better than any radar term could, so a common last step
+would add noise only. Camera-lidar is concluded after lidar-radar: its time offset moves the cloud along the car's way,
+whose direction in lidar axes lidar-radar estimates.
+
+A loop that is closed by construction checks nothing, so estimates that took no part are compared with it: camera-radar
+without the lidar, disjoint halves of the day, restarts, and the registration's own roll and pitch (`failed_checks`).
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar, analyse_camera_lidar
-from pipeline.calibrate.joint.camera_lidar.initialise import SAME_ROTATION_RAD
+from pipeline.calibrate.joint.camera_lidar.estimate import Aligned, align_camera_lidar, analyse_camera_lidar
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
+from pipeline.calibrate.joint.failed_checks import camera_lidar_failures, lidar_radar_failures, open_loop
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.config import SolveConfig
@@ -31,10 +32,11 @@ from schemas.observations import Observation
 
 __all__ = ["compose_pairs", "solve_joint"]
 
-_SIGMAS = 3.0
 _MOSTLY = 0.5  # of a variance: from there on it is called the prior's
-_NO_OFFSET_S, _ANYWHERE_M = 1e-4, 10.0
-_RESTART_ROTATION_RAD, _RESTART_SHIFT_M = np.radians(0.15), 0.05
+_NO_OFFSET_S, _ANYWHERE_M = (
+    1e-4,
+    10.0,
+)  # sigmas of priors where `terms` leaves time offsets or the position prior out
 
 
 def solve_joint(
@@ -57,72 +59,59 @@ def solve_joint(
         progress: told about each pair.
 
     Returns:
-        The solution; a pair that the day cannot determine keeps its prior, with a doubt that says why.
+        The solution; a pair that the day cannot determine keeps its prior, with a failed check that says why.
     """
     prior, config = _without_terms(prior, config)
     failed: dict[str, list[str]] = {pair: [] for pair in PAIRS}
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
     progress(0, 3, "camera-lidar")
-    camera_lidar, aligned = _kept("camera_lidar", prior), None
-    T_camera_lidar, covariance = camera_lidar.T, camera_lidar.covariance
     rng = np.random.default_rng([seed, 0])
+    aligned: Aligned | None = None
     if "camera_lidar" in wanted:
         try:
             aligned = align_camera_lidar(observations["camera_lidar"], prior, config, rng)
-            T_camera_lidar, covariance = aligned.T_camera_lidar, aligned.covariance
         except SolveError as err:
             failed["camera_lidar"].append(err.reason)
     progress(1, 3, "lidar-radar")
-    lidar_radar = _kept("lidar_radar", prior)
+    lidar_radar = _unchanged("lidar_radar", prior)
     if "lidar_radar" in wanted:
         try:
-            lidar_radar = estimate_lidar_radar(
-                observations["lidar_radar"],
-                prior,
-                T_camera_lidar,
-                config,
-                np.random.default_rng([seed, 1]),
-                covariance_camera_lidar=covariance,
-            )
+            lidar_radar = _lidar_radar(observations["lidar_radar"], prior, aligned, config, seed)
         except SolveError as err:
             failed["lidar_radar"].append(err.reason)
+    camera_lidar = _unchanged("camera_lidar", prior)
     if aligned is not None:
         camera_lidar = analyse_camera_lidar(aligned, rng, heading=_heading(lidar_radar))
     progress(2, 3, "camera-radar")
-    alone = estimate_camera_radar(
+    without_lidar = estimate_camera_radar(
         observations["camera_radar"], prior, config, np.random.default_rng([seed, 2])
     )
-    camera_radar, loop_rad, open_loop = compose_pairs(camera_lidar, lidar_radar, alone, prior)
-    failed["camera_lidar"] += _camera_lidar_failures(camera_lidar)
-    failed["lidar_radar"] += _lidar_radar_failures(lidar_radar)
-    failed["camera_radar"] += [*failed["camera_lidar"], *failed["lidar_radar"], *open_loop]
+    camera_radar, loop_rad, contradictions = compose_pairs(camera_lidar, lidar_radar, without_lidar, prior)
+    failed["camera_lidar"] += camera_lidar_failures(camera_lidar)
+    failed["lidar_radar"] += lidar_radar_failures(lidar_radar)
+    failed["camera_radar"] += [*failed["camera_lidar"], *failed["lidar_radar"], *contradictions]
     pairs = {"camera_lidar": camera_lidar, "camera_radar": camera_radar, "lidar_radar": lidar_radar}
     progress(3, 3, "done")
     return Solution("joint", pairs, loop_rad, None, {pair: why for pair, why in failed.items() if why})
 
 
 def compose_pairs(
-    camera_lidar: PairEstimate, lidar_radar: PairEstimate, alone: PairEstimate, prior: Prior
+    camera_lidar: PairEstimate, lidar_radar: PairEstimate, without_lidar: PairEstimate, prior: Prior
 ) -> tuple[PairEstimate, float | None, list[str]]:
     """Camera-radar by the loop, and how far the camera-radar estimate that never saw the lidar is from it.
 
     Returns:
-        The composed estimate; the loop's angle over the rotations that `alone` determined (None where it determined
-        none; its translation is the prior's, so no translation is compared); failed where that angle is beyond sigma.
+        The composed estimate; the loop's angle over the rotations that `without_lidar` determined (None where it
+        determined none; its translation is the prior's, so no translation is compared); sentences where that angle is
+        beyond its sigma.
     """
     T = camera_lidar.T @ lidar_radar.T
     covariance = compose_covariance(camera_lidar.T, camera_lidar.covariance, lidar_radar.covariance)
     observability, observable = _composed_observability(camera_lidar, lidar_radar, prior)
-    difference = log_so3((T @ inverse(alone.T))[:3, :3])
-    sigma = np.sqrt(np.diag(covariance)[:3] + np.diag(alone.covariance)[:3])
-    known = alone.observable[:3]
-    failed = [
-        f"without the lidar {name} turns by {np.degrees(d):+.2f} deg against the loop, sigma {np.degrees(s):.2f} deg"
-        for name, d, s, k in zip(("pitch", "yaw", "roll"), -difference, sigma, known, strict=True)
-        if k and abs(d) > _SIGMAS * s
-    ]
-    loop_rad = float(np.linalg.norm(difference[known])) if known.any() else None
-    diagnostics = {f"alone_{k}": v for k, v in alone.diagnostics.items()}
+    difference = log_so3((T @ inverse(without_lidar.T))[:3, :3])
+    sigma = np.sqrt(np.diag(covariance)[:3] + np.diag(without_lidar.covariance)[:3])
+    known = without_lidar.observable[:3]
+    diagnostics = {f"alone_{k}": v for k, v in without_lidar.diagnostics.items()}
     diagnostics |= {f"alone_{n}_rad": float(d) for n, d in zip(("rx", "ry", "rz"), -difference, strict=True)}
     diagnostics |= {f"alone_{n}_sigma_rad": float(s) for n, s in zip(("rx", "ry", "rz"), sigma, strict=True)}
     if known.any():
@@ -142,7 +131,27 @@ def compose_pairs(
             "loop: camera-radar without the lidar, rotations only (its translation is the prior's)",
         ],
     )
-    return estimate, loop_rad, failed
+    loop_rad = float(np.linalg.norm(difference[known])) if known.any() else None
+    return estimate, loop_rad, open_loop(difference, sigma, known)
+
+
+def _lidar_radar(
+    observations: Sequence[Observation],
+    prior: Prior,
+    aligned: Aligned | None,
+    config: SolveConfig,
+    seed: int,
+) -> PairEstimate:
+    """Lidar-radar with camera-lidar as aligned so far, or as the prior has it."""
+    camera = _unchanged("camera_lidar", prior)
+    return estimate_lidar_radar(
+        observations,
+        prior,
+        camera.T if aligned is None else aligned.T_camera_lidar,
+        config,
+        np.random.default_rng([seed, 1]),
+        covariance_camera_lidar=camera.covariance if aligned is None else aligned.covariance,
+    )
 
 
 def _composed_observability(
@@ -150,22 +159,22 @@ def _composed_observability(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Observability of the composed pair, and which of its unknowns do not rest on the prior.
 
-    Counted as the record shows them, turns about the radar and its position in the camera: an unknown rests on the
-    prior where the factors' unobservable unknowns make up half of its variance, or the factors' variance together is
-    no better than half of the prior's.
+    In the record's coordinates, turns about the radar and its position in the camera: an unknown rests on the prior
+    where the factors' unobservable unknowns make up half of its variance, or the factors' variance together is no
+    better than half of the prior's.
     """
     T = camera_lidar.T @ lidar_radar.T
     to_change = change_jacobian(T)
-    variance, kept = np.zeros(6), np.zeros(6)
+    variance, of_prior = np.zeros(6), np.zeros(6)
     for estimate, lever in ((camera_lidar, np.eye(6)), (lidar_radar, adjoint(camera_lidar.T))):
         # From the factor's own turn and position to its twist, to the composed twist, to the composed position.
         A = to_change @ lever @ np.linalg.inv(change_jacobian(estimate.T))
         own = change_covariance(estimate.T, estimate.covariance)
         variance += np.diag(A @ own @ A.T)
         unseen = A[:, ~estimate.observable]
-        kept += np.diag(unseen @ own[np.ix_(~estimate.observable, ~estimate.observable)] @ unseen.T)
+        of_prior += np.diag(unseen @ own[np.ix_(~estimate.observable, ~estimate.observable)] @ unseen.T)
     observability = np.clip(1 - variance / np.diag(prior.covariance("camera_radar")), 0.0, 1.0)
-    return observability, (observability >= OBSERVABLE) & (kept < _MOSTLY * variance)
+    return observability, (observability >= OBSERVABLE) & (of_prior < _MOSTLY * variance)
 
 
 def _time_offset(camera_lidar: PairEstimate, lidar_radar: PairEstimate) -> tuple[float | None, float | None]:
@@ -178,50 +187,8 @@ def _time_offset(camera_lidar: PairEstimate, lidar_radar: PairEstimate) -> tuple
     )
 
 
-def _camera_lidar_failures(estimate: PairEstimate) -> list[str]:
-    """A best end that no other restart came near may be one of several optima: its sigma knows only its own."""
-    apart_deg = estimate.diagnostics.get("restart_rotation_spread_deg", 0.0)
-    if apart_deg <= np.degrees(SAME_ROTATION_RAD):
-        return []
-    return [f"no restart vouches for the optimum: the nearest other end is {apart_deg:.1f} deg away"]
-
-
-def _lidar_radar_failures(estimate: PairEstimate) -> list[str]:
-    """Restarts, halves, and the registration against the camera's boxes."""
-    d = estimate.diagnostics
-    failed: list[str] = []
-    if not d:
-        return failed
-    sigma = np.sqrt(np.diag(estimate.covariance))
-    # Restarts end where finishing begins: only what would be another basin counts, and only in what is claimed.
-    for k, name, key, least in (
-        (2, "yaw", "restarts_rz_rad", _RESTART_ROTATION_RAD),
-        (3, "x", "restarts_tx_m", _RESTART_SHIFT_M),
-        (4, "y", "restarts_ty_m", _RESTART_SHIFT_M),
-    ):
-        if estimate.observable[k] and abs(d[key]) > max(least, _SIGMAS * sigma[k]):
-            failed.append(f"restarts disagree in {name} by {_size(k, d[key])}")
-    # Two halves differ by twice the error of the whole, if their errors are independent.
-    for k, (name, key) in enumerate(
-        zip(
-            ("roll", "pitch", "yaw", "x", "y", "z"),
-            ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m"),
-            strict=True,
-        )
-    ):
-        if estimate.observable[k] and abs(d[f"halves_{key}"]) > _SIGMAS * 2 * sigma[k]:
-            failed.append(f"disjoint halves disagree in {name} by {_size(k, d[f'halves_{key}'])}")
-    for k, name in ((0, "roll"), (1, "pitch")):
-        offset, floor = d[f"registration_{name}_offset_rad"], d[f"registration_{name}_sigma_rad"]
-        if estimate.observable[k] and abs(offset) > _SIGMAS * np.hypot(floor, sigma[k]):
-            failed.append(
-                f"the registration would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
-            )
-    return failed
-
-
 def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfig]:
-    """Time offsets nailed to zero, and a prior that knows no position, where `terms` leaves those out."""
+    """Time offsets fixed to zero, and a prior without position, where `terms` leaves those out."""
     if "time_offsets" not in config.terms:
         config = config.model_copy(update={"time_offset_sigma_s": _NO_OFFSET_S})
     if "translation_prior" not in config.terms:
@@ -230,16 +197,12 @@ def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfi
 
 
 def _heading(lidar_radar: PairEstimate) -> tuple[np.ndarray, float] | None:
-    """What lidar-radar found of the way the car goes in the lidar's axes; None where it did not find its yaw."""
+    """Radar pose and sigma of its yaw [rad], which give the car's heading in lidar axes; None where yaw is unknown."""
     if not lidar_radar.observable[2]:
         return None
     return lidar_radar.T, float(np.sqrt(lidar_radar.covariance[2, 2]))
 
 
-def _size(k: int, value: float) -> str:
-    return f"{np.degrees(value):+.2f} deg" if k < 3 else f"{value:+.3f} m"
-
-
-def _kept(pair: str, prior: Prior) -> PairEstimate:
+def _unchanged(pair: str, prior: Prior) -> PairEstimate:
     """The prior, where a pair is not estimated."""
     return PairEstimate(pair, prior.of(pair), prior.covariance(pair), np.zeros(6), np.zeros(6, bool), 0)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 __all__ = [
+    "BOX_ELEVATION_GATES_RAD",
     "BOX_ROLL_FLOOR_CAMERA_RAD",
     "BOX_ROLL_FLOOR_LIDAR_RAD",
     "CAMERA_LIDAR_BIAS",
@@ -32,6 +33,7 @@ __all__ = [
     "PRIOR_CONTRADICTION_SIGMAS",
     "RADAR_ELEVATION_BIAS_RAD",
     "RANGE_BIAS_SIGMA_M",
+    "REGISTRATION_COMPARISON_SIGMA",
     "SWEEP_S",
     "TRACKING_BIAS_RAD",
     "TYPICAL_RANGE_M",
@@ -77,6 +79,9 @@ LIDAR_RADAR_DT_FLOOR_S = 0.002  # halves of a real day differed by 3 ms where re
 RANGE_BIAS_SIGMA_M = 0.05
 # Density of stray static detections, in lidar points at distance 0: assigns about 40 % of a real radar's detections.
 OUTLIER_DENSITY = 0.2
+# Sigmas of azimuth [rad], elevation [rad] and range [m] at which poses are compared: wide in elevation, which is not
+# what decides.
+REGISTRATION_COMPARISON_SIGMA = np.array([np.radians(0.5), np.radians(6.0), 0.2])
 # Roll by vehicle boxes: which detections of a box are taken moved it by 0.5 deg on real logs.
 BOX_ROLL_FLOOR_LIDAR_RAD = np.radians(1.0)
 
@@ -92,6 +97,8 @@ BOX_ROLL_FLOOR_CAMERA_RAD = np.radians(1.2)
 
 # Data that contradict the prior by more sigmas than this are believed: Cauchy scale of the prior's weight.
 PRIOR_CONTRADICTION_SIGMAS = 2.5
+# How far a detection's elevation may lie from its box's: at the start, and once pitch and roll are about right.
+BOX_ELEVATION_GATES_RAD = (np.radians(12.0), np.radians(7.0))
 
 # -- held-out frames -------------------------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from pipeline.calibrate.numerics.bias_floors import (
     MAX_GAP_PX,
     OUTLIER_DENSITY,
     RANGE_BIAS_SIGMA_M,
+    REGISTRATION_COMPARISON_SIGMA,
     TYPICAL_RANGE_M,
     TYPICAL_SPEED_MPS,
 )
@@ -41,15 +42,12 @@ from pipeline.objective.radar.moving_clusters import azimuth_equations_camera, m
 from pipeline.objective.radar.registration import RegistrationFrames, normal_equations, registration_frames
 from schemas.observations import Observation
 
-__all__ = ["HELD_OUT_SIGMA", "HeldOutScore", "held_out_score"]
+__all__ = ["HeldOutScore", "held_out_score"]
 
 _SHARP_PX, _SHARP_CONTRAST = 1.5, 2  # kernel width and contrast level that costs are compared at
 _WIDE_CONTRAST = 1  # for kernels twice as wide and more
 _SURFACE_SIZE = 1.8  # radius of the response surface in kernel widths: the score is rough below one
 _REACH_RAD = np.radians(1.0)  # beyond result and prior, for points near the image's border
-# Sigmas of azimuth [rad], elevation [rad] and range [m] at which poses are compared: wide in elevation, which is not
-# what decides.
-HELD_OUT_SIGMA = np.array([np.radians(0.5), np.radians(6.0), 0.2])
 _PLANAR = np.array([0.0, 0, 1, 1, 1, 0, 1, 1])  # yaw, x, y, time offset, range bias
 _BOX_GATE_RAD = np.radians(2.0)
 _NO_NUISANCE_SIGMA = 1.0  # any: nothing depends on it
@@ -138,7 +136,13 @@ def _lidar_radar(
         if frames.count:
             planar = _with_planar(estimate.T, T)
             found = normal_equations(
-                frames, planar, dt_s, HELD_OUT_SIGMA, 0.0, OUTLIER_DENSITY, range_bias_m=range_bias_m
+                frames,
+                planar,
+                dt_s,
+                REGISTRATION_COMPARISON_SIGMA,
+                0.0,
+                OUTLIER_DENSITY,
+                range_bias_m=range_bias_m,
             )
             out[frames.frame] = found.cost
         return out
@@ -170,7 +174,7 @@ def _registration_derivatives(
         frames,
         T,
         (estimate.time_offset_s or 0.0) + float(step[6]),
-        HELD_OUT_SIGMA * np.array([width, 1.0, width]),
+        REGISTRATION_COMPARISON_SIGMA * np.array([width, 1.0, width]),
         0.0,
         OUTLIER_DENSITY,
         range_bias_m=range_bias_m + float(step[7]),

@@ -55,7 +55,7 @@ _UNKNOWN_SHARE = 0.7  # of the prior's sigma: from there on the day's speeds did
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """An alignment good to a tenth of a degree: `analyse_camera_lidar` goes on from it, maybe with better velocities."""
+    """An alignment good to a tenth of a degree: `analyse_camera_lidar` continues, maybe with better velocities."""
 
     problem: CameraLidarProblem
     frames: list[Observation]

@@ -1,9 +1,9 @@
 """Lidar-radar half of method `joint`: T_lidar_radar and the radar's time offset from a day of observations.
 
 What the day cannot determine keeps the prior: after the first solution, every unknown of the pose whose variance the
-day did not halve, and likewise the time offset, is held at the prior's value and sigma, the others are solved again,
-and what the held ones leave open is part of their covariance. A weakly determined unknown would else wander along
-whatever the scene offers, by many sigmas of the prior.
+day did not halve, and likewise the time offset, is fixed at the prior's value and sigma, the others are solved again,
+and what the fixed ones leave open is part of their covariance. A weakly determined unknown would otherwise follow any
+weak structure of the scene, by many sigmas of the prior.
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ from jaxtyping import Float
 from pipeline.calibrate.joint.lidar_radar.normal_equations import (
     AZIMUTH_RANGE_DOF,
     DT,
-    OUTLIER,
     RANGE,
-    RANGE_BIAS_SIGMA_M,
     STEP_LIMIT,
     UNKNOWNS,
     Linear,
@@ -30,7 +28,16 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import (
     linearise,
 )
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
-from pipeline.calibrate.joint.lidar_radar.search import FREE, anneal, finish, last_step, scan
+from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
+from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, anneal, finish, last_step, scan
+from pipeline.calibrate.numerics.bias_floors import (
+    LIDAR_RADAR_BIAS,
+    LIDAR_RADAR_DT_FLOOR_S,
+    OUTLIER_DENSITY,
+    RADAR_ELEVATION_BIAS_RAD,
+    RANGE_BIAS_SIGMA_M,
+    REGISTRATION_COMPARISON_SIGMA,
+)
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
 from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
@@ -45,34 +52,32 @@ from schemas.observations import Observation
 __all__ = ["estimate_lidar_radar"]
 
 _FEWEST_FRAMES = 5
-_MANY_FRAMES = 60  # from here on half of them find the basin
-_VERDICT_SIGMA = np.array(
-    [np.radians(0.5), np.radians(6.0), 0.2]
-)  # wide in elevation: that is not what decides
-# What resampling can't show, sigma per DoF: a radar's own constant elevation error looks like pitch and is taken as
-# 0 +- 0.2 deg (a thirtieth of a car radar's resolution cell), unobserved roll tilts azimuths, radars see into objects.
-# Yaw, x and y: what the errors of 16 simulated days with known truth (40 frames; .021 deg, .029 m, .015 m) leave beyond
-# resampling's .027 deg, .018 m and .010 m.
-_ELEVATION_BIAS_RAD = np.radians(0.2)
-_BIAS_FLOOR = np.array([np.radians(0.1), _ELEVATION_BIAS_RAD, np.radians(0.01), 0.025, 0.013, 0.02])
-_DT_FLOOR_S = 0.002  # halves of a real day differed by 3 ms where resampling said 1
-_DT_TOLD_S = 0.005  # a time offset known no better than this is called so
+_DT_UNSURE_S = 0.005  # a time offset known no better than this gets a note
 _CLEARLY = 4.0  # standard errors by which frames reject the end of another start
-_CAMERA_SIGMA_RAD = np.radians(0.5)  # a camera less sure than what its boxes tell is left out
-_CLOCK_STEP_M, _CLOCK_LEAST_MPS = 0.2, 8.0  # steps of time in metres of way; slower cars need no finer ones
+_CAMERA_SIGMA_RAD = np.radians(0.5)  # a camera less sure than what its boxes show is left out
+_REMAINING_STEPS = 10.0  # of dt, that count as uncertainty: the valley is flat
+_MEASURED_SHARE = (0.02, 1.0)  # range of the measured curvature, as a share of the predicted one
 _NAMES = np.array(["roll", "pitch", "yaw", "x", "y", "z"])
 _DOF_UNITS = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
 
 
 @dataclass(frozen=True, eq=False)
-class _Settled:
-    """The solution in which every unknown is either determined by the day or held at the prior."""
+class _ObservabilityAnalysis:
+    """The solution in which every unknown is either determined by the day or fixed at the prior."""
 
     state: RadarState
     linear: Linear
-    covariance: np.ndarray  # of all unknowns, turns about the radar
-    held: np.ndarray
-    observability: np.ndarray  # of pose and dt
+    covariance: np.ndarray  # P P, of all unknowns, turns about the radar
+    fixed: np.ndarray  # P, bool
+    observability: np.ndarray  # 7, of pose and dt
+
+
+@dataclass(frozen=True, eq=False)
+class _Camera:
+    """Camera-lidar's pose and covariance, which bring the camera's vehicle boxes in."""
+
+    T_camera_lidar: np.ndarray | None
+    covariance: np.ndarray | None
 
 
 def estimate_lidar_radar(
@@ -98,7 +103,31 @@ def estimate_lidar_radar(
     Raises:
         SolveError: too few frames with static detections and a lidar map.
     """
-    given, observations = len(observations), _believed(observations)
+    camera = _usable_camera(T_camera_lidar, covariance_camera_lidar, config)
+    problem, rejected = _problem(observations, prior, camera.T_camera_lidar, config, rng)
+    count = problem.frames.count
+    some = problem if count < SCHEDULE.many_frames else problem.of_frames(np.arange(0, count, 2))
+    ends = [anneal(some, start) for start in scan(problem, config)]
+    costs = [_comparison_cost(problem, end) for end in ends]
+    best = ends[int(np.argmin([c.mean() for c in costs]))]
+    analysis = _analyse_observability(problem, best, camera, config, rng)
+    other = _better_time_offset(problem, analysis.state)
+    if other is not None:
+        analysis = _analyse_observability(problem, other, camera, config, rng)
+    parts = [problem.of_frames(np.arange(k, count, 2)) for k in (0, 1)]
+    halves = [finish(part, analysis.state, analysis.fixed)[0] for part in parts]
+    return _conclude(problem, analysis, [best, _second_best(ends, costs)], halves, rejected)
+
+
+def _problem(
+    observations: Sequence[Observation],
+    prior: Prior,
+    T_camera_lidar: np.ndarray | None,
+    config: SolveConfig,
+    rng: np.random.Generator,
+) -> tuple[RadarProblem, dict[str, int]]:
+    """Usable frames and what they show, and the counts of rejected ones by reason."""
+    given, observations = len(observations), _consistent_with_odometry(observations)
     frames = registration_frames(observations, prior.T_lidar_radar, rng)
     found = frames.count
     turning = turns_unmeasured([observations[k] for k in frames.frame])
@@ -112,13 +141,6 @@ def estimate_lidar_radar(
         raise SolveError(
             f"lidar-radar needs {_FEWEST_FRAMES} frames with static detections, the day has {frames.count}"
         )
-    if (
-        covariance_camera_lidar is not None
-        and np.diag(covariance_camera_lidar)[:3].max() > _CAMERA_SIGMA_RAD**2
-    ):
-        T_camera_lidar = None  # its own error would go into roll and pitch
-    if "boxes" not in config.terms:
-        T_camera_lidar = None
     problem = RadarProblem(
         observations,
         frames,
@@ -131,50 +153,52 @@ def estimate_lidar_radar(
         elevation_spread(frames),
         config.terms,
     )
-    some = problem if frames.count < _MANY_FRAMES else problem.of_frames(np.arange(0, frames.count, 2))
-    ends = [anneal(some, start) for start in scan(problem, config)]
-    costs = [_sharp_cost(problem, end) for end in ends]
-    best = ends[int(np.argmin([c.mean() for c in costs]))]
-    settled = _settle(problem, best, covariance_camera_lidar, config, rng)
-    clock = _better_clock(problem, settled.state)
-    if clock is not None:
-        settled = _settle(problem, clock, covariance_camera_lidar, config, rng)
-    parts = [problem.of_frames(np.arange(k, frames.count, 2)) for k in (0, 1)]
-    halves = [finish(part, settled.state, settled.held)[0] for part in parts]
-    return _conclude(problem, settled, [best, _rival(ends, costs)], halves, rejected)
+    return problem, rejected
 
 
-def _believed(observations: Sequence[Observation]) -> list[Observation]:
-    """Frames whose radar knows what stands still."""
+def _usable_camera(
+    T_camera_lidar: np.ndarray | None, covariance: np.ndarray | None, config: SolveConfig
+) -> _Camera:
+    """The camera, unless `terms` leaves its boxes out or its own error would go into roll and pitch."""
+    unsure = covariance is not None and np.diag(covariance)[:3].max() > _CAMERA_SIGMA_RAD**2
+    if unsure or "boxes" not in config.terms:
+        return _Camera(None, covariance)
+    return _Camera(T_camera_lidar, covariance)
+
+
+def _consistent_with_odometry(observations: Sequence[Observation]) -> list[Observation]:
+    """Frames whose radar velocity the odometry does not contradict."""
     wrong = contradicts_odometry(observations)
     return [o for o, w in zip(observations, wrong, strict=True) if not w]
 
 
-def _sharp_cost(problem: RadarProblem, state: RadarState) -> np.ndarray:
-    """Cost of each frame that compares ends of different starts: same sigmas for all."""
+def _comparison_cost(problem: RadarProblem, state: RadarState) -> np.ndarray:
+    """Cost of each frame (F), to compare the ends of different starts: the same sigmas for all."""
     T, dt_s = state.T_lidar_radar, state.dt_s
-    return normal_equations(problem.frames, T, dt_s, _VERDICT_SIGMA, 0.0, OUTLIER, stride=2).cost
+    return normal_equations(
+        problem.frames, T, dt_s, REGISTRATION_COMPARISON_SIGMA, 0.0, OUTLIER_DENSITY, stride=2
+    ).cost
 
 
-def _better_clock(problem: RadarProblem, state: RadarState) -> RadarState | None:
-    """The state with another time offset, where the frames clearly rate that better than the solution's own.
+def _better_time_offset(problem: RadarProblem, state: RadarState) -> RadarState | None:
+    """The state with another time offset, where the frames' cost is clearly lower than at the solution's own.
 
-    Sharp steps see half a metre: at 30 m/s an offset of 20 ms is out of their reach, and stays where it began.
+    Sharp sigmas reach half a metre: at 30 m/s a time offset that is 20 ms off is beyond that, and would stay there.
     """
     speed_mps = float(np.sqrt(np.mean(np.sum(problem.frames.velocity_mps**2, axis=1))))
-    step_s = _CLOCK_STEP_M / max(speed_mps, _CLOCK_LEAST_MPS)
+    step_s = SCHEDULE.dt_compare_step_m / max(speed_mps, SCHEDULE.least_scan_speed_mps)
     count = int(2 * problem.dt_sigma_s / step_s)
-    own = _sharp_cost(problem, state)
+    own = _comparison_cost(problem, state)
     others = [replace(state, dt_s=step_s * k) for k in range(-count, count + 1)]
-    costs = [_sharp_cost(problem, other) - own for other in others]
+    costs = [_comparison_cost(problem, other) - own for other in others]
     best = int(np.argmin([c.mean() for c in costs]))
     better = costs[best].mean() < -_CLEARLY * costs[best].std() / np.sqrt(len(own))
     apart = abs(others[best].dt_s - state.dt_s) > step_s
     return others[best] if better and apart else None
 
 
-def _rival(ends: list[RadarState], costs: list[np.ndarray]) -> RadarState:
-    """The end of another start that the frames do not clearly rate below the best one; else the best one itself."""
+def _second_best(ends: list[RadarState], costs: list[np.ndarray]) -> RadarState:
+    """The end of another start whose cost is not clearly higher than the best one's; else the best one itself."""
     best = int(np.argmin([c.mean() for c in costs]))
     for end, cost in zip(ends, costs, strict=True):
         worse = cost - costs[best]
@@ -183,90 +207,91 @@ def _rival(ends: list[RadarState], costs: list[np.ndarray]) -> RadarState:
     return ends[best]
 
 
-def _settle(
+def _analyse_observability(
     problem: RadarProblem,
     state: RadarState,
-    covariance_camera_lidar: np.ndarray | None,
+    camera: _Camera,
     config: SolveConfig,
     rng: np.random.Generator,
-) -> _Settled:
-    """Solve, hold what the day did not determine, and solve again until nothing more has to be held."""
+) -> _ObservabilityAnalysis:
+    """Solve, fix what the day did not determine, and solve again until nothing more has to be fixed."""
     block = bootstrap_blocks(np.array([o.drive for o in problem.observations]), config.bootstrap_blocks)
     before = np.append(np.diag(problem.prior.covariance("lidar_radar")), problem.dt_sigma_s**2)
-    held, observability = FREE.copy(), np.ones(DT + 1)
+    fixed, observability = NONE_FIXED.copy(), np.ones(DT + 1)
     while True:
-        if held.any() and not held[DT]:
-            # Free, x had followed dt through their valley; back at the prior, dt may be out of reach.
-            state = state.kept(problem.prior, held)
-            state = _better_clock(problem, state) or state
-        # Once the radar's sigmas are known, comparing solutions asks that they stay.
-        state, linear = finish(problem, state, held, sharpen=not held.any())
+        if fixed.any() and not fixed[DT]:
+            # While free, x had followed dt through their valley; with x back at the prior, dt may be out of reach.
+            state = state.with_fixed(problem.prior, fixed)
+            state = _better_time_offset(problem, state) or state
+        # Once the radar's sigmas are estimated they stay, so that solutions can be compared.
+        state, linear = finish(problem, state, fixed, sharpen=not fixed.any())
         information = _with_measured_curvature(problem, state, linear.information)
-        curvature = information.sum(0) + linear.pull
-        variance = 1 / np.diag(linear.pull)
-        variance[: DT + 1] = np.where(held[: DT + 1], before, variance[: DT + 1])
-        full = covariance_with_fixed(information, linear.g, variance, curvature, held, block, rng)
-        full[:2, :2] += _camera_share(problem, covariance_camera_lidar) * ~(held[:2, None] | held[:2])
-        free = ~held[: DT + 1]
-        bias = np.where(free, [*_BIAS_FLOOR**2, _DT_FLOOR_S**2 + _crawl(linear, state, held) ** 2], 0.0)
-        told = _observability(np.diag(full)[: DT + 1], bias, before)
-        observability[free] = told[free]
-        if np.all(told[free] >= OBSERVABLE):
+        curvature = information.sum(0) + linear.prior_information
+        variance = 1 / np.diag(linear.prior_information)
+        variance[: DT + 1] = np.where(fixed[: DT + 1], before, variance[: DT + 1])
+        full = covariance_with_fixed(information, linear.g, variance, curvature, fixed, block, rng)
+        full[:2, :2] += _camera_share(camera) * ~(fixed[:2, None] | fixed[:2])
+        free = ~fixed[: DT + 1]
+        dt_bias = LIDAR_RADAR_DT_FLOOR_S**2 + _remaining_dt(linear, state, fixed) ** 2
+        bias = np.where(free, [*LIDAR_RADAR_BIAS**2, dt_bias], 0.0)
+        removed = _observability(np.diag(full)[: DT + 1], bias, before)
+        observability[free] = removed[free]
+        if np.all(removed[free] >= OBSERVABLE):
             break
-        held[: DT + 1] |= told < OBSERVABLE
+        fixed[: DT + 1] |= removed < OBSERVABLE
     full[np.arange(DT + 1), np.arange(DT + 1)] += bias
-    return _Settled(state, linear, full, held, observability)
+    return _ObservabilityAnalysis(state, linear, full, fixed, observability)
 
 
 def _observability(variance: np.ndarray, bias: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Share of the prior's variance that the day would take away if its word were weighed with its own bias.
+    """Fraction of prior variance removed, bias floor included.
 
     Args:
         variance: of the estimate, day and prior together, without bias.
-        bias: squared bias floor of what the day says.
+        bias: squared bias floor of the day's information.
         before: variance of the prior.
     """
-    # A floor is an error of the day's word: it doesn't add to what the prior knows.
+    # The floor is an error of the day's information alone: it does not widen what the prior knows.
     day = 1 / np.maximum(1 / variance - 1 / before, 1e-9 / before) + bias
     return before / (before + day)
 
 
 def _conclude(
     problem: RadarProblem,
-    settled: _Settled,
+    analysis: _ObservabilityAnalysis,
     ends: list[RadarState],
     halves: list[RadarState],
     rejected: dict[str, int],
 ) -> PairEstimate:
-    state, held = settled.state, settled.held
-    notes = _notes(settled)
+    state, fixed = analysis.state, analysis.fixed
+    notes = _notes(analysis)
     # The record's covariance is of a left perturbation: a turn about the lidar carries the radar along.
     J = np.linalg.inv(change_jacobian(state.T_lidar_radar))
     return PairEstimate(
         "lidar_radar",
         state.T_lidar_radar,
-        J @ settled.covariance[:6, :6] @ J.T,
-        settled.observability[:6],
-        ~held[:6],
+        J @ analysis.covariance[:6, :6] @ J.T,
+        analysis.observability[:6],
+        ~fixed[:6],
         problem.frames.count,
         {reason: count for reason, count in rejected.items() if count},
         state.dt_s,
-        float(np.sqrt(settled.covariance[DT, DT])),
-        _diagnostics(settled, ends, halves),
+        float(np.sqrt(analysis.covariance[DT, DT])),
+        _diagnostics(analysis, ends, halves),
         notes,
     )
 
 
-def _notes(settled: _Settled) -> list[str]:
+def _notes(analysis: _ObservabilityAnalysis) -> list[str]:
     """What was not determined, and what was assumed."""
-    held, linear = settled.held, settled.linear
+    fixed, linear = analysis.fixed, analysis.linear
     notes = []
-    if held[:6].any():
-        notes.append(f"not determined by this day, kept at the prior: {', '.join(_NAMES[held[:6]])}")
-    dt_sigma_s = float(np.sqrt(settled.covariance[DT, DT]))
-    if held[DT]:
+    if fixed[:6].any():
+        notes.append(f"not determined by this day, kept at the prior: {', '.join(_NAMES[fixed[:6]])}")
+    dt_sigma_s = float(np.sqrt(analysis.covariance[DT, DT]))
+    if fixed[DT]:
         notes.append("time offset not determined by this day, kept at the prior")
-    elif dt_sigma_s > _DT_TOLD_S:
+    elif dt_sigma_s > _DT_UNSURE_S:
         notes.append(
             f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: where the car keeps one speed, x looks the same"
         )
@@ -276,17 +301,19 @@ def _notes(settled: _Settled) -> list[str]:
         )
     else:
         notes.append("radar pitch assumes that returns lie at a constant angle (0 +- 1 deg) from box centres")
-    bias_sigma_m = float(np.sqrt(settled.covariance[RANGE, RANGE]))
-    pitch_deg = float(np.degrees(_ELEVATION_BIAS_RAD))
+    bias_sigma_m = float(np.sqrt(analysis.covariance[RANGE, RANGE]))
+    pitch_deg = float(np.degrees(RADAR_ELEVATION_BIAS_RAD))
     notes += [
         f"assumes a constant elevation error of the radar of 0 +- {pitch_deg:.2f} deg: it looks like pitch",
-        f"range bias {settled.state.range_bias_m:+.3f} +- {bias_sigma_m:.3f} m (prior 0 +- {RANGE_BIAS_SIGMA_M:.2f})",
+        f"range bias {analysis.state.range_bias_m:+.3f} +- {bias_sigma_m:.3f} m (prior 0 +- {RANGE_BIAS_SIGMA_M:.2f})",
     ]
     return notes
 
 
-def _diagnostics(settled: _Settled, ends: list[RadarState], halves: list[RadarState]) -> dict[str, float]:
-    state, linear = settled.state, settled.linear
+def _diagnostics(
+    analysis: _ObservabilityAnalysis, ends: list[RadarState], halves: list[RadarState]
+) -> dict[str, float]:
+    state, linear = analysis.state, analysis.linear
     half = change_between(halves[1].T_lidar_radar, halves[0].T_lidar_radar)
     apart = change_between(ends[-1].T_lidar_radar, ends[0].T_lidar_radar)
     diagnostics = {
@@ -294,7 +321,7 @@ def _diagnostics(settled: _Settled, ends: list[RadarState], halves: list[RadarSt
         "elevation_sigma_rad": float(state.sigma[1]),
         "range_sigma_m": float(state.sigma[2]),
         "range_bias_m": state.range_bias_m,
-        "range_bias_sigma_m": float(np.sqrt(settled.covariance[RANGE, RANGE])),
+        "range_bias_sigma_m": float(np.sqrt(analysis.covariance[RANGE, RANGE])),
         "bounce_share": state.bounce,
         "assigned_share": float(linear.registration.assigned.mean()),
         "boxes": float(linear.boxes),
@@ -315,9 +342,9 @@ def _diagnostics(settled: _Settled, ends: list[RadarState], halves: list[RadarSt
 
 
 def _with_measured_curvature(problem: RadarProblem, state: RadarState, information: np.ndarray) -> np.ndarray:
-    """Curvature over yaw, x, y, dt and range bias as the cost itself has it, from differences of its gradient.
+    """Information with the cost's own curvature over yaw, x, y, dt and range bias, from differences of its gradient.
 
-    On days of one speed, x, dt and the range bias share a valley that is far flatter than soft assignment promises.
+    On days of one speed, x, dt and the range bias share a valley that is far flatter than soft assignment predicts.
     """
     dof = AZIMUTH_RANGE_DOF
     total = information.sum(0)[np.ix_(dof, dof)]
@@ -334,7 +361,7 @@ def _with_measured_curvature(problem: RadarProblem, state: RadarState, informati
     root = L @ vectors
     out = information.copy()
     out[np.ix_(np.arange(len(out)), dof, dof)] += (
-        (root * np.clip(values, 0.02, 1.0)) @ root.T - total
+        (root * np.clip(values, *_MEASURED_SHARE)) @ root.T - total
     ) / len(out)
     return out
 
@@ -344,14 +371,14 @@ def _gradient(problem: RadarProblem, state: RadarState) -> np.ndarray:
     return g.sum(0)[AZIMUTH_RANGE_DOF]
 
 
-def _crawl(linear: Linear, state: RadarState, held: np.ndarray) -> float:
-    """Ten of the steps of dt that were still to come [s], for the valley is flat."""
-    return float(10 * last_step(linear, state, held)[DT])
+def _remaining_dt(linear: Linear, state: RadarState, fixed: np.ndarray) -> float:
+    """Ten times the step of dt that was still to come [s]: in a flat valley many small steps may follow."""
+    return float(_REMAINING_STEPS * last_step(linear, state, fixed)[DT])
 
 
-def _camera_share(problem: RadarProblem, covariance: np.ndarray | None) -> np.ndarray:
-    """Roll and pitch inherit the camera-lidar rotation's own errors through the boxes."""
-    if covariance is None or problem.T_camera_lidar is None:
+def _camera_share(camera: _Camera) -> np.ndarray:
+    """Covariance (2 2) of roll and pitch that the boxes bring in from the camera-lidar rotation."""
+    if camera.covariance is None or camera.T_camera_lidar is None:
         return np.zeros((2, 2))
-    R = problem.T_camera_lidar[:3, :3]
-    return (R.T @ covariance[:3, :3] @ R)[:2, :2]
+    R = camera.T_camera_lidar[:3, :3]
+    return (R.T @ camera.covariance[:3, :3] @ R)[:2, :2]

@@ -1,13 +1,13 @@
-"""Normal equations of lidar-radar: which term may speak of which degree of freedom, and what the prior says.
+"""Normal equations of lidar-radar: which term contributes to which degree of freedom, and the prior.
 
 The unknowns are counted about the radar itself: a turn R <- exp(r) R and a shift t <- t + s along the lidar's axes, as
 the record shows them. A turn about the lidar's origin would carry the radar along by its lever arm, and pass an error
 of pitch on to z.
 
-Which term decides which degree of freedom is fixed here, for measured reasons: azimuth and range of the static
-registration decide yaw, x, y and dt; its elevations say something of roll, pitch and z, but no more than the lidar's
+Which term determines which degree of freedom is chosen here, for measured reasons: azimuth and range of the static
+registration determine yaw, x, y and dt; its elevations contribute to roll, pitch and z, but no more than the lidar's
 own beam spacing allows (points collapse onto the rings, repeatably and with the lowest residual); the camera's vehicle
-boxes decide roll, and pitch up to their constant. Moving clusters add azimuth. The prior keeps what is left.
+boxes determine roll, and pitch up to their constant. Moving clusters add azimuth. The prior keeps what is left.
 """
 
 from __future__ import annotations
@@ -18,6 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.calibrate.numerics.bias_floors import (
+    BOX_ROLL_FLOOR_LIDAR_RAD,
+    OUTLIER_DENSITY,
+    PRIOR_CONTRADICTION_SIGMAS,
+    RANGE_BIAS_SIGMA_M,
+)
 from pipeline.config import TERMS
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_jacobian
@@ -37,9 +43,7 @@ from schemas.observations import EDGE_ABOVE, EDGE_BELOW, Observation
 __all__ = [
     "AZIMUTH_RANGE_DOF",
     "DT",
-    "OUTLIER",
     "RANGE",
-    "RANGE_BIAS_SIGMA_M",
     "STEP_LIMIT",
     "UNKNOWNS",
     "ElevationSpread",
@@ -52,37 +56,33 @@ __all__ = [
     "tempered",
 ]
 
-OUTLIER = 0.2  # in lidar points at distance 0: assigns about 40 % of a real radar's static detections
 DT, RANGE = 6, 7
 UNKNOWNS = 8 + len(BOX_CLASSES)
 STEP_LIMIT = np.array([0.05] * 3 + [0.15] * 3 + [0.03, 0.1] + [0.05] * len(BOX_CLASSES))
 AZIMUTH_RANGE_DOF = np.array([2, 3, 4, 6, 7])
 _ELEVATION_DOF = np.array([0, 1, 5])
-# How far elevations that are matched to the nearest lidar points mislead roll, pitch [rad] and z [m]. Noise takes a
-# part `noise^2 / spread^2` of every mismatch away as if it were truth (regression dilution), and a mismatch is as
-# large as the spread of the elevations: the angle noise^2 / spread. Real logs (3.2 deg of noise, spread 3.9): 2.6 deg
-# where 1-2 deg of pitch and 4-5 deg of roll were seen; simulation (.65 deg, spread 3-6): .07-.16 deg where .01-.12 was
-# seen. A coarse lidar adds a share of its beam spacing, for points collapse onto the rings. z is wrong by the same
-# angle at 15 m.
+# How far elevations that are matched to the nearest lidar points bias roll, pitch [rad] and z [m]. Noise removes a part
+# `noise^2 / spread^2` of every mismatch (regression dilution), and a mismatch is as large as the spread of the
+# elevations: the angle noise^2 / spread. Real logs (3.2 deg of noise, spread 3.9): 2.6 deg where 1-2 deg of pitch and
+# 4-5 deg of roll were seen; simulation (0.65 deg, spread 3-6): 0.07-0.16 deg where 0.01-0.12 was seen. A coarse lidar
+# adds a share of its beam spacing, for points collapse onto the rings. z is wrong by the same angle at 15 m.
 _RING_SHARE, _Z_DISTANCE_M, _Z_FLOOR_M = 0.05, 15.0, 0.03
 _ROLL_FACTOR = 0.7  # of pitch's at an azimuth of one radian: both sides seldom err in opposite directions
 _DEFAULT_SPACING_RAD = np.radians(1.0)
-RANGE_BIAS_SIGMA_M = 0.05  # radars' own, and what lies behind the surface that the lidar sees
-# Roll of the boxes: which detections of a box are taken moved it by 0.5 deg on real logs. Pitch has its own unknowns.
-_BOX_FLOOR = np.radians(np.array([1.0, 0.0] + [0.0] * len(BOX_CLASSES)))
-_CONTRADICTED = 2.5  # prior sigmas from which data that say otherwise are believed
+# Roll and pitch of the boxes, and their constants: pitch has unknowns of its own.
+_BOX_FLOOR = np.array([BOX_ROLL_FLOOR_LIDAR_RAD, 0.0] + [0.0] * len(BOX_CLASSES))
 
 
 @dataclass(frozen=True, eq=False)
 class RadarState:
-    """Where the solver stands: pose, time offset, box biases, and the radar's sigmas."""
+    """The unknowns as estimated so far, and the radar's sigmas."""
 
-    T_lidar_radar: np.ndarray
+    T_lidar_radar: np.ndarray  # 4 4
     dt_s: float
     range_bias_m: float
-    bias_rad: np.ndarray
-    sigma: np.ndarray
-    bounce: float
+    bias_rad: np.ndarray  # elevation of returns from the box's centre, by class
+    sigma: np.ndarray  # 3: azimuth [rad], elevation [rad], range [m]
+    bounce: float  # share of detections that are mirrored in the road
 
     def moved(self, step: Float[np.ndarray, " P"]) -> RadarState:
         """The state after a step."""
@@ -95,23 +95,23 @@ class RadarState:
             bias_rad=self.bias_rad + step[RANGE + 1 :],
         )
 
-    def kept(self, prior: Prior, held: Bool[np.ndarray, " P"]) -> RadarState:
-        """The state with the held pose unknowns (rotation vector from the prior, position) and dt at the prior's."""
-        if not held.any():
+    def with_fixed(self, prior: Prior, fixed: Bool[np.ndarray, " P"]) -> RadarState:
+        """The state with its fixed unknowns (rotation vector from the prior, position, dt) back at the prior."""
+        if not fixed.any():
             return self
         T0, T = prior.T_lidar_radar, self.T_lidar_radar
-        turn = np.where(held[:3], 0.0, log_so3(T[:3, :3] @ T0[:3, :3].T))
-        position = np.where(held[3:6], T0[:3, 3], T[:3, 3])
+        turn = np.where(fixed[:3], 0.0, log_so3(T[:3, :3] @ T0[:3, :3].T))
+        position = np.where(fixed[3:6], T0[:3, 3], T[:3, 3])
         return replace(
             self,
             T_lidar_radar=from_rotation_translation(exp_so3(turn) @ T0[:3, :3], position),
-            dt_s=0.0 if held[DT] else self.dt_s,
+            dt_s=0.0 if fixed[DT] else self.dt_s,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class ElevationSpread:
-    """How the static detections lie: standard deviation of their elevations, RMS of their azimuths [rad]."""
+    """Distribution of the static detections: standard deviation of elevations, RMS of azimuths [rad]."""
 
     elevation_rad: float
     azimuth_rad: float
@@ -125,7 +125,7 @@ class ElevationSpread:
 
 @dataclass(frozen=True, eq=False)
 class RadarProblem:
-    """All that stays the same while the state moves."""
+    """All that stays the same while the state changes."""
 
     observations: Sequence[Observation]
     frames: RegistrationFrames
@@ -156,17 +156,26 @@ class RadarProblem:
 class Linear:
     """Normal equations per observation at one state, and what came with them."""
 
-    H: np.ndarray  # F P P, for steps
-    information: np.ndarray  # F P P, what the frames really say
-    g: np.ndarray  # F P
-    pull: np.ndarray
-    pull_g: np.ndarray
+    H: np.ndarray  # F P P, EM's: for steps
+    information: np.ndarray  # F P P, what uncertain assignment leaves of it
+    g: np.ndarray  # F P, gradient of the cost
+    prior_information: np.ndarray  # P P
+    prior_gradient: np.ndarray  # P
     registration: NormalEquations
     box_sigma_rad: float
     boxes: int
     mover_sigma_rad: float
-    registration_step: np.ndarray  # where elevations of the registration alone would put roll, pitch, z
-    floor: np.ndarray  # sigma of roll, pitch, z as the registration's elevations give them
+    registration_step: np.ndarray  # 3: where the registration's elevations alone would move roll, pitch, z
+    floor: np.ndarray  # 3: sigma that those elevations leave of roll, pitch [rad] and z [m]
+
+
+@dataclass(eq=False)
+class _Sums:
+    """Equations per observation while terms are added."""
+
+    H: np.ndarray  # F P P
+    information: np.ndarray  # F P P
+    g: np.ndarray  # F P
 
 
 def linearise(
@@ -182,8 +191,38 @@ def linearise(
         stride: use every n-th static detection.
     """
     F = len(problem.observations)
-    H, info, g = np.zeros((F, UNKNOWNS, UNKNOWNS)), np.zeros((F, UNKNOWNS, UNKNOWNS)), np.zeros((F, UNKNOWNS))
+    sums = _Sums(
+        np.zeros((F, UNKNOWNS, UNKNOWNS)), np.zeros((F, UNKNOWNS, UNKNOWNS)), np.zeros((F, UNKNOWNS))
+    )
     about_radar = np.linalg.inv(change_jacobian(state.T_lidar_radar))
+    equations = _registration(problem, state, widen, stride, about_radar)
+    _add_azimuths_and_ranges(problem, equations, stride, sums)
+    floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
+    registration_step = _add_elevations(problem, equations, stride, floor, sums)
+    box_sigma = _add_boxes(problem, state, pairs, about_radar, sums)
+    mover_sigma = float("nan")
+    if widen == 1.0 and "moving" in problem.terms:  # partners are found only once the clusters lie near them
+        mover_sigma = _add_movers(problem, state, about_radar, sums)
+    prior_information, prior_gradient = _prior_equations(problem, state)
+    return Linear(
+        sums.H,
+        sums.information,
+        sums.g,
+        prior_information,
+        prior_gradient,
+        equations,
+        box_sigma,
+        0 if pairs is None else pairs.count,
+        mover_sigma,
+        registration_step,
+        floor,
+    )
+
+
+def _registration(
+    problem: RadarProblem, state: RadarState, widen: float, stride: int, about_radar: np.ndarray
+) -> NormalEquations:
+    """Equations of the static detections about the radar; zero where `terms` leaves them out."""
     equations = _about_radar(
         about_radar,
         normal_equations(
@@ -192,38 +231,38 @@ def linearise(
             state.dt_s,
             state.sigma * widen,
             state.bounce,
-            OUTLIER,
+            OUTLIER_DENSITY,
             stride,
             state.range_bias_m,
         ),
     )
-    if "static" not in problem.terms:
-        equations = replace(
-            equations, H=0 * equations.H, g=0 * equations.g, information=0 * equations.information
-        )
+    if "static" in problem.terms:
+        return equations
+    return replace(equations, H=0 * equations.H, g=0 * equations.g, information=0 * equations.information)
+
+
+def _add_azimuths_and_ranges(
+    problem: RadarProblem, equations: NormalEquations, stride: int, sums: _Sums
+) -> None:
+    """Yaw, x, y, dt and range bias from the registration's azimuths and ranges."""
     at = problem.frames.frame
-    decide = np.ix_(at, AZIMUTH_RANGE_DOF, AZIMUTH_RANGE_DOF)
+    where = np.ix_(at, AZIMUTH_RANGE_DOF, AZIMUTH_RANGE_DOF)
     block = np.ix_(np.arange(len(at)), AZIMUTH_RANGE_DOF, AZIMUTH_RANGE_DOF)
-    H[decide] += stride * equations.H[0][block]
-    info[decide] += stride * equations.information[0][block]
-    g[np.ix_(at, AZIMUTH_RANGE_DOF)] += stride * equations.g[0][:, AZIMUTH_RANGE_DOF]
-    floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
-    registration_step = _add_elevations(problem, equations, stride, floor, H, info, g)
-    box_sigma = _add_boxes(problem, state, pairs, about_radar, H, info, g)
-    mover_sigma = float("nan")
-    if widen == 1.0 and "moving" in problem.terms:  # partners are found only once the clusters lie near them
-        Hm, gm, mover_sigma = azimuth_equations_lidar(problem.movers, state.T_lidar_radar, state.dt_s)
-        Hm, gm = _turned(about_radar, Hm, gm)
-        # As with static detections, azimuths say yaw, x and y; roll would come from heights that clusters lack.
-        flat = AZIMUTH_RANGE_DOF[:3]
-        for array in (H, info):
-            array[np.ix_(np.arange(F), flat, flat)] += Hm[:, flat[:, None], flat]
-        g[:, flat] += gm[:, flat]
-    prior_H, prior_g = _prior_equations(problem, state)
-    boxes = 0 if pairs is None else pairs.count
-    return Linear(
-        H, info, g, prior_H, prior_g, equations, box_sigma, boxes, mover_sigma, registration_step, floor
-    )
+    sums.H[where] += stride * equations.H[0][block]
+    sums.information[where] += stride * equations.information[0][block]
+    sums.g[np.ix_(at, AZIMUTH_RANGE_DOF)] += stride * equations.g[0][:, AZIMUTH_RANGE_DOF]
+
+
+def _add_movers(problem: RadarProblem, state: RadarState, about_radar: np.ndarray, sums: _Sums) -> float:
+    """Add moving clusters; returns the sigma of their azimuths [rad]."""
+    H, g, sigma = azimuth_equations_lidar(problem.movers, state.T_lidar_radar, state.dt_s)
+    H, g = _turned(about_radar, H, g)
+    # As with static detections, azimuths determine yaw, x and y; roll would come from heights that clusters lack.
+    flat = AZIMUTH_RANGE_DOF[:3]
+    for array in (sums.H, sums.information):
+        array[np.ix_(np.arange(len(array)), flat, flat)] += H[:, flat[:, None], flat]
+    sums.g[:, flat] += g[:, flat]
+    return sigma
 
 
 def _about_radar(about_radar: np.ndarray, equations: NormalEquations) -> NormalEquations:
@@ -245,24 +284,22 @@ def _add_boxes(
     state: RadarState,
     pairs: BoxPairs | None,
     about_radar: np.ndarray,
-    H: np.ndarray,
-    info: np.ndarray,
-    g: np.ndarray,
+    sums: _Sums,
 ) -> float:
-    """Add what vehicle boxes say; returns the sigma of a detection's elevation in its box [rad]."""
+    """Add the camera's vehicle boxes; returns the sigma of a detection's elevation in its box [rad]."""
     if pairs is None or problem.T_camera_lidar is None:
         return float("nan")
-    F = len(g)
+    F = len(sums.g)
     Hb, gb, sigma = box_equations(pairs, problem.T_camera_lidar, state.T_lidar_radar, state.bias_rad, F)
     Hb, gb = _turned(about_radar, Hb, gb)
-    # Roll, pitch and the biases only: a constant below the centre in metres would pass for z, and boxes' azimuths
-    # were chosen by the pose.
+    # Roll, pitch and the biases only: a constant offset below the centre in metres would look like z, and boxes were
+    # matched by azimuth at this pose.
     columns = np.array([0, 1, *range(RANGE + 1, UNKNOWNS)])
     own = np.array([0, 1, *range(6, 6 + len(BOX_CLASSES))])
     Hb, gb = tempered(Hb[:, own[:, None], own], gb[:, own], _BOX_FLOOR)
-    for array in (H, info):
+    for array in (sums.H, sums.information):
         array[np.ix_(np.arange(F), columns, columns)] += Hb
-    g[:, columns] += gb
+    sums.g[:, columns] += gb
     return sigma
 
 
@@ -271,9 +308,7 @@ def _add_elevations(
     equations: NormalEquations,
     stride: int,
     floor: np.ndarray,
-    H: np.ndarray,
-    info: np.ndarray,
-    g: np.ndarray,
+    sums: _Sums,
 ) -> np.ndarray:
     """Roll, pitch and z from the registration's elevations as one measurement with covariance `H^-1 + floor^2`.
 
@@ -285,9 +320,9 @@ def _add_elevations(
     at = problem.frames.frame
     where = np.ix_(at, _ELEVATION_DOF, _ELEVATION_DOF)
     He_t, ge_t = tempered(He, ge, floor)
-    H[where] += He_t
-    info[where] += tempered(Ie, ge, floor)[0]
-    g[np.ix_(at, _ELEVATION_DOF)] += ge_t
+    sums.H[where] += He_t
+    sums.information[where] += tempered(Ie, ge, floor)[0]
+    sums.g[np.ix_(at, _ELEVATION_DOF)] += ge_t
     return -np.linalg.pinv(He.sum(0), rcond=1e-6) @ ge.sum(0)
 
 
@@ -304,8 +339,8 @@ def tempered(
 def _prior_equations(problem: RadarProblem, state: RadarState) -> tuple[np.ndarray, np.ndarray]:
     """Prior on pose (Cauchy: data may contradict it), dt and biases (Gaussian).
 
-    Rotation as a whole and every axis of the position lose weight on their own: a z that elevations mislead is no
-    reason to doubt x and y, nor the other way round.
+    Rotation as a whole and every axis of the position lose weight separately: a z that elevations mislead is no reason
+    to trust the prior's x and y less, nor the other way round.
     """
     prior = problem.prior
     x = np.zeros(UNKNOWNS)
@@ -315,9 +350,9 @@ def _prior_equations(problem: RadarProblem, state: RadarState) -> tuple[np.ndarr
     x[RANGE + 1 :] = state.bias_rad
     weight = np.empty(UNKNOWNS)
     turned = float(x[:3] @ x[:3]) / prior.rotation_sigma_rad**2
-    weight[:3] = 1 / prior.rotation_sigma_rad**2 / (1 + turned / _CONTRADICTED**2)
+    weight[:3] = 1 / prior.rotation_sigma_rad**2 / (1 + turned / PRIOR_CONTRADICTION_SIGMAS**2)
     shifted = (x[3:6] / prior.translation_sigma_m) ** 2
-    weight[3:6] = 1 / prior.translation_sigma_m**2 / (1 + shifted / _CONTRADICTED**2)
+    weight[3:6] = 1 / prior.translation_sigma_m**2 / (1 + shifted / PRIOR_CONTRADICTION_SIGMAS**2)
     weight[DT] = 1 / problem.dt_sigma_s**2
     weight[RANGE] = 1 / RANGE_BIAS_SIGMA_M**2
     weight[RANGE + 1 :] = 1 / BIAS_SIGMA_RAD**2
@@ -335,7 +370,7 @@ def beam_spacing(observations: Sequence[Observation]) -> float:
 
 
 def elevation_spread(frames: RegistrationFrames) -> ElevationSpread:
-    """How the static detections of these frames lie."""
+    """Distribution of the static detections of these frames."""
     azimuth, elevation, _ = to_spherical(frames.radar_m).T
     # One degree: below it, noise alone would make as much.
     return ElevationSpread(

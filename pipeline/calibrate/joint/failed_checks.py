@@ -1,0 +1,74 @@
+"""Checks of method `joint` on its own estimates: restarts, disjoint halves, the camera, and the loop without the lidar.
+
+Each returns sentences, one per failed check; none where all is well.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.calibrate.joint.camera_lidar.initialise import SAME_ROTATION_RAD
+from pipeline.extrinsics.estimates import PairEstimate
+
+__all__ = ["camera_lidar_failures", "lidar_radar_failures", "open_loop"]
+
+_SIGMAS = 3.0
+# Restarts end before the last steps: only what would be another basin counts, and only in what is claimed.
+_RESTART_ROTATION_RAD, _RESTART_SHIFT_M = np.radians(0.15), 0.05
+_HALVES_FACTOR = 2  # two halves differ by twice the error of the whole, if their errors are independent
+_NAMES = ("roll", "pitch", "yaw", "x", "y", "z")
+_KEYS = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
+
+
+def camera_lidar_failures(estimate: PairEstimate) -> list[str]:
+    """No second restart agrees: the score may have several maxima, and the covariance describes only one of them."""
+    apart_deg = estimate.diagnostics.get("restart_rotation_spread_deg", 0.0)
+    if apart_deg <= np.degrees(SAME_ROTATION_RAD):
+        return []
+    return [f"no restart agrees with the best one: the nearest other end is {apart_deg:.1f} deg away"]
+
+
+def lidar_radar_failures(estimate: PairEstimate) -> list[str]:
+    """Restarts, halves, and the registration against the camera's boxes."""
+    d = estimate.diagnostics
+    if not d:
+        return []
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    failed = []
+    for k, least in ((2, _RESTART_ROTATION_RAD), (3, _RESTART_SHIFT_M), (4, _RESTART_SHIFT_M)):
+        key = f"restarts_{_KEYS[k]}"
+        if estimate.observable[k] and abs(d[key]) > max(least, _SIGMAS * sigma[k]):
+            failed.append(f"restarts disagree in {_NAMES[k]} by {_size(k, d[key])}")
+    for k, name in enumerate(_NAMES):
+        key = f"halves_{_KEYS[k]}"
+        if estimate.observable[k] and abs(d[key]) > _SIGMAS * _HALVES_FACTOR * sigma[k]:
+            failed.append(f"disjoint halves disagree in {name} by {_size(k, d[key])}")
+    for k, name in ((0, "roll"), (1, "pitch")):
+        offset, floor = d[f"registration_{name}_offset_rad"], d[f"registration_{name}_sigma_rad"]
+        if estimate.observable[k] and abs(offset) > _SIGMAS * np.hypot(floor, sigma[k]):
+            failed.append(
+                f"the registration would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
+            )
+    return failed
+
+
+def open_loop(
+    difference: Float[np.ndarray, " 3"], sigma: Float[np.ndarray, " 3"], known: Bool[np.ndarray, " 3"]
+) -> list[str]:
+    """Camera-radar without the lidar contradicts the composed one.
+
+    Args:
+        difference: rotation vector from the estimate without the lidar to the composed one, camera axes [rad].
+        sigma: of it.
+        known: axes that the estimate without the lidar determined.
+    """
+    return [
+        f"without the lidar {name} turns by {np.degrees(d):+.2f} deg against the loop, sigma {np.degrees(s):.2f} deg"
+        for name, d, s, k in zip(("pitch", "yaw", "roll"), -difference, sigma, known, strict=True)
+        if k and abs(d) > _SIGMAS * s
+    ]
+
+
+def _size(k: int, value: float) -> str:
+    return f"{np.degrees(value):+.2f} deg" if k < 3 else f"{value:+.3f} m"
