@@ -67,19 +67,28 @@ def solve_joint(
     progress(0, 3, "camera-lidar")
     rng = np.random.default_rng([seed, 0])
     aligned: Aligned | None = None
+    camera_lidar = _unchanged("camera_lidar", prior)
+    camera = camera_lidar.T, camera_lidar.covariance
     if "camera_lidar" in wanted:
         try:
             aligned = align_camera_lidar(observations["camera_lidar"], prior, config, rng)
+            camera = aligned.T_camera_lidar, aligned.covariance
         except SolveError as err:
             failed["camera_lidar"].append(err.reason)
     progress(1, 3, "lidar-radar")
     lidar_radar = _unchanged("lidar_radar", prior)
     if "lidar_radar" in wanted:
         try:
-            lidar_radar = _lidar_radar(observations["lidar_radar"], prior, aligned, config, seed)
+            lidar_radar = estimate_lidar_radar(
+                observations["lidar_radar"],
+                prior,
+                camera[0],
+                config,
+                np.random.default_rng([seed, 1]),
+                covariance_camera_lidar=camera[1],
+            )
         except SolveError as err:
             failed["lidar_radar"].append(err.reason)
-    camera_lidar = _unchanged("camera_lidar", prior)
     if aligned is not None:
         camera_lidar = analyse_camera_lidar(aligned, rng, heading=_heading(lidar_radar))
     progress(2, 3, "camera-radar")
@@ -90,8 +99,8 @@ def solve_joint(
     failed["camera_lidar"] += camera_lidar_failures(camera_lidar)
     failed["lidar_radar"] += lidar_radar_failures(lidar_radar)
     failed["camera_radar"] += [*failed["camera_lidar"], *failed["lidar_radar"], *contradictions]
-    pairs = {"camera_lidar": camera_lidar, "camera_radar": camera_radar, "lidar_radar": lidar_radar}
     progress(3, 3, "done")
+    pairs = {"camera_lidar": camera_lidar, "camera_radar": camera_radar, "lidar_radar": lidar_radar}
     return Solution("joint", pairs, loop_rad, None, {pair: why for pair, why in failed.items() if why})
 
 
@@ -133,25 +142,6 @@ def compose_pairs(
     )
     loop_rad = float(np.linalg.norm(difference[known])) if known.any() else None
     return estimate, loop_rad, open_loop(difference, sigma, known)
-
-
-def _lidar_radar(
-    observations: Sequence[Observation],
-    prior: Prior,
-    aligned: Aligned | None,
-    config: SolveConfig,
-    seed: int,
-) -> PairEstimate:
-    """Lidar-radar with camera-lidar as aligned so far, or as the prior has it."""
-    camera = _unchanged("camera_lidar", prior)
-    return estimate_lidar_radar(
-        observations,
-        prior,
-        camera.T if aligned is None else aligned.T_camera_lidar,
-        config,
-        np.random.default_rng([seed, 1]),
-        covariance_camera_lidar=camera.covariance if aligned is None else aligned.covariance,
-    )
 
 
 def _composed_observability(
