@@ -122,7 +122,7 @@ def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> list[Ta
 
 
 def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outcome]:
-    """All days, in view of whoever watches."""
+    """All days, with progress."""
     from contextlib import closing
     from functools import partial
 

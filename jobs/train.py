@@ -75,7 +75,7 @@ def train(  # options of the command: as many as a user may set
 
 
 def _run(request: TrainRequest, settings: TrainConfig, ray_workers: int | None) -> int:
-    """Train here, as one of torchrun's processes, or on Ray; the summary is told once."""
+    """Train here, as one of torchrun's processes, or on Ray; the summary is printed once."""
     import os
     from dataclasses import asdict
 

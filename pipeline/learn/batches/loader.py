@@ -1,8 +1,8 @@
 """Batches of table `training`: shuffled by row group, the same for the same seed, resumed to the frame.
 
 The order of an epoch is decided before anything is read: row groups in random order, cut into windows, and the frames
-of each window in random order. So a place in the stream is two numbers (epoch, frames taken), and whoever comes back
-to it continues exactly as if nothing had happened. The next window is read while the current one is used.
+of each window in random order. So a place in the stream is two numbers (epoch, frames taken), and a loader that resumes
+there gives the same batches as one that never stopped. The next window is read while the current one is used.
 """
 
 from __future__ import annotations
@@ -42,11 +42,9 @@ class TrainingLoader:
         lake: where table `training` lies.
         batch_size: frames of a batch, on this rank.
         split: train, val or test.
-        seed: order of the frames; the same on all ranks.
-        shuffle: False: frames in order.
+        seed: of the frames' order, the same on all ranks; None: frames as the table has them.
         repeat: True: epoch after epoch without end, all batches full. False: once, the last batch as it comes.
-        rank: of this process; each takes its own row groups.
-        ranks: how many processes there are.
+        rank_of: rank of this process and number of processes; each takes its own row groups.
         window_groups: row groups that are mixed with each other and held in memory, twice (5-10 MB each).
         partitions: only these vehicle-days.
 
@@ -60,20 +58,18 @@ class TrainingLoader:
         batch_size: int,
         *,
         split: str = "train",
-        seed: int = 0,
-        shuffle: bool = True,
+        seed: int | None = 0,
         repeat: bool = True,
-        rank: int = 0,
-        ranks: int = 1,
+        rank_of: tuple[int, int] = (0, 1),
         window_groups: int = 16,
         partitions: Sequence[Partition] | None = None,
     ) -> None:
         self._lake, self._batch_size = lake, batch_size
-        self._seed, self._shuffle, self._repeat = seed, shuffle, repeat
-        self._rank, self._ranks, self._window = rank, ranks, window_groups
+        self._seed, self._shuffle, self._repeat = seed or 0, seed is not None, repeat
+        (self._rank, self._ranks), self._window = rank_of, window_groups
         self._chunks, self._data_key = _find_chunks(lake, split, partitions)
-        if len(self._chunks) < ranks:
-            problem = f"{split} has {len(self._chunks)} row groups, not enough for {ranks} processes"
+        if len(self._chunks) < self._ranks:
+            problem = f"{split} has {len(self._chunks)} row groups, not enough for {self._ranks} processes"
             raise ContractError(str(lake.root / TRAINING.name), problem)
         self._epoch, self._taken = 0, 0
         self._order: list[tuple[RowGroup, int]] = []
@@ -113,7 +109,7 @@ class TrainingLoader:
             rows.append(self._row(self._taken))
             self._taken += 1
         if not rows:
-            self._epoch, self._taken = 0, 0  # whoever iterates again begins again
+            self._epoch, self._taken = 0, 0  # the next iteration begins anew
             raise StopIteration
         return collate(rows)
 

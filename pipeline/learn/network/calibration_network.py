@@ -1,4 +1,4 @@
-"""The networks: sensor data and a guess in, better extrinsics and their doubt out.
+"""The networks: sensor data and a guess in, better extrinsics and their log variances out.
 
 `matching` computes correspondences explicitly and learns what classes look like, how sharp evidence is, and residuals;
 `concat` is the paper's: encode, concatenate, fuse, regress. Both come for all pairs at once (joint) or for one alone.

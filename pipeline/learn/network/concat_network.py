@@ -45,7 +45,7 @@ class ConcatCore(nn.Module):
         self.heads = Heads(hidden, pairs, _STD)
 
     def forward(self, view: RenderedView) -> CoreOutputs:
-        """Corrections and doubt from the sensors' grids at the current guess."""
+        """Corrections and log variances from the sensors' grids at the current guess."""
         grids = {
             "camera": standardised(view.camera),
             "lidar": view.lidar_grid,

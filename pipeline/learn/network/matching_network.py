@@ -20,12 +20,9 @@ from schemas.training import GRID_CLASSES
 __all__ = ["MatchingCore"]
 
 _CLASSES = len(GRID_CLASSES)
-_RESIDUAL_STD = 1e-3  # the network starts as its geometry
-_AXES_CAMERA_OF_LIDAR = (
-    1,
-    2,
-    0,
-)  # camera x, y, z look along lidar y, z, x (signs do not matter to variances)
+_RESIDUAL_STD = 1e-3  # of the heads' weights: an untrained network answers as its matchers
+# The camera's x, y, z look along the lidar's y, z, x; signs do not matter to variances.
+_AXES_CAMERA_OF_LIDAR = (1, 2, 0)
 
 
 class MatchingCore(nn.Module):
@@ -53,7 +50,7 @@ class MatchingCore(nn.Module):
         self.heads = Heads(128, pairs, _RESIDUAL_STD)
 
     def forward(self, view: RenderedView) -> CoreOutputs:
-        """Corrections and doubt; gradients of the corrections do not reach the encoders, which learn from classes."""
+        """Corrections and log variances; their gradients do not reach the encoders, which learn from classes."""
         camera_logits = self.camera_encoder(view.camera) if self.camera_encoder is not None else None
         likelihood = None if camera_logits is None else self.camera_log_likelihood(view.camera, camera_logits)
         return self.match(view, likelihood, camera_logits)
@@ -62,13 +59,13 @@ class MatchingCore(nn.Module):
         """Logits of the encoders; nothing is matched, so no pose is corrected."""
         frames = len(view.camera)
         identity = torch.eye(4, device=view.camera.device).expand(frames, len(PAIRS), 4, 4)
-        doubt = self.heads.start.expand(frames, len(PAIRS), 6)
+        log_variance = self.heads.start.expand(frames, len(PAIRS), 6)
         camera = self.camera_encoder(view.camera) if self.camera_encoder is not None else None
         lidar = self.encode_lidar(view.lidar_grid) if "camera_lidar" in self.pairs else None
         radar = None
         if self.pairs == ("camera_radar",):
             radar = self.radar_encoder(view.radar_features, view.radar_camera.norm(dim=-1))
-        return CoreOutputs(identity, doubt, None, camera, lidar, radar)
+        return CoreOutputs(identity, log_variance, None, camera, lidar, radar)
 
     def camera_log_likelihood(
         self, camera: Float[Tensor, "B 4 H W"], logits: Float[Tensor, "B K H W"]
@@ -84,7 +81,7 @@ class MatchingCore(nn.Module):
         likelihood: Float[Tensor, "B K H W"] | None,
         camera_logits: Float[Tensor, "B K H W"] | None = None,
     ) -> CoreOutputs:
-        """All that depends on the guess."""
+        """The part that depends on the guess: matchers, residuals, log variances."""
         bases: dict[str, Match | OccupancyMatch] = {}
         lidar_logits = radar_logits = None
         features = []
@@ -149,10 +146,10 @@ class MatchingCore(nn.Module):
                 corrections.append(identity)
                 log_variance.append(self.heads.start.expand(len(fused), 6))
                 continue
-            residual, doubt = residuals[pair]
+            residual, log_factor = residuals[pair]
             base = pose_of_twist(bases[pair].twist) if pair in bases else identity
             corrections.append(residual @ base)
-            log_variance.append(torch.log(variances[pair]) + doubt)
+            log_variance.append(torch.log(variances[pair]) + log_factor)
         return torch.stack(corrections, 1), torch.stack(log_variance, 1)
 
 

@@ -14,7 +14,7 @@ from pipeline.objective.differentiable.poses import exp_so3, pose, pose_of_euler
 __all__ = ["PAIRS", "CoreOutputs", "Heads", "Predictions", "pose_of_twist"]
 
 _ANGLE_UNIT_RAD, _SHIFT_UNIT_M = 0.0175, 0.05  # heads put out numbers of the order of one
-# Doubt of an untrained network: 0.3 deg and 5 cm.
+# Log variance of an untrained network: 0.3 deg and 5 cm.
 _LOG_VARIANCE = (-10.5, -10.5, -10.5, -6.0, -6.0, -6.0)
 
 

@@ -1,4 +1,4 @@
-"""Making the guess wrong on purpose and turning the camera's view: what keeps a network from learning one rig by heart.
+"""Random wrong guesses and turned camera views, so that a network does not memorise the mounting of one rig.
 
 To move a cloud by A and look at it through T is to look at it as it is through T A; so clouds stay, and the guesses
 move. Lidar and radar move independently, the three guesses close the loop. A turned view is the same image on a grid

@@ -1,4 +1,4 @@
-"""One step of training: a batch, a wrong guess, the network's answers, and the loss of them."""
+"""The loss of one batch: random wrong guesses, the network's answers, and what they are worth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.learn.network.outputs import Predictions
 from pipeline.learn.sample.layout import PAIRS
 from pipeline.learn.train.augment import Guess, random_guess, turned_view
 from pipeline.learn.train.frame_objective import frame_objective, weighted
-from pipeline.learn.train.running_mean import Consensus, doubt_loss
+from pipeline.learn.train.running_mean import DayMeans, uncertainty_loss
 from pipeline.learn.train.semantics_loss import semantics_loss
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
 from pipeline.objective.differentiable.poses import pose, transform_points
@@ -51,7 +51,7 @@ def batch_loss(
     passes: nn.Module,
     batch: TrainingBatch,
     config: TrainConfig,
-    consensus: Consensus,
+    day_means: DayMeans,
     generator: torch.Generator,
     network: CalibrationNetwork,
     *,
@@ -63,7 +63,7 @@ def batch_loss(
         passes: a `Passes` of the network, bare or wrapped for data parallelism.
         batch: frames on the network's device.
         config: of the run.
-        consensus: each day's mean answer; the batch's answers join it.
+        day_means: running mean of each day's answers; the batch's answers join it.
         generator: of everything random here.
         network: of the passes, for its grid.
         matched: whether poses are estimated and judged, or encoders learn classes only.
@@ -76,7 +76,7 @@ def batch_loss(
     )
     answers: list[Predictions] = passes(inputs, matched=matched)
     if not matched:
-        semantics = _semantics(answers, view, guess, batch, consensus, network)
+        semantics = _semantics(answers, view, guess, batch, day_means, network)
         loss = config.loss.semantics * semantics
         return StepLoss(loss, {"loss": loss.detach(), "semantics": semantics.detach()})
     objective, pairs = frame_objective(batch), PAIRS_OF[config.pairs]
@@ -90,12 +90,12 @@ def batch_loss(
             pairs,
         )
         total = total + weighted(terms, config.loss, pairs).mean() / len(answers)
-    semantics = _semantics(answers, view, guess, batch, consensus, network)
-    doubt, scatter = _doubt(answers[-1], guess, batch, consensus)
-    loss = total + config.loss.semantics * semantics + config.doubt_weight * doubt
+    semantics = _semantics(answers, view, guess, batch, day_means, network)
+    uncertainty, scatter = _uncertainty(answers[-1], guess, batch, day_means)
+    loss = total + config.loss.semantics * semantics + config.uncertainty_weight * uncertainty
     report = {f"term/{name}": value.detach().mean() for name, value in terms.items()}
     report |= {"loss": loss.detach(), "alignment": total.detach(), "semantics": semantics.detach()}
-    report |= {"doubt": doubt.detach()}
+    report |= {"uncertainty": uncertainty.detach()}
     report |= {f"scatter_deg/{pair}": scatter[i] * _DEG for i, pair in enumerate(PAIRS) if pair in pairs}
     return StepLoss(loss, report)
 
@@ -105,15 +105,15 @@ def _semantics(
     view: TrainingBatch,
     guess: Guess,
     batch: TrainingBatch,
-    consensus: Consensus,
+    day_means: DayMeans,
     network: CalibrationNetwork,
 ) -> Tensor:
-    """Cross-entropy of the encoders; classes are carried to points by each day's mean answer so far."""
+    """Cross-entropy of the encoders; each day's running mean carries the classes to points."""
     grid = network.config.grid
     turned = pose(guess.R_turned_camera, torch.zeros_like(guess.R_turned_camera[..., 0]))
     days = _days(batch)
-    T_camera_lidar = turned @ consensus.pose(days, 0, batch.T_camera_lidar)
-    T_camera_radar = turned @ consensus.pose(days, 1, batch.T_camera_radar)
+    T_camera_lidar = turned @ day_means.pose(days, 0, batch.T_camera_lidar)
+    T_camera_radar = turned @ day_means.pose(days, 1, batch.T_camera_radar)
     grid_class = crop(view.grid_class, view.grid_step_deg, grid)
     radar = transform_points(T_camera_radar, batch.radar_xyz_m)
     # The camera's logits are the same in all passes; the lidar is rendered anew in each.
@@ -133,10 +133,10 @@ def _semantics(
     return torch.stack(losses).mean()
 
 
-def _doubt(
-    answer: Predictions, guess: Guess, batch: TrainingBatch, consensus: Consensus
+def _uncertainty(
+    answer: Predictions, guess: Guess, batch: TrainingBatch, day_means: DayMeans
 ) -> tuple[Tensor, Tensor]:
-    """Likelihood of the scatter, and the root mean square of its angles by pair [rad]."""
+    """Negative log-likelihood of the scatter, and the root mean square of its angles by pair [rad]."""
     answers = torch.stack(
         [
             guess.unturned(answer.T_camera_lidar),
@@ -147,9 +147,11 @@ def _doubt(
     )
     references = torch.stack([batch.T_camera_lidar, batch.T_camera_radar, batch.T_lidar_radar], 1)
     days = _days(batch)
-    known = torch.tensor(consensus.known(days), device=answers.device).float()
-    scatter = consensus.scatter(days, answers, references)
-    return doubt_loss(answer.log_variance, scatter, known), scatter[..., :3].square().sum(-1).mean(0).sqrt()
+    known = torch.tensor(day_means.known(days), device=answers.device).float()
+    scatter = day_means.scatter(days, answers, references)
+    return uncertainty_loss(answer.log_variance, scatter, known), scatter[..., :3].square().sum(-1).mean(
+        0
+    ).sqrt()
 
 
 def _days(batch: TrainingBatch) -> list[str]:

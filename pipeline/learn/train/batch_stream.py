@@ -51,9 +51,8 @@ def batch_stream(data: str, config: TrainConfig, processes: Processes, *, reside
     """
     if resident:
         return _ResidentStream(data, config, processes)
-    loader = TrainingLoader(
-        Lake.at(data), config.batch_size, seed=config.seed, rank=processes.rank, ranks=processes.count
-    )
+    rank_of = (processes.rank, processes.count)
+    loader = TrainingLoader(Lake.at(data), config.batch_size, seed=config.seed, rank_of=rank_of)
     return _LoaderStream(loader, processes.device)
 
 

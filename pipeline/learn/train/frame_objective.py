@@ -1,7 +1,7 @@
 """What training minimises for a batch: terms of the three pairs and the loop, as in the estimator's objective.
 
-Angles in degrees, translations in metres, per-frame means over what is valid. No term knows a true transform: the
-reference only says which points the camera surely sees.
+Angles in degrees, translations in metres, per-frame means over what is valid. No term uses a true transform: the
+reference only says which points the camera sees for certain.
 
 Source: paper section 4.4 (SSL minimises L_P + L_G); the project's evidence on self-supervision, section 3, for the
 weights.
@@ -55,9 +55,9 @@ PAIR_OF_TERM = {
     "prior_camera_radar": "camera_radar",
     "prior_lidar_radar": "lidar_radar",
 }
-_MARGIN_DEG = 3.0  # what the reference may be wrong by, for points that are asked to lie in view
-_RADAR_SKY_FREE_DEG = 2.0  # a radar's elevation is noisy: only what is deep in the sky is wrong
-_LOOP_METRE = 5.0  # a fifth of a metre counts as a degree: what it moves at 11 m
+_MARGIN_DEG = 3.0  # how wrong the reference may be, where points must lie in view
+_RADAR_SKY_FREE_DEG = 2.0  # radar elevation is noisy: only detections this deep in the sky count as wrong
+_LOOP_METRE = 5.0  # 0.2 m counts as a degree, by which it moves what is 11 m away
 _PRIOR_ROUND_DEG = 0.05  # below this the absolute value is rounded off
 _RADAR_CELL_M = 1.0  # of the stored drivable map
 
@@ -172,11 +172,11 @@ def frame_objective(batch: TrainingBatch) -> FrameObjective:
 def _from_prior(
     T: Float[Tensor, "*batch 4 4"], T_prior: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch"]:
-    """How far a pose lies from the day's prior: absolute angles [deg] and shifts (a metre as in the loop), rounded off.
+    """Distance of a pose to the day's prior: absolute angles [deg] and shifts (a metre as in the loop), smooth at 0.
 
-    Absolute values, not squares: over a fleet the priors' errors cancel in the median, and a constant small pull holds
-    what frames say nothing of (a shift along the camera's axis, a radar's height), where the bias of some other term
-    would move it for nothing; what frames do tell, pulls harder.
+    Absolute values, not squares: over a fleet, the priors' errors cancel in the median. The gradient is small and
+    constant. It keeps at the prior what frames do not determine (a shift along the camera's axis, a radar's height),
+    which the bias of some other term would move; what frames determine has larger gradients.
     """
     twist = twist_between(T, T_prior.to(T.dtype))
     scaled = torch.cat([twist[..., :3] * DEG, twist[..., 3:] * _LOOP_METRE], -1)
@@ -200,16 +200,16 @@ def _weight(weights: LossConfig, name: str) -> float:
 
 
 def _at_lag(batch: TrainingBatch, points: Float[Tensor, "B N 3"], lag_s: Float[Tensor, " B"]) -> Tensor:
-    """Where standing points are, lidar frame, when another sensor looks `lag_s` later: the car has driven towards them.
+    """Static points in the lidar frame `lag_s` later, when another sensor measures: the car has moved towards them.
 
-    What the clocks do not know, a constant offset between them, stays in the answer as a shift along the way driven.
+    A constant time offset that the stamps do not show remains in the answer as a shift along the direction of travel.
     """
     ahead = (batch.ego_speed_mps * lag_s)[:, None]
     return torch.stack([points[..., 0] - ahead, points[..., 1], points[..., 2]], -1)
 
 
 def _surely_in_view(maps: GridMaps, T: Tensor, points: Tensor) -> Tensor:
-    """Points that the camera sees at this pose, and when it is turned by the margin to any side."""
+    """Points that the camera sees at this pose, and still sees when it is turned by the margin to any side."""
     uv, valid = maps.projection.project(transform_points(T.to(points.dtype), points))
     margin = _MARGIN_DEG / DEG / maps.projection.step_rad
     frame = torch.arange(len(points), device=points.device)[:, None]

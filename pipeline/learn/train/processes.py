@@ -1,4 +1,4 @@
-"""One process or many: who am I, on which device, and what all must decide together."""
+"""One training process or several: rank, device, and the decisions that all must take together."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def _cause(out: Path, error: Exception) -> BoresightError:
 
 
 def _work(settings: dict[str, Any]) -> None:
-    """One worker: Ray has joined the process group; tell ours who we are."""
+    """One worker: Ray has joined the process group; set the rank that `joined` reads from the environment."""
     from ray.train import get_context  # noqa: PLC0415 - an extra
 
     context = get_context()

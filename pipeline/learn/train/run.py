@@ -25,7 +25,7 @@ from pipeline.learn.train.checkpoints import BEST, save_checkpoint
 from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.processes import Processes, joined
 from pipeline.learn.train.run_state import RunState, begin_run
-from pipeline.learn.train.running_mean import Consensus
+from pipeline.learn.train.running_mean import DayMeans
 from pipeline.learn.train.schedule import cosine_rate
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.learn.train.stop_signals import stop_signals
@@ -74,7 +74,7 @@ class TrainResult:
 
 
 def train(request: TrainRequest, config: TrainConfig, progress: Progress = silent) -> TrainResult:
-    """Train, or go on training, until the run is finished, the time is up or a signal says stop.
+    """Train, or go on training, until the run is finished, the time is up or a signal asks to stop.
 
     Raises:
         ConfigError: the run in `out` was begun with another configuration; no such device.
@@ -84,7 +84,7 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
     request.out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         processes = stack.enter_context(joined(request.device))
-        told = stack.enter_context(stop_signals())
+        stops = stack.enter_context(stop_signals())
         run = begin_run(
             request.data,
             request.out,
@@ -101,7 +101,7 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
                 json.dumps(config.model_dump(mode="json"), indent=1) + "\n"
             )
             log = stack.enter_context(closing(MetricsLog(request.out, run.step)))
-        return _loop(request, run, processes, log, told, progress)
+        return _loop(request, run, processes, log, stops, progress)
 
 
 def _loop(
@@ -109,7 +109,7 @@ def _loop(
     run: RunState,
     processes: Processes,
     log: MetricsLog | None,
-    told: list[int],
+    stops: list[int],
     progress: Progress,
 ) -> TrainResult:
     config, began = run.config, time.monotonic()
@@ -121,7 +121,7 @@ def _loop(
         now = time.monotonic()
         run.trained_s, tick = run.trained_s + now - tick, now
         late = request.time_limit_s is not None and now - began >= request.time_limit_s
-        stop, save = processes.any([bool(told) or late, now - saved >= 60 * config.checkpoint_minutes])
+        stop, save = processes.any([bool(stops) or late, now - saved >= 60 * config.checkpoint_minutes])
         if stop:
             break
         if save:
@@ -140,14 +140,14 @@ def _loop(
         if validation is not None and (run.step % config.validate_every == 0 or run.finished):
             _validate(run, validation, request.out, log)
     run.save(request.out, processes)
-    status = "done" if run.finished else ("stopped" if told else "time_limit")
+    status = "done" if run.finished else ("stopped" if stops else "time_limit")
     samples = (run.step - first_step) * config.batch_size * processes.count
     seconds = time.monotonic() - began
-    return TrainResult(status, run.step, run.steps, samples, seconds, report, told[0] if told else 0)
+    return TrainResult(status, run.step, run.steps, samples, seconds, report, stops[0] if stops else 0)
 
 
 def _step(run: RunState, processes: Processes) -> dict[str, torch.Tensor]:
-    """Descend once; returns what to report."""
+    """One step of Adam; returns what to report."""
     config = run.config
     rate = cosine_rate(run.progress, config.learning_rate, config.final_learning_rate)
     for group in run.optimiser.param_groups:
@@ -158,7 +158,7 @@ def _step(run: RunState, processes: Processes) -> dict[str, torch.Tensor]:
         run.passes,
         batch,
         config,
-        run.consensus,
+        run.day_means,
         _generator(config.seed, run.step, processes.rank),
         run.network,
         matched=matched,
@@ -166,26 +166,26 @@ def _step(run: RunState, processes: Processes) -> dict[str, torch.Tensor]:
     run.optimiser.zero_grad(set_to_none=True)
     found.loss.backward()  # type: ignore[no-untyped-call]
     norm = torch.nn.utils.clip_grad_norm_(run.network.parameters(), config.gradient_norm)
-    told = processes.mean(torch.stack([found.report["loss"].float(), norm.detach().float()]))
-    loss, gradient = told.tolist()
+    means = processes.mean(torch.stack([found.report["loss"].float(), norm.detach().float()]))
+    loss, gradient = means.tolist()
     if matched:  # losses of the encoders alone are of another size
         run.guard.check(run.step, loss, gradient)
     run.optimiser.step()
     run.step += 1
-    return found.report | {"loss": told[0], "gradient_norm": told[1], "learning_rate": torch.tensor(rate)}
+    return found.report | {"loss": means[0], "gradient_norm": means[1], "learning_rate": torch.tensor(rate)}
 
 
 def _validate(run: RunState, frames: TrainingBatch, folder: Path, log: MetricsLog | None) -> None:
     """Report the losses of held-out frames from the same guesses every time; keep the best weights."""
     passes = Passes(run.network, run.config.iterations)
-    generator, consensus = torch.Generator().manual_seed(_VALIDATION_SEED), Consensus()
+    generator, day_means = torch.Generator().manual_seed(_VALIDATION_SEED), DayMeans()
     device = next(run.network.parameters()).device
     sums: dict[str, float] = {}
     run.network.eval()
     with torch.no_grad():
         for first in range(0, len(frames), 16):
             part = frames_at(frames, torch.arange(first, min(first + 16, len(frames)))).to(device)
-            found = batch_loss(passes, part, run.config, consensus, generator, run.network)
+            found = batch_loss(passes, part, run.config, day_means, generator, run.network)
             for name, value in found.report.items():
                 sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
     run.network.train()
@@ -205,6 +205,6 @@ def _validation_frames(data: str, config: TrainConfig) -> TrainingBatch | None:
 
 
 def _generator(seed: int, step: int, rank: int) -> torch.Generator:
-    """The step's own random numbers: nothing to save, nothing that depends on what came before."""
+    """Random numbers of one step: they depend on (seed, step, rank) only, so a checkpoint need not hold a state."""
     # Odd multipliers keep neighbouring steps and ranks apart.
     return torch.Generator().manual_seed((seed * 1_000_003 + step * 8_191 + rank * 131) % 2**63)

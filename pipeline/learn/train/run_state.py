@@ -20,9 +20,9 @@ from pipeline.learn.train.batch_loss import Passes
 from pipeline.learn.train.batch_stream import BatchStream, batch_stream
 from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
 from pipeline.learn.train.processes import Processes
-from pipeline.learn.train.running_mean import Consensus
+from pipeline.learn.train.running_mean import DayMeans
 from pipeline.learn.train.schedule import DivergenceGuard
-from pipeline.learn.train.settings import TrainConfig
+from pipeline.learn.train.settings import RENAMED, TrainConfig
 
 __all__ = ["RunState", "begin_run", "network_of_run"]
 
@@ -39,7 +39,7 @@ class RunState:
     passes: nn.Module
     optimiser: torch.optim.Adam
     stream: BatchStream
-    consensus: Consensus
+    day_means: DayMeans
     guard: DivergenceGuard
     steps: int
     step: int = 0
@@ -60,7 +60,8 @@ class RunState:
 
     def save(self, folder: Path, processes: Processes) -> None:
         """Write the last checkpoint; every process must call."""
-        own = {"stream": self.stream.state_dict(), "consensus": self.consensus.state_dict()}
+        # "consensus": name of the running day means in checkpoints of format 1.
+        own = {"stream": self.stream.state_dict(), "consensus": self.day_means.state_dict()}
         everyone = processes.gather(own)
         if processes.leads:
             state = self.weights() | {
@@ -88,13 +89,13 @@ class RunState:
             ConfigError: it was written by another number of processes.
         """
         if len(state["processes"]) != processes.count:
-            told = f"begun by {len(state['processes'])}, now {processes.count}"
-            raise ConfigError("train", "processes", f"a run goes on with as many as it was {told}")
+            problem = f"begun by {len(state['processes'])}, now {processes.count}"
+            raise ConfigError("train", "processes", f"a run goes on with as many as it was {problem}")
         self.network.load_state_dict(state["network"])
         self.optimiser.load_state_dict(state["optimiser"])
         own = state["processes"][processes.rank]
         self.stream.load_state_dict(own["stream"])
-        self.consensus.load_state_dict(own["consensus"])
+        self.day_means.load_state_dict(own["consensus"])
         self.guard.load_state_dict(state["guard"])
         self.step, self.trained_s, self.best = (
             int(state["step"]),
@@ -119,7 +120,7 @@ def begin_run(
         data: see `TrainRequest`.
         folder: of the run.
         config: a run goes on only with the same.
-        processes: who trains.
+        processes: this process among those that train together.
         compiled: see `TrainRequest`.
         resident: see `TrainRequest`.
         start: run whose weights a fresh run begins with; a run that goes on has its own.
@@ -144,7 +145,7 @@ def begin_run(
             passes,
             torch.optim.Adam(network.parameters(), lr=config.learning_rate, betas=config.adam_betas),
             stream,
-            Consensus(),
+            DayMeans(),
             DivergenceGuard(config.diverged_factor),
             _steps(config, stream.frames, processes.count),
         )
@@ -179,8 +180,8 @@ def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
 def _take_weights(network: CalibrationNetwork, start: Path) -> None:
     trained = network_of_run(start)
     if trained.config != network.config:
-        told = f"{start} has a network of another kind, {trained.config}, not {network.config}"
-        raise ConfigError("train", "start-from", told)
+        problem = f"{start} has a network of another kind, {trained.config}, not {network.config}"
+        raise ConfigError("train", "start-from", problem)
     network.load_state_dict(trained.state_dict())
 
 
@@ -198,7 +199,10 @@ def _steps(config: TrainConfig, frames: int, processes: int) -> int:
 
 def _same_config(folder: Path, begun: dict[str, Any], config: TrainConfig) -> None:
     now = config.model_dump(mode="json")
+    begun = {RENAMED.get(key, key): value for key, value in begun.items()}
     other = sorted(k for k in begun.keys() | now.keys() if begun.get(k) != now.get(k))
     if other:
-        told = f"the run in this folder was begun with another {other[0]}: use a new folder, or the old value"
-        raise ConfigError(str(folder), other[0], told)
+        problem = (
+            f"the run in this folder was begun with another {other[0]}: use a new folder, or the old value"
+        )
+        raise ConfigError(str(folder), other[0], problem)

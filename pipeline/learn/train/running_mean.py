@@ -1,7 +1,7 @@
-"""Each vehicle-day's mean answer so far: what a single frame's doubt is measured against, no truth needed.
+"""Running mean of each vehicle-day's answers: the reference that teaches single frames their variance, without truth.
 
-The scatter of single frames about their day's mean is what their variance should say. A constant bias of the network
-is not in it, and cannot be without truth.
+The variance that a network predicts for a frame should be that of single frames about their day's mean. A bias that all
+frames of a day share does not show in it, and cannot without truth.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pipeline.objective.differentiable.poses import exp_so3, inverse, pose
 
-__all__ = ["Consensus", "doubt_loss", "twist_between"]
+__all__ = ["DayMeans", "twist_between", "uncertainty_loss"]
 
 _LOG_VARIANCE = (-18.0, 2.0)  # sigmas of 0.1 mrad to 3 m: what lies beyond has no gradient
 _LEAST_SHARE = 0.02  # of the newest frame in the mean: networks change while they learn
@@ -41,8 +41,8 @@ def _moved(twist: Float[Tensor, "*batch 6"], T: Float[Tensor, "*batch 4 4"]) -> 
     return pose(exp_so3(twist[..., :3]), twist[..., 3:]) @ T
 
 
-class Consensus:
-    """Running mean, by vehicle, day and pair, of how far answers lie from the day's reference."""
+class DayMeans:
+    """Running mean, by vehicle-day and pair, of the twists from the day's reference to the answers."""
 
     def __init__(self) -> None:
         self._mean: dict[str, Tensor] = {}
@@ -68,7 +68,7 @@ class Consensus:
         return out.to(answers.device)
 
     def known(self, days: list[str], least: int = 8) -> list[bool]:
-        """Whether each day's mean is worth anything yet."""
+        """Whether each day's mean rests on at least `least` answers."""
         return [self._count.get(day, 0) >= least for day in days]
 
     def pose(self, days: list[str], pair: int, references: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
@@ -87,10 +87,10 @@ class Consensus:
         self._count = {day: int(count) for day, count in state["count"].items()}
 
 
-def doubt_loss(
+def uncertainty_loss(
     log_variance: Float[Tensor, "B 3 6"], scatter: Float[Tensor, "B 3 6"], known: Float[Tensor, " B"]
 ) -> Float[Tensor, ""]:
-    """Negative log likelihood of the scatter: teaches the variances only, for the scatter has no gradient."""
+    """Negative log-likelihood of the scatter; only the variances learn from it, for the scatter has no gradient."""
     bounded = log_variance.clamp(*_LOG_VARIANCE)
     per_frame = 0.5 * (scatter.square() * torch.exp(-bounded) + bounded).mean((1, 2))
     return (per_frame * known).sum() / known.sum().clamp_min(1)

@@ -1,8 +1,8 @@
-"""What teaches the encoders: the precomputed classes of the camera, carried to lidar and radar points by a guess.
+"""The encoders' loss: the precomputed classes of the camera, carried to lidar and radar points by a guess.
 
-No lidar semantics exist and none are needed: a point takes the class of the image cell that it falls into. A wrong
-guess blurs that, but says nothing wrong on average over a fleet; the network's own estimate, once it is better than
-the day's prior, is the better guess.
+Lidar semantics are not needed: a point takes the class of the image cell that it falls into. A wrong guess blurs these
+labels, but over a fleet it does not bias them. Once the network's own estimate is better than the day's prior, it is
+the better guess.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from schemas.training import UNKNOWN_CLASS
 
 __all__ = ["class_of_points", "semantics_accuracy", "semantics_loss"]
 
-_RADAR_WEIGHT = 0.2  # what a detection is can hardly be told from its echo
+_RADAR_WEIGHT = 0.2  # a detection's features hardly determine its class
 
 
 def class_of_points(

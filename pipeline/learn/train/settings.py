@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pipeline.errors import ConfigError
 from pipeline.learn.sample.grid import Grid
 
-__all__ = ["PAIRS_OF", "AugmentConfig", "LossConfig", "TrainConfig", "load_train_config"]
+__all__ = ["PAIRS_OF", "RENAMED", "AugmentConfig", "LossConfig", "TrainConfig", "load_train_config"]
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -27,6 +27,10 @@ PAIRS_OF: dict[str, tuple[str, ...]] = {
     "camera_radar": ("camera_radar",),
     "lidar_radar": ("lidar_radar",),
 }
+
+
+# Keys of train.toml and of runs of 0.3.0 that have another name now; both are understood.
+RENAMED = {"doubt_weight": "uncertainty_weight"}
 
 
 class _Section(BaseModel):
@@ -45,15 +49,15 @@ class LossConfig(_Section):
     tracks_lidar: NotNegative = 0.5
     drivable: NotNegative = 2.0
     loop: NotNegative = 1.0
-    prior: NotNegative = 0.1  # holds what no frame tells, and is weaker than all that frames do tell
+    prior: NotNegative = 0.1  # holds what frames do not determine, and is weaker than what they determine
     semantics: NotNegative = 1.0  # the encoders' cross-entropy to the precomputed classes
 
 
 class AugmentConfig(_Section):
     """How wrong the guess is made, and how far the camera's view is turned, in training.
 
-    Moving the lidar's and the radar's clouds at random is the paper's; turning the camera's view as well keeps a
-    network from learning one viewpoint by heart.
+    The paper moves the lidar's and the radar's clouds at random. Turning the camera's view as well keeps a network from
+    memorising one viewpoint.
     """
 
     rotation_deg: NotNegative = 3.0  # per axis, even
@@ -88,9 +92,8 @@ class TrainConfig(_Section):
     budget_minutes: Positive | None = (
         None  # in place of epochs: the run ends, and the cosine, after so much time
     )
-    doubt_weight: NotNegative = (
-        0.01  # of the likelihood of each frame's scatter, which teaches the log variances
-    )
+    # Of the likelihood of each frame's scatter about its day's mean, which teaches the log variances.
+    uncertainty_weight: NotNegative = 0.01
     validate_every: Count = 500  # steps
     validation_frames: Count = 128
     log_every: Count = 10  # steps
@@ -99,6 +102,13 @@ class TrainConfig(_Section):
     seed: int = 0
     loss: LossConfig = LossConfig()
     augment: AugmentConfig = AugmentConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, values: object) -> object:
+        if not isinstance(values, Mapping):
+            return values
+        return {RENAMED.get(key, key): value for key, value in values.items()}
 
     @model_validator(mode="after")
     def _cells_fit(self) -> TrainConfig:

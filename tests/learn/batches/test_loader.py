@@ -70,14 +70,14 @@ def test_a_resumed_loader_continues_as_if_nothing_had_happened(lake, after):
 
 
 def test_ranks_share_the_frames_without_overlap(lake):
-    loaders = [TrainingLoader(lake, 1, rank=r, ranks=3, repeat=False, seed=9) for r in range(3)]
+    loaders = [TrainingLoader(lake, 1, rank_of=(r, 3), repeat=False, seed=9) for r in range(3)]
     shares = [[n for b in loader for n in names(b)] for loader in loaders]
     assert sorted(n for s in shares for n in s) == sorted(names(load_split(lake, "train")))
     assert min(len(s) for s in shares) >= 8
 
 
 def test_a_single_pass_in_order_ends_with_what_is_left_and_begins_again(lake):
-    loader = TrainingLoader(lake, 7, split="val", shuffle=False, repeat=False)
+    loader = TrainingLoader(lake, 7, split="val", seed=None, repeat=False)
     passes = [[names(b) for b in loader] for _ in range(2)]
     assert passes[0] == passes[1]
     assert [len(b) for b in passes[0]] == [7, 3]
@@ -116,7 +116,7 @@ def test_a_changed_table_or_another_order_refuses_to_resume(lake, tmp_path):
 
 def test_too_little_data_is_said(lake, tmp_path):
     with pytest.raises(ContractError, match="not enough for 99"):
-        TrainingLoader(lake, 3, ranks=99)
+        TrainingLoader(lake, 3, rank_of=(0, 99))
     with pytest.raises(ContractError, match="run `boresight prepare`"):
         TrainingLoader(training_lakes.Lake.at(tmp_path), 3)
 

@@ -7,7 +7,7 @@ import torch
 from pipeline.geometry import se3
 from pipeline.learn.train.augment import random_guess, turned_view
 from pipeline.learn.train.frame_objective import PAIR_OF_TERM, frame_objective, weighted
-from pipeline.learn.train.running_mean import Consensus, doubt_loss, twist_between
+from pipeline.learn.train.running_mean import DayMeans, twist_between, uncertainty_loss
 from pipeline.learn.train.settings import PAIRS_OF, AugmentConfig, LossConfig
 from pipeline.objective.differentiable.poses import exp_se3, exp_so3, pose, transform_points
 from pipeline.objective.differentiable.terms import soft_clamp, soft_minimum
@@ -165,10 +165,10 @@ def class_under(batch, b, points_camera):
     return torch.where(inside, found, torch.full_like(found, UNKNOWN_CLASS))
 
 
-def test_doubt_is_least_where_it_says_what_the_scatter_is():
+def test_the_loss_of_a_variance_is_least_at_the_scatter_s_own():
     scatter = 0.01 * torch.randn(4000, 3, 6, generator=torch.Generator().manual_seed(0))
     losses = [
-        doubt_loss(torch.full((4000, 3, 6), 2 * np.log(s)), scatter, torch.ones(4000))
+        uncertainty_loss(torch.full((4000, 3, 6), 2 * np.log(s)), scatter, torch.ones(4000))
         for s in (0.005, 0.01, 0.02)
     ]
     assert losses[1] < min(losses[0], losses[2])
@@ -176,21 +176,21 @@ def test_doubt_is_least_where_it_says_what_the_scatter_is():
 
 def test_scatter_is_about_the_days_mean_not_about_the_reference():
     """A day whose answers all lie 0.02 rad off its reference has no scatter; two days do not mix."""
-    consensus, generator = Consensus(), torch.Generator().manual_seed(0)
+    means, generator = DayMeans(), torch.Generator().manual_seed(0)
     reference = torch.eye(4).expand(2, 3, 4, 4)
     bias = torch.tensor([[0.02, 0, 0, 0, 0, 0], [0, -0.03, 0, 0, 0, 0.1]])[:, None].expand(2, 3, 6)
     for _ in range(50):
         noise = 1e-3 * torch.randn(2, 3, 6, generator=generator)
-        scatter = consensus.scatter(
+        scatter = means.scatter(
             ["a", "b"], pose(exp_so3((bias + noise)[..., :3]), (bias + noise)[..., 3:]), reference
         )
-    assert consensus.known(["a", "b", "c"]) == [True, True, False]
+    assert means.known(["a", "b", "c"]) == [True, True, False]
     assert scatter.abs().max() < 6e-3
-    mean = consensus.pose(["a", "b"], 0, reference[:, 0])
+    mean = means.pose(["a", "b"], 0, reference[:, 0])
     np.testing.assert_allclose(mean, pose(exp_so3(bias[:, 0, :3]), bias[:, 0, 3:]), atol=1e-3)
-    back = Consensus()
-    back.load_state_dict(consensus.state_dict())
-    assert torch.equal(back.pose(["b"], 1, reference[:1, 0]), consensus.pose(["b"], 1, reference[:1, 0]))
+    back = DayMeans()
+    back.load_state_dict(means.state_dict())
+    assert torch.equal(back.pose(["b"], 1, reference[:1, 0]), means.pose(["b"], 1, reference[:1, 0]))
 
 
 def test_soft_minimum_and_clamp_are_what_they_say():
