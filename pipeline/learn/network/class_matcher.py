@@ -5,7 +5,7 @@ a surface over shifts; strips of azimuth see a roll as shifts of opposite sign i
 translation as different shifts. Rotations are found level by level and applied to the points themselves, so no map is
 ever warped and a point's place within its cell counts.
 
-Source: evidence of the project's prototype; the idea of a cost volume is LCCNet's (Lv et al. 2021).
+Source: the cost volume is LCCNet's idea (Lv et al. 2021); the search over class likelihoods is this project's own.
 """
 
 from __future__ import annotations

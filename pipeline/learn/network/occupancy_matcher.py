@@ -1,6 +1,6 @@
 """Lidar and radar: radar detections against the density of lidar object points in azimuth, elevation and range.
 
-A radar's elevation is worth little and its azimuth much, so the search goes yaw first, then pitch (and roll, from how
+Radar azimuth is precise and elevation noisy, so the search goes yaw first, then pitch (and roll, from how
 pitch changes with azimuth), each by the likelihood of the detections under the lidar's kernel density; a step of damped
 least squares over soft associations finishes all six degrees of freedom. Clutter meets a floor of the likelihood.
 """

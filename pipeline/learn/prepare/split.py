@@ -1,10 +1,10 @@
-"""Which frames teach, which choose the network and which judge it: no vehicle, day or place on both sides.
+"""Which frames train, validate and test a network: no vehicle, day or place on two sides.
 
 Frames are linked by what they share. Where the links leave separate groups, whole groups are dealt out and no frame is
 lost. Where everything hangs together (every vehicle drives every day), vehicles and days are divided each for itself,
 every place goes to the side that has most of it, and a frame counts only where all of its keys agree.
 
-What an earlier run decided stays decided: a lake grows, and a frame that judged yesterday must not teach today.
+What an earlier run decided stays decided: a lake grows, and a frame that tested one network must not train the next.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def plan_split(
     Args:
         units: what there is.
         by: kinds of keys that no two sides may share: vehicle, day, place.
-        val_fraction: share of the frames that choose.
-        test_fraction: share of the frames that judge.
-        seed: other seeds deal otherwise.
+        val_fraction: share of the frames that choose the best weights.
+        test_fraction: share of the frames that test a finished network.
+        seed: of the draw.
         decided: sides of keys that earlier runs gave.
     """
     shares = {TRAIN: 1 - val_fraction - test_fraction, VAL: val_fraction, TEST: test_fraction}

@@ -4,8 +4,8 @@ To move a cloud by A and look at it through T is to look at it as it is through 
 move. Lidar and radar move independently, the three guesses close the loop. A turned view is the same image on a grid
 turned by R: poses into the turned camera are R T, and the losses, which keep the unturned maps, are given R^-1 T.
 
-Source: paper section 4.5.4 (random rotation and translation of lidar and radar clouds); the project's evidence on
-self-supervision, section 1, for turning both sides.
+Source: paper section 4.5.4 (random rotation and translation of lidar and radar clouds); turning the camera's view as
+well is this project's own.
 """
 
 from __future__ import annotations

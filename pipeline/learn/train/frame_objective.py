@@ -3,8 +3,7 @@
 Angles in degrees, translations in metres, per-frame means over what is valid. No term uses a true transform: the
 reference only says which points the camera sees for certain.
 
-Source: paper section 4.4 (SSL minimises L_P + L_G); the project's evidence on self-supervision, section 3, for the
-weights.
+Source: paper section 4.4 (SSL minimises L_P + L_G); edges, static points and the prior's term are this project's own.
 """
 
 from __future__ import annotations
