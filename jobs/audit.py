@@ -31,12 +31,15 @@ def audit(
     """
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+    from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.stages import AUDIT, REPORT
     from pipeline.store.partitions import Lake
     from pipeline.work import Task, Window
     from schemas.drift import DRIFT_STATUSES
 
+    if method is not None:
+        method_named(method)
     config = load_fleet(fleet)
     tables = Lake.at(lake)
     with progress_reporter("audit") as progress:

@@ -8,9 +8,18 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
 
 from pipeline.errors import ConfigError
+from schemas.calibrations import METHODS
 
 __all__ = [
     "TERMS",
@@ -43,6 +52,15 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Topic = Annotated[str, Field(pattern=r"^/\S+$")]
 Term = Literal["edges", "reflectivity", "static", "boxes", "moving", "time_offsets", "translation_prior"]
 TERMS: tuple[Term, ...] = get_args(Term)
+
+
+def _known_method(name: str) -> str:
+    if name not in METHODS:
+        raise ValueError(f"{name!r} does not exist; choose from {', '.join(METHODS)}")
+    return name
+
+
+MethodName = Annotated[str, AfterValidator(_known_method)]
 
 
 class _Section(BaseModel):
@@ -215,7 +233,7 @@ class SolveConfig(_Section):
     time_offset_sigma_s: Positive = 0.05
     terms: tuple[Term, ...] = TERMS  # of method joint; leave some out to see what they are worth
     polish: bool = False  # of the SSL methods: let method joint finish from the network's answer
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
     def _terms_differ_and_show_the_lidar(self) -> SolveConfig:
@@ -275,12 +293,42 @@ class PrepareConfig(_Section):
 
 
 class VerifyConfig(_Section):
-    """What an accepted calibration must be good for: errors of azimuth and elevation at targets 15 to 40 m away."""
+    """What an accepted calibration must be good for, and from where on a check of a pair fails.
+
+    Limits are of the errors of azimuth and elevation at targets 15 to 40 m away. The thresholds below them were chosen
+    on simulated days (seeds 140 to 145, demo and paper rig, 40 frames; 24 good days and 28 with faults), and on the
+    real day for the question what methods that are 0.3 to 0.8 deg off look like. `prior_sigmas` are sigmas of the
+    prior, other `sigmas` those of the quantity itself; `z` is a one-sided normal deviate of the paired test on
+    held-out frames.
+    """
 
     camera_lidar_limit_deg: Positive = 0.2
     radar_limit_deg: Positive = 0.4
-    # Probability that an error stays within the limit, before a direction is vouched for.
+    # Probability that an error stays within the limit, before a direction is certified.
     confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.995
+    # A move this large happens once in 16,000 days if the prior's sigma is right.
+    max_move_prior_sigmas: Positive = 4.0
+    # z above which held-out frames align worse than at the prior. One-sided 1 %: a right result near a good prior
+    # aligns worse by chance.
+    worse_alignment_z: Positive = 2.33
+    # -z from which they align better. One-sided 16 %: short days hold out some ten frames, and 5 % would hold right
+    # results that moved by 10 cm.
+    better_alignment_z: Positive = 1.0
+    # A result within so many of its sigmas of the prior need not align better; the largest of six degrees of freedom.
+    prior_agreement_sigmas: Positive = 4.0
+    # Frames of the fit: with fewer the record is refused. Selection refuses a pair with fewer than 8 before that.
+    min_fit_frames: Annotated[int, Field(ge=8)] = 8
+    # Frames, and blocks of frames that share a scene, without which held-out data decide nothing.
+    min_held_out_frames: Annotated[int, Field(ge=1)] = 3
+    min_held_out_blocks: Annotated[int, Field(ge=2)] = 3
+    # Held-out frames that would move the result by more of that move's sigmas contradict it.
+    held_out_contradiction_sigmas: Positive = 3.0
+    # An open loop of three independent estimates is an error of one of them beyond so many sigmas of the loop.
+    max_loop_sigmas: Positive = 3.0
+    # Camera-lidar was solved along the prior's heading: beyond so many of its sigmas that heading was wrong ...
+    heading_change_prior_sigmas: Positive = 3.0
+    # ... and the record is held where this costs more than this share of `camera_lidar_limit_deg`.
+    max_heading_error_share: Fraction = 0.25
 
 
 class LearnConfig(_Section):
@@ -295,7 +343,7 @@ class LearnConfig(_Section):
 class AuditConfig(_Section):
     """Control charts."""
 
-    method: str = "joint"
+    method: MethodName = "joint"
     false_alarms_per_1000_vehicle_days: Positive = 1.0
     baseline_days: Annotated[int, Field(gt=0)] = 2  # a chart says nothing until it has one day more than this
     held_sigma_factor: Annotated[float, Field(ge=1)] = (

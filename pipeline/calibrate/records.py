@@ -22,7 +22,7 @@ from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRe
 from schemas.observations import Observation
 from schemas.versions import CODE_VERSION
 
-__all__ = ["Inputs", "Judged", "environment_of", "record_of", "refused_records"]
+__all__ = ["Inputs", "Judged", "SolvedDay", "environment_of", "record_of", "refused_records"]
 
 # Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
 _FAST_MPS = 20.0
@@ -50,35 +50,28 @@ class Judged:
     claims: Mapping[str, Claim]
 
 
-def record_of(
-    about: Inputs,
-    pair: str,
-    solution: Solution,
-    prior: Prior,
-    judged: Judged,
-    selection: Selection,
-    observations: Sequence[Observation],
-    *,
-    before: Mapping[str, float],
-    after: Mapping[str, float],
-    triggered: bool,
-) -> CalibrationRecord:
+@dataclass(frozen=True)
+class SolvedDay:
+    """A day that was computed: what went in, what came out, and how each pair was judged."""
+
+    observations: Sequence[Observation]
+    selection: Selection
+    prior: Prior
+    solution: Solution
+    judged: Mapping[str, Judged]
+    trigger_before: Mapping[str, Mapping[str, float]]  # metrics of each pair at the prior
+    trigger_after: Mapping[str, Mapping[str, float]]  # and at the result
+    triggered: Mapping[str, bool]  # pairs with a metric beyond its threshold at the prior
+
+
+def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
     """The record of one pair that was computed."""
-    estimate, verdict, test = solution.pairs[pair], judged.verdict, judged.test
-    loop_sigma = _loop_sigmas(solution)
-    sigma = target_sigmas(pair, estimate.T, estimate.covariance)
-    refused = verdict.status == "refused"
-    computed: dict[str, Any] = {
-        "covariance": estimate.covariance,
-        "observability": [float(v) for v in estimate.observability],
-        "observable": [bool(v) for v in estimate.observable],
-        "azimuth_sigma_rad": float(sigma[0]),
-        "elevation_sigma_rad": float(sigma[1]),
-        **_transform_fields("", estimate.T),
-    }
+    estimate, judged, selection = day.solution.pairs[pair], day.judged[pair], day.selection
+    verdict, test = judged.verdict, judged.test
     return CalibrationRecord(
-        **_identity(about, pair, len(observations), prior),
-        **({} if refused else computed),
+        **_identity(about, pair, len(day.observations), day.prior),
+        **({} if verdict.status == "refused" else _estimate_fields(estimate)),
+        **_loop_fields(day.solution),
         status=verdict.status,
         reason=verdict.reason,
         score=verdict.score,
@@ -86,20 +79,16 @@ def record_of(
         limit_rad=judged.claims["azimuth"].limit_rad,
         frames_used=estimate.frames_used,
         frames_rejected=_add(selection.rejected[pair], estimate.frames_rejected),
-        environment=environment_of(observations),
-        triggered=triggered,
-        trigger_before=dict(before),
-        trigger_after=dict(after),
+        environment=environment_of(day.observations),
+        triggered=day.triggered[pair],
+        trigger_before=dict(day.trigger_before[pair]),
+        trigger_after=dict(day.trigger_after[pair]),
         alignment_before=test.before if test else None,
         alignment_after=test.after if test else None,
-        loop_rotation_rad=solution.loop_rotation_rad,
-        loop_translation_m=solution.loop_translation_m,
-        loop_rotation_sigma_rad=loop_sigma[0],
-        loop_translation_sigma_m=loop_sigma[1],
         time_offset_s=estimate.time_offset_s,
         time_offset_sigma_s=estimate.time_offset_sigma_s,
         notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable), *_focal(estimate)],
-        assumptions=[*_assumed(pair, observations), *estimate.notes],
+        assumptions=[*_assumed(pair, day.observations), *estimate.notes],
         drive_missing=selection.missing.get(pair, []),
         diagnostics=dict(estimate.diagnostics)
         | _test_numbers(test)
@@ -220,12 +209,29 @@ def _claim_numbers(judged: Judged) -> dict[str, float]:
     }
 
 
-def _loop_sigmas(solution: Solution) -> tuple[float | None, float | None]:
-    """Sigma of the loop's angle and translation, from three pairs estimated apart or from the method's own check."""
-    apart = loop_sigmas(solution)
-    if apart is not None:
-        return apart
-    return solution.pairs["camera_radar"].diagnostics.get("loop_rotation_sigma_rad"), None
+def _estimate_fields(estimate: PairEstimate) -> dict[str, Any]:
+    """What a refused record does not have: the transform and how well the day determines it."""
+    sigma = target_sigmas(estimate.pair, estimate.T, estimate.covariance)
+    return {
+        "covariance": estimate.covariance,
+        "observability": [float(v) for v in estimate.observability],
+        "observable": [bool(v) for v in estimate.observable],
+        "azimuth_sigma_rad": float(sigma[0]),
+        "elevation_sigma_rad": float(sigma[1]),
+        **_transform_fields("", estimate.T),
+    }
+
+
+def _loop_fields(solution: Solution) -> dict[str, Any]:
+    """Residual of the loop, with sigmas from three pairs estimated apart or from the method's own check."""
+    checked = solution.pairs["camera_radar"].diagnostics.get("loop_rotation_sigma_rad")
+    rotation, translation = loop_sigmas(solution) or (checked, None)
+    return {
+        "loop_rotation_rad": solution.loop_rotation_rad,
+        "loop_translation_m": solution.loop_translation_m,
+        "loop_rotation_sigma_rad": rotation,
+        "loop_translation_sigma_m": translation,
+    }
 
 
 def _add(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:

@@ -7,13 +7,14 @@ record.
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
+from dataclasses import fields
 
 import numpy as np
 
 from pipeline.calibrate.methods import Method, Solver, method_named
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.calibrate.records import Inputs, Judged, record_of, refused_records
+from pipeline.calibrate.records import Inputs, Judged, SolvedDay, record_of, refused_records
 from pipeline.calibrate.select.frames import Selection, select_frames
 from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
@@ -23,7 +24,7 @@ from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.calibrate.verify.verdict import Evidence, judge
-from pipeline.config import FleetConfig
+from pipeline.config import FleetConfig, VerifyConfig
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.extrinsics.prior import perturbed, prior_key, read_prior
@@ -139,22 +140,17 @@ def calibrate_observations(
     )
     progress(2, 4, "judge on held-out frames")
     after = trigger_metrics(sample, {pair: solution.pairs[pair].T for pair in PAIRS})
-    judged = _judge_all(observations, selection, prior, solution, fleet, active)
-    records = [
-        record_of(
-            about,
-            pair,
-            solution,
-            prior,
-            judged[pair],
-            selection,
-            observations,
-            before=before[pair],
-            after=after[pair],
-            triggered=bool(fired[pair]),
-        )
-        for pair in PAIRS
-    ]
+    day = SolvedDay(
+        observations,
+        selection,
+        prior,
+        solution,
+        _judge_all(observations, selection, prior, solution, fleet, active),
+        before,
+        after,
+        {pair: bool(fired[pair]) for pair in PAIRS},
+    )
+    records = [record_of(about, pair, day) for pair in PAIRS]
     progress(4, 4, "done")
     return records
 
@@ -186,7 +182,7 @@ def _judge_all(
     active: Sequence[str],
 ) -> dict[str, Judged]:
     """Verdict and evidence of each pair; pairs that a method composes come after their factors."""
-    limits, search = VerdictLimits(), search_range(prior, fleet.solve)
+    limits, search = _limits(fleet.verify), search_range(prior, fleet.solve)
     composed = method_named(solution.method).composed
     failed = _contradictions(solution, composed)
     limit_rad = float(np.radians(fleet.verify.camera_lidar_limit_deg))
@@ -212,6 +208,11 @@ def _judge_all(
         )
         found[pair] = Judged(verdict, test, claims)
     return found
+
+
+def _limits(verify: VerifyConfig) -> VerdictLimits:
+    """The thresholds that `[verify]` of fleet.toml names as the verdict does."""
+    return VerdictLimits(**{f.name: getattr(verify, f.name) for f in fields(VerdictLimits)})
 
 
 def _contradictions(solution: Solution, composed: Sequence[str]) -> dict[str, list[str]]:

@@ -1,11 +1,12 @@
 """The stage: observations in a lake to records, refused days included, the same work never twice."""
 
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
 
 from pipeline.calibrate.records import environment_of
+from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion, rotation_angle_rad
@@ -221,6 +222,26 @@ def test_unknown_vehicle_or_method_is_a_usage_error(tmp_path):
         calibrate_day(
             Partition("other", "2024-05-06"), fleet_of(), Lake.at(tmp_path), method="joint-optimisation"
         )
+
+
+def test_the_verdicts_thresholds_are_those_of_the_configuration(tmp_path, day):
+    defaults = FleetConfig.model_validate({"fleet": {"name": "f"}, "rigs": {}}).verify
+    assert {f.name: getattr(defaults, f.name) for f in fields(VerdictLimits)} == asdict(VerdictLimits())
+    lake = lake_with(tmp_path, day)
+    strict = fleet_of(verify={"max_move_prior_sigmas": 1e-6})
+    result = calibrate_day(DAY, strict, lake, method="pairwise-optimisation")
+    assert result.kept["accepted"] == 0
+    assert all("prior sigmas" in r.reason for r in result.records)
+
+
+def test_unknown_methods_are_a_usage_error_before_anything_is_read(tmp_path):
+    nothing = Lake.at(tmp_path / "nothing")
+    with pytest.raises(ConfigError, match="magic") as caught:
+        calibrate_day(DAY, fleet_of(), nothing, method="magic")
+    assert caught.value.exit_code == 2
+    assert not nothing.root.exists()
+    with pytest.raises(ConfigError, match="magic"):
+        fleet_of(audit={"method": "joint"}).changed(audit={"method": "magic"})
 
 
 @pytest.mark.parametrize(

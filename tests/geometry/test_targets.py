@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.calibrate.records import Inputs, Judged, record_of
+from pipeline.calibrate.records import Inputs, Judged, SolvedDay, record_of
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.calibrate.verify.verdict import Verdict
@@ -109,13 +109,10 @@ def make_run(method="joint", seed=0, key="k1", off_deg=0.2, speed=10.0):
     day = [replace(o, ego_speed_mps=speed) for o in make_day(1)]
     about = Inputs(Partition("v", "2024-01-01"), method, key, seed, ())
     claims = dict.fromkeys(("azimuth", "elevation"), Claim(0.003, 0.0, 0.003, 0.002, 0.007, 0.995))
-    return [
-        record_of(
-            about, p, Solution(method, pairs), prior, Judged(Verdict("accepted", ""), None, claims), selection, day,
-            before={}, after={}, triggered=True,
-        )
-        for p in PAIRS
-    ]  # fmt: skip
+    judged = dict.fromkeys(PAIRS, Judged(Verdict("accepted", ""), None, claims))
+    metrics, fired = {p: {} for p in PAIRS}, dict.fromkeys(PAIRS, True)
+    solved = SolvedDay(day, selection, prior, Solution(method, pairs), judged, metrics, metrics, fired)
+    return [record_of(about, p, solved) for p in PAIRS]
 
 
 def compared_runs(picks=None):
