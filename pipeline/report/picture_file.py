@@ -65,7 +65,7 @@ def _animation(scene: Scene, before: Extrinsics, after: Extrinsics) -> cv2.Anima
     window = lidar_window(scene, after)
     animation = cv2.Animation()
     animation.frames = [_drawn(scene, between(before, after, float(s)), after, window) for s in shares]
-    animation.durations = np.array([_FIRST_MS, *[_STEP_MS] * (_STEPS - 2), _LAST_MS], np.int32)
+    animation.durations = [_FIRST_MS, *[_STEP_MS] * (_STEPS - 2), _LAST_MS]
     return animation
 
 
