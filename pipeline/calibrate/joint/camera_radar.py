@@ -164,8 +164,8 @@ def camera_radar_cost(
     residual, _, frame = camera_azimuth_residuals(clusters, T_camera_radar, 3 * _MATCH_RAD)
     gain = np.bincount(frame, 1 / (1 + (residual / _MATCH_RAD) ** 2), minlength=len(observations))
     total = np.bincount(clusters.frame[visible], minlength=len(observations))
-    told = (total > 0) & np.array([len(o.road_user_classes) > 0 for o in observations])
-    out[told] = 1 - np.minimum(gain[told] / total[told], 1.0)
+    informative = (total > 0) & np.array([len(o.road_user_classes) > 0 for o in observations])
+    out[informative] = 1 - np.minimum(gain[informative] / total[informative], 1.0)
     return out
 
 

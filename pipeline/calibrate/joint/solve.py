@@ -92,9 +92,8 @@ def solve_joint(
     if aligned is not None:
         camera_lidar = analyse_camera_lidar(aligned, rng, heading=_heading(lidar_radar))
     progress(2, 3, "camera-radar")
-    without_lidar = estimate_camera_radar(
-        observations["camera_radar"], prior, config, np.random.default_rng([seed, 2])
-    )
+    own_rng = np.random.default_rng([seed, 2])
+    without_lidar = estimate_camera_radar(observations["camera_radar"], prior, config, own_rng)
     camera_radar, loop_rad, contradictions = compose_pairs(camera_lidar, lidar_radar, without_lidar, prior)
     failed["camera_lidar"] += camera_lidar_failures(camera_lidar)
     failed["lidar_radar"] += lidar_radar_failures(lidar_radar)

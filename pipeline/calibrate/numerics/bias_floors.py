@@ -74,7 +74,7 @@ RADAR_ELEVATION_BIAS_RAD = np.radians(0.2)
 # Unobserved roll tilts azimuths; radars see into objects. Yaw, x and y: what the errors of 16 simulated days with known
 # truth (40 frames; 0.021 deg, 0.029 m, 0.015 m) leave beyond resampling's 0.027 deg, 0.018 m and 0.010 m.
 LIDAR_RADAR_BIAS = np.array([np.radians(0.1), RADAR_ELEVATION_BIAS_RAD, np.radians(0.01), 0.025, 0.013, 0.02])
-LIDAR_RADAR_DT_FLOOR_S = 0.002  # halves of a real day differed by 3 ms where resampling said 1
+LIDAR_RADAR_DT_FLOOR_S = 0.002  # halves of a real day differed by 3 ms where resampling gave 1
 # Radars' own range bias, and what lies behind the surface that the lidar sees.
 RANGE_BIAS_SIGMA_M = 0.05
 # Density of stray static detections, in lidar points at distance 0: assigns about 40 % of a real radar's detections.
@@ -95,7 +95,7 @@ BOX_ROLL_FLOOR_CAMERA_RAD = np.radians(1.2)
 
 # -- both radar pairs ------------------------------------------------------------------------------------------------
 
-# Data that contradict the prior by more sigmas than this are believed: Cauchy scale of the prior's weight.
+# A prior that the data contradict by more sigmas than this loses weight: the scale of its Cauchy weight.
 PRIOR_CONTRADICTION_SIGMAS = 2.5
 # How far a detection's elevation may lie from its box's: at the start, and once pitch and roll are about right.
 BOX_ELEVATION_GATES_RAD = (np.radians(12.0), np.radians(7.0))

@@ -1,9 +1,10 @@
 """How sure a pose is: information matrix, block bootstrap over drives, and a stated bias floor.
 
-An information matrix alone is too sure (on real logs 6 times in yaw): residuals of one scene err together. Blocks
-of frames that share no scene are resampled instead: each resampled day moves the estimate by one Newton step, and the
-spread of these steps, plus what the prior leaves open, is the covariance. No direction becomes surer than information
-says. What no resampling shows, a bias common to all frames, is added as a floor that the caller states per DoF.
+The inverse of an information matrix alone is too small (on real logs 6 times in yaw): residuals of one scene err
+together. Blocks of frames that share no scene are resampled instead: each resampled day moves the estimate by one
+Newton step, and the spread of these steps, plus what the prior leaves open, is the covariance. No direction becomes
+surer than the information allows. A bias common to all frames, which no resampling shows, is added as a floor per
+degree of freedom.
 
 Source: Efron & Tibshirani 1993, ch. 8 (blocks); White 1982 (the sandwich that one Newton step per resample tends to).
 """
@@ -48,7 +49,7 @@ def bootstrap_covariance(
     """Covariance of a MAP estimate by resampling blocks of frames.
 
     Args:
-        information: what each frame says (second derivative of its cost), at the estimate.
+        information: of each frame (second derivative of its cost), at the estimate.
         score: gradient of each frame's cost, at the estimate.
         prior_information: of the prior; zero where there is none (then the frames must determine that parameter).
         block: frames with the same number are drawn together.
@@ -74,12 +75,12 @@ def bootstrap_covariance(
 
 
 def response(
-    curvature: Float[np.ndarray, "P P"], given: Bool[np.ndarray, " P"], held: Bool[np.ndarray, " P"]
+    curvature: Float[np.ndarray, "P P"], given: Bool[np.ndarray, " P"], fixed: Bool[np.ndarray, " P"]
 ) -> Float[np.ndarray, "P G"]:
-    """How far the optimum follows when the `given` parameters are moved by one unit; `held` ones stay."""
+    """How far the optimum follows when the `given` parameters are moved by one unit; `fixed` ones stay."""
     out = np.zeros((len(given), int(given.sum())))
     out[given] = np.eye(out.shape[1])
-    free = ~given & ~held
+    free = ~given & ~fixed
     out[free] = -np.linalg.solve(curvature[np.ix_(free, free)], curvature[np.ix_(free, given)])
     return out
 
@@ -89,33 +90,33 @@ def covariance_with_fixed(
     score: Float[np.ndarray, "F P"],
     prior_variance: Float[np.ndarray, " P"],
     curvature: Float[np.ndarray, "P P"],
-    held: Bool[np.ndarray, " P"],
+    fixed: Bool[np.ndarray, " P"],
     block: Int64[np.ndarray, " F"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "P P"]:
-    """Covariance of a MAP estimate some parameters of which were held at the prior.
+    """Covariance of a MAP estimate some of whose parameters were fixed at the prior.
 
     Args:
-        information: what each frame says, as for `bootstrap_covariance`.
+        information: of each frame, as for `bootstrap_covariance`.
         score: gradient of each frame's cost.
         prior_variance: of every parameter, independent.
-        curvature: of the whole cost, prior included: says how far the others follow a held parameter.
-        held: parameters that the frames had no say in.
+        curvature: of the whole cost, prior included: how far the others follow a fixed parameter.
+        fixed: parameters that the frames did not move.
         block: frames with the same number are drawn together.
         rng: draws the blocks.
 
     Returns:
-        The free parameters' covariance given the held ones, plus what the prior leaves open in the held ones,
-        for them and for all that follow them.
+        The free parameters' covariance given the fixed ones, plus what the prior leaves open in the fixed ones, for
+        them and for all that follow them.
     """
-    at = np.ix_(~held, ~held)
-    out = np.zeros((len(held), len(held)))
-    prior_information = np.diag(1 / prior_variance[~held])
+    at = np.ix_(~fixed, ~fixed)
+    out = np.zeros((len(fixed), len(fixed)))
+    prior_information = np.diag(1 / prior_variance[~fixed])
     out[at] = bootstrap_covariance(
-        information[:, ~held][:, :, ~held], score[:, ~held], prior_information, block, rng
+        information[:, ~fixed][:, :, ~fixed], score[:, ~fixed], prior_information, block, rng
     )
-    along = response(curvature, held, np.zeros_like(held))
-    return out + (along * prior_variance[held]) @ along.T
+    along = response(curvature, fixed, np.zeros_like(fixed))
+    return out + (along * prior_variance[fixed]) @ along.T
 
 
 def spread_to_covariance(
@@ -142,7 +143,7 @@ def posterior(
         bias_floor: sigma per DoF of errors common to all frames [rad, m].
 
     Returns:
-        Observability 1 - posterior/prior variance (0 = the day said nothing); a DoF below 0.5 is not observable, and
+        Observability 1 - posterior/prior variance (0 = the day added nothing); a DoF below 0.5 is not observable, and
         its sigma is at least the prior's.
     """
     full = covariance + np.diag(bias_floor**2)

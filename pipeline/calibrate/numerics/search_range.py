@@ -1,4 +1,4 @@
-"""How far around the prior a solver must look: as far as the prior's sigma says, at least as the config says."""
+"""How far around the prior a solver must look: by the prior's sigma, at least as far as configured."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.paper.minimise import minimise, poses_about
+from pipeline.calibrate.paper.minimise import at_border, minimise, poses_about
 from pipeline.calibrate.paper.pairwise import (
     PairProblem,
     border_failures,
@@ -69,7 +69,7 @@ def solve_joint_optimisation(
         )
         for pair, x in zip(active, found.x.reshape(-1, 6), strict=True):
             half = search_of(config).half_widths(1)
-            own = replace(found, x=x, at_border=bool(np.any(np.abs(x) > 0.98 * half)))
+            own = replace(found, x=x, at_border=at_border(x, half))
             pairs[pair] = estimate_of(problems[pair], poses_about(prior.of(pair), x[None])[0], prior, own)
     return Solution("joint-optimisation", pairs, *loop_size(pairs), failed_checks=border_failures(pairs))
 

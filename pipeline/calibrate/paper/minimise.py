@@ -15,10 +15,15 @@ from scipy.optimize import differential_evolution, minimize
 
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 
-__all__ = ["Minimum", "Search", "minimise", "poses_about"]
+__all__ = ["Minimum", "Search", "at_border", "minimise", "poses_about"]
 
 # Costs of a batch of parameter vectors: (S, D) -> (S,)
 Objective = Callable[[np.ndarray], np.ndarray]
+
+
+_BORDER = 0.98  # of the half-width: a minimum beyond it counts as at the border
+_SIMPLEX = 0.05  # edge of Nelder-Mead's first simplex, as a share of the half-width
+_EVALUATIONS_PER_PARAMETER = 150
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,7 @@ def minimise(
         updating="deferred",
         rng=rng,
     )
-    simplex = np.vstack([found.x, found.x + np.diag(0.05 * half)])
+    simplex = np.vstack([found.x, found.x + np.diag(_SIMPLEX * half)])
     finished = minimize(
         lambda x: float(counted(x[None])[0]),
         found.x,
@@ -100,12 +105,17 @@ def minimise(
             "initial_simplex": simplex,
             "xatol": 1e-5,  # 0.0006 deg, 0.01 mm
             "fatol": 1e-7,
-            "maxfev": 150 * len(start),
+            "maxfev": _EVALUATIONS_PER_PARAMETER * len(start),
             "adaptive": len(start) > 6,
         },
     )
     x = np.clip(finished.x, -half, half)
-    return Minimum(x, float(finished.fun), evaluations, bool(np.any(np.abs(x) > 0.98 * half)))
+    return Minimum(x, float(finished.fun), evaluations, at_border(x, half))
+
+
+def at_border(x: Float[np.ndarray, " D"], half_widths: Float[np.ndarray, " D"]) -> bool:
+    """Whether a minimum lies so near the border of the box that the true one may lie outside."""
+    return bool(np.any(np.abs(x) > _BORDER * half_widths))
 
 
 def _latin_hypercube(members: int, dimensions: int, rng: np.random.Generator) -> np.ndarray:

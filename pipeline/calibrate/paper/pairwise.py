@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.numerics.bias_floors import PAPER_BIAS
+from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.paper.minimise import Minimum, Search, minimise, poses_about
 from pipeline.calibrate.paper.sandwich import sandwich_covariance
@@ -160,7 +161,7 @@ def estimate_of(
         blank,
         covariance=covariance,
         observability=observability,
-        observable=observability > 0.5,
+        observable=observability > OBSERVABLE,
         diagnostics=diagnostics,
         notes=[NO_UNCERTAINTY],
     )

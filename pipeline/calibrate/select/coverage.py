@@ -1,6 +1,6 @@
-"""What a frame shows of a pair's view, cell by cell: to choose frames for information, and to say what is missing.
+"""What a frame shows of a pair's view, cell by cell: to choose frames for information, and to name what is missing.
 
-A cell is a stretch of azimuth, of elevation and of range. The hundredth edge of a cell says less than its first, so a
+A cell is a stretch of azimuth, of elevation and of range. The hundredth edge of a cell adds less than its first, so a
 set of frames is worth the sum over cells of log(1 + points); the frame that adds most comes next (submodular: greedy is
 within 1 - 1/e of the best choice, Nemhauser et al. 1978).
 """

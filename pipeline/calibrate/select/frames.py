@@ -3,7 +3,7 @@
 The paper's conditions (section 4.5.1) per pair, read as: camera-lidar needs sky, drivable area and road
 users; camera-radar needs sky, road users and dynamic radar clusters; lidar-radar needs drivable area and
 dynamic clusters; all need stamps within 5 ms. Where they leave fewer frames than a calibration takes, the
-frames that come nearest to them fill up, and the selection says so: a narrow camera may never see 20 % of
+frames that come nearest to them fill up, and the selection notes it: a narrow camera may never see 20 % of
 sky.
 
 Method `joint` does not need the paper's conditions; there they are only counted, and frames are chosen for what
@@ -63,12 +63,12 @@ def select_frames(
     Raises:
         SolveError: fewer than MIN_FRAMES frames are left for a pair.
     """
-    held = hold_out(observations, config.holdout_fraction)
+    held_out = hold_out(observations, config.holdout_fraction)
     fit, holdout, passed, rejected, notes, missing = {}, {}, {}, {}, {}, {}
     for pair in PAIRS:
         reasons = [unmet_conditions(o, pair, config, sync_gate_s) for o in observations]
         usable = [i for i, r in enumerate(reasons) if "sync" not in r and "empty" not in r]
-        candidates = [i for i in usable if held[i] is False]
+        candidates = [i for i in usable if held_out[i] is False]
         ideal = [i for i in candidates if not reasons[i]]
         contents = contents_of(observations, pair)
         chosen = choose_for_information(ideal if paper else candidates, contents, config.frames)
@@ -80,9 +80,9 @@ def select_frames(
         if len(chosen) < MIN_FRAMES:
             raise SolveError(_too_few(pair, chosen, reasons))
         fit[pair] = chosen
-        holdout[pair] = [i for i in usable if held[i] is True]
+        holdout[pair] = [i for i in usable if held_out[i] is True]
         passed[pair] = sum(1 for r in reasons if not r)
-        rejected[pair] = _count_rejected(reasons, held, chosen, paper=paper)
+        rejected[pair] = _count_rejected(reasons, held_out, chosen, paper=paper)
         notes[pair] = _notes(pair, passed[pair], [i for i in chosen if reasons[i]], len(chosen), paper=paper)
         missing[pair] = missing_content([observations[i] for i in chosen], pair)
     return Selection(fit, holdout, passed, rejected, notes, missing)
@@ -171,7 +171,7 @@ def _near(stamps: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def _count_rejected(
-    reasons: list[list[str]], held: list[bool | None], chosen: Sequence[int], *, paper: bool
+    reasons: list[list[str]], held_out: list[bool | None], chosen: Sequence[int], *, paper: bool
 ) -> dict[str, int]:
     taken = set(chosen)
     counts: Counter[str] = Counter()
@@ -181,8 +181,8 @@ def _count_rejected(
         hard = [r for r in unmet if r in ("sync", "empty")]
         if hard:
             counts[hard[0]] += 1
-        elif held[i] is not False:
-            counts["held_out" if held[i] else "next_to_held_out"] += 1
+        elif held_out[i] is not False:
+            counts["held_out" if held_out[i] else "next_to_held_out"] += 1
         elif paper and unmet:
             counts[unmet[0]] += 1
         else:

@@ -5,8 +5,8 @@ a sum over a day exceeds 1 for every calibration. A dynamic detection is a movin
 before, within the paper's 80 m: a cluster of a single scan may be noise. "The entire point cloud" is what lies in
 the image: the paper's lidar sees less than its camera, a 360 deg lidar would drown what is misplaced.
 
-What they tell on simulated days of the paper's rig: the camera's two metrics grow by half or more with 1 deg,
-the lidar's boxes with 1 deg of pitch only. The drivable metric measures how far the radar's free space falls short of
+How they react on simulated days of the paper's rig: the camera's two metrics grow by half or more with 1 deg, the
+lidar's boxes with 1 deg of pitch only. The drivable metric measures how far the radar's free space falls short of
 the lidar's (behind parked cars, 8 % to 47 %), hardly its turn; at 1 % it fires at the truth as well.
 """
 

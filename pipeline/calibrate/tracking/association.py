@@ -68,7 +68,7 @@ def associate(
 
     Args:
         shared: what reference and other sensor saw in the same frames, level axes.
-        T_other_reference: transform between the level axes, as believed.
+        T_other_reference: transform between the level axes, as estimated so far.
         rotation_sigma_rad: how uncertain its rotation is per axis.
         elevation: False where one of the two measures none.
     """
@@ -174,8 +174,8 @@ def _medians(value: np.ndarray, first: np.ndarray, count: np.ndarray) -> np.ndar
     return 0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2])
 
 
-def _along(velocity: np.ndarray, sight: np.ndarray) -> np.ndarray:
-    return np.sum(velocity * sight, axis=1) / np.maximum(np.linalg.norm(sight, axis=1), 1e-6)
+def _along(velocity: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    return np.sum(velocity * direction, axis=1) / np.maximum(np.linalg.norm(direction, axis=1), 1e-6)
 
 
 def _gathered(tracks: Sequence[Track], track: np.ndarray, row: np.ndarray) -> Track:

@@ -22,11 +22,24 @@ from pipeline.geometry.spherical import spherical_jacobian, to_spherical, wrap_a
 
 __all__ = ["AlignedBearings", "Bearings", "Consistency", "align_bearings", "consistency"]
 
-_WIDEST, _NARROWEST, _NARROWING = 12.0, 2.0, 0.7  # Geman-McClure scale in sigmas
-_POLISHING = 12
-_LEAST_SCALE, _INTRACLASS = 0.2, 0.5
+_INTRACLASS = 0.5  # correlation of sightings of one track
+_LEAST_SCALE = 0.2  # of the sightings' spread, in their stated sigmas
 _OUTLIER_WEIGHT = 0.25
 _CONFIDENCE = 0.999
+
+
+@dataclass(frozen=True)
+class _Schedule:
+    """Graduated non-convexity: Geman-McClure scale in sigmas, narrowed at each step, then kept."""
+
+    widest: float = 12.0
+    narrowest: float = 2.0
+    narrowing: float = 0.7
+    last_steps: int = 12
+    spread_steps: int = 6  # of the last ones, the first in which the sightings' spread is estimated anew
+
+
+_SCHEDULE = _Schedule()
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +87,7 @@ class AlignedBearings:
 
     T: Float[np.ndarray, "4 4"]
     covariance: Float[np.ndarray, "6 6"]  # without a bias floor; translation is the prior's
-    spread: Float[
-        np.ndarray, "3 3"
-    ]  # the part of the rotation's covariance that is known from resampling tracks
+    spread: Float[np.ndarray, "3 3"]  # part of the rotation's covariance that comes from resampling tracks
     weight: Float[np.ndarray, " N"]  # Geman-McClure, 0..1
     kept: Bool[np.ndarray, " K"]  # tracks that agree
     residual_rad: Float[np.ndarray, " A"]  # robust standard deviation of the kept sightings
@@ -113,7 +124,7 @@ def align_bearings(
     count = np.bincount(bearings.track, minlength=bearings.tracks)[bearings.track]
     share = 1 / (1 + _INTRACLASS * (count - 1))  # sightings of one track err together
     scale = np.ones(bearings.bearing_rad.shape[1])
-    c, rounds = _WIDEST, 0
+    c, rounds = _SCHEDULE.widest, 0
     while True:
         z, J = _whitened(bearings, T, scale)
         weight = _geman_mcclure(z, c)
@@ -122,13 +133,13 @@ def align_bearings(
         g = np.einsum("n,nai,na->i", share * weight, J[..., :3], z) + prior_information @ turned
         step = -np.linalg.solve(H, g)
         T = from_rotation_translation(exp_so3(step) @ T[:3, :3], T[:3, 3])
-        if c <= _NARROWEST:
+        if c <= _SCHEDULE.narrowest:
             rounds += 1
-            if rounds == _POLISHING:
+            if rounds == _SCHEDULE.last_steps:
                 break
             z, _ = _whitened(bearings, T, np.ones_like(scale))
-            scale = np.maximum(_spread(z), _LEAST_SCALE) if rounds < 6 else scale
-        c = max(c * _NARROWING, _NARROWEST)
+            scale = np.maximum(_spread(z), _LEAST_SCALE) if rounds < _SCHEDULE.spread_steps else scale
+        c = max(c * _SCHEDULE.narrowing, _SCHEDULE.narrowest)
     z, J = _whitened(bearings, T, scale)
     weight = _geman_mcclure(z, c)
     per_track = np.bincount(bearings.track, weight, minlength=bearings.tracks)
@@ -157,7 +168,7 @@ def consistency(
     n, p = int(aligned.kept.sum()), 3
     if n < 2:
         return Consistency(0.0, float("inf"))
-    # Along the axis that tells most of the turn: how much of the variance is known only from the spread of n tracks.
+    # Along the axis that contributes most to the turn: share of the variance that is estimated from n tracks' spread.
     u = np.linalg.solve(covariance, turned)
     share = float(u @ aligned.spread @ u) / max(float(u @ covariance @ u), 1e-300)
     dof = (n - 1) / max(share, 1e-3) ** 2
@@ -198,9 +209,8 @@ def _covariance(
     prior_information = np.linalg.inv(prior_covariance[:3, :3])
     rotation = bootstrap_covariance(H6[:, :3, :3], g6[:, :3], prior_information, np.arange(K), rng)
     total = H6.sum(0)
-    slope = -np.linalg.solve(
-        total[:3, :3] + prior_information, total[:3, 3:]
-    )  # turn per metre of translation error
+    # Turn [rad] per metre of translation error.
+    slope = -np.linalg.solve(total[:3, :3] + prior_information, total[:3, 3:])
     translation = prior_covariance[3:, 3:]
     covariance = prior_covariance.copy()
     covariance[:3, :3] = rotation + slope @ translation @ slope.T

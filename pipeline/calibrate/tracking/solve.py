@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.numerics.covariance import posterior
+from pipeline.calibrate.numerics.bias_floors import TRACKING_BIAS_RAD
+from pipeline.calibrate.numerics.covariance import OBSERVABLE, posterior
 from pipeline.calibrate.tracking.association import (
     Association,
     associate,
@@ -46,17 +47,13 @@ from pipeline.results import Progress, silent
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 
-__all__ = ["BIAS_FLOOR_RAD", "MIN_TRACKS", "PairTracks", "calibrate_pair", "solve_tracking"]
+__all__ = ["MIN_TRACKS", "PairTracks", "calibrate_pair", "solve_tracking"]
 
 MIN_TRACKS = 5  # pairs of tracks: fewer are no majority that could outvote a wrong one
-# What is common to all tracks: the accuracy that the authors claim. Simulated days err by 0.1-0.2 deg at the
-# targets; on the real logs (16 rings) camera elevation differs by 0.4 deg from the calibration given with them.
-BIAS_FLOOR_RAD = np.radians([0.2, 0.2, 0.2])
-_ROUNDS = 6
+_ROUNDS = 6  # of association and alignment in turns, at most
 _LEAST_ROTATION_SIGMA_RAD = np.radians(0.5)  # gate of later rounds: box against cluster, object by object
-_CAMERA_LEVEL = np.array(
-    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
-)  # optical to x forward, y left, z up
+# Optical axes to x forward, y left, z up.
+_CAMERA_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _SENSOR = {"camera_lidar": "camera", "lidar_radar": "radar"}
 _ROTATION_ONLY = "only the rotation is calibrated, as in the source; the translation keeps the prior"
 
@@ -106,7 +103,7 @@ def solve_tracking(
     failed_checks: dict[str, list[str]] = {pair: [] for pair in PAIRS}
     for k, pair in enumerate(("camera_lidar", "lidar_radar")):
         progress(1 + k, 3, pair)
-        pairs[pair] = _kept(pair, prior)
+        pairs[pair] = _unchanged(pair, prior)
         if pair not in wanted:
             pairs[pair] = replace(pairs[pair], notes=["not triggered: keeps the prior"])
             continue
@@ -253,10 +250,10 @@ def _estimate(
     frame: np.ndarray,
 ) -> PairEstimate:
     before = prior.covariance(pair)
-    floor = np.concatenate([BIAS_FLOOR_RAD, np.zeros(3)])
+    floor = np.concatenate([TRACKING_BIAS_RAD, np.zeros(3)])
     found = posterior(aligned.covariance, before, floor)
     observability = np.concatenate([found.observability[:3], np.zeros(3)])
-    test = consistency(aligned, prior.of(pair), BIAS_FLOOR_RAD)
+    test = consistency(aligned, prior.of(pair), TRACKING_BIAS_RAD)
     turned = log_so3(aligned.T[:3, :3] @ prior.of(pair)[:3, :3].T)
     inlier = aligned.kept[bearings.track]
     diagnostics = {
@@ -290,7 +287,7 @@ def _composed(camera_lidar: PairEstimate, lidar_radar: PairEstimate, prior: Prio
     observability = np.clip(1 - np.diag(covariance) / before, 0.0, 1.0)
     observability[3:] = 0.0
     return PairEstimate(
-        "camera_radar", camera_lidar.T @ lidar_radar.T, covariance, observability, observability >= 0.5,
+        "camera_radar", camera_lidar.T @ lidar_radar.T, covariance, observability, observability >= OBSERVABLE,
         min(camera_lidar.frames_used, lidar_radar.frames_used),
         notes=["composed over the lidar, the reference sensor", _ROTATION_ONLY],
     )  # fmt: skip
@@ -306,6 +303,6 @@ def _too_few(pair: str, tracks: PairTracks, paired: int) -> str:
     )
 
 
-def _kept(pair: str, prior: Prior) -> PairEstimate:
+def _unchanged(pair: str, prior: Prior) -> PairEstimate:
     """The prior, where a pair is not calibrated."""
     return PairEstimate(pair, prior.of(pair), prior.covariance(pair), np.zeros(6), np.zeros(6, bool), 0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.methods import method_named
+from pipeline.calibrate.numerics.bias_floors import TRACKING_BIAS_RAD
 from pipeline.calibrate.tracking.association import associate, shared_sightings
 from pipeline.calibrate.tracking.bearings import Bearings, align_bearings, consistency
 from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow
@@ -17,7 +18,7 @@ from pipeline.calibrate.tracking.object_tracks import (
     passes_by,
     turn_between,
 )
-from pipeline.calibrate.tracking.solve import BIAS_FLOOR_RAD, PairTracks, calibrate_pair, solve_tracking
+from pipeline.calibrate.tracking.solve import PairTracks, calibrate_pair, solve_tracking
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
@@ -212,7 +213,7 @@ def test_few_tracks_raise_the_threshold_of_the_miscalibration_test():
         bearings = replace(bearings, bearing_rad=bearings.residuals(T_LIDAR_RADAR)[0])
         aligned = align_bearings(bearings, T_LIDAR_RADAR, np.eye(6) * 1e-3, np.random.default_rng(0))
         noisy = replace(aligned, covariance=np.eye(6) * 1e-4, spread=np.eye(3) * 1e-4)
-        thresholds.append(consistency(noisy, turned_prior(), BIAS_FLOOR_RAD).threshold)
+        thresholds.append(consistency(noisy, turned_prior(), TRACKING_BIAS_RAD).threshold)
     assert thresholds[0] > 2 * thresholds[1] > 2 * 16.2  # chi^2 with 3 degrees of freedom, 99.9 %
 
 

@@ -27,7 +27,7 @@ class Schedule:
     wide_box_deg: float = 9.0
 
     # Points of edges, and of markings: with wide kernels, with sharp ones, and for the time offset's profile, which is
-    # sharp. More say the same again.
+    # sharp. More add nothing.
     wide_points: int = 8000
     sharp_points: int = 18000
     time_offset_points: int = 9000

@@ -93,8 +93,8 @@ def estimate_lidar_radar(
 
     Args:
         observations: the day's frames.
-        prior: start, and weak information; it loses weight where the data contradict it by many sigmas, and stands
-            where they say little.
+        prior: start, and weak information; it loses weight where the data contradict it by many sigmas, and decides
+            where they show little.
         T_camera_lidar: brings the camera's boxes in; None leaves roll and pitch to the registration and the prior.
         config: search range, sigma of the time offset, resampling.
         rng: picks detections and resamples.
@@ -354,7 +354,7 @@ def _with_measured_curvature(problem: RadarProblem, state: RadarState, informati
         step[k] = 0.05 * STEP_LIMIT[k]
         ahead, behind = (_gradient(problem, state.moved(s)) for s in (step, -step))
         measured[:, column] = (ahead - behind) / (2 * step[k])
-    # A standing car says nothing of dt: what is added is far below any prior.
+    # A standing car has no information on dt: what is added is far below any prior.
     L = np.linalg.cholesky(total + np.diag(1e-3 / STEP_LIMIT[dof] ** 2))
     W = np.linalg.solve(L, np.linalg.solve(L, 0.5 * (measured + measured.T)).T)
     values, vectors = np.linalg.eigh(0.5 * (W + W.T))

@@ -1,8 +1,8 @@
-"""Which frames' radar velocity cannot be believed: it decides what stands still, and where points are a moment later.
+"""Frames whose radar velocity is wrong: it decides which detections are static, and where points are a moment later.
 
-A radar finds its own velocity by what most detections agree on. Beside a convoy that is the convoy: on a simulated
-highway 18 of 67 frames were 3 to 9 m/s off, their moving vehicles taken for standing ones, and moved x by 0.2 to 1.5 m
-at a sigma of 0.09. The car's odometry knows better, and so does a direction of travel that never changes.
+A radar's own velocity is that on which most detections agree. Beside a convoy that is the convoy's: on a simulated
+highway 18 of 67 frames were 3 to 9 m/s off, their moving vehicles taken for static ones, and moved x by 0.2 to 1.5 m
+at a sigma of 0.09. The car's odometry contradicts such frames, and so does a direction of travel that never changes.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ _MOVING_MPS = 3.0
 _SIDEWAYS_MPS = (
     0.3  # of a radar 3 m ahead of the axle: 6 deg/s, 0.1 deg in 20 ms; Doppler's own noise is 0.05 m/s
 )
-# What radar and odometry may differ by: on 15 of 16 simulated days no frame was beyond .4 m/s, but for real outliers.
+# What radar and odometry may differ by: on 15 of 16 simulated days no frame was beyond .4 m/s, except for real
+# outliers.
 _DIFFERENT_MPS = 0.5
 _DIFFERENT_SHARE = 0.03  # of the speed
-_MOST = 0.5  # of the frames: more of them say that the odometry errs
+_MOST = 0.5  # of the frames: where more contradict it, the odometry is wrong
 _LEVER_M = (-1.0, 6.0)  # of a radar ahead of the rear axle
 _PASSES = 8  # of fitting lever arm and mounting in turn
 
 
 def turns_unmeasured(observations: Sequence[Observation]) -> Bool[np.ndarray, " F"]:
-    """Which frames were taken in a turn that no odometry measured.
+    """Frames taken in a turn that no odometry measured.
 
     A radar ahead of the rear axle moves sideways in a turn, by yaw rate times lever arm. Without the yaw rate neither
     the lidar's sweep nor the gap between the stamps is turned back: on a real day one such turn of eleven frames moved
@@ -41,7 +42,7 @@ def turns_unmeasured(observations: Sequence[Observation]) -> Bool[np.ndarray, " 
 
 
 def contradicts_odometry(observations: Sequence[Observation]) -> Bool[np.ndarray, " F"]:
-    """Which frames' radar velocity is none that a radar on this car can have had, by its speed or its yaw rate.
+    """Frames whose radar velocity is impossible on this car, by its speed or its yaw rate.
 
     Sideways the radar moves by yaw rate times a lever arm, the same all day; an odometer may count a constant share too
     much. What the car does not log cannot be contradicted, and an odometry that most frames contradict is itself wrong.
