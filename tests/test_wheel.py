@@ -13,7 +13,7 @@ from dockerfile_parse import DockerfileParser
 from tests.makers.loaded_libraries import foreign, loaded, tracing
 
 REPO = Path(__file__).resolve().parent.parent
-SMALL = ["--vehicles", "1", "--days", "1", "--frames", "6"]
+SMALL = ["--vehicles", "1", "--days", "1", "--frames", "12"]  # of 6 the network refuses to speak
 DOCKERFILE = REPO / "jobs" / "deploy" / "Dockerfile"
 
 
