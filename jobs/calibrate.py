@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 __all__ = ["calibrate", "parse_pair", "parse_perturb"]
 
 
+# A command's parameters are its options: more than eight, because each is one that a user sets.
 def calibrate(
     *,
     fleet: Path,

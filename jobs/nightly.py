@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["nightly", "watch_night"]
 
 
+# A command's parameters are its options: more than eight, because each is one that a user sets.
 def nightly(
     *,
     fleet: Path,

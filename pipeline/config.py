@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 from pydantic import (
     AfterValidator,
     BaseModel,
-    ConfigDict,
     Field,
     PrivateAttr,
     ValidationError,
@@ -19,37 +18,26 @@ from pydantic import (
 )
 
 from pipeline.errors import ConfigError
+from pipeline.rigs import Positive, Rig, Section
 from schemas.calibrations import METHODS
 
 __all__ = [
     "TERMS",
     "AuditConfig",
-    "CameraTopics",
-    "EgoTopics",
     "FleetConfig",
     "IngestConfig",
     "LearnConfig",
-    "LidarTopics",
-    "OnnxDrivable",
-    "OnnxPointSemantics",
-    "OnnxSemantics",
     "PerceiveConfig",
     "PrepareConfig",
-    "PriorConfig",
-    "RadarTopics",
-    "Rig",
     "SelectConfig",
     "SolveConfig",
-    "TopicSemantics",
     "TriggerConfig",
     "VerifyConfig",
     "config_hash",
     "load_fleet",
 ]
 
-Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Topic = Annotated[str, Field(pattern=r"^/\S+$")]
 Term = Literal["edges", "reflectivity", "static", "boxes", "moving", "time_offsets", "translation_prior"]
 TERMS: tuple[Term, ...] = get_args(Term)
 
@@ -63,117 +51,22 @@ def _known_method(name: str) -> str:
 MethodName = Annotated[str, AfterValidator(_known_method)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+_Kind = TypeVar("_Kind", bound=Section)
 
 
-_Kind = TypeVar("_Kind", bound=_Section)
-
-
-class TopicSemantics(_Section):
-    """Semantics that the car already logged."""
-
-    source: Literal["topics"]
-    labels: Topic
-    detections: Topic
-    label_set: Literal["cityscapes", "ade20k", "coco"] = "cityscapes"
-
-
-class OnnxSemantics(_Section):
-    """Semantics computed here by ONNX models; paths of manifests, relative to fleet.toml."""
-
-    source: Literal["onnx"]
-    segmenter: str
-    detector: str
-
-
-class CameraTopics(_Section):
-    """The camera's topics."""
-
-    image: Topic
-    info: Topic
-    semantics: Annotated[TopicSemantics | OnnxSemantics, Field(discriminator="source")]
-
-
-class OnnxPointSemantics(_Section):
-    """What lidar points are, computed here by a range-image model; path of its manifest, relative to fleet.toml."""
-
-    source: Literal["onnx"]
-    segmenter: str
-    remission_scale: Positive = 1.0  # makes logged intensity what the model was trained on
-
-
-class LidarTopics(_Section):
-    """The lidar's topic."""
-
-    points: Topic
-    # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
-    semantics: OnnxPointSemantics | None = Field(default=None, exclude=True)
-
-
-class OnnxDrivable(_Section):
-    """The radar's drivable area computed here by a network; path of its manifest, relative to fleet.toml."""
-
-    source: Literal["onnx"]
-    model: str
-
-
-class RadarTopics(_Section):
-    """The radar's topic and what its Doppler means."""
-
-    points: Topic
-    doppler_field: str = "doppler"
-    doppler_positive: Literal["approaching", "receding"] = "receding"
-    doppler_period_mps: Positive | None = None
-    azimuth_positive: Literal["left", "right"] = "left"  # RadarScan drivers differ; PointCloud2 has x y z
-    # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
-    drivable: OnnxDrivable | None = Field(default=None, exclude=True)
-
-
-class EgoTopics(_Section):
-    """Optional ego motion."""
-
-    odometry: Topic
-
-
-class PriorConfig(_Section):
-    """Where the prior comes from and how far to trust it."""
-
-    source: Literal["tf_static", "file"] = "tf_static"
-    file: str | None = None  # JSON: {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}, relative to fleet.toml
-    rotation_sigma_deg: Positive = 2.0
-    translation_sigma_m: Positive = 0.05
-
-    @model_validator(mode="after")
-    def _file_goes_with_source(self) -> PriorConfig:
-        if (self.source == "file") != (self.file is not None):
-            raise ValueError('source = "file" needs file = "...", and file needs source = "file"')
-        return self
-
-
-class Rig(_Section):
-    """One rig model; a vehicle names its rig."""
-
-    camera: CameraTopics
-    lidar: LidarTopics
-    radar: RadarTopics
-    ego: EgoTopics | None = None
-    prior: PriorConfig = PriorConfig()
-
-
-class Vehicle(_Section):
+class Vehicle(Section):
     """One vehicle."""
 
     rig: str = "default"
 
 
-class FleetSection(_Section):
+class FleetSection(Section):
     """The fleet's name."""
 
     name: str
 
 
-class IngestConfig(_Section):
+class IngestConfig(Section):
     """Synchronisation and what to keep."""
 
     sync_gate_s: Positive = 0.005  # paper, section 4.5.1
@@ -184,7 +77,7 @@ class IngestConfig(_Section):
     deskew: bool = True
 
 
-class PerceiveConfig(_Section):
+class PerceiveConfig(Section):
     """Feature extraction."""
 
     label_scale: Annotated[float, Field(gt=0, le=1)] = 0.5
@@ -199,7 +92,7 @@ class PerceiveConfig(_Section):
     detection_min_score: Fraction = 0.3
 
 
-class SelectConfig(_Section):
+class SelectConfig(Section):
     """The paper's frame selection, section 4.5.1, and how many frames a calibration takes."""
 
     frames: Annotated[int, Field(gt=0)] = 100
@@ -210,7 +103,7 @@ class SelectConfig(_Section):
     min_radar_clusters: Annotated[int, Field(ge=0)] = 3
 
 
-class TriggerConfig(_Section):
+class TriggerConfig(Section):
     """The paper's triggers, section 4.5.2."""
 
     when: Literal["always", "triggered"] = "always"
@@ -220,7 +113,7 @@ class TriggerConfig(_Section):
     drivable_outside_fraction: Fraction = 0.01
 
 
-class SolveConfig(_Section):
+class SolveConfig(Section):
     """Search range and effort; `paper_*` steer the paper's DE and Nelder-Mead."""
 
     search_rotation_deg: Positive = 6.0
@@ -248,7 +141,7 @@ class SolveConfig(_Section):
         return self
 
 
-class PrepareConfig(_Section):
+class PrepareConfig(Section):
     """Training data: the camera's grid, how much of each cloud, and how frames are split."""
 
     grid_step_deg: Annotated[float, Field(ge=0.1, le=0.5)] = 0.4
@@ -292,7 +185,7 @@ class PrepareConfig(_Section):
         return height, width
 
 
-class VerifyConfig(_Section):
+class VerifyConfig(Section):
     """What an accepted calibration must be good for, and from where on a check of a pair fails.
 
     Limits are of the errors of azimuth and elevation at targets 15 to 40 m away. The thresholds below them were chosen
@@ -331,23 +224,25 @@ class VerifyConfig(_Section):
     max_heading_error_share: Fraction = 0.25
 
 
-class LearnConfig(_Section):
+class LearnConfig(Section):
     """Networks of the methods `joint-ssl` and `pairwise-ssl`; left out: those that come with Boresight."""
 
     model: str | None = None  # ONNX file of the joint network, relative to fleet.toml
-    pairwise_models: dict[Literal["camera_lidar", "camera_radar", "lidar_radar"], str] = {}
+    pairwise_models: dict[Literal["camera_lidar", "camera_radar", "lidar_radar"], str] = Field(
+        default_factory=dict
+    )
     iterations: Annotated[int, Field(ge=1, le=5)] = 3  # passes per frame, each rendered at the one before
     threads: Annotated[int, Field(ge=1)] = 1
 
 
-class AuditConfig(_Section):
+class AuditConfig(Section):
     """Control charts."""
 
     method: MethodName = "joint"
     false_alarms_per_1000_vehicle_days: Positive = 1.0
     baseline_days: Annotated[int, Field(gt=0)] = 2  # a chart says nothing until it has one day more than this
     held_sigma_factor: Annotated[float, Field(ge=1)] = (
-        2.0  # days that no held-out frame vouched for weigh less
+        2.0  # held days weigh less: held-out frames did not confirm them
     )
     window_days: Annotated[int, Field(gt=2)] = 28  # audited days where the command names no first day
     camera_lidar_limit_deg: Positive = 0.1
@@ -355,12 +250,12 @@ class AuditConfig(_Section):
     translation_limit_m: Positive = 0.05
 
 
-class FleetConfig(_Section):
+class FleetConfig(Section):
     """The whole of fleet.toml, and which file it was read from: paths in it are relative to that file."""
 
     fleet: FleetSection
     rigs: dict[str, Rig]
-    vehicles: dict[str, Vehicle] = {}
+    vehicles: dict[str, Vehicle] = Field(default_factory=dict)
     ingest: IngestConfig = IngestConfig()
     perceive: PerceiveConfig = PerceiveConfig()
     select: SelectConfig = SelectConfig()
@@ -408,7 +303,7 @@ class FleetConfig(_Section):
         new: dict[str, Any] = {}
         for name, values in sections.items():
             section = getattr(self, name, None)
-            if not isinstance(section, _Section):
+            if not isinstance(section, Section):
                 raise ConfigError(str(self._file), name, "no such section")
             # Not through a dump: it would leave out what is no part of a work key (`exclude`).
             kept = {key: getattr(section, key) for key in type(section).model_fields}

@@ -3,8 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import PriorConfig, config_hash, load_fleet
+from pipeline.config import config_hash, load_fleet
 from pipeline.errors import ConfigError
+from pipeline.rigs import PriorConfig
 from tests.makers.fleet_files import fleet_toml
 
 GOOD = fleet_toml("car-1")

@@ -14,7 +14,7 @@ from pipeline.stages import STAGES
 
 REPO = Path(__file__).resolve().parent.parent
 LAYERS = ("schemas", "pipeline", "jobs")
-FOUNDATIONS = {"config", "errors", "results", "geometry", "store", "objective", "extrinsics", "work"}
+FOUNDATIONS = {"config", "errors", "results", "geometry", "store", "objective", "extrinsics", "rigs", "work"}
 # Folders of commands.
 ROOMS = {"ingest", "perceive", "calibrate", "evaluate", "audit", "report", "fleet", "simulate", "learn"}
 # Beside the rooms: the table of contents, which knows them all, and what runs a stage of it.

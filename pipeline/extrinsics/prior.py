@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.config import FleetConfig, PriorConfig
+from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import from_quaternion, inverse, log_se3, perturb_exactly
+from pipeline.rigs import PriorConfig
 from schemas.observations import Observation
 
 __all__ = ["logged_prior", "perturbed", "prior_key", "read_prior", "read_transforms"]

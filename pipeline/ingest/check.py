@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.config import FleetConfig, IngestConfig, OnnxSemantics, Rig
+from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected
@@ -18,6 +18,7 @@ from pipeline.ingest.index import ACCEPTED_TYPES, DayIndex, index_logs, topics_o
 from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
 from pipeline.ingest.stage import pick_trios, read_file_prior
 from pipeline.results import Progress, silent
+from pipeline.rigs import OnnxSemantics, Rig
 from schemas.frames import Frame
 
 __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs", "doppler_speed"]

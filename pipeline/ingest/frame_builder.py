@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.config import IngestConfig, Rig
+from pipeline.config import IngestConfig
 from pipeline.errors import LogError
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import to_quaternion
@@ -22,6 +22,7 @@ from pipeline.ingest.messages.odometry import EgoState
 from pipeline.ingest.messages.point_cloud import LidarCloud, read_lidar
 from pipeline.ingest.messages.radar import RadarCloud, read_radar
 from pipeline.ingest.sync import Rejection
+from pipeline.rigs import Rig
 from schemas.frames import Frame
 
 __all__ = ["FrameBuilder", "Rejected", "Trio"]

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from pipeline.config import Rig, TopicSemantics
 from pipeline.errors import LogError
 from pipeline.geometry.cameras import Camera
 from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
@@ -18,6 +17,7 @@ from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stam
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.messages.transforms import TransformTree
+from pipeline.rigs import Rig, TopicSemantics
 
 __all__ = ["ACCEPTED_TYPES", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]
 

@@ -8,7 +8,7 @@ from collections.abc import Generator, Iterator
 import numpy as np
 from jaxtyping import Int64
 
-from pipeline.config import FleetConfig, IngestConfig, Rig
+from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError
 from pipeline.extrinsics.prior import read_transforms
 from pipeline.ingest.containers.reader import content_identity
@@ -16,6 +16,7 @@ from pipeline.ingest.frame_builder import FrameBuilder, Rejected, Trio
 from pipeline.ingest.index import DayIndex, index_logs, topics_of
 from pipeline.ingest.sync import Rejection, match_nearest, match_trios, number_drives
 from pipeline.results import Progress
+from pipeline.rigs import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.frames import Frame
 

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from pipeline.config import PerceiveConfig, TopicSemantics
+from pipeline.config import PerceiveConfig
 from pipeline.perceive.labels import ROAD_ID, SKY_ID, road_user_name, to_cityscapes
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
+from pipeline.rigs import TopicSemantics
 from schemas.frames import Frame
 
 __all__ = [

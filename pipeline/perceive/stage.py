@@ -9,14 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config import (
-    FleetConfig,
-    LidarTopics,
-    OnnxSemantics,
-    PerceiveConfig,
-    RadarTopics,
-    TopicSemantics,
-)
+from pipeline.config import FleetConfig, PerceiveConfig
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.radar_grid import Scan
 from pipeline.perceive.camera import SemanticsSource, TopicSource, decode_grey, encode_png
@@ -29,6 +22,7 @@ from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_unifo
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
 from pipeline.perceive.road_markings import lidar_markings, road_contrast
 from pipeline.perceive.tracks import EgoMotion, Tracks, TrackState, advance_tracks, measure_clusters
+from pipeline.rigs import LidarTopics, OnnxSemantics, RadarTopics, TopicSemantics
 from pipeline.store.tables import iterate_rows
 from pipeline.work import Run, Task, Work
 from schemas.frames import FRAMES, Frame

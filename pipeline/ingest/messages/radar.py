@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.config import RadarTopics
 from pipeline.ingest.messages.point_cloud import cloud_columns, first_field
+from pipeline.rigs import RadarTopics
 
 __all__ = ["RadarCloud", "read_radar"]
 

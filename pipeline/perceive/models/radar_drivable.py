@@ -14,12 +14,13 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipeline.config import FleetConfig, OnnxDrivable
+from pipeline.config import FleetConfig
 from pipeline.errors import ModelError
 from pipeline.geometry.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, grid_layout, sector_of
 from pipeline.perceive.drivable import FreeSector
 from pipeline.perceive.models.manifest import check_hash, read_manifest
 from pipeline.perceive.models.session import open_session
+from pipeline.rigs import OnnxDrivable
 
 __all__ = ["RadarDrivable"]
 

@@ -35,12 +35,13 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pipeline.config import FleetConfig, OnnxPointSemantics
+from pipeline.config import FleetConfig
 from pipeline.errors import ModelError
 from pipeline.geometry.range_image import EMPTY, channels_of, project, vote_of_neighbours
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.manifest import check_hash, read_manifest
 from pipeline.perceive.models.session import open_session
+from pipeline.rigs import OnnxPointSemantics
 
 __all__ = ["POINT_LABEL_SETS", "RangeImageManifest", "RangeImageSegmenter"]
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.config import FleetConfig, OnnxSemantics, PerceiveConfig
+from pipeline.config import FleetConfig, PerceiveConfig
 from pipeline.perceive.camera import CameraSemantics, decode_colour, label_size
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import Manifest, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
+from pipeline.rigs import OnnxSemantics
 from schemas.frames import Frame
 
 __all__ = ["ModelSource"]

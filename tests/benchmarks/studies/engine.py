@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.stage import calibrate_observations
-from pipeline.config import FleetConfig, PriorConfig, SolveConfig
+from pipeline.config import FleetConfig, SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import logged_prior, perturbed
@@ -31,6 +31,7 @@ from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.geometry.targets import loop_errors
 from pipeline.learn.perception.radar_drivable.samples import scan_of
 from pipeline.perceive.models.radar_drivable import RadarDrivable
+from pipeline.rigs import PriorConfig
 from pipeline.store.partitions import Partition
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation

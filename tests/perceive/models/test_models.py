@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.config import OnnxSemantics, load_fleet
+from pipeline.config import load_fleet
 from pipeline.errors import ModelError
 from pipeline.perceive.models.detector import Candidates, Detector, decode_head, suppress
 from pipeline.perceive.models.manifest import InputSpec, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
 from pipeline.perceive.models.session import Fit, fit_image
 from pipeline.perceive.models.source import ModelSource
+from pipeline.rigs import OnnxSemantics
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.onnx_models import save_constant, save_segmenter, write_manifest
 

@@ -1,0 +1,122 @@
+"""What fleet.toml says of a rig: topics of its sensors, what its radar's numbers mean, where its prior comes from."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+__all__ = [
+    "CameraTopics",
+    "EgoTopics",
+    "LidarTopics",
+    "OnnxDrivable",
+    "OnnxPointSemantics",
+    "OnnxSemantics",
+    "Positive",
+    "PriorConfig",
+    "RadarTopics",
+    "Rig",
+    "Section",
+    "TopicSemantics",
+]
+
+Positive = Annotated[float, Field(gt=0)]
+Topic = Annotated[str, Field(pattern=r"^/\S+$")]
+
+
+class Section(BaseModel):
+    """A section of fleet.toml: unknown keys, nan and inf are errors, and nothing changes after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class TopicSemantics(Section):
+    """Semantics that the car already logged."""
+
+    source: Literal["topics"]
+    labels: Topic
+    detections: Topic
+    label_set: Literal["cityscapes", "ade20k", "coco"] = "cityscapes"
+
+
+class OnnxSemantics(Section):
+    """Semantics computed here by ONNX models; paths of manifests, relative to fleet.toml."""
+
+    source: Literal["onnx"]
+    segmenter: str
+    detector: str
+
+
+class CameraTopics(Section):
+    """The camera's topics."""
+
+    image: Topic
+    info: Topic
+    semantics: Annotated[TopicSemantics | OnnxSemantics, Field(discriminator="source")]
+
+
+class OnnxPointSemantics(Section):
+    """What lidar points are, computed here by a range-image model; path of its manifest, relative to fleet.toml."""
+
+    source: Literal["onnx"]
+    segmenter: str
+    remission_scale: Positive = 1.0  # makes logged intensity what the model was trained on
+
+
+class LidarTopics(Section):
+    """The lidar's topic."""
+
+    points: Topic
+    # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
+    semantics: OnnxPointSemantics | None = Field(default=None, exclude=True)
+
+
+class OnnxDrivable(Section):
+    """The radar's drivable area computed here by a network; path of its manifest, relative to fleet.toml."""
+
+    source: Literal["onnx"]
+    model: str
+
+
+class RadarTopics(Section):
+    """The radar's topic and what its Doppler means."""
+
+    points: Topic
+    doppler_field: str = "doppler"
+    doppler_positive: Literal["approaching", "receding"] = "receding"
+    doppler_period_mps: Positive | None = None
+    azimuth_positive: Literal["left", "right"] = "left"  # RadarScan drivers differ; PointCloud2 has x y z
+    # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
+    drivable: OnnxDrivable | None = Field(default=None, exclude=True)
+
+
+class EgoTopics(Section):
+    """Optional ego motion."""
+
+    odometry: Topic
+
+
+class PriorConfig(Section):
+    """Where the prior comes from and how far to trust it."""
+
+    source: Literal["tf_static", "file"] = "tf_static"
+    file: str | None = None  # JSON: {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}, relative to fleet.toml
+    rotation_sigma_deg: Positive = 2.0
+    translation_sigma_m: Positive = 0.05
+
+    @model_validator(mode="after")
+    def _file_goes_with_source(self) -> PriorConfig:
+        if (self.source == "file") != (self.file is not None):
+            raise ValueError('source = "file" needs file = "...", and file needs source = "file"')
+        return self
+
+
+class Rig(Section):
+    """One rig model; a vehicle names its rig."""
+
+    camera: CameraTopics
+    lidar: LidarTopics
+    radar: RadarTopics
+    ego: EgoTopics | None = None
+    prior: PriorConfig = PriorConfig()
