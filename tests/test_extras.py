@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from jobs.cli import COMMANDS
 
@@ -39,7 +40,7 @@ CALLS = {
 def declared(*extras):
     """Import names of what `pip install boresight[extras]` asks for."""
     wanted = [*PROJECT["dependencies"], *(d for e in extras for d in PROJECT["optional-dependencies"][e])]
-    names = {d.split("=")[0].split("[")[0] for d in wanted}
+    names = {Requirement(d).name for d in wanted}
     called = {distribution: name for name, distribution in DISTRIBUTION_OF.items()}
     return {called.get(n, n.replace("-", "_")) for n in names}
 

@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 REPO = Path(__file__).resolve().parent.parent
 PACKAGES = ("jobs", "pipeline", "schemas")
@@ -55,7 +56,7 @@ def test_every_dependency_is_pinned_to_what_was_tested():
     project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"].values()
     wanted = [*project["dependencies"], *(name for extra in extras for name in extra)]
-    names = {w.split("=")[0].split("[")[0].lower() for w in wanted} - {"boresight"}
+    names = {Requirement(w).name.lower() for w in wanted} - {"boresight"}
     lines = (REPO / "constraints.txt").read_text().splitlines()
     pinned = {line.split("==")[0].lower() for line in lines if "==" in line and not line.startswith("#")}
     assert names <= pinned, names - pinned
