@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, scales
-from pipeline.calibrate.joint.lidar_radar.normal_equations import OUTLIER
+from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY
 from pipeline.calibrate.numerics.response_surface import DESIGN
 from pipeline.calibrate.paper.minimise import poses_about
 from pipeline.objective.camera_lidar.score import KernelSettings, lidar_velocities, prepare_terms
@@ -77,7 +77,7 @@ def test_the_registration_is_many_times_as_fast_as_numpy(day, gate):
     rows, truth = day
     T = truth["lidar_radar"]
     frames = registration_frames(rows, T, np.random.default_rng(0))
-    how = (frames, T, 0.005, SIGMA_START, BOUNCE_PRIOR, OUTLIER)
+    how = (frames, T, 0.005, SIGMA_START, BOUNCE_PRIOR, OUTLIER_DENSITY)
     ours, plain = normal_equations(*how), numpy_objectives.registration(*how)
     for a, b in zip((ours.H, ours.g, ours.information, ours.cost), plain, strict=True):
         assert np.abs(b).max() > 0.1

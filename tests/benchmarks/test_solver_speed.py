@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
-from pipeline.calibrate.joint.lidar_radar.normal_equations import OUTLIER
 from pipeline.calibrate.joint.solve import solve_joint
+from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY
 from pipeline.calibrate.paper.pairwise import solve_pairwise
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
@@ -57,7 +57,7 @@ def test_a_joint_day_costs_a_fraction_of_scipy_on_numpy(day, gate):
 
     def registration():
         T, sigma = prior.T_lidar_radar, SIGMA_START
-        return numpy_objectives.registration_cost(frames, T, 0.0, sigma, BOUNCE_PRIOR, OUTLIER)
+        return numpy_objectives.registration_cost(frames, T, 0.0, sigma, BOUNCE_PRIOR, OUTLIER_DENSITY)
 
     score_s, registration_s, joint_s = best_cpu_s(
         ROUNDS,
