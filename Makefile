@@ -43,8 +43,8 @@ bench: setup ## speed and memory, measured as ratios against the committed basel
 bench-accept: setup ## the same, and writes what it measures into the baseline
 	$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks -p no:xdist -s --accept-baseline
 
-licenses: setup ## write THIRD_PARTY_LICENSES.md anew
-	$(BIN)/python -m tests.makers.third_party > THIRD_PARTY_LICENSES.md
+licenses: setup ## write jobs/deploy/THIRD_PARTY_LICENSES.md anew
+	$(BIN)/python -m tests.makers.third_party > jobs/deploy/THIRD_PARTY_LICENSES.md
 
 clean: ## remove what the other targets made
 	rm -rf .venv demo .pytest_cache .mypy_cache .ruff_cache

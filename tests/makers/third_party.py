@@ -1,6 +1,6 @@
 """Every distribution that `pip install 'boresight[simulate,train]'` brings, with its licence (by pip-licenses).
 
-python -m tests.makers.third_party    prints THIRD_PARTY_LICENSES.md (`make licenses`)
+python -m tests.makers.third_party    prints jobs/deploy/THIRD_PARTY_LICENSES.md (`make licenses`)
 """
 
 import json

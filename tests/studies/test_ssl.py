@@ -165,7 +165,7 @@ def day_line(pair_error, sigma, observable=(1,) * 6, **more):
 
 
 def test_the_bias_that_sigmas_lack_is_found():
-    """Errors of .3 deg about a sigma that allows for `BIAS_SIGMA` and .1 deg of scatter."""
+    """Errors of 0.3 deg about a sigma that allows for `BIAS_SIGMA` and 0.1 deg of scatter."""
     rng = np.random.default_rng(0)
     bias = np.array(BIAS_SIGMA["camera_lidar"])
     scatter = np.radians(0.1)

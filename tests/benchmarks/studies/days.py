@@ -2,10 +2,11 @@
 
     python tests/benchmarks/studies/days.py generate --root DAYS --sets table1 coverage verdict offsets
     python tests/benchmarks/studies/days.py adopt --root DAYS --fleet astyx.toml --lake LAKE --vehicle V --day D
+    python tests/benchmarks/studies/days.py gather --root DAYS --sets dev --out FLEET
 
 Of a day only its truth, its fleet.toml and its observations stay on the disk; days that are there are not made again.
 `adopt` puts a real day, ingested and perceived, beside them: its logged calibration stands in for the truth that nobody
-knows.
+knows. `gather` makes one fleet of the days of some sets, each a vehicle of its own, for a command that learns from a lake.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import json
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -23,6 +25,8 @@ from pipeline.config import FleetConfig, load_fleet
 from pipeline.extrinsics.prior import read_prior
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
+from pipeline.simulate.logs.fleet_toml import fleet_toml
+from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
 from schemas.calibrations import PAIRS
@@ -117,6 +121,18 @@ def adopt_day(fleet_file: Path, lake: str, partition: Partition, root: Path) -> 
     return folder
 
 
+def gather_days(specs: Sequence[DaySpec], root: Path, out: Path) -> Path:
+    """Observations of generated days of one rig as a fleet of their own: FLEET/fleet.toml and FLEET/lake."""
+    [rig] = {spec.rig for spec in specs}
+    for spec in specs:
+        source = Lake.at(root / spec.name / "lake").folder(OBSERVATIONS.name, Partition(VEHICLE, DATE))
+        target = Lake.at(out / "lake").folder(OBSERVATIONS.name, Partition(spec.name, DATE))
+        shutil.copytree(source, target, dirs_exist_ok=True)
+    path = out / "fleet.toml"
+    path.write_text(fleet_toml("gathered", rig, rig_named(rig), [spec.name for spec in specs]))
+    return path
+
+
 def load_day(spec: DaySpec, root: Path) -> Day:
     """Observations, truth and configuration of a generated (or adopted) day."""
     folder = root / spec.name
@@ -195,12 +211,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("command", choices=["generate", "adopt"])
+    parser.add_argument("command", choices=["generate", "adopt", "gather"])
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     parser.add_argument(
         "--shard", default="0/1", help="I/N: every N-th day from the I-th, for N commands at once"
     )
+    parser.add_argument("--out", type=Path, help="folder of the gathered fleet")
     parser.add_argument("--fleet", type=Path)
     parser.add_argument("--lake")
     parser.add_argument("--vehicle")
@@ -208,6 +225,9 @@ def main() -> None:
     args = parser.parse_args()
     if args.command == "adopt":
         print(adopt_day(args.fleet, args.lake, Partition(args.vehicle, args.day), args.root))
+        return
+    if args.command == "gather":
+        print(gather_days([spec for name in args.sets for spec in SETS[name]], args.root, args.out))
         return
     shard, shards = (int(v) for v in args.shard.split("/"))
     for name in args.sets:

@@ -3,10 +3,10 @@
     boresight train --data LAKE --out TUNED --config tests/benchmarks/studies/ssl_recipes/real.toml --start-from RUN
     python -m tests.benchmarks.studies.ssl_real --data LAKE --runs before=RUN after=TUNED
 
-Held-out frames of table training, of places that no other side has, are started 2 deg / .1 m off the logs'
+Held-out frames of table training, of places that no other side has, are started 2 deg / 0.1 m off the logs'
 own calibration, each by a draw of its own. Alignment is the weighted sum that training descends, at the starts, at the
 networks' answers and at the logs' own calibration, which nobody trained on; distances are to that calibration, itself
-good to about .2 deg.
+good to about 0.2 deg.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Study: the paper's Table 1 on simulated days: four methods on the same ten days from the same priors.
 
     python tests/benchmarks/studies/days.py generate --root DAYS --sets table1 one-clock
+    python tests/benchmarks/studies/days.py gather --root DAYS --sets dev --out FLEET
     boresight train-radar-drivable --fleet FLEET/fleet.toml --lake FLEET/lake --out DAYS/radar_drivable
     python tests/benchmarks/studies/table1.py --root DAYS --workers 2
     python tests/benchmarks/studies/table1.py --root DAYS --workers 2 --days one-clock

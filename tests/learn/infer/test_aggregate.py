@@ -125,7 +125,7 @@ def targets_deg(estimate, x, pair="camera_lidar"):
 
 
 def test_a_wrong_translation_of_the_network_turns_nothing_that_is_seen():
-    """It puts the lidar .3 m to the right, turns it back by .3 m over 25 m, and sees everything where it is."""
+    """It puts the lidar 0.3 m to the right, turns it back by 0.3 m over 25 m, and sees everything where it is."""
     rng = np.random.default_rng(12)
     aside = np.array([0.0, -0.3 / 25, 0.0, 0.3, 0.0, 0.0])
     answers = day(rng, np.zeros((6, 6)), np.zeros(6), count=40, blocks=8)

@@ -23,7 +23,7 @@ def test_bfloat16_is_near_float32_but_not_it_and_goes_in_and_out_as_float32(enco
     assert rounded.dtype == torch.float32
     assert all(p.dtype == torch.float32 for p in half.parameters())
     difference = (plain - rounded).abs().max() / plain.abs().max()
-    assert 1e-5 < difference < 0.05  # eight bits: .4 % a layer
+    assert 1e-5 < difference < 0.05  # eight bits: 0.4 % a layer
     for one in (encoder, half):
         one(image).square().mean().backward()
     # The direction of a step, not each weight: where thousands of pixels cancel, little is left to compare.

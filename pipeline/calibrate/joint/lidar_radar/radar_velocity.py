@@ -21,7 +21,7 @@ _MOVING_MPS = 3.0
 _SIDEWAYS_MPS = (
     0.3  # of a radar 3 m ahead of the axle: 6 deg/s, 0.1 deg in 20 ms; Doppler's own noise is 0.05 m/s
 )
-# What radar and odometry may differ by: on 15 of 16 simulated days no frame was beyond .4 m/s, except for real
+# What radar and odometry may differ by: on 15 of 16 simulated days no frame was beyond 0.4 m/s, except for real
 # outliers.
 _DIFFERENT_MPS = 0.5
 _DIFFERENT_SHARE = 0.03  # of the speed
