@@ -37,6 +37,15 @@ def real_detector() -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def real_segmenter() -> Path:
+    """The real third-party ONNX segmenter that made the logged labels."""
+    path = SHARED / "models" / "espnetv2_city.onnx"
+    if not path.is_file():
+        pytest.skip("the real segmenter is not on this machine")
+    return path
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say last, and without being asked, which tests were left out and how to have them."""

@@ -1,22 +1,7 @@
 """Model manifests: a small TOML file beside each ONNX file says what goes in and what comes out.
 
-It also holds the hash of the one file that it describes.
-
-```toml
-path = "yolox_nano.onnx"          # relative to the manifest
-sha256 = "..."
-task = "detect"                   # or "segment"
-[input]
-size = [416, 416]                 # rows, columns
-mean = [0.0, 0.0, 0.0]            # in the order of `colour`, on the scale of `scale`
-std = [1.0, 1.0, 1.0]
-scale = 1.0                       # pixel values are multiplied by it first (0.00392156862745098 for 0..1)
-colour = "bgr"                    # or "rgb"
-fit = "letterbox_top_left"        # or "letterbox_centre", "stretch"
-pad = 114.0
-tile_scales = [0.625, 0.25]       # optional, detect only: run on overlapping tiles of the image at these
-sizes [output] layout = "yolox"                  # "yolov5" (objectness x class), "yolov8" (classes only,
-transposed), "logits", "labels" label_set = "coco" ```
+It also holds the hash of the one file that it describes. Whole examples, for a detector and a segmenter:
+`pipeline/perceive/README.md`.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@
 
 Of a day only its truth, its fleet.toml and its observations stay on the disk; days that are there are not made again.
 `adopt` puts a real day, ingested and perceived, beside them: its logged calibration stands in for the truth that nobody
-knows. `gather` makes one fleet of the days of some sets, each a vehicle of its own, for commands that learn from a lake.
+knows. `gather` makes one fleet of the days of some sets, each a vehicle, for commands that learn from a lake.
 """
 
 from __future__ import annotations
