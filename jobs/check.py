@@ -29,6 +29,7 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.ingest.check import check_logs
+    from pipeline.perceive.models.source import check_models
 
     config = load_fleet(fleet)
     name = rig or (next(iter(config.rigs)) if len(config.rigs) == 1 else "default")
@@ -36,6 +37,7 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
         raise ConfigError(
             str(fleet), "rigs", f"no rig {name!r}; name one of {sorted(config.rigs)} with --rig"
         )
+    check_models(config.rigs[name], config)
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log")
     with progress_reporter("check") as progress:

@@ -35,9 +35,12 @@ def show(
         json: print a JSON list and nothing else: oldest record first, names as the columns, and for
             calibrations "T", the 4x4 row-major T_parent_child (null where the day was refused).
     """
+    from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake
 
     tables = Lake.at(lake)
+    if not tables.root.is_dir():
+        raise ConfigError("command line", "lake", f"no such folder: {lake}")
     if table in ("frames", "observations"):
         rows = _partitions(tables, table, vehicle, day)
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 import tomllib
@@ -339,10 +340,34 @@ def _validated(kind: type[_Kind], values: dict[str, Any], file: Path, *above: st
         return kind.model_validate(values)
     except ValidationError as err:
         problems = [
-            (".".join(map(str, (*above, *p["loc"]))), p["msg"]) for p in err.errors(include_url=False)
+            (".".join(map(str, (*above, *p["loc"]))), _unknown_key(p["loc"][-1]) or p["msg"])
+            if p["type"] == "extra_forbidden"
+            else (".".join(map(str, (*above, *p["loc"]))), p["msg"])
+            for p in err.errors(include_url=False)
         ]
-        text = "; ".join(f"{key}: {said}" for key, said in problems)
-        raise ConfigError(str(file), problems[0][0], text) from err
+        (key, first), *others = problems
+        text = "; ".join([first, *(f"{other}: {said}" for other, said in others)])
+        raise ConfigError(str(file), key, text) from err
+
+
+def _unknown_key(key: str | int) -> str:
+    """What to say of a key that no section has: the nearest one that some section has."""
+    known = {name for kind in _kinds(FleetConfig, set()) for name in kind.model_fields}
+    near = difflib.get_close_matches(str(key), known, n=1)
+    return f"unknown key; did you mean {near[0]!r}?" if near else "unknown key"
+
+
+def _kinds(annotation: Any, seen: set[type[BaseModel]]) -> set[type[BaseModel]]:
+    """All sections that an annotation reaches."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        if annotation not in seen:
+            seen.add(annotation)
+            for field in annotation.model_fields.values():
+                _kinds(field.annotation, seen)
+    else:
+        for part in get_args(annotation):
+            _kinds(part, seen)
+    return seen
 
 
 def config_hash(*sections: BaseModel | dict[str, Any]) -> str:

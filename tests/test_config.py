@@ -51,6 +51,13 @@ def test_what_cannot_be_right_is_refused_by_the_name_of_its_key(change, key, tmp
     assert caught.value.exit_code == 2
 
 
+def test_a_mistyped_key_is_named_once_and_with_the_key_that_was_meant(tmp_path):
+    text = GOOD.replace('points = "/radar/points"', 'points = "/radar/points"\ndoppler_period_mp = 10')
+    with pytest.raises(ConfigError, match="unknown key; did you mean 'doppler_period_mps'") as caught:
+        load(tmp_path, text)
+    assert str(caught.value).count("doppler_period_mp:") == 1
+
+
 @pytest.mark.parametrize("text", ["not toml [", "\x00"])
 def test_a_file_that_is_no_toml_is_named(text, tmp_path):
     with pytest.raises(ConfigError, match="not a TOML file"):

@@ -22,7 +22,7 @@ from pipeline.ingest.messages.odometry import EgoState
 from pipeline.ingest.messages.point_cloud import LidarCloud, read_lidar
 from pipeline.ingest.messages.radar import RadarCloud, read_radar
 from pipeline.ingest.sync import Rejection
-from pipeline.rigs import Rig
+from pipeline.rigs import Rig, TopicSemantics
 from schemas.frames import Frame
 
 __all__ = ["FrameBuilder", "Rejected", "Trio"]
@@ -58,6 +58,8 @@ class FrameBuilder:
         self, index: DayIndex, rig: Rig, ingest: IngestConfig, file_prior: _Prior | None = None
     ) -> None:
         self._index, self._rig, self._ingest, self._file_prior = index, rig, ingest, file_prior
+        # Where models compute semantics later, frames without logged ones lack nothing.
+        self._logged_semantics = int(isinstance(rig.camera.semantics, TopicSemantics))
         self._priors: dict[tuple[int, str, str, str], dict[str, float | None]] = {}
         self.counts: Counter[str] = Counter()
         self.frame_ids: dict[str, list[str]] = {}
@@ -158,7 +160,7 @@ class FrameBuilder:
 
     def _labels(self, trio: Trio) -> bytes | None:
         if trio.labels is None:
-            self.counts["frames_without_labels"] += 1
+            self.counts["frames_without_labels"] += self._logged_semantics
             return None
         try:
             return label_image(self._message(self._located("labels", trio.labels))[0])
@@ -169,7 +171,7 @@ class FrameBuilder:
 
     def _detections(self, trio: Trio) -> tuple[np.ndarray | None, list[str] | None, np.ndarray | None]:
         if trio.detections is None:
-            self.counts["frames_without_detections"] += 1
+            self.counts["frames_without_detections"] += self._logged_semantics
             return None, None, None
         try:
             boxes, classes, scores, dropped = read_detections(

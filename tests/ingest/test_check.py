@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ConfigError
+from jobs.check import check
+from pipeline.errors import ConfigError, ModelError
 from pipeline.ingest.check import check_logs, doppler_speed
 from pipeline.ingest.readiness import Evidence, judge, overall
+from tests.makers.fleet_files import fleet_toml
 
 GOOD = Evidence(
     frames=120,
@@ -144,3 +146,17 @@ def test_unusable_logs_are_a_no_and_missing_ones_a_mistake(kit, tmp_path):
     assert report.problems
     with pytest.raises(ConfigError, match="no such file"):
         check_logs([tmp_path / "none.mcap"], config.rigs["default"], config)
+
+
+def test_a_model_that_is_not_what_its_manifest_means_stops_the_check(tmp_path):
+    (tmp_path / "model.onnx").write_bytes(b"another")
+    (tmp_path / "m.toml").write_text(
+        f'path = "model.onnx"\nsha256 = "{"0" * 64}"\ntask = "segment"\n[input]\nsize = [32, 32]\n'
+        '[output]\nlayout = "logits"\nlabel_set = "cityscapes"\n'
+    )
+    text = fleet_toml("car-1")
+    line = next(line for line in text.splitlines() if line.startswith("semantics"))
+    onnx = 'semantics = { source = "onnx", segmenter = "m.toml", detector = "m.toml" }'
+    (tmp_path / "fleet.toml").write_text(text.replace(line, onnx))
+    with pytest.raises(ModelError, match=r"m\.toml.*sha256"):
+        check(tmp_path / "fleet.toml", tmp_path / "log.mcap")

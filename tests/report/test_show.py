@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jobs.show import show
+from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_records
@@ -57,10 +58,16 @@ def test_filters_choose_vehicle_day_and_method(lake: Path, capsys: pytest.Captur
 
 def test_a_lake_without_records_is_an_empty_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for table in ("calibrations", "drift", "frames", "observations"):
-        assert show(table, lake=str(tmp_path / "none"), json=True) == 0
+        assert show(table, lake=str(tmp_path), json=True) == 0
         assert json.loads(capsys.readouterr().out) == []
-        assert show(table, lake=str(tmp_path / "none")) == 0
-        assert capsys.readouterr().out == f"{table}: nothing of this choice in {tmp_path / 'none'}\n"
+        assert show(table, lake=str(tmp_path)) == 0
+        assert capsys.readouterr().out == f"{table}: nothing of this choice in {tmp_path}\n"
+
+
+def test_a_lake_that_is_not_there_is_a_usage_error_and_not_an_empty_fleet(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no such folder") as caught:
+        show("calibrations", lake=str(tmp_path / "lkae"), json=True)
+    assert caught.value.exit_code == 2
 
 
 def test_the_table_for_people_names_status_and_reason(lake: Path, capsys: pytest.CaptureFixture[str]) -> None:

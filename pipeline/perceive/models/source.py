@@ -9,10 +9,21 @@ from pipeline.perceive.camera import CameraSemantics, decode_colour, label_size
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import Manifest, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
-from pipeline.rigs import OnnxSemantics
+from pipeline.rigs import OnnxSemantics, Rig
 from schemas.frames import Frame
 
-__all__ = ["ModelSource"]
+__all__ = ["ModelSource", "check_models"]
+
+
+def check_models(rig: Rig, fleet: FleetConfig) -> None:
+    """Make sure that every model that a rig names is there and is the one that its manifest means; nothing is run.
+
+    Raises:
+        ModelError: a manifest or model is missing, wrong, or not the one that its hash says.
+    """
+    if isinstance(rig.camera.semantics, OnnxSemantics):
+        load_manifest(fleet.path_of(rig.camera.semantics.segmenter), "segment")
+        load_manifest(fleet.path_of(rig.camera.semantics.detector), "detect")
 
 
 class ModelSource:
