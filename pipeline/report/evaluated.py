@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +26,7 @@ __all__ = ["Compared", "Comparison", "page_of_runs"]
 _FAVOURITES = ("joint", "joint-ssl", "joint-optimisation")  # whose pictures are worth a look, best first
 
 
+@runtime_checkable
 class Comparison(Protocol):
     """Errors of one run, as `evaluate` measures them: by pair azimuth and elevation [rad] and range [m]."""
 
@@ -41,6 +42,7 @@ class Comparison(Protocol):
     def normalised(self) -> Float[np.ndarray, " N"]: ...  # noqa: D102
 
 
+@runtime_checkable
 class Compared(Protocol):
     """A run (records by pair), what it was compared with (transforms by pair, or picks), and the result."""
 

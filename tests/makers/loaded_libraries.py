@@ -26,6 +26,8 @@ ALWAYS_THERE = {
     "libstdc++.so.6",
     "libutil.so.1",
 }
+# Plugins of the resolver, which glibc loads as /etc/nsswitch.conf of that very machine tells it.
+_CHOSEN_BY_THE_SYSTEM = re.compile(r"libnss_\w+\.so\.2")
 _LOADED = re.compile(rb"calling init: (\S+)")
 # Modules of the standard library that stand on a library of the system: such a library is the interpreter's own.
 _OF_THE_INTERPRETER = "import bz2, ctypes, hashlib, lzma, pyexpat, sqlite3, ssl, uuid, zlib"
@@ -61,6 +63,7 @@ def foreign(paths, folder, python=sys.executable):
         p
         for p in paths
         if Path(p).name not in ALWAYS_THERE
+        and not _CHOSEN_BY_THE_SYSTEM.fullmatch(Path(p).name)
         and Path(p).resolve() not in own
         and not any(Path(p).resolve().is_relative_to(h) for h in homes)
         and not re.search(r"/python3\.\d+/lib-dynload/|/libpython3", p)
