@@ -6,15 +6,15 @@ counts, outcome. Inline, in a pool of processes or elsewhere, this is what runs.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import importlib
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from pipeline.config import config_hash
 from pipeline.errors import BoresightError, ContractError
 from pipeline.results import Outcome, Progress
-from pipeline.stages import STAGES, Stage
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.tables import Manifest, read_manifest, read_records, write_partition, write_records
 from pipeline.work import NothingUsable, Records, Run, Task, Work
@@ -23,13 +23,45 @@ from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
 from schemas.versions import CODE_VERSION
 
-__all__ = ["run_stage", "try_stage"]
+__all__ = ["Stage", "run_stage", "try_stage"]
 
 # Tables of records: small, added to and never replaced. The others are replaced by whole partitions.
 _RECORD_ROWS: dict[str, type] = {CALIBRATIONS.name: CalibrationRecord, DRIFT.name: DriftFinding}
 # A row group: large enough to compress, small enough that a worker that holds one stays far below 2 GB.
 _GROUP_ROWS = 16
 _GROUP_BYTES = 24 << 20
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the night.
+
+    Args:
+        name: what its command and its outcomes are called.
+        reads: tables that it reads.
+        writes: table that it writes; none where it writes files.
+        function: import path of `work(task) -> Work`.
+        needs_inputs: a vehicle-day without all that the stage reads is an error. False where the stage reads what
+            the task's method asks for and answers for its absence itself.
+        per_vehicle_day: False where it looks at all vehicles and days of a window.
+    """
+
+    name: str
+    reads: tuple[TableSchema, ...]
+    writes: tuple[TableSchema, ...]
+    function: str
+    needs_inputs: bool = True
+    per_vehicle_day: bool = True
+
+    def load(self) -> Callable[[Task], Work]:
+        """The stage's function; its module is imported now."""
+        module, name = self.function.split(":")
+        function: Callable[[Task], Work] = getattr(importlib.import_module(module), name)
+        return function
+
+    def run(self, task: Task) -> Outcome:
+        """Do the task unless it is done already; see `run_stage`."""
+        return run_stage(self, task)
 
 
 def run_stage(stage: Stage, task: Task) -> Outcome:
@@ -73,8 +105,7 @@ def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
     for schema in stage.reads:
         manifest = read_manifest(task.lake, schema, task.partition)
         if manifest is None:
-            maker = next(s.name for s in STAGES if schema in s.writes)
-            problem = f"no {schema.name} of this vehicle and day: run `boresight {maker}` first"
+            problem = f"no {schema.name} of this vehicle and day: run `boresight {schema.made_by}` first"
             raise ContractError(str(task.lake.folder(schema.name, task.partition)), problem)
         found[schema.name] = manifest
     return found

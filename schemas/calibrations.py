@@ -133,6 +133,7 @@ CALIBRATIONS = TableSchema(
         scalar("inputs", "list<string>", "work keys or paths of what was read"),
     ),
     "One row per pair and method. boresight show calibrations --json prints these names plus T, 4x4 row-major.",
+    made_by="calibrate",
 )
 
 

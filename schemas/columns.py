@@ -84,6 +84,7 @@ class TableSchema:
     version: int
     columns: tuple[Column, ...]
     doc: str = ""
+    made_by: str = ""  # stage, and command, that writes it
 
     def arrow_schema(self) -> pa.Schema:
         """The Arrow schema that every file of the table has."""

@@ -79,6 +79,7 @@ DRIFT = TableSchema(
         scalar("vehicle_since", "string", "first day after the vehicle's clearest change", nullable=True),
         scalar("vehicle_reason", "string", "why the vehicle has this status, in words", nullable=True),
     ),
+    made_by="audit",
 )
 
 

@@ -96,6 +96,7 @@ FRAMES = TableSchema(
         ),
     ),
     "One trio per row, in order of stamp. Camera: optical frame; lidar and radar: x forward, y left, z up.",
+    made_by="ingest",
 )
 
 

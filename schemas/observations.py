@@ -146,6 +146,7 @@ OBSERVATIONS = TableSchema(
         array("radar_drivable_range_m", "<f4", ("N",), "drivable until this range in each bin"),
     ),
     "Perception of one frame per row; points stay in the frame of the sensor that saw them.",
+    made_by="perceive",
 )
 
 

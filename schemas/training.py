@@ -193,6 +193,7 @@ TRAINING = TableSchema(
         *transform_columns("prior_lidar_radar_", "reference T_lidar_radar: the day's prior, never a truth"),
     ),
     "One frame per row. Padded rows of arrays are 0.",
+    made_by="prepare",
 )
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from jobs.cli import COMMANDS
 from pipeline.stages import STAGES
+from schemas.versions import TABLES
 
 REPO = Path(__file__).resolve().parent.parent
 LAYERS = ("schemas", "pipeline", "jobs")
@@ -95,6 +96,10 @@ def test_stages_read_only_what_an_earlier_one_writes():
     for stage in STAGES:
         assert {t.name for t in stage.reads} <= written, stage.name
         written |= {t.name for t in stage.writes}
+
+
+def test_a_table_names_the_stage_that_writes_it():
+    assert {t.name: t.made_by for t in TABLES.values()} == {t.name: s.name for s in STAGES for t in s.writes}
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda s: s.name)

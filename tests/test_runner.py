@@ -16,8 +16,8 @@ from pipeline.errors import ConfigError, ContractError, LogError
 from pipeline.learn.prepare.split import SplitPlan
 from pipeline.report.stage import Pages
 from pipeline.results import Outcome
-from pipeline.runner import try_stage
-from pipeline.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES, Stage
+from pipeline.runner import Stage, try_stage
+from pipeline.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_records, read_rows, write_partition
 from pipeline.work import NothingUsable, Records, Run, Task, Told, Window, Work
@@ -133,7 +133,7 @@ _KILLED = """
 import os, signal, sys
 from pathlib import Path
 from pipeline.config import load_fleet
-from pipeline.stages import Stage
+from pipeline.runner import Stage
 from pipeline.store.partitions import Lake, Partition
 from pipeline.work import Task, Work
 from schemas.observations import OBSERVATIONS

@@ -15,8 +15,8 @@ from pipeline.config import FleetConfig
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import Outcome, Progress
-from pipeline.runner import try_stage
-from pipeline.stages import CALIBRATE, INGEST, PERCEIVE, Stage
+from pipeline.runner import Stage, try_stage
+from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.store.partitions import Lake, Partition
 from pipeline.work import Task
 

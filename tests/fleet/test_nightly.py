@@ -10,7 +10,7 @@ from pipeline.errors import ConfigError, LogError
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import Outcome
-from pipeline.stages import Stage
+from pipeline.runner import Stage
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records, write_records
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
