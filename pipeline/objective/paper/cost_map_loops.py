@@ -66,6 +66,7 @@ def pinhole_costs(poses, xs, ys, zs, first, quads, map_first, size_px, camera, p
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @_jit
 def polynomial_costs(poses, xs, ys, zs, first, quads, map_first, size_px, camera, penalty, out) -> None:
+    # One long body: LLVM turns the loop over points into vector code only where nothing in it is a call.
     one, zero, tiny = _f4(1), _f4(0), _f4(1e-6)
     for f in range(len(map_first)):
         width, height = size_px[f, 0], size_px[f, 1]

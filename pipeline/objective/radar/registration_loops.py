@@ -134,6 +134,7 @@ def accumulate_frames(
     `info` is H less what the uncertain assignment takes away (Louis 1982), row by row. A detection whose elevation in
     lidar axes is not inside `limits` (tangents, low and high) is assigned by azimuth and range alone.
     """
+    # One long body: its buffers are made once for all frames, and each step would pass a dozen of them on.
     R, t = T[:3, :3], T[:3, 3]
     most = 1
     for f in range(len(radar_first) - 1):
