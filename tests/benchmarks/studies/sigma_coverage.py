@@ -1,7 +1,7 @@
 """Study: does the truth lie where `joint` says? One calibration on each of 100 simulated vehicle-days.
 
     python tests/benchmarks/studies/days.py generate --root DAYS --sets coverage
-    python tests/benchmarks/studies/coverage.py --root DAYS --workers 2
+    python tests/benchmarks/studies/sigma_coverage.py --root DAYS --workers 2
 
 Every day has a seed, a vehicle and streets of its own, 40 frames, urban and highway in turn, the paper's sensors. Its
 prior is drawn from the normal distribution that its sigmas state (2 deg and 5 cm per axis, the defaults), so that what
