@@ -6,8 +6,12 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pipeline.store.partitions import Lake
+from pipeline.store.tables import read_records
+from schemas.drift import DRIFT, DriftFinding
 from tests.makers.loaded_libraries import foreign, loaded, tracing
 
 BORESIGHT = f"{sys.prefix}/bin/boresight"
@@ -50,6 +54,22 @@ def test_the_demo_ends_with_a_table_a_report_and_a_summary(demo):
         "joint",
         "joint-ssl",
     ]
+
+
+@pytest.mark.slow
+def test_the_knocked_radar_is_found_with_its_day_and_size_and_nobody_else_is_accused(demo):
+    out, done = demo
+    summary = json.loads(done.stdout.splitlines()[-1])
+    assert summary["moved"] == summary["knocked"]
+    found = read_records(Lake.at(out / "lake"), DRIFT, DriftFinding)
+    alarms = {f.vehicle for f in found if f.status in ("RED", "YELLOW")}
+    assert alarms == {"vehicle-2"}
+    assert {f.vehicle: f.vehicle_status for f in found}["vehicle-2"] == "RED"
+    [(turn, sigma)] = {
+        (f.moved_motion[2], f.moved_motion_sigma[2]) for f in found if f.moved_motion is not None
+    }
+    assert abs(np.degrees(turn) - 1.2) < 0.2  # the demo's knock; remounts add 0.03 deg
+    assert np.degrees(sigma) < 0.15
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, to_quaternion
 from schemas.calibrations import CalibrationRecord
-from tests.benchmarks.studies.sigma_coverage import summary as coverage_summary
 from tests.benchmarks.studies.metrics import claimed_error_deg, inside_share, measure, rms, within
+from tests.benchmarks.studies.sigma_coverage import summary as coverage_summary
 from tests.benchmarks.studies.verdict import is_right, precision_recall, worse_than_prior
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
 
