@@ -22,7 +22,7 @@ demo: setup ## synthetic fleet to HTML report, in minutes
 	$(BIN)/boresight demo --out demo || [ $$? -eq 3 ] # 3: done, and something was held, as it should be
 
 test: setup browser ## every test, with shapes and types of the annotations checked
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 25 --ignore tests/benchmarks \
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --durations 25 --ignore tests/benchmarks \
 		--jaxtyping-packages=schemas,pipeline,beartype.beartype
 
 # Page tests want Chromium. It is installed where that is allowed without asking, and nowhere else; tests without it are

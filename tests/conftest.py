@@ -46,22 +46,6 @@ def real_segmenter() -> Path:
     return path
 
 
-# Files that take a minute or more, longest first: begun last, they would keep one worker busy alone.
-_LONG = (
-    "test_wheel",
-    "test_demo",
-    "test_nightly",
-    "test_real_day",
-    "test_simulated_day",
-    "test_frame_objective",
-)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first; all others as they were."""
-    items.sort(key=lambda item: _LONG.index(item.path.stem) if item.path.stem in _LONG else len(_LONG))
-
-
 @pytest.hookimpl(trylast=True)
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say last, and without being asked, which tests were left out and how to have them."""
