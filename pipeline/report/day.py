@@ -152,8 +152,18 @@ def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFind
     if not accepted:
         return "bad", "No. Nothing was accepted: keep the transforms that the car has."
     if not other:
-        return "good", "Yes. All pairs are accepted: they may go on the car, with the sigmas below."
-    return "partly", f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."
+        sentence = "Yes. All pairs are accepted: they may go on the car, with the sigmas below."
+        return "good", sentence + _azimuth_only(views)
+    sentence = f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."
+    return "partly", sentence + _azimuth_only(views)
+
+
+def _azimuth_only(views: Sequence[PairView]) -> str:
+    """A sentence on accepted pairs whose elevation nobody certifies; empty where there is none."""
+    limited = [
+        v.title for v in views if v.status == "accepted" and v.certified and "elevation" not in v.certified
+    ]
+    return f" Certified in azimuth only: {', '.join(limited)}." if limited else ""
 
 
 def status_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
