@@ -1,7 +1,8 @@
 """What goes wrong with a vehicle, and bad days: written `vehicle:day:sensor:kind:amount`, several with commas.
 
 Kinds: yaw, pitch, roll [deg] and x, y, z [m] are knocks from that day on, about the vehicle's axes at the sensor; the
-same with `drift-` before it grow by the amount per day, starting that day; `time` [s] delays a clock from that day on.
+same with `drift-` before it grow by the amount per day, starting that day. From that day on `time` [s] lets a sensor
+measure earlier than its stamps say, which stay with the others'; `stamp` [s] shifts its stamps, and nothing else.
 Only on that day: `missing` (no data), `swap` (the sensor's topic carries the other point cloud), `intrinsics` (logged
 focal length wrong by the fraction), `labels` (classes permuted), `night` (dark images, bad semantics), `few` (that many
 frames in all).
@@ -24,9 +25,10 @@ __all__ = ["KINDS", "DayFaults", "Fault", "faults_on", "misread", "parse_faults"
 
 _AXES: Final = {"roll": 0, "pitch": 1, "yaw": 2, "x": 0, "y": 1, "z": 2}
 _DAY_ONLY: Final = ("missing", "swap", "intrinsics", "labels", "night", "few")
-KINDS: Final = (*_AXES, *(f"drift-{a}" for a in _AXES), "time", *_DAY_ONLY)
+_CLOCKS: Final = ("time", "stamp")
+KINDS: Final = (*_AXES, *(f"drift-{a}" for a in _AXES), *_CLOCKS, *_DAY_ONLY)
 _SENSORS: Final = {
-    "time": ("camera", "radar"),
+    **dict.fromkeys(_CLOCKS, ("camera", "radar")),
     "missing": ("camera", "lidar", "radar"),
     "swap": ("lidar", "radar"),
     **dict.fromkeys(("intrinsics", "labels", "night", "few"), ("camera",)),
@@ -91,9 +93,10 @@ def shaken(mounting: Mounting, faults: tuple[Fault, ...], vehicle: str, day: int
     for fault in faults:
         if fault.vehicle != vehicle or fault.day > day or fault.kind in _DAY_ONLY:
             continue
-        if fault.kind == "time":
-            name = f"{fault.sensor}_delay_s"
-            changes[name] = float(changes.get(name, getattr(mounting, name))) + fault.amount  # type: ignore[arg-type]
+        if fault.kind in _CLOCKS:
+            # A stamp that is late belongs to an event as much earlier: shifting both leaves the event where it was.
+            for name in (f"{fault.sensor}_delay_s", f"{fault.sensor}_phase_s")[: 1 + (fault.kind == "stamp")]:
+                changes[name] = float(changes.get(name, getattr(mounting, name))) + fault.amount  # type: ignore[arg-type]
             continue
         kind = fault.kind.removeprefix("drift-")
         amount = fault.amount * (day - fault.day + 1 if kind != fault.kind else 1)

@@ -13,9 +13,18 @@ from pipeline.geometry.se3 import from_rotation_translation
 from pipeline.simulate.faults import DayFaults, misread
 from pipeline.simulate.logs.messages import Messages
 from pipeline.simulate.logs.writers import TOPICS, OpenLog
+from pipeline.simulate.sensors.clocks import Clocks, free_clocks
+from pipeline.simulate.sensors.radar import Scan
 from pipeline.simulate.sensors.rigs import Mounting, RigSpec
 from pipeline.simulate.sensors.semantics import SemanticsSpec, encode_png
-from pipeline.simulate.sensors.simulated_frame import SimulatedFrame, frame_of, scene_of
+from pipeline.simulate.sensors.simulated_frame import (
+    Image,
+    SimulatedFrame,
+    frame_of,
+    image_of,
+    scan_of,
+    scene_of,
+)
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
@@ -23,6 +32,9 @@ __all__ = ["FIRST_FRAME_S", "Setup", "nominal_poses", "record_drive", "trio"]
 
 _ODOMETRY_HZ: Final = 20.0
 FIRST_FRAME_S: Final = 1.0  # a drive's log begins this long before its first frame
+# Of free-running sensors the log holds the image and the scan next to each sweep, for rendering costs most of a day;
+# with every so many sweeps also the second next ones, so that pairing has to choose.
+_NEIGHBOURS_EVERY: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,17 +76,34 @@ def record_drive(
     log.put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), nominal_poses(setup.mounting)))
     scene = scene_of(drive)
     semantics = _night(setup.semantics) if setup.faults.night else setup.semantics
+    free_hz = setup.rig.free_hz
+    clocks = None if free_hz is None else free_clocks(free_hz, np.random.default_rng([drive.seed, 53]))
     for k in range(frames):
         stamp = FIRST_FRAME_S + k / rate_hz + rng.uniform(0, 0.02)
+        stamp, near = (stamp, None) if clocks is None else _free_stamps(clocks, stamp)
         moment = world.moment(stamp - setup.rig.lidar.sweep_s / 2)
-        frame = frame_of(moment, scene, setup.rig, setup.mounting, stamp, rng, semantics)
+        view = moment, scene, setup.rig, setup.mounting
+        frame = frame_of(*view, stamp, rng, semantics, near and near[0])
         pending = trio(messages, frame, setup, at, rng)
+        if near is not None and k % _NEIGHBOURS_EVERY == 0:
+            image, scan = image_of(*view, near[1][0], rng, semantics), scan_of(*view, near[1][1], rng)
+            pending += _of_camera(messages, image, setup, at, rng)
+            pending += _of_radar(messages, scan, near[1][1], setup, at)
         while odometry and odometry[0][0] <= stamp + 0.1:
             t, T, speed, yaw_rate = odometry.pop(0)
             pending.append((at(t), TOPICS["odometry"], messages.odometry(at(t), T, speed, yaw_rate)))
         for time_ns, topic, message in sorted(pending, key=lambda p: p[0]):
             log.put(topic, time_ns, message)
         tick(k + 1)
+
+
+def _free_stamps(
+    clocks: Clocks, about_s: float
+) -> tuple[float, tuple[tuple[float, float], tuple[float, float]]]:
+    """The sweep nearest to a time, the (image, scan) nearest to it, and the next nearest."""
+    stamp = clocks.lidar.nearest(about_s)[0]
+    camera, radar = clocks.camera.nearest(stamp), clocks.radar.nearest(stamp)
+    return stamp, ((camera[0], radar[0]), (camera[1], radar[1]))
 
 
 def trio(
@@ -93,30 +122,58 @@ def trio(
         at: stamp [ns] of a time of the drive [s].
         rng: exchanges classes where the day's labels are permuted.
     """
-    today, rig = setup.faults, setup.rig
-    camera, lidar, radar = at(frame.camera_stamp_s), at(frame.lidar_stamp_s), at(frame.radar_stamp_s)
-    sweep, scan = frame.sweep, frame.scan
-    sign = np.float32(-1.0 if rig.radar.doppler_positive == "approaching" else 1.0)
+    image = Image(frame.camera_stamp_s, frame.jpeg, frame.labels_png, frame.boxes, frame.true_labels)
+    return [
+        *_of_camera(messages, image, setup, at, rng),
+        *_of_lidar(messages, frame, setup, at),
+        *_of_radar(messages, frame.scan, frame.radar_stamp_s, setup, at),
+    ]
+
+
+def _of_camera(
+    messages: Messages,
+    image: Image,
+    setup: Setup,
+    at: Callable[[float], int],
+    rng: np.random.Generator,
+) -> list[tuple[int, str, Any]]:
+    """An image with its intrinsics, labels and detections; none where the camera is missing."""
+    today, stamp = setup.faults, at(image.stamp_s)
+    if "camera" in today.missing:
+        return []
+    info = misread(setup.mounting.nominal_camera, today.focal_factor)
+    labels = _permuted(image.labels_png, rng) if today.labels_permuted else image.labels_png
+    return [
+        (stamp, TOPICS["info"], messages.camera_info(stamp, info)),
+        (stamp, TOPICS["image"], messages.image(stamp, image.jpeg, "jpeg")),
+        (stamp, TOPICS["labels"], messages.image(stamp, labels, "mono8; png compressed")),
+        (stamp, TOPICS["detections"], messages.detections(stamp, image.boxes)),
+    ]
+
+
+def _of_lidar(
+    messages: Messages, frame: SimulatedFrame, setup: Setup, at: Callable[[float], int]
+) -> list[tuple[int, str, Any]]:
+    stamp, sweep = at(frame.lidar_stamp_s), frame.sweep
+    if "lidar" in setup.faults.missing:
+        return []
     points = dict(zip("xyz", sweep.xyz_m.T, strict=True))
     points |= {"intensity": sweep.intensity, "ring": sweep.ring, "time": sweep.time_s}
+    topic = TOPICS["radar" if setup.faults.swapped else "lidar"]
+    return [(stamp, topic, messages.cloud(stamp, "lidar", points))]
+
+
+def _of_radar(
+    messages: Messages, scan: Scan, stamp_s: float, setup: Setup, at: Callable[[float], int]
+) -> list[tuple[int, str, Any]]:
+    stamp = at(stamp_s)
+    if "radar" in setup.faults.missing:
+        return []
+    sign = np.float32(-1.0 if setup.rig.radar.doppler_positive == "approaching" else 1.0)
     detections = dict(zip("xyz", scan.xyz_m.T, strict=True))
     detections |= {"doppler": sign * scan.range_rate_mps, "power": scan.power_db}
-    lidar_topic, radar_topic = TOPICS["lidar"], TOPICS["radar"]
-    if today.swapped:
-        lidar_topic, radar_topic = radar_topic, lidar_topic
-    info = misread(setup.mounting.nominal_camera, today.focal_factor)
-    labels = _permuted(frame.labels_png, rng) if today.labels_permuted else frame.labels_png
-    sent = {
-        "camera": [
-            (camera, TOPICS["info"], messages.camera_info(camera, info)),
-            (camera, TOPICS["image"], messages.image(camera, frame.jpeg, "jpeg")),
-            (camera, TOPICS["labels"], messages.image(camera, labels, "mono8; png compressed")),
-            (camera, TOPICS["detections"], messages.detections(camera, frame.boxes)),
-        ],
-        "lidar": [(lidar, lidar_topic, messages.cloud(lidar, "lidar", points))],
-        "radar": [(radar, radar_topic, messages.cloud(radar, "radar", detections))],
-    }
-    return [item for sensor, items in sent.items() if sensor not in today.missing for item in items]
+    topic = TOPICS["lidar" if setup.faults.swapped else "radar"]
+    return [(stamp, topic, messages.cloud(stamp, "radar", detections))]
 
 
 def nominal_poses(mounting: Mounting) -> dict[str, np.ndarray]:

@@ -87,6 +87,8 @@ class RigSpec:
     radar_delay_s: float = -0.018
     delay_sd_s: float = 0.004  # sd per vehicle of both delays
     sync_jitter_s: float = 0.0012
+    # Rates [Hz] of camera, lidar and radar that run freely; None = the lidar triggers both.
+    free_hz: tuple[float, float, float] | None = None
     prior_rotation_deg: float = 1.2  # sd per vehicle and sensor of the mounting against CAD, angle
     prior_translation_m: float = 0.02  # sd per axis
     remount_rotation_deg: float = 0.02  # sd per day and axis
@@ -97,6 +99,8 @@ RIGS: Final = {
     "paper": RigSpec("paper"),
     # One clock without delays, as the paper's car has it: what methods without time offsets are owed.
     "paper-one-clock": RigSpec("paper-one-clock", camera_delay_s=0.0, radar_delay_s=0.0, delay_sd_s=0.0),
+    # No common trigger: every sensor at its own rate and phase, as on most cars.
+    "paper-free": RigSpec("paper-free", free_hz=(30.0, 10.0, 13.0)),
     "demo": RigSpec(
         "demo",
         camera=CameraSpec(912, 470),
@@ -138,6 +142,8 @@ class Mounting:
     radar_delay_s: float
     radar_range_bias_m: float
     radar_elevation_bias_rad: float
+    camera_phase_s: float = 0.0  # of a triggered sensor's stamps after the sweep's, beside jitter
+    radar_phase_s: float = 0.0
 
     def truth(self) -> dict[str, Float[np.ndarray, "4 4"]]:
         """T_camera_lidar, T_lidar_radar, T_camera_radar."""

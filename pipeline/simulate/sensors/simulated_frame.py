@@ -1,4 +1,4 @@
-"""One synchronised trio, from the world to what the sensors deliver."""
+"""One trio, from the world to what the sensors deliver."""
 
 from __future__ import annotations
 
@@ -22,7 +22,18 @@ from pipeline.simulate.sensors.semantics import (
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Drive, Motion
 
-__all__ = ["Scene", "SimulatedFrame", "frame_of", "scene_of"]
+__all__ = ["Image", "Scene", "SimulatedFrame", "frame_of", "image_of", "scan_of", "scene_of"]
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """An image and what networks make of it; `true_labels` goes into no log."""
+
+    stamp_s: float
+    jpeg: bytes
+    labels_png: bytes
+    boxes: list[Box]
+    true_labels: np.ndarray = field(repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,20 +78,41 @@ def frame_of(
     stamp_s: float,
     rng: np.random.Generator,
     semantics: SemanticsSpec,
+    stamps_s: tuple[float, float] | None = None,
 ) -> SimulatedFrame:
-    """The trio whose lidar sweep ends at `stamp_s`; `moment` should be near the middle of the sweep."""
-    camera_stamp, radar_stamp = stamp_s + np.clip(rng.normal(0, rig.sync_jitter_s, 2), -0.0045, 0.0045)
+    """The trio whose lidar sweep ends at `stamp_s`; `moment` should be near the middle of the sweep.
+
+    `stamps_s` are those of image and scan; None = the sweep triggers both.
+    """
+    camera_stamp, radar_stamp = stamps_s or _triggered(rig, mounting, stamp_s, rng)
     sweep = sweep_lidar(moment, scene.ego, mounting.T_vehicle_lidar, rig.lidar, stamp_s, rng)
-    exposure = moment.advanced(float(camera_stamp - mounting.camera_delay_s))
-    T_map_camera = scene.ego.poses(np.array([exposure.t_s]))[0] @ mounting.T_vehicle_camera
-    view = view_of(exposure, mounting.camera, T_map_camera)
-    image = render(exposure, view, scene.sun, rng, night=scene.night)
-    true = label_image(exposure, view.coarse)
-    size_px = (mounting.camera.width_px, mounting.camera.height_px)
-    boxes = noisy_boxes(boxes_of(exposure, view.coarse), size_px, semantics, rng)
+    jpeg, true, boxes = _exposed(moment, scene, rig, mounting, camera_stamp, rng, semantics)
+    scan = scan_of(moment, scene, rig, mounting, radar_stamp, rng)
+    labels = encode_png(noisy_labels(true, semantics, rng))
+    return SimulatedFrame(stamp_s, camera_stamp, radar_stamp, jpeg, labels, boxes, sweep, scan, true)
+
+
+def image_of(
+    moment: Moment,
+    scene: Scene,
+    rig: RigSpec,
+    mounting: Mounting,
+    stamp_s: float,
+    rng: np.random.Generator,
+    semantics: SemanticsSpec,
+) -> Image:
+    """The image with a stamp, taken the camera's delay before it."""
+    jpeg, true, boxes = _exposed(moment, scene, rig, mounting, stamp_s, rng, semantics)
+    return Image(stamp_s, jpeg, encode_png(noisy_labels(true, semantics, rng)), boxes, true)
+
+
+def scan_of(
+    moment: Moment, scene: Scene, rig: RigSpec, mounting: Mounting, stamp_s: float, rng: np.random.Generator
+) -> Scan:
+    """The radar scan with a stamp, taken the radar's delay before it."""
     errors = RadarErrors(mounting.radar_range_bias_m, mounting.radar_elevation_bias_rad)
-    scan = scan_radar(
-        moment.advanced(float(radar_stamp - mounting.radar_delay_s)),
+    return scan_radar(
+        moment.advanced(stamp_s - mounting.radar_delay_s),
         scene.ego,
         mounting.T_vehicle_radar,
         rig.radar,
@@ -89,14 +121,31 @@ def frame_of(
         scene.mirrors_m,
         scene.beacons_map,
     )
-    return SimulatedFrame(
-        stamp_s,
-        float(camera_stamp),
-        float(radar_stamp),
-        encode_jpeg(image, rig.camera.jpeg_quality),
-        encode_png(noisy_labels(true, semantics, rng)),
-        boxes,
-        sweep,
-        scan,
-        true,
-    )
+
+
+def _triggered(
+    rig: RigSpec, mounting: Mounting, stamp_s: float, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Stamps of image and scan that a sweep triggers."""
+    camera, radar = stamp_s + np.clip(rng.normal(0, rig.sync_jitter_s, 2), -0.0045, 0.0045)
+    return float(camera) + mounting.camera_phase_s, float(radar) + mounting.radar_phase_s
+
+
+def _exposed(
+    moment: Moment,
+    scene: Scene,
+    rig: RigSpec,
+    mounting: Mounting,
+    stamp_s: float,
+    rng: np.random.Generator,
+    semantics: SemanticsSpec,
+) -> tuple[bytes, np.ndarray, list[Box]]:
+    """JPEG, true labels and noisy boxes of the image with a stamp."""
+    exposure = moment.advanced(stamp_s - mounting.camera_delay_s)
+    T_map_camera = scene.ego.poses(np.array([exposure.t_s]))[0] @ mounting.T_vehicle_camera
+    view = view_of(exposure, mounting.camera, T_map_camera)
+    image = render(exposure, view, scene.sun, rng, night=scene.night)
+    true = label_image(exposure, view.coarse)
+    size_px = (mounting.camera.width_px, mounting.camera.height_px)
+    boxes = noisy_boxes(boxes_of(exposure, view.coarse), size_px, semantics, rng)
+    return encode_jpeg(image, rig.camera.jpeg_quality), true, boxes

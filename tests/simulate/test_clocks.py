@@ -1,0 +1,76 @@
+"""Sensors without a common trigger, and stamps that are late: what the log then holds."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.simulate.faults import Fault
+from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day
+from pipeline.simulate.logs.writers import TOPICS
+from pipeline.simulate.sensors.clocks import Ticks, free_clocks
+from pipeline.simulate.sensors.rigs import rig_named
+
+SHORT = {"vehicles": 1, "days": 1, "drives": 1, "environments": "urban"}
+FIRST = "2026-03-02"
+
+
+@pytest.mark.parametrize("t_s", [0.0, 0.99, 1.0, 1.02, 7.3])
+def test_the_two_ticks_nearest_to_a_time_enclose_it(t_s):
+    ticks = Ticks(0.1, 0.03)
+    first, second = ticks.nearest(t_s)
+    assert abs(first - t_s) <= 0.05 + 1e-12
+    assert abs(first - t_s) <= abs(second - t_s)
+    assert min(first, second) <= t_s <= max(first, second)
+    assert abs(second - first) == pytest.approx(0.1)
+
+
+def test_free_clocks_drift_through_all_gaps_even_where_rates_are_multiples():
+    clocks = free_clocks((30.0, 10.0, 13.0), np.random.default_rng(0))
+    sweeps = [clocks.lidar.nearest(t)[0] for t in np.arange(0, 60, 0.5)]
+    gaps = np.array([clocks.camera.nearest(t)[0] - t for t in sweeps])
+    assert np.abs(gaps).max() <= clocks.camera.period_s / 2 + 1e-12
+    assert np.ptp(gaps) > 0.9 * clocks.camera.period_s
+
+
+def stamps_of(read, log, topic):
+    return np.array([t for name, t, _ in read(log) if name == topic]) * 1e-9
+
+
+def test_a_free_running_log_holds_the_nearest_image_and_scan_and_some_that_are_not(
+    tmp_path, read, the_log, monkeypatch
+):
+    free = replace(rig_named("demo"), free_hz=rig_named("paper-free").free_hz)
+    monkeypatch.setattr("pipeline.simulate.fleet.rig_named", lambda _: free)
+    simulate_vehicle_day(FleetSpec(**SHORT, frames=5), 0, 0, tmp_path)
+    log = the_log(tmp_path)
+    sweeps, images, scans = (stamps_of(read, log, TOPICS[n]) for n in ("lidar", "image", "radar"))
+    assert len(sweeps) == 5
+    assert (len(images), len(scans)) == (7, 7)  # with the first and the fifth sweep two of each
+    for stamps, period_s in ((images, 1 / 30), (scans, 1 / 13)):
+        nearest = np.abs(stamps - sweeps[:, None]).min(1)
+        assert nearest.max() <= 0.51 * period_s
+        assert nearest.max() > 0.005
+
+
+def test_a_stamp_fault_shifts_stamps_and_nothing_else(tmp_path, read, the_log):
+    late = FleetSpec(**SHORT, frames=1, faults=(Fault("vehicle-1", 0, "camera", "stamp", 0.06),))
+    for name, spec in (("good", FleetSpec(**SHORT, frames=1)), ("late", late)):
+        simulate_vehicle_day(spec, 0, 0, tmp_path / name)
+    good, shifted = ({t: (s, m) for t, s, m in read(the_log(tmp_path / n))} for n in ("good", "late"))
+    for topic, by_s in (("image", 0.06), ("labels", 0.06), ("lidar", 0.0), ("radar", 0.0)):
+        (before, sent), (after, sent_late) = good[TOPICS[topic]], shifted[TOPICS[topic]]
+        assert (after - before) * 1e-9 == pytest.approx(by_s, abs=2e-9)
+        np.testing.assert_array_equal(sent_late.data, sent.data)
+    truth = [
+        json.loads((tmp_path / n / "truth" / "vehicle-1" / f"{FIRST}.json").read_text())
+        for n in ("good", "late")
+    ]
+    assert truth[1]["dt_camera_lidar_s"] - truth[0]["dt_camera_lidar_s"] == pytest.approx(0.06)
+
+
+def test_a_late_clock_shifts_what_a_sensor_sees_and_not_its_stamps():
+    fault = Fault("vehicle-1", 0, "radar", "time", 0.03)
+    mounting = mounting_on(FleetSpec(**SHORT, frames=1, faults=(fault,)), 0, 0)
+    assert mounting.radar_phase_s == 0.0
