@@ -4,6 +4,9 @@ Range rate of a static point in direction u seen from a radar with velocity v: `
 the Doppler period where the radar is ambiguous. Wide fields of view lift that: points at 30 deg to the side
 see 13 % less than points ahead, so a wrong multiple of the period does not fit.
 
+The search lies about the direction of travel that the mounting prior gives, so a radar that looks to a corner or back
+is none different from one that looks ahead. Where there is no prior, or nothing is found there, it goes wider.
+
 Source: Kellner et al. 2013, "Instantaneous ego-motion estimation using Doppler radar" (their sine fit, here
 with wrapped residuals and a grid of hypotheses instead of RANSAC, which makes it deterministic).
 """
@@ -18,21 +21,36 @@ from jaxtyping import Float, Float32, Int32, UInt8
 from numba import njit
 
 from pipeline.config import PerceiveConfig
+from pipeline.perceive.moving import cluster_moving, wrapped
 
-__all__ = ["MOVING", "STATIC", "UNDECIDED", "RadarMotion", "cluster_moving", "radar_motion"]
+__all__ = ["MOVING", "STATIC", "UNDECIDED", "RadarMotion", "Travel", "radar_motion"]
 
 STATIC, MOVING, UNDECIDED = 0, 1, 2
 
 _SPEED_MPS = (-8.0, 60.0)  # reversing to motorway
 _LATERAL_MPS = 3.0  # yaw rate times lever arm, and a radar mounted askew
+# The wider search: coarser, for it covers 20 times the velocities; refining needs a start within about 1 m/s.
+_WIDE_STEP_MPS, _WIDE_SIGMA_MPS = 0.5, 0.5
+_WIDE_CONE_RAD = np.radians(30.0)  # about a known heading: more than any bracket bends
+_CONVINCING = 1.0  # of 2, see `_value`: below it the wider search is tried too
+_CLEARLY = 0.1  # by so much must an answer far from the heading be better
 _VERTICAL_SLOPE = 0.1  # sigma of vertical over forward velocity: mounting pitch and road slope, 6 deg
 _GRID_STEP_MPS = 0.2
 _GRID_SIGMA_MPS = 0.3  # covers the grid's own error
 _GRID_POINTS = 200
+_PEAKS, _APART_MPS = 4, 1.0
 _MIN_POINTS = 12  # fewer say nothing about which of them stand still
 _MIN_STATIC_FRACTION = 0.35
 _MIN_STATIC_FRACTION_WITH_HINT = 0.1
 _NOISE_FLOOR_MPS = 0.03
+
+
+@dataclass(frozen=True)
+class Travel:
+    """What is known of the radar's own velocity before the scan is looked at; None = unknown."""
+
+    speed_mps: float | None = None  # forward, from odometry; good to 1.5 m/s + 5 %
+    heading_rad: float | None = None  # azimuth in radar axes of the car's way ahead, from the mounting prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +69,7 @@ def radar_motion(
     range_rate_mps: Float32[np.ndarray, " M"],
     power_db: Float32[np.ndarray, " M"] | None,
     period_mps: float | None,
-    speed_hint_mps: float | None,
+    travel: Travel,
     has_elevation: bool,
     config: PerceiveConfig,
     rng: np.random.Generator,
@@ -63,7 +81,7 @@ def radar_motion(
         range_rate_mps: positive = receding, not ego-compensated.
         power_db: strong detections are preferred in the search for the velocity; None = all alike.
         period_mps: range rates are known modulo this; None = unambiguous.
-        speed_hint_mps: forward speed from odometry, good to 1.5 m/s + 5 %; None = search all speeds.
+        travel: where to search; a wrong heading costs time, and is left where the scan contradicts it.
         has_elevation: False leaves elevations out (vertical velocity is then 0, with its prior variance).
         config: gates and cluster size.
         rng: picks the detections that the search looks at.
@@ -83,12 +101,12 @@ def radar_motion(
     u = _directions(xyz_m[usable].astype(np.float64), has_elevation)
     rate = range_rate_mps[usable].astype(np.float64)
     power = None if power_db is None else power_db[usable].astype(np.float64)
-    fit = _fit_static_world(u, rate, power, period_mps or 0.0, speed_hint_mps, config.static_gate_mps, rng)
+    fit = _fit_static_world(u, rate, power, period_mps or 0.0, travel, config.static_gate_mps, rng)
     if fit is None:
         return undecided
     velocity, covariance, noise = fit
     residual = np.zeros(M)
-    residual[usable] = _wrapped(rate + u @ velocity, period_mps or 0.0)
+    residual[usable] = wrapped(rate + u @ velocity, period_mps or 0.0)
     motion = np.full(M, UNDECIDED, np.uint8)
     # Between three sigmas of the static world and the gate, slow walkers and noise look alike: undecided.
     motion[usable & (np.abs(residual) < min(max(3 * noise, 0.12), config.static_gate_mps))] = STATIC
@@ -97,77 +115,10 @@ def radar_motion(
     return RadarMotion(velocity, covariance, residual.astype(np.float32), motion, cluster)
 
 
-def cluster_moving(
-    xyz_m: Float32[np.ndarray, "M 3"],
-    residual_mps: Float[np.ndarray, " M"],
-    is_moving: np.ndarray,
-    period_mps: float,
-    eps_m: float,
-    min_points: int = 2,
-) -> Int32[np.ndarray, " M"]:
-    """Density clusters (DBSCAN) of moving detections in x, y and Doppler; -1 = none.
-
-    `eps_m` metres count as 1 m/s; lengths shrink with range, as azimuth noise spreads far objects sideways.
-
-    Args:
-        xyz_m: detections [m].
-        residual_mps: range rate over ground; compared modulo `period_mps` where that is positive.
-        is_moving: which detections take part.
-        period_mps: 0 = unambiguous.
-        eps_m: neighbourhood near the car.
-        min_points: detections (with itself) that make a core; far cars give a scanning radar two.
-
-    Source: Ester et al. 1996.
-    """
-    label = np.full(len(xyz_m), -1, np.int32)
-    index = np.flatnonzero(is_moving)
-    if not len(index):
-        return label
-    xy = xyz_m[index, :2].astype(np.float64)
-    scale = eps_m * (1 + np.hypot(*xy.T) / 60.0)
-    distance = np.linalg.norm(xy[:, None] - xy[None], axis=-1) / np.minimum(scale[:, None], scale[None])
-    doppler = np.abs(_wrapped(residual_mps[index][:, None] - residual_mps[index][None], period_mps))
-    near = np.hypot(distance, doppler) <= 1.0
-    core = near.sum(1) >= min_points
-    label[index] = _connect(near, core)
-    return label
-
-
-@no_type_check  # keeps the tests' shape checks out of compiled code
-@njit(cache=True)
-def _connect(near: np.ndarray, core: np.ndarray) -> np.ndarray:
-    """Labels of the connected cores and the points that they reach."""
-    n = len(core)
-    label = np.full(n, -1, np.int32)
-    stack = np.empty(n, np.int64)
-    count = 0
-    for seed in range(n):
-        if not core[seed] or label[seed] >= 0:
-            continue
-        label[seed] = count
-        stack[0] = seed
-        top = 1
-        while top:
-            top -= 1
-            i = stack[top]
-            for j in range(n):
-                if near[i, j] and label[j] < 0:
-                    label[j] = count
-                    if core[j]:
-                        stack[top] = j
-                        top += 1
-        count += 1
-    return label
-
-
 def _directions(xyz: np.ndarray, has_elevation: bool) -> np.ndarray:
     """Unit vectors; flat ones where elevations mean nothing."""
     xyz = xyz if has_elevation else xyz * [1.0, 1.0, 0.0]
     return xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
-
-
-def _wrapped(value: np.ndarray, period: float) -> np.ndarray:
-    return value - period * np.round(value / period) if period > 0 else value
 
 
 def _fit_static_world(
@@ -175,33 +126,93 @@ def _fit_static_world(
     rate: np.ndarray,
     power: np.ndarray | None,
     period: float,
-    hint: float | None,
+    travel: Travel,
     gate: float,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Velocity, covariance and noise of the hypothesis that explains most; None where too little."""
     chosen = _search_points(u, power, rng)
-    vx = np.arange(*_SPEED_MPS, _GRID_STEP_MPS)
-    if hint is not None:
-        vx = vx[np.abs(vx - hint) <= 1.5 + 0.05 * abs(hint)]
-    vy = np.arange(-_LATERAL_MPS, _LATERAL_MPS + 0.01, _GRID_STEP_MPS)
-    if not len(vx):
+    searched = u[chosen], rate[chosen]
+    best = _best_fit(u, rate, _starts(*searched, _ahead(travel), period, _GRID_SIGMA_MPS), period, gate)
+    if best is None or travel.heading_rad is None or _value(u, rate, best, period, gate) < _CONVINCING:
+        # Every third detection: the coarse grid is large.
+        some = searched[0][::3], searched[1][::3]
+        wide = _best_fit(u, rate, _starts(*some, _around(travel), period, _WIDE_SIGMA_MPS), period, gate)
+        if wide is not None and (
+            best is None
+            or _value(u, rate, wide, period, gate) > _value(u, rate, best, period, gate) + _CLEARLY
+        ):
+            best = wide
+    if best is None:
         return None
-    score = _grid_score(u[chosen], rate[chosen], vx, vy, period, _GRID_SIGMA_MPS)
-    best: tuple[float, tuple[np.ndarray, np.ndarray, float]] | None = None
-    for i, j in _separate_peaks(score, 4):
-        fit = _refine(u, rate, np.array([vx[i], vy[j], 0.0]), period, gate)
-        # Share of detections within the gate, and how many of them agree finely.
-        r = _wrapped(rate + u @ fit[0], period)
-        value = float(np.mean(np.exp(-0.5 * (r / 0.15) ** 2)) + np.mean(np.abs(r) < gate))
-        if best is None or value > best[0]:
-            best = value, fit
-    assert best is not None
-    r = _wrapped(rate + u @ best[1][0], period)
-    static = np.abs(r) < gate
+    static = np.abs(wrapped(rate + u @ best[0], period)) < gate
     # A bus alongside may answer with most detections of a scan; odometry tells which of the others stand still.
-    least = _MIN_STATIC_FRACTION if hint is None else _MIN_STATIC_FRACTION_WITH_HINT
-    return best[1] if static.sum() >= _MIN_POINTS and np.mean(static) >= least else None
+    least = _MIN_STATIC_FRACTION if travel.speed_mps is None else _MIN_STATIC_FRACTION_WITH_HINT
+    return best if static.sum() >= _MIN_POINTS and np.mean(static) >= least else None
+
+
+def _ahead(travel: Travel) -> np.ndarray:
+    """Velocities (K 2) to try: any speed along the heading (ahead where it is unknown), a little aside."""
+    along = np.arange(*_SPEED_MPS, _GRID_STEP_MPS)
+    if travel.speed_mps is not None:
+        along = along[np.abs(along - travel.speed_mps) <= _speed_margin(travel.speed_mps)]
+    aside = np.arange(-_LATERAL_MPS, _LATERAL_MPS + 0.01, _GRID_STEP_MPS)
+    v = np.stack(np.meshgrid(along, aside, indexing="ij"), -1).reshape(-1, 2)
+    c, s = np.cos(travel.heading_rad or 0.0), np.sin(travel.heading_rad or 0.0)
+    return v @ np.array([[c, s], [-s, c]])
+
+
+def _around(travel: Travel) -> np.ndarray:
+    """Velocities (K 2) to try where those ahead explain too little: a cone about the heading, or all directions."""
+    axis = np.arange(-_SPEED_MPS[1], _SPEED_MPS[1] + 0.01, _WIDE_STEP_MPS)
+    v = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    speed = np.hypot(*v.T)
+    keep = speed <= _SPEED_MPS[1]
+    if travel.speed_mps is not None:
+        keep &= np.abs(speed - abs(travel.speed_mps)) <= _speed_margin(travel.speed_mps)
+    if travel.heading_rad is not None:
+        off = np.abs(wrapped(np.arctan2(v[:, 1], v[:, 0]) - travel.heading_rad, 2 * np.pi))
+        keep &= off <= _WIDE_CONE_RAD
+    return v[keep]
+
+
+def _speed_margin(speed_mps: float) -> float:
+    return 1.5 + 0.05 * abs(speed_mps)
+
+
+def _starts(
+    u: np.ndarray, rate: np.ndarray, velocities: np.ndarray, period: float, sigma: float
+) -> np.ndarray:
+    """The few velocities (K 2) that explain most and lie at least 1 m/s apart."""
+    score = _scores(u, rate, velocities, period, sigma)
+    peaks = []
+    for _ in range(_PEAKS):
+        if not len(score) or score.max() <= 0:
+            break
+        peaks.append(velocities[int(np.argmax(score))])
+        off = np.abs(velocities - peaks[-1]) <= _APART_MPS + 1e-9
+        score[off[:, 0] & off[:, 1]] = 0
+    return np.array(peaks).reshape(-1, 2)
+
+
+def _best_fit(
+    u: np.ndarray, rate: np.ndarray, starts: np.ndarray, period: float, gate: float
+) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """The refined start that explains most; None without starts."""
+    fits = [_refine(u, rate, np.append(start, 0.0), period, gate) for start in starts]
+    return max(fits, key=lambda fit: _value(u, rate, fit, period, gate), default=None)
+
+
+def _value(
+    u: np.ndarray,
+    rate: np.ndarray,
+    fit: tuple[np.ndarray, np.ndarray, float],
+    period: float,
+    gate: float,
+) -> float:
+    """Share of detections within the gate, and how many of them agree finely: 0 to 2."""
+    r = wrapped(rate + u @ fit[0], period)
+    return float(np.mean(np.exp(-0.5 * (r / 0.15) ** 2)) + np.mean(np.abs(r) < gate))
 
 
 def _search_points(u: np.ndarray, power: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
@@ -223,36 +234,19 @@ def _search_points(u: np.ndarray, power: np.ndarray | None, rng: np.random.Gener
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @njit(cache=True, fastmath=True)
-def _grid_score(
-    u: np.ndarray, rate: np.ndarray, vx: np.ndarray, vy: np.ndarray, period: float, sigma: float
-) -> np.ndarray:
-    """Sum of (1 + (r / sigma)^2)^-2 over detections for each (vx, vy)."""
-    out = np.zeros((len(vx), len(vy)))
+def _scores(u: np.ndarray, rate: np.ndarray, v: np.ndarray, period: float, sigma: float) -> np.ndarray:
+    """Sum of (1 + (r / sigma)^2)^-2 over detections for each velocity."""
+    out = np.zeros(len(v))
     inverse_period = 1 / period if period > 0 else 0.0
-    for i in range(len(vx)):
-        for j in range(len(vy)):
-            total = 0.0
-            for k in range(len(u)):
-                r = rate[k] + u[k, 0] * vx[i] + u[k, 1] * vy[j]
-                r -= period * np.floor(r * inverse_period + 0.5)
-                t = 1 / (1 + (r / sigma) ** 2)
-                total += t * t
-            out[i, j] = total
+    for i in range(len(v)):
+        total = 0.0
+        for k in range(len(u)):
+            r = rate[k] + u[k, 0] * v[i, 0] + u[k, 1] * v[i, 1]
+            r -= period * np.floor(r * inverse_period + 0.5)
+            t = 1 / (1 + (r / sigma) ** 2)
+            total += t * t
+        out[i] = total
     return out
-
-
-def _separate_peaks(score: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """Indices of the highest scores that lie at least 1 m/s apart."""
-    score = score.copy()
-    reach = round(1.0 / _GRID_STEP_MPS)
-    peaks = []
-    for _ in range(count):
-        i, j = np.unravel_index(int(np.argmax(score)), score.shape)
-        if score[i, j] <= 0:
-            break
-        peaks.append((int(i), int(j)))
-        score[max(0, i - reach) : i + reach + 1, max(0, j - reach) : j + reach + 1] = 0
-    return peaks
 
 
 def _refine(
@@ -262,13 +256,13 @@ def _refine(
     scale = max(gate, _GRID_SIGMA_MPS)
     noise, information = scale, np.eye(3)
     for _ in range(12):
-        r = _wrapped(rate + u @ velocity, period)
+        r = wrapped(rate + u @ velocity, period)
         near = np.abs(r[np.abs(r) < gate])
         noise = float(np.clip(1.4826 * np.median(near), _NOISE_FLOOR_MPS, gate)) if len(near) else gate
         scale = max(0.6 * scale, 2.5 * noise)
         w = (1 + (r / scale) ** 2) ** -2
         # Poor elevations say nothing about the vertical: the prior keeps it from running away.
-        vertical = 1 / (0.05 + _VERTICAL_SLOPE * abs(velocity[0])) ** 2
+        vertical = 1 / (0.05 + _VERTICAL_SLOPE * np.hypot(velocity[0], velocity[1])) ** 2
         information = (u.T * w) @ u / noise**2 + np.diag([1e-6, 1e-6, vertical])
         step = np.linalg.solve(information, -(u.T @ (w * r)) / noise**2 - [0, 0, vertical * velocity[2]])
         velocity = velocity + step

@@ -12,10 +12,11 @@ import numpy as np
 from pipeline.config import FleetConfig, PerceiveConfig
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.radar_grid import Scan
+from pipeline.geometry.se3 import from_quaternion
 from pipeline.perceive.camera import SemanticsSource, TopicSource, decode_grey, encode_png
 from pipeline.perceive.depth_edges import lidar_edges
 from pipeline.perceive.drivable import DrivableSource, free_sector
-from pipeline.perceive.ego_velocity import RadarMotion, radar_motion
+from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
 from pipeline.perceive.ground import PointSource, find_ground
 from pipeline.perceive.labels import ROAD_ID
 from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
@@ -210,8 +211,8 @@ def _perceive_radar(
     """The radar_* columns but those copied from the frame."""
     xyz = frame.radar_xyz_m
     motion = radar_motion(
-        xyz, frame.radar_range_rate_mps, frame.radar_power_db, frame.doppler_period_mps, frame.ego_speed_mps,
-        frame.radar_has_elevation, config, rng,
+        xyz, frame.radar_range_rate_mps, frame.radar_power_db, frame.doppler_period_mps,
+        Travel(frame.ego_speed_mps, _heading(frame)), frame.radar_has_elevation, config, rng,
     )  # fmt: skip
     returns = measure_clusters(xyz, motion.residual_mps, motion.cluster, frame.doppler_period_mps)
     state, found = advance_tracks(
@@ -302,4 +303,15 @@ def _ego_speed(frame: Frame, motion: RadarMotion) -> float | None:
     if frame.ego_speed_mps is not None or motion.velocity_mps is None:
         return frame.ego_speed_mps
     vx, vy = float(motion.velocity_mps[0]), float(motion.velocity_mps[1])
-    return float(np.copysign(np.hypot(vx, vy), vx))
+    heading = _heading(frame) or 0.0
+    return float(np.copysign(np.hypot(vx, vy), vx * np.cos(heading) + vy * np.sin(heading)))
+
+
+def _heading(frame: Frame) -> float | None:
+    """Azimuth in radar axes of the lidar's x axis, which points ahead, by the prior that the frame carries."""
+    names = ("qw", "qx", "qy", "qz")
+    q = [getattr(frame, f"prior_lidar_radar_{name}") for name in names]
+    if any(v is None for v in q):
+        return None
+    ahead = from_quaternion(np.array(q, np.float64), np.zeros(3))[0, :3]
+    return float(np.arctan2(ahead[1], ahead[0]))

@@ -81,6 +81,19 @@ def test_the_car_ahead_is_one_track_through_the_drive(lake):
     assert last.radar_track_velocity_mps[0] == pytest.approx([5.0, 0.0, 0.0], abs=0.5)
 
 
+def test_a_radar_that_looks_back_still_drives_forwards(lake, made_frame):
+    frame = made_frame(0)
+    turned = replace(
+        frame, radar_x_m=-frame.radar_x_m, radar_y_m=-frame.radar_y_m,
+        prior_lidar_radar_qw=0.0, prior_lidar_radar_qx=0.0, prior_lidar_radar_qy=0.0, prior_lidar_radar_qz=1.0,
+    )  # fmt: skip
+    write_frames(lake, [turned], key="turned")
+    perceive_day(DAY, fleet(), lake)
+    [row] = rows(lake)
+    assert row.radar_velocity_mps[0] == pytest.approx(-8.0, abs=0.1)
+    assert row.ego_speed_mps == pytest.approx(8.0, abs=0.1)
+
+
 def test_the_same_work_is_cached_and_other_work_is_not(lake, made_frame):
     first = perceive_day(DAY, fleet(), lake)
     again = perceive_day(DAY, fleet(), lake)
