@@ -111,10 +111,11 @@ def _measured(report: CheckReport) -> list[str]:
     }
     sync = f"{s.trios} of {s.sweeps} sweeps have image and scan within {s.gate_ms:g} ms"
     nearest = f"median to image {_number(s.camera_median_ms)}, to scan {_number(s.radar_median_ms)}"
+    known = "; ".join(f"{name}: {value}" for name, value in facts.items())
     return [
         f"sync: {sync} ({nearest})",
         f"frame ids: {', '.join(frame_ids) or 'none'}",
-        "; ".join(f"{name}: {value}" for name, value in facts.items()),
+        known if e.frames else f"not known, for want of a frame: {', '.join(facts)}",
     ]
 
 

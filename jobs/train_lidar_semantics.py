@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jobs.extras import needs
+
+if TYPE_CHECKING:
+    from pipeline.learn.perception.lidar_semantics.days import SweepSamples
+    from pipeline.learn.perception.lidar_semantics.network import SweepNetwork
+    from pipeline.learn.perception.lidar_semantics.training import SweepTraining
+    from pipeline.learn.perception.trainer import TrainingResult
 
 __all__ = ["train_lidar_semantics"]
 
@@ -53,8 +60,7 @@ def train_lidar_semantics(  # options of the command: as many as a user may set
     from jobs.train import parse_duration
     from pipeline.config import load_fleet
     from pipeline.learn.perception.lidar_semantics.days import labelled_sweeps
-    from pipeline.learn.perception.lidar_semantics.export import export_sweeps
-    from pipeline.learn.perception.lidar_semantics.training import SweepTraining, normal_of, train_sweeps
+    from pipeline.learn.perception.lidar_semantics.training import SweepTraining, train_sweeps
     from pipeline.store.partitions import Lake
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
@@ -63,14 +69,24 @@ def train_lidar_semantics(  # options of the command: as many as a user may set
     torch.set_num_threads(threads)
     with progress_reporter(f"train {out.name}") as progress:
         network, result = train_sweeps(samples.train, samples.held_out, out, config, limit, progress)
-    outputs: list[Path] = []
-    if result.status == "done":
-        card = {
-            "data": samples.numbers,
-            "training": asdict(config),
-            "held_out_against_projected_labels": result.scores,
-        }
-        outputs = [export_sweeps(network, samples.layout, normal_of(samples.train), out, card)]
+    outputs = [_export(network, samples, result, config, out)] if result.status == "done" else []
     fields = samples.numbers | asdict(result)
     print_summary("train-lidar-semantics", fields.pop("status"), out=out, outputs=outputs, **fields)
     return 128 + result.signal if result.signal else 0
+
+
+def _export(
+    network: SweepNetwork, samples: SweepSamples, result: TrainingResult, config: SweepTraining, out: Path
+) -> Path:
+    """The finished network as a model with a card that says what it was trained on and how well it does."""
+    from dataclasses import asdict
+
+    from pipeline.learn.perception.lidar_semantics.export import export_sweeps
+    from pipeline.learn.perception.lidar_semantics.training import normal_of
+
+    card = {
+        "data": samples.numbers,
+        "training": asdict(config),
+        "held_out_against_projected_labels": result.scores,
+    }
+    return export_sweeps(network, samples.layout, normal_of(samples.train), out, card)

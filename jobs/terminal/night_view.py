@@ -1,4 +1,4 @@
-"""What a person sees of a night: bars on a terminal, one structured line per vehicle-day otherwise."""
+"""What a person sees of a night: bars on a terminal, else a structured line per stage begun and vehicle-day ended."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class NightView(Protocol):
 def night_view(names: list[str], total: int, title: str = "night") -> Iterator[NightView]:
     """A view of `total` vehicle-days, of which those in work have `names` in order of their index."""
     if not is_terminal():
-        yield _Lines(total, title)
+        yield _Lines(names, total, title)
         return
     from rich.console import Console
     from rich.progress import (
@@ -66,11 +66,22 @@ def night_view(names: list[str], total: int, title: str = "night") -> Iterator[N
 
 
 class _Lines:
-    def __init__(self, total: int, title: str) -> None:
-        self._total, self._title, self._ended = total, title, 0
+    """Lines for a log file. Whoever watches looks five times a second: a stage shorter than that may get no line."""
+
+    def __init__(self, names: list[str], total: int, title: str) -> None:
+        from pipeline.stages import STAGES
+
+        self._names, self._total, self._title, self._ended = names, total, title, 0
+        self._stages = {stage.name for stage in STAGES}
+        self._in_work: dict[int, str] = {}
 
     def watch(self, index: int, done: int, total: int, what: str) -> None:
-        pass  # only ends are worth a log line
+        del done, total
+        stage = what.partition(" ")[0]
+        if stage in self._stages and self._in_work.get(index) != stage:
+            self._in_work[index] = stage
+            vehicle, _, day = self._names[index].rpartition(" ")
+            logger().info("stage", vehicle=vehicle, day=day, stage=stage)
 
     def finished(self, outcome: DayOutcome) -> None:
         self._ended += 1
@@ -82,6 +93,7 @@ class _Lines:
             day=outcome.day,
             status=outcome.status,
             reason=outcome.reason,
+            stages=outcome.stages,
             pairs=outcome.pairs,
             frames=outcome.frames,
             ended=self._ended,

@@ -8,6 +8,7 @@ is an upper bound, not an approximation: see `alarm_threshold`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -191,9 +192,18 @@ def judge_chart(
         reason = "a change may have begun, but it is not sure enough for an alarm"
         return ChartVerdict("UNKNOWN", reason, days, statistic, threshold, visible, None)
     if visible > limit:
-        reason = "no change seen, but one of the size that matters could hide in the sigmas"
+        reason = _what_could_hide(days, visible / limit)
         return ChartVerdict("UNKNOWN", reason, days, statistic, threshold, visible, None)
     return ChartVerdict("GREEN", "no change", days, statistic, threshold, visible, None)
+
+
+def _what_could_hide(days: int, times: float) -> str:
+    """`times`: what a chart of so many days shows, in sizes that matter. It shrinks with the root of the days."""
+    needed = math.ceil(days * times**2)
+    return (
+        f"no change seen, but one of the size that matters could hide: {times:.1f} times as much would show, and "
+        f"that size after about {_count(needed)} like these"
+    )
 
 
 def _step_sizes(chart: Chart) -> tuple[np.ndarray, np.ndarray]:

@@ -53,8 +53,15 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
         return VehicleStatus("GREEN", f"no sensor moved ({count})")
     if max((f.days_used for f in findings), default=0) > 1:
         hidden = " and of the ".join(unwatched)
-        return VehicleStatus("UNKNOWN", f"no change seen, but a turn of the {hidden} could hide ({count})")
+        blind = [f for f in findings if (f.pair, f.dof) in _charts(unwatched[0]) and f.status != "GREEN"]
+        why = "".join(f"; {f.pair} {f.dof}: {f.reason}" for f in blind[:1])
+        return VehicleStatus("UNKNOWN", f"a turn of the {hidden} could hide ({count}){why}")
     return VehicleStatus("UNKNOWN", "too little data to say whether a sensor moved")
+
+
+def _charts(sensor: str) -> tuple[tuple[str, str], ...]:
+    """The charts that watch a sensor, where it has a choice the first."""
+    return _WATCHED[sensor][0]
 
 
 def _clarity(alarm: DriftFinding) -> tuple[bool, bool, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected
-from pipeline.ingest.index import ACCEPTED_TYPES, DayIndex, index_logs, topics_of
+from pipeline.ingest.index import ACCEPTED_TYPES, NEEDED, DayIndex, index_logs, topics_of
 from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
 from pipeline.ingest.stage import pick_trios, read_file_prior
 from pipeline.results import Progress, silent
@@ -100,9 +100,10 @@ def check_logs(
     finally:
         index.close()
     usable = round(len(trios) * len(frames) / len(picked)) if trios else 0
-    evidence = _evidence(frames, usable, rig)
-    verdicts = judge(evidence)
     topics = _topics(index, rig)
+    missing = [f"{t.topic} ({t.role}): {t.problem}" for t in topics if t.problem and t.role in NEEDED]
+    evidence = replace(_evidence(frames, usable, rig), missing=tuple(missing))
+    verdicts = judge(evidence)
     return CheckReport(
         answer=overall(verdicts),
         verdicts=verdicts,

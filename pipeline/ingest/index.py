@@ -19,7 +19,7 @@ from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.messages.transforms import TransformTree
 from pipeline.rigs import Rig, TopicSemantics
 
-__all__ = ["ACCEPTED_TYPES", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]
+__all__ = ["ACCEPTED_TYPES", "NEEDED", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]
 
 _IMAGE_TYPES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
@@ -33,7 +33,8 @@ ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
     "tf_static": ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
 }
 _MOST_CAMERAS = 1000  # distinct camera_info contents remembered: a bound where a driver writes noise into it
-_NEEDED = ("image", "info", "lidar", "radar")
+# Roles without which there is no frame.
+NEEDED = ("image", "info", "lidar", "radar")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +136,7 @@ def index_logs(paths: Sequence[Path], rig: Rig, *, survey: bool = False) -> DayI
             index.complain(f"{path}: cannot be read further: {err}")
             index.damage["logs_lost_while_reading"] += 1
     for topic, role in topics.items():
-        if role in _NEEDED and topic not in index.topics_seen:
+        if role in NEEDED and topic not in index.topics_seen:
             index.complain(f"topic {topic} ({role}) has no message in any log")
     for tree in index.trees:
         for other in index.trees:

@@ -14,7 +14,10 @@ _DENSE_RINGS = 32  # below, reflectivity on the road has to carry pitch
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a verdict rests on; shares are of the frames looked at."""
+    """What a verdict rests on; shares are of the frames looked at, and say nothing where there are none.
+
+    `missing` names the topics without which no frame can be put together: no message of theirs, or of another type.
+    """
 
     frames: int
     has_prior: bool
@@ -25,6 +28,7 @@ class Evidence:
     elevation_share: float
     moving_share: float | None
     doppler_problem: str = ""
+    missing: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -39,12 +43,19 @@ class DofVerdict:
 
 def judge(evidence: Evidence) -> list[DofVerdict]:
     """One verdict per pair and class of DoF, the weakest of what it needs."""
+    if evidence.frames == 0:
+        return [_verdict(pair, dof, _without_frames(evidence)) for pair, dof, _ in _needs(evidence)]
+    return [_verdict(pair, dof, needs) for pair, dof, needs in _needs(evidence)]
+
+
+def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
+    """What each pair and class of DoF needs and has not."""
     camera, radar, ground = _camera_needs(evidence), _radar_needs(evidence), _common_needs(evidence)
     pitch = ground + camera + _pitch_needs(evidence)
     tilt = ground + radar + _elevation_needs(evidence)
     moving = ground + _moving_needs(evidence)
     shift = [("weak", "far objects say little about shifts: the prior carries part of it")]
-    rows = [
+    return [
         ("camera_lidar", "yaw and roll", ground + camera),
         ("camera_lidar", "pitch", pitch),
         ("camera_lidar", "translation", ground + camera + shift),
@@ -56,7 +67,6 @@ def judge(evidence: Evidence) -> list[DofVerdict]:
         ("camera_radar", "roll and pitch", tilt + camera),
         ("camera_radar", "translation", ground + camera + radar + shift),
     ]
-    return [_verdict(pair, dof, needs) for pair, dof, needs in rows]
 
 
 def overall(verdicts: list[DofVerdict]) -> str:
@@ -66,6 +76,14 @@ def overall(verdicts: list[DofVerdict]) -> str:
 
 
 _Needs = list[tuple[str, str]]
+
+
+def _without_frames(e: Evidence) -> _Needs:
+    """Where no frame could be looked at, only why: nobody knows whether prior, labels or motion are there."""
+    why = [("no", topic) for topic in e.missing] or [
+        ("no", f"0 usable synchronised frames; at least {_FEW_FRAMES} are needed")
+    ]
+    return [*why, ("no", "so prior, labels and motion could not be judged")]
 
 
 def _common_needs(e: Evidence) -> _Needs:

@@ -1,5 +1,7 @@
 """The charts: their false alarms, their power, their start days."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -146,6 +148,19 @@ def test_green_is_only_said_where_a_change_of_the_limit_would_be_seen() -> None:
     blind = judge_chart(_chart(np.zeros(4), 0.3), 0.25, PROBABILITY, 2)
     assert (seeing.status, blind.status) == ("GREEN", "UNKNOWN")
     assert "could hide" in blind.reason
+
+
+@pytest.mark.parametrize("sigma", [0.13, 0.2, 0.31])
+@pytest.mark.parametrize("days", [3, 4, 9])
+def test_a_chart_that_cannot_tell_yet_says_after_how_many_days_it_can(sigma: float, days: int) -> None:
+    blind = judge_chart(_chart(np.zeros(days), sigma), 0.25, PROBABILITY, 2)
+    if blind.status == "GREEN":
+        assert days >= 9  # only then is the sigma small enough
+        return
+    needed = int(re.search(r"after about (\d+) days", blind.reason)[1])
+    # An odd number of days splits unevenly, three of them by an eighth of sigma squared: "about".
+    assert judge_chart(_chart(np.zeros(needed + 1), sigma), 0.25, PROBABILITY, 2).status == "GREEN"
+    assert judge_chart(_chart(np.zeros(int(0.8 * needed)), sigma), 0.25, PROBABILITY, 2).status == "UNKNOWN"
 
 
 def test_what_looks_like_a_change_but_is_not_sure_is_not_called_green() -> None:

@@ -39,9 +39,10 @@ def test_a_vehicle_is_green_although_charts_of_what_the_road_does_not_determine_
 
 @pytest.mark.parametrize("missing", sorted(WATCHED))
 def test_a_chart_on_which_a_turn_could_hide_makes_the_vehicle_unknown_and_names_the_sensor(missing):
-    found = decide_status(charts(**{"_".join(missing): {"status": "UNKNOWN"}}))
+    found = decide_status(charts(**{"_".join(missing): {"status": "UNKNOWN", "reason": "what could hide"}}))
     assert found.status == "UNKNOWN"
     assert ("radar" if missing[0] == "lidar_radar" else "camera or lidar") in found.reason
+    assert f"{missing[0]} {missing[1]}: what could hide" in found.reason
 
 
 def test_radar_yaw_may_be_watched_from_the_camera_instead():

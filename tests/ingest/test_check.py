@@ -111,6 +111,23 @@ def test_a_missing_topic_is_named_with_those_that_it_might_be(kit, tmp_path):
     assert any(kit.RADAR in line and "/radar/rear" in line for line in report.advice)
 
 
+@pytest.mark.parametrize("role", ["LIDAR", "RADAR", "IMAGE"])
+def test_without_a_sensors_topic_nothing_else_is_said_to_be_missing(kit, tmp_path, role):
+    topic = getattr(kit, role)
+    drive = kit.Kit(frames=12).drive()
+    drive.messages = [("/mistyped", *m[1:]) if m[0] == topic else m for m in drive.messages]
+    for found in report_on(kit, tmp_path, drive).verdicts:
+        assert found.verdict == "no"
+        assert topic in found.reasons[0]
+        assert "/mistyped" in found.reasons[0]
+        assert found.reasons[1:] == ["so prior, labels and motion could not be judged"]
+
+
+def test_sensors_that_never_meet_are_told_from_absent_ones():
+    (first, *_), *_ = [v.reasons for v in judge(changed(frames=0, has_prior=False, labels_share=0.0))]
+    assert first == "0 usable synchronised frames; at least 10 are needed"
+
+
 def test_a_planar_radar_a_missing_field_and_a_wrong_sign_are_noticed(kit, tmp_path):
     drive, planar = kit.Kit(frames=40).drive(), kit.Kit(frames=40).drive()
     for i in range(40):

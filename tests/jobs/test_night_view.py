@@ -20,9 +20,13 @@ def show(names=NAMES):
         view.ended("bus 2026-03-02")
 
 
-def test_without_a_terminal_every_vehicle_day_is_one_json_line(capsys):
+def lines_of(capsys):
+    return [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+
+
+def test_without_a_terminal_every_vehicle_day_that_ends_is_one_json_line(capsys):
     show()
-    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    lines = [line for line in lines_of(capsys) if line["event"] != "stage"]
     assert [(line["level"], line.get("status")) for line in lines] == [
         ("info", "done"),
         ("error", "failed"),
@@ -31,6 +35,23 @@ def test_without_a_terminal_every_vehicle_day_is_one_json_line(capsys):
     ]
     assert lines[1]["trace"].startswith("Traceback")
     assert (lines[2]["ended"], lines[2]["total"]) == (3, 4)
+
+
+def test_without_a_terminal_every_stage_that_begins_is_one_json_line(capsys):
+    with night_view(NAMES, 3) as view:
+        for done in range(3):
+            view.watch(0, done, 3, "ingest frames")
+        view.watch(2, 0, 0, "ingest frames")
+        view.watch(0, 1, 9, "perceive perceive")
+    told = [(line["vehicle"], line["day"], line["stage"]) for line in lines_of(capsys)]
+    car, bus = ("car", "2026-03-02"), ("bus", "2026-03-02")
+    assert told == [(*car, "ingest"), (*bus, "ingest"), (*car, "perceive")]
+
+
+def test_what_is_simulated_is_no_stage(capsys):
+    with night_view(NAMES, 3, "simulate") as view:
+        view.watch(0, 1, 9, NAMES[0])
+    assert lines_of(capsys) == []
 
 
 def test_on_a_terminal_every_end_is_a_line_and_bars_do_not_stay(capsys, monkeypatch):
