@@ -6,10 +6,11 @@ from tests.benchmarks.studies.days import Day, DaySpec
 from tests.benchmarks.studies.engine import Run, calibrate_once
 from tests.makers.simulated_days import simulated_day
 
-SPEC = DaySpec(150, "urban", 32, "demo")
-# Measured on this tuning day: 0.033 / 0.015, 0.036 / 0.103, 0.025 / 0.124 deg, 0.018 m of lidar-radar range. The bounds
-# are three to five times as much: room for other rounding, none for a lost basin or a swapped frame.
-BOUNDS_DEG = {"camera_lidar": (0.12, 0.08), "camera_radar": (0.15, 0.40), "lidar_radar": (0.12, 0.40)}
+# A day that nothing was chosen on: bounds come from what is promised, not from what this day shows. Angles: what an
+# accepted record certifies (pipeline/calibrate/verify/limits.py); elevation of radar pairs: four times the constant
+# elevation error that the simulator draws for a radar (0.15 deg); range: no worse than the start.
+SPEC = DaySpec(4900, "urban", 32, "demo")
+BOUNDS_DEG = {"camera_lidar": (0.2, 0.2), "camera_radar": (0.4, 0.6), "lidar_radar": (0.4, 0.6)}
 RANGE_M = 0.10
 
 
@@ -28,7 +29,7 @@ def test_a_simulated_day_is_calibrated_to_its_truth(pairs, pair):
     azimuth_deg, elevation_deg = BOUNDS_DEG[pair]
     assert pairs[pair]["az_deg"] <= azimuth_deg
     assert pairs[pair]["el_deg"] <= elevation_deg
-    assert pairs[pair]["prior_az_deg"] > 2 * azimuth_deg or pairs[pair]["prior_el_deg"] > 2 * elevation_deg
+    assert pairs[pair]["prior_az_deg"] > azimuth_deg or pairs[pair]["prior_el_deg"] > elevation_deg
 
 
 @pytest.mark.slow
