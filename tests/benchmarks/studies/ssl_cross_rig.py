@@ -24,7 +24,7 @@ __all__ = ["DAYS", "summary"]
 
 _FRAMES = 40
 DAYS = [
-    DaySpec(900 + 2 * i + k, environment, _FRAMES, rig)
+    DaySpec(3900 + 2 * i + k, environment, _FRAMES, rig)
     for i, rig in enumerate(("paper", "demo", "ring16"))
     for k, environment in enumerate(("urban", "highway"))
 ]
