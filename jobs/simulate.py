@@ -22,7 +22,7 @@ def simulate(
     first_day: str = "2026-03-02",
     frames: int = 40,
     rate_hz: float = 2.0,
-    rig: Literal["demo", "paper", "ring16", "demo-flat", "paper-flat", "ring16-flat"] = "demo",
+    rig: str = "demo",
     environments: Literal["mixed", "urban", "highway"] = "mixed",
     container: Literal["mcap", "ros1", "db3", "mixed"] = "mcap",
     faults: str = "",
@@ -40,11 +40,13 @@ def simulate(
         first_day: first of them, YYYY-MM-DD.
         frames: camera-lidar-radar trios per vehicle-day, in three drives.
         rate_hz: trios per second within a drive.
-        rig: sensors; `-flat` means a radar without elevation.
+        rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128, rosette,
+            fisheye, pinhole, rolling, truck, bumper or tilted; each with `-flat` behind it for a radar without
+            elevation. pipeline/simulate/README.md says what they are.
         environments: what the drives lead through.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
         faults: vehicle:day:sensor:kind:amount, several with commas; kinds: yaw pitch roll [deg], x y z [m],
-            drift-... per day, time [s], missing, swap, intrinsics, labels, night, few.
+            drift-... per day, time [s], missing, swap, intrinsics, centre, centre-v [px], labels, night, dusk, few.
         remount_deg: sd per axis by which every day's mounting differs from the day before, as when a rig is taken off
             every evening; fixed sensors move by hundredths of a degree, which is the default.
         reflectors: also record three corner reflectors on every vehicle's last day, under OUT/reflectors.

@@ -4,8 +4,10 @@ Kinds: yaw, pitch, roll [deg] and x, y, z [m] are knocks from that day on, about
 same with `drift-` before it grow by the amount per day, starting that day. From that day on `time` [s] lets a sensor
 measure earlier than its stamps say, which stay with the others'; `stamp` [s] shifts its stamps, and nothing else.
 Only on that day: `missing` (no data), `swap` (the sensor's topic carries the other point cloud), `intrinsics` (logged
-focal length wrong by the fraction), `labels` (classes permuted), `night` (dark images, bad semantics), `few` (that many
-frames in all).
+focal length wrong by the fraction), `centre` and `centre-v` (logged principal point too far to the right, or down, by
+so many pixels), `labels` (classes permuted), `night` (dark images, outlines three times as loose, classes confused,
+half of the boxes missed), `dusk` (dark images, outlines 2 label pixels noisier, half of the boxes missed, nothing
+else), `few` (that many frames in all).
 """
 
 from __future__ import annotations
@@ -24,14 +26,15 @@ from pipeline.simulate.sensors.rigs import Mounting
 __all__ = ["KINDS", "DayFaults", "Fault", "faults_on", "misread", "parse_faults", "shaken"]
 
 _AXES: Final = {"roll": 0, "pitch": 1, "yaw": 2, "x": 0, "y": 1, "z": 2}
-_DAY_ONLY: Final = ("missing", "swap", "intrinsics", "labels", "night", "few")
+_CAMERA_ONLY: Final = ("intrinsics", "centre", "centre-v", "labels", "night", "dusk", "few")
+_DAY_ONLY: Final = ("missing", "swap", *_CAMERA_ONLY)
 _CLOCKS: Final = ("time", "stamp")
 KINDS: Final = (*_AXES, *(f"drift-{a}" for a in _AXES), *_CLOCKS, *_DAY_ONLY)
 _SENSORS: Final = {
     **dict.fromkeys(_CLOCKS, ("camera", "radar")),
     "missing": ("camera", "lidar", "radar"),
     "swap": ("lidar", "radar"),
-    **dict.fromkeys(("intrinsics", "labels", "night", "few"), ("camera",)),
+    **dict.fromkeys(_CAMERA_ONLY, ("camera",)),
 }
 
 
@@ -53,8 +56,10 @@ class DayFaults:
     missing: tuple[str, ...] = ()
     swapped: bool = False
     focal_factor: float = 1.0
+    centre_shift_px: tuple[float, float] = (0.0, 0.0)
     labels_permuted: bool = False
     night: bool = False
+    dusk: bool = False
     frames: int | None = None
 
 
@@ -115,18 +120,25 @@ def faults_on(faults: tuple[Fault, ...], vehicle: str, day: int) -> DayFaults:
     """What is wrong on that day only."""
     today = [f for f in faults if f.vehicle == vehicle and f.day == day]
     kinds = {f.kind: f for f in today}
+
+    def amount(kind: str) -> float:
+        return kinds[kind].amount if kind in kinds else 0.0
+
     return DayFaults(
         missing=tuple(f.sensor for f in today if f.kind == "missing"),
         swapped="swap" in kinds,
-        focal_factor=1 + kinds["intrinsics"].amount if "intrinsics" in kinds else 1.0,
+        focal_factor=1 + amount("intrinsics"),
+        centre_shift_px=(amount("centre"), amount("centre-v")),
         labels_permuted="labels" in kinds,
         night="night" in kinds,
+        dusk="dusk" in kinds,
         frames=int(kinds["few"].amount) if "few" in kinds else None,
     )
 
 
-def misread(camera: Camera, factor: float) -> Camera:
-    """The camera as its log describes it where the logged focal length is wrong by a factor."""
+def misread(camera: Camera, today: DayFaults) -> Camera:
+    """The camera as the day's logs describe it: focal length or principal point may be wrong."""
     K = camera.K.copy()
-    K[[0, 1], [0, 1]] *= factor
+    K[[0, 1], [0, 1]] *= today.focal_factor
+    K[:2, 2] += today.centre_shift_px
     return replace(camera, K=K)

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.results import Progress, silent
-from pipeline.simulate.faults import DayFaults, Fault, faults_on, shaken
+from pipeline.simulate.faults import DayFaults, Fault, faults_on, misread, shaken
 from pipeline.simulate.logs.fleet_toml import fleet_toml
 from pipeline.simulate.logs.recording import FIRST_FRAME_S, Setup, record_drive
 from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log
@@ -213,7 +213,7 @@ def drive_of(spec: FleetSpec, vehicle: int, day: int, number: int, frames: int) 
     seed = int(np.random.default_rng([spec.seed, vehicle, day, number, 52]).integers(1 << 31))
     today: DayFaults = faults_on(spec.faults, vehicle_names(spec)[vehicle], day)
     duration = FIRST_FRAME_S + frames / spec.rate_hz + 1.0
-    return Drive(seed, environment, duration, int(start.timestamp()) * 10**9, today.night)
+    return Drive(seed, environment, duration, int(start.timestamp()) * 10**9, today.night or today.dusk)
 
 
 def _truth(spec: FleetSpec, vehicle: int, day: int, m: Mounting) -> dict[str, Any]:
@@ -234,6 +234,7 @@ def _truth(spec: FleetSpec, vehicle: int, day: int, m: Mounting) -> dict[str, An
         "radar_range_bias_m": m.radar_range_bias_m,
         "radar_elevation_bias_rad": m.radar_elevation_bias_rad,
         "camera_K": m.camera.K.tolist(),
-        "camera_K_logged": m.nominal_camera.K.tolist(),
+        "camera_K_logged": misread(m.nominal_camera, faults_on(spec.faults, name, day)).K.tolist(),
+        "camera_readout_s": rig_named(spec.rig).camera.readout_s,
         "faults": [asdict(f) | {"active": f.day <= day} for f in spec.faults if f.vehicle == name],
     }

@@ -65,6 +65,19 @@ def flat_shot():
     return shots_of("urban", rig=small, times=(2.0,))[0]
 
 
+@pytest.fixture(scope="session")
+def shots_of_rig():
+    """One trio of a rig; where its lidar looks all around, with fewer columns, for time."""
+
+    def make(name, environment):
+        rig = rig_named(name)
+        around = rig.lidar.azimuth_deg[1] == 180
+        lidar = replace(rig.lidar, columns=450) if around else rig.lidar
+        return shots_of(environment, rig=replace(rig, lidar=lidar), times=(2.0,))[0]
+
+    return make
+
+
 def messages_of(path):
     one, two = Messages(1).typestore, Messages(2).typestore
     if path.suffix == ".mcap":

@@ -118,6 +118,31 @@ def test_bad_days_spoil_what_they_say(tmp_path, logged):
     assert np.mean(decoded(bad[TOPICS["labels"]]) != decoded(good[TOPICS["labels"]])) > 0.5
 
 
+def test_a_wrong_principal_point_is_in_the_log_and_in_the_truth_but_not_in_the_image(tmp_path, logged):
+    good, truth = logged(FleetSpec(**QUIET), tmp_path / "good")
+    bad, spoiled = logged(
+        spec_with(
+            Fault("vehicle-1", 1, "camera", "centre", 4.0), Fault("vehicle-1", 1, "camera", "centre-v", -3.0)
+        ),
+        tmp_path / "bad",
+    )
+    shift = np.array(bad[TOPICS["info"]].k) - np.array(good[TOPICS["info"]].k)
+    np.testing.assert_allclose(shift.reshape(3, 3), [[0, 0, 4], [0, 0, -3], [0, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(np.array(spoiled["camera_K_logged"]).ravel(), bad[TOPICS["info"]].k)
+    assert spoiled["camera_K"] == truth["camera_K"]
+    np.testing.assert_array_equal(bad[TOPICS["image"]].data, good[TOPICS["image"]].data)
+
+
+def test_dusk_is_dark_and_blurs_outlines_but_confuses_less_than_night(tmp_path, logged):
+    wrong = {}
+    good, _ = logged(FleetSpec(**QUIET), tmp_path / "day")
+    for kind in ("dusk", "night"):
+        dark, _ = logged(spec_with(Fault("vehicle-1", 1, "camera", kind, 1.0)), tmp_path / kind)
+        assert decoded(dark[TOPICS["image"]]).mean() < 0.75 * decoded(good[TOPICS["image"]]).mean()
+        wrong[kind] = np.mean(decoded(dark[TOPICS["labels"]]) != decoded(good[TOPICS["labels"]]))
+    assert 0.02 < wrong["dusk"] < 0.6 * wrong["night"]
+
+
 def test_night_is_dark_and_confuses_the_networks(tmp_path, logged):
     good, _ = logged(FleetSpec(**QUIET), tmp_path / "day")
     dark, truth = logged(spec_with(Fault("vehicle-1", 1, "camera", "night", 1.0)), tmp_path / "night")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from jaxtyping import Float, Int32
 
 from pipeline.geometry.cameras import Camera
 from pipeline.simulate.sensors.pixels import upsampled
+from pipeline.simulate.sensors.rolling_shutter import RollingShutter
 from pipeline.simulate.sensors.shading import Light, Materials, Shadows, Sight, Surfaces, developed, shade
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.materials import TABLE
@@ -23,12 +24,16 @@ _GROUND_LABELS: Final = (0, 1, 9)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Triangle seen by each pixel, at half size (`coarse`) and at full size, and the rays behind it."""
+    """Triangle seen by each pixel, at half size (`coarse`) and at full size, and the rays behind it.
+
+    `origin` is where all rays begin; with a rolling shutter those of the row in the middle do.
+    """
 
     coarse: Int32[np.ndarray, "h w"]
     full: Int32[np.ndarray, "H W"]
     rays_map: Float[np.ndarray, "H W 3"]
     origin: Float[np.ndarray, " 3"]
+    shutter: RollingShutter | None = None
 
 
 @lru_cache(maxsize=8)
@@ -42,20 +47,52 @@ def _rays_of(camera: Camera) -> np.ndarray:
     return _rays(camera.model, tuple(camera.K.ravel()), tuple(camera.D), camera.width_px, camera.height_px)
 
 
-def view_of(moment: Moment, camera: Camera, T_map_camera: Float[np.ndarray, "4 4"]) -> View:
-    """Cast every pixel of the half-size image, then those of the full image whose surroundings at half size differ."""
-    R = T_map_camera[:3, :3].astype(np.float32)
-    origin = (T_map_camera[:3, 3] - moment.standing.origin).astype(np.float32)
-    half = _rays_of(camera.scaled(0.5)) @ R.T
-    full = _rays_of(camera) @ R.T
-    coarse = _seen(moment, origin, half.reshape(-1, 3)).reshape(half.shape[:2])
+def view_of(
+    moment: Moment,
+    camera: Camera,
+    T_map_camera: Float[np.ndarray, "4 4"],
+    shutter: RollingShutter | None = None,
+) -> View:
+    """Cast every pixel of the half-size image, then those of the full image whose surroundings at half size differ.
+
+    With a rolling shutter every ray begins where the camera is when its row is exposed, and meets the world of then;
+    `T_map_camera` is the pose of the row in the middle.
+    """
+    half, half_rows = _aimed(moment, camera.scaled(0.5), T_map_camera, shutter)
+    full, full_rows = _aimed(moment, camera, T_map_camera, shutter)
+    coarse = _seen(moment, half, half_rows, np.arange(half[..., 0].size)).reshape(half.shape[:2])
     guess, unsure = upsampled(coarse, _surfaces(moment), camera.height_px, camera.width_px)
-    guess.reshape(-1)[unsure] = _seen(moment, origin, full.reshape(-1, 3)[unsure])
-    return View(coarse, guess, full, origin)
+    guess.reshape(-1)[unsure] = _seen(moment, full, full_rows, unsure)
+    return View(
+        coarse, guess, full, (T_map_camera[:3, 3] - moment.standing.origin).astype(np.float32), shutter
+    )
 
 
-def _seen(moment: Moment, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    return moment.cast(np.broadcast_to(origin, rays.shape), rays, np.zeros(len(rays), np.float32)).triangle
+class _Rows(NamedTuple):
+    """Where the rays of each image row begin, in the moment's coordinates, and how long after the moment."""
+
+    origin: np.ndarray
+    delay_s: np.ndarray
+
+
+def _aimed(
+    moment: Moment, camera: Camera, T_map_camera: np.ndarray, shutter: RollingShutter | None
+) -> tuple[np.ndarray, _Rows]:
+    """Directions of all pixels in the map, and the rows that they belong to."""
+    rows = camera.height_px
+    if shutter is None:
+        R = T_map_camera[:3, :3].astype(np.float32)
+        origin = (T_map_camera[:3, 3] - moment.standing.origin).astype(np.float32)
+        return _rays_of(camera) @ R.T, _Rows(np.broadcast_to(origin, (rows, 3)), np.zeros(rows, np.float32))
+    T = shutter.poses(moment.t_s, rows)
+    origin = (T[:, :3, 3] - moment.standing.origin).astype(np.float32)
+    rays = np.einsum("hij,hwj->hwi", T[:, :3, :3].astype(np.float32), _rays_of(camera))
+    return rays, _Rows(origin, shutter.delays_s(rows).astype(np.float32))
+
+
+def _seen(moment: Moment, rays: np.ndarray, rows: _Rows, pixels: np.ndarray) -> np.ndarray:
+    row = pixels // rays.shape[1]
+    return moment.cast(rows.origin[row], rays.reshape(-1, 3)[pixels], rows.delay_s[row]).triangle
 
 
 def _surfaces(moment: Moment) -> np.ndarray:
@@ -69,21 +106,41 @@ def render(
     moment: Moment, view: View, sun: Float[np.ndarray, " 3"], rng: np.random.Generator, *, night: bool = False
 ) -> np.ndarray:
     """BGR image, uint8."""
-    mesh, shadows = moment.mesh, moment.standing.shadows
     # Sun and sky add up to about 1 on a white surface facing the sun; at night only a street-lamp glow is left.
-    sun_light, sky_light, sky_radiance = (0.01, 0.06, 0.006) if night else (0.95, 0.42, 1.0)
+    light = Light(sun.astype(np.float32), *((0.01, 0.06, 0.006) if night else (0.95, 0.42, 1.0)))
+    if view.shutter is None:
+        image = _lit(moment, Sight(view.full, view.rays_map, view.origin), light)
+    else:
+        image = _lit_in_bands(moment, view, view.shutter, light)
+    exposure = 1.55 * rng.uniform(0.9, 1.12) * (3.2 if night else 1.0)
+    return _exposed(image, exposure, 7.0 if night else 2.2, rng)
+
+
+def _lit_in_bands(moment: Moment, view: View, shutter: RollingShutter, light: Light) -> np.ndarray:
+    """Rows that are exposed together see light and bodies of their own time."""
+    rows = len(view.full)
+    delays, T_map_camera = shutter.delays_s(rows), shutter.poses(moment.t_s, rows)
+    parts = []
+    for band in shutter.bands(rows):
+        middle = (band.start + band.stop) // 2
+        origin = (T_map_camera[middle, :3, 3] - moment.standing.origin).astype(np.float32)
+        sight = Sight(view.full[band], view.rays_map[band], origin)
+        parts.append(_lit(moment.advanced(moment.t_s + float(delays[middle])), sight, light))
+    return np.concatenate(parts)
+
+
+def _lit(moment: Moment, sight: Sight, light: Light) -> np.ndarray:
+    mesh, shadows = moment.mesh, moment.standing.shadows
     patches = np.array(
         [_footprint(a.T_map_actor, moment.standing.origin, a.kind) for a in moment.actors], np.float32
     ).reshape(-1, 8)
-    image = shade(
-        Sight(view.full, view.rays_map, view.origin),
+    return shade(
+        sight,
         Surfaces(mesh.corners, moment.normals, mesh.material, mesh.tint, mesh.uv),
         Materials(TABLE.albedo, TABLE.texture, TABLE.glass, TABLE.glow, TABLE.label),
-        Light(sun.astype(np.float32), sun_light, sky_light, sky_radiance),
+        light,
         Shadows(shadows.light, shadows.s0, shadows.d0, shadows.cell_m, patches),
     )
-    exposure = 1.55 * rng.uniform(0.9, 1.12) * (3.2 if night else 1.0)
-    return _exposed(image, exposure, 7.0 if night else 2.2, rng)
 
 
 def _footprint(T_map_actor: np.ndarray, origin: np.ndarray, kind: str) -> list[float]:

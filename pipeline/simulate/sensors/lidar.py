@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.spherical import from_spherical
-from pipeline.simulate.sensors.rigs import LidarSpec
+from pipeline.simulate.sensors.beams import beams_of
+from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.world.casting import Hits, Moment
 from pipeline.simulate.world.drives import Motion
 from pipeline.simulate.world.materials import LABELS, TABLE
@@ -25,23 +25,16 @@ _FAINTEST: Final = 0.018
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Points in the lidar frame at their own times; `label` is the truth, for tests, and goes into no log."""
+    """Points in the lidar frame at their own times; `label` is the truth, for tests, and goes into no log.
+
+    `ring` is the laser: a row of a scanner, and no row at all where prisms turn the beams.
+    """
 
     xyz_m: np.ndarray
     intensity: np.ndarray
     ring: np.ndarray
     time_s: np.ndarray
     label: np.ndarray
-
-
-@lru_cache(maxsize=8)
-def _beams(spec: LidarSpec) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(azimuth, elevation, ring, column) of all beams, column by column."""
-    azimuth = np.radians(np.linspace(spec.azimuth_deg[1], spec.azimuth_deg[0], spec.columns, endpoint=False))
-    elevation = np.radians(np.linspace(*spec.elevation_deg, spec.rows))
-    a, e = np.meshgrid(azimuth, elevation, indexing="ij")
-    column, ring = np.meshgrid(np.arange(spec.columns), np.arange(spec.rows), indexing="ij")
-    return np.stack([a.ravel(), e.ravel()], 1), ring.ravel().astype(np.uint16), column.ravel()
 
 
 def sweep_lidar(
@@ -53,7 +46,8 @@ def sweep_lidar(
     rng: np.random.Generator,
 ) -> Sweep:
     """One sweep that ends at `end_s` of the drive."""
-    angles, ring, column = _beams(spec)
+    beams = beams_of(spec, end_s)
+    angles, ring, column = beams.angles, beams.laser, beams.column
     column_time = np.linspace(-spec.sweep_s, 0.0, spec.columns)
     T = ego.poses(end_s + column_time) @ T_vehicle_lidar
     R, origin = T[:, :3, :3], T[:, :3, 3] - moment.standing.origin

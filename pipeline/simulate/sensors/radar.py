@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import from_spherical, to_spherical
-from pipeline.simulate.sensors.rigs import RadarSpec
+from pipeline.simulate.sensors.data_sheets import RadarSpec
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Motion
 from pipeline.simulate.world.materials import LABELS, TABLE, material

@@ -1,17 +1,19 @@
-"""What is mounted on a vehicle: sensor data sheets, nominal (CAD) poses, and how true poses differ from them."""
+"""What is mounted on a vehicle: rigs of sensors, nominal (CAD) poses, and how true poses differ from them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.errors import ConfigError
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
 
-__all__ = ["RIGS", "CameraSpec", "LidarSpec", "Mounting", "RadarSpec", "RigSpec", "mounting_of", "rig_named"]
+__all__ = ["RIGS", "Mounting", "RigSpec", "mounting_of", "rig_named"]
 
 # Optical axes (x right, y down, z forward) in a frame with x forward, y left, z up.
 _R_BODY_OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -19,70 +21,20 @@ SENSORS: Final = ("camera", "lidar", "radar")
 
 
 @dataclass(frozen=True)
-class CameraSpec:
-    """An f-theta camera: angle from the axis grows linearly with the distance from the centre."""
-
-    width_px: int = 1824
-    height_px: int = 940
-    horizontal_deg: float = 116.0
-    vertical_deg: float = 58.5
-    focal_error: float = 0.001  # sd of the true focal length against the logged one
-    centre_error_px: float = 0.4  # at full width
-    jpeg_quality: int = 88
-
-    def nominal(self) -> Camera:
-        """Intrinsics as logged."""
-        fx = self.width_px / 2 / np.radians(self.horizontal_deg / 2)
-        fy = self.height_px / 2 / np.radians(self.vertical_deg / 2)
-        K = np.array([[fx, 0, (self.width_px - 1) / 2], [0, fy, (self.height_px - 1) / 2], [0, 0, 1.0]])
-        return Camera("equidistant", K, np.zeros(4), self.width_px, self.height_px)
-
-
-@dataclass(frozen=True)
-class LidarSpec:
-    """A scanning lidar; all beams of a column fire together, columns from left to right during `sweep_s`."""
-
-    azimuth_deg: tuple[float, float] = (-30.0, 30.0)
-    elevation_deg: tuple[float, float] = (-15.0, 9.0)
-    columns: int = 240
-    rows: int = 96
-    sweep_s: float = 0.08
-    min_range_m: float = 5.0
-    max_range_m: float = 80.0
-    range_sigma_m: float = 0.02
-    divergence_deg: float = 0.10  # half angle of the footprint
-
-
-@dataclass(frozen=True)
-class RadarSpec:
-    """An FMCW MIMO radar: resolution cells and what the estimator inside it makes of them."""
-
-    azimuth_deg: float = 30.0  # half field of view
-    elevation_deg: float = 12.0
-    min_range_m: float = 5.0
-    max_range_m: float = 80.0
-    azimuth_resolution_deg: float = 1.6
-    elevation_resolution_deg: float = 6.0
-    range_resolution_m: float = 0.3
-    doppler_resolution_mps: float = 0.15
-    doppler_step_mps: float = 0.08
-    doppler_period_mps: float | None = 40.0
-    doppler_positive: str = "receding"
-    has_elevation: bool = True
-    rays: int = 9000
-
-
-@dataclass(frozen=True)
 class RigSpec:
     """Sensors, nominal poses in the vehicle frame (rear axle, on the ground), and clocks."""
 
     name: str
-    camera: CameraSpec = CameraSpec()
-    lidar: LidarSpec = LidarSpec()
-    radar: RadarSpec = RadarSpec()
+    camera: CameraSpec = field(default_factory=CameraSpec)
+    lidar: LidarSpec = field(default_factory=LidarSpec)
+    radar: RadarSpec = field(default_factory=RadarSpec)
     camera_xyz_m: tuple[float, float, float] = (1.62, 0.02, 1.62)
     lidar_xyz_m: tuple[float, float, float] = (1.50, 0.00, 1.80)
     radar_xyz_m: tuple[float, float, float] = (1.66, -0.22, 1.58)
+    # Turned about the vehicle's axes: roll first, then pitch (positive = nose down), then yaw (to the left).
+    camera_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lidar_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radar_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     camera_delay_s: float = 0.012  # stamp of an event on the camera less its stamp on the lidar
     radar_delay_s: float = -0.018
     delay_sd_s: float = 0.004  # sd per vehicle of both delays
@@ -95,30 +47,86 @@ class RigSpec:
     remount_translation_m: float = 0.002
 
 
-RIGS: Final = {
-    "paper": RigSpec("paper"),
+# Half the pixels of the paper's camera, and a lidar and a radar to match: as good for most purposes, and much faster.
+_CAMERA, _LIDAR, _RADAR = CameraSpec(912, 470), LidarSpec(columns=160, rows=64), RadarSpec(rays=6000)
+# All around, as on a roof: 0.4 deg by 1.3 deg.
+_SPINNING: Final = LidarSpec((-180.0, 180.0), (-25.0, 15.0), 900, 32, 0.1, 0.8, 100.0)
+# Steps of data sheets with 128 channels: 0.125 deg around the horizon, 0.5 deg above and below, 1 deg at the ends.
+_ROWS_128: Final = (
+    *np.arange(-25.0, -14.0, 1.0).tolist(),
+    *np.arange(-14.0, -7.0, 0.5).tolist(),
+    *np.arange(-7.0, 3.0, 0.125).tolist(),
+    *np.arange(3.0, 13.0, 0.5).tolist(),
+    *np.arange(13.0, 15.5, 1.0).tolist(),
+)
+_CORNER: Final = RadarSpec(azimuth_deg=60.0, azimuth_resolution_deg=3.2, rays=9000)
+_BASE: Final = RigSpec("demo", camera=_CAMERA, lidar=_LIDAR, radar=_RADAR)
+
+_ALL: Final = (
+    RigSpec("paper"),
     # One clock without delays, as the paper's car has it: what methods without time offsets are owed.
-    "paper-one-clock": RigSpec("paper-one-clock", camera_delay_s=0.0, radar_delay_s=0.0, delay_sd_s=0.0),
+    RigSpec("paper-one-clock", camera_delay_s=0.0, radar_delay_s=0.0, delay_sd_s=0.0),
     # No common trigger: every sensor at its own rate and phase, as on most cars.
-    "paper-free": RigSpec("paper-free", free_hz=(30.0, 10.0, 13.0)),
-    "demo": RigSpec(
-        "demo",
-        camera=CameraSpec(912, 470),
-        lidar=LidarSpec(columns=160, rows=64),
-        radar=RadarSpec(rays=6000),
-    ),
-    "ring16": RigSpec(
+    RigSpec("paper-free", free_hz=(30.0, 10.0, 13.0)),
+    _BASE,
+    RigSpec(
         "ring16",
-        camera=CameraSpec(912, 470),
+        camera=_CAMERA,
         lidar=LidarSpec((-180.0, 180.0), (-15.0, 15.0), 1800, 16, 0.1, 0.8, 100.0),
         radar=RadarSpec(rays=6000, doppler_period_mps=10.394, doppler_positive="approaching"),
     ),
-}
+    # Radars of the bumper's corners look past what a forward lidar sees.
+    replace(
+        _BASE, name="corner-left", lidar=_SPINNING, radar=_CORNER,
+        radar_xyz_m=(3.60, 0.80, 0.60), radar_rpy_deg=(0.0, 0.0, 45.0),
+    ),
+    replace(
+        _BASE, name="corner-right", lidar=_SPINNING, radar=_CORNER,
+        radar_xyz_m=(3.60, -0.80, 0.60), radar_rpy_deg=(0.0, 0.0, -45.0),
+    ),
+    replace(
+        _BASE, name="spin128",
+        lidar=LidarSpec(
+            (-180.0, 180.0), (-25.0, 15.0), 1200, 128, 0.1, 0.8, 120.0, row_elevation_deg=_ROWS_128
+        ),
+    ),
+    # 240,000 beams a second over 82 x 25 deg, as Livox' Horizon has them; six lasers behind the same prisms.
+    replace(
+        _BASE, name="rosette",
+        lidar=LidarSpec((-41.0, 41.0), (-14.5, 10.5), 4000, 6, 0.1, 1.0, 100.0, pattern="rosette"),
+    ),
+    replace(_BASE, name="fisheye", camera=CameraSpec(1280, 960, 190.0, 142.5), lidar=_SPINNING),
+    replace(
+        _BASE, name="pinhole",
+        camera=CameraSpec(
+            1280, 720, 72.0, 44.5, model="plumb_bob", distortion=(-0.32, 0.11, 5e-4, -4e-4, -0.015)
+        ),
+    ),
+    replace(_BASE, name="rolling", camera=replace(_CAMERA, readout_s=0.03)),
+    # A cab: everything high up but the radar, and looking down.
+    replace(
+        _BASE, name="truck", lidar=replace(_LIDAR, elevation_deg=(-21.0, 3.0)),
+        camera_xyz_m=(2.10, 0.10, 2.55), camera_rpy_deg=(0.0, 6.0, 0.0), lidar_xyz_m=(1.90, 0.0, 3.00),
+        radar_xyz_m=(2.60, -0.15, 0.65),
+    ),
+    replace(_BASE, name="bumper", radar_xyz_m=(3.70, 0.05, 0.50)),
+    # Nose down, and twice as fast.
+    replace(_BASE, name="tilted", lidar=replace(_LIDAR, sweep_s=0.04), lidar_rpy_deg=(0.0, 5.0, 0.0)),
+)  # fmt: skip
+RIGS: Final = {rig.name: rig for rig in _ALL}
 
 
 def rig_named(name: str) -> RigSpec:
-    """One of RIGS; `-flat` behind the name takes the radar's elevation away."""
-    base = RIGS[name.removesuffix("-flat")]
+    """One of RIGS; `-flat` behind the name takes the radar's elevation away.
+
+    Raises:
+        ConfigError: no such rig.
+    """
+    base = RIGS.get(name.removesuffix("-flat"))
+    if base is None:
+        raise ConfigError(
+            "simulate", "rig", f"{name!r} is not one of {', '.join(RIGS)}, each with or without -flat"
+        )
     return (
         replace(base, name=name, radar=replace(base.radar, has_elevation=False))
         if name.endswith("-flat")
@@ -157,10 +165,19 @@ class Mounting:
 
 def _nominal(rig: RigSpec) -> dict[str, np.ndarray]:
     return {
-        "camera": from_rotation_translation(_R_BODY_OPTICAL, np.array(rig.camera_xyz_m)),
-        "lidar": from_rotation_translation(np.eye(3), np.array(rig.lidar_xyz_m)),
-        "radar": from_rotation_translation(np.eye(3), np.array(rig.radar_xyz_m)),
+        "camera": from_rotation_translation(
+            _turned(rig.camera_rpy_deg) @ _R_BODY_OPTICAL, np.array(rig.camera_xyz_m)
+        ),
+        "lidar": from_rotation_translation(_turned(rig.lidar_rpy_deg), np.array(rig.lidar_xyz_m)),
+        "radar": from_rotation_translation(_turned(rig.radar_rpy_deg), np.array(rig.radar_xyz_m)),
     }
+
+
+def _turned(rpy_deg: tuple[float, float, float]) -> np.ndarray:
+    R = np.eye(3)
+    for axis, angle in zip(np.eye(3), np.radians(rpy_deg), strict=True):
+        R = exp_so3(angle * axis) @ R
+    return R
 
 
 def _disturbed(T: np.ndarray, rotation_rad: np.ndarray, translation_m: np.ndarray) -> np.ndarray:

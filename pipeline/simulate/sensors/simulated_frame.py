@@ -10,6 +10,7 @@ from pipeline.simulate.sensors.camera import encode_jpeg, render, view_of
 from pipeline.simulate.sensors.lidar import Sweep, sweep_lidar
 from pipeline.simulate.sensors.radar import RadarErrors, Scan, scan_radar
 from pipeline.simulate.sensors.rigs import Mounting, RigSpec
+from pipeline.simulate.sensors.rolling_shutter import RollingShutter
 from pipeline.simulate.sensors.semantics import (
     Box,
     SemanticsSpec,
@@ -143,7 +144,9 @@ def _exposed(
     """JPEG, true labels and noisy boxes of the image with a stamp."""
     exposure = moment.advanced(stamp_s - mounting.camera_delay_s)
     T_map_camera = scene.ego.poses(np.array([exposure.t_s]))[0] @ mounting.T_vehicle_camera
-    view = view_of(exposure, mounting.camera, T_map_camera)
+    readout_s = rig.camera.readout_s
+    shutter = RollingShutter(scene.ego, mounting.T_vehicle_camera, readout_s) if readout_s else None
+    view = view_of(exposure, mounting.camera, T_map_camera, shutter)
     image = render(exposure, view, scene.sun, rng, night=scene.night)
     true = label_image(exposure, view.coarse)
     size_px = (mounting.camera.width_px, mounting.camera.height_px)

@@ -1,0 +1,169 @@
+"""Rigs that differ from the paper's: laws of their sensors, seen through one simulated trio each."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from pipeline.config import load_fleet
+from pipeline.errors import ConfigError
+from pipeline.geometry.se3 import inverse
+from pipeline.simulate.logs.fleet_toml import fleet_toml
+from pipeline.simulate.sensors.beams import beams_of
+from pipeline.simulate.sensors.camera import render, view_of
+from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
+from pipeline.simulate.sensors.rigs import RIGS, mounting_of, rig_named
+from pipeline.simulate.sensors.rolling_shutter import RollingShutter
+from pipeline.simulate.world.casting import World
+from pipeline.simulate.world.drives import Drive
+
+every_rig = pytest.mark.parametrize("name", RIGS)
+
+
+@every_rig
+def test_a_rig_has_a_fleet_file_and_true_poses_near_its_drawings(name, tmp_path):
+    rig = rig_named(name)
+    (tmp_path / "fleet.toml").write_text(fleet_toml("f", name, rig, ["v"]))
+    assert (
+        load_fleet(tmp_path / "fleet.toml").rig_of("v").radar.doppler_period_mps
+        == rig.radar.doppler_period_mps
+    )
+    mounting = mounting_of(rig, 3, 0, 0)
+    for sensor in ("camera", "lidar", "radar"):
+        true, drawn = (getattr(mounting, f"T_vehicle_{kind}{sensor}") for kind in ("", "nominal_"))
+        turn = np.degrees(np.arccos(np.clip((np.trace(true[:3, :3].T @ drawn[:3, :3]) - 1) / 2, -1, 1)))
+        assert 0 < turn < 4
+        assert np.linalg.norm(true[:3, 3] - drawn[:3, 3]) < 0.15
+
+
+@every_rig
+def test_pixels_of_a_rig_s_camera_are_where_its_rays_come_from(name):
+    camera = rig_named(name).camera.nominal()
+    u, v = np.meshgrid(np.linspace(0, camera.width_px - 1, 15), np.linspace(0, camera.height_px - 1, 11))
+    pixels = np.stack([u, v], -1)
+    rays = camera.unproject(pixels)
+    back, valid = camera.project(20.0 * rays)
+    assert valid.all()
+    np.testing.assert_allclose(back, pixels, atol=1e-6)
+
+
+def test_an_unknown_rig_is_refused_with_those_that_exist():
+    with pytest.raises(ConfigError, match="corner-left"):
+        rig_named("corner-middle")
+
+
+@pytest.mark.parametrize(("name", "yaw_deg"), [("corner-left", 45), ("corner-right", -45)])
+def test_a_corner_radar_looks_across(name, yaw_deg):
+    ahead = mounting_of(rig_named(name), 1, 0, 0).T_vehicle_nominal_radar[:3, 0]
+    assert np.degrees(np.arctan2(ahead[1], ahead[0])) == pytest.approx(yaw_deg)
+    assert ahead[2] == pytest.approx(0)
+
+
+def test_a_sensor_pitched_by_a_positive_angle_looks_down():
+    assert mounting_of(rig_named("tilted"), 1, 0, 0).T_vehicle_nominal_lidar[2, 0] == pytest.approx(
+        -np.sin(np.radians(5))
+    )
+    camera = mounting_of(rig_named("truck"), 1, 0, 0).T_vehicle_nominal_camera
+    assert camera[2, 2] == pytest.approx(-np.sin(np.radians(6)))  # the optical axis is z
+
+
+def test_a_fisheye_sees_behind_itself():
+    camera = rig_named("fisheye").camera.nominal()
+    left, right = camera.unproject(np.array([[-0.5, 479.5], [1279.5, 479.5]]))
+    assert left[2] < 0
+    assert right[2] < 0
+    assert 360 - np.degrees(np.arccos(left @ right)) == pytest.approx(190, abs=0.1)
+
+
+def test_128_rows_are_dense_around_the_horizon_and_sparse_elsewhere():
+    spec = rig_named("spin128").lidar
+    rows = np.array(spec.row_elevation_deg)
+    steps = np.diff(rows)
+    assert len(rows) == spec.rows == 128
+    assert (rows[0], rows[-1]) == spec.elevation_deg
+    assert set(steps) == {0.125, 0.5, 1.0}
+    assert (steps[np.abs(rows[:-1]) < 2] == 0.125).all()
+    elevation = np.degrees(beams_of(spec, 0.0).angles[:128, 1])
+    np.testing.assert_allclose(elevation, rows)
+    with pytest.raises(ValueError, match="2 row elevations for 96 rows"):
+        LidarSpec(row_elevation_deg=(0.0, 1.0))
+
+
+def nearest_deg(spec, first_s, second_s):
+    """Angle from each beam of the second sweep to the nearest of the first."""
+    first, second = (np.degrees(beams_of(spec, t).angles) for t in (first_s, second_s))
+    return cKDTree(first).query(second)[0]
+
+
+def test_a_rosette_does_not_repeat_itself_and_a_scanner_does():
+    rosette, rows = rig_named("rosette").lidar, rig_named("demo").lidar
+    assert nearest_deg(rows, 1.0, 1.1).max() == 0
+    # As far apart as two random draws of as many beams: half the mean spacing (82 x 25 deg, 24,000 beams).
+    assert np.median(nearest_deg(rosette, 1.0, 1.1)) > 0.05
+    for sweeps in range(2, 40):
+        assert np.mean(nearest_deg(rosette, 1.0, 1.0 + 0.1 * sweeps) < 1e-3) < 0.02
+
+
+def test_a_rosette_fills_an_ellipse_and_leaves_no_hole():
+    spec = rig_named("rosette").lidar
+    angles = np.degrees(beams_of(spec, 3.21).angles)
+    shares = (angles - np.mean([spec.azimuth_deg, spec.elevation_deg], axis=1)) / [41.0, 12.5]
+    assert np.hypot(*shares.T).max() <= 1 + 1e-9
+    grid = np.stack(np.meshgrid(np.linspace(-35, 35, 60), np.linspace(-8, 4, 20)), -1).reshape(-1, 2)
+    inside = np.hypot(*((grid - [0, -2]) / [41.0, 12.5]).T) < 0.9
+    assert np.quantile(cKDTree(angles).query(grid[inside])[0], 0.99) < 1.5
+
+
+def moving_camera(rig="demo", environment="highway", t=2.0):
+    """A moment of a drive, the rig's mounting, and the vehicle's motion."""
+    drive = Drive(5, environment, 8.0, 0)
+    return World(drive).moment(t), mounting_of(rig_named(rig), 3, 0, 0), drive
+
+
+def shown_at(moment, mounting, drive, delay_s):
+    """What a camera that exposes all rows at once sees a little later."""
+    T = drive.ego.poses(np.array([moment.t_s + delay_s]))[0] @ mounting.T_vehicle_camera
+    return view_of(moment.advanced(moment.t_s + delay_s), mounting.camera, T).coarse
+
+
+def test_each_row_of_a_rolling_shutter_sees_the_world_of_its_own_time():
+    moment, mounting, drive = moving_camera()
+    shutter = RollingShutter(drive.ego, mounting.T_vehicle_camera, 0.06)
+    T = drive.ego.poses(np.array([moment.t_s]))[0] @ mounting.T_vehicle_camera
+    rolled = view_of(moment, mounting.camera, T, shutter).coarse
+    rows = len(rolled)
+    delays = shutter.delays_s(rows)
+    assert delays[0] == pytest.approx(-0.03, abs=2e-4)
+    assert delays[-1] == pytest.approx(0.03, abs=2e-4)
+    middle = shown_at(moment, mounting, drive, 0.0)
+    own, at_once = [], []
+    for row in (rows // 2, int(0.65 * rows), int(0.85 * rows)):
+        own.append(np.mean(rolled[row] != shown_at(moment, mounting, drive, delays[row])[row]))
+        at_once.append(np.mean(rolled[row] != middle[row]))
+    assert max(own) < 0.004
+    assert max(at_once) > 0.02
+
+
+def test_a_rolling_shutter_that_takes_no_time_gives_the_image_of_a_global_one():
+    moment, mounting, drive = moving_camera(environment="urban")
+    T = drive.ego.poses(np.array([moment.t_s]))[0] @ mounting.T_vehicle_camera
+    images = [
+        render(
+            moment, view_of(moment, mounting.camera, T, shutter), drive.sun, np.random.default_rng(1)
+        ).astype(float)
+        for shutter in (None, RollingShutter(drive.ego, mounting.T_vehicle_camera, 1e-6))
+    ]
+    assert np.mean(np.abs(images[0] - images[1]) > 3) < 1e-3
+
+
+def test_only_rolling_cameras_have_a_readout_time():
+    assert {name for name, rig in RIGS.items() if rig.camera.readout_s > 0} == {"rolling"}
+    assert replace(CameraSpec(), readout_s=0.02).nominal().K[0, 0] == CameraSpec().nominal().K[0, 0]
+
+
+@pytest.mark.parametrize("name", ["corner-left", "corner-right"])
+def test_truth_of_a_turned_radar_is_one_consistent_triangle(name):
+    truth = mounting_of(rig_named(name), 1, 0, 0).truth()
+    loop = truth["T_camera_lidar"] @ truth["T_lidar_radar"] @ inverse(truth["T_camera_radar"])
+    np.testing.assert_allclose(loop, np.eye(4), atol=1e-12)
