@@ -198,6 +198,8 @@ class VerifyConfig(Section):
 
     camera_lidar_limit_deg: Positive = 0.2
     radar_limit_deg: Positive = 0.4
+    # Of a radar's elevation, the coarser of its two angles: aperture is scarce upwards.
+    radar_elevation_limit_deg: Positive = 0.6
     # Probability that an error stays within the limit, before a direction is certified.
     confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.995
     # A move this large happens once in 16,000 days if the prior's sigma is right.

@@ -72,7 +72,12 @@ CALIBRATIONS = TableSchema(
             "of azimuth and elevation at targets 15 to 40 m away: those whose error is below limit_rad with "
             "probability verify.confidence",
         ),
-        scalar("limit_rad", "float64", "the largest error that the calibration's use allows", nullable=True),
+        scalar(
+            "limit_rad",
+            "float64",
+            "the largest error that the calibration's use allows; elevation's own is diagnostics' elevation_limit_rad",
+            nullable=True,
+        ),
         scalar(
             "azimuth_sigma_rad", "float64", "sigma of a target's azimuth, from the covariance", nullable=True
         ),

@@ -198,6 +198,7 @@ def _claim_numbers(judged: Judged) -> dict[str, float]:
         "confidence": judged.verdict.score,
         "vouched_az": float("azimuth" in certified),
         "vouched_el": float("elevation" in certified),
+        "elevation_limit_rad": judged.claims["elevation"].limit_rad,
     } | {
         f"holdout_{name}_{what}_rad": value
         for name, claim in judged.claims.items()

@@ -235,7 +235,11 @@ def _held_out_evidence(
 ) -> tuple[HeldOutTest | None, dict[str, Claim]]:
     """Held-out frames at the prior and at the result, and what they leave to claim."""
     pair, verify = estimate.pair, fleet.verify
-    limit_deg = verify.camera_lidar_limit_deg if pair == "camera_lidar" else verify.radar_limit_deg
+    azimuth_deg, elevation_deg = (
+        (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
+        if pair == "camera_lidar"
+        else (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
+    )
     test = update = None
     if held_out:
         score = held_out_score(estimate, held_out, prior, fleet.solve)
@@ -249,9 +253,10 @@ def _held_out_evidence(
         estimate.T,
         estimate.covariance,
         update,
-        float(np.radians(limit_deg)),
+        float(np.radians(azimuth_deg)),
         verify.confidence,
         limits.held_out_contradiction_sigmas,
+        float(np.radians(elevation_deg)),
     )
     return test, claims
 

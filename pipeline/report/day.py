@@ -123,7 +123,14 @@ def _certified(record: CalibrationRecord) -> str:
     """Directions that an accepted record certifies, and its score; empty where it was never judged."""
     if record.score is None or record.limit_rad is None:
         return ""
-    what = f"{' and '.join(record.determined)} within {np.degrees(record.limit_rad):.2g} deg at 15 to 40 m"
+    limits = {
+        "azimuth": record.limit_rad,
+        "elevation": record.diagnostics.get("elevation_limit_rad", record.limit_rad),
+    }
+    same = len({limits[name] for name in record.determined}) == 1
+    each = [f"{name} within {np.degrees(limits[name]):.2g} deg" for name in record.determined]
+    together = f"{' and '.join(record.determined)} within {np.degrees(record.limit_rad):.2g} deg"
+    what = f"{together if same else ' and '.join(each)} at 15 to 40 m"
     return f"{what if record.determined else 'nothing'}; score {record.score:.2f}"
 
 

@@ -12,6 +12,7 @@ import pytest
 from pipeline.config import SolveConfig, load_fleet
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3, inverse, log_so3, transform_points
+from pipeline.geometry.spherical import from_spherical, to_spherical
 from tests.benchmarks.recovery import changed_radar
 from tests.benchmarks.studies import engine, table1
 from tests.benchmarks.studies.ablation import _settings, setting_of
@@ -101,6 +102,17 @@ def test_a_wrong_principal_point_is_a_turned_camera_and_pixels_fall_into_place(d
     again = wrong.project(transform_points(T, point))[0]
     assert np.abs(again - seen).max() < 0.5
     assert engine.reference(day, "lidar_radar", "centre:20") == pytest.approx(T_LIDAR_RADAR)
+
+
+def test_a_radar_is_measured_against_where_its_detections_point(day):
+    bias_rad = 0.01
+    biased = replace(day, truth=day.truth | {"radar_elevation_bias_rad": bias_rad})
+    target = np.array([[30.0, 0.0, 0.4]])  # in radar axes, straight ahead but for its height
+    azimuth, elevation, range_m = to_spherical(target)[0]
+    seen = from_spherical(np.array([[azimuth, elevation + bias_rad, range_m]]))
+    found = transform_points(engine.reference(biased, "lidar_radar", ""), seen)
+    assert found == pytest.approx(transform_points(T_LIDAR_RADAR, target), abs=1e-3)
+    assert engine.reference(biased, "camera_lidar", "") == pytest.approx(T_CAMERA_LIDAR)
 
 
 def test_few_frames_are_spread_over_the_day(day):

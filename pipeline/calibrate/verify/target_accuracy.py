@@ -101,6 +101,7 @@ def claims_of(
     limit_rad: float,
     confidence: float,
     contradiction_sigmas: float = VerdictLimits.held_out_contradiction_sigmas,
+    elevation_limit_rad: float | None = None,
 ) -> dict[str, Claim]:
     """What can be claimed of each direction, by name.
 
@@ -112,7 +113,9 @@ def claims_of(
         limit_rad: largest error that the purpose allows.
         confidence: probability with which an error has to stay within it.
         contradiction_sigmas: sigmas of the shift from which held-out frames contradict the estimate.
+        elevation_limit_rad: for elevation, where it differs from azimuth's.
     """
+    limits_rad = (limit_rad, limit_rad if elevation_limit_rad is None else elevation_limit_rad)
     own = target_sigmas(pair, T, covariance)
     claims = {}
     for d, name in enumerate(DIRECTIONS):
@@ -129,6 +132,6 @@ def claims_of(
             remaining = min(sigma, max(updated, bias))
             shift = float(np.sqrt(np.mean((J @ update.shift) ** 2)))
         claims[name] = Claim(
-            sigma, shift, shift_sigma, remaining, limit_rad, confidence, contradiction_sigmas
+            sigma, shift, shift_sigma, remaining, limits_rad[d], confidence, contradiction_sigmas
         )
     return claims

@@ -23,6 +23,7 @@ import numpy as np
 
 from pipeline.config import FleetConfig, load_fleet
 from pipeline.extrinsics.prior import read_prior
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
 from pipeline.simulate.logs.fleet_toml import fleet_toml
@@ -70,6 +71,17 @@ class Day:
     def true_of(self, pair: str) -> np.ndarray:
         """True transform of a pair."""
         return np.array(self.truth[f"T_{pair}"], np.float64)
+
+    def pointing_of(self, pair: str) -> np.ndarray:
+        """The transform that puts a radar's detections where they came from; the true one of other pairs.
+
+        A radar that measures all elevations too high by b points as one that is mounted right and turned down by b.
+        """
+        T, bias_rad = self.true_of(pair), self.truth.get("radar_elevation_bias_rad")
+        if not pair.endswith("radar") or not isinstance(bias_rad, float):
+            return T
+        down = exp_so3(np.array([0.0, bias_rad, 0.0]))
+        return T @ from_rotation_translation(down, np.zeros(3))
 
 
 def generate_day(spec: DaySpec, root: Path, *, images: bool = False) -> Path:

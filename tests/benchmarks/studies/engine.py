@@ -38,7 +38,7 @@ from schemas.observations import Observation
 from tests.benchmarks.studies.commits import accept_argument, commit_now, is_accepted
 from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, load_day
 from tests.benchmarks.studies.looks import look
-from tests.benchmarks.studies.metrics import measure, transform_of
+from tests.benchmarks.studies.metrics import measure, mounting_error, transform_of
 
 __all__ = [
     "DRIVABLE_MODEL",
@@ -156,12 +156,14 @@ def spoiled(rows: Sequence[Observation], how: str) -> list[Observation]:
 
 
 def reference(day: Day, pair: str, spoil: str) -> np.ndarray:
-    """What a result is measured against: the truth, turned as a wrong principal point turns the camera.
+    """What a result is measured against: where detections point, and how a wrong principal point turns the camera.
+
+    A constant elevation error is a turn of the radar for whoever uses its detections: they are what is certified.
 
     A principal point wrong by d pixels is, but for second order, a camera turned by d / f. No alignment tells the two
     apart, and the pixels fall into place: the pose that does this is the right one for this camera model.
     """
-    T = day.true_of(pair)
+    T = day.pointing_of(pair)
     kind, _, amount = spoil.partition(":")
     if kind != "centre" or not pair.startswith("camera"):
         return T
@@ -183,6 +185,7 @@ def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
         return {"refused": err.reason, "pairs": {}}
     measured = {
         r.pair: measure(r, reference(day, r.pair, run.spoil), prior, day.truth.get(f"dt_{r.pair}_s"))
+        | mounting_error(r, day.true_of(r.pair))
         for r in records
     }
     out = {"cpu_s": round(time.process_time() - began, 1), "pairs": measured}

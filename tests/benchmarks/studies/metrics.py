@@ -19,6 +19,7 @@ __all__ = [
     "claimed_error_deg",
     "inside_share",
     "measure",
+    "mounting_error",
     "rms",
     "share",
     "transform_of",
@@ -27,6 +28,7 @@ __all__ = [
 
 # The issue's limits for an accepted result, and the axes of the parent frame that turn azimuth and elevation.
 LIMITS_DEG = {"camera_lidar": 0.2, "camera_radar": 0.4, "lidar_radar": 0.4}
+ELEVATION_LIMITS_DEG = {"camera_lidar": 0.2, "camera_radar": 0.6, "lidar_radar": 0.6}
 AZIMUTH_ELEVATION_DOF = {"camera_lidar": (1, 0), "camera_radar": (1, 0), "lidar_radar": (2, 1)}
 
 
@@ -74,6 +76,14 @@ def measure(
     return out
 
 
+def mounting_error(record: CalibrationRecord, T_mounted: Float[np.ndarray, "4 4"]) -> dict[str, float]:
+    """Elevation error at the targets against the mounting itself, a radar's own constant error included."""
+    T = transform_of(record)
+    if T is None or not record.pair.endswith("radar"):
+        return {}
+    return {"mounting_el_deg": _number(np.degrees(errors_at_targets(record.pair, T, T_mounted)[1]))}
+
+
 def transform_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
     """T_parent_child of a record; None where it was refused."""
     if record.qw is None:
@@ -93,19 +103,25 @@ def within(pair: str, measured: Mapping[str, Any], *, claimed: bool = False) -> 
         claimed: ask only of angles that the record vouches for (`diagnostics["vouched_az"]`, `vouched_el`); where it
             does not say, of those whose axis it calls determined by the day.
     """
-    return claimed_error_deg(pair, measured, claimed=claimed) <= LIMITS_DEG[pair]
+    azimuth, elevation = _claimed_angles(pair, measured, claimed=claimed)
+    return azimuth <= LIMITS_DEG[pair] and elevation <= ELEVATION_LIMITS_DEG[pair]
 
 
 def claimed_error_deg(pair: str, measured: Mapping[str, Any], *, claimed: bool) -> float:
     """The larger of azimuth and elevation error at the targets [deg]; 0 where nothing is claimed."""
-    angles = [measured["az_deg"], measured["el_deg"]]
+    return max(_claimed_angles(pair, measured, claimed=claimed))
+
+
+def _claimed_angles(pair: str, measured: Mapping[str, Any], *, claimed: bool) -> tuple[float, float]:
+    """Azimuth and elevation error [deg]; 0 for what is not claimed."""
+    angles = [float(measured["az_deg"]), float(measured["el_deg"])]
     if claimed:
         flags = [
             measured.get("diagnostics", {}).get(f"vouched_{name}", measured["observable"][k])
             for name, k in zip(("az", "el"), AZIMUTH_ELEVATION_DOF[pair], strict=True)
         ]
-        angles = [a for a, flag in zip(angles, flags, strict=True) if flag]
-    return max(angles, default=0.0)
+        angles = [a if flag else 0.0 for a, flag in zip(angles, flags, strict=True)]
+    return angles[0], angles[1]
 
 
 def inside_share(errors: Float[np.ndarray, " N"], sigmas: Float[np.ndarray, " N"], count: float) -> float:

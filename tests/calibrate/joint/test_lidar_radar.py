@@ -143,7 +143,7 @@ def test_a_radar_of_poor_elevation_is_not_trusted_with_roll(day):
 
 def test_constant_elevation_and_range_errors_are_named_as_assumptions(day):
     notes = "\n".join(solve(day[:20], prior_off_by(1, 0.02)).notes)
-    assert "constant elevation error of the radar of 0 +- 0.20 deg" in notes
+    assert "own constant elevation error (0 +- 0.20 deg)" in notes
     assert "range bias" in notes
 
 

@@ -134,6 +134,15 @@ def test_held_out_frames_make_nothing_surer_than_their_own_bias():
     assert claim.remaining_sigma_rad == claim.sigma_rad  # and nothing less sure than it was
 
 
+def test_elevation_may_have_a_limit_of_its_own():
+    arguments = ("lidar_radar", np.eye(4), COVARIANCE[:6, :6], None, np.radians(0.4), 0.995)
+    same, own = claims_of(*arguments), claims_of(*arguments, elevation_limit_rad=np.radians(0.6))
+    assert own["azimuth"] == same["azimuth"]
+    assert own["elevation"].limit_rad == pytest.approx(np.radians(0.6))
+    assert own["elevation"].bound_rad == same["elevation"].bound_rad
+    assert own["elevation"].margin > same["elevation"].margin
+
+
 def test_without_held_out_frames_the_covariance_alone_is_claimed():
     claims = claims_of("camera_lidar", T_CAMERA, COVARIANCE[:6, :6], None, np.radians(0.2), 0.995)
     assert tuple(claims) == DIRECTIONS

@@ -264,7 +264,7 @@ def _conclude(
     rejected: dict[str, int],
 ) -> PairEstimate:
     state, fixed = analysis.state, analysis.fixed
-    notes = _notes(analysis)
+    notes = _notes(analysis, has_elevation=bool(problem.frames.has_elevation.any()))
     # The record's covariance is of a left perturbation: a turn about the lidar carries the radar along.
     J = np.linalg.inv(change_jacobian(state.T_lidar_radar))
     return PairEstimate(
@@ -282,7 +282,7 @@ def _conclude(
     )
 
 
-def _notes(analysis: _ObservabilityAnalysis) -> list[str]:
+def _notes(analysis: _ObservabilityAnalysis, *, has_elevation: bool) -> list[str]:
     """What was not determined, and what was assumed."""
     fixed, linear = analysis.fixed, analysis.linear
     notes = []
@@ -302,9 +302,17 @@ def _notes(analysis: _ObservabilityAnalysis) -> list[str]:
     else:
         notes.append("radar pitch assumes that returns lie at a constant angle (0 +- 1 deg) from box centres")
     bias_sigma_m = float(np.sqrt(analysis.covariance[RANGE, RANGE]))
-    pitch_deg = float(np.degrees(RADAR_ELEVATION_BIAS_RAD))
+    if has_elevation:
+        own_deg = float(np.degrees(RADAR_ELEVATION_BIAS_RAD))
+        notes.append(
+            "pitch says where the radar's detections point: its mounting differs by the radar's own constant elevation"
+            f" error (0 +- {own_deg:.2f} deg)"
+        )
+    else:
+        notes.append(
+            "the radar measures no elevation: azimuth and range only, roll and pitch are the prior's"
+        )
     notes += [
-        f"assumes a constant elevation error of the radar of 0 +- {pitch_deg:.2f} deg: it looks like pitch",
         f"range bias {analysis.state.range_bias_m:+.3f} +- {bias_sigma_m:.3f} m (prior 0 +- {RANGE_BIAS_SIGMA_M:.2f})",
     ]
     return notes
