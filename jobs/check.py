@@ -109,11 +109,13 @@ def _measured(report: CheckReport) -> list[str]:
         "time per point": "yes" if report.has_point_time else "no",
         "odometry": "yes" if report.has_odometry else "no",
     }
-    sync = f"{s.trios} of {s.sweeps} sweeps have image and scan within {s.gate_ms:g} ms"
+    gate = "near enough by motion" if s.gate_ms is None else f"within {s.gate_ms:g} ms"
+    sync = f"{s.trios} of {s.sweeps} sweeps have image and scan {gate}"
+    offsets = f"constant offsets: camera {s.camera_offset_ms:+.1f} ms, radar {s.radar_offset_ms:+.1f} ms"
     nearest = f"median to image {_number(s.camera_median_ms)}, to scan {_number(s.radar_median_ms)}"
     known = "; ".join(f"{name}: {value}" for name, value in facts.items())
     return [
-        f"sync: {sync} ({nearest})",
+        f"sync: {sync} ({nearest}; {offsets})",
         f"frame ids: {', '.join(frame_ids) or 'none'}",
         known if e.frames else f"not known, for want of a frame: {', '.join(facts)}",
     ]

@@ -20,7 +20,8 @@ def load(tmp_path, text):
 def test_a_small_file_is_enough_and_defaults_are_physical(tmp_path):
     fleet = load(tmp_path, GOOD)
     assert fleet.rig_of("car-1").prior == PriorConfig()
-    assert fleet.ingest.sync_gate_s == 0.005
+    assert fleet.ingest.sync_gate_s is None
+    assert (fleet.ingest.sync_gate_m, fleet.ingest.sync_gate_deg) == (2.5, 2.0)
     assert fleet.rigs["default"].ego is None
 
 
@@ -79,10 +80,11 @@ def test_all_problems_are_told_at_once(tmp_path):
 
 
 def test_the_hash_changes_with_every_value_and_not_with_how_it_was_written(tmp_path):
-    a = load(tmp_path, GOOD)
+    a = load(tmp_path, GOOD + "[ingest]\nsync_gate_s = 0.005\n")
     b = load(tmp_path, GOOD + "[ingest]\nsync_gate_s = 5e-3\n")
     c = load(tmp_path, GOOD + "[ingest]\nsync_gate_s = 6e-3\n")
     assert config_hash(a.ingest) == config_hash(b.ingest) != config_hash(c.ingest)
+    assert config_hash(load(tmp_path, GOOD).ingest) != config_hash(a.ingest)
     assert config_hash(a.ingest, {"x": 1}) != config_hash(a.ingest, {"x": 2})
 
 

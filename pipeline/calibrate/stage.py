@@ -15,7 +15,7 @@ from pipeline.calibrate.methods import Method, Solver, method_named
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.calibrate.records import Inputs, Judged, SolvedDay, record_of, refused_records
-from pipeline.calibrate.select.frames import Selection, select_frames
+from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
 from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.held_out_score import held_out_score
@@ -122,7 +122,7 @@ def calibrate_observations(
     if method.frames == "all":
         select = select.model_copy(update={"frames": max(len(observations), 1)})
     selection = select_frames(
-        observations, select, paper=method.paper_selection, sync_gate_s=fleet.ingest.sync_gate_s
+        observations, select, paper=method.paper_selection, sync_gate_s=_sync_gate_s(method, fleet)
     )
     frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in PAIRS}
     sample = _spread(observations, selection)
@@ -153,6 +153,12 @@ def calibrate_observations(
     records = [record_of(about, pair, day) for pair in PAIRS]
     progress(4, 4, "done")
     return records
+
+
+def _sync_gate_s(method: Method, fleet: FleetConfig) -> float | None:
+    """The gate of ingest; where that is by motion, the paper's methods, which know of none, keep the paper's."""
+    gate_s = fleet.ingest.sync_gate_s
+    return PAPER_SYNC_GATE_S if gate_s is None and method.paper_selection else gate_s
 
 
 def _to_calibrate(method: Method, fired: Mapping[str, Sequence[str]], when: str) -> list[str]:

@@ -17,6 +17,7 @@ from pipeline.ingest.frame_builder import FrameBuilder, Rejected
 from pipeline.ingest.index import ACCEPTED_TYPES, NEEDED, DayIndex, index_logs, topics_of
 from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
 from pipeline.ingest.stage import pick_trios, read_file_prior
+from pipeline.ingest.sync import constant_gap_ns
 from pipeline.results import Progress, silent
 from pipeline.rigs import OnnxSemantics, Rig
 from schemas.frames import Frame
@@ -42,13 +43,19 @@ class TopicFinding:
 
 @dataclass(frozen=True)
 class SyncQuality:
-    """How sweeps meet images and scans: median distance to the nearest, and trios within the gate."""
+    """How sweeps meet images and scans: median distance to the nearest, and trios within the gate.
+
+    `gate_ms` is of raw stamps, None where the gate is by motion; `camera_offset_ms` and `radar_offset_ms` are the
+    constant parts of the gaps, 0 where sensors run freely.
+    """
 
     sweeps: int
     trios: int
     camera_median_ms: float | None
     radar_median_ms: float | None
-    gate_ms: float
+    gate_ms: float | None
+    camera_offset_ms: float
+    radar_offset_ms: float
 
 
 @dataclass(frozen=True)
@@ -212,14 +219,15 @@ def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
 
 
 def _sync(index: DayIndex, trios: int, config: IngestConfig) -> SyncQuality:
-    lidar = np.unique(index.stream("lidar").stamps_ns)
-    image, radar = (np.unique(index.stream(role).stamps_ns) for role in ("image", "radar"))
+    lidar, image, radar = (np.unique(index.stream(role).stamps_ns) for role in ("lidar", "image", "radar"))
     return SyncQuality(
         sweeps=len(index.stream("lidar").stamps),
         trios=trios,
         camera_median_ms=_median_distance_ms(lidar, image),
         radar_median_ms=_median_distance_ms(lidar, radar),
-        gate_ms=config.sync_gate_s * 1e3,
+        gate_ms=None if config.sync_gate_s is None else config.sync_gate_s * 1e3,
+        camera_offset_ms=constant_gap_ns(lidar, image) * 1e-6,
+        radar_offset_ms=constant_gap_ns(lidar, radar) * 1e-6,
     )
 
 

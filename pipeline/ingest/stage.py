@@ -14,15 +14,24 @@ from pipeline.extrinsics.prior import read_transforms
 from pipeline.ingest.containers.reader import content_identity
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected, Trio
 from pipeline.ingest.index import DayIndex, index_logs, topics_of
-from pipeline.ingest.sync import Rejection, match_nearest, match_trios, number_drives
+from pipeline.ingest.sync import (
+    Rejection,
+    Trios,
+    match_by_motion,
+    match_nearest,
+    match_trios,
+    motion_gates_ns,
+    number_drives,
+)
 from pipeline.results import Progress
 from pipeline.rigs import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.frames import Frame
 
-__all__ = ["pick_trios", "read_file_prior", "work"]
+__all__ = ["find_trios", "pick_trios", "read_file_prior", "work"]
 
 _PROBLEMS_SHOWN = 3
+_SAME_IMAGE_NS = 5_000_000  # labels and detections carry the stamp of the image that they were computed on
 _UNUSABLE = (
     Rejection.IMAGE_DAMAGED,
     Rejection.IMAGE_SIZE,
@@ -74,7 +83,7 @@ def _rows(
             yield frame
         run.rejected.update(_all_counts(rejected, index, builder))
         if not made:
-            raise NothingUsable(refusal(index, rig, rejected, config.sync_gate_s))
+            raise NothingUsable(refusal(index, rig, rejected, config))
         run.extra |= {"problems": index.problems, "logs": index.log_names}
         run.remarks = _shorten(index.problems)
     finally:
@@ -83,13 +92,10 @@ def _rows(
 
 def pick_trios(index: DayIndex, config: IngestConfig) -> tuple[list[Trio], Counter[str]]:
     """Trios in order of time, thinned evenly to `max_frames`, and why the other sweeps are left out."""
-    gate_ns = round(config.sync_gate_s * 1e9)
-    camera_ns = index.stream("image").stamps_ns
-    found = match_trios(index.stream("lidar").stamps_ns, camera_ns, index.stream("radar").stamps_ns, gate_ns)
-    drives = _drives(index)
-    # Labels and detections carry the stamp of the image that they were computed on.
-    labels = match_nearest(camera_ns[found.camera], index.stream("labels").stamps_ns, gate_ns)
-    detections = match_nearest(camera_ns[found.camera], index.stream("detections").stamps_ns, gate_ns)
+    found, drives = find_trios(index, config), _drives(index)
+    images_ns = index.stream("image").stamps_ns[found.camera]
+    labels = match_nearest(images_ns, index.stream("labels").stamps_ns, _SAME_IMAGE_NS)
+    detections = match_nearest(images_ns, index.stream("detections").stamps_ns, _SAME_IMAGE_NS)
     picked = _spread(len(found.lidar), config.max_frames)
     trios = [
         Trio(
@@ -105,7 +111,17 @@ def pick_trios(index: DayIndex, config: IngestConfig) -> tuple[list[Trio], Count
     return trios, +(found.rejected + Counter({Rejection.NOT_PICKED: len(found.lidar) - len(picked)}))
 
 
-def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], gate_s: float) -> str:
+def find_trios(index: DayIndex, config: IngestConfig) -> Trios:
+    """All trios of the day within the gate that the configuration asks for."""
+    lidar, camera, radar = (index.stream(role).stamps_ns for role in ("lidar", "image", "radar"))
+    if config.sync_gate_s is not None:
+        return match_trios(lidar, camera, radar, round(config.sync_gate_s * 1e9))
+    speed, yaw_rate = index.ego.motion_at(lidar)
+    gates = motion_gates_ns(speed, yaw_rate, config.sync_gate_m, float(np.radians(config.sync_gate_deg)))
+    return match_by_motion(lidar, camera, radar, gates)
+
+
+def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig) -> str:
     """Why a day gives no frame, in words: which topic, and what to do."""
     topics = {role: topic for topic, role in topics_of(rig).items()}
     absent = [f"{topics[r]} ({r})" for r in ("image", "lidar", "radar") if not index.stream(r).stamps]
@@ -118,13 +134,24 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], gate_s: float) ->
     elif not set(rejected) & set(_UNUSABLE):
         what = (
             f"no sweep of {topics['lidar']} has an image of {topics['image']} and a scan of "
-            f"{topics['radar']} within {gate_s * 1e3:g} ms: trigger the sensors together, check their "
-            "clocks, or raise ingest.sync_gate_s"
+            f"{topics['radar']} {_near_enough(config)}"
         )
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
         what = f"every synchronised trio was unusable, most often {reason} ({rejected[reason]})"
     return _shorten([what, *index.problems])
+
+
+def _near_enough(config: IngestConfig) -> str:
+    """The gate in words, and what to do where nothing passes it."""
+    if config.sync_gate_s is not None:
+        gate = f"within {config.sync_gate_s * 1e3:g} ms"
+        return f"{gate}: check their clocks, raise ingest.sync_gate_s, or leave it out to gate by motion"
+    gate = f"before the car drives {config.sync_gate_m:g} m or turns {config.sync_gate_deg:g} deg"
+    return (
+        f"{gate}, constant offsets aside: check the sensors' clocks and rates, or raise "
+        "ingest.sync_gate_m and sync_gate_deg"
+    )
 
 
 def read_file_prior(rig: Rig, fleet: FleetConfig) -> tuple[np.ndarray, np.ndarray] | None:

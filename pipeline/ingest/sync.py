@@ -8,11 +8,27 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Int, Int64
+from jaxtyping import Float, Int, Int64
 
-__all__ = ["Rejection", "Trios", "first_occurrences", "match_nearest", "match_trios", "number_drives"]
+__all__ = [
+    "Rejection",
+    "Trios",
+    "constant_gap_ns",
+    "first_occurrences",
+    "match_by_motion",
+    "match_nearest",
+    "match_trios",
+    "motion_gates_ns",
+    "number_drives",
+]
 
 _DRIVE_GAP_NS = 10 * 10**9
+_HALF_A_PERIOD = 0.55  # and a tenth for jitter
+_TRIGGERED = (
+    0.8  # length of the gaps' mean on the circle of a period: they scatter by a tenth of it, one sigma
+)
+# What is taken for a car that nobody measured, and for others that drive past one that stands.
+_UNKNOWN_MPS, _UNKNOWN_RADPS, _OTHERS_MPS = 40.0, float(np.radians(30.0)), 10.0
 
 
 class Rejection(StrEnum):
@@ -43,6 +59,8 @@ class Trios:
     camera: Int64[np.ndarray, " N"]
     radar: Int64[np.ndarray, " N"]
     rejected: Counter[str] = field(default_factory=Counter)
+    camera_gap_ns: int = 0  # the constant part of the stamps' gaps to the sweep's, found before gating
+    radar_gap_ns: int = 0
 
 
 def first_occurrences(stamps_ns: Int[np.ndarray, " N"]) -> Int64[np.ndarray, " M"]:
@@ -90,18 +108,126 @@ def match_trios(
     Stamps may come in any order and more than once: the first of equal stamps counts.
     """
     lidar, camera, radar = (first_occurrences(s) for s in (lidar_ns, camera_ns, radar_ns))
-    rejected = Counter[str]({Rejection.DUPLICATE_STAMP: len(lidar_ns) - len(lidar)})
     to_camera = match_nearest(lidar_ns[lidar], camera_ns[camera], gate_ns)
     to_radar = match_nearest(lidar_ns[lidar], radar_ns[radar], gate_ns)
-    both = (to_camera >= 0) & (to_radar >= 0)
-    spread = np.zeros(len(lidar), np.int64)
-    if both.any():
-        spread[both] = np.abs(camera_ns[camera[to_camera[both]]] - radar_ns[radar[to_radar[both]]])
-    kept = both & (spread <= gate_ns)
-    rejected[Rejection.NO_CAMERA] = int(np.sum(to_camera < 0))
-    rejected[Rejection.NO_RADAR] = int(np.sum((to_camera >= 0) & (to_radar < 0)))
-    rejected[Rejection.SPREAD] = int(np.sum(both & ~kept))
-    return Trios(lidar[kept], camera[to_camera[kept]], radar[to_radar[kept]], +rejected)
+    gates = np.full(len(lidar_ns), gate_ns, np.int64)
+    stamps = lidar_ns, camera_ns, radar_ns
+    return _gated(stamps, (lidar, camera, radar), (to_camera, to_radar), (0, 0), gates)
+
+
+def match_by_motion(
+    lidar_ns: Int[np.ndarray, " L"],
+    camera_ns: Int[np.ndarray, " C"],
+    radar_ns: Int[np.ndarray, " R"],
+    gates_ns: Int[np.ndarray, " L"],
+) -> Trios:
+    """Each sweep with the image and the scan nearest to it, where the stamps' gaps are within the sweep's own gate.
+
+    The constant part of a sensor's gaps is found first and counts for nothing: a calibration estimates it. Nearest
+    means within half a period, so that a sweep without a partner does not borrow a neighbour's.
+
+    Args:
+        lidar_ns: stamps, in any order, the first of equal ones counts.
+        camera_ns: likewise.
+        radar_ns: likewise.
+        gates_ns: per sweep, the largest gap beyond the constant ones between any two of its trio.
+    """
+    lidar, camera, radar = (first_occurrences(s) for s in (lidar_ns, camera_ns, radar_ns))
+    partners, constant = [], []
+    for stamps in (camera_ns[camera], radar_ns[radar]):
+        constant.append(constant_gap_ns(lidar_ns[lidar], stamps))
+        period = _period_ns(stamps)
+        half = int(gates_ns.max(initial=0)) if period is None else int(_HALF_A_PERIOD * period)
+        partners.append(match_nearest(lidar_ns[lidar] + constant[-1], stamps, half))
+    stamps_ns = lidar_ns, camera_ns, radar_ns
+    return _gated(
+        stamps_ns,
+        (lidar, camera, radar),
+        (partners[0], partners[1]),
+        (constant[0], constant[1]),
+        gates_ns,
+    )
+
+
+def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, " M"]) -> int:
+    """By how much the stamps of a triggered sensor come after the sweeps' [ns]; 0 where it runs freely.
+
+    It is known up to whole periods of the sensor, and the one next to 0 is taken.
+
+    Args:
+        lidar_ns: stamps of the sweeps.
+        stamps_ns: of the sensor, each once, in order.
+    """
+    period = _period_ns(stamps_ns)
+    if period is None or not len(lidar_ns):
+        return 0
+    right = np.clip(np.searchsorted(stamps_ns, lidar_ns), 1, len(stamps_ns) - 1)
+    before, after = stamps_ns[right - 1] - lidar_ns, stamps_ns[right] - lidar_ns
+    gap = np.where(np.abs(before) <= np.abs(after), before, after)
+    gap = gap[np.abs(gap) <= _HALF_A_PERIOD * period]
+    if not len(gap):
+        return 0
+    mean = np.mean(np.exp(2j * np.pi * gap / period))
+    if abs(mean) < _TRIGGERED:
+        return 0
+    middle = float(np.angle(mean)) / (2 * np.pi) * period
+    # Gaps of half a period are of either sign: all on the side of the mean, before their median is taken.
+    return round(middle + float(np.median((gap - middle + period / 2) % period - period / 2)))
+
+
+def motion_gates_ns(
+    speed_mps: Float[np.ndarray, " L"],
+    yaw_rate_radps: Float[np.ndarray, " L"],
+    move_m: float,
+    turn_rad: float,
+) -> Int64[np.ndarray, " L"]:
+    """Per sweep, the time in which the car drives `move_m` or turns `turn_rad`, whichever comes first [ns].
+
+    Speeds and yaw rates that are unknown (NaN) are taken for as high as a car's are.
+    """
+    speed = np.maximum(np.where(np.isnan(speed_mps), _UNKNOWN_MPS, np.abs(speed_mps)), _OTHERS_MPS)
+    turn = np.where(np.isnan(yaw_rate_radps), _UNKNOWN_RADPS, np.abs(yaw_rate_radps))
+    return (1e9 * np.minimum(move_m / speed, turn_rad / np.maximum(turn, 1e-6))).astype(np.int64)
+
+
+def _period_ns(stamps_ns: Int[np.ndarray, " M"]) -> float | None:
+    """Median time between stamps, None of fewer than two."""
+    return float(np.median(np.diff(np.sort(stamps_ns)))) if len(stamps_ns) > 1 else None
+
+
+def _gated(
+    stamps_ns: tuple[np.ndarray, np.ndarray, np.ndarray],
+    once: tuple[np.ndarray, np.ndarray, np.ndarray],
+    partners: tuple[np.ndarray, np.ndarray],
+    constant_ns: tuple[int, int],
+    gates_ns: np.ndarray,
+) -> Trios:
+    """The trios of which every two stamps, less the constant gaps, lie within the sweep's gate; the others counted.
+
+    `once` are the places of the stamps that count, of lidar, camera and radar; `partners` are places in those of camera
+    and radar, -1 = none.
+    """
+    lidar, own = once[0], stamps_ns[0][once[0]]
+    gates, gaps = gates_ns[lidar], []
+    for sensor in (0, 1):
+        to, others = partners[sensor], stamps_ns[sensor + 1][once[sensor + 1]]
+        gap = np.zeros(len(lidar), np.int64)
+        gap[to >= 0] = others[to[to >= 0]] - own[to >= 0] - constant_ns[sensor]
+        gaps.append(gap)
+    has_camera = (partners[0] >= 0) & (np.abs(gaps[0]) <= gates)
+    has_radar = (partners[1] >= 0) & (np.abs(gaps[1]) <= gates)
+    both = has_camera & has_radar
+    kept = both & (np.abs(gaps[0] - gaps[1]) <= gates)
+    rejected = Counter[str](
+        {
+            Rejection.DUPLICATE_STAMP: len(stamps_ns[0]) - len(lidar),
+            Rejection.NO_CAMERA: int(np.sum(~has_camera)),
+            Rejection.NO_RADAR: int(np.sum(has_camera & ~has_radar)),
+            Rejection.SPREAD: int(np.sum(both & ~kept)),
+        }
+    )
+    camera, radar = (once[i + 1][partners[i][kept]] for i in (0, 1))
+    return Trios(lidar[kept], camera, radar, +rejected, *constant_ns)
 
 
 def number_drives(stamps_ns: Sequence[int], logs: Sequence[int]) -> Int64[np.ndarray, " N"]:

@@ -152,7 +152,8 @@ def test_each_fault_of_one_frame_costs_that_frame_under_its_own_name(kit, tmp_pa
     small = drive.image(start + 9 * period, np.zeros((5, 6, 3), np.uint8), "rgb8")
     drive.replaced(kit.IMAGE, 9, small)
     drive.replaced(kit.LIDAR, 10, drive.cloud(0, kit.lidar(10)))
-    result, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    paper = kit.fleet(ingest={"sync_gate_s": 0.005})
+    result, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"), fleet=paper)
     assert [(f.stamp_ns - start) // period for f in frames] == [0, 11]
     assert [f.frame_index for f in frames] == [0, 1]
     counted = {k: v for k, v in result.rejected.items() if k in set(Rejection)}
@@ -168,6 +169,26 @@ def test_each_fault_of_one_frame_costs_that_frame_under_its_own_name(kit, tmp_pa
     }
     assert result.rejected["lidar_without_stamp"] == 1
     assert result.rows + sum(counted.values()) == 11  # every sweep that has a stamp is accounted for
+
+
+def test_an_image_that_is_late_by_as_much_as_all_others_costs_nothing_and_one_that_is_late_alone_goes(
+    kit, tmp_path, run_ingest
+):
+    drive, late = kit.Kit(frames=24).drive(), 40_000_000
+    for i in range(24):
+        stamp = kit.START_NS + i * kit.PERIOD_NS + late + (30_000_000 if i == 5 else 0)
+        drive.replaced(kit.IMAGE, i, drive.compressed(stamp, kit.jpeg(i)))
+    for i in range(-1, 26):
+        stamp = kit.START_NS + i * kit.PERIOD_NS
+        drive.add(kit.ODOMETRY, "nav_msgs/msg/Odometry", stamp, drive.odometry(stamp, 0.0, 0.0, 100.0, 0.0))
+    log = drive.mcap(tmp_path / "a.mcap")
+    result, frames = run_ingest(log)
+    assert [f.frame_index for f in frames] == list(range(23))
+    assert {f.camera_stamp_ns - f.stamp_ns for f in frames} == {late}
+    assert result.rejected["no_camera_in_gate"] == 1
+    paper, none = run_ingest(log, fleet=kit.fleet(ingest={"sync_gate_s": 0.005}), name="paper")
+    assert (paper.status, none) == ("refused", [])
+    assert "leave it out to gate by motion" in paper.reason
 
 
 def test_intrinsics_that_are_not_calibrated_are_refused_with_what_to_do(kit, tmp_path, run_ingest):

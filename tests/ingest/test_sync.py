@@ -1,13 +1,23 @@
 """Trios by stamps alone: within the gate, one to one, each sweep accounted for."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.ingest.sync import first_occurrences, match_nearest, match_trios, number_drives
+from pipeline.ingest.sync import (
+    constant_gap_ns,
+    first_occurrences,
+    match_by_motion,
+    match_nearest,
+    match_trios,
+    motion_gates_ns,
+    number_drives,
+)
 
 stamps = st.lists(st.integers(0, 400), max_size=30).map(lambda v: np.array(v, np.int64))
 GATE = 7
+MS = 1_000_000
 
 
 @settings(max_examples=200, deadline=None)
@@ -62,6 +72,80 @@ def test_reasons_name_the_sensor_that_is_missing():
         "no_camera_in_gate": 1,
         "no_radar_in_gate": 2,
     }
+
+
+def ticks(rate_hz, phase_ms, seconds=60.0, jitter_ms=0.0):
+    k = np.arange(int(seconds * rate_hz))
+    jitter = np.random.default_rng(0).normal(0, jitter_ms, len(k))
+    return ((k / rate_hz * 1e3 + phase_ms + jitter) * MS).astype(np.int64)
+
+
+def gates(sweeps, speed=20.0, yaw_rate=0.1):
+    return motion_gates_ns(np.full(len(sweeps), speed), np.full(len(sweeps), yaw_rate), 2.5, np.radians(2.0))
+
+
+@settings(max_examples=200, deadline=None)
+@given(stamps, stamps, stamps, st.integers(0, 40))
+def test_by_motion_too_no_sweep_is_lost_and_gaps_beyond_the_constant_ones_stay_within_the_gate(
+    lidar, camera, radar, gate
+):
+    trios = match_by_motion(lidar, camera, radar, np.full(len(lidar), gate))
+    for own, stamps_ns in ((trios.lidar, lidar), (trios.camera, camera), (trios.radar, radar)):
+        assert len(set(stamps_ns[own])) == len(own)
+    apart = np.stack(
+        [
+            camera[trios.camera] - lidar[trios.lidar] - trios.camera_gap_ns,
+            radar[trios.radar] - lidar[trios.lidar] - trios.radar_gap_ns,
+            np.zeros(len(trios.lidar)),
+        ]
+    )
+    assert apart.size == 0 or np.ptp(apart, axis=0).max() <= gate
+    assert np.all(np.diff(lidar[trios.lidar]) > 0)
+    assert len(trios.lidar) + sum(trios.rejected.values()) == len(lidar)
+
+
+def test_every_sweep_of_free_running_sensors_gets_the_image_and_scan_nearest_to_it():
+    sweeps, images, scans = ticks(10.03, 3, jitter_ms=0.1), ticks(30, 11), ticks(13, 40)
+    trios = match_by_motion(sweeps, images, scans, gates(sweeps, speed=35.0))
+    assert (trios.camera_gap_ns, trios.radar_gap_ns) == (0, 0)
+    assert len(trios.lidar) >= len(sweeps) - 2  # the last ones outlive the radar
+    for stamps_ns, own in ((images, trios.camera), (scans, trios.radar)):
+        distance = np.abs(stamps_ns[None] - sweeps[trios.lidar][:, None])
+        np.testing.assert_array_equal(distance.argmin(1), own)
+    assert len(match_trios(sweeps, images, scans, 5 * MS).lidar) < 0.1 * len(sweeps)
+
+
+@pytest.mark.parametrize("offset_ms", [-60.0, -25.0, 0.0, 25.0, 49.0, 50.0, 60.0])
+def test_a_constant_offset_costs_no_sweep_and_is_found_up_to_whole_periods(offset_ms):
+    sweeps = ticks(10, 0, jitter_ms=0.5)
+    images, scans = sweeps + int(offset_ms * MS), sweeps + 2 * MS
+    trios = match_by_motion(sweeps, images, scans, gates(sweeps, speed=40.0))
+    assert len(trios.lidar) >= len(sweeps) - 1
+    found_ms = trios.camera_gap_ns / MS
+    assert (found_ms - offset_ms + 50) % 100 - 50 == pytest.approx(0, abs=0.2)
+    assert abs(found_ms) <= 50.2
+    assert trios.radar_gap_ns / MS == pytest.approx(2.0, abs=0.2)
+
+
+def test_where_a_message_is_missing_the_sweep_goes_and_takes_no_neighbour_s():
+    sweeps = ticks(10, 0)
+    images = np.delete(sweeps + MS, [5, 6, 17])
+    trios = match_by_motion(sweeps, images, sweeps, gates(sweeps, speed=0.0))
+    assert dict(trios.rejected) == {"no_camera_in_gate": 3}
+    np.testing.assert_array_equal(np.setdiff1d(np.arange(len(sweeps)), trios.lidar), [5, 6, 17])
+
+
+def test_the_faster_a_car_drives_or_turns_the_nearer_the_stamps_must_be():
+    speed, yaw_rate = np.array([0.0, 20.0, 50.0, 20.0, np.nan]), np.array([0.0, 0.0, 0.0, 1.0, np.nan])
+    found = motion_gates_ns(speed, yaw_rate, 2.5, np.radians(2.0)) / MS
+    # Standing: what others drive at 10 m/s; unknown: 40 m/s and 30 deg/s.
+    np.testing.assert_allclose(found, [250.0, 125.0, 50.0, 34.9, 62.5], atol=0.1)
+
+
+def test_the_constant_of_a_free_running_sensor_is_none():
+    assert constant_gap_ns(ticks(10.03, 0), ticks(13, 5)) == 0
+    assert constant_gap_ns(np.zeros(0, np.int64), ticks(13, 5)) == 0
+    assert constant_gap_ns(ticks(10, 0), ticks(10, 5)[:1]) == 0
 
 
 def test_a_drive_ends_where_the_log_changes_or_ten_seconds_pass():

@@ -2,9 +2,9 @@
 
 The paper's conditions (section 4.5.1) per pair, read as: camera-lidar needs sky, drivable area and road
 users; camera-radar needs sky, road users and dynamic radar clusters; lidar-radar needs drivable area and
-dynamic clusters; all need stamps within 5 ms. Where they leave fewer frames than a calibration takes, the
-frames that come nearest to them fill up, and the selection notes it: a narrow camera may never see 20 % of
-sky.
+dynamic clusters; all need stamps within 5 ms, which the paper's methods keep also where ingest gates by
+motion. Where they leave fewer frames than a calibration takes, the frames that come nearest to them fill up,
+and the selection notes it: a narrow camera may never see 20 % of sky.
 
 Method `joint` does not need the paper's conditions; there they are only counted, and frames are chosen for what
 they add to the view that the others cover (image, azimuth, elevation, range).
@@ -24,7 +24,17 @@ from pipeline.errors import SolveError
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS
 from schemas.observations import Observation
 
-__all__ = ["MIN_FRAMES", "Selection", "hold_out", "missing_content", "select_frames", "unmet_conditions"]
+__all__ = [
+    "MIN_FRAMES",
+    "PAPER_SYNC_GATE_S",
+    "Selection",
+    "hold_out",
+    "missing_content",
+    "select_frames",
+    "unmet_conditions",
+]
+
+PAPER_SYNC_GATE_S = 0.005  # section 4.5.1
 
 MIN_FRAMES = 8  # fewer carry no calibration: 10 frames already scatter by 0.1 deg (evidence on the real logs)
 _SCARCE, _BRISK_MPS = 0.1, 5.0
@@ -50,7 +60,7 @@ def select_frames(
     config: SelectConfig,
     *,
     paper: bool,
-    sync_gate_s: float = 0.005,
+    sync_gate_s: float | None = PAPER_SYNC_GATE_S,
 ) -> Selection:
     """Choose frames to fit and to judge, the same way whenever it is asked.
 
@@ -58,7 +68,7 @@ def select_frames(
         observations: the day in order of time.
         config: thresholds, number of frames, share held out.
         paper: prefer frames that meet the paper's conditions; else choose by content alone.
-        sync_gate_s: largest difference of a pair's stamps.
+        sync_gate_s: largest difference of a pair's stamps; None = any that ingest let in.
 
     Raises:
         SolveError: fewer than MIN_FRAMES frames are left for a pair.
@@ -89,7 +99,10 @@ def select_frames(
 
 
 def unmet_conditions(
-    observation: Observation, pair: str, config: SelectConfig, sync_gate_s: float = 0.005
+    observation: Observation,
+    pair: str,
+    config: SelectConfig,
+    sync_gate_s: float | None = PAPER_SYNC_GATE_S,
 ) -> list[str]:
     """The paper's conditions that a frame does not meet for a pair, by name; "empty" where it has nothing to align."""
     camera, lidar, radar = (s in FRAMES_OF_PAIR[pair] for s in ("camera", "lidar", "radar"))
@@ -101,7 +114,7 @@ def unmet_conditions(
     first, second = FRAMES_OF_PAIR[pair]
     clusters = len(observation.radar_track_xyz_m)
     unmet = {
-        "sync": abs(stamps[first] - stamps[second]) > sync_gate_s * 1e9,
+        "sync": sync_gate_s is not None and abs(stamps[first] - stamps[second]) > sync_gate_s * 1e9,
         "sky": camera and observation.sky_fraction < config.min_sky,
         "drivable": lidar and observation.drivable_fraction < config.min_drivable,
         "road_users": camera and len(observation.road_user_boxes_px) < config.min_road_users,

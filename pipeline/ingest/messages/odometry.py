@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation, log_so3
 
@@ -61,6 +61,22 @@ class EgoTrack:
             return None
         share = (stamp_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
         return _state(values[i - 1], values[i], float(share))
+
+    def motion_at(
+        self, stamps_ns: Int[np.ndarray, " N"]
+    ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+        """Forward speed [m/s] and yaw rate [rad/s] at many stamps, NaN where `at` says nothing."""
+        unknown = np.full(len(stamps_ns), np.nan)
+        if len(self._rows) < 2:
+            return unknown, unknown
+        stamps, values = self._arrays()
+        i = np.clip(np.searchsorted(stamps, stamps_ns, "right"), 1, len(stamps) - 1)
+        known = (stamps_ns >= stamps[0]) & (stamps_ns <= stamps[-1])
+        known &= stamps[i] - stamps[i - 1] <= _LONGEST_GAP_S * 1e9
+        known |= (stamps[i - 1] == stamps_ns) | (stamps[i] == stamps_ns)
+        share = (stamps_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
+        mixed = values[i - 1] + share[:, None] * (values[i] - values[i - 1])
+        return np.where(known, mixed[:, 7], np.nan), np.where(known, mixed[:, 8], np.nan)
 
     def _arrays(self) -> tuple[np.ndarray, np.ndarray]:
         if self._sorted is None:
