@@ -12,7 +12,9 @@ from jaxtyping import Float, Int64
 
 from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError
+from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.se3 import from_quaternion
+from pipeline.geometry.spherical import to_spherical
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected
 from pipeline.ingest.index import ACCEPTED_TYPES, NEEDED, DayIndex, index_logs, topics_of
 from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
@@ -150,7 +152,7 @@ def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:
 
     uses_models = isinstance(rig.camera.semantics, OnnxSemantics)
     moving, problem = _motion(frames, rig)
-    rings = max((len(np.unique(f.lidar_ring)) for f in frames if f.lidar_ring is not None), default=0)
+    rings = max((_rings(f) for f in frames), default=0)
     return Evidence(
         frames=usable,
         has_prior=share(
@@ -165,6 +167,16 @@ def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:
         moving_share=moving,
         doppler_problem=problem,
     )
+
+
+def _rings(frame: Frame) -> int:
+    """Rows that the log names; none where what it calls rings are lasers of a pattern without rows."""
+    if frame.lidar_ring is None:
+        return 0
+    xyz = frame.lidar_xyz_m.astype(np.float64)
+    finite = np.isfinite(xyz).all(axis=1)
+    row = rows_of(to_spherical(xyz[finite]), frame.lidar_ring[finite])
+    return 0 if row is None else int(row.max()) + 1
 
 
 def _motion(frames: list[Frame], rig: Rig) -> tuple[float | None, str]:

@@ -2,7 +2,8 @@
 
 Along a ring the beams are close together, so a jump is a sharp edge (EDGE_LEFT, EDGE_RIGHT). Between rings it is
 only an interval, as wide as the rings are apart (EDGE_ABOVE, EDGE_BELOW with `gap_rad`): 0.25 deg on one lidar,
-2 deg on another.
+2 deg on another. A sweep without rows (a rosette) has neither: there each point looks at its neighbours, see
+`scattered_edges.py`.
 
 Source: the foreground range at mid-beam direction is where the silhouette is expected, because the last foreground
 beam lies anywhere between 0 and one beam inside it; jumps as in Levinson, Thrun 2013, "Automatic online calibration
@@ -14,13 +15,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32, UInt8, UInt16
+from jaxtyping import Float32, Int32, UInt8, UInt16
 
 from pipeline.config import PerceiveConfig
+from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.perceive.scattered_edges import jumps_between_neighbours
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
-__all__ = ["LidarEdges", "lidar_edges", "rows_by_elevation"]
+__all__ = ["LidarEdges", "lidar_edges"]
 
 # Neighbours along a ring may be this many nominal steps apart: one missing return between two surfaces
 # leaves an edge whose gap says that it is less sharp; more missing returns (glass, dark paint, sky) tell
@@ -35,13 +38,14 @@ _MIN_RANGE_M = 1.0  # nearer returns are the own vehicle
 
 @dataclass(frozen=True, eq=False)
 class LidarEdges:
-    """Depth jumps, one row each; the columns `lidar_edge_*` of table observations."""
+    """Depth jumps, one row each: the columns `lidar_edge_*` of table observations. Whether the sweep has rows."""
 
     xyz_m: Float32[np.ndarray, "E 3"]
     side: UInt8[np.ndarray, " E"]
     jump_m: Float32[np.ndarray, " E"]
     gap_rad: Float32[np.ndarray, " E"]
     points: Int32[np.ndarray, " E"]
+    has_rows: bool
 
 
 def lidar_edges(
@@ -54,7 +58,7 @@ def lidar_edges(
 
     Args:
         xyz_m: one sweep, lidar frame, de-skewed or not.
-        ring: beam number; without it rows are found from the elevations.
+        ring: beam number as logged, which need not be a row; without it rows are found from the elevations.
         cluster: object cluster of each point, -1 = none. Only clustered points make edges between rings, because
             there the ground alone jumps from ring to ring.
         config: `edge_jump_m` and `edge_jump_fraction`; a jump must exceed both.
@@ -62,51 +66,20 @@ def lidar_edges(
     aer = to_spherical(xyz_m.astype(np.float64))
     keep = np.flatnonzero(np.isfinite(aer).all(1) & (aer[:, 2] > _MIN_RANGE_M))
     if keep.size < 2:
-        return _edges([], cluster)
+        return _edges([], cluster, has_rows=False)
     aer = aer[keep]
-    row = _rows_by_height(ring[keep], aer[:, 1]) if ring is not None else rows_by_elevation(aer)
+    row = rows_of(aer, None if ring is None else ring[keep])
+    if row is None:
+        found = jumps_between_neighbours(aer, cluster[keep], config.edge_jump_m, config.edge_jump_fraction)
+        return _edges([(*f[:4], keep[f.foreground]) for f in found], cluster, has_rows=False)
     order = np.lexsort((aer[:, 0], row))
     aer, row, keep = aer[order], row[order], keep[order]
     step_rad = _azimuth_step(aer[:, 0], row)
-    found = [
+    in_rows = [
         *_along_rings(aer, row, step_rad, config),
         *_between_rings(aer, row, cluster[keep], step_rad, config),
     ]
-    return _edges([(a, s, j, g, keep[i]) for a, s, j, g, i in found], cluster)
-
-
-def rows_by_elevation(azimuth_elevation_range: Float[np.ndarray, "N 3"]) -> Int32[np.ndarray, " N"]:
-    """Row numbers, upwards, for a lidar that does not log its rings.
-
-    Elevations of a multi-beam lidar crowd around one value per beam; rows are the crowds. Where de-skewing
-    has smeared the crowds into each other, rows become even bins of the azimuth step, which is right for
-    square grids.
-    """
-    elevation = azimuth_elevation_range[:, 1]
-    order = np.argsort(elevation, kind="stable")
-    gaps = np.diff(elevation[order])
-    # A gap between crowds is wide against what lies inside them; jitter inside is below 0.02 deg for
-    # real beams.
-    wide = gaps > np.radians(0.03)
-    typical_size = len(elevation) / (1 + np.count_nonzero(wide))
-    row = np.empty(len(elevation), np.int32)
-    if np.count_nonzero(wide) >= 7 and typical_size >= 16:
-        row[order] = np.concatenate([[0], np.cumsum(wide)])
-        return row
-    azimuth = np.sort(azimuth_elevation_range[:, 0])
-    steps = np.diff(azimuth)
-    steps = steps[steps > np.radians(0.03)]
-    step = float(np.median(steps)) if steps.size else np.radians(0.25)
-    return np.floor((elevation - elevation.min()) / step + 0.5).astype(np.int32)
-
-
-def _rows_by_height(ring: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Ring numbers renumbered from the lowest beam up (drivers number beams in firing order)."""
-    rings, inverse = np.unique(ring, return_inverse=True)
-    mean = np.bincount(inverse, elevation) / np.bincount(inverse)
-    rank = np.empty(len(rings), np.int32)
-    rank[np.argsort(mean, kind="stable")] = np.arange(len(rings), dtype=np.int32)
-    return rank[inverse]
+    return _edges([(a, s, j, g, keep[i]) for a, s, j, g, i in in_rows], cluster, has_rows=True)
 
 
 def _azimuth_step(azimuth: np.ndarray, row: np.ndarray) -> float:
@@ -205,7 +178,7 @@ def _jumps_to_row(
     return here[ok], there[ok]
 
 
-def _edges(found: list[_Found], cluster: np.ndarray) -> LidarEdges:
+def _edges(found: list[_Found], cluster: np.ndarray, *, has_rows: bool) -> LidarEdges:
     """Stack what was found; `points` counts the foreground's cluster."""
     if not found:
         found = [(np.empty((0, 3)), EDGE_LEFT, np.empty(0), np.empty(0), np.empty(0, np.int64))]
@@ -218,4 +191,5 @@ def _edges(found: list[_Found], cluster: np.ndarray) -> LidarEdges:
         jump_m=np.concatenate([f[2] for f in found]).astype(np.float32),
         gap_rad=np.concatenate([f[3] for f in found]).astype(np.float32),
         points=np.where(own >= 0, sizes[np.maximum(own, 0)], 1).astype(np.int32),
+        has_rows=has_rows,
     )

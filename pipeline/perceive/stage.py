@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -32,7 +32,9 @@ from schemas.observations import Observation
 __all__ = ["perceive_frame", "work"]
 
 _MIN_LIDAR_POINTS = 100  # less shows neither ground nor objects
-_PerceiveFrame = Callable[..., tuple[Observation, TrackState]]
+WITHOUT_ROWS: Final = (
+    "frames_without_lidar_rows"  # among the manifest's kept: edges between neighbours, see README
+)
 _PRIOR_FIELDS = [
     f"prior_{pair}_{part}"
     for pair in ("camera_lidar", "lidar_radar")
@@ -70,20 +72,30 @@ def work(task: Task) -> Work:
     )
 
 
-def _rows(task: Task, perceive: _PerceiveFrame, run: Run) -> Generator[Observation, None, None]:
+def _rows(task: Task, perceive: Callable[..., Perceived], run: Run) -> Generator[Observation, None, None]:
     """The day's observations, a row group of frames in memory at a time."""
     total, state, seen = task.inputs[FRAMES.name].rows, TrackState.empty(), 0
     for group in iterate_rows(task.lake, FRAMES, task.partition, Frame):
         for frame in group:
-            observation: Observation | None = None
+            found: Perceived | None = None
             try:
-                observation, state = perceive(frame, tracks=state)
+                found = perceive(frame, tracks=state)
             except FrameRejectedError as rejection:
                 run.rejected[rejection.reason.value] += 1
             seen += 1
             run.progress(seen, total, "perceive")
-            if observation is not None:
-                yield observation
+            if found is not None:
+                state = found.tracks
+                run.kept.update([] if found.lidar_has_rows else [WITHOUT_ROWS])
+                yield found.observation
+
+
+class Perceived(NamedTuple):
+    """What one frame shows, the radar tracks after it, and whether its sweep has rows (a rosette has none)."""
+
+    observation: Observation
+    tracks: TrackState
+    lidar_has_rows: bool
 
 
 def perceive_frame(
@@ -93,7 +105,7 @@ def perceive_frame(
     tracks: TrackState,
     drivable: DrivableSource | None = None,
     points: PointSource | None = None,
-) -> tuple[Observation, TrackState]:
+) -> Perceived:
     """Everything that one frame shows, and the radar tracks carried on.
 
     Args:
@@ -114,7 +126,7 @@ def perceive_frame(
     contrast = road_contrast(grey, semantics.labels == ROAD_ID)
     # One generator per frame: the result does not depend on which frames came before.
     rng = np.random.default_rng([frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index])
-    lidar = _perceive_lidar(frame, config, rng, points)
+    lidar, has_rows = _perceive_lidar(frame, config, rng, points)
     radar, motion, state = _perceive_radar(frame, config, tracks, rng, drivable)
     copied = {name: getattr(frame, name) for name in _COPIED_FIELDS}
     users = semantics.detections
@@ -133,7 +145,7 @@ def perceive_frame(
         road_user_scores=users.scores,
         road_contrast_png=encode_png(contrast),
     )
-    return observation, state
+    return Perceived(observation, state, has_rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +183,8 @@ def _check(frame: Frame) -> None:
 
 def _perceive_lidar(
     frame: Frame, config: PerceiveConfig, rng: np.random.Generator, points: PointSource | None
-) -> dict[str, Any]:
-    """The lidar_*, marking_* and ground_* columns."""
+) -> tuple[dict[str, Any], bool]:
+    """The lidar_*, marking_* and ground_* columns; whether the sweep has rows."""
     sweep = _finite_sweep(frame)
     xyz = sweep.xyz_m
     kind = None if points is None else points.kinds(xyz, sweep.intensity)
@@ -182,7 +194,7 @@ def _perceive_lidar(
     sample = sample_uniformly(xyz, config.voxel_m)
     edges = lidar_edges(xyz, sweep.ring, cluster, config)
     markings = lidar_markings(xyz, sweep.intensity, sweep.ring, ground.is_road)
-    return {
+    columns = {
         "lidar_map_xyz_m": xyz[sample],
         "lidar_map_is_ground": ground.is_ground[sample].astype(np.uint8),
         "lidar_map_cluster": cluster[sample],
@@ -199,6 +211,7 @@ def _perceive_lidar(
         "ground_plane": ground.plane,
         "lidar_drivable_xyz_m": ground.drivable_xyz_m,
     }
+    return columns, edges.has_rows
 
 
 def _perceive_radar(

@@ -70,8 +70,56 @@ def test_a_point_between_two_surfaces_adds_no_second_edge():
     )
 
 
+def scattered(range_of, seed=0, points=24000):
+    """A sweep of 40 x 20 deg in no order at all, and which of six lasers drew each point."""
+    rng = np.random.default_rng(seed)
+    a, e = np.radians(rng.uniform(-20, 20, points)), np.radians(rng.uniform(-12, 8, points))
+    xyz = from_spherical(np.stack([a, e, range_of(a, e)], -1)).astype(np.float32)
+    return xyz, np.degrees(a), np.degrees(e), rng.integers(0, 6, points).astype(np.uint16)
+
+
+def is_post(azimuth_deg, elevation_deg):
+    return (np.abs(azimuth_deg) < 2.0) & (elevation_deg < 3.0)
+
+
+LOGGED = {
+    "no ring": lambda _: None,
+    "lasers as rings": lambda laser: laser,
+    "ring 0 for all": np.zeros_like,
+}
+
+
+@pytest.mark.parametrize("logged", LOGGED)
+def test_a_sweep_without_rows_shows_the_outline_of_a_post_where_it_is(logged):
+    xyz, a, e, laser = scattered(lambda a, e: np.where(is_post(np.degrees(a), np.degrees(e)), 10.0, 30.0))
+    cluster = np.where(is_post(a, e), 0, -1).astype(np.int32)
+    edges = lidar_edges(xyz, LOGGED[logged](laser), cluster, CONFIG)
+    assert not edges.has_rows
+    aer = to_spherical(edges.xyz_m.astype(float))
+    azimuth, elevation, gap = np.degrees(aer[:, 0]), np.degrees(aer[:, 1]), np.degrees(edges.gap_rad)
+    off = {EDGE_RIGHT: azimuth - 2.0, EDGE_LEFT: azimuth + 2.0, EDGE_BELOW: elevation - 3.0}
+    for side, distance in off.items():
+        mine = edges.side == side
+        assert mine.sum() > 15
+        # The silhouette lies between the two beams: within half the gap of their middle, and gaps are small. At the
+        # post's corner a neighbour above lies beyond its side.
+        assert np.mean(np.abs(distance[mine]) <= gap[mine] / 2 + 1e-6) > 0.9
+        assert abs(np.median(distance[mine])) < 0.05
+        assert np.median(gap[mine]) < 0.4
+    assert (edges.side == EDGE_ABOVE).sum() <= 2  # the post stands on the lower border
+    np.testing.assert_allclose(aer[:, 2], 10.0, atol=1e-3)
+    np.testing.assert_allclose(edges.jump_m, 20.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("logged", LOGGED)
+def test_the_road_under_a_sweep_without_rows_has_no_edges(logged):
+    xyz, a, _, laser = scattered(lambda _, e: np.where(e < -0.02, 1.8 / np.sin(np.maximum(-e, 0.02)), 90.0))
+    edges = lidar_edges(xyz, LOGGED[logged](laser), np.full(len(a), -1, np.int32), CONFIG)
+    assert len(edges.side) == 0
+
+
 def test_empty_and_tiny_clouds_have_no_edges():
-    for n in (0, 1):
-        edges = lidar_edges(np.zeros((n, 3), np.float32), None, np.full(n, -1, np.int32), CONFIG)
+    for n in (0, 1, 5):
+        edges = lidar_edges(np.full((n, 3), 5, np.float32), None, np.full(n, -1, np.int32), CONFIG)
         assert len(edges.side) == 0
         assert edges.xyz_m.shape == (0, 3)

@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, ContractError
+from pipeline.perceive.stage import WITHOUT_ROWS
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_rows, write_partition
 from schemas.frames import FRAMES
@@ -143,6 +144,19 @@ def test_points_that_are_not_numbers_are_left_out(lake, made_frame):
     write_frames(lake, [replace(frame, lidar_x_m=x)], key="nan")
     perceive_day(DAY, fleet(), lake)
     assert np.isfinite(rows(lake)[0].lidar_map_xyz_m).all()
+
+
+def test_sweeps_without_rows_are_counted_and_still_show_edges(lake, made_frame):
+    lasers = np.random.default_rng(0).integers(0, 6, len(made_frame(0).lidar_x_m)).astype(np.uint16)
+    frames = [
+        made_frame(0),
+        replace(made_frame(1), lidar_ring=lasers),
+        replace(made_frame(2), lidar_ring=lasers),
+    ]
+    write_frames(lake, frames, key="rosette")
+    result = perceive_day(DAY, fleet(), lake)
+    assert (result.kept, result.rejected) == ({"frames": 3, WITHOUT_ROWS: 2}, {})
+    assert all(len(o.lidar_edge_xyz_m) > 0 for o in rows(lake))
 
 
 def test_sensors_that_say_little_are_enough(lake, made_frame):

@@ -9,7 +9,9 @@ from scipy.spatial import cKDTree
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import inverse
+from pipeline.simulate.fleet import FleetSpec, simulate_vehicle_day
 from pipeline.simulate.logs.fleet_toml import fleet_toml
+from pipeline.simulate.logs.writers import TOPICS
 from pipeline.simulate.sensors.beams import beams_of
 from pipeline.simulate.sensors.camera import render, view_of
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
@@ -167,3 +169,11 @@ def test_truth_of_a_turned_radar_is_one_consistent_triangle(name):
     truth = mounting_of(rig_named(name), 1, 0, 0).truth()
     loop = truth["T_camera_lidar"] @ truth["T_lidar_radar"] @ inverse(truth["T_camera_radar"])
     np.testing.assert_allclose(loop, np.eye(4), atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "field"), [("rosette", "line"), ("demo", "ring")])
+def test_lasers_of_a_rosette_are_logged_as_its_driver_does(name, field, tmp_path, read, the_log):
+    spec = FleetSpec(vehicles=1, days=1, frames=1, drives=1, rig=name, environments="urban")
+    simulate_vehicle_day(spec, 0, 0, tmp_path)
+    cloud = next(m for topic, _, m in read(the_log(tmp_path)) if topic == TOPICS["lidar"])
+    assert [f.name for f in cloud.fields] == ["x", "y", "z", "intensity", field, "time"]

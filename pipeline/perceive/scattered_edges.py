@@ -1,0 +1,110 @@
+"""Depth jumps of a sweep without rows: between each point and its nearest neighbours to the four sides.
+
+What lies between two neighbours is a silhouette wherever the nearer one belongs to something that stands and the
+farther one does not belong to it. No row is assumed: a neighbour to the left lies left, not exactly, but within half as
+much up or down as to the side. Which way the silhouette faces, all neighbours behind it tell together: beside a post's
+left edge the beam above may miss the post too, and is no upper edge.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int32
+from scipy.spatial import cKDTree
+
+from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
+
+__all__ = ["Jumps", "jumps_between_neighbours"]
+
+_NEIGHBOURS: Final = 16  # of a random pattern these reach about 2.3 mean spacings far
+_REACH_STEPS: Final = (
+    4.0  # median distances to the nearest point; beyond, something did not return in between
+)
+_ASIDE: Final = 0.5  # a neighbour to one side lies at most this much of its distance to another
+# Axis of (azimuth, elevation) and sign towards the background: azimuth grows to the left, and a foreground that ends
+# at its left lies right of its silhouette.
+_SIDES: Final = ((EDGE_RIGHT, 0, 1.0), (EDGE_LEFT, 0, -1.0), (EDGE_BELOW, 1, 1.0), (EDGE_ABOVE, 1, -1.0))
+
+
+class Jumps(NamedTuple):
+    """Jumps of one side: where the silhouette is expected (azimuth, elevation, range), and what made it."""
+
+    at_aer: Float[np.ndarray, "E 3"]
+    side: int
+    jump_m: Float[np.ndarray, " E"]
+    gap_rad: Float[np.ndarray, " E"]
+    foreground: Int[np.ndarray, " E"]
+
+
+class _Neighbours(NamedTuple):
+    """The nearest points of each point but itself, and (azimuth, elevation) [rad] from it to them."""
+
+    point: np.ndarray
+    offset_rad: np.ndarray
+    reachable: np.ndarray
+
+
+def jumps_between_neighbours(
+    aer: Float[np.ndarray, "N 3"],
+    cluster: Int32[np.ndarray, " N"],
+    edge_jump_m: float,
+    edge_jump_fraction: float,
+) -> list[Jumps]:
+    """Jumps in range from clustered points to what is not of their cluster, side by side.
+
+    Args:
+        aer: azimuth, elevation [rad] and range [m] of the points.
+        cluster: object cluster of each point, -1 = none. Only clustered points make edges: neighbours differ in
+            elevation, and then the ground alone jumps.
+        edge_jump_m: a jump must exceed this,
+        edge_jump_fraction: and this share of the nearer range.
+    """
+    if len(aer) <= _NEIGHBOURS:
+        return []
+    near = _neighbours(aer[:, :2])
+    range_m = aer[:, 2]
+    least = np.maximum(edge_jump_m, edge_jump_fraction * range_m)
+    is_behind = (range_m[near.point] - range_m[:, None] > least[:, None]) & (
+        cluster[near.point] != cluster[:, None]
+    )
+    towards = _towards(near, is_behind)
+    found = []
+    for side, axis, sign in _SIDES:
+        there, seen = _nearest_to(near, axis, sign)
+        before, opposite = _nearest_to(near, axis, -sign)
+        faces = sign * towards[:, axis] > np.abs(towards[:, 1 - axis])
+        jump = range_m[there] - range_m
+        is_edge = seen & faces & (cluster >= 0) & (cluster[there] != cluster) & (jump > least)
+        # A beam that hits two surfaces returns a point between them: in front of it the silhouette comes earlier.
+        is_edge &= ~(opposite & (range_m - range_m[before] > least[before]))
+        here = np.flatnonzero(is_edge)
+        middle = (aer[here, :2] + aer[there[here], :2]) / 2
+        gap = np.abs(aer[there[here], axis] - aer[here, axis])
+        found.append(Jumps(np.column_stack([middle, range_m[here]]), side, jump[here], gap, here))
+    return found
+
+
+def _towards(near: _Neighbours, chosen: Bool[np.ndarray, "N K"]) -> Float[np.ndarray, "N 2"]:
+    """Sum of the directions to some neighbours: towards the background, across the silhouette."""
+    distance = np.maximum(np.linalg.norm(near.offset_rad, axis=-1, keepdims=True), 1e-9)
+    return np.sum(near.offset_rad / distance * (chosen & near.reachable)[..., None], axis=1)
+
+
+def _neighbours(directions: Float[np.ndarray, "N 2"]) -> _Neighbours:
+    distance, index = cKDTree(directions).query(directions, k=_NEIGHBOURS + 1)
+    distance, index = distance[:, 1:], index[:, 1:]
+    step = float(np.median(distance[:, 0]))
+    return _Neighbours(index, directions[index] - directions[:, None], distance < _REACH_STEPS * step)
+
+
+def _nearest_to(
+    near: _Neighbours, axis: int, sign: float
+) -> tuple[Int[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+    """The neighbour to one side of each point, and whether it has one."""
+    along, aside = sign * near.offset_rad[..., axis], np.abs(near.offset_rad[..., 1 - axis])
+    fits = near.reachable & (along > 0) & (aside <= _ASIDE * along)
+    nearest = np.argmin(np.where(fits, along, np.inf), axis=1)
+    rows = np.arange(len(along))
+    return near.point[rows, nearest], fits[rows, nearest]

@@ -1,0 +1,53 @@
+"""Rows are found where a lidar draws them, and nowhere else."""
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.scan_rows import rows_of
+
+
+def scanner(rows=16, columns=200, spacing_deg=2.0, droop_deg=0.0, jitter_deg=0.0, seed=0):
+    """Azimuth, elevation, range of a scanner whose rows may sag towards the sides, and the row of each point."""
+    row, column = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+    azimuth = np.radians(np.linspace(-40, 40, columns)[column])
+    sag = droop_deg * np.linspace(-1, 1, columns)[column] ** 2
+    elevation = np.radians(spacing_deg * (row - rows / 2) - sag)
+    elevation = elevation + np.radians(jitter_deg) * np.random.default_rng(seed).standard_normal(row.shape)
+    aer = np.stack([azimuth.ravel(), elevation.ravel(), np.full(row.size, 20.0)], 1)
+    return aer, row.ravel().astype(np.int32)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [{}, {"droop_deg": 5.0}, {"jitter_deg": 0.05}, {"rows": 128, "spacing_deg": 0.125}, {"rows": 1}],
+)
+def test_rows_that_are_logged_are_rows_whatever_their_numbering(shape):
+    aer, row = scanner(**shape)
+    numbering = np.random.default_rng(1).permutation(row.max() + 1).astype(np.uint16)
+    shuffled = np.random.default_rng(2).permutation(len(row))
+    found = rows_of(aer[shuffled], numbering[row][shuffled])
+    np.testing.assert_array_equal(found, row[shuffled])
+
+
+def test_rows_that_are_not_logged_are_crowds_of_elevations():
+    aer, row = scanner(rows=4, jitter_deg=0.002)
+    np.testing.assert_array_equal(rows_of(aer, None), row)
+
+
+def test_rows_that_run_into_each_other_and_are_not_logged_are_none():
+    aer, _ = scanner(rows=64, spacing_deg=0.2, jitter_deg=0.05)
+    assert rows_of(aer, None) is None
+
+
+def test_lasers_of_a_rosette_are_no_rows():
+    t = np.arange(4000) / 40000
+    turns = [2 * np.pi * f * t[:, None] + np.arange(6) * p for f, p in ((121.57, 1.0), (-77.73, 2.1))]
+    azimuth, elevation = 0.7 * sum(np.cos(w) for w in turns) / 2, 0.2 * sum(np.sin(w) for w in turns) / 2
+    aer = np.stack([azimuth.ravel(), elevation.ravel(), np.full(azimuth.size, 20.0)], 1)
+    for ring in (np.tile(np.arange(6), 4000).astype(np.uint16), np.zeros(24000, np.uint16), None):
+        assert rows_of(aer, ring) is None
+
+
+def test_no_points_have_no_rows():
+    assert rows_of(np.zeros((0, 3)), None) is None
+    assert rows_of(np.zeros((0, 3)), np.zeros(0, np.uint16)) is None
