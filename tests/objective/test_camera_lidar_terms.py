@@ -22,6 +22,7 @@ from pipeline.objective.camera_lidar.score import (
     lidar_velocities,
     prepare_terms,
 )
+from pipeline.simulate.sensors.rigs import rig_named
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
 
@@ -118,6 +119,18 @@ def test_vector_projection_agrees_with_the_point_by_point_one_and_marks_what_can
     seen = np.array([a[2] for a in alone])
     np.testing.assert_array_equal(u == -1, ~seen)
     np.testing.assert_allclose(np.stack([u, v], -1)[seen], [a[:2] for a in alone if a[2]], atol=0.02)
+
+
+def test_a_fisheye_is_projected_where_its_model_says_behind_the_camera_too():
+    camera = rig_named("fisheye").camera.nominal().scaled(0.5)
+    u, v = np.meshgrid(np.linspace(0, camera.width_px - 1, 33), np.linspace(0, camera.height_px - 1, 25))
+    pixels = np.stack([u.ravel(), v.ravel()], -1)
+    rays = camera.unproject(pixels)
+    assert (rays[:, 2] < -0.3).any()
+    c = camera_parameters(camera)
+    found = np.array([project_point(c, *p) for p in (12.0 * rays).astype(np.float32)])
+    assert found[:, 2].all()
+    np.testing.assert_allclose(found[:, :2], pixels, atol=0.1)
 
 
 def test_information_is_positive_semidefinite(terms):

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import inverse
-from pipeline.simulate.fleet import FleetSpec, simulate_vehicle_day
+from pipeline.simulate.fleet import FleetSpec, drive_of, simulate_vehicle_day
 from pipeline.simulate.logs.fleet_toml import fleet_toml
 from pipeline.simulate.logs.writers import TOPICS
 from pipeline.simulate.sensors.beams import beams_of
@@ -177,3 +177,8 @@ def test_lasers_of_a_rosette_are_logged_as_its_driver_does(name, field, tmp_path
     simulate_vehicle_day(spec, 0, 0, tmp_path)
     cloud = next(m for topic, _, m in read(the_log(tmp_path)) if topic == TOPICS["lidar"])
     assert [f.name for f in cloud.fields] == ["x", "y", "z", "intensity", field, "time"]
+
+
+def test_a_mixed_day_drives_through_town_and_on_highways():
+    spec = FleetSpec(vehicles=1, days=1, environments="mixed")
+    assert [drive_of(spec, 0, 0, i, 10).environment for i in range(3)] == ["urban", "highway", "urban"]

@@ -14,7 +14,7 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3, inverse, log_so3, transform_points
 from pipeline.geometry.spherical import from_spherical, to_spherical
 from tests.benchmarks.recovery import changed_radar
-from tests.benchmarks.studies import engine, table1
+from tests.benchmarks.studies import engine, rigs, table1
 from tests.benchmarks.studies.ablation import _settings, setting_of
 from tests.benchmarks.studies.commits import is_same_code
 from tests.benchmarks.studies.days import SETS, Day, DaySpec
@@ -263,8 +263,18 @@ def test_a_calibration_is_measured_against_truth_pair_by_pair(day):
     assert set(json.loads(json.dumps(result))["pairs"]) == {"camera_lidar", "camera_radar", "lidar_radar"}
 
 
+def test_the_table_of_rigs_says_how_far_off_the_worst_dof_is_and_what_was_refused():
+    pair = {"az_deg": 0.1, "el_deg": 0.2, "range_m": 0.05, "status": "held", "frames_used": 31}
+    pair |= {"error": [0.01, 0, 0, 0, -0.08, 0], "sigma": [0.01] * 3 + [0.02] * 3}
+    about = {"day": asdict(replace(SPEC, rig="bumper", fault="camera:dusk:1")), "cpu_s": 5.0}
+    lines = rigs.summary([about | {"pairs": {"lidar_radar": pair}}]).splitlines()
+    assert lines[2] == (
+        "| bumper camera:dusk:1 | 31 | refused | refused | 0.100 / 0.200 held, far 4.0 (ty) | 0.050 | 5.0 |"
+    )
+
+
 def test_seeds_of_tuning_and_test_sets_never_meet():
-    tuning = {d.seed for name in ("dev", "dev-bad") for d in SETS[name]}
+    tuning = {d.seed for name, days in SETS.items() if name.startswith("dev") for d in days}
     test = [d.seed for name, days in SETS.items() if not name.startswith("dev") for d in days]
     assert max(tuning) < 200 <= min(test)
     assert len(set(test)) == len(test)

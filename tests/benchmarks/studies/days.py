@@ -195,6 +195,30 @@ SETS: dict[str, list[DaySpec]] = {
         DaySpec(138, "urban", fault="radar:yaw:12"),
         DaySpec(139, "highway", fault="camera:yaw:12"),
     ],
+    # Other cars, all on the same drives; `mixed` is town and highway in turn, drive by drive.
+    "dev-rigs": [
+        *(
+            DaySpec(183, "mixed", rig=rig)
+            for rig in (
+                "demo",
+                "ring16",
+                "corner-left",
+                "corner-right",
+                "spin128",
+                "rosette",
+                "fisheye",
+                "pinhole",
+                "rolling",
+                "truck",
+                "bumper",
+                "tilted",
+            )
+        ),
+        *(
+            DaySpec(183, "mixed", rig="demo", fault=fault)
+            for fault in ("camera:centre:4", "camera:dusk:1", "camera:night:1")
+        ),
+    ],
     "table1": [DaySpec(3200 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
     "one-clock": [
         DaySpec(3220 + i, "urban" if i < 5 else "highway", 100, "paper-one-clock") for i in range(10)
