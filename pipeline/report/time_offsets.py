@@ -1,4 +1,6 @@
-"""Time offsets in pictures: a sweep and an image with the same stamp were taken that far apart, and the car drove on.
+"""Time offsets in pictures: sweep, image and scan of a frame were taken some time apart, and the car drove on.
+
+That time is the gap of the frame's stamps and the offset of the clocks together.
 
 At 15 m/s an offset of 30 ms is half a metre: pictures of a calibration without its time offsets look worse than it is.
 """
@@ -21,10 +23,10 @@ __all__ = ["TimeOffsets", "as_stamped", "time_offsets_of"]
 
 @dataclass(frozen=True)
 class TimeOffsets:
-    """What to add to a stamp of the child to have it on the parent's clock [s]."""
+    """What to add to a child's stamp to have it on the parent's clock [s]; None = unknown: drawn as taken at once."""
 
-    camera_lidar_s: float = 0.0
-    lidar_radar_s: float = 0.0
+    camera_lidar_s: float | None = None
+    lidar_radar_s: float | None = None
 
     def in_words(self) -> str:
         """Both in milliseconds; empty where neither is known."""
@@ -33,9 +35,9 @@ class TimeOffsets:
 
 
 def time_offsets_of(records: Mapping[str, CalibrationRecord]) -> TimeOffsets:
-    """The estimated offsets of a run, by pair; 0 where a method or a day gave none, as the prior assumes."""
-    offset_s = {pair: r.time_offset_s for pair, r in records.items() if r.time_offset_s is not None}
-    return TimeOffsets(offset_s.get("camera_lidar", 0.0), offset_s.get("lidar_radar", 0.0))
+    """The estimated offsets of a run, by pair; None where a method or a day gave none."""
+    offset_s = {pair: r.time_offset_s for pair, r in records.items()}
+    return TimeOffsets(offset_s.get("camera_lidar"), offset_s.get("lidar_radar"))
 
 
 def as_stamped(state: Extrinsics, observation: Observation, offsets: TimeOffsets) -> Extrinsics:
@@ -44,7 +46,13 @@ def as_stamped(state: Extrinsics, observation: Observation, offsets: TimeOffsets
     T_camera_radar stays as it is: it draws moving clusters only, whose way is their own.
     """
     v, yaw_rate = _velocity_lidar(state, observation), observation.ego_yaw_rate_radps or 0.0
-    to_image, to_sweep = (_way(v, yaw_rate, dt_s) for dt_s in (offsets.camera_lidar_s, offsets.lidar_radar_s))
+    camera_gap_s, radar_gap_s = (
+        (stamp - observation.stamp_ns) * 1e-9
+        for stamp in (observation.camera_stamp_ns, observation.radar_stamp_ns)
+    )
+    image_s = 0.0 if offsets.camera_lidar_s is None else offsets.camera_lidar_s - camera_gap_s
+    sweep_s = 0.0 if offsets.lidar_radar_s is None else offsets.lidar_radar_s + radar_gap_s
+    to_image, to_sweep = (_way(v, yaw_rate, way_s) for way_s in (image_s, sweep_s))
     return Extrinsics(state.T_camera_lidar @ to_image, state.T_camera_radar, to_sweep @ state.T_lidar_radar)
 
 

@@ -2,9 +2,10 @@
 
 Exact geometry and no noise model: what the camera-lidar terms must find is in the picture by construction. The world
 is where the camera's clock says it is: with a time offset dt it has moved dt times the own speed (stamp_camera =
-stamp_lidar + dt).
+stamp_lidar + dt), and with a gap between the stamps by as much less.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -49,16 +50,32 @@ DENSE = Rig(FISHEYE, np.arange(-12.0, 6.0, 0.25), 0.25, 30.0, T_TRUE, has_ring=F
 
 
 def traced_day(
-    rig: Rig, frames: int, seed: int, dt_s: float = 0.0, *, reflective: bool = True
+    rig: Rig,
+    frames: int,
+    seed: int,
+    dt_s: float = 0.0,
+    *,
+    reflective: bool = True,
+    gaps_s: Sequence[float] | None = None,
 ) -> list[Observation]:
-    """Observations of independent scenes, six frames to a drive, every third standing still."""
+    """Observations of independent scenes, six frames to a drive, every third standing; gaps of images to sweeps."""
     rng = np.random.default_rng(seed)
     speeds = [0.0 if i % 3 == 0 else float(rng.uniform(5, 25)) for i in range(frames)]
-    return [traced_frame(rig, rng, i, speeds[i], dt_s, reflective=reflective) for i in range(frames)]
+    return [
+        traced_frame(rig, rng, i, speeds[i], dt_s, gap_s, reflective=reflective)
+        for i, gap_s in enumerate(gaps_s or [0.0] * frames)
+    ]
 
 
 def traced_frame(
-    rig: Rig, rng: np.random.Generator, index: int, speed_mps: float, dt_s: float, *, reflective: bool
+    rig: Rig,
+    rng: np.random.Generator,
+    index: int,
+    speed_mps: float,
+    dt_s: float,
+    gap_s: float,
+    *,
+    reflective: bool,
 ) -> Observation:
     """One scene, seen by both sensors."""
     boxes, labels_of_box = scatter_boxes(rng)
@@ -69,8 +86,8 @@ def traced_frame(
     )
     rays = label_camera.unproject(np.stack([u, v], -1).reshape(-1, 2))
     T_lidar_camera = inverse(rig.T_camera_lidar)
-    # The image is dt older on the lidar's clock: the car stood speed * dt behind.
-    origin = T_lidar_camera[:3, 3] - np.array([speed_mps * dt_s, 0, 0])
+    # The image is dt older on the lidar's clock than its stamp: the car stood so much behind.
+    origin = T_lidar_camera[:3, 3] - np.array([speed_mps * (dt_s - gap_s), 0, 0])
     _, what, paint = trace(origin, rays @ T_lidar_camera[:3, :3].T, boxes, labels_of_box, phase)
     labels = what.reshape(u.shape).astype(np.uint8)
     grey = np.where(what == ROAD, np.where(paint, 200, 80), 120).reshape(u.shape).astype(np.uint8)
@@ -79,8 +96,9 @@ def traced_frame(
     xyz, ring, cluster, is_ground, intensity = sweep(rig, boxes, labels_of_box, phase)
     edges = lidar_edges(xyz, ring, cluster, PerceiveConfig())
     marks = lidar_markings(xyz, intensity if reflective else None, ring, is_ground)
+    made = make_observation(rng, index, index // 6, float(index))
     return replace(
-        make_observation(rng, index, index // 6, float(index)),
+        made, camera_stamp_ns=made.stamp_ns + round(gap_s * 1e9),
         image_width_px=rig.camera.width_px, image_height_px=rig.camera.height_px,
         camera_model=rig.camera.model, camera_K=rig.camera.K, camera_D=rig.camera.D,
         ego_speed_mps=speed_mps, ego_yaw_rate_radps=None, radar_velocity_mps=None,

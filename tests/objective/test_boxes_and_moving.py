@@ -145,6 +145,24 @@ def test_moving_clusters_are_brought_to_the_lidar_time():
     assert np.median(np.abs(np.linalg.norm(off, axis=1) - np.linalg.norm(centres, axis=1))) > 0.4
 
 
+def test_in_a_turn_clusters_are_turned_back_to_when_sweep_and_image_were_taken():
+    day = [
+        replace(o, ego_yaw_rate_radps=0.5, radar_stamp_ns=o.stamp_ns + (k - 3) * 10_000_000)
+        for k, o in enumerate(street_day(7))
+    ]
+    still = replace(moving_clusters(day), relative_mps=np.zeros((moving_clusters(day).count, 3)))
+    azimuth = np.arctan2(still.point_radar_m[:, 1], still.point_radar_m[:, 0])
+    # The scan came later: by then the car had turned to the left, and what stands to the right.
+    for earlier, by_s in (
+        (still.at_lidar_time(0.02), 0.02 + 0.01 * (still.frame - 3)),
+        (still.at_image_time(), 0.01 * (still.frame - 3)),
+    ):
+        np.testing.assert_allclose(np.arctan2(earlier[:, 1], earlier[:, 0]) - azimuth, 0.5 * by_s, atol=1e-9)
+        np.testing.assert_allclose(
+            np.linalg.norm(earlier, axis=1), np.linalg.norm(still.point_radar_m, axis=1)
+        )
+
+
 def test_moving_clusters_give_yaw_against_lidar_and_camera():
     day = street_day(40)
     clusters = moving_clusters(day)

@@ -1,5 +1,7 @@
 """Boundary maps, analytic gradients, the sign of the time offset, and what the score says of right and wrong poses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -99,7 +101,7 @@ def test_gradients_agree_with_differences_of_the_score(camera):
     )[None]
     maps = CameraMaps(camera, offsets, contrast, np.stack([labels] * F))
     velocity = np.array([[12.0, 0.5, 0.0], [5.0, 0.0, 0.0]])
-    terms = Terms(maps, camera_parameters(camera), points, points, points, velocity, np.zeros(F))
+    terms = Terms(maps, camera_parameters(camera), points, points, points, velocity, np.zeros(F), np.zeros(F))
     level = KernelSettings.wide(20.0, 0)
     state = AlignmentState(T_TRUE, 0.02, 1.001)
     analytic = terms.gradient(state.alone, level)[0].sum(0)
@@ -131,6 +133,19 @@ def test_a_fisheye_is_projected_where_its_model_says_behind_the_camera_too():
     found = np.array([project_point(c, *p) for p in (12.0 * rays).astype(np.float32)])
     assert found[:, 2].all()
     np.testing.assert_allclose(found[:, :2], pixels, atol=0.1)
+
+
+def test_a_gap_between_the_stamps_is_a_time_offset_of_its_frame_the_other_way_round(terms):
+    gaps = np.random.default_rng(0).uniform(-0.04, 0.04, terms.frames)
+    moving = replace(terms, yaw_rate=np.full(terms.frames, 0.2))
+    gapped = replace(moving, gap_s=gaps).poses(AlignmentState(T_TRUE, 0.03).alone)[0]
+    for f, gap in enumerate(gaps):
+        without = replace(moving, gap_s=np.zeros(terms.frames)).poses(
+            AlignmentState(T_TRUE, 0.03 - gap).alone
+        )
+        np.testing.assert_allclose(gapped[f], without[0, f], atol=1e-6)
+    kept = replace(terms, gap_s=gaps).of_frames(np.array([1, 0]))
+    np.testing.assert_array_equal(kept.gap_s, gaps[[1, 0]])
 
 
 def test_information_is_positive_semidefinite(terms):

@@ -211,7 +211,7 @@ def _in_view(
     clusters: MovingClusters, observations: Sequence[Observation], T_camera_radar: np.ndarray
 ) -> np.ndarray:
     """Clusters whose azimuth the camera covers."""
-    points = transform_points(T_camera_radar, clusters.point_radar_m)
+    points = transform_points(T_camera_radar, clusters.at_image_time())
     out = np.zeros(clusters.count, bool)
     for f in np.unique(clusters.frame):
         o = observations[f]

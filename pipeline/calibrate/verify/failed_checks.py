@@ -14,6 +14,7 @@ from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.geometry.changes import change_between
 from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from schemas.observations import Observation
 
 __all__ = ["heading_failures", "loop_failures", "loop_sigmas"]
@@ -58,12 +59,17 @@ def heading_failures(
         limits: from where on the heading is wrong, and what share of `limit_rad` that may cost; None = the defaults.
     """
     limits = limits or VerdictLimits()
-    dt_s = solution.pairs["camera_lidar"].time_offset_s or 0.0
+    dt_s, expected_s = (
+        solution.pairs["camera_lidar"].time_offset_s,
+        constant_gap_s(camera_gaps_s(observations)),
+    )
     turn = abs(float(change_between(prior.T_lidar_radar, solution.pairs["lidar_radar"].T)[2]))
     speeds = [abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None]
     if not speeds or turn < limits.heading_change_prior_sigmas * prior.rotation_sigma_rad:
         return []
-    lateral_m = turn * abs(dt_s) * float(np.mean(speeds))
+    # What lies between sweep and image on the way, where the stamps' constant gap is the clock's.
+    way_s = 0.0 if dt_s is None else abs(dt_s - expected_s)
+    lateral_m = turn * way_s * float(np.mean(speeds))
     rad_per_metre = float(np.sqrt(np.mean(1 / np.sum(DEFAULT_TARGETS**2, axis=1))))
     if lateral_m * rad_per_metre < limits.max_heading_error_share * limit_rad:
         return []

@@ -40,6 +40,7 @@ from pipeline.objective.camera_lidar.score import (
 )
 from pipeline.objective.radar.moving_clusters import azimuth_equations_camera, moving_clusters
 from pipeline.objective.radar.registration import RegistrationFrames, normal_equations, registration_frames
+from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s, radar_gaps_s
 from schemas.observations import Observation
 
 __all__ = ["HeldOutScore", "held_out_score"]
@@ -96,7 +97,13 @@ def _camera_lidar(
     velocity = lidar_velocities(observations, prior.T_lidar_radar)
     reach = float(apart) + _REACH_RAD
     terms = prepare_terms(observations, estimate.T, velocity, reach_rad=reach).sharp(MAX_GAP_PX)
-    focal, dt_s = estimate.diagnostics.get("focal_scale", 1.0), estimate.time_offset_s or 0.0
+    focal = estimate.diagnostics.get("focal_scale", 1.0)
+    # Of methods that estimate none: as if sensors of constant gaps measured together.
+    dt_s = (
+        constant_gap_s(camera_gaps_s(observations))
+        if estimate.time_offset_s is None
+        else estimate.time_offset_s
+    )
     has_points = np.array([len(o.lidar_edge_xyz_m) + len(o.marking_xyz_m) > 0 for o in observations])
     sharp = KernelSettings.wide(_SHARP_PX, _SHARP_CONTRAST)
 
@@ -129,7 +136,12 @@ def _lidar_radar(
     del prior
     # A generator of its own: the same detections are picked at every pose.
     frames = registration_frames(observations, estimate.T, np.random.default_rng(0))
-    range_bias_m, dt_s = estimate.diagnostics.get("range_bias_m", 0.0), estimate.time_offset_s or 0.0
+    range_bias_m = estimate.diagnostics.get("range_bias_m", 0.0)
+    dt_s = (
+        -constant_gap_s(radar_gaps_s(observations))
+        if estimate.time_offset_s is None
+        else estimate.time_offset_s
+    )
 
     def cost(T: np.ndarray) -> np.ndarray:
         out = np.full(len(observations), np.nan)
@@ -151,7 +163,7 @@ def _lidar_radar(
         g, H = np.zeros((len(observations), 8)), np.zeros((len(observations), 8, 8))
         if frames.count:
             g[frames.frame], H[frames.frame] = _registration_derivatives(
-                frames, estimate, range_bias_m, step, width
+                frames, estimate.T, dt_s, range_bias_m, step, width
             )
         return g, H
 
@@ -166,14 +178,19 @@ def _with_planar(T: np.ndarray, T_planar: np.ndarray) -> np.ndarray:
 
 
 def _registration_derivatives(
-    frames: RegistrationFrames, estimate: PairEstimate, range_bias_m: float, step: np.ndarray, width: float
+    frames: RegistrationFrames,
+    T_lidar_radar: np.ndarray,
+    dt_s: float,
+    range_bias_m: float,
+    step: np.ndarray,
+    width: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient (F 8) and information (F 8 8) of the registration by yaw, x, y, time offset and range bias only."""
-    T = exp_se3(step[:6]) @ estimate.T
+    T = exp_se3(step[:6]) @ T_lidar_radar
     found = normal_equations(
         frames,
         T,
-        (estimate.time_offset_s or 0.0) + float(step[6]),
+        dt_s + float(step[6]),
         REGISTRATION_COMPARISON_SIGMA * np.array([width, 1.0, width]),
         0.0,
         OUTLIER_DENSITY,

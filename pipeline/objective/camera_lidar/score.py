@@ -36,6 +36,7 @@ from pipeline.objective.camera_lidar.points import (
 )
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters
 from pipeline.objective.camera_lidar.reflectivity import marking_gradients, marking_scores
+from pipeline.objective.stamp_gaps import camera_gaps_s
 from schemas.observations import Observation
 
 __all__ = ["CONTRAST_BLURS_PX", "Alignments", "KernelSettings", "Terms", "lidar_velocities", "prepare_terms"]
@@ -64,6 +65,7 @@ class Terms:
     classes: Points  # sampled cloud by height and range, for the basin
     velocity_lidar: np.ndarray  # F 3, own velocity in lidar axes [m/s]
     yaw_rate: np.ndarray  # F [rad/s]
+    gap_s: np.ndarray  # F, image stamp minus lidar stamp
 
     @property
     def frames(self) -> int:
@@ -124,17 +126,22 @@ class Terms:
             self.classes.of_frames(frames),
             self.velocity_lidar[frames],
             self.yaw_rate[frames],
+            self.gap_s[frames],
         )
+
+    def gaps_beyond(self, constant_s: float) -> Terms:
+        """With gaps less a constant, so that time offsets count from it."""
+        return replace(self, gap_s=self.gap_s - constant_s)
 
     def poses(self, at: Alignments) -> Float32[np.ndarray, "P F 12"]:
         """Rows of the transform from each frame's lidar points to its image [P, F, 12].
 
-        By the lidar's clock the image was taken dt before its stamp (stamp_camera = stamp_lidar + dt). The car was then
-        dt earlier on its way, so what stands still lay dt times the own velocity further ahead: p' =
-        Rz(yaw_rate dt) (p + v dt).
+        By the lidar's clock the image was taken dt before its stamp (stamp_camera = stamp_lidar + dt), which is the
+        frame's gap after the sweep's. The car was then tau = dt - gap earlier on its way, so what stands still lay tau
+        times the own velocity further ahead: p' = Rz(yaw_rate tau) (p + v tau).
         """
         R, t = at.T_camera_lidar[:, :3, :3], at.T_camera_lidar[:, :3, 3]
-        return _moving_poses(R, t, at.dt_s, self.velocity_lidar, self.yaw_rate)
+        return _moving_poses(R, t, at.dt_s, self.gap_s, self.velocity_lidar, self.yaw_rate)
 
     def edge_score(self, at: Alignments, settings: KernelSettings) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the edges."""
@@ -223,20 +230,26 @@ class Terms:
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def _moving_poses(
-    R: np.ndarray, t: np.ndarray, dt_s: np.ndarray, velocity: np.ndarray, yaw_rate: np.ndarray
+    R: np.ndarray,
+    t: np.ndarray,
+    dt_s: np.ndarray,
+    gap_s: np.ndarray,
+    velocity: np.ndarray,
+    yaw_rate: np.ndarray,
 ) -> np.ndarray:
-    """[R Rz(yaw_rate dt) | R Rz(yaw_rate dt) v dt + t] as rows, for each pose and frame."""
+    """[R Rz(yaw_rate tau) | R Rz(yaw_rate tau) v tau + t] as rows, tau = dt - gap, for each pose and frame."""
     count, frames = R.shape[0], velocity.shape[0]
     out = np.empty((count, frames, 12), np.float32)
     for p in range(count):
         for f in range(frames):
-            c, s = np.cos(yaw_rate[f] * dt_s[p]), np.sin(yaw_rate[f] * dt_s[p])
+            tau = dt_s[p] - gap_s[f]
+            c, s = np.cos(yaw_rate[f] * tau), np.sin(yaw_rate[f] * tau)
             for i in range(3):
                 a, b, d = c * R[p, i, 0] + s * R[p, i, 1], c * R[p, i, 1] - s * R[p, i, 0], R[p, i, 2]
                 ahead = a * velocity[f, 0] + b * velocity[f, 1] + d * velocity[f, 2]
                 row = 4 * i
                 out[p, f, row], out[p, f, row + 1], out[p, f, row + 2] = a, b, d
-                out[p, f, row + 3] = ahead * dt_s[p] + t[p, i]
+                out[p, f, row + 3] = ahead * tau + t[p, i]
     return out
 
 
@@ -277,4 +290,7 @@ def prepare_terms(
     view = (observations, T_camera_lidar, maps.camera, reach_rad)
     edges, markings, classes = gather_edges(*view), gather_markings(*view), gather_classes(*view)
     yaw_rate = np.array([o.ego_yaw_rate_radps or 0.0 for o in observations])
-    return Terms(maps, camera_parameters(maps.camera), edges, markings, classes, velocity_lidar, yaw_rate)
+    gap_s = camera_gaps_s(observations)
+    return Terms(
+        maps, camera_parameters(maps.camera), edges, markings, classes, velocity_lidar, yaw_rate, gap_s
+    )

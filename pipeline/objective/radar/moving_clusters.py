@@ -19,6 +19,7 @@ from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, wrap_angle
 from pipeline.objective.radar.vehicle_boxes import select_frames
+from pipeline.objective.stamp_gaps import radar_gaps_s, scan_to_image_s
 from schemas.observations import Observation
 
 __all__ = [
@@ -48,11 +49,13 @@ _LEAST_SIGMA_RAD = np.radians(0.3)
 
 @dataclass(frozen=True, eq=False)
 class MovingClusters:
-    """Centres of moving clusters in radar axes, with what is needed to bring them to the lidar's time."""
+    """Centres of moving clusters in radar axes, with what is needed to bring them to lidar's and camera's time."""
 
     point_radar_m: Float[np.ndarray, "B 3"]
     relative_mps: Float[np.ndarray, "B 3"]  # velocity relative to the radar along the line of sight
     stamp_gap_s: Float[np.ndarray, " B"]  # radar stamp minus lidar stamp
+    after_image_s: Float[np.ndarray, " B"]  # as in `stamp_gaps.scan_to_image_s`
+    yaw_rate_radps: Float[np.ndarray, " B"]  # own, positive to the left
     frame: Int64[np.ndarray, " B"]  # index into the observations given
     lidar_centres_m: list[np.ndarray]  # per observation: lidar clusters that can be road users
     box_azimuths: list[tuple[np.ndarray, np.ndarray]]  # per observation: azimuth and range by height of boxes
@@ -81,6 +84,8 @@ class MovingClusters:
             self.point_radar_m[index],
             self.relative_mps[index],
             self.stamp_gap_s[index],
+            self.after_image_s[index],
+            self.yaw_rate_radps[index],
             number,
             [self.lidar_centres_m[f] for f in frames],
             [self.box_azimuths[f] for f in frames],
@@ -88,14 +93,25 @@ class MovingClusters:
 
     def at_lidar_time(self, dt_s: float) -> Float[np.ndarray, "B 3"]:
         """Where they were at the lidar's stamp, radar axes; stamp_lidar = stamp_radar + dt."""
-        return self.point_radar_m - self.relative_mps * (self.stamp_gap_s + dt_s)[:, None]
+        return self._earlier(self.stamp_gap_s + dt_s)
+
+    def at_image_time(self) -> Float[np.ndarray, "B 3"]:
+        """Where they were when the image was taken, radar axes, with clocks off by the stamps' constant gaps."""
+        return self._earlier(self.after_image_s)
+
+    def _earlier(self, by_s: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
+        """Back along the line of sight, and turned as the own turn had not yet turned them."""
+        p = self.point_radar_m - self.relative_mps * by_s[:, None]
+        turn = self.yaw_rate_radps * by_s
+        c, s = np.cos(turn), np.sin(turn)
+        return np.stack([c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1], p[:, 2]], -1)
 
 
 def moving_clusters(
     observations: Sequence[Observation], least_detections: int = 2, with_boxes: bool = True
 ) -> MovingClusters:
     """Moving clusters between 3 and 60 m; without boxes it is cheaper, and enough against the lidar."""
-    points, speeds, gaps, frames = [], [], [], []
+    points, speeds, frames = [], [], []
     for index, o in enumerate(observations):
         for label in range(int(o.radar_cluster.max(initial=-1)) + 1):
             member = o.radar_cluster == label
@@ -110,13 +126,15 @@ def moving_clusters(
             rate = float(np.median(o.radar_residual_mps[member])) - u @ own
             points.append(centre)
             speeds.append(rate * u)
-            gaps.append((o.radar_stamp_ns - o.stamp_ns) * 1e-9)
             frames.append(index)
+    frame = np.array(frames, np.int64)
     return MovingClusters(
         np.array(points).reshape(-1, 3),
         np.array(speeds).reshape(-1, 3),
-        np.array(gaps, np.float64),
-        np.array(frames, np.int64),
+        radar_gaps_s(observations)[frame],
+        scan_to_image_s(observations)[frame],
+        np.array([o.ego_yaw_rate_radps or 0.0 for o in observations], np.float64)[frame],
+        frame,
         [_object_centres(o) for o in observations],
         [_box_azimuths(o) if with_boxes else (np.zeros(0), np.zeros(0)) for o in observations],
     )
@@ -160,7 +178,7 @@ def camera_azimuth_residuals(
     Returns:
         Residuals [rad] of the clusters that found a box within `gate_rad`, d/d(left twist of T_camera_radar), frames.
     """
-    in_camera = transform_points(T_camera_radar, clusters.point_radar_m)
+    in_camera = transform_points(T_camera_radar, clusters.at_image_time())
     azimuth = camera_direction_angles(in_camera)[:, 0]
     distance = np.linalg.norm(in_camera, axis=1)
     chosen: list[int] = []

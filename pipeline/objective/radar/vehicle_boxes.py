@@ -16,6 +16,7 @@ from jaxtyping import Float, Int64
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import hat, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical, to_spherical
+from pipeline.objective.stamp_gaps import scan_to_image_s
 from schemas.observations import Observation
 
 __all__ = [
@@ -124,8 +125,10 @@ def box_pairs(
         least_detections: fewer tell nothing.
     """
     rows: list[tuple[np.ndarray, float, float, int, int, int]] = []
+    turns = scan_to_image_s(observations) * [o.ego_yaw_rate_radps or 0.0 for o in observations]
     for index in np.unique(boxes.frame):
-        radar = observations[index].radar_xyz_m.astype(np.float64)
+        # Where they were when the image was taken; what they moved along the line of sight changes no direction.
+        radar = _turned(observations[index].radar_xyz_m.astype(np.float64), turns[index])
         in_camera = transform_points(T_camera_radar, radar)
         angles = camera_direction_angles(in_camera)
         distance = np.linalg.norm(in_camera, axis=1)
@@ -190,6 +193,11 @@ def box_equations(
     np.add.at(H, pairs.frame, weight[:, None, None] * J[:, :, None] * J[:, None, :])
     np.add.at(g, pairs.frame, (weight * residual)[:, None] * J)
     return H, g, sigma
+
+
+def _turned(points: np.ndarray, yaw_rad: float) -> np.ndarray:
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _boxes_of_frame(o: Observation) -> np.ndarray:

@@ -39,6 +39,33 @@ def test_pose_and_time_offset_are_recovered_from_four_degrees(rig, frames, dt_s)
     assert e.frames_used == frames
 
 
+@pytest.mark.parametrize("rig", [SPARSE, DENSE], ids=["16 rings", "dense"])
+def test_frames_with_gaps_of_their_own_are_solved_as_well_as_frames_without(rig):
+    frames = 16 if rig is SPARSE else 8
+    gaps_s = list(np.random.default_rng(2).uniform(-0.04, 0.04, frames))
+    day = traced_day(rig, frames, seed=1, dt_s=0.03, gaps_s=gaps_s)
+    e = estimate_camera_lidar(day, prior_off_by(4.0, 0.05, 0), SolveConfig(), np.random.default_rng(0))
+    turn = np.degrees(log_so3((e.T @ inverse(T_TRUE))[:3, :3]))
+    assert np.abs(turn).max() < 0.35
+    assert (np.abs(np.radians(turn)) < 5 * np.sqrt(np.diag(e.covariance))[:3]).all()
+    assert abs(e.time_offset_s - 0.03) < 0.015
+
+
+def test_stamps_that_are_all_late_by_as_much_change_the_time_offset_by_it_and_nothing_else():
+    late_ns, solved = 60_000_000, []
+    day = traced_day(DENSE, 8, seed=1, dt_s=0.01)
+    for by_ns in (0, late_ns):
+        shifted = [replace(o, camera_stamp_ns=o.camera_stamp_ns + by_ns) for o in day]
+        solved.append(
+            estimate_camera_lidar(
+                shifted, prior_off_by(2.0, 0.05, 0), SolveConfig(), np.random.default_rng(0)
+            )
+        )
+    np.testing.assert_allclose(solved[0].T, solved[1].T, atol=1e-7)
+    assert solved[1].time_offset_s - solved[0].time_offset_s == pytest.approx(0.06, abs=1e-6)
+    assert abs(solved[1].time_offset_s - 0.07) < 0.015
+
+
 def test_road_without_reflectivity_leaves_the_edges_to_do_it():
     day = traced_day(DENSE, 8, seed=1, reflective=False)
     e = estimate_camera_lidar(day, prior_off_by(3.0, 0.05, 1), SolveConfig(), np.random.default_rng(0))

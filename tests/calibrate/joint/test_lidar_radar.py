@@ -147,10 +147,17 @@ def test_constant_elevation_and_range_errors_are_named_as_assumptions(day):
     assert "range bias" in notes
 
 
+def test_stamps_that_are_all_late_by_as_much_change_the_time_offset_by_it_and_nothing_else(day):
+    late = [replace(o, radar_stamp_ns=o.radar_stamp_ns + 60_000_000) for o in day]
+    a, b = (solve(d, prior_off_by(1.0, 0.03)) for d in (day, late))
+    np.testing.assert_allclose(a.T, b.T, atol=1e-6)
+    assert b.time_offset_s - a.time_offset_s == pytest.approx(-0.06, abs=1e-5)
+
+
 def test_a_standing_car_does_not_determine_the_time_offset():
     still = [replace(o, radar_velocity_mps=np.zeros(3)) for o in street_day(16, dt_s=0.0)]
     found = solve(still, prior_off_by(1, 0.02))
-    assert found.time_offset_s == 0.0
+    assert found.time_offset_s == pytest.approx(0.001)  # what the stamps' constant gap of -1 ms suggests
     assert found.time_offset_sigma_s == pytest.approx(CONFIG.time_offset_sigma_s)
     assert any("time offset not determined" in note for note in found.notes)
 

@@ -36,6 +36,7 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, lidar_velocities, prepare_terms
+from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from schemas.observations import Observation
 
 __all__ = [
@@ -63,6 +64,7 @@ class Aligned:
     basin: Basin
     state: AlignmentState
     kernel: KernelSettings
+    expected_dt_s: float  # the state's time offset counts from it: the constant part of the stamps' gaps
 
     @property
     def T_camera_lidar(self) -> Float[np.ndarray, "4 4"]:
@@ -89,7 +91,8 @@ def estimate_camera_lidar(
 
     Args:
         observations: the day's frames; those with another camera or label size than the first are left out.
-        prior: start, and weak information about pose; dt has prior 0 +- `time_offset_sigma_s`.
+        prior: start, and weak information about pose; dt is expected to be the constant part of the stamps' gaps, with
+            `time_offset_sigma_s`.
         config: search box and resampling.
         rng: decides everything random.
         velocity_lidar: own velocity per observation in lidar axes [m/s]; by default the speed along the
@@ -146,7 +149,7 @@ def align_camera_lidar(
         prior.translation_sigma_m**2,
         MotionSigmas(heading_sigma, sweep_s_per_rad(frames)),
     )
-    return Aligned(problem, frames, rejected, basin, state, kernel)
+    return Aligned(problem, frames, rejected, basin, state, kernel, constant_gap_s(camera_gaps_s(frames)))
 
 
 def analyse_camera_lidar(
@@ -180,7 +183,7 @@ def analyse_camera_lidar(
         half = replace(scored, terms=problem.terms.of_frames(np.arange(k, problem.terms.frames, 2)))
         halves.append(refine(half, analysis.state, steps=SCHEDULE.half_steps, fixed=fixed))
     diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves)
-    return _conclude(analysis, problem.config, len(aligned.frames), aligned.rejected, diagnostics)
+    return _conclude(analysis, aligned, problem.config, diagnostics)
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
@@ -192,6 +195,7 @@ def _terms(
     """The terms that the config asks for, with all points that the search range can bring into view."""
     reach = search_range(prior, config).rotation_rad + _MARGIN_RAD
     terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar, reach_rad=reach)
+    terms = terms.gaps_beyond(constant_gap_s(terms.gap_s))
     terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
     if "edges" in config.terms and len(terms.edges.xyz_m) < _FEWEST_EDGES * len(frames):
         raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
@@ -252,9 +256,8 @@ def _diagnostics(
 
 def _conclude(
     analysis: ObservabilityAnalysis,
+    aligned: Aligned,
     config: SolveConfig,
-    frames: int,
-    rejected: dict[str, int],
     diagnostics: dict[str, float],
 ) -> PairEstimate:
     """The estimate, its covariance by left perturbation, notes."""
@@ -271,9 +274,9 @@ def _conclude(
         to_left @ analysis.covariance[:6, :6] @ to_left.T,
         analysis.observability,
         analysis.observability >= OBSERVABLE,
-        frames_used=frames,
-        frames_rejected=rejected,
-        time_offset_s=analysis.state.dt_s,
+        frames_used=len(aligned.frames),
+        frames_rejected=aligned.rejected,
+        time_offset_s=aligned.expected_dt_s + analysis.state.dt_s,
         time_offset_sigma_s=dt_sigma,
         diagnostics=diagnostics,
         notes=notes,

@@ -47,6 +47,7 @@ from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import normal_equations, registration_frames
 from pipeline.objective.radar.vehicle_boxes import vehicle_boxes
+from pipeline.objective.stamp_gaps import constant_gap_s, radar_gaps_s
 from schemas.observations import Observation
 
 __all__ = ["estimate_lidar_radar"]
@@ -141,10 +142,12 @@ def _problem(
         raise SolveError(
             f"lidar-radar needs {_FEWEST_FRAMES} frames with static detections, the day has {frames.count}"
         )
+    gap_s = constant_gap_s(radar_gaps_s(observations))
+    movers = moving_clusters(observations, with_boxes=False)
     problem = RadarProblem(
         observations,
-        frames,
-        moving_clusters(observations, with_boxes=False),
+        replace(frames, stamp_gap_s=frames.stamp_gap_s - gap_s),
+        replace(movers, stamp_gap_s=movers.stamp_gap_s - gap_s),
         vehicle_boxes(observations),
         T_camera_lidar,
         prior,
@@ -152,6 +155,7 @@ def _problem(
         beam_spacing(observations),
         elevation_spread(frames),
         config.terms,
+        gap_s,
     )
     return problem, rejected
 
@@ -275,7 +279,7 @@ def _conclude(
         ~fixed[:6],
         problem.frames.count,
         {reason: count for reason, count in rejected.items() if count},
-        state.dt_s,
+        state.dt_s - problem.constant_gap_s,
         float(np.sqrt(analysis.covariance[DT, DT])),
         _diagnostics(analysis, ends, halves),
         notes,
@@ -290,7 +294,7 @@ def _notes(analysis: _ObservabilityAnalysis, *, has_elevation: bool) -> list[str
         notes.append(f"not determined by this day, kept at the prior: {', '.join(_NAMES[fixed[:6]])}")
     dt_sigma_s = float(np.sqrt(analysis.covariance[DT, DT]))
     if fixed[DT]:
-        notes.append("time offset not determined by this day, kept at the prior")
+        notes.append("time offset not determined by this day, kept at what its stamps' constant gap suggests")
     elif dt_sigma_s > _DT_UNSURE_S:
         notes.append(
             f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: where the car keeps one speed, x looks the same"

@@ -137,6 +137,8 @@ class RadarProblem:
     spacing_rad: float  # of the lidar's beams, vertically
     spread: ElevationSpread
     terms: Sequence[str] = TERMS  # that take part
+    # Of the stamps [s], taken out of all frames' gaps: the state's dt counts from minus it, as if the clocks were off.
+    constant_gap_s: float = 0.0
 
     def of_frames(self, index: np.ndarray) -> RadarProblem:
         """The same with part of the registration's frames (and of the observations behind them)."""
