@@ -133,8 +133,8 @@ def doppler_speed(
 ) -> tuple[float, float]:
     """Forward speed [m/s] whose static world fits most detections of a scan, and the share that it fits.
 
-    The radar is taken to look along the driving direction; a share below a third says that this is not so, or
-    that the Doppler is not what the configuration says. Negative = its sign is wrong, or the car reverses.
+    The directions' x axis is taken to point along the driving direction; a share below a third says that this is not
+    so, or that the Doppler is not what the configuration says. Negative = its sign is wrong, or the car reverses.
     """
     speeds = np.arange(-45.0, 45.01, 0.15)
     misfit = range_rate_mps + speeds[:, None] * directions[:, 0]
@@ -184,7 +184,8 @@ def _motion(frames: list[Frame], rig: Rig) -> tuple[float | None, str]:
     period = rig.radar.doppler_period_mps
     fits = []
     for f in frames:
-        xyz = f.radar_xyz_m.astype(np.float64)
+        # A radar may look anywhere; a lidar's x axis is taken to point ahead.
+        xyz = f.radar_xyz_m.astype(np.float64) @ _prior_rotation(f, "lidar_radar").T
         directions = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
         fits.append(doppler_speed(directions, f.radar_range_rate_mps.astype(np.float64), period))
     speeds = np.array([s for s, share in fits if share > 1 / 3])
@@ -193,6 +194,14 @@ def _motion(frames: list[Frame], rig: Rig) -> tuple[float | None, str]:
     known = odometry if len(odometry) else fitted
     moving = float(np.mean(np.abs(known) > _MOVING_MPS)) if len(known) else None
     return moving, _doppler_problem(frames, speeds, rig)
+
+
+def _prior_rotation(frame: Frame, pair: str) -> Float[np.ndarray, "3 3"]:
+    """Rotation of a pair's prior; none where the frame has no prior."""
+    q = [getattr(frame, f"prior_{pair}_{name}") for name in ("qw", "qx", "qy", "qz")]
+    if q[0] is None:
+        return np.eye(3)
+    return from_quaternion(np.array(q, np.float64), np.zeros(3))[:3, :3]
 
 
 def _doppler_problem(frames: list[Frame], speeds: Float[np.ndarray, " N"], rig: Rig) -> str:
@@ -258,9 +267,7 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
         f"{t.topic}: {t.problem}" for t in topics if t.problem and t.role not in {"tf_static", "odometry"}
     ]
     if frames and frames[0].prior_camera_lidar_qw is not None:
-        f = frames[0]
-        q = [getattr(f, f"prior_camera_lidar_{name}") for name in ("qw", "qx", "qy", "qz")]
-        R = from_quaternion(np.array(q, np.float64), np.zeros(3))[:3, :3]
+        R = _prior_rotation(frames[0], "camera_lidar")
         # Up of the lidar is -y of an optical frame; more than 45 deg off, the frame is no optical one.
         if -R[1, 2] < np.cos(np.pi / 4):
             advice.append(

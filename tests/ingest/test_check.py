@@ -147,6 +147,31 @@ def test_a_planar_radar_a_missing_field_and_a_wrong_sign_are_noticed(kit, tmp_pa
     assert "doppler_period_mps = 2" in report.evidence.doppler_problem
 
 
+@pytest.mark.parametrize("logged", ["its heading", "straight ahead"])
+def test_a_radar_in_the_corner_fits_the_standing_world_where_the_log_says_how_it_is_turned(
+    kit, tmp_path, logged
+):
+    """Turned by 45 deg to the left; where tf_static calls that straight ahead, its heading is what is wrong."""
+    drive, half = kit.Kit(frames=20).drive(), np.sqrt(0.5)
+    for i in range(20):
+        columns = kit.radar(i)
+        x, y = columns["x"].copy(), columns["y"].copy()
+        columns |= {"x": half * (x + y), "y": half * (y - x)}
+        drive.replaced(kit.RADAR, i, drive.cloud(kit.START_NS + i * kit.PERIOD_NS, columns, frame_id="radar"))
+    q = (np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)) if logged == "its heading" else (1, 0, 0, 0)
+    optical, stamp = (0.5, -0.5, 0.5, -0.5), kit.START_NS
+    turned = drive.tf(
+        drive.transform(stamp, "base_link", "camera_optical", optical, (1.5, 0, 1.4)),
+        drive.transform(stamp, "base_link", "lidar", t=(1.0, 0, 1.8)),
+        drive.transform(stamp, "base_link", "radar", q, (3.6, 0.8, 0.5)),
+    )
+    drive.replaced("/tf_static", 0, turned)
+    report = report_on(kit, tmp_path, drive)
+    assert ("heading" in report.evidence.doppler_problem) == (logged != "its heading")
+    if logged == "its heading":
+        assert report.evidence.doppler_problem == ""
+
+
 def test_a_camera_frame_that_is_not_optical_is_noticed(kit, tmp_path):
     drive = kit.Kit(frames=12).drive()
     for i, m in enumerate(drive.messages):
