@@ -115,6 +115,19 @@ def test_a_radar_is_measured_against_where_its_detections_point(day):
     assert engine.reference(biased, "camera_lidar", "") == pytest.approx(T_CAMERA_LIDAR)
 
 
+def test_stamps_that_lie_are_later_on_the_camera_and_earlier_on_the_radar_and_so_is_the_truth(day):
+    rows = spoiled(day.rows, "stamps:0.06")
+    for before, after in zip(day.rows, rows, strict=True):
+        assert after.camera_stamp_ns - before.camera_stamp_ns == 60_000_000
+        assert after.radar_stamp_ns - before.radar_stamp_ns == -60_000_000
+        assert after.stamp_ns == before.stamp_ns
+    # stamp_camera = stamp_lidar + dt, stamp_lidar = stamp_radar + dt
+    for pair, late_s in (("camera_lidar", 0.06), ("lidar_radar", 0.06), ("camera_radar", 0.12)):
+        true = replace(day, truth=day.truth | {f"dt_{pair}_s": 0.01})
+        assert engine.true_offset_s(true, pair, "stamps:0.06") == pytest.approx(0.01 + late_s)
+        assert engine.true_offset_s(true, pair, "") == 0.01
+
+
 def test_few_frames_are_spread_over_the_day(day):
     assert [o.frame_index for o in spoiled(day.rows, "few:3")] == [0, 4, 9]
     with pytest.raises(ValueError, match="no such fault"):

@@ -51,6 +51,7 @@ __all__ = [
     "results_of",
     "run_study",
     "study_arguments",
+    "true_offset_s",
 ]
 
 # The default sigmas of `rigs.*.prior` in fleet.toml: what a user has who says nothing.
@@ -136,7 +137,9 @@ def spoiled(rows: Sequence[Observation], how: str) -> list[Observation]:
     """Faults that can be put into observations exactly, because perceive hands these columns on as it finds them.
 
     `focal:F` scales the camera's focal length by 1 + F as a wrong calibration file would; `centre:PX` shifts its
-    principal point; `few:N` leaves N frames, spread over the day. `drivable` is no fault, and done before (`_work`).
+    principal point; `few:N` leaves N frames, spread over the day; `stamps:S` makes the camera's stamps S seconds later
+    and the radar's as much earlier, which is all that the simulator's fault `stamp` does. `drivable` is no fault, and
+    done before (`_work`).
     """
     if how in {"", "drivable"}:
         return list(rows)
@@ -144,6 +147,12 @@ def spoiled(rows: Sequence[Observation], how: str) -> list[Observation]:
     if kind == "few":
         kept = np.unique(np.linspace(0, len(rows) - 1, int(amount)).round().astype(int))
         return [rows[i] for i in kept]
+    if kind == "stamps":
+        by_ns = round(float(amount) * 1e9)
+        return [
+            replace(o, camera_stamp_ns=o.camera_stamp_ns + by_ns, radar_stamp_ns=o.radar_stamp_ns - by_ns)
+            for o in rows
+        ]
     change = np.zeros((3, 3))
     if kind == "focal":
         factor = np.ones((3, 3))
@@ -172,6 +181,14 @@ def reference(day: Day, pair: str, spoil: str) -> np.ndarray:
     return from_rotation_translation(exp_so3(turn) @ T[:3, :3], T[:3, 3])
 
 
+def true_offset_s(day: Day, pair: str, spoil: str) -> float | None:
+    """The pair's time offset as `spoil` leaves it; None where nobody knows it."""
+    offset_s, (kind, _, amount) = day.truth.get(f"dt_{pair}_s"), spoil.partition(":")
+    if offset_s is None or kind != "stamps":
+        return offset_s
+    return offset_s + float(amount) * (2 if pair == "camera_radar" else 1)
+
+
 def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
     """Calibrate a day as a run says and measure every pair against truth."""
     prior = prior_of(day, run.prior, run.seed)
@@ -184,7 +201,7 @@ def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
     except SolveError as err:
         return {"refused": err.reason, "pairs": {}}
     measured = {
-        r.pair: measure(r, reference(day, r.pair, run.spoil), prior, day.truth.get(f"dt_{r.pair}_s"))
+        r.pair: measure(r, reference(day, r.pair, run.spoil), prior, true_offset_s(day, r.pair, run.spoil))
         | mounting_error(r, day.true_of(r.pair))
         for r in records
     }
