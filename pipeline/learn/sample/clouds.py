@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float, Int, Integer, UInt8
 from scipy.spatial import cKDTree
 
 from pipeline.config import PrepareConfig
+from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.se3 import transform_points
-from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.geometry.spherical import camera_direction_angles, to_spherical
 from pipeline.objective.paper.lidar_radar import drivable_map
 from schemas.frames import Frame
 from schemas.observations import Observation
@@ -95,15 +96,18 @@ def range_edges(
 ) -> Bool[np.ndarray, " N"]:
     """True for points that stand in front of their neighbour along the ring by a jump in range.
 
-    From ranges alone: the class of an object would tell the network where its mask ends.
+    From ranges alone: the class of an object would tell the network where its mask ends. Nothing where the sweep has no
+    rows: neighbours differ in elevation there, and the ground alone jumps.
     """
     out = np.zeros(len(xyz_m), bool)
     finite = np.flatnonzero(np.isfinite(xyz_m).all(axis=1))
     if len(finite) < 2:
         return out
-    x, y, z = xyz_m[finite].astype(np.float64).T
-    azimuth, distance = np.arctan2(y, x), np.sqrt(x * x + y * y + z * z)
-    row = ring[finite].astype(np.int64) if ring is not None else _elevation_rows(z, distance)
+    aer = to_spherical(xyz_m[finite].astype(np.float64))
+    row = rows_of(aer, None if ring is None else ring[finite].astype(np.uint16))
+    if row is None:
+        return out
+    azimuth, _, distance = aer.T
     order = np.lexsort((azimuth, row))
     step = np.diff(azimuth[order])
     along = np.diff(row[order]) == 0
@@ -234,8 +238,3 @@ def _some(available: int, count: int, rng: np.random.Generator) -> Int[np.ndarra
     if available <= count:
         return np.arange(available)
     return np.sort(rng.choice(available, count, replace=False))
-
-
-def _elevation_rows(z: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Rows of a lidar that logs no rings: bands of elevation as wide as rings usually lie apart."""
-    return np.floor(np.arcsin(z / np.maximum(distance, 1e-6)) / np.radians(0.2)).astype(np.int64)

@@ -199,6 +199,17 @@ def test_range_edges_are_the_near_ends_of_jumps():
     assert not range_edges(np.full((5, 3), np.nan, np.float32), None).any()
 
 
+def test_range_edges_are_none_where_lasers_draw_no_rows():
+    rng = np.random.default_rng(0)
+    down, azimuth = np.radians(rng.uniform(3, 12, 6000)), np.radians(rng.uniform(-30, 30, 6000))
+    away = 1.8 / np.tan(down)
+    road = np.stack([away * np.cos(azimuth), away * np.sin(azimuth), np.full(6000, -1.8)], -1).astype(
+        np.float32
+    )
+    for ring in (rng.integers(0, 6, 6000), None):
+        assert not range_edges(road, ring).any()
+
+
 def test_the_reference_is_the_prior_and_the_row_repeats():
     frame, observation = scene()
     a, b = row_of(frame, observation), row_of(frame, observation)
