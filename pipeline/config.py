@@ -39,7 +39,9 @@ __all__ = [
 ]
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Term = Literal["edges", "reflectivity", "static", "boxes", "moving", "time_offsets", "translation_prior"]
+Term = Literal[
+    "edges", "reflectivity", "static", "boxes", "moving", "doppler", "time_offsets", "translation_prior"
+]
 TERMS: tuple[Term, ...] = get_args(Term)
 
 

@@ -14,28 +14,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.joint.lidar_radar.conclusions import ObservabilityAnalysis, diagnostics_of, notes_of
+from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, elevation_spread
 from pipeline.calibrate.joint.lidar_radar.normal_equations import (
     AZIMUTH_RANGE_DOF,
     DT,
-    RANGE,
+    PITCH,
     STEP_LIMIT,
     UNKNOWNS,
     Linear,
     RadarProblem,
     RadarState,
-    beam_spacing,
-    elevation_spread,
     linearise,
 )
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, anneal, finish, last_step, scan
+from pipeline.calibrate.joint.lidar_radar.witnesses import contradiction
 from pipeline.calibrate.numerics.bias_floors import (
     LIDAR_RADAR_BIAS,
     LIDAR_RADAR_DT_FLOOR_S,
     OUTLIER_DENSITY,
-    RADAR_ELEVATION_BIAS_RAD,
-    RANGE_BIAS_SIGMA_M,
     REGISTRATION_COMPARISON_SIGMA,
 )
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
@@ -43,9 +42,10 @@ from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.changes import change_between, change_jacobian
+from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import normal_equations, registration_frames
+from pipeline.objective.radar.travel import travel_directions
 from pipeline.objective.radar.vehicle_boxes import vehicle_boxes
 from pipeline.objective.stamp_gaps import constant_gap_s, radar_gaps_s
 from schemas.observations import Observation
@@ -53,24 +53,10 @@ from schemas.observations import Observation
 __all__ = ["estimate_lidar_radar"]
 
 _FEWEST_FRAMES = 5
-_DT_UNSURE_S = 0.005  # a time offset known no better than this gets a note
 _CLEARLY = 4.0  # standard errors by which frames reject the end of another start
 _CAMERA_SIGMA_RAD = np.radians(0.5)  # a camera less sure than what its boxes show is left out
 _REMAINING_STEPS = 10.0  # of dt, that count as uncertainty: the valley is flat
 _MEASURED_SHARE = (0.02, 1.0)  # range of the measured curvature, as a share of the predicted one
-_NAMES = np.array(["roll", "pitch", "yaw", "x", "y", "z"])
-_DOF_UNITS = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
-
-
-@dataclass(frozen=True, eq=False)
-class _ObservabilityAnalysis:
-    """The solution in which every unknown is either determined by the day or fixed at the prior."""
-
-    state: RadarState
-    linear: Linear
-    covariance: np.ndarray  # P P, of all unknowns, turns about the radar
-    fixed: np.ndarray  # P, bool
-    observability: np.ndarray  # 7, of pose and dt
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +97,11 @@ def estimate_lidar_radar(
     ends = [anneal(some, start) for start in scan(problem, config)]
     costs = [_comparison_cost(problem, end) for end in ends]
     best = ends[int(np.argmin([c.mean() for c in costs]))]
+    if "doppler" in config.terms:
+        travel = travel_directions(
+            problem.observations, best.T_lidar_radar, best.dt_s - problem.constant_gap_s
+        )
+        problem = replace(problem, travel=travel)
     analysis = _analyse_observability(problem, best, camera, config, rng)
     other = _better_time_offset(problem, analysis.state)
     if other is not None:
@@ -217,7 +208,7 @@ def _analyse_observability(
     camera: _Camera,
     config: SolveConfig,
     rng: np.random.Generator,
-) -> _ObservabilityAnalysis:
+) -> ObservabilityAnalysis:
     """Solve, fix what the day did not determine, and solve again until nothing more has to be fixed."""
     block = bootstrap_blocks(np.array([o.drive for o in problem.observations]), config.bootstrap_blocks)
     before = np.append(np.diag(problem.prior.covariance("lidar_radar")), problem.dt_sigma_s**2)
@@ -244,7 +235,11 @@ def _analyse_observability(
             break
         fixed[: DT + 1] |= removed < OBSERVABLE
     full[np.arange(DT + 1), np.arange(DT + 1)] += bias
-    return _ObservabilityAnalysis(state, linear, full, fixed, observability)
+    disagreement = contradiction(linear.witnesses)
+    if disagreement is not None and not fixed[PITCH]:
+        full[PITCH] *= disagreement.factor
+        full[:, PITCH] *= disagreement.factor
+    return ObservabilityAnalysis(state, linear, full, fixed, observability)
 
 
 def _observability(variance: np.ndarray, bias: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -262,13 +257,13 @@ def _observability(variance: np.ndarray, bias: np.ndarray, before: np.ndarray) -
 
 def _conclude(
     problem: RadarProblem,
-    analysis: _ObservabilityAnalysis,
+    analysis: ObservabilityAnalysis,
     ends: list[RadarState],
     halves: list[RadarState],
     rejected: dict[str, int],
 ) -> PairEstimate:
     state, fixed = analysis.state, analysis.fixed
-    notes = _notes(analysis, has_elevation=bool(problem.frames.has_elevation.any()))
+    notes = notes_of(analysis, has_elevation=bool(problem.frames.has_elevation.any()))
     # The record's covariance is of a left perturbation: a turn about the lidar carries the radar along.
     J = np.linalg.inv(change_jacobian(state.T_lidar_radar))
     return PairEstimate(
@@ -281,76 +276,9 @@ def _conclude(
         {reason: count for reason, count in rejected.items() if count},
         state.dt_s - problem.constant_gap_s,
         float(np.sqrt(analysis.covariance[DT, DT])),
-        _diagnostics(analysis, ends, halves),
+        diagnostics_of(analysis, ends, halves),
         notes,
     )
-
-
-def _notes(analysis: _ObservabilityAnalysis, *, has_elevation: bool) -> list[str]:
-    """What was not determined, and what was assumed."""
-    fixed, linear = analysis.fixed, analysis.linear
-    notes = []
-    if fixed[:6].any():
-        notes.append(f"not determined by this day, kept at the prior: {', '.join(_NAMES[fixed[:6]])}")
-    dt_sigma_s = float(np.sqrt(analysis.covariance[DT, DT]))
-    if fixed[DT]:
-        notes.append("time offset not determined by this day, kept at what its stamps' constant gap suggests")
-    elif dt_sigma_s > _DT_UNSURE_S:
-        notes.append(
-            f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: where the car keeps one speed, x looks the same"
-        )
-    if linear.boxes < _FEWEST_FRAMES:
-        notes.append(
-            "no vehicle boxes with radar elevations: roll and pitch rest on the registration and the prior"
-        )
-    else:
-        notes.append("radar pitch assumes that returns lie at a constant angle (0 +- 1 deg) from box centres")
-    bias_sigma_m = float(np.sqrt(analysis.covariance[RANGE, RANGE]))
-    if has_elevation:
-        own_deg = float(np.degrees(RADAR_ELEVATION_BIAS_RAD))
-        notes.append(
-            "pitch says where the radar's detections point: its mounting differs by the radar's own constant elevation"
-            f" error (0 +- {own_deg:.2f} deg)"
-        )
-    else:
-        notes.append(
-            "the radar measures no elevation: azimuth and range only, roll and pitch are the prior's"
-        )
-    notes += [
-        f"range bias {analysis.state.range_bias_m:+.3f} +- {bias_sigma_m:.3f} m (prior 0 +- {RANGE_BIAS_SIGMA_M:.2f})",
-    ]
-    return notes
-
-
-def _diagnostics(
-    analysis: _ObservabilityAnalysis, ends: list[RadarState], halves: list[RadarState]
-) -> dict[str, float]:
-    state, linear = analysis.state, analysis.linear
-    half = change_between(halves[1].T_lidar_radar, halves[0].T_lidar_radar)
-    apart = change_between(ends[-1].T_lidar_radar, ends[0].T_lidar_radar)
-    diagnostics = {
-        "azimuth_sigma_rad": float(state.sigma[0]),
-        "elevation_sigma_rad": float(state.sigma[1]),
-        "range_sigma_m": float(state.sigma[2]),
-        "range_bias_m": state.range_bias_m,
-        "range_bias_sigma_m": float(np.sqrt(analysis.covariance[RANGE, RANGE])),
-        "bounce_share": state.bounce,
-        "assigned_share": float(linear.registration.assigned.mean()),
-        "boxes": float(linear.boxes),
-        "box_sigma_rad": linear.box_sigma_rad,
-        **{f"box_bias_{k}_rad": float(v) for k, v in zip(("car", "large"), state.bias_rad, strict=True)},
-        "moving_azimuth_sigma_rad": linear.mover_sigma_rad,
-        "registration_roll_offset_rad": float(linear.registration_step[0]),
-        "registration_pitch_offset_rad": float(linear.registration_step[1]),
-        "registration_roll_sigma_rad": float(linear.floor[0]),
-        "registration_pitch_sigma_rad": float(linear.floor[1]),
-        **{f"halves_{n}": float(v) for n, v in zip(_DOF_UNITS, half, strict=True)},
-        "halves_dt_s": halves[0].dt_s - halves[1].dt_s,
-        "restarts_rz_rad": float(apart[2]),
-        "restarts_tx_m": float(apart[3]),
-        "restarts_ty_m": float(apart[4]),
-    }  # fmt: skip
-    return {k: v for k, v in diagnostics.items() if np.isfinite(v)}
 
 
 def _with_measured_curvature(problem: RadarProblem, state: RadarState, information: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@ of pitch on to z.
 Which term determines which degree of freedom is chosen here, for measured reasons: azimuth and range of the static
 registration determine yaw, x, y and dt; its elevations contribute to roll, pitch and z, but no more than the lidar's
 own beam spacing allows (points collapse onto the rings, repeatably and with the lowest residual); the camera's vehicle
-boxes determine roll, and pitch up to their constant. Moving clusters add azimuth. The prior keeps what is left.
+boxes determine roll, and pitch up to their constant. Moving clusters add azimuth. The way that the car drives adds
+pitch: Doppler knows it in radar axes, the road in lidar axes. The prior keeps what is left.
 """
 
 from __future__ import annotations
@@ -18,8 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
+from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_opinion
 from pipeline.calibrate.numerics.bias_floors import (
     BOX_ROLL_FLOOR_LIDAR_RAD,
+    DOPPLER_PITCH_FLOOR_RAD,
     OUTLIER_DENSITY,
     PRIOR_CONTRADICTION_SIGMAS,
     RANGE_BIAS_SIGMA_M,
@@ -28,9 +32,9 @@ from pipeline.config import TERMS
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
-from pipeline.geometry.spherical import to_spherical
 from pipeline.objective.radar.moving_clusters import MovingClusters, azimuth_equations_lidar
 from pipeline.objective.radar.registration import NormalEquations, RegistrationFrames, normal_equations
+from pipeline.objective.radar.travel import TravelDirections, pitch_equations
 from pipeline.objective.radar.vehicle_boxes import (
     BIAS_SIGMA_RAD,
     BOX_CLASSES,
@@ -38,37 +42,27 @@ from pipeline.objective.radar.vehicle_boxes import (
     VehicleBoxes,
     box_equations,
 )
-from schemas.observations import EDGE_ABOVE, EDGE_BELOW, Observation
+from schemas.observations import Observation
 
 __all__ = [
     "AZIMUTH_RANGE_DOF",
     "DT",
+    "PITCH",
     "RANGE",
     "STEP_LIMIT",
     "UNKNOWNS",
-    "ElevationSpread",
     "Linear",
     "RadarProblem",
     "RadarState",
-    "beam_spacing",
-    "elevation_spread",
     "linearise",
     "tempered",
 ]
 
-DT, RANGE = 6, 7
+PITCH, DT, RANGE = 1, 6, 7
 UNKNOWNS = 8 + len(BOX_CLASSES)
 STEP_LIMIT = np.array([0.05] * 3 + [0.15] * 3 + [0.03, 0.1] + [0.05] * len(BOX_CLASSES))
 AZIMUTH_RANGE_DOF = np.array([2, 3, 4, 6, 7])
 _ELEVATION_DOF = np.array([0, 1, 5])
-# How far elevations that are matched to the nearest lidar points bias roll, pitch [rad] and z [m]. Noise removes a part
-# `noise^2 / spread^2` of every mismatch (regression dilution), and a mismatch is as large as the spread of the
-# elevations: the angle noise^2 / spread. Real logs (3.2 deg of noise, spread 3.9): 2.6 deg where 1-2 deg of pitch and
-# 4-5 deg of roll were seen; simulation (0.65 deg, spread 3-6): 0.07-0.16 deg where 0.01-0.12 was seen. A coarse lidar
-# adds a share of its beam spacing, for points collapse onto the rings. z is wrong by the same angle at 15 m.
-_RING_SHARE, _Z_DISTANCE_M, _Z_FLOOR_M = 0.05, 15.0, 0.03
-_ROLL_FACTOR = 0.7  # of pitch's at an azimuth of one radian: both sides seldom err in opposite directions
-_DEFAULT_SPACING_RAD = np.radians(1.0)
 # Roll and pitch of the boxes, and their constants: pitch has unknowns of its own.
 _BOX_FLOOR = np.array([BOX_ROLL_FLOOR_LIDAR_RAD, 0.0] + [0.0] * len(BOX_CLASSES))
 
@@ -110,20 +104,6 @@ class RadarState:
 
 
 @dataclass(frozen=True, eq=False)
-class ElevationSpread:
-    """Distribution of the static detections: standard deviation of elevations, RMS of azimuths [rad]."""
-
-    elevation_rad: float
-    azimuth_rad: float
-
-    def floor(self, noise_rad: float, spacing_rad: float) -> np.ndarray:
-        """Sigma of roll, pitch [rad] and z [m] that such elevation noise leaves to the registration."""
-        angle = np.hypot(noise_rad**2 / self.elevation_rad, _RING_SHARE * spacing_rad)
-        roll, z_m = _ROLL_FACTOR * angle / self.azimuth_rad, np.hypot(_Z_DISTANCE_M * angle, _Z_FLOOR_M)
-        return np.array([roll, angle, z_m])
-
-
-@dataclass(frozen=True, eq=False)
 class RadarProblem:
     """All that stays the same while the state changes."""
 
@@ -139,6 +119,7 @@ class RadarProblem:
     terms: Sequence[str] = TERMS  # that take part
     # Of the stamps [s], taken out of all frames' gaps: the state's dt counts from minus it, as if the clocks were off.
     constant_gap_s: float = 0.0
+    travel: TravelDirections | None = None  # None until the pose is near enough to measure them
 
     def of_frames(self, index: np.ndarray) -> RadarProblem:
         """The same with part of the registration's frames (and of the observations behind them)."""
@@ -151,6 +132,7 @@ class RadarProblem:
             frames=frames,
             movers=self.movers.of_frames(chosen),
             boxes=self.boxes.of_frames(chosen),
+            travel=None if self.travel is None else self.travel.of_frames(chosen),
         )
 
 
@@ -169,6 +151,9 @@ class Linear:
     mover_sigma_rad: float
     registration_step: np.ndarray  # 3: where the registration's elevations alone would move roll, pitch, z
     floor: np.ndarray  # 3: sigma that those elevations leave of roll, pitch [rad] and z [m]
+    witnesses: tuple[Witness, ...]  # of pitch
+    travel_frames: int
+    travel_scatter_rad: float  # of the frames' ways beyond their own sigmas
 
 
 @dataclass(eq=False)
@@ -201,7 +186,10 @@ def linearise(
     _add_azimuths_and_ranges(problem, equations, stride, sums)
     floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
     registration_step = _add_elevations(problem, equations, stride, floor, sums)
-    box_sigma = _add_boxes(problem, state, pairs, about_radar, sums)
+    box_sigma, box_witness = _add_boxes(problem, state, pairs, about_radar, sums)
+    travel_scatter, travel_witness = _add_travel(problem, state, sums)
+    own = Witness("registration", float(registration_step[1]), float(floor[1]))
+    seen = own if problem.frames.has_elevation.any() and "static" in problem.terms else None
     mover_sigma = float("nan")
     if widen == 1.0 and "moving" in problem.terms:  # partners are found only once the clusters lie near them
         mover_sigma = _add_movers(problem, state, about_radar, sums)
@@ -218,6 +206,9 @@ def linearise(
         mover_sigma,
         registration_step,
         floor,
+        tuple(w for w in (seen, box_witness, travel_witness) if w is not None),
+        0 if travel_witness is None or problem.travel is None else problem.travel.count,
+        travel_scatter,
     )
 
 
@@ -287,10 +278,10 @@ def _add_boxes(
     pairs: BoxPairs | None,
     about_radar: np.ndarray,
     sums: _Sums,
-) -> float:
-    """Add the camera's vehicle boxes; returns the sigma of a detection's elevation in its box [rad]."""
+) -> tuple[float, Witness | None]:
+    """Add the camera's vehicle boxes; returns an elevation's sigma in its box [rad], and what they say of pitch."""
     if pairs is None or problem.T_camera_lidar is None:
-        return float("nan")
+        return float("nan"), None
     F = len(sums.g)
     Hb, gb, sigma = box_equations(pairs, problem.T_camera_lidar, state.T_lidar_radar, state.bias_rad, F)
     Hb, gb = _turned(about_radar, Hb, gb)
@@ -298,11 +289,29 @@ def _add_boxes(
     # matched by azimuth at this pose.
     columns = np.array([0, 1, *range(RANGE + 1, UNKNOWNS)])
     own = np.array([0, 1, *range(6, 6 + len(BOX_CLASSES))])
-    Hb, gb = tempered(Hb[:, own[:, None], own], gb[:, own], _BOX_FLOOR)
+    Hb, gb = Hb[:, own[:, None], own], gb[:, own]
+    prior = np.diag([0.0, *[1 / BIAS_SIGMA_RAD**2] * len(BOX_CLASSES)])
+    witness = own_opinion(
+        "boxes", Hb[:, 1:, 1:].sum(0) + prior, gb[:, 1:].sum(0) + prior @ [0.0, *state.bias_rad], 0.0
+    )
+    Hb, gb = tempered(Hb, gb, _BOX_FLOOR)
     for array in (sums.H, sums.information):
         array[np.ix_(np.arange(F), columns, columns)] += Hb
     sums.g[:, columns] += gb
-    return sigma
+    return sigma, witness
+
+
+def _add_travel(problem: RadarProblem, state: RadarState, sums: _Sums) -> tuple[float, Witness | None]:
+    """Add the car's way by Doppler and road; returns its scatter over the frames [rad], and what it says of pitch."""
+    if problem.travel is None:
+        return float("nan"), None
+    H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
+    witness = own_opinion("doppler", H[:, 1:, 1:].sum(0), g[:, 1:].sum(0), DOPPLER_PITCH_FLOOR_RAD)
+    H, g = tempered(H, g, np.full(2, DOPPLER_PITCH_FLOOR_RAD))
+    for array in (sums.H, sums.information):
+        array[:, :2, :2] += H
+    sums.g[:, :2] += g
+    return scatter, witness
 
 
 def _add_elevations(
@@ -359,23 +368,3 @@ def _prior_equations(problem: RadarProblem, state: RadarState) -> tuple[np.ndarr
     weight[RANGE] = 1 / RANGE_BIAS_SIGMA_M**2
     weight[RANGE + 1 :] = 1 / BIAS_SIGMA_RAD**2
     return np.diag(weight), weight * x
-
-
-def beam_spacing(observations: Sequence[Observation]) -> float:
-    """Vertical spacing of the lidar's beams [rad], as its depth jumps between rings show it."""
-    gaps = [
-        o.lidar_edge_gap_rad[(o.lidar_edge_side == EDGE_ABOVE) | (o.lidar_edge_side == EDGE_BELOW)]
-        for o in observations
-    ]
-    every = np.concatenate(gaps) if gaps else np.zeros(0)
-    return float(np.median(every)) if len(every) else float(_DEFAULT_SPACING_RAD)
-
-
-def elevation_spread(frames: RegistrationFrames) -> ElevationSpread:
-    """Distribution of the static detections of these frames."""
-    azimuth, elevation, _ = to_spherical(frames.radar_m).T
-    # One degree: below it, noise alone would make as much.
-    return ElevationSpread(
-        max(float(np.std(elevation)), np.radians(1.0)),
-        max(float(np.sqrt(np.mean(azimuth**2))), np.radians(3.0)),
-    )

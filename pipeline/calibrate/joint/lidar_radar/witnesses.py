@@ -1,0 +1,97 @@
+"""Witnesses of radar pitch: what each says by itself, and what is made of it where they contradict each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+__all__ = ["Contradiction", "Witness", "contradiction", "own_numbers", "own_opinion"]
+
+_SIGMAS = 2.0  # from which two witnesses contradict each other
+_SINGULAR = 1e-9
+
+
+@dataclass(frozen=True)
+class Witness:
+    """What one source says of pitch, all other unknowns as they were solved."""
+
+    name: str
+    offset_rad: float  # from the solution to where this witness alone would turn it
+    sigma_rad: float  # of the witness, its own bias included
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Witnesses are farther apart than their sigmas allow."""
+
+    factor: float  # by which pitch is less sure than they say together
+    sentence: str
+
+
+def own_opinion(
+    name: str, H: Float[np.ndarray, "P P"], g: Float[np.ndarray, " P"], floor_rad: float
+) -> Witness | None:
+    """Where equations of pitch (the first unknown) and nuisances would turn it; None where they say nothing of it.
+
+    Args:
+        name: of the witness.
+        H: information.
+        g: gradient.
+        floor_rad: sigma of what all of its frames err by alike.
+    """
+    scale = np.sqrt(np.maximum(np.diag(H), _SINGULAR))
+    if H[0, 0] <= _SINGULAR or np.linalg.eigvalsh(H / np.outer(scale, scale))[0] < _SINGULAR:
+        return None
+    covariance = np.linalg.inv(H)
+    sigma = float(np.hypot(np.sqrt(covariance[0, 0]), floor_rad))
+    return Witness(name, float(-(covariance @ g)[0]), sigma)
+
+
+def contradiction(witnesses: Sequence[Witness]) -> Contradiction | None:
+    """The witnesses that contradict the mean of the others, and by how much that widens pitch; None where none does.
+
+    The factor is the square root of chi-squared per degree of freedom, at least one.
+
+    Source: Birge 1932, "The calculation of errors by the method of least squares".
+    """
+    apart = [w for w in witnesses if _is_contradicted(w, [o for o in witnesses if o is not w])]
+    if not apart:
+        return None
+    mean, _ = _mean(witnesses)
+    chi2 = sum(((w.offset_rad - mean) / w.sigma_rad) ** 2 for w in witnesses)
+    factor = max(1.0, float(np.sqrt(chi2 / (len(witnesses) - 1))))
+    said = ", ".join(
+        f"{w.name} {np.degrees(w.offset_rad):+.2f} +- {np.degrees(w.sigma_rad):.2f} deg" for w in witnesses
+    )
+    sentence = (
+        f"witnesses of radar pitch contradict each other ({said}): its sigma is {factor:.1f} times as wide"
+    )
+    return Contradiction(factor, sentence)
+
+
+def own_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
+    """Offset and sigma of each witness, for a record's diagnostics."""
+    numbers: dict[str, float] = {}
+    for w in witnesses:
+        numbers |= {
+            f"{w.name}_pitch_offset_rad": w.offset_rad,
+            f"{w.name}_pitch_sigma_rad": w.sigma_rad,
+        }
+    return numbers
+
+
+def _is_contradicted(witness: Witness, others: Sequence[Witness]) -> bool:
+    if not others:
+        return False
+    mean, sigma = _mean(others)
+    return bool(abs(witness.offset_rad - mean) > _SIGMAS * np.hypot(witness.sigma_rad, sigma))
+
+
+def _mean(witnesses: Sequence[Witness]) -> tuple[float, float]:
+    """Weighted mean and its sigma."""
+    weight = np.array([w.sigma_rad**-2 for w in witnesses])
+    offset = np.array([w.offset_rad for w in witnesses])
+    return float(weight @ offset / weight.sum()), float(weight.sum() ** -0.5)

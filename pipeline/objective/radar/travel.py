@@ -1,0 +1,217 @@
+"""The way the car drives, in radar axes by Doppler and in lidar axes by the road: a witness of the radar's pitch.
+
+It needs no camera, and no detection to be matched with the lidar point that it came from. A static detection in
+direction u has the range rate `-u . v`, so three components of v follow from a scan, and on average the car drives
+along its road.
+
+The vertical component is where care is due. Elevations are the noisiest thing a radar measures, and least squares on
+them pulls v towards the mean elevation of the detections (errors in variables: by half a degree in simulation, by more
+where noise is as large as the spread). So the equations are weighed by instruments: the mean elevation of what the
+lidar sees at the detection's azimuth and range, whatever its height. That follows the true elevation and knows nothing
+of the radar's noise. A detection by way of the road, there or back, has the mean Doppler of both ways and the angle of
+one of them, as often too much as too little: with one detection in six of that kind, made ones err by 0.2 deg.
+
+The road is a parabola along the way, and its slope is taken under the car: a plane through what lies 7 to 35 m ahead
+was 0.3 to 0.5 deg off the way on hilly streets.
+
+A constant error of all elevations turns v in radar axes as it turns the detections: this is where detections point.
+
+Source: Kellner et al. 2014, "Instantaneous ego-motion estimation using multiple Doppler radars", for three components
+from one; Durbin 1954, "Errors in variables", for instruments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.geometry.se3 import hat, inverse, transform_points
+from pipeline.objective.radar.registration import RANGE_M, SIDE_RAD
+from pipeline.objective.radar.vehicle_boxes import select_frames
+from schemas.observations import Observation
+
+__all__ = ["TravelDirections", "pitch_equations", "pitch_residuals", "travel_directions"]
+
+_LEAST_SPEED_MPS = 5.0  # slower, a vertical error of 0.05 m/s is half a degree
+_LEAST_DETECTIONS = 30
+_SINGULAR = 1e-9
+_CELL_RAD, _CELL_M = np.radians(0.5), 0.25
+_WINDOW = 3  # cells to each side: 1.75 deg and 0.9 m, some sigmas of any car radar
+_LEAST_LIDAR_POINTS = 2
+_ROAD_M, _ROAD_ASIDE_M, _ROAD_BIN_M = 25.0, 6.0, 2.0
+_ROAD_POINTS = 40
+_FLAT_M = 0.01
+_PASSES = 6
+_LEAST_FRAMES = 5  # fewer show no scatter
+_LEAST_SCATTER_RAD = np.radians(0.1)  # springs and road
+
+
+@dataclass(frozen=True, eq=False)
+class TravelDirections:
+    """The radar's velocity and the road's slope along it, one frame per row."""
+
+    velocity_mps: Float[np.ndarray, "D 3"]  # radar axes
+    sigma_rad: Float[np.ndarray, " D"]  # of the velocity's elevation, by the scan alone
+    slope: Float[np.ndarray, " D"]  # of the road along the velocity, lidar axes; up positive
+    frame: Int64[np.ndarray, " D"]  # index into the observations given
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+        return len(self.frame)
+
+    def of_frames(self, frames: Int64[np.ndarray, " S"]) -> TravelDirections:
+        """Those of some observations, which are numbered anew in the order given."""
+        index, number = select_frames(self.frame, frames)
+        return TravelDirections(self.velocity_mps[index], self.sigma_rad[index], self.slope[index], number)
+
+
+def travel_directions(
+    observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"], dt_s: float
+) -> TravelDirections:
+    """Measure what moving frames show; standing ones, flat radars and empty streets are left out.
+
+    Args:
+        observations: any frames.
+        T_lidar_radar: a pose, good to a degree of azimuth: it says only which lidar points lie near a detection.
+        dt_s: time offset, stamp_lidar = stamp_radar + dt.
+    """
+    rows = []
+    for index, o in enumerate(observations):
+        v = o.radar_velocity_mps
+        if not o.radar_has_elevation or v is None or np.hypot(v[0], v[1]) < _LEAST_SPEED_MPS:
+            continue
+        found = _velocity(o, T_lidar_radar, dt_s)
+        if found is None:
+            continue
+        velocity, covariance = found
+        in_lidar = T_lidar_radar[:3, :3] @ velocity
+        slope = _road_slope(o, in_lidar[:2] / np.hypot(*in_lidar[:2]))
+        if slope is not None:
+            up = T_lidar_radar[2, :3]
+            sigma = float(np.sqrt(up @ covariance @ up) / np.linalg.norm(velocity))
+            rows.append((velocity, sigma, slope, index))
+    if not rows:
+        return TravelDirections(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
+    velocities, sigmas, slopes, frames = zip(*rows, strict=True)
+    return TravelDirections(
+        np.array(velocities), np.array(sigmas), np.array(slopes), np.array(frames, np.int64)
+    )
+
+
+def pitch_residuals(
+    travel: TravelDirections, T_lidar_radar: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, " D"], Float[np.ndarray, "D 3"]]:
+    """How far the velocity points above the road [rad], and the Jacobian for a turn R <- exp(r) R."""
+    v = travel.velocity_mps @ T_lidar_radar[:3, :3].T
+    x, y, z = v.T
+    h = np.hypot(x, y)
+    r2 = h * h + z * z
+    gradient = np.stack([-x * z / (h * r2), -y * z / (h * r2), h / r2], -1)
+    return np.arctan2(z, h) - np.arctan(travel.slope), -(gradient[:, None, :] @ hat(v))[:, 0]
+
+
+def pitch_equations(
+    travel: TravelDirections, T_lidar_radar: Float[np.ndarray, "4 4"], frames: int
+) -> tuple[Float[np.ndarray, "F 2 2"], Float[np.ndarray, "F 2"], float]:
+    """Per frame, information and gradient of the robust (Cauchy) cost for roll and pitch, and the scatter [rad].
+
+    That is what frames differ by beyond their own sigmas, and it is added to these. NaN, and nothing said, where they
+    are too few.
+    """
+    H, g = np.zeros((frames, 2, 2)), np.zeros((frames, 2))
+    if travel.count < _LEAST_FRAMES:
+        return H, g, float("nan")
+    residual, J = pitch_residuals(travel, T_lidar_radar)
+    spread = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
+    common = max(spread**2 - float(np.median(travel.sigma_rad)) ** 2, _LEAST_SCATTER_RAD**2)
+    variance = travel.sigma_rad**2 + common
+    weight = 1 / (variance + residual**2 / 4)
+    np.add.at(H, travel.frame, weight[:, None, None] * J[:, :2, None] * J[:, None, :2])
+    np.add.at(g, travel.frame, (weight * residual)[:, None] * J[:, :2])
+    return H, g, float(np.sqrt(common))
+
+
+def _velocity(o: Observation, T_lidar_radar: np.ndarray, dt_s: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Velocity and covariance of one scan by instruments; None where too few detections have one."""
+    assert o.radar_velocity_mps is not None
+    xyz = o.radar_xyz_m[o.radar_motion == 0].astype(np.float64)
+    residual = o.radar_residual_mps[o.radar_motion == 0].astype(np.float64)
+    instrument = _lidar_elevation(o, T_lidar_radar, dt_s, xyz)
+    seen = np.isfinite(instrument)
+    if seen.sum() < _LEAST_DETECTIONS:
+        return None
+    xyz, residual, elevation = xyz[seen], residual[seen], instrument[seen]
+    u = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    flat = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], 1)
+    Z = flat * np.cos(elevation)[:, None]
+    M = Z.T @ u
+    if abs(np.linalg.det(M)) < _SINGULAR * len(Z) ** 3:
+        return None
+    # No robust weights: noise of an elevation moves the residual one way more than the other, by how steep the
+    # detection is seen, and what cuts that off is biased. Static detections lie within their gate as it is.
+    M_inverse = np.linalg.inv(M)
+    step = -M_inverse @ (Z.T @ residual)
+    score = Z * (residual + u @ step)[:, None]
+    return o.radar_velocity_mps + step, M_inverse @ (score.T @ score) @ M_inverse.T
+
+
+def _lidar_elevation(o: Observation, T_lidar_radar: np.ndarray, dt_s: float, xyz_m: np.ndarray) -> np.ndarray:
+    """Mean elevation [rad] of lidar points around each detection's azimuth and range, at any height; NaN of none."""
+    assert o.radar_velocity_mps is not None
+    lidar = transform_points(inverse(T_lidar_radar), o.lidar_map_xyz_m.astype(np.float64))
+    lidar -= o.radar_velocity_mps * ((o.radar_stamp_ns - o.stamp_ns) * 1e-9 + dt_s)
+    size = (int(np.ceil(2 * SIDE_RAD / _CELL_RAD)), int(np.ceil(RANGE_M[1] / _CELL_M)))
+    (rows, columns, inside), (row, column, usable) = _cells(lidar, size), _cells(xyz_m, size)
+    flat = rows[inside] * size[1] + columns[inside]
+    elevation = np.arctan2(lidar[inside, 2], np.hypot(lidar[inside, 0], lidar[inside, 1]))
+    count, total = (
+        _window_sums(np.bincount(flat, w, size[0] * size[1]).reshape(size)) for w in (None, elevation)
+    )
+    out = np.full(len(xyz_m), np.nan)
+    points = count[row[usable], column[usable]]
+    enough = points >= _LEAST_LIDAR_POINTS
+    mean = total[row[usable], column[usable]] / np.maximum(points, 1)
+    out[np.flatnonzero(usable)[enough]] = mean[enough]
+    return out
+
+
+def _cells(xyz_m: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cell of azimuth and of range of each point, and whether it lies within the useful view."""
+    row = np.floor((np.arctan2(xyz_m[:, 1], xyz_m[:, 0]) + SIDE_RAD) / _CELL_RAD).astype(np.int64)
+    range_m = np.linalg.norm(xyz_m, axis=1)
+    column = np.floor(range_m / _CELL_M).astype(np.int64)
+    inside = (row >= 0) & (row < size[0]) & (range_m > RANGE_M[0]) & (column < size[1])
+    return row, column, inside
+
+
+def _window_sums(cells: np.ndarray) -> np.ndarray:
+    """Sum over a window around each cell."""
+    padded = np.pad(cells, ((_WINDOW + 1, _WINDOW), (_WINDOW + 1, _WINDOW))).cumsum(0).cumsum(1)
+    n = 2 * _WINDOW + 1
+    return np.asarray(padded[n:, n:] - padded[:-n, n:] - padded[n:, :-n] + padded[:-n, :-n])
+
+
+def _road_slope(o: Observation, ahead: np.ndarray) -> float | None:
+    """Slope of the road under the lidar along a horizontal direction, by a robust parabola through ground points."""
+    ground = o.lidar_map_xyz_m[o.lidar_map_is_ground.astype(bool)].astype(np.float64)
+    along, aside = ground[:, :2] @ ahead, ground[:, :2] @ np.array([-ahead[1], ahead[0]])
+    near = (np.abs(along) < _ROAD_M) & (np.abs(aside) < _ROAD_ASIDE_M)
+    if near.sum() < _ROAD_POINTS:
+        return None
+    along, aside, z = along[near], aside[near], ground[near, 2]
+    A = np.stack([np.ones_like(along), along, along**2, aside], 1)
+    # Rings crowd near the car: each stretch of road counts alike.
+    stretch = ((along + _ROAD_M) / _ROAD_BIN_M).astype(np.int64)
+    even = 1 / np.bincount(stretch)[stretch]
+    weight, solution = even, np.zeros(4)
+    for _ in range(_PASSES):
+        solution = np.linalg.lstsq((A.T * weight) @ A, (A.T * weight) @ z, rcond=None)[0]
+        r = z - A @ solution
+        sigma = max(1.4826 * float(np.median(np.abs(r))), _FLAT_M)
+        weight = even / (1 + (r / (2 * sigma)) ** 2)
+    return float(solution[1])

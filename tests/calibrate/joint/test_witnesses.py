@@ -1,0 +1,57 @@
+"""Witnesses of radar pitch: what each says by itself, and what their contradictions do to the sigma."""
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, own_numbers, own_opinion
+
+
+def test_witnesses_that_agree_change_nothing():
+    assert contradiction([]) is None
+    assert contradiction([Witness("boxes", 0.3, 0.01)]) is None
+    assert contradiction([Witness("boxes", 0.01, 0.01), Witness("doppler", -0.01, 0.01)]) is None
+
+
+def test_witnesses_that_contradict_each_other_widen_the_sigma_and_are_named():
+    found = contradiction([Witness("registration", 0.0, 0.002), Witness("doppler", 0.012, 0.002)])
+    # Two values six sigmas apart: chi-squared is 18 for one degree of freedom.
+    assert found.factor == pytest.approx(np.sqrt(18))
+    assert "registration +0.00 +- 0.11 deg" in found.sentence
+    assert "doppler +0.69 +- 0.11 deg" in found.sentence
+
+
+def test_the_widened_sigma_covers_both_sides():
+    a, b = Witness("registration", 0.0, 0.002), Witness("doppler", 0.012, 0.004)
+    found = contradiction([a, b])
+    weight = np.array([a.sigma_rad, b.sigma_rad]) ** -2.0
+    mean, sigma = weight @ [a.offset_rad, b.offset_rad] / weight.sum(), weight.sum() ** -0.5
+    assert abs(b.offset_rad - mean) < 2.5 * found.factor * sigma
+
+
+def test_errors_as_large_as_their_sigmas_seldom_contradict():
+    rng = np.random.default_rng(0)
+    sigma = np.array([0.002, 0.01, 0.003])
+    found = [
+        contradiction(
+            [Witness(str(k), e, s) for k, (e, s) in enumerate(zip(rng.normal(0, sigma), sigma, strict=True))]
+        )
+        for _ in range(400)
+    ]
+    assert 0.01 < np.mean([f is not None for f in found]) < 0.15
+
+
+def test_an_opinion_is_the_step_with_nuisances_following():
+    H, g = np.array([[4.0, 2.0], [2.0, 3.0]]), np.array([1.0, -1.0])
+    opinion = own_opinion("boxes", H, g, 0.1)
+    assert opinion.offset_rad == pytest.approx(-np.linalg.solve(H, g)[0])
+    assert opinion.sigma_rad == pytest.approx(np.hypot(np.sqrt(3 / 8), 0.1))
+    assert own_numbers([opinion]) == {
+        "boxes_pitch_offset_rad": opinion.offset_rad,
+        "boxes_pitch_sigma_rad": opinion.sigma_rad,
+    }
+
+
+def test_who_has_seen_nothing_has_no_opinion():
+    assert own_opinion("doppler", np.zeros((1, 1)), np.zeros(1), 0.1) is None
+    # Pitch and its constant cannot be told apart without a prior on the constant.
+    assert own_opinion("boxes", np.ones((2, 2)), np.ones(2), 0.1) is None

@@ -1,0 +1,156 @@
+"""Radar pitch from the car's way: Doppler in radar axes against the road in lidar axes, on streets of known truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, transform_points
+from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.objective.radar.travel import pitch_equations, pitch_residuals, travel_directions
+from tests.makers.solve_scenes import make_day
+
+GROUND_M, SPEED_MPS = -1.7, 14.0
+T_LIDAR_RADAR = from_rotation_translation(exp_so3(np.array([0.02, -0.02, 0.03])), np.array([0.8, 0.1, -0.7]))
+TEMPLATE = make_day(frames=1)[0]
+
+
+def scene(rng, *, T=T_LIDAR_RADAR, noise_deg=2.0, mirrored=0.0, bias_deg=0.0, curvature=0.0, speed=SPEED_MPS):
+    """One frame: poles and kerbs; elevations are noisy, some are those of the image in the road, all may be off."""
+    foot = np.stack([rng.uniform(8, 45, 40), rng.choice([-1, 1], 40) * rng.uniform(5, 14, 40)], -1)
+    foot = np.concatenate([foot, foot @ [[0.0, -1], [1, 0]]])  # a street that crosses
+    top = rng.uniform(0.1, 6.0, len(foot))
+    heights = np.arange(0.0, 6.0, 0.2)
+    poles = np.concatenate(
+        [np.column_stack([np.tile(f, (30, 1)), heights])[heights < t] for f, t in zip(foot, top, strict=True)]
+    )
+    ground = np.column_stack([rng.uniform(-2, 40, 1500), rng.uniform(-12, 12, 1500), np.zeros(1500)])
+    world = poles[rng.integers(0, len(poles), 400)]
+    height = world[:, 2:].copy()
+    for p in (poles, ground, world):
+        p[:, 2] += GROUND_M + 0.5 * curvature * p[:, 0] ** 2
+    velocity = T[:3, :3].T @ [speed, 0.0, 0.0]
+    aer = to_spherical(transform_points(inverse(T), world))
+    image = to_spherical(transform_points(inverse(T), world - 2 * height * [0.0, 0.0, 1.0]))
+    # Sent and received by way of the road or not: the Doppler is the mean of both ways, the angle that of the second.
+    there, back = rng.random((2, len(world), 1)) < mirrored
+    ways = [
+        np.where(w, from_spherical(image) / image[:, 2:], from_spherical(aer) / aer[:, 2:])
+        for w in (there, back)
+    ]
+    rate = -0.5 * (ways[0] + ways[1]) @ velocity + rng.normal(0, 0.06, len(world))
+    aer[:, 1] = np.where(back[:, 0], image[:, 1], aer[:, 1])
+    aer += np.radians([0.3, noise_deg, 0.0]) * rng.normal(size=aer.shape) + np.radians([0.0, bias_deg, 0.0])
+    radar = from_spherical(aer).astype(np.float32)
+    u = radar / np.linalg.norm(radar, axis=1, keepdims=True)
+    n = len(radar)
+    return replace(
+        TEMPLATE, radar_stamp_ns=TEMPLATE.stamp_ns, radar_xyz_m=radar,
+        radar_residual_mps=(rate + u @ velocity).astype(np.float32), radar_motion=np.zeros(n, np.uint8),
+        radar_cluster=np.full(n, -1, np.int32), radar_velocity_mps=velocity,
+        lidar_map_xyz_m=np.concatenate([poles, ground]).astype(np.float32),
+        lidar_map_is_ground=np.r_[np.zeros(len(poles)), np.ones(len(ground))].astype(np.uint8),
+    )  # fmt: skip
+
+
+def day_of(seed, frames=12, **settings):
+    rng = np.random.default_rng(seed)
+    return [scene(rng, **settings) for _ in range(frames)]
+
+
+def turned(T, pitch_rad):
+    return from_rotation_translation(exp_so3(np.array([0.0, pitch_rad, 0.0])) @ T[:3, :3], T[:3, 3])
+
+
+def pitch_error(day, T=T_LIDAR_RADAR):
+    """By how much the day would turn the true pose, and its sigma [rad]."""
+    travel = travel_directions(day, T, 0.0)
+    pitch = 0.0
+    for _ in range(8):
+        H, g, _ = pitch_equations(travel, turned(T, pitch), len(day))
+        pitch -= g[:, 1].sum() / H[:, 1, 1].sum()
+    return pitch, H[:, 1, 1].sum() ** -0.5
+
+
+def test_the_jacobian_is_that_of_differences():
+    travel = travel_directions(day_of(1, 6), T_LIDAR_RADAR, 0.0)
+    _, J = pitch_residuals(travel, T_LIDAR_RADAR)
+    for k, axis in enumerate(np.eye(3)):
+        ahead, behind = (
+            pitch_residuals(
+                travel,
+                from_rotation_translation(exp_so3(s * 1e-6 * axis) @ T_LIDAR_RADAR[:3, :3], np.zeros(3)),
+            )[0]
+            for s in (1, -1)
+        )
+        np.testing.assert_allclose(J[:, k], (ahead - behind) / 2e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("noise_deg", [0.5, 4.0])
+def test_noisy_elevations_do_not_bias_pitch(noise_deg):
+    errors = np.array([pitch_error(day_of(seed, noise_deg=noise_deg)) for seed in range(6)])
+    assert abs(np.degrees(errors[:, 0].mean())) < 0.12
+    assert np.sqrt(np.mean((errors[:, 0] / errors[:, 1]) ** 2)) < 1.8
+
+
+def test_bounce_off_the_road_stays_within_the_sigma():
+    # One detection in six came or went by way of the road.
+    errors = np.array([pitch_error(day_of(seed, noise_deg=2.0, mirrored=0.08)) for seed in range(6)])
+    assert abs(np.degrees(errors[:, 0].mean())) < 0.3
+    assert np.sqrt(np.mean((errors[:, 0] / errors[:, 1]) ** 2)) < 1.8
+
+
+def test_least_squares_on_the_same_scans_is_biased_which_is_why_there_are_instruments():
+    travel_deg, plain_deg = [], []
+    for o in day_of(3, 12, noise_deg=4.0):
+        u = o.radar_xyz_m / np.linalg.norm(o.radar_xyz_m, axis=1, keepdims=True)
+        rate = o.radar_residual_mps - u @ o.radar_velocity_mps
+        v = T_LIDAR_RADAR[:3, :3] @ np.linalg.lstsq(u, -rate, rcond=None)[0]
+        plain_deg.append(np.degrees(np.arctan2(v[2], v[0])))
+        found = travel_directions([o], T_LIDAR_RADAR, 0.0)
+        travel_deg.append(np.degrees(pitch_residuals(found, T_LIDAR_RADAR)[0][0]))
+    assert abs(np.median(plain_deg)) > 0.5
+    assert abs(np.median(travel_deg)) < 0.5 * abs(np.median(plain_deg))
+
+
+def test_a_constant_elevation_error_turns_the_way_as_it_turns_the_detections():
+    plain, biased = (pitch_error(day_of(4, bias_deg=b, noise_deg=0.5))[0] for b in (0.0, 1.0))
+    # Detections point 1 deg too high; turning the radar down puts those ahead right, and those aside less.
+    assert np.degrees(biased - plain) == pytest.approx(0.8, abs=0.2)
+
+
+@pytest.mark.parametrize("curvature", [-0.002, 0.002])
+def test_a_road_that_bends_up_or_down_ahead_does_not_turn_the_radar(curvature):
+    flat, bent = (pitch_error(day_of(5, curvature=c, noise_deg=0.5))[0] for c in (0.0, curvature))
+    assert abs(np.degrees(bent - flat)) < 0.1
+
+
+def test_a_radar_that_looks_to_the_corner_knows_its_pitch_as_well():
+    T = from_rotation_translation(
+        exp_so3(np.array([0.0, 0.0, 0.8])) @ T_LIDAR_RADAR[:3, :3], T_LIDAR_RADAR[:3, 3]
+    )
+    error, sigma = pitch_error(day_of(6, T=T), T)
+    assert abs(error) < 3 * sigma
+    assert np.degrees(sigma) < 0.3
+
+
+def test_standing_cars_flat_radars_and_streets_without_ground_say_nothing():
+    [o] = day_of(7, 1)
+    blind = replace(o, lidar_map_is_ground=np.zeros_like(o.lidar_map_is_ground))
+    flat = replace(o, radar_has_elevation=False)
+    lost = replace(o, radar_velocity_mps=None)
+    [standing] = day_of(7, 1, speed=1.0)
+    assert travel_directions([o], T_LIDAR_RADAR, 0.0).count == 1
+    travel = travel_directions([blind, flat, lost, standing], T_LIDAR_RADAR, 0.0)
+    assert travel.count == 0
+    H, g, scatter = pitch_equations(travel, T_LIDAR_RADAR, 4)
+    assert not H.any()
+    assert not g.any()
+    assert np.isnan(scatter)
+
+
+def test_parts_of_a_day_keep_their_own_frames():
+    travel = travel_directions(day_of(8, 5), T_LIDAR_RADAR, 0.0)
+    part = travel.of_frames(np.array([1, 4]))
+    assert part.frame.tolist() == [0, 1]
+    assert part.velocity_mps.tolist() == travel.velocity_mps[[1, 4]].tolist()
