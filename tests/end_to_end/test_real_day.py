@@ -8,9 +8,11 @@ import pytest
 from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import load_fleet
+from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.store.partitions import Lake, Partition
+from schemas.calibrations import CalibrationRecord
 from tests.benchmarks.studies.metrics import transform_of
 from tests.makers.simulated_days import perceived
 
@@ -22,8 +24,8 @@ SEED = 0
 
 
 @pytest.fixture(scope="module")
-def errors(real_logs, tmp_path_factory) -> dict[str, tuple[float, float, float]]:
-    """Azimuth, elevation [deg] and range [m] between `joint` and the given calibration, pair by pair.
+def solved(real_logs, tmp_path_factory) -> tuple[Prior, dict[str, CalibrationRecord]]:
+    """The given calibration, and what `joint` made of the day, pair by pair.
 
     Everything is ingested and perceived; every second frame is calibrated, which is half of the time.
     """
@@ -36,8 +38,15 @@ def errors(real_logs, tmp_path_factory) -> dict[str, tuple[float, float, float]]
     records = calibrate_observations(
         rows[::2], perturbed(given, START, SEED), fleet, Inputs(DAY, "joint", "test", SEED, ())
     )
+    return given, {record.pair: record for record in records}
+
+
+@pytest.fixture(scope="module")
+def errors(solved) -> dict[str, tuple[float, float, float]]:
+    """Azimuth, elevation [deg] and range [m] between `joint` and the given calibration, pair by pair."""
+    given, records = solved
     found = {}
-    for record in records:
+    for record in records.values():
         T = transform_of(record)
         assert T is not None, record.reason
         azimuth, elevation, range_m = errors_at_targets(record.pair, T, given.of(record.pair))
@@ -55,3 +64,14 @@ def test_radar_azimuth_and_range_come_back_to_the_given_calibration(errors):
     assert errors["lidar_radar"][0] <= 0.35
     assert errors["camera_radar"][0] <= 0.35
     assert errors["lidar_radar"][2] <= 0.10
+
+
+def test_the_radars_elevation_has_witnesses_that_agree_and_a_sigma_of_half_a_degree_at_most(solved, errors):
+    _, records = solved
+    record = records["lidar_radar"]
+    said = record.diagnostics
+    apart = said["doppler_pitch_offset_rad"] - said["boxes_pitch_offset_rad"]
+    assert abs(apart) <= 2 * np.hypot(said["doppler_pitch_sigma_rad"], said["boxes_pitch_sigma_rad"])
+    assert said["doppler_frames"] >= 40
+    assert errors["lidar_radar"][1] <= 0.6
+    assert record.elevation_sigma_rad <= np.radians(0.5)

@@ -10,6 +10,7 @@ from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, to_quaternion
 from schemas.calibrations import CalibrationRecord
 from tests.benchmarks.studies.metrics import claimed_error_deg, inside_share, measure, rms, within
+from tests.benchmarks.studies.radar_elevation import summary as elevation_summary
 from tests.benchmarks.studies.sigma_coverage import summary as coverage_summary
 from tests.benchmarks.studies.verdict import is_right, precision_recall, worse_than_prior
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
@@ -106,3 +107,26 @@ def test_a_held_record_that_vouches_for_nothing_is_not_right_by_that():
     assert is_right("lidar_radar", coarse)
     assert not is_right("camera_lidar", coarse)
     assert not is_right("lidar_radar", coarse | {"diagnostics": {"vouched_az": 1, "vouched_el": 1}})
+
+
+def elevation_result(error_deg, seed=1, status="accepted", offset_rad=0.0):
+    said = {"registration_pitch_offset_rad": 0.0, "registration_pitch_sigma_rad": 0.002}
+    said |= {"doppler_pitch_offset_rad": offset_rad, "doppler_pitch_sigma_rad": 0.003, "doppler_frames": 38.0}
+    pair = {
+        "status": status, "el_deg": error_deg, "mounting_el_deg": error_deg + 0.1, "error": [0, 0.002, 0, 0, 0, 0],
+        "sigma": [0.004, 0.001, 0.004, 1, 1, 1], "diagnostics": said | {"vouched_el": 1.0},
+    }  # fmt: skip
+    return {"day": {"rig": "paper", "environment": "urban", "seed": seed}, "pairs": {"lidar_radar": pair}}
+
+
+def test_certified_elevations_beyond_their_limit_and_witnesses_apart_are_counted():
+    far = elevation_result(0.7, seed=2, offset_rad=0.02)
+    held = elevation_result(0.1, seed=3, status="held")
+    text = elevation_summary([elevation_result(0.2), far, held])
+    assert "certified within 0.6 deg 2/3 (66.7 %), right 1/2 (50.0 %)" in text
+    assert "witnesses agree within two sigmas 2/3 (66.7 %)" in text
+    assert "RMS pitch error/sigma 2.00" in text
+    assert (
+        "| paper urban 2 | 38 | accepted | 0.700 | 0.800 | +2.0 | +0.00 +- 0.11 | - | +1.15 +- 0.17 | yes |"
+        in text
+    )

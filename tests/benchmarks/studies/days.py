@@ -239,6 +239,13 @@ SETS: dict[str, list[DaySpec]] = {
         *_both(4100, 8, fault="camera:time:0.06"),
     ],
     "dev-clocks": [*_both(160, 8), *_both(160, 8, rig="paper-free")],
+    "radar-elevation": [
+        *_both(4000, 4),
+        *_both(4006, 2),
+        *_both(4010, 2),
+        *_both(4004, 2, rig="ring16"),
+        *_both(4008, 2, rig="ring16"),
+    ],
     "ablation": [
         DaySpec(3800, "urban", 100),
         DaySpec(3801, "highway", 100),
