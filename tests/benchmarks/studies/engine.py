@@ -65,6 +65,12 @@ _DIAGNOSTICS = {
     "holdout_z",
     "loop_rotation_sigma_rad",
     "focal_scale",
+    "doppler_frames",
+    *(
+        f"{who}_pitch_{what}_rad"
+        for who in ("registration", "boxes", "doppler")
+        for what in ("offset", "sigma")
+    ),
 }
 
 
