@@ -274,9 +274,13 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
                 "the image's frame id is no optical frame (x right, y down, z forward): check /tf_static"
             )
     if rig.ego is None:
-        advice.append("no odometry configured: ego speed comes from Doppler, the lidar is not de-skewed")
+        advice.append(
+            "no odometry configured: ego speed comes from Doppler, by which the lidar is de-skewed but for turns"
+        )
     elif frames and all(f.ego_speed_mps is None for f in frames):
-        advice.append(f"{rig.ego.odometry} never brackets a sweep: the lidar is not de-skewed")
+        advice.append(
+            f"{rig.ego.odometry} never brackets a sweep: the lidar is de-skewed by Doppler, but for turns"
+        )
     if frames and all(f.lidar_time_s is None for f in frames):
         advice.append("the lidar logs no time per point: sweeps cannot be de-skewed")
     if 0 < usable < 100:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, NamedTuple
 
@@ -15,6 +15,7 @@ from pipeline.geometry.radar_grid import Scan
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.perceive.camera import SemanticsSource, TopicSource, decode_grey, encode_png
 from pipeline.perceive.depth_edges import lidar_edges
+from pipeline.perceive.deskew import deskew_straight, velocity_ahead
 from pipeline.perceive.drivable import DrivableSource, free_sector
 from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
 from pipeline.perceive.ground import PointSource, find_ground
@@ -35,6 +36,9 @@ _MIN_LIDAR_POINTS = 100  # less shows neither ground nor objects
 WITHOUT_ROWS: Final = (
     "frames_without_lidar_rows"  # among the manifest's kept: edges between neighbours, see README
 )
+# Likewise, of sweeps that no odometry de-skewed: moved by the radar's velocity, or left, for that was unknown.
+BY_DOPPLER: Final = "frames_deskewed_by_doppler"
+AS_LOGGED: Final = "frames_not_deskewed"
 _PRIOR_FIELDS = [
     f"prior_{pair}_{part}"
     for pair in ("camera_lidar", "lidar_radar")
@@ -63,7 +67,12 @@ def work(task: Task) -> Work:
     for model in (drivable, points):
         semantics_key |= {} if model is None else model.provenance
     perceive = partial(
-        perceive_frame, source=source, config=task.fleet.perceive, drivable=drivable, points=points
+        perceive_frame,
+        source=source,
+        config=task.fleet.perceive,
+        drivable=drivable,
+        points=points,
+        deskew=task.fleet.ingest.deskew,
     )
     return Work(
         (task.fleet.perceive, semantics_key),
@@ -87,15 +96,17 @@ def _rows(task: Task, perceive: Callable[..., Perceived], run: Run) -> Generator
             if found is not None:
                 state = found.tracks
                 run.kept.update([] if found.lidar_has_rows else [WITHOUT_ROWS])
+                run.kept.update([] if found.deskew is None else [found.deskew])
                 yield found.observation
 
 
 class Perceived(NamedTuple):
-    """What one frame shows, the radar tracks after it, and whether its sweep has rows (a rosette has none)."""
+    """What one frame shows, and the radar tracks after it."""
 
     observation: Observation
     tracks: TrackState
-    lidar_has_rows: bool
+    lidar_has_rows: bool  # a rosette has none
+    deskew: str | None  # of a sweep that came as logged though its points have times: BY_DOPPLER or AS_LOGGED
 
 
 def perceive_frame(
@@ -105,6 +116,8 @@ def perceive_frame(
     tracks: TrackState,
     drivable: DrivableSource | None = None,
     points: PointSource | None = None,
+    *,
+    deskew: bool = True,
 ) -> Perceived:
     """Everything that one frame shows, and the radar tracks carried on.
 
@@ -115,6 +128,7 @@ def perceive_frame(
         tracks: from the frame before.
         drivable: network for the radar's drivable area, which remembers the scans before; None = geometry.
         points: model that tells what lidar points are; None = geometry.
+        deskew: sweeps that ingest had no odometry for, by the radar's velocity.
 
     Raises:
         ModelError: a model does not do what its manifest says.
@@ -125,9 +139,14 @@ def perceive_frame(
     grey = decode_grey(frame, config.label_scale)
     contrast = road_contrast(grey, semantics.labels == ROAD_ID)
     # One generator per frame: the result does not depend on which frames came before.
-    rng = np.random.default_rng([frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index])
-    lidar, has_rows = _perceive_lidar(frame, config, rng, points)
-    radar, motion, state = _perceive_radar(frame, config, tracks, rng, drivable)
+    seed = [frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index]
+    rng, own = np.random.default_rng(seed), None
+    if deskew and not frame.lidar_deskewed and frame.lidar_time_s is not None:
+        own = _motion(frame, config, np.random.default_rng([*seed, 1]))
+    swept = frame if own is None else _deskewed(frame, own)
+    lidar, has_rows = _perceive_lidar(swept, config, rng, points)
+    motion = _motion(frame, config, rng) if own is None else own
+    radar, state = _perceive_radar(frame, motion, tracks, drivable)
     copied = {name: getattr(frame, name) for name in _COPIED_FIELDS}
     users = semantics.detections
     observation = Observation(
@@ -145,7 +164,25 @@ def perceive_frame(
         road_user_scores=users.scores,
         road_contrast_png=encode_png(contrast),
     )
-    return Perceived(observation, state, has_rows)
+    how = None if own is None else AS_LOGGED if swept is frame else BY_DOPPLER
+    return Perceived(observation, state, has_rows, how)
+
+
+def _motion(frame: Frame, config: PerceiveConfig, rng: np.random.Generator) -> RadarMotion:
+    return radar_motion(
+        frame.radar_xyz_m, frame.radar_range_rate_mps, frame.radar_power_db, frame.doppler_period_mps,
+        Travel(frame.ego_speed_mps, _heading(frame)), frame.radar_has_elevation, config, rng,
+    )  # fmt: skip
+
+
+def _deskewed(frame: Frame, motion: RadarMotion) -> Frame:
+    """The frame with its points moved to the stamp by the radar's velocity; itself where that is unknown."""
+    heading, time_s = _heading(frame), frame.lidar_time_s
+    if motion.velocity_mps is None or heading is None or time_s is None:
+        return frame
+    velocity = velocity_ahead(motion.velocity_mps, heading)
+    x, y, z = deskew_straight(frame.lidar_xyz_m, time_s, velocity).T
+    return replace(frame, lidar_x_m=x, lidar_y_m=y, lidar_z_m=z, lidar_deskewed=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,18 +252,10 @@ def _perceive_lidar(
 
 
 def _perceive_radar(
-    frame: Frame,
-    config: PerceiveConfig,
-    tracks: TrackState,
-    rng: np.random.Generator,
-    drivable: DrivableSource | None,
-) -> tuple[dict[str, Any], RadarMotion, TrackState]:
+    frame: Frame, motion: RadarMotion, tracks: TrackState, drivable: DrivableSource | None
+) -> tuple[dict[str, Any], TrackState]:
     """The radar_* columns but those copied from the frame."""
     xyz = frame.radar_xyz_m
-    motion = radar_motion(
-        xyz, frame.radar_range_rate_mps, frame.radar_power_db, frame.doppler_period_mps,
-        Travel(frame.ego_speed_mps, _heading(frame)), frame.radar_has_elevation, config, rng,
-    )  # fmt: skip
     returns = measure_clusters(xyz, motion.residual_mps, motion.cluster, frame.doppler_period_mps)
     state, found = advance_tracks(
         tracks, frame.radar_stamp_ns, frame.drive, _ego_motion(frame, motion), returns,
@@ -248,7 +277,7 @@ def _perceive_radar(
         "radar_drivable_azimuth_rad": sector.azimuth_rad,
         "radar_drivable_range_m": sector.range_m,
     }
-    return columns, motion, state
+    return columns, state
 
 
 def _drivable(radar: RadarTopics, fleet: FleetConfig) -> DrivableSource | None:

@@ -1,0 +1,88 @@
+"""Sweeps that no odometry de-skewed: by Doppler, as far as that knows, and counted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.config import PerceiveConfig
+from pipeline.geometry.se3 import exp_so3
+from pipeline.perceive.camera import TopicSource
+from pipeline.perceive.deskew import deskew_straight, velocity_ahead
+from pipeline.perceive.stage import AS_LOGGED, BY_DOPPLER, perceive_frame
+from pipeline.perceive.tracks import TrackState
+from pipeline.rigs import TopicSemantics
+
+SPEED_MPS = 8.0  # of the made frames
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-10, 40), st.floats(-3, 3), st.integers(0, 100))
+def test_a_world_seen_by_a_car_that_drives_straight_stands_still(speed, heading, seed):
+    rng = np.random.default_rng(seed)
+    world = rng.uniform(-50, 50, (40, 3))
+    time = np.linspace(-0.1, 0.02, 40)
+    seen = world - time[:, None] * [speed, 0.0, 0.0]  # the lidar looks ahead, the radar anywhere
+    velocity_radar = exp_so3(np.array([0.0, 0.0, heading])) @ [speed, 0.0, 0.0]
+    v = velocity_ahead(velocity_radar, heading)
+    still = deskew_straight(seen.astype(np.float32), time.astype(np.float32), v)
+    np.testing.assert_allclose(still, world, atol=1e-4)
+
+
+def skewed(made_frame, **changes):
+    """A frame without odometry, as a lidar that turns within 100 ms would log it."""
+    frame = made_frame(3)
+    time_s = np.linspace(-0.1, 0.0, len(frame.lidar_x_m)).astype(np.float32)
+    prior = {"prior_lidar_radar_qw": 1.0, **{f"prior_lidar_radar_q{k}": 0.0 for k in "xyz"}}
+    as_seen = {"lidar_x_m": (frame.lidar_x_m - SPEED_MPS * time_s).astype(np.float32), "lidar_time_s": time_s}
+    return frame, replace(frame, lidar_deskewed=False, **as_seen, **prior, **changes)
+
+
+def perceived(frame, **options):
+    source = TopicSource(TopicSemantics(source="topics", labels="/l", detections="/d"), PerceiveConfig())
+    return perceive_frame(frame, source, PerceiveConfig(), TrackState.empty(), **options)
+
+
+def farthest(found, frame):
+    """How far the sampled cloud lies from the points of a frame, at most."""
+    cloud = found.observation.lidar_map_xyz_m
+    apart = np.linalg.norm(cloud[:, None] - frame.lidar_xyz_m[None], axis=2)
+    return apart.min(1).max()
+
+
+def test_a_sweep_without_odometry_is_moved_by_the_radar_s_velocity(made_frame):
+    right, frame = skewed(made_frame)
+    found = perceived(frame)
+    assert found.deskew == BY_DOPPLER
+    # 0.05 m/s of Doppler noise times a tenth of a second
+    assert farthest(found, right) < 0.03
+    left = perceived(frame, deskew=False)
+    assert left.deskew is None
+    assert farthest(left, frame) == 0.0
+    assert farthest(left, right) > 0.2
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"prior_lidar_radar_qw": None}, {"radar_range_rate_mps": None}],
+    ids=["no prior", "no velocity"],
+)
+def test_where_the_velocity_is_unknown_the_sweep_stays_as_logged_and_is_counted(made_frame, changes):
+    _, frame = skewed(made_frame)
+    if "radar_range_rate_mps" in changes:
+        noise = np.random.default_rng(0).uniform(-15, 15, len(frame.radar_x_m))
+        changes = {"radar_range_rate_mps": noise.astype(np.float32)}
+    frame = replace(frame, **changes)
+    found = perceived(frame)
+    assert found.deskew == AS_LOGGED
+    assert farthest(found, frame) == 0.0
+
+
+def test_what_ingest_moved_or_has_no_times_is_left_alone_and_not_counted(made_frame):
+    _, frame = skewed(made_frame)
+    for same in (replace(frame, lidar_deskewed=True), replace(frame, lidar_time_s=None)):
+        found = perceived(same)
+        assert found.deskew is None
+        assert farthest(found, same) == 0.0
