@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar, estimate_camera_lidar
+from pipeline.calibrate.joint.camera_lidar.estimate import _usable, align_camera_lidar, estimate_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
 from pipeline.calibrate.joint.camera_lidar.time_offset import TimeOffsetProfile, s_per_metre
 from pipeline.calibrate.numerics.differential_evolution import evolve
@@ -15,6 +15,7 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import inverse, log_so3, perturb_exactly
+from tests.makers.solve_scenes import make_day
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
 
 
@@ -64,6 +65,14 @@ def test_stamps_that_are_all_late_by_as_much_change_the_time_offset_by_it_and_no
     np.testing.assert_allclose(solved[0].T, solved[1].T, atol=1e-7)
     assert solved[1].time_offset_s - solved[0].time_offset_s == pytest.approx(0.06, abs=1e-6)
     assert abs(solved[1].time_offset_s - 0.07) < 0.015
+
+
+def test_frames_of_unknown_speed_are_left_out_where_most_are_known():
+    day = make_day(8)
+    some = [replace(o, ego_speed_mps=None) if k in (2, 5) else o for k, o in enumerate(day)]
+    assert _usable(some) == ([0, 1, 3, 4, 6, 7], {"own speed unknown": 2})
+    none = [replace(o, ego_speed_mps=None) if k else o for k, o in enumerate(day)]
+    assert _usable(none) == (list(range(8)), {})
 
 
 def test_road_without_reflectivity_leaves_the_edges_to_do_it():

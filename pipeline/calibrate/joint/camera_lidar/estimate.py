@@ -203,7 +203,11 @@ def _terms(
 
 
 def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, int]]:
-    """Frames that share the first frame's camera and label size."""
+    """Frames that share the first frame's camera and label size, and whose own speed is known where most are.
+
+    Where it is not, nothing tells how far the car drove between sweep and image: taken for a car that stands, 10 frames
+    of 32 on a simulated highway moved the time offset by 30 ms.
+    """
     if not observations:
         return [], {}
     key = [
@@ -211,8 +215,13 @@ def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, i
         for o in observations
     ]
     used = [i for i, k in enumerate(key) if k == key[0]]
-    others = len(observations) - len(used)
-    return used, {"another camera": others} if others else {}
+    moving = [i for i in used if observations[i].ego_speed_mps is not None]
+    known = moving if 2 * len(moving) >= len(used) else used
+    rejected = {
+        "another camera": len(observations) - len(used),
+        "own speed unknown": len(used) - len(known),
+    }
+    return known, {reason: count for reason, count in rejected.items() if count}
 
 
 def _at_prior_tz(state: AlignmentState, prior: Prior, terms: Terms) -> AlignmentState:
