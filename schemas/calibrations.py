@@ -130,7 +130,8 @@ CALIBRATIONS = TableSchema(
         scalar(
             "diagnostics",
             "map<string,float64>",
-            "numbers behind the verdict (restarts, halves, biases), names with units",
+            "numbers behind the verdict (origins of the search, halves, biases), names with units; `disproved` is 1 "
+            "where a check shows that the pose is wrong",
         ),
         scalar("work_key", "string", "hash of code version, config, inputs"),
         scalar("code_version", "string", "boresight version"),

@@ -98,10 +98,10 @@ def _window(
 
 
 def _pairs(records: Sequence[CalibrationRecord], held_sigma_factor: float) -> dict[str, PairDays]:
-    """Estimates by pair, with larger sigmas where the day was held; refused days are gaps."""
+    """Estimates by pair, with larger sigmas where the day was held; refused and disproved days are gaps."""
     pairs = {}
     for pair in PAIRS:
-        rows = [r for r in records if r.pair == pair and r.status != "refused" and r.covariance is not None]
+        rows = [r for r in records if r.pair == pair and _may_be_right(r)]
         transforms = [transform_of(r) for r in rows]
         if rows:
             factor = np.array([1.0 if r.status == "accepted" else held_sigma_factor for r in rows])
@@ -114,6 +114,15 @@ def _pairs(records: Sequence[CalibrationRecord], held_sigma_factor: float) -> di
                 np.array([r.status == "accepted" for r in rows], dtype=bool),
             )
     return pairs
+
+
+def _may_be_right(record: CalibrationRecord) -> bool:
+    """Whether a record has a pose that no check disproved: a lost basin is 0.7 m off at a sigma of millimetres."""
+    return (
+        record.status != "refused"
+        and record.covariance is not None
+        and not record.diagnostics.get("disproved", 0.0)
+    )
 
 
 def _scatter(fleet_days: Sequence[dict[str, PairDays]]) -> dict[tuple[str, str], float]:

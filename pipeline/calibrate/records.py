@@ -196,6 +196,7 @@ def _claim_numbers(judged: Judged) -> dict[str, float]:
     certified = judged.verdict.determined
     return {
         "confidence": judged.verdict.score,
+        "disproved": float(judged.verdict.disproved),
         "vouched_az": float("azimuth" in certified),
         "vouched_el": float("elevation" in certified),
         "elevation_limit_rad": judged.claims["elevation"].limit_rad,

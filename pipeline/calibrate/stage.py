@@ -6,7 +6,7 @@ record.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -38,6 +38,9 @@ from schemas.observations import OBSERVATIONS, Observation
 
 __all__ = ["calibrate_observations", "work"]
 
+# Pairs that others are estimated with the help of: boxes are read through the camera, the camera's clock along the
+# heading that the radar shows.
+_HELPING = frozenset({"camera_lidar", "lidar_radar"})
 _TRIGGER_FRAMES = 40  # metrics are means over frames: more of them only cost time
 
 
@@ -139,13 +142,16 @@ def calibrate_observations(
         progress=lambda done, total, what: progress(1, 4, f"{what} ({done}/{total})"),
     )
     progress(2, 4, "judge on held-out frames")
+    solution, judged = _believed(
+        solution, lambda found: _judge_all(observations, selection, prior, found, fleet, active), active
+    )
     after = trigger_metrics(sample, {pair: solution.pairs[pair].T for pair in PAIRS})
     day = SolvedDay(
         observations,
         selection,
         prior,
         solution,
-        _judge_all(observations, selection, prior, solution, fleet, active),
+        judged,
         before,
         after,
         {pair: bool(fired[pair]) for pair in PAIRS},
@@ -153,6 +159,26 @@ def calibrate_observations(
     records = [record_of(about, pair, day) for pair in PAIRS]
     progress(4, 4, "done")
     return records
+
+
+def _believed(
+    solution: Solution, judge_all: Callable[[Solution], dict[str, Judged]], active: Sequence[str]
+) -> tuple[Solution, dict[str, Judged]]:
+    """The solution in which nothing rests on a pair that is not accepted, and its verdicts.
+
+    Pairs that help others and are not accepted are taken out, and what rested on them is solved and judged again; that
+    can cost another pair its acceptance, so again, until no more has to go.
+    """
+    judged, disbelieved = judge_all(solution), frozenset[str]()
+    while solution.without is not None:
+        held = {pair for pair in active if judged[pair].verdict.status != "accepted"}
+        more = disbelieved | (held & _HELPING)
+        if more == disbelieved:
+            break
+        disbelieved = more
+        solution = solution.without(disbelieved)
+        judged = judge_all(solution)
+    return solution, judged
 
 
 def _sync_gate_s(method: Method, fleet: FleetConfig) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,8 @@ class Prior:
     T_lidar_radar: np.ndarray
     rotation_sigma_rad: float
     translation_sigma_m: float
+    # What an earlier day found, where one was accepted: a place to look at, no information.
+    T_camera_lidar_before: np.ndarray | None = None
 
     @property
     def T_camera_radar(self) -> Float[np.ndarray, "4 4"]:
@@ -63,6 +66,7 @@ class PairEstimate:
     time_offset_sigma_s: float | None = None
     diagnostics: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    disproved: str = ""  # why it cannot be right, where a check of the solver's shows that
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,3 +83,5 @@ class Solution:
     loop_translation_m: float | None = None
     # By pair, checks that failed while solving, in words: restarts or halves disagree, camera contradicts radar.
     failed_checks: dict[str, list[str]] = field(default_factory=dict)
+    # Solves again whatever rests on the pairs named, without them; None where no pair rests on another.
+    without: Callable[[frozenset[str]], Solution] | None = None

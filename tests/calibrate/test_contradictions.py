@@ -141,3 +141,42 @@ def test_frames_that_ingest_was_told_to_pair_are_not_thrown_away_by_another_gate
         found = records_of(late, solver=nothing_found, ingest=ingest)
         assert all("sync" not in r.frames_rejected for r in found.values())
         assert found["camera_lidar"].frames_used >= 12
+
+
+def test_what_rests_on_a_pair_that_is_not_accepted_is_solved_again_until_nothing_does(street):
+    asked = []
+
+    def at_prior(pair, T):
+        unknown = np.zeros(6, bool)
+        return PairEstimate(pair, T, PRIOR.covariance(pair), np.zeros(6), unknown, 40)
+
+    def solution(disbelieved):
+        asked.append(disbelieved)
+        pairs = {pair: at_prior(pair, PRIOR.of(pair)) for pair in PAIRS}
+        checks = {} if disbelieved else {"camera_lidar": ["lost"]}
+        return Solution("joint", pairs, None, None, checks, solution)
+
+    records = records_of(street, solver=lambda *_, **__: solution(frozenset()))
+    # Nothing here determines anything, so both are held in the end, and each was taken out once.
+    assert asked[0] == frozenset()
+    assert asked[-1] == frozenset({"camera_lidar", "lidar_radar"})
+    assert len(asked) <= 3
+    assert {r.status for r in records.values()} == {"held"}
+
+
+def test_a_pose_beyond_the_search_range_is_disproved_and_one_that_is_only_unsure_is_not(street):
+    def solved(metres):
+        T = PRIOR.T_lidar_radar.copy()
+        T[0, 3] += metres
+        estimates = {
+            pair: PairEstimate(
+                pair, PRIOR.of(pair), PRIOR.covariance(pair), np.zeros(6), np.zeros(6, bool), 40
+            )
+            for pair in PAIRS
+        }
+        estimates["lidar_radar"] = replace(estimates["lidar_radar"], T=T)
+        return records_of(street, solver=lambda *_, **__: Solution("joint", estimates))
+
+    assert solved(0.75)["lidar_radar"].diagnostics["disproved"] == 1.0
+    assert solved(0.75)["camera_radar"].diagnostics["disproved"] == 1.0  # composed of it
+    assert solved(0.02)["lidar_radar"].diagnostics["disproved"] == 0.0

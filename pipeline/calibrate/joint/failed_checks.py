@@ -1,4 +1,4 @@
-"""Checks of method `joint` on its own estimates: restarts, disjoint halves, the camera, and the loop without the lidar.
+"""Checks of method `joint` on its own estimates: origins of the search, halves, the camera, the loop.
 
 Each returns sentences, one per failed check; none where all is well.
 """
@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.calibrate.joint.camera_lidar.initialise import SAME_ROTATION_RAD
+from pipeline.calibrate.joint.camera_lidar.initialise import Basin
 from pipeline.extrinsics.estimates import PairEstimate
 
-__all__ = ["camera_lidar_failures", "lidar_radar_failures", "open_loop"]
+__all__ = ["lidar_radar_failures", "open_loop", "unvouched_basin"]
 
 _SIGMAS = 3.0
 # Restarts end before the last steps: only what would be another basin counts, and only in what is claimed.
@@ -21,12 +21,17 @@ _NAMES = ("roll", "pitch", "yaw", "x", "y", "z")
 _KEYS = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
 
 
-def camera_lidar_failures(estimate: PairEstimate) -> list[str]:
-    """No second restart agrees: the score may have several maxima, and the covariance describes only one of them."""
-    apart_deg = estimate.diagnostics.get("restart_rotation_spread_deg", 0.0)
-    if apart_deg <= np.degrees(SAME_ROTATION_RAD):
-        return []
-    return [f"no restart agrees with the best one: the nearest other end is {apart_deg:.1f} deg away"]
+def unvouched_basin(basin: Basin) -> str:
+    """Why the basin is not to be believed: no other origin leads there. Empty where one does.
+
+    The score then has several maxima, and the covariance describes only one of them.
+    """
+    if basin.vouched_by:
+        return ""
+    return (
+        f"no other origin of the search agrees with the best end ({basin.origin}): "
+        f"the nearest other one is {np.degrees(basin.apart_rad):.1f} deg away"
+    )
 
 
 def lidar_radar_failures(estimate: PairEstimate) -> list[str]:

@@ -54,6 +54,7 @@ class Verdict:
     reason: str
     score: float = 0.0
     determined: tuple[str, ...] = field(default=())
+    disproved: bool = False  # a check shows that the pose is wrong, not only unproved: nobody should use it
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class _Check:
 
     margin: float
     reason: str
+    disproves: bool = False  # where it fails, the pose is wrong, not only unproved
 
 
 def judge(
@@ -93,6 +95,8 @@ def judge(
         few = f"too few frames: {estimate.frames_used}, needs {limits.min_fit_frames}"
         return Verdict("refused", "; ".join([*evidence.failed_checks, few]), _FAILED)
     checks = [_Check(_FAILED, sentence) for sentence in evidence.failed_checks]
+    if estimate.disproved:
+        checks.append(_Check(_FAILED, estimate.disproved, disproves=True))
     if factors:
         good = all(f.status == "accepted" for f in factors)
         margin = min(f.score for f in factors) if good else _FAILED
@@ -107,7 +111,8 @@ def judge(
     score = min(1.0, *(c.margin for c in checks))
     reasons = [c.reason for c in checks if c.margin < 0]
     if reasons:
-        return Verdict("held", "; ".join(reasons), score)
+        disproved = any(c.disproves for c in checks if c.margin < 0) or any(f.disproved for f in factors)
+        return Verdict("held", "; ".join(reasons), score, disproved=disproved)
     certified = tuple(name for name, claim in evidence.claims.items() if claim.margin >= 0)
     return Verdict("accepted", _reservations(estimate, evidence.claims), score, certified)
 
@@ -123,10 +128,15 @@ def _moves_little(
     ratio = np.abs(step) / np.sqrt(np.diag(prior.covariance(estimate.pair)))
     worst = int(np.argmax(ratio))
     return [
-        _Check(1 - rotation / reach, f"moved {np.degrees(rotation):.1f} deg, beyond the search range"),
+        _Check(
+            1 - rotation / reach,
+            f"moved {np.degrees(rotation):.1f} deg, beyond the search range",
+            disproves=True,
+        ),
         _Check(
             1 - translation / search.translation_m,
             f"moved {translation:.2f} m, beyond the search range",
+            disproves=True,
         ),
         _Check(
             1 - ratio[worst] / limits.max_move_prior_sigmas,
@@ -145,7 +155,7 @@ def _aligns_better(
             _FAILED, f"too few held-out frames to judge: {found}, needs {limits.min_held_out_frames}"
         )
     if test.z > limits.worse_alignment_z:
-        return _Check(1 - test.z / limits.worse_alignment_z, _worse(test))
+        return _Check(1 - test.z / limits.worse_alignment_z, _worse(test), disproves=True)
     name, ratio = _largest_move(estimate, prior)
     same = 1 - ratio / limits.prior_agreement_sigmas
     better = (-test.z - limits.better_alignment_z) / limits.better_alignment_z

@@ -14,7 +14,14 @@ import numpy as np
 if TYPE_CHECKING:
     from pipeline.geometry.cameras import Camera
 
-__all__ = ["camera_parameters", "most_points", "project_point", "project_points", "project_with_jacobian"]
+__all__ = [
+    "camera_parameters",
+    "count_in_view",
+    "most_points",
+    "project_point",
+    "project_points",
+    "project_with_jacobian",
+]
 
 _PINHOLE, _DISTORTED, _EQUIDISTANT = 0.0, 1.0, 2.0
 _POLYNOMIAL_DEGREE = 9
@@ -143,6 +150,26 @@ def project_points(
             )
         u[i] = cu + fu * a if seen else away
         v[i] = cv + fv * b
+
+
+@no_type_check
+@numba.njit(fastmath=True, nogil=True, cache=True, error_model="numpy")
+def count_in_view(
+    c: np.ndarray, xyz: np.ndarray, start: np.ndarray, poses: np.ndarray, width: int, height: int
+) -> np.ndarray:
+    """Points xyz[3, N] of all frames that each pose (rows of 3x4 transforms, P F 12) puts into the image."""
+    count, frames = poses.shape[0], poses.shape[1]
+    out = np.zeros(count, np.int64)
+    u_max, v_max = np.float32(width - 1), np.float32(height - 1)
+    us, vs = np.empty(most_points(start), np.float32), np.empty(most_points(start), np.float32)
+    for f in range(frames):
+        for p in range(count):
+            project_points(c, xyz, start[f], start[f + 1], poses[p, f], np.float32(1.0), us, vs)
+            for i in range(start[f + 1] - start[f]):
+                u, v = us[i], vs[i]
+                if u >= np.float32(0) and v >= np.float32(0) and u <= u_max and v <= v_max:
+                    out[p] += 1
+    return out
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code

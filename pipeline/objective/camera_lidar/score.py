@@ -12,7 +12,7 @@ from typing import no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 
 from pipeline.objective.camera_lidar.edges import (
     chance_of,
@@ -34,7 +34,7 @@ from pipeline.objective.camera_lidar.points import (
     is_near_view,
     view_bounds,
 )
-from pipeline.objective.camera_lidar.projection_loops import camera_parameters
+from pipeline.objective.camera_lidar.projection_loops import camera_parameters, count_in_view
 from pipeline.objective.camera_lidar.reflectivity import marking_gradients, marking_scores
 from pipeline.objective.stamp_gaps import camera_gaps_s
 from schemas.observations import Observation
@@ -147,6 +147,12 @@ class Terms:
         """Unweighted log likelihood ratio of the edges."""
         focal = at.focal.astype(np.float32)
         return edge_scores(self.camera, self.maps.offsets, self.edges, self.poses(at), focal, settings)
+
+    def edges_in_view(self, at: Alignments) -> Int64[np.ndarray, " P"]:
+        """How many edges each alignment puts into the image (at the logged focal length)."""
+        height, width = self.maps.offsets.shape[2:]
+        xyz = np.ascontiguousarray(self.edges.xyz_m.T)
+        return count_in_view(self.camera, xyz, self.edges.start, self.poses(at), width, height)
 
     def edge_excess(self, at: Alignments, settings: KernelSettings) -> Float[np.ndarray, "P F"]:
         """Edge score minus what the same edges score when the image is shifted: 0 for a pose that matches by chance.

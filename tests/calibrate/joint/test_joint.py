@@ -1,12 +1,14 @@
 """Method `joint`: the hard loop, what camera and radar alone may contradict, pairs that cannot be solved."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.solve import compose_pairs, solve_joint
+from pipeline.calibrate.joint.camera_lidar.estimate import Aligned, AlignmentState
+from pipeline.calibrate.joint.camera_lidar.initialise import Basin
+from pipeline.calibrate.joint.composition import compose_pairs
+from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
@@ -104,18 +106,47 @@ def test_pairs_that_cannot_be_solved_keep_the_prior_and_fail_a_check():
     assert len(solution.failed_checks["camera_radar"]) >= 2
 
 
-def test_a_camera_lidar_end_that_no_restart_came_near_fails_a_check_of_both_camera_pairs(monkeypatch):
-    for apart_deg, fails in ((0.1, False), (2.6, True)):
-        found = replace(camera_lidar(), diagnostics={"restart_rotation_spread_deg": apart_deg})
-        aligned = SimpleNamespace(T_camera_lidar=found.T, covariance=found.covariance)
-        monkeypatch.setattr("pipeline.calibrate.joint.solve.align_camera_lidar", lambda *_, a=aligned: a)
-        monkeypatch.setattr(
-            "pipeline.calibrate.joint.solve.analyse_camera_lidar", lambda *_, e=found, **__: e
-        )
-        solution = solve_joint(dict.fromkeys(PAIRS, street_day(3)), PRIOR, SolveConfig(), seed=0)
-        for pair in ("camera_lidar", "camera_radar"):
-            assert any("no restart" in why for why in solution.failed_checks.get(pair, [])) == fails
-        assert not any("no restart" in why for why in solution.failed_checks["lidar_radar"])
+def solved_with_camera(monkeypatch, day, vouched_by):
+    """The solution of a day whose camera-lidar is put in its place: at the truth, sure, and so vouched for."""
+    basin = Basin(AlignmentState(T_CAMERA_LIDAR), "prior", 4, vouched_by, float(np.radians(2.6)), 0.1)
+    covariance = np.diag([np.radians(0.02) ** 2] * 3 + [0.01**2] * 3)
+    aligned = object.__new__(Aligned)  # without the terms and frames that nothing here looks at
+    object.__setattr__(aligned, "basin", basin)
+    object.__setattr__(aligned, "state", AlignmentState(T_CAMERA_LIDAR))
+    monkeypatch.setattr(Aligned, "covariance", covariance)
+    monkeypatch.setattr("pipeline.calibrate.joint.solve.align_camera_lidar", lambda *_: aligned)
+    headings = []
+
+    def analysed(_aligned, _rng, *, heading):
+        headings.append(heading)
+        return camera_lidar()
+
+    monkeypatch.setattr("pipeline.calibrate.joint.solve.analyse_camera_lidar", analysed)
+    return solve_joint(dict.fromkeys(PAIRS, day), PRIOR, SolveConfig(), seed=0), headings
+
+
+def test_a_basin_that_no_other_origin_leads_to_disproves_both_camera_pairs_and_helps_nobody(monkeypatch):
+    day = street_day(12)
+    found, _ = solved_with_camera(monkeypatch, day, ("evolution",))
+    assert not found.pairs["camera_lidar"].disproved
+    assert found.pairs["lidar_radar"].diagnostics["boxes"] > 0
+    lost, _ = solved_with_camera(monkeypatch, day, ())
+    for pair in ("camera_lidar", "camera_radar"):
+        assert "2.6 deg away" in lost.pairs[pair].disproved
+    assert not lost.pairs["lidar_radar"].disproved
+    assert lost.pairs["lidar_radar"].diagnostics["boxes"] == 0
+    assert any("without its help" in note for note in lost.pairs["lidar_radar"].notes)
+
+
+def test_what_rested_on_a_disbelieved_pair_is_solved_again_without_it(monkeypatch):
+    found, headings = solved_with_camera(monkeypatch, street_day(12), ("evolution",))
+    assert headings[-1] is not None
+    without_camera = found.without(frozenset({"camera_lidar"}))
+    assert without_camera.pairs["lidar_radar"].diagnostics["boxes"] == 0
+    assert headings[-1] is not None
+    without_radar = found.without(frozenset({"lidar_radar"}))
+    assert without_radar.pairs["lidar_radar"].diagnostics["boxes"] > 0
+    assert headings[-1] is None
 
 
 def test_an_untriggered_camera_lidar_stays_at_the_prior_and_its_boxes_are_not_trusted():

@@ -126,7 +126,8 @@ def align_camera_lidar(
 
     first = KernelSettings.wide(*SCHEDULE.kernels[0])
     sharp = terms.sharp(MAX_GAP_PX)
-    thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config)
+    limits = search_range(prior, config)
+    thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config, limits)
     basin = find_basin(terms, thin, rng)
     sharp = sharp.in_view(basin.state.T_camera_lidar, _MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
     # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
@@ -138,7 +139,7 @@ def align_camera_lidar(
     for sigma_px, contrast in SCHEDULE.kernels[1:]:
         fitted = sharp.fitted(state.alone, KernelSettings.wide(sigma_px, contrast), rng)
         kernel = weighted(sharp, state, fitted)
-        scored = Scored(sharp, kernel, prior, config)
+        scored = Scored(sharp, kernel, prior, config, limits)
         state = refine(scored, state, steps=SCHEDULE.sharper_steps, fixed=fixed)
     problem = CameraLidarProblem(
         sharp,
@@ -240,10 +241,10 @@ def _diagnostics(
     apart = difference(halves[0], halves[1])
     kernel, profile = analysis.kernel, analysis.profile
     return {
-        "restarts": float(basin.restarts),
-        "restart_rotation_spread_deg": float(np.degrees(basin.rotation_spread_rad)),
-        "restart_translation_spread_m": basin.translation_spread_m,
-        "restart_score_spread": basin.score_spread,
+        "candidates": float(basin.candidates),
+        "vouching_origins": float(len(basin.vouched_by)),
+        "other_origin_deg": float(np.degrees(basin.apart_rad)),
+        "basin_score_lead": basin.score_lead,
         **{f"halves_{n}_deg": float(np.degrees(abs(apart[i]))) for i, n in enumerate(("rx", "ry", "rz"))},
         **{f"halves_{n}_m": float(abs(apart[3 + i])) for i, n in enumerate(("tx", "ty", "tz"))},
         "halves_dt_s": float(abs(apart[6])),

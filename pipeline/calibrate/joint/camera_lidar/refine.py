@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.numerics.bias_floors import FOCAL_SIGMA, TYPICAL_RANGE_M, TYPICAL_SPEED_MPS
 from pipeline.calibrate.numerics.response_surface import DESIGN, at_least, fit_quadratics
+from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3
@@ -68,6 +69,16 @@ class AlignmentState:
         t = np.where(fixed[3:6], prior.T_camera_lidar[:3, 3], self.T_camera_lidar[:3, 3])
         return replace(self, T_camera_lidar=from_rotation_translation(R, t))
 
+    def within(self, prior: Prior, limits: SearchRange) -> AlignmentState:
+        """The nearest state whose turn and shift from the prior stay, per axis, within the search range."""
+        turn = log_so3(self.T_camera_lidar[:3, :3] @ prior.T_camera_lidar[:3, :3].T)
+        shift = self.T_camera_lidar[:3, 3] - prior.T_camera_lidar[:3, 3]
+        if np.abs(turn).max() <= limits.rotation_rad and np.abs(shift).max() <= limits.translation_m:
+            return self
+        R = exp_so3(np.clip(turn, -limits.rotation_rad, limits.rotation_rad)) @ prior.T_camera_lidar[:3, :3]
+        t = prior.T_camera_lidar[:3, 3] + np.clip(shift, -limits.translation_m, limits.translation_m)
+        return replace(self, T_camera_lidar=from_rotation_translation(R, t))
+
     @property
     def alone(self) -> Alignments:
         """The state as one candidate."""
@@ -76,12 +87,16 @@ class AlignmentState:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """What a refinement maximises: the terms' score at a kernel plus the prior's log density."""
+    """What a refinement maximises: the terms' score at a kernel plus the prior's log density.
+
+    `limits` is the range about the prior that it does not leave; None = no limit.
+    """
 
     terms: Terms
     kernel: KernelSettings
     prior: Prior
     config: SolveConfig
+    limits: SearchRange | None = None
 
 
 def prior_value(at: Alignments, prior: Prior, config: SolveConfig) -> Float[np.ndarray, " P"]:
@@ -119,6 +134,8 @@ def refine(
         step[free] = np.linalg.solve(curvature[np.ix_(free, free)], gradient[free])
         length = float(np.linalg.norm(step))
         state = state.stepped(step / max(length, 1.0) * scale).with_fixed(scored.prior, fixed)
+        if scored.limits is not None:
+            state = state.within(scored.prior, scored.limits)
         if length < _CONVERGED:
             break
         if length < 1.0:

@@ -14,12 +14,22 @@ class Schedule:
     # Kernel width [label px] and contrast level, from wide to sharp.
     kernels: tuple[tuple[float, int], ...] = ((4.0, 0), (2.5, 1), (1.5, 2))
 
-    # Basin: restarts of a differential evolution at a coarse kernel, each refined at the first kernel above.
+    # Basin: candidates of different origin climb at the first kernel above, until another origin's end agrees.
+    wide_climb_steps: int = 4
+    climb_steps: int = 6
+    finishing_steps: int = 4  # of the best end
+    fewest_origins: int = 3  # that are tried whatever agrees
+    evolutions: int = 3
+    # Grid of rotations: kernel, step in kernels, points, how many of its maxima are climbed and how far apart they are.
+    grid_kernel_deg: float = 0.6
+    wide_grid_kernel_deg: float = 0.9  # beyond wide_box_deg
+    grid_step_kernels: float = 1.5
+    grid_points: int = 2500
+    grid_maxima: int = 2
+    grid_apart_kernels: float = 3.0
+    # Evolution: kernel [label px], share of matching edges that it presumes.
     coarse_kernel: tuple[float, int] = (10.0, 0)
-    coarse_match: float = 0.1  # share of matching edges that the coarse kernel presumes
-    restarts: int = 2
-    max_restarts: int = 6
-    restart_steps: int = 10
+    coarse_match: float = 0.1
     # Candidates, generations and points of the evolution: in a box of 6 deg about the prior ...
     narrow_evolution: tuple[int, int, int] = (48, 36, 6000)
     # ... and in one beyond wide_box_deg, as of 20 or 30.
