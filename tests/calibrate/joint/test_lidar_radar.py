@@ -11,9 +11,9 @@ from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import exp_se3, log_se3, perturb_exactly
+from pipeline.geometry.se3 import exp_se3, exp_so3, log_se3, perturb_exactly
 from pipeline.geometry.spherical import from_spherical, to_spherical
-from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
+from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 CONFIG = SolveConfig()
@@ -76,6 +76,7 @@ def test_a_radar_without_elevation_leaves_roll_and_pitch_to_the_prior():
     assert_kept(found, prior)
     assert abs(error_of(found)[2]) < np.radians(0.2)
     assert any("roll, pitch" in note for note in found.notes)
+    assert any("measures no elevation" in note for note in found.notes)
 
 
 def test_a_height_that_the_day_cannot_tell_stays_while_a_knock_aside_is_found(day):
@@ -139,6 +140,36 @@ def test_a_radar_of_poor_elevation_is_not_trusted_with_roll(day):
     assert sigma[1] > 2 * sigma[0]
     for found, s in zip((sharp, poor), sigma, strict=True):
         assert abs(error_of(found)[0]) < 3 * s
+
+
+def with_road(day, pitched_deg=0.0):
+    """The same day with its ground known, and velocities that point up by so much."""
+    up = exp_so3(np.array([0.0, -np.radians(pitched_deg), 0.0]))
+    return [
+        replace(
+            o,
+            lidar_map_is_ground=(o.lidar_map_xyz_m[:, 2] < GROUND_M + 0.01).astype(np.uint8),
+            radar_velocity_mps=up @ o.radar_velocity_mps,
+        )
+        for o in day
+    ]
+
+
+def test_the_way_along_the_road_makes_pitch_surer(day):
+    blind, seeing = (solve(rows, prior_off_by(1, 0.02), None) for rows in (day[:20], with_road(day[:20])))
+    assert blind.diagnostics["doppler_frames"] == 0
+    assert seeing.diagnostics["doppler_frames"] >= 10
+    assert seeing.covariance[1, 1] < 0.8 * blind.covariance[1, 1]
+    assert abs(error_of(seeing)[1]) < 3 * np.sqrt(seeing.covariance[1, 1])
+    assert not any("contradict" in note for note in seeing.notes)
+
+
+def test_a_way_that_contradicts_the_registration_makes_pitch_less_sure_and_says_so(day):
+    agreeing, contradicting = (
+        solve(with_road(day[:20], pitched_deg), prior_off_by(1, 0.02), None) for pitched_deg in (0.0, 3.0)
+    )
+    assert contradicting.covariance[1, 1] > 4 * agreeing.covariance[1, 1]
+    assert any("witnesses of radar pitch contradict each other" in note for note in contradicting.notes)
 
 
 def test_constant_elevation_and_range_errors_are_named_as_assumptions(day):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.calibrate.joint.lidar_radar.normal_equations import DT, RANGE, Linear, RadarState
-from pipeline.calibrate.joint.lidar_radar.witnesses import contradiction, own_numbers
+from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, own_numbers
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD, RANGE_BIAS_SIGMA_M
 from pipeline.geometry.changes import change_between
 
@@ -28,6 +28,7 @@ class ObservabilityAnalysis:
     covariance: np.ndarray  # P P, of all unknowns, turns about the radar
     fixed: np.ndarray  # P, bool
     observability: np.ndarray  # 7, of pose and dt
+    witnesses: tuple[Witness, ...]  # of pitch, asked where the car's way had no say yet
 
 
 def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[str]:
@@ -53,7 +54,7 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
         notes.append(
             "radar pitch assumes that the car drives along its road, as the lidar sees it under the car"
         )
-    disagreement = contradiction(linear.witnesses)
+    disagreement = contradiction(analysis.witnesses)
     if disagreement is not None:
         notes.append(disagreement.sentence)
     bias_sigma_m = float(np.sqrt(analysis.covariance[RANGE, RANGE]))
@@ -96,7 +97,7 @@ def diagnostics_of(
         "registration_roll_sigma_rad": float(linear.floor[0]),
         "registration_pitch_offset_rad": float(linear.registration_step[1]),
         "registration_pitch_sigma_rad": float(linear.floor[1]),
-        **own_numbers(linear.witnesses),
+        **own_numbers(analysis.witnesses),
         "doppler_frames": float(linear.travel_frames),
         "doppler_scatter_rad": linear.travel_scatter_rad,
         **{f"halves_{n}": float(v) for n, v in zip(_DOF_UNITS, half, strict=True)},

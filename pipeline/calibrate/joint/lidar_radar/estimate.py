@@ -26,11 +26,12 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import (
     RadarProblem,
     RadarState,
     linearise,
+    travel_opinion,
 )
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, anneal, finish, last_step, scan
-from pipeline.calibrate.joint.lidar_radar.witnesses import contradiction
+from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction
 from pipeline.calibrate.numerics.bias_floors import (
     LIDAR_RADAR_BIAS,
     LIDAR_RADAR_DT_FLOOR_S,
@@ -42,7 +43,7 @@ from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.changes import change_jacobian
+from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import normal_equations, registration_frames
 from pipeline.objective.radar.travel import travel_directions
@@ -97,15 +98,15 @@ def estimate_lidar_radar(
     ends = [anneal(some, start) for start in scan(problem, config)]
     costs = [_comparison_cost(problem, end) for end in ends]
     best = ends[int(np.argmin([c.mean() for c in costs]))]
+    witnesses: tuple[Witness, ...] | None = None
+    without_way = best
     if "doppler" in config.terms:
-        travel = travel_directions(
-            problem.observations, best.T_lidar_radar, best.dt_s - problem.constant_gap_s
-        )
-        problem = replace(problem, travel=travel)
-    analysis = _analyse_observability(problem, best, camera, config, rng)
+        problem, without_way, witnesses = _with_way(problem, best)
+    analysis = _analyse_observability(problem, without_way, camera, config, rng)
     other = _better_time_offset(problem, analysis.state)
     if other is not None:
         analysis = _analyse_observability(problem, other, camera, config, rng)
+    analysis = _with_witnesses(analysis, witnesses, without_way)
     parts = [problem.of_frames(np.arange(k, count, 2)) for k in (0, 1)]
     halves = [finish(part, analysis.state, analysis.fixed)[0] for part in parts]
     return _conclude(problem, analysis, [best, _second_best(ends, costs)], halves, rejected)
@@ -149,6 +150,36 @@ def _problem(
         gap_s,
     )
     return problem, rejected
+
+
+def _with_way(
+    problem: RadarProblem, state: RadarState
+) -> tuple[RadarProblem, RadarState, tuple[Witness, ...]]:
+    """The problem with the car's way, the solution without it, and what all witnesses say of that solution's pitch.
+
+    They are asked there, and the radar's sigmas are estimated there: a wrong way would draw the pose along, and the
+    registration would then take what contradicts it for noise.
+    """
+    state, linear = finish(problem, state, sharpen=True)
+    dt_s = state.dt_s - problem.constant_gap_s
+    seeing = replace(problem, travel=travel_directions(problem.observations, state.T_lidar_radar, dt_s))
+    way = travel_opinion(seeing, state)
+    return seeing, state, linear.witnesses if way is None else (*linear.witnesses, way)
+
+
+def _with_witnesses(
+    analysis: ObservabilityAnalysis, witnesses: tuple[Witness, ...] | None, asked_at: RadarState
+) -> ObservabilityAnalysis:
+    """The analysis with what witnesses say of its pitch, which is less sure where they contradict each other."""
+    if witnesses is None:
+        return analysis
+    moved = float(change_between(asked_at.T_lidar_radar, analysis.state.T_lidar_radar)[PITCH])
+    witnesses = tuple(replace(w, offset_rad=w.offset_rad - moved) for w in witnesses)
+    covariance, disagreement = analysis.covariance.copy(), contradiction(witnesses)
+    if disagreement is not None and not analysis.fixed[PITCH]:
+        covariance[PITCH] *= disagreement.factor
+        covariance[:, PITCH] *= disagreement.factor
+    return replace(analysis, witnesses=witnesses, covariance=covariance)
 
 
 def _usable_camera(
@@ -219,7 +250,8 @@ def _analyse_observability(
             state = state.with_fixed(problem.prior, fixed)
             state = _better_time_offset(problem, state) or state
         # Once the radar's sigmas are estimated they stay, so that solutions can be compared.
-        state, linear = finish(problem, state, fixed, sharpen=not fixed.any())
+        sharpen = problem.travel is None and not fixed.any()
+        state, linear = finish(problem, state, fixed, sharpen=sharpen)
         information = _with_measured_curvature(problem, state, linear.information)
         curvature = information.sum(0) + linear.prior_information
         variance = 1 / np.diag(linear.prior_information)
@@ -235,11 +267,7 @@ def _analyse_observability(
             break
         fixed[: DT + 1] |= removed < OBSERVABLE
     full[np.arange(DT + 1), np.arange(DT + 1)] += bias
-    disagreement = contradiction(linear.witnesses)
-    if disagreement is not None and not fixed[PITCH]:
-        full[PITCH] *= disagreement.factor
-        full[:, PITCH] *= disagreement.factor
-    return ObservabilityAnalysis(state, linear, full, fixed, observability)
+    return ObservabilityAnalysis(state, linear, full, fixed, observability, linear.witnesses)
 
 
 def _observability(variance: np.ndarray, bias: np.ndarray, before: np.ndarray) -> np.ndarray:

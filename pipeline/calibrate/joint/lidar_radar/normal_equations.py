@@ -56,6 +56,7 @@ __all__ = [
     "RadarState",
     "linearise",
     "tempered",
+    "travel_opinion",
 ]
 
 PITCH, DT, RANGE = 1, 6, 7
@@ -306,12 +307,20 @@ def _add_travel(problem: RadarProblem, state: RadarState, sums: _Sums) -> tuple[
     if problem.travel is None:
         return float("nan"), None
     H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
-    witness = own_opinion("doppler", H[:, 1:, 1:].sum(0), g[:, 1:].sum(0), DOPPLER_PITCH_FLOOR_RAD)
+    witness = travel_opinion(problem, state)
     H, g = tempered(H, g, np.full(2, DOPPLER_PITCH_FLOOR_RAD))
     for array in (sums.H, sums.information):
         array[:, :2, :2] += H
     sums.g[:, :2] += g
     return scatter, witness
+
+
+def travel_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
+    """What the car's way says of pitch at a state; None where it says nothing."""
+    if problem.travel is None:
+        return None
+    H, g, _ = pitch_equations(problem.travel, state.T_lidar_radar, len(problem.observations))
+    return own_opinion("doppler", H[:, 1:, 1:].sum(0), g[:, 1:].sum(0), DOPPLER_PITCH_FLOOR_RAD)
 
 
 def _add_elevations(
