@@ -3,9 +3,10 @@
     python tests/benchmarks/studies/days.py generate --root DAYS --sets clocks
     python tests/benchmarks/studies/clocks.py --root DAYS --workers 2
 
-Eight drives of 40 frames, urban and highway in turn, each driven with four kinds of clocks: triggered by the lidar
+Six drives of 40 frames, urban and highway in turn, each driven with several kinds of clocks: triggered by the lidar
 within a few milliseconds; running freely at 30, 10 and 13 Hz; triggered with stamps that lie (camera 60 ms late, radar
-60 ms early, the measurements themselves together); triggered, with a camera that measures 60 ms before its stamp.
+60 ms early, the measurements themselves together); four of them triggered, with a camera that measures 60 ms before its
+stamp. Ratios are to the same drives triggered.
 Every vehicle has delays of its own besides (12 and -18 ms, scattering by 4 ms).
 """
 

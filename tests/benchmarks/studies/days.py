@@ -234,9 +234,9 @@ SETS: dict[str, list[DaySpec]] = {
     "offsets": [*_both(3700, 5, fault="camera:time:0.04"), *_both(3705, 5, fault="radar:time:0.04")],
     # The same drives with sensors that the lidar triggers, that run freely, and with a camera that is 60 ms late.
     "clocks": [
-        *_both(4100, 8),
-        *_both(4100, 8, rig="paper-free"),
-        *_both(4100, 8, fault="camera:time:0.06"),
+        *_both(4100, 6),
+        *_both(4100, 6, rig="paper-free"),
+        *_both(4100, 4, fault="camera:time:0.06"),
     ],
     "dev-clocks": [*_both(160, 8), *_both(160, 8, rig="paper-free")],
     "radar-elevation": [
