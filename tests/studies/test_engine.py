@@ -298,7 +298,7 @@ def test_seeds_of_tuning_and_test_sets_never_meet():
 
 def test_an_ablation_changes_one_thing_at_a_time():
     settings = [setting_of(asdict(run)) for run in _settings(SPEC, 1)]
-    assert len(set(settings)) == len(settings) == 13
+    assert len(set(settings)) == len(settings) == 14
     assert settings[0] == "all"
 
 
