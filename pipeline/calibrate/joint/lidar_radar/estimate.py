@@ -31,12 +31,11 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import (
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, anneal, finish, last_step, scan
+from pipeline.calibrate.joint.lidar_radar.time_offset import better_time_offset, comparison_cost
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction
 from pipeline.calibrate.numerics.bias_floors import (
     LIDAR_RADAR_BIAS,
     LIDAR_RADAR_DT_FLOOR_S,
-    OUTLIER_DENSITY,
-    REGISTRATION_COMPARISON_SIGMA,
 )
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
 from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
@@ -45,7 +44,7 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.objective.radar.moving_clusters import moving_clusters
-from pipeline.objective.radar.registration import normal_equations, registration_frames
+from pipeline.objective.radar.registration import registration_frames
 from pipeline.objective.radar.travel import travel_directions
 from pipeline.objective.radar.vehicle_boxes import vehicle_boxes
 from pipeline.objective.stamp_gaps import constant_gap_s, radar_gaps_s
@@ -96,20 +95,25 @@ def estimate_lidar_radar(
     count = problem.frames.count
     some = problem if count < SCHEDULE.many_frames else problem.of_frames(np.arange(0, count, 2))
     ends = [anneal(some, start) for start in scan(problem, config)]
-    costs = [_comparison_cost(problem, end) for end in ends]
+    costs = [comparison_cost(problem, end) for end in ends]
     best = ends[int(np.argmin([c.mean() for c in costs]))]
     witnesses: tuple[Witness, ...] | None = None
     without_way = best
     if "doppler" in config.terms:
         problem, without_way, witnesses = _with_way(problem, best)
     analysis = _analyse_observability(problem, without_way, camera, config, rng)
-    other = _better_time_offset(problem, analysis.state)
+    other = better_time_offset(problem, analysis.state)
     if other is not None:
         analysis = _analyse_observability(problem, other, camera, config, rng)
     analysis = _with_witnesses(analysis, witnesses, without_way)
     parts = [problem.of_frames(np.arange(k, count, 2)) for k in (0, 1)]
     halves = [finish(part, analysis.state, analysis.fixed)[0] for part in parts]
-    return _conclude(problem, analysis, [best, _second_best(ends, costs)], halves, rejected)
+    rival = _second_best(ends, costs)
+    if rival is not best:
+        # Annealed ends lie a few steps before their optimum: only where they end up do they agree or not.
+        rival = finish(problem, rival.with_fixed(problem.prior, analysis.fixed), analysis.fixed)[0]
+    compared = [analysis.state, analysis.state if rival is best else rival]
+    return _conclude(problem, analysis, compared, halves, rejected)
 
 
 def _problem(
@@ -198,31 +202,6 @@ def _consistent_with_odometry(observations: Sequence[Observation]) -> list[Obser
     return [o for o, w in zip(observations, wrong, strict=True) if not w]
 
 
-def _comparison_cost(problem: RadarProblem, state: RadarState) -> np.ndarray:
-    """Cost of each frame (F), to compare the ends of different starts: the same sigmas for all."""
-    T, dt_s = state.T_lidar_radar, state.dt_s
-    return normal_equations(
-        problem.frames, T, dt_s, REGISTRATION_COMPARISON_SIGMA, 0.0, OUTLIER_DENSITY, stride=2
-    ).cost
-
-
-def _better_time_offset(problem: RadarProblem, state: RadarState) -> RadarState | None:
-    """The state with another time offset, where the frames' cost is clearly lower than at the solution's own.
-
-    Sharp sigmas reach half a metre: at 30 m/s a time offset that is 20 ms off is beyond that, and would stay there.
-    """
-    speed_mps = float(np.sqrt(np.mean(np.sum(problem.frames.velocity_mps**2, axis=1))))
-    step_s = SCHEDULE.dt_compare_step_m / max(speed_mps, SCHEDULE.least_scan_speed_mps)
-    count = int(2 * problem.dt_sigma_s / step_s)
-    own = _comparison_cost(problem, state)
-    others = [replace(state, dt_s=step_s * k) for k in range(-count, count + 1)]
-    costs = [_comparison_cost(problem, other) - own for other in others]
-    best = int(np.argmin([c.mean() for c in costs]))
-    better = costs[best].mean() < -_CLEARLY * costs[best].std() / np.sqrt(len(own))
-    apart = abs(others[best].dt_s - state.dt_s) > step_s
-    return others[best] if better and apart else None
-
-
 def _second_best(ends: list[RadarState], costs: list[np.ndarray]) -> RadarState:
     """The end of another start whose cost is not clearly higher than the best one's; else the best one itself."""
     best = int(np.argmin([c.mean() for c in costs]))
@@ -248,7 +227,7 @@ def _analyse_observability(
         if fixed.any() and not fixed[DT]:
             # While free, x had followed dt through their valley; with x back at the prior, dt may be out of reach.
             state = state.with_fixed(problem.prior, fixed)
-            state = _better_time_offset(problem, state) or state
+            state = better_time_offset(problem, state) or state
         # Once the radar's sigmas are estimated they stay, so that solutions can be compared.
         sharpen = problem.travel is None and not fixed.any()
         state, linear = finish(problem, state, fixed, sharpen=sharpen)
@@ -265,7 +244,11 @@ def _analyse_observability(
         observability[free] = removed[free]
         if np.all(removed[free] >= OBSERVABLE):
             break
-        fixed[: DT + 1] |= removed < OBSERVABLE
+        unknown = removed < OBSERVABLE
+        # Where x and dt look alike, neither is determined while both are free, and one is once the other is fixed. Both
+        # fixed, they contradict the scene by metres, and yaw follows.
+        unknown[DT] &= not np.any(unknown[:DT] & ~fixed[:DT])
+        fixed[: DT + 1] |= unknown
     full[np.arange(DT + 1), np.arange(DT + 1)] += bias
     return ObservabilityAnalysis(state, linear, full, fixed, observability, linear.witnesses)
 

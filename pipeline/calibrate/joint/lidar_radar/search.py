@@ -17,6 +17,7 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import (
     linearise,
 )
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
+from pipeline.calibrate.joint.lidar_radar.time_offset import scan_time_offset
 from pipeline.calibrate.numerics.bias_floors import BOX_ELEVATION_GATES_RAD, OUTLIER_DENSITY
 from pipeline.config import SolveConfig
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
@@ -65,7 +66,7 @@ def anneal(problem: RadarProblem, state: RadarState) -> RadarState:
             pairs = _boxes(problem, state, BOX_ELEVATION_GATES_RAD[min(k, 1)])
         linear = linearise(problem, state, widen, pairs, stride=SCHEDULE.stride)
         if k in SCHEDULE.dt_scans:
-            state, valley = _scan_dt(problem, state, SCHEDULE.dt_scans[k]), _Valley()
+            state, valley = scan_time_offset(problem, state, SCHEDULE.dt_scans[k]), _Valley()
         # Where sigmas are wide, dt would only wander: x shifts detections as it does.
         fixed = _ONLY_DT if widen > 1.0 else NONE_FIXED
         em_share = SCHEDULE.wide_em_share if widen > 1.0 else SCHEDULE.sharp_em_share
@@ -74,29 +75,6 @@ def anneal(problem: RadarProblem, state: RadarState) -> RadarState:
         if widen == 1.0:
             state, valley = _sharpened(linear, state), valley.forgetting()
     return state
-
-
-def _scan_dt(problem: RadarProblem, state: RadarState, widen: float) -> RadarState:
-    """The time offset under which most detections meet the lidar, by the medium cost of some frames.
-
-    At 30 m/s 25 ms are 0.75 m: posts and signs are then out of reach of sharp sigmas, and guard rails meet themselves.
-    """
-    frames = problem.frames
-    speed = float(np.sqrt(np.mean(np.sum(frames.velocity_mps**2, axis=1))))
-    step_s = SCHEDULE.dt_scan_step_m / max(speed, SCHEDULE.least_scan_speed_mps)
-    count = int(np.ceil(2 * problem.dt_sigma_s / step_s))
-    part = frames.subset(np.arange(0, frames.count, 1 + (frames.count > SCHEDULE.scan_frames)))
-    offsets = state.dt_s + step_s * np.arange(-count, count + 1)
-
-    def cost(dt_s: float) -> float:
-        T, sigma = state.T_lidar_radar, widen * SIGMA_START
-        found = normal_equations(
-            part, T, dt_s, sigma, 0.0, OUTLIER_DENSITY, SCHEDULE.stride, state.range_bias_m
-        )
-        detections = max(len(part.radar_m) / SCHEDULE.stride / max(part.count, 1), 1.0)
-        return float(found.cost.sum() * detections) + 0.5 * (dt_s / problem.dt_sigma_s) ** 2
-
-    return replace(state, dt_s=float(offsets[int(np.argmin([cost(float(dt_s)) for dt_s in offsets]))]))
 
 
 def finish(
