@@ -7,10 +7,11 @@ record.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 
+from pipeline.calibrate.earlier import accepted_before
 from pipeline.calibrate.methods import Method, Solver, method_named
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
@@ -87,6 +88,8 @@ def _records(task: Task, method: Method, about: Inputs, progress: Progress) -> l
     try:
         rows = _observations(task.lake, task.partition)
         prior = perturbed(read_prior(rows, fleet, task.partition.vehicle), task.perturb, about.seed)
+        before = accepted_before(task.lake, task.partition, method.name)
+        prior = replace(prior, T_camera_lidar_before=before)
         return calibrate_observations(rows, prior, fleet, about, progress, method.solver_of(task))
     except SolveError as err:
         return refused_records(about, err.reason, len(rows), prior)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from pipeline.calibrate.joint.failed_checks import open_loop
@@ -43,7 +45,7 @@ def compose_pairs(
         observability,
         observable,
         min(camera_lidar.frames_used, lidar_radar.frames_used),
-        {},
+        _either(camera_lidar.frames_rejected, lidar_radar.frames_rejected),
         *_time_offset(camera_lidar, lidar_radar),
         diagnostics,
         [
@@ -76,6 +78,11 @@ def _composed_observability(
         of_prior += np.diag(unseen @ own[np.ix_(~estimate.observable, ~estimate.observable)] @ unseen.T)
     observability = np.clip(1 - variance / np.diag(prior.covariance("camera_radar")), 0.0, 1.0)
     return observability, (observability >= OBSERVABLE) & (of_prior < _MOSTLY * variance)
+
+
+def _either(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
+    """Frames that one of the factors could not use, by reason."""
+    return {reason: a.get(reason, 0) + b.get(reason, 0) for reason in {**a, **b}}
 
 
 def _time_offset(camera_lidar: PairEstimate, lidar_radar: PairEstimate) -> tuple[float | None, float | None]:

@@ -1,5 +1,6 @@
 """The basin: candidates of different origin, what vouches for an end, the search range as a hard limit."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -107,11 +108,17 @@ def test_one_origin_alone_vouches_for_nothing(terms, monkeypatch):
     assert "evolution" in unvouched_basin(basin)
 
 
-def test_the_state_of_an_earlier_day_is_an_origin(terms):
+def test_the_state_of_an_earlier_day_is_looked_at_where_the_others_do_not_agree(terms, monkeypatch):
     prior = replace(off_by(5.0, 0.05, 6), T_camera_lidar_before=T_TRUE)
-    basin = searched(terms, prior)
-    assert degrees_off(basin.state.T_camera_lidar) < KERNEL_DEG
-    assert "state" in {basin.origin, *basin.vouched_by}
+    agreed = searched(terms, prior)
+    assert "state" not in {agreed.origin, *agreed.vouched_by}  # and so changes no bit of it
+    wrong = [turned(prior.T_camera_lidar, np.radians([sign * 5.0, 0.0, sign * 5.9])) for sign in (1, -1)]
+    halves = itertools.cycle([[wrong[0]], [wrong[1]]])
+    monkeypatch.setattr(initialise, "grid_maxima", lambda *_: next(halves))
+    monkeypatch.setattr(initialise, "_evolved", lambda *_: AlignmentState(T_TRUE))
+    rescued = searched(terms, prior)
+    assert degrees_off(rescued.state.T_camera_lidar) < KERNEL_DEG
+    assert {rescued.origin, *rescued.vouched_by} >= {"state", "evolution"}
 
 
 def test_no_climb_leaves_the_search_range(terms):

@@ -80,7 +80,8 @@ def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator) -> Basin:
         apart = [_apart_rad(scored.terms, e.state, best.state) for e in ends]
         near = {e.origin for e, a in zip(ends, apart, strict=True) if a < same_rad}
         vouching = tuple(sorted(near - {best.origin}))
-        if len({e.origin for e in ends}) >= SCHEDULE.fewest_origins and vouching:
+        # The prior alone does not end the search: where a grid was misled to its side, both climb to the same end.
+        if len(near - {"prior"}) > 1:
             break
     others = [a for a, e in zip(apart, ends, strict=True) if e.origin != best.origin]
     elsewhere = [e.score for a, e in zip(apart, ends, strict=True) if a >= same_rad]
@@ -105,8 +106,6 @@ def _candidates(
     """Starts with the name of their origin, those first that cost least."""
     prior, config = scored.prior, scored.config
     yield "prior", AlignmentState(prior.T_camera_lidar)
-    if prior.T_camera_lidar_before is not None:
-        yield "state", AlignmentState(prior.T_camera_lidar_before)
     reach = search_range(prior, config).rotation_rad
     # Each half of the frames by itself: what both show is no accident of one scene.
     sharp = terms.sharp(MAX_GAP_PX)
@@ -114,7 +113,12 @@ def _candidates(
     grids = [grid_maxima(half, prior.T_camera_lidar, reach, rng) for half in halves]
     for name, grid in zip(("grid, even frames", "grid, odd frames"), grids, strict=True):
         yield name, AlignmentState(grid[0])
-    for _ in range(SCHEDULE.evolutions):
+    yield "evolution", _evolved(terms, prior, config, rng)
+    if prior.T_camera_lidar_before is not None:
+        # Not before: whether an earlier day was calibrated already must not change a day whose own data agree.
+        state = AlignmentState(prior.T_camera_lidar_before)
+        yield "state", state.within(prior, search_range(prior, config))
+    for _ in range(SCHEDULE.evolutions - 1):
         yield "evolution", _evolved(terms, prior, config, rng)
     for name, grid in zip(("grid, even frames", "grid, odd frames"), grids, strict=True):
         for T in grid[1:]:

@@ -18,7 +18,6 @@ class Schedule:
     wide_climb_steps: int = 4
     climb_steps: int = 6
     finishing_steps: int = 4  # of the best end
-    fewest_origins: int = 3  # that are tried whatever agrees
     evolutions: int = 3
     # Grid of rotations: kernel, step in kernels, points, how many of its maxima are climbed and how far apart they are.
     grid_kernel_deg: float = 0.6
