@@ -161,9 +161,13 @@ def _assumed(pair: str, observations: Sequence[Observation]) -> list[str]:
     edge = np.array([[0.0, o.image_height_px / 2], [o.image_width_px - 1.0, o.image_height_px / 2]])
     angles = camera_direction_angles(camera.unproject(edge)) - camera_direction_angles(wrong.unproject(edge))
     worth = float(np.degrees(np.abs(angles[:, 0]).max()))
+    turn = float(np.degrees(1 / o.camera_K[0, 0]))
     return [
         *assumed,
-        f"camera intrinsics as logged: a focal length wrong by 0.1 % puts the image's edge {worth:.2f} deg off",
+        (
+            f"camera intrinsics as logged: a focal length wrong by 0.1 % puts the image's edge {worth:.2f} deg off, a "
+            f"principal point wrong by 1 px is a camera turned by {turn:.2f} deg: no alignment tells the two apart"
+        ),
     ]
 
 

@@ -239,6 +239,18 @@ SETS: dict[str, list[DaySpec]] = {
         *_both(4100, 4, fault="camera:time:0.06"),
     ],
     "dev-clocks": [*_both(160, 8), *_both(160, 8, rig="paper-free")],
+    # Rigs in turn, so that whoever stops early has seen all of them; every fifth day at dusk.
+    "basin": [
+        DaySpec(
+            4200 + i,
+            ("urban", "highway", "mixed")[i % 3],
+            rig=rig,
+            fault="camera:dusk:1" if i % 5 == 3 else "",
+        )
+        for i, rig in enumerate(
+            8 * ("paper", "ring16", "demo", "spin128", "pinhole", "rosette", "fisheye", "truck")
+        )
+    ],
     "radar-elevation": [
         *_both(4000, 4),
         *_both(4006, 2),
