@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.calibrate.joint import camera_radar
 from pipeline.calibrate.joint.camera_radar import camera_radar_cost, estimate_camera_radar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.config import SolveConfig
@@ -221,6 +222,21 @@ def test_the_held_out_cost_of_camera_radar_prefers_the_truth_and_names_frames_th
     )
     assert np.nanmean(camera_right) < np.nanmean(camera_wrong)
     assert np.isnan(camera_right[8])
+
+
+def test_an_azimuth_that_two_turns_explain_alike_is_left_open(day, monkeypatch):
+    """Cars in the next lane meet the boxes of this one: the loop is not to be judged by such an azimuth."""
+    prior, seen = prior_off_by(1, 0.02, 0), estimate_camera_radar
+    sure = seen(day, prior, CONFIG, np.random.default_rng(0))
+    assert sure.diagnostics["rival_share"] < 0.82
+    assert sure.observable[1]
+    scan = camera_radar._scan_azimuth
+    monkeypatch.setattr(camera_radar, "_scan_azimuth", lambda *a: (scan(*a)[0], 0.95))
+    unsure = seen(day, prior, CONFIG, np.random.default_rng(0))
+    assert not unsure.observable[1]
+    assert unsure.observability[1] == 0
+    assert any("azimuth is open" in note for note in unsure.notes)
+    assert unsure.observable[[0, 2]].tolist() == sure.observable[[0, 2]].tolist()
 
 
 def test_camera_and_radar_alone_find_their_azimuth(day):
