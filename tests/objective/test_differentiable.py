@@ -133,8 +133,9 @@ def check_paper_losses(rows, truth):
     ours = lidar_radar_tensors(loss, torch.float64)
     value, gradient = value_and_gradient(ours.frame_losses, T["lidar_radar"])
     assert_close(value, loss.frame_losses(T["lidar_radar"]))
-    # The kernel adds in float32: differences need a wide step, which rounds the corners of the bilinear map.
-    assert_close(gradient, by_differences(loss.frame_losses, T["lidar_radar"], 1e-4))
+    # Not against differences of the kernel: it adds in float32, and the wide step which that needs goes round the corners
+    # of the bilinear map.
+    assert_slope(ours.frame_losses, T["lidar_radar"], gradient)
 
 
 def check_edges(rows, truth):
