@@ -133,8 +133,8 @@ def check_paper_losses(rows, truth):
     ours = lidar_radar_tensors(loss, torch.float64)
     value, gradient = value_and_gradient(ours.frame_losses, T["lidar_radar"])
     assert_close(value, loss.frame_losses(T["lidar_radar"]))
-    # Not against differences of the kernel: it adds in float32, and the wide step which that needs goes round the corners
-    # of the bilinear map.
+    # Not against differences of the kernel: it adds in float32, and the wide step which that needs goes round the
+    # corners of the bilinear map.
     assert_slope(ours.frame_losses, T["lidar_radar"], gradient)
 
 

@@ -16,8 +16,8 @@ without the lidar, disjoint halves of the day, other origins of the search, and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -85,17 +85,20 @@ class _Day:
     wanted: frozenset[str]
     aligned: Aligned | str  # or why not; empty where nobody asked
     progress: Progress
+    # Estimates made before, with the checks that they failed, by pair and what they rest on: solved again is only what
+    # rests on a disbelieved pair.
+    made: dict[tuple[object, ...], tuple[PairEstimate, list[str]]] = field(default_factory=dict)
 
     def solved(self, disbelieved: frozenset[str]) -> Solution:
         """The solution in which no pair rests on a disbelieved one."""
-        failed: dict[str, list[str]] = {pair: [] for pair in PAIRS}
         self.progress(1, 3, "lidar-radar")
-        lidar_radar = self._lidar_radar(disbelieved, failed["lidar_radar"])
-        camera_lidar = self._camera_lidar(disbelieved, lidar_radar, failed["camera_lidar"])
+        helped, headed = self._camera_helps(disbelieved), "lidar_radar" not in disbelieved
+        lidar_radar, radar_failed = self._once(("lidar_radar", helped), lambda: self._lidar_radar(helped))
+        camera_lidar, camera_failed = self._once(
+            ("camera_lidar", helped, headed), lambda: self._camera_lidar(lidar_radar if headed else None)
+        )
         self.progress(2, 3, "camera-radar")
-        rng = np.random.default_rng([self.seed, 2])
-        seen = self.observations["camera_radar"]
-        without_lidar = estimate_camera_radar(seen, self.prior, self.config, rng)
+        without_lidar, _ = self._once(("camera_radar",), self._camera_radar)
         camera_radar, loop_rad, contradictions = compose_pairs(
             camera_lidar, lidar_radar, without_lidar, self.prior
         )
@@ -104,12 +107,29 @@ class _Day:
             # is only unsure is compared with its sigma, like any other.
             camera = _unchanged("camera_lidar", self.prior)
             _, _, contradictions = compose_pairs(camera, lidar_radar, without_lidar, self.prior)
-        failed["camera_radar"] += [*failed["camera_lidar"], *failed["lidar_radar"], *contradictions]
         camera_radar = replace(camera_radar, disproved=camera_lidar.disproved)
         self.progress(3, 3, "done")
         pairs = {"camera_lidar": camera_lidar, "camera_radar": camera_radar, "lidar_radar": lidar_radar}
+        failed = {
+            "camera_lidar": camera_failed,
+            "lidar_radar": radar_failed,
+            "camera_radar": [*camera_failed, *radar_failed, *contradictions],
+        }
         checks = {pair: why for pair, why in failed.items() if why}
         return Solution("joint", pairs, loop_rad, None, checks, self.solved)
+
+    def _once(
+        self, key: tuple[object, ...], make: Callable[[], tuple[PairEstimate, list[str]]]
+    ) -> tuple[PairEstimate, list[str]]:
+        if key not in self.made:
+            self.made[key] = make()
+        return self.made[key]
+
+    def _camera_radar(self) -> tuple[PairEstimate, list[str]]:
+        """Without the lidar."""
+        rng = np.random.default_rng([self.seed, 2])
+        seen = self.observations["camera_radar"]
+        return estimate_camera_radar(seen, self.prior, self.config, rng), []
 
     def _camera_helps(self, disbelieved: frozenset[str]) -> bool:
         """Whether lidar-radar may rest on the camera's alignment: not where nobody vouches for its basin."""
@@ -117,11 +137,11 @@ class _Day:
             return False
         return bool(self.aligned.basin.vouched_by)
 
-    def _lidar_radar(self, disbelieved: frozenset[str], failed: list[str]) -> PairEstimate:
-        """With the camera's boxes, unless camera-lidar is not to be believed."""
-        prior, helped = self.prior, self._camera_helps(disbelieved)
+    def _lidar_radar(self, helped: bool) -> tuple[PairEstimate, list[str]]:
+        """With the camera's boxes where it may help."""
+        prior = self.prior
         if "lidar_radar" not in self.wanted:
-            return _unchanged("lidar_radar", prior)
+            return _unchanged("lidar_radar", prior), []
         # Without an alignment the prior stays current: where that is exact enough, boxes are read through it.
         T, covariance = prior.T_camera_lidar, prior.covariance("camera_lidar")
         if helped and isinstance(self.aligned, Aligned):
@@ -136,26 +156,19 @@ class _Day:
                 covariance_camera_lidar=covariance,
             )
         except SolveError as err:
-            failed.append(err.reason)
-            return _unchanged("lidar_radar", prior)
-        failed += lidar_radar_failures(found)
-        if helped or "camera_lidar" not in self.wanted:
-            return found
-        return replace(
-            found, notes=[*found.notes, "camera-lidar is not believed: estimated without its help"]
-        )
+            return _unchanged("lidar_radar", prior), [err.reason]
+        if not helped and "camera_lidar" in self.wanted:
+            note = "camera-lidar is not believed: estimated without its help"
+            found = replace(found, notes=[*found.notes, note])
+        return found, lidar_radar_failures(found)
 
-    def _camera_lidar(
-        self, disbelieved: frozenset[str], lidar_radar: PairEstimate, failed: list[str]
-    ) -> PairEstimate:
-        """Along the heading that lidar-radar shows, unless that is disbelieved."""
+    def _camera_lidar(self, lidar_radar: PairEstimate | None) -> tuple[PairEstimate, list[str]]:
+        """Along the heading that lidar-radar shows; None = that is disbelieved."""
         if not isinstance(self.aligned, Aligned):
-            failed += [self.aligned] if self.aligned else []
-            return _unchanged("camera_lidar", self.prior)
-        heading = None if "lidar_radar" in disbelieved else _heading(lidar_radar)
-        rng = np.random.default_rng([self.seed, 3])
-        found = analyse_camera_lidar(self.aligned, rng, heading=heading)
-        return replace(found, disproved=unvouched_basin(self.aligned.basin))
+            return _unchanged("camera_lidar", self.prior), [self.aligned] if self.aligned else []
+        heading = None if lidar_radar is None else _heading(lidar_radar)
+        found = analyse_camera_lidar(self.aligned, np.random.default_rng([self.seed, 3]), heading=heading)
+        return replace(found, disproved=unvouched_basin(self.aligned.basin)), []
 
 
 def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfig]:
