@@ -49,6 +49,19 @@ def test_a_worse_alignment_is_held_whatever_else_looks_fine():
     assert "align worse than at the prior" in found.reason
 
 
+def test_what_a_check_shows_to_be_wrong_is_told_from_what_is_only_unproved():
+    assert verdict(estimate(0.01), WORSE).disproved
+    assert verdict(estimate(shift_m=0.5), BETTER).disproved  # beyond the search range
+    assert verdict(replace(estimate(1.5), disproved="nobody vouches for it"), BETTER).disproved
+    unproved = [
+        verdict(estimate(1.0), SAME),
+        verdict(estimate(1.5), BETTER, failed=["disjoint halves disagree"]),
+        verdict(estimate(0.01, pair="lidar_radar"), WORSE),  # its cost has slopes of its own
+    ]
+    assert [found.status for found in unproved] == ["held"] * 3
+    assert not any(found.disproved for found in unproved)
+
+
 def test_no_better_alignment_is_accepted_where_the_result_agrees_with_the_prior():
     assert verdict(estimate(0.2), SAME).status == "accepted"
 
