@@ -13,9 +13,8 @@ from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
 __all__ = ["accepted_before"]
 
-_DAYS_BACK = (
-    10  # days with records that are looked at: a vehicle that was held for longer has no state worth a look
-)
+# Days with records that are looked at: a vehicle that was held for longer has no state worth a look.
+_DAYS_BACK = 10
 
 
 def accepted_before(lake: Lake, partition: Partition, method: str) -> Float[np.ndarray, "4 4"] | None:

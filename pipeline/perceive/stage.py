@@ -33,9 +33,8 @@ from schemas.observations import Observation
 __all__ = ["perceive_frame", "work"]
 
 _MIN_LIDAR_POINTS = 100  # less shows neither ground nor objects
-WITHOUT_ROWS: Final = (
-    "frames_without_lidar_rows"  # among the manifest's kept: edges between neighbours, see README
-)
+# Among the manifest's kept: edges between neighbours, see README.
+WITHOUT_ROWS: Final = "frames_without_lidar_rows"
 # Likewise, of sweeps that no odometry de-skewed: moved by the radar's velocity, or left, for that was unknown.
 BY_DOPPLER: Final = "frames_deskewed_by_doppler"
 AS_LOGGED: Final = "frames_not_deskewed"
@@ -345,7 +344,9 @@ def _ego_speed(frame: Frame, motion: RadarMotion) -> float | None:
     if frame.ego_speed_mps is not None or motion.velocity_mps is None:
         return frame.ego_speed_mps
     vx, vy = float(motion.velocity_mps[0]), float(motion.velocity_mps[1])
-    heading = _heading(frame) or 0.0
+    heading = _heading(frame)
+    if heading is None:  # frames without a prior are not calibrated; for other readers the radar looks ahead
+        heading = 0.0
     return float(np.copysign(np.hypot(vx, vy), vx * np.cos(heading) + vy * np.sin(heading)))
 
 

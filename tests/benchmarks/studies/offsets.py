@@ -3,7 +3,7 @@
     python tests/benchmarks/studies/days.py generate --root DAYS --sets offsets
     python tests/benchmarks/studies/offsets.py --root DAYS --workers 2
 
-Five days each, 40 frames, urban and highway in turn, the paper's sensors. Every simulated vehicle has delays of its own
+Ten days each, 40 frames, urban and highway in turn, the paper's sensors. Every simulated vehicle has delays of its own
 (12 and -18 ms, scattering by 4 ms); the truth is all of it. The prior knows nothing of it: 0 +- 50 ms.
 """
 
