@@ -24,7 +24,7 @@ DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 CALIBRATIONS = TableSchema(
     "calibrations",
-    1,
+    2,
     (
         scalar("vehicle", "string", "vehicle id"),
         scalar("day", "string", "YYYY-MM-DD"),
@@ -38,6 +38,15 @@ CALIBRATIONS = TableSchema(
             "<f8",
             (6, 6),
             "of (rx ry rz tx ty tz), left perturbation in parent axes [rad, m]; null where refused",
+            nullable=True,
+        ),
+        array(
+            "common_covariance",
+            "<f8",
+            (6, 6),
+            "the part of covariance that all days of a vehicle err by alike: bias floors, and the prior where the day "
+            "leaves it its weight; covariance less it varies from day to day and averages down. Null where refused and "
+            "in rows of version 1",
             nullable=True,
         ),
         scalar(
@@ -140,6 +149,7 @@ CALIBRATIONS = TableSchema(
     ),
     "One row per pair and method. boresight show calibrations --json prints these names plus T, 4x4 row-major.",
     made_by="calibrate",
+    reads_versions=(1,),
 )
 
 
@@ -170,6 +180,7 @@ class CalibrationRecord:
     ty_m: float | None = None
     tz_m: float | None = None
     covariance: np.ndarray | None = None
+    common_covariance: np.ndarray | None = None
     observability: list[float] | None = None
     observable: list[bool] | None = None
     prior_qw: float | None = None

@@ -85,6 +85,8 @@ class TableSchema:
     columns: tuple[Column, ...]
     doc: str = ""
     made_by: str = ""  # stage, and command, that writes it
+    # Older versions whose rows are read too: what they lack has a default in the row's dataclass.
+    reads_versions: tuple[int, ...] = ()
 
     def arrow_schema(self) -> pa.Schema:
         """The Arrow schema that every file of the table has."""

@@ -220,6 +220,7 @@ def _estimate_fields(estimate: PairEstimate) -> dict[str, Any]:
     sigma = target_sigmas(estimate.pair, estimate.T, estimate.covariance)
     return {
         "covariance": estimate.covariance,
+        "common_covariance": estimate.common_covariance,
         "observability": [float(v) for v in estimate.observability],
         "observable": [bool(v) for v in estimate.observable],
         "azimuth_sigma_rad": float(sigma[0]),

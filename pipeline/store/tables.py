@@ -218,8 +218,8 @@ def _manifest(path: Path, schema: TableSchema) -> Manifest:
     if raw is None:
         raise ContractError(str(path), "was not written by Boresight (no manifest in the footer)")
     values = json.loads(raw)
-    found, wanted = (values.get("table"), values.get("version")), (schema.name, schema.version)
-    if found != wanted:
-        problem = f"holds {found[0]}/{found[1]}, this version reads {wanted[0]}/{wanted[1]}: make it anew"
+    found, version = values.get("table"), values.get("version")
+    if found != schema.name or version not in (schema.version, *schema.reads_versions):
+        problem = f"holds {found}/{version}, this version reads {schema.name}/{schema.version}: make it anew"
         raise ContractError(str(path), problem)
     return Manifest(**{f.name: values[f.name] for f in fields(Manifest) if f.name in values})

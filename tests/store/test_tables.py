@@ -4,6 +4,7 @@ import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
@@ -122,6 +123,20 @@ def test_another_version_a_foreign_file_and_a_damaged_one_are_named(lake, rng):
             read_manifest(lake, FRAMES, DAY)
     with pytest.raises(ContractError, match="no partition for car on 2026-03-03"):
         read_rows(lake, FRAMES, Partition("car", "2026-03-03"), Frame)
+
+
+def test_records_of_an_older_version_are_read_with_the_defaults_of_what_they_lack(lake, rng):
+    row = make_row("calibrations", rng, vehicle="car", seed=1)
+    without = tuple(c for c in CALIBRATIONS.columns if c.name != "common_covariance")
+    write_records(lake, replace(CALIBRATIONS, version=1, columns=without), DAY, [row], "old", "0.5.0")
+    write_records(lake, CALIBRATIONS, DAY, [row], "new", "0.6.0")
+    old, new = read_records(lake, CALIBRATIONS, CalibrationRecord)
+    assert old.common_covariance is None
+    np.testing.assert_array_equal(old.covariance, row.covariance)
+    np.testing.assert_array_equal(new.common_covariance, row.common_covariance)
+    unread = replace(CALIBRATIONS, reads_versions=())
+    with pytest.raises(ContractError, match=r"calibrations/1.*calibrations/2"):
+        read_records(lake, unread, CalibrationRecord)
 
 
 def test_records_are_appended_and_the_same_work_gives_the_same_file(lake, rng):

@@ -52,9 +52,16 @@ def compose_pairs(
             "composed of camera-lidar and lidar-radar, their errors taken as independent",
             "loop: camera-radar without the lidar, rotations only (its translation is the prior's)",
         ],
+        _composed_common(camera_lidar, lidar_radar),
     )
     loop_rad = float(np.linalg.norm(difference[known])) if known.any() else None
     return estimate, loop_rad, open_loop(difference, sigma, known)
+
+
+def _composed_common(camera_lidar: PairEstimate, lidar_radar: PairEstimate) -> np.ndarray | None:
+    """What all days err by alike, of both factors."""
+    a, b = camera_lidar.common_covariance, lidar_radar.common_covariance
+    return None if a is None or b is None else compose_covariance(camera_lidar.T, a, b)
 
 
 def _composed_observability(

@@ -189,4 +189,7 @@ def _heading(lidar_radar: PairEstimate) -> tuple[np.ndarray, float] | None:
 
 def _unchanged(pair: str, prior: Prior) -> PairEstimate:
     """The prior, where a pair is not estimated."""
-    return PairEstimate(pair, prior.of(pair), prior.covariance(pair), np.zeros(6), np.zeros(6, bool), 0)
+    covariance = prior.covariance(pair)
+    return PairEstimate(
+        pair, prior.of(pair), covariance, np.zeros(6), np.zeros(6, bool), 0, common_covariance=covariance
+    )

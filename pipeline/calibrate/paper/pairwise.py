@@ -28,6 +28,7 @@ from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.paper.minimise import Minimum, Search, minimise, poses_about
 from pipeline.calibrate.paper.sandwich import sandwich_covariance
 from pipeline.config import SolveConfig
+from pipeline.extrinsics.common_share import common_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import rotation_angle_rad
 from pipeline.objective.paper.camera_lidar import CameraLidarLoss, camera_lidar_loss
@@ -140,7 +141,7 @@ def estimate_of(
     """A pair's result with its covariance; `minimum` None = not calibrated, the prior stays."""
     base = prior.covariance(problem.pair)
     used = int(problem.informative.sum())
-    blank = PairEstimate(problem.pair, T, base, np.zeros(6), np.zeros(6, bool), used)
+    blank = PairEstimate(problem.pair, T, base, np.zeros(6), np.zeros(6, bool), used, common_covariance=base)
     if minimum is None:
         return replace(blank, notes=["not triggered: keeps the prior"])
     losses = problem.loss(np.stack([problem.T_prior, T]))
@@ -150,12 +151,13 @@ def estimate_of(
         "evaluations": float(minimum.evaluations),
         "at_search_border": float(minimum.at_border),
     }
+    floor = PAPER_BIAS[problem.pair]
     covariance, observability = sandwich_covariance(
         lambda poses: problem.frame_losses(poses)[:, problem.informative],
         T,
         problem.blocks[problem.informative],
         base,
-        PAPER_BIAS[problem.pair],
+        floor,
     )
     return replace(
         blank,
@@ -164,6 +166,7 @@ def estimate_of(
         observable=observability > OBSERVABLE,
         diagnostics=diagnostics,
         notes=[NO_UNCERTAINTY],
+        common_covariance=common_of(covariance, base, np.diag(np.square(np.repeat(floor, 3)))),
     )
 
 

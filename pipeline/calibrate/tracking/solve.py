@@ -40,6 +40,7 @@ from pipeline.calibrate.tracking.object_tracks import (
 )
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
+from pipeline.extrinsics.common_share import common_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import compose_covariance, inverse, log_so3
 from pipeline.geometry.spherical import to_spherical
@@ -278,6 +279,7 @@ def _estimate(
     return PairEstimate(
         pair, aligned.T, found.covariance, observability, found.observable & (np.arange(6) < 3),
         len(np.unique(frame[inlier])), diagnostics=diagnostics, notes=notes,
+        common_covariance=common_of(found.covariance, before, np.diag(floor**2)),
     )  # fmt: skip
 
 
@@ -286,10 +288,12 @@ def _composed(camera_lidar: PairEstimate, lidar_radar: PairEstimate, prior: Prio
     before = np.diag(prior.covariance("camera_radar"))
     observability = np.clip(1 - np.diag(covariance) / before, 0.0, 1.0)
     observability[3:] = 0.0
+    commons = [e.common_covariance for e in (camera_lidar, lidar_radar) if e.common_covariance is not None]
     return PairEstimate(
         "camera_radar", camera_lidar.T @ lidar_radar.T, covariance, observability, observability >= OBSERVABLE,
         min(camera_lidar.frames_used, lidar_radar.frames_used),
         notes=["composed over the lidar, the reference sensor", _ROTATION_ONLY],
+        common_covariance=compose_covariance(camera_lidar.T, *commons) if len(commons) == 2 else None,
     )  # fmt: skip
 
 
@@ -305,4 +309,7 @@ def _too_few(pair: str, tracks: PairTracks, paired: int) -> str:
 
 def _unchanged(pair: str, prior: Prior) -> PairEstimate:
     """The prior, where a pair is not calibrated."""
-    return PairEstimate(pair, prior.of(pair), prior.covariance(pair), np.zeros(6), np.zeros(6, bool), 0)
+    covariance = prior.covariance(pair)
+    return PairEstimate(
+        pair, prior.of(pair), covariance, np.zeros(6), np.zeros(6, bool), 0, common_covariance=covariance
+    )

@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipeline.extrinsics.common_share import common_of
 from pipeline.extrinsics.estimates import PairEstimate
 from pipeline.geometry.se3 import exp_se3, hat, inverse, log_se3, transform_points
 from pipeline.geometry.spherical import from_spherical
@@ -132,6 +133,11 @@ def day_estimate(
         observable,
         answers.frames,
         diagnostics=_diagnostics(fit, gain, answers),
+        common_covariance=common_of(
+            (covariance + covariance.T) / 2,
+            prior_covariance,
+            twist_of_bearing @ np.diag(np.square(_bias_sigma(pair, answers))) @ twist_of_bearing.T,
+        ),
     )
 
 
@@ -173,9 +179,13 @@ def _spread(pair: str, answers: Answers, draws: np.ndarray, ignored: np.ndarray)
     """Covariance of the mean answer: of the bootstrap, but no less than the network predicts, plus the bias."""
     spread = np.cov(draws[:, 0].T)
     predicted = np.median(answers.variance, axis=0) / answers.frames
-    bias = BIAS_SIGMA[pair] if answers.bias_sigma is None else answers.bias_sigma
+    bias = _bias_sigma(pair, answers)
     spread += np.diag(np.maximum(predicted - np.diag(spread), 0.0) + np.square(bias))
     return np.asarray(spread + np.diag(np.where(ignored, _IGNORED, 0.0)))
+
+
+def _bias_sigma(pair: str, answers: Answers) -> Float[np.ndarray, " 6"]:
+    return np.asarray(BIAS_SIGMA[pair] if answers.bias_sigma is None else answers.bias_sigma)
 
 
 @dataclass(frozen=True, eq=False)

@@ -258,8 +258,10 @@ def _estimate(pair: str, answers: Answers, asked: _Asked, rng: np.random.Generat
 
 
 def _unchanged(pair: str, prior: Prior) -> PairEstimate:
-    nothing = np.zeros(6)
-    return PairEstimate(pair, prior.of(pair), prior.covariance(pair), nothing, nothing.astype(bool), 0)
+    nothing, covariance = np.zeros(6), prior.covariance(pair)
+    return PairEstimate(
+        pair, prior.of(pair), covariance, nothing, nothing.astype(bool), 0, common_covariance=covariance
+    )
 
 
 def _halves_disagree(pair: str, answers: Answers, asked: _Asked, rng: np.random.Generator) -> list[str]:

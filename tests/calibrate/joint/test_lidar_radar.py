@@ -78,6 +78,11 @@ def test_a_radar_without_elevation_leaves_roll_and_pitch_to_the_prior():
     assert abs(error_of(found)[2]) < np.radians(0.2)
     assert any("roll, pitch" in note for note in found.notes)
     assert any("measures no elevation" in note for note in found.notes)
+    # What rests on the prior is the same every day; yaw, which the day determines, varies.
+    varying = np.diag(change_covariance(found.T, found.covariance - found.common_covariance))
+    total = np.diag(change_covariance(found.T, found.covariance))
+    assert np.allclose(varying[[0, 1, 5]], 0, atol=1e-3 * total[[0, 1, 5]].max())
+    assert varying[2] > 0.2 * total[2]
 
 
 def test_a_height_that_the_day_cannot_tell_stays_while_a_knock_aside_is_found(day):

@@ -23,7 +23,7 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     CameraLidarProblem,
     ObservabilityAnalysis,
     analyse_observability,
-    covariance_and_observability,
+    day_covariance,
 )
 from pipeline.calibrate.joint.camera_lidar.refine import NONE_FIXED, AlignmentState, Scored, refine, weighted
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
@@ -33,6 +33,7 @@ from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
+from pipeline.extrinsics.common_share import common_part
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, lidar_velocities, prepare_terms
@@ -74,7 +75,7 @@ class Aligned:
     @property
     def covariance(self) -> Float[np.ndarray, "6 6"]:
         """Of the pose, by left perturbation."""
-        of_changes = covariance_and_observability(self.problem, self.state, self.kernel, IS_TZ)[0][:6, :6]
+        of_changes = day_covariance(self.problem, self.state, self.kernel, IS_TZ).covariance[:6, :6]
         to_left = np.linalg.inv(change_jacobian(self.state.T_camera_lidar))
         return to_left @ of_changes @ to_left.T
 
@@ -290,4 +291,7 @@ def _conclude(
         time_offset_sigma_s=dt_sigma,
         diagnostics=diagnostics,
         notes=notes,
+        common_covariance=common_part(
+            to_left @ analysis.common[:6, :6] @ to_left.T, to_left @ analysis.covariance[:6, :6] @ to_left.T
+        ),
     )

@@ -34,6 +34,7 @@ from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, CAMERA_LI
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed, response
 from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
+from pipeline.extrinsics.common_share import prior_share
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
@@ -43,7 +44,7 @@ __all__ = [
     "CameraLidarProblem",
     "ObservabilityAnalysis",
     "analyse_observability",
-    "covariance_and_observability",
+    "day_covariance",
     "time_offset_variance",
 ]
 
@@ -61,6 +62,12 @@ class CameraLidarProblem:
     seed: int  # of the bootstrap: solutions compare on the same resampled days
     tz_variance: float  # [m2]
     motion: MotionSigmas
+    tz_common_share: float = 1.0  # of its variance, the same every day
+
+    @property
+    def common_share(self) -> Float[np.ndarray, " 8"]:
+        """Share of what the gradients are not asked for that is the same every day: all of a prior, part of tz's."""
+        return np.where(IS_TZ, self.tz_common_share, 1.0)
 
     def scored(self, kernel: KernelSettings) -> Scored:
         """Its score and prior at a kernel."""
@@ -76,6 +83,7 @@ class ObservabilityAnalysis:
     kernel: KernelSettings
     fixed: np.ndarray  # 8, bool: at the prior
     covariance: np.ndarray  # 8 8
+    common: np.ndarray  # 8 8, of the covariance what all days of a vehicle err by alike
     observability: np.ndarray  # 6
     profile: TzProfile
 
@@ -96,11 +104,16 @@ def analyse_observability(
     kernel = weighted(problem.terms, state, problem.terms.fitted(state.alone, kernel, rng))
     follow = response(_curvature(problem, state, kernel), IS_TZ, _IS_FOCAL)[:, 0]
     prior_tz_m, prior_sigma_m = float(problem.prior.T_camera_lidar[2, 3]), problem.prior.translation_sigma_m
-    tz_m, variance = profile.with_prior(prior_tz_m, prior_sigma_m)
+    tz_m, variance, common_share = profile.with_prior(prior_tz_m, prior_sigma_m)
     tz_observability = 1 - variance / prior_sigma_m**2
     if tz_observability < OBSERVABLE:
-        tz_m, variance = prior_tz_m, prior_sigma_m**2
-    problem = replace(problem, prior=with_tz(problem.prior, tz_m), tz_variance=variance)
+        tz_m, variance, common_share = prior_tz_m, prior_sigma_m**2, 1.0
+    problem = replace(
+        problem,
+        prior=with_tz(problem.prior, tz_m),
+        tz_variance=variance,
+        tz_common_share=common_share,
+    )
     if tz_m != state.T_camera_lidar[2, 3]:
         state = state.stepped(follow * (tz_m - state.T_camera_lidar[2, 3]))
         timed = _timed(problem, state, kernel, rng)
@@ -131,13 +144,15 @@ def _fix_unobservable(
         kernel = weighted(problem.terms, state, problem.terms.fitted(state.alone, kernel, rng))
         steps = SCHEDULE.steps_after_weights
         state = refine(problem.scored(kernel), state, steps=steps, fixed=solved_for)
-        covariance, shrunk = covariance_and_observability(problem, state, kernel, fixed)
-        observability = np.where(fixed[:6], observability, shrunk)
+        day = day_covariance(problem, state, kernel, fixed)
+        observability = np.where(fixed[:6], observability, day.observability)
         more_fixed = fixed | np.append(observability < OBSERVABLE, [False, False])
         if more_fixed.sum() == fixed.sum():
             break
         fixed = more_fixed
-    return ObservabilityAnalysis(problem.prior, state, kernel, fixed, covariance, observability, profile)
+    return ObservabilityAnalysis(
+        problem.prior, state, kernel, fixed, day.covariance, day.common, observability, profile
+    )
 
 
 def _timed(
@@ -158,9 +173,18 @@ def time_offset_variance(
     return 1 / (1 / day_variance + 1 / problem.config.time_offset_sigma_s**2)
 
 
-def covariance_and_observability(
+@dataclass(frozen=True, eq=False)
+class DayCovariance:
+    """How sure one day's solution is."""
+
+    covariance: np.ndarray  # 8 8
+    common: np.ndarray  # 8 8, of the covariance what all days of a vehicle err by alike
+    observability: np.ndarray  # 6
+
+
+def day_covariance(
     problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, fixed: Bool[np.ndarray, " 8"]
-) -> tuple[Float[np.ndarray, "8 8"], Float[np.ndarray, " 6"]]:
+) -> DayCovariance:
     """Covariance of a solution and observability; what is fixed has its prior's variance, and the others follow it."""
     terms, prior_variance = problem.terms, _prior_variance(problem)
     scale, curvature = scales(terms, kernel), _curvature(problem, state, kernel)
@@ -180,8 +204,13 @@ def covariance_and_observability(
     )
     floor = np.where(fixed, 0.0, np.append(CAMERA_LIDAR_BIAS, [CAMERA_LIDAR_DT_FLOOR_S, 0.0]))
     motion = motion_biases(terms, state, kernel, curvature, fixed, problem.motion)
-    covariance = covariance + np.diag(floor**2) + motion.T @ motion
-    return covariance, np.clip(1 - np.diag(covariance) / prior_variance, 0.0, 1.0)[:6]
+    # Masks, intrinsics and the lidar's mounting are the same every day.
+    floors = np.diag(floor**2) + motion.T @ motion
+    prior_information = np.diag(problem.common_share / prior_variance)
+    common = floors + prior_share(covariance, prior_information)
+    covariance = covariance + floors
+    observability = np.clip(1 - np.diag(covariance) / prior_variance, 0.0, 1.0)[:6]
+    return DayCovariance(covariance, common, observability)
 
 
 def _prior_variance(problem: CameraLidarProblem) -> Float[np.ndarray, " 8"]:

@@ -41,11 +41,14 @@ class TzProfile:
     kinds_apart_m: float  # tz by markings alone less tz by edges alone
     kinds_sigma_m: float
 
-    def with_prior(self, tz_m: float, sigma_m: float) -> tuple[float, float]:
-        """Value [m] and variance [m2] together with a prior."""
-        variance = self.variance_m2 + self.bias_m**2 + TZ_COMMON_BIAS_M**2
+    def with_prior(self, tz_m: float, sigma_m: float) -> tuple[float, float, float]:
+        """Value [m] and variance [m2] together with a prior, and the share of it that is the same every day."""
+        bias = self.bias_m**2 + TZ_COMMON_BIAS_M**2
+        variance = self.variance_m2 + bias
         weight = 1 / (1 + variance / sigma_m**2)
-        return tz_m + weight * (self.tz_m - tz_m), (1 - weight) * sigma_m**2
+        total = (1 - weight) * sigma_m**2
+        common = weight**2 * bias + (1 - weight) ** 2 * sigma_m**2
+        return tz_m + weight * (self.tz_m - tz_m), total, common / total
 
 
 def profile_tz(scored: Scored, state: AlignmentState, follow: Float[np.ndarray, " 8"]) -> TzProfile:

@@ -26,6 +26,7 @@ class ObservabilityAnalysis:
     state: RadarState
     linear: Linear
     covariance: np.ndarray  # P P, of all unknowns, turns about the radar
+    common: np.ndarray  # P P, of the covariance what all days of a vehicle err by alike
     fixed: np.ndarray  # P, bool
     observability: np.ndarray  # 7, of pose and dt
     witnesses: tuple[Witness, ...]  # of pitch, asked where the car's way had no say yet

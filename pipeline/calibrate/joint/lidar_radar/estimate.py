@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.lidar_radar.conclusions import ObservabilityAnalysis, diagnostics_of, notes_of
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, elevation_spread
@@ -41,6 +41,7 @@ from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_f
 from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
+from pipeline.extrinsics.common_share import common_part, prior_share
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.objective.radar.moving_clusters import moving_clusters
@@ -179,11 +180,16 @@ def _with_witnesses(
         return analysis
     moved = float(change_between(asked_at.T_lidar_radar, analysis.state.T_lidar_radar)[PITCH])
     witnesses = tuple(replace(w, offset_rad=w.offset_rad - moved) for w in witnesses)
-    covariance, disagreement = analysis.covariance.copy(), contradiction(witnesses)
+    covariance, common, disagreement = (
+        analysis.covariance.copy(),
+        analysis.common.copy(),
+        contradiction(witnesses),
+    )
     if disagreement is not None and not analysis.fixed[PITCH]:
-        covariance[PITCH] *= disagreement.factor
-        covariance[:, PITCH] *= disagreement.factor
-    return replace(analysis, witnesses=witnesses, covariance=covariance)
+        for part in (covariance, common):
+            part[PITCH] *= disagreement.factor
+            part[:, PITCH] *= disagreement.factor
+    return replace(analysis, witnesses=witnesses, covariance=covariance, common=common)
 
 
 def _usable_camera(
@@ -249,8 +255,20 @@ def _analyse_observability(
         # fixed, they contradict the scene by metres, and yaw follows.
         unknown[DT] &= not np.any(unknown[:DT] & ~fixed[:DT])
         fixed[: DT + 1] |= unknown
-    full[np.arange(DT + 1), np.arange(DT + 1)] += bias
-    return ObservabilityAnalysis(state, linear, full, fixed, observability, linear.witnesses)
+    common = _floors(linear, curvature, fixed) + prior_share(full, np.diag(1 / variance))
+    for covariance in (full, common):
+        covariance[np.arange(DT + 1), np.arange(DT + 1)] += bias
+    return ObservabilityAnalysis(state, linear, full, common, fixed, observability, linear.witnesses)
+
+
+def _floors(
+    linear: Linear, curvature: Float[np.ndarray, "P P"], fixed: Bool[np.ndarray, " P"]
+) -> Float[np.ndarray, "P P"]:
+    """Covariance that the floors of elevation's witnesses leave: their bias is the rig's, the same every day."""
+    out, free = np.zeros_like(curvature), np.ix_(~fixed, ~fixed)
+    follow = np.linalg.inv(curvature[free])
+    out[free] = follow @ linear.floors[free] @ follow.T
+    return out
 
 
 def _observability(variance: np.ndarray, bias: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -289,6 +307,7 @@ def _conclude(
         float(np.sqrt(analysis.covariance[DT, DT])),
         diagnostics_of(analysis, ends, halves),
         notes,
+        common_part(J @ analysis.common[:6, :6] @ J.T, J @ analysis.covariance[:6, :6] @ J.T),
     )
 
 

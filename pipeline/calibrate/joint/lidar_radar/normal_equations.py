@@ -155,6 +155,9 @@ class Linear:
     witnesses: tuple[Witness, ...]  # of pitch
     travel_frames: int
     travel_scatter_rad: float  # of the frames' ways beyond their own sigmas
+    floors: (
+        np.ndarray
+    )  # P P, scatter of the total gradient by what witnesses of elevation err by on every day
 
 
 @dataclass(eq=False)
@@ -164,6 +167,7 @@ class _Sums:
     H: np.ndarray  # F P P
     information: np.ndarray  # F P P
     g: np.ndarray  # F P
+    floors: np.ndarray  # P P
 
 
 def linearise(
@@ -180,7 +184,10 @@ def linearise(
     """
     F = len(problem.observations)
     sums = _Sums(
-        np.zeros((F, UNKNOWNS, UNKNOWNS)), np.zeros((F, UNKNOWNS, UNKNOWNS)), np.zeros((F, UNKNOWNS))
+        np.zeros((F, UNKNOWNS, UNKNOWNS)),
+        np.zeros((F, UNKNOWNS, UNKNOWNS)),
+        np.zeros((F, UNKNOWNS)),
+        np.zeros((UNKNOWNS, UNKNOWNS)),
     )
     about_radar = np.linalg.inv(change_jacobian(state.T_lidar_radar))
     equations = _registration(problem, state, widen, stride, about_radar)
@@ -210,6 +217,7 @@ def linearise(
         tuple(w for w in (seen, box_witness, travel_witness) if w is not None),
         0 if travel_witness is None or problem.travel is None else problem.travel.count,
         travel_scatter,
+        sums.floors,
     )
 
 
@@ -296,6 +304,7 @@ def _add_boxes(
         "boxes", Hb[:, 1:, 1:].sum(0) + prior, gb[:, 1:].sum(0) + prior @ [0.0, *state.bias_rad], 0.0
     )
     Hb, gb = tempered(Hb, gb, _BOX_FLOOR)
+    sums.floors[np.ix_(columns, columns)] += _floor_scatter(Hb, _BOX_FLOOR)
     for array in (sums.H, sums.information):
         array[np.ix_(np.arange(F), columns, columns)] += Hb
     sums.g[:, columns] += gb
@@ -308,7 +317,9 @@ def _add_travel(problem: RadarProblem, state: RadarState, sums: _Sums) -> tuple[
         return float("nan"), None
     H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
     witness = travel_opinion(problem, state)
-    H, g = tempered(H, g, np.full(2, DOPPLER_PITCH_FLOOR_RAD))
+    floor = np.full(2, DOPPLER_PITCH_FLOOR_RAD)
+    H, g = tempered(H, g, floor)
+    sums.floors[:2, :2] += _floor_scatter(H, floor)
     for array in (sums.H, sums.information):
         array[:, :2, :2] += H
     sums.g[:, :2] += g
@@ -342,6 +353,7 @@ def _add_elevations(
     He_t, ge_t = tempered(He, ge, floor)
     sums.H[where] += He_t
     sums.information[where] += tempered(Ie, ge, floor)[0]
+    sums.floors[np.ix_(_ELEVATION_DOF, _ELEVATION_DOF)] += _floor_scatter(He_t, floor)
     sums.g[np.ix_(at, _ELEVATION_DOF)] += ge_t
     return -np.linalg.pinv(He.sum(0), rcond=1e-6) @ ge.sum(0)
 
@@ -354,6 +366,14 @@ def tempered(
     W = np.linalg.inv(np.eye(len(floor)) + H.sum(0) @ np.diag(floor**2))
     product = W @ H
     return 0.5 * (product + np.swapaxes(product, 1, 2)), g @ W.T
+
+
+def _floor_scatter(
+    H_tempered: Float[np.ndarray, "F P P"], floor: Float[np.ndarray, " P"]
+) -> Float[np.ndarray, "P P"]:
+    """Covariance of a measurement's total gradient by its floor alone: `J floor^2 J`, with J as `tempered` left it."""
+    J = H_tempered.sum(0)
+    return J @ np.diag(floor**2) @ J
 
 
 def _prior_equations(problem: RadarProblem, state: RadarState) -> tuple[np.ndarray, np.ndarray]:
