@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.calibrate.verify import held_out_score as held_out_score_module
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.target_accuracy import claims_of
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
-from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
+from pipeline.geometry.spherical import from_spherical
+from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
 
 SIGMA = np.array([*np.radians([0.05] * 3), 0.02, 0.02, 0.02])
@@ -85,6 +87,38 @@ def test_costs_compare_azimuth_and_range_of_the_radar_and_nothing_else(street):
     )
     for yaw in (-1.0, 1.0):
         assert np.nanmean(score.cost(turned(T_LIDAR_RADAR, 2, yaw))) > best
+
+
+def test_a_street_that_is_dense_nearby_does_not_prefer_a_radar_that_is_farther_back(monkeypatch):
+    # Ground in even steps of elevation, detections anywhere: nothing tells where along the way they are.
+    rng, day = np.random.default_rng(3), street_day(12, seed=5)
+    for k, o in enumerate(day):
+        ranges = -GROUND_M / np.tan(rng.uniform(0.03, 0.4, 6000))
+        ground = from_spherical(np.stack([rng.uniform(-0.9, 0.9, 6000), np.zeros(6000), ranges], -1))
+        ground[:, 2] = GROUND_M
+        seen = np.stack([rng.uniform(6, 25, 300), rng.uniform(-5, 5, 300), np.full(300, -1.0)], -1)
+        day[k] = replace(
+            o,
+            lidar_map_xyz_m=ground.astype(np.float32),
+            lidar_map_is_ground=np.ones(6000, np.uint8),
+            lidar_map_cluster=np.full(6000, -1, np.int32),
+            radar_xyz_m=seen.astype(np.float32),
+            radar_residual_mps=np.zeros(300, np.float32),
+            radar_motion=np.zeros(300, np.uint8),
+            radar_cluster=np.full(300, -1, np.int32),
+        )
+    back = from_rotation_translation(T_LIDAR_RADAR[:3, :3], T_LIDAR_RADAR[:3, 3] - 0.5 * T_LIDAR_RADAR[:3, 0])
+
+    def preferred():
+        estimate = result("lidar_radar", T_LIDAR_RADAR, DT_S)
+        cost = held_out_score(estimate, day, Prior(np.eye(4), back, np.radians(2), 0.1), SolveConfig()).cost
+        return float(np.mean(cost(T_LIDAR_RADAR) - cost(back)))
+
+    without_slope = preferred()
+    monkeypatch.setattr(held_out_score_module, "_trend_along_axis", lambda T, value: 0 * value(T))
+    by_value = preferred()
+    assert by_value > 0.03
+    assert abs(without_slope) < 0.25 * by_value
 
 
 def test_camera_lidar_costs_prefer_the_truth(traced):
