@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = [
+    "CameraPrior",
     "CameraTopics",
     "EgoTopics",
     "LidarTopics",
@@ -48,12 +50,28 @@ class OnnxSemantics(Section):
     detector: str
 
 
+@dataclass(frozen=True)
+class CameraPrior:
+    """What is known of a camera beside its CameraInfo."""
+
+    readout_s: float = 0.0
+
+
 class CameraTopics(Section):
-    """The camera's topics."""
+    """The camera's topics, and what CameraInfo does not say."""
 
     image: Topic
     info: Topic
     semantics: Annotated[TopicSemantics | OnnxSemantics, Field(discriminator="source")]
+    # Rolling shutter: time from the first image row to the last, which is seen later [s]; 0 = global shutter. The stamp
+    # is that of the middle row; where it is another row's, the time offset that is estimated takes that up. Left out of
+    # dumps: it is calibration's, and no reason to ingest a rig's logs again.
+    readout_s: Annotated[float, Field(ge=0, le=0.1)] = Field(default=0.0, exclude=True)
+
+    @property
+    def known(self) -> CameraPrior:
+        """What calibration takes as known of the camera."""
+        return CameraPrior(self.readout_s)
 
 
 class OnnxPointSemantics(Section):

@@ -127,3 +127,14 @@ def test_changed_sections_are_validated_and_keep_what_dumps_leave_out(tmp_path):
         with pytest.raises(ConfigError) as caught:
             fleet.changed(**wrong)
         assert caught.value.key == key
+
+
+def test_what_calibration_takes_as_known_of_a_camera_is_no_reason_to_ingest_its_logs_again(tmp_path):
+    info = 'info = "/camera/info"'
+    assert info in GOOD
+    plain = load(tmp_path, GOOD).rig_of("car-1")
+    rolling = load(tmp_path, GOOD.replace(info, f"{info}\nreadout_s = 0.03", 1)).rig_of("car-1")
+    assert (plain.camera.known.readout_s, rolling.camera.known.readout_s) == (0.0, 0.03)
+    assert plain.model_dump() == rolling.model_dump()
+    with pytest.raises(ConfigError, match="readout_s"):
+        load(tmp_path, GOOD.replace(info, f"{info}\nreadout_s = 30", 1))

@@ -7,7 +7,7 @@ record.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 
@@ -60,13 +60,15 @@ def work(task: Task) -> Work:
         raise ConfigError("command line", "seed", f"{seed} is less than 0")
     if task.given is not None:
         return _refusal(task.given, task.partition, method, seed)
+    rig = fleet.rig_of(task.partition.vehicle)
     settings = {"method": method.name} | method.settings_of(task)
     settings |= {
         "perturb": task.perturb,
         "seed": seed,
         "prior_file": prior_key(fleet, task.partition.vehicle),
+        "camera": asdict(rig.camera.known),
     }
-    prior = fleet.rig_of(task.partition.vehicle).prior
+    prior = rig.prior
     tables = (FRAMES, OBSERVATIONS) if method.needs_images else (OBSERVATIONS,)
     manifests = [read_manifest(task.lake, table, task.partition) for table in tables]
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.se3 import adjoint
+from pipeline.rigs import CameraPrior
 
 __all__ = ["PairEstimate", "Prior", "Solution"]
 
@@ -23,6 +24,7 @@ class Prior:
     translation_sigma_m: float
     # What an earlier day found, where one was accepted: a place to look at, no information.
     T_camera_lidar_before: np.ndarray | None = None
+    camera: CameraPrior = field(default_factory=CameraPrior)
 
     @property
     def T_camera_radar(self) -> Float[np.ndarray, "4 4"]:

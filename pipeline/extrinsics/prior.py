@@ -31,11 +31,13 @@ def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle:
         SolveError: no frame carries a tf_static prior, or it changes over the day.
         ConfigError: unknown vehicle, or the prior file cannot be read.
     """
-    config = fleet.rig_of(vehicle).prior
+    rig = fleet.rig_of(vehicle)
+    config, camera = rig.prior, rig.camera.known
     if config.file is None:
-        return logged_prior(observations, config)
+        return replace(logged_prior(observations, config), camera=camera)
     transforms = read_transforms(fleet.path_of(config.file))
-    return Prior(transforms["camera_lidar"], transforms["lidar_radar"], *_sigmas(config))
+    pair = transforms["camera_lidar"], transforms["lidar_radar"]
+    return Prior(*pair, *_sigmas(config), camera=camera)
 
 
 def logged_prior(observations: Sequence[Observation], config: PriorConfig) -> Prior:

@@ -29,8 +29,9 @@ TOPICS = {
 }
 
 
-def fleet_of(prior=None, **sections):
+def fleet_of(prior=None, camera=None, **sections):
     rig = TOPICS | ({"prior": prior} if prior else {})
+    rig = rig | {"camera": TOPICS["camera"] | (camera or {})}
     small = {"paper_population": 20, "paper_generations": 10, "search_rotation_deg": 4.0}
     solve = small | sections.pop("solve", {})
     return FleetConfig.model_validate(
@@ -132,6 +133,7 @@ def test_other_seed_method_perturbation_or_config_is_other_work(tmp_path):
         (fleet_of(), {"method": "joint", "seed": 5, "perturb": (2.0, 0.1)}),
         (fleet_of(solve={"paper_generations": 11}), {"method": "joint", "seed": 5}),
         (fleet_of(trigger={"when": "triggered"}), {"method": "joint", "seed": 5}),
+        (fleet_of(camera={"readout_s": 0.03}), {"method": "joint", "seed": 5}),
     ]
     keys = {calibrate_day(DAY, fleet, lake, **way).work_key for fleet, way in ways}
     assert len(keys) == len(ways)

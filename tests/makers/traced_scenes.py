@@ -2,7 +2,8 @@
 
 Exact geometry and no noise model: what the camera-lidar terms must find is in the picture by construction. The world
 is where the camera's clock says it is: with a time offset dt it has moved dt times the own speed (stamp_camera =
-stamp_lidar + dt), and with a gap between the stamps by as much less.
+stamp_lidar + dt), and with a gap between the stamps by as much less. With a readout time the rows are seen one after
+the other, the middle one at the image's time.
 """
 
 from collections.abc import Sequence
@@ -57,12 +58,13 @@ def traced_day(
     *,
     reflective: bool = True,
     gaps_s: Sequence[float] | None = None,
+    readout_s: float = 0.0,
 ) -> list[Observation]:
     """Observations of independent scenes, six frames to a drive, every third standing; gaps of images to sweeps."""
     rng = np.random.default_rng(seed)
     speeds = [0.0 if i % 3 == 0 else float(rng.uniform(5, 25)) for i in range(frames)]
     return [
-        traced_frame(rig, rng, i, speeds[i], dt_s, gap_s, reflective=reflective)
+        traced_frame(rig, rng, i, speeds[i], dt_s, gap_s, reflective=reflective, readout_s=readout_s)
         for i, gap_s in enumerate(gaps_s or [0.0] * frames)
     ]
 
@@ -76,6 +78,7 @@ def traced_frame(
     gap_s: float,
     *,
     reflective: bool,
+    readout_s: float = 0.0,
 ) -> Observation:
     """One scene, seen by both sensors."""
     boxes, labels_of_box = scatter_boxes(rng)
@@ -87,7 +90,9 @@ def traced_frame(
     rays = label_camera.unproject(np.stack([u, v], -1).reshape(-1, 2))
     T_lidar_camera = inverse(rig.T_camera_lidar)
     # The image is dt older on the lidar's clock than its stamp: the car stood so much behind.
-    origin = T_lidar_camera[:3, 3] - np.array([speed_mps * (dt_s - gap_s), 0, 0])
+    late_s = ((v.ravel() + 0.5) / label_camera.height_px - 0.5) * readout_s
+    way_m = speed_mps * (dt_s - gap_s - late_s)
+    origin = T_lidar_camera[:3, 3] - way_m[:, None] * np.array([1.0, 0, 0])
     _, what, paint = trace(origin, rays @ T_lidar_camera[:3, :3].T, boxes, labels_of_box, phase)
     labels = what.reshape(u.shape).astype(np.uint8)
     grey = np.where(what == ROAD, np.where(paint, 200, 80), 120).reshape(u.shape).astype(np.uint8)
@@ -138,7 +143,7 @@ def trace(
     t0, t1 = ((corner[:, None] - origin) / safe for corner in boxes)
     near, far = np.minimum(t0, t1).max(-1), np.maximum(t0, t1).min(-1)
     to_box = np.where((near <= far) & (near > 0), near, np.inf)
-    to_ground = np.where(safe[:, 2] < 0, (GROUND_M - origin[2]) / safe[:, 2], np.inf)
+    to_ground = np.where(safe[:, 2] < 0, (GROUND_M - origin[..., 2]) / safe[:, 2], np.inf)
     to_ground = np.where(to_ground < 90.0, to_ground, np.inf)
     first = to_box.argmin(0)
     box = to_box.min(0)

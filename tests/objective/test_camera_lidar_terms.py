@@ -90,9 +90,8 @@ def test_gradients_agree_with_differences_of_the_score(camera):
     xyz = np.stack([rng.uniform(6, 30, n), rng.uniform(-2, 2, n), rng.uniform(-1, 1, n)], -1).astype(
         np.float32
     )
-    points = Points(
-        xyz, np.array([0, 150, n]), np.zeros(n, np.uint8), np.zeros(n, np.uint8), np.zeros(n, np.float32)
-    )
+    none, start = np.zeros(n, np.float32), np.array([0, 150, n])
+    points = Points(xyz, start, np.zeros(n, np.uint8), np.zeros(n, np.uint8), none, none)
     labels = np.full((camera.height_px, camera.width_px), SKY, np.uint8)
     labels[:, :200] = CAR
     offsets = np.stack([boundary_offsets(labels)] * F)
@@ -101,13 +100,29 @@ def test_gradients_agree_with_differences_of_the_score(camera):
     )[None]
     maps = CameraMaps(camera, offsets, contrast, np.stack([labels] * F))
     velocity = np.array([[12.0, 0.5, 0.0], [5.0, 0.0, 0.0]])
-    terms = Terms(maps, camera_parameters(camera), points, points, points, velocity, np.zeros(F), np.zeros(F))
+    yaw_rate = np.array([0.3, -0.1])
+    parameters = camera_parameters(camera)
+    terms = Terms(maps, parameters, points, points, points, velocity, yaw_rate, np.zeros(F), 0.03)
     level = KernelSettings.wide(20.0, 0)
     state = AlignmentState(T_TRUE, 0.02, 1.001)
-    analytic = terms.gradient(state.alone, level)[0].sum(0)
+    terms = terms.exposed_at(state.alone)
+    analytic = terms.camera_gradient(state.alone, level)[0].sum(0)
+    np.testing.assert_array_equal(terms.gradient(state.alone, level)[0].sum(0), analytic[:8])
     h = np.array([1e-3] * 3 + [1e-2] * 3 + [2e-3, 2e-3])
     value = terms.score(state.moved(np.concatenate([np.diag(h), -np.diag(h)])), level).sum(1)
-    np.testing.assert_allclose(analytic, (value[:8] - value[8:]) / (2 * h), rtol=0.02, atol=2.0)
+    np.testing.assert_allclose(analytic[:8], (value[:8] - value[8:]) / (2 * h), rtol=0.02, atol=2.0)
+
+    def score(right_px, down_px, longer_s):
+        shifted = parameters + np.array([0, 0, 0, right_px, down_px, *np.zeros(13)], np.float32)
+        other = replace(terms, camera=shifted, readout_s=terms.readout_s + longer_s)
+        return other.exposed_at(state.alone).score(state.alone, level).sum()
+
+    h = np.array([0.4, 0.4, 0.01])
+    differences = [
+        (score(*step) - score(*-step)) / (2 * size) for step, size in zip(np.diag(h), h, strict=True)
+    ]
+    # A later row sees points elsewhere, in a later row again: a few hundredths more by differences.
+    np.testing.assert_allclose(analytic[8:], differences, rtol=0.05, atol=0.5)
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())

@@ -97,13 +97,18 @@ def _camera_lidar(
     apart = rotation_angle_rad(estimate.T @ np.linalg.inv(prior.T_camera_lidar))
     velocity = lidar_velocities(observations, prior.T_lidar_radar)
     reach = float(apart) + _REACH_RAD
-    terms = prepare_terms(observations, estimate.T, velocity, reach_rad=reach).sharp(MAX_GAP_PX)
+    readout_s = prior.camera.readout_s
+    terms = prepare_terms(observations, estimate.T, velocity, reach_rad=reach, readout_s=readout_s)
     focal = estimate.diagnostics.get("focal_scale", 1.0)
     # Of methods that estimate none: as if sensors of constant gaps measured together.
     dt_s = (
         constant_gap_s(camera_gaps_s(observations))
         if estimate.time_offset_s is None
         else estimate.time_offset_s
+    )
+    # The same points at every pose that is compared: rows that a prior a few degrees off would change by a tenth.
+    terms = terms.sharp(MAX_GAP_PX).exposed_at(
+        Alignments(estimate.T[None], np.array([dt_s]), np.array([focal]))
     )
     has_points = np.array([len(o.lidar_edge_xyz_m) + len(o.marking_xyz_m) > 0 for o in observations])
     sharp = KernelSettings.wide(_SHARP_PX, _SHARP_CONTRAST)

@@ -18,6 +18,7 @@ from jaxtyping import Float32, Float64, Int8, UInt8
 from pipeline.objective.camera_lidar.kernel_settings import CHANCE_BINS, KernelSettings
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.projection_loops import (
+    along_motion,
     most_points,
     project_point,
     project_points,
@@ -75,13 +76,14 @@ def edge_gradients(
     edges: Points,
     poses: Float64[np.ndarray, "F 12"],
     focal: float,
-    velocity: Float64[np.ndarray, "F 3"],
+    motion: Float64[np.ndarray, "F 4"],
     settings: KernelSettings,
-) -> tuple[Float64[np.ndarray, "F 8"], Float64[np.ndarray, "F 8 8"]]:
+) -> tuple[Float64[np.ndarray, "F 11"], Float64[np.ndarray, "F 11 11"]]:
     """Gradient of each frame's score at ONE pose, and its information.
 
-    By left perturbation of T_camera_lidar (rotation [rad], translation [m]), time offset [s] and focal scale. The
-    information is Gauss-Newton's: residuals weighted by how likely they are matches (iterated re-weighting).
+    By left perturbation of T_camera_lidar (rotation [rad], translation [m]), time offset [s], focal scale, principal
+    point [px of the label image] and readout time [s]. The information is Gauss-Newton's: residuals weighted by how
+    likely they are matches (iterated re-weighting).
 
     Args:
         camera: as for `edge_scores`.
@@ -89,7 +91,7 @@ def edge_gradients(
         edges: as for `edge_scores`.
         poses: rows of the 3x4 transform by frame.
         focal: focal length in units of the camera's.
-        velocity: own velocity of each frame in camera axes [m/s].
+        motion: of each frame, as for `along_motion`.
         settings: as for `edge_scores`.
     """
     return _gradient_loop(
@@ -102,7 +104,7 @@ def edge_gradients(
         edges.start,
         poses,
         focal,
-        velocity,
+        motion,
         settings.match,
         settings.chance,
         settings.sigma_px,
@@ -186,7 +188,7 @@ def _gradient_loop(
     start: np.ndarray,
     poses: np.ndarray,
     focal: float,
-    velocity: np.ndarray,
+    motion: np.ndarray,
     match: np.ndarray,
     chance: np.ndarray,
     sigma_px: float,
@@ -194,9 +196,9 @@ def _gradient_loop(
     """Sums over each frame's points of weighted gradients and their outer products."""
     frames = poses.shape[0]
     height, width = offsets.shape[2], offsets.shape[3]
-    gradient, information = np.zeros((frames, 8)), np.zeros((frames, 8, 8))
+    gradient, information = np.zeros((frames, 11)), np.zeros((frames, 11, 11))
     s2, beam = sigma_px * sigma_px, camera[1] * camera[1] / 12
-    row = np.zeros(8)
+    row = np.zeros(11)
     for f in range(frames):
         m = poses[f]
         for i in range(start[f], start[f + 1]):
@@ -225,11 +227,13 @@ def _gradient_loop(
             weight = part / (1 - pi + part) * 4 / (si2 * q)  # -d score / d r = weight r, and dr = -du
             row[0], row[1], row[2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
             row[3], row[4], row[5] = dx, dy, dz
-            row[6] = dx * velocity[f, 0] + dy * velocity[f, 1] + dz * velocity[f, 2]
+            row[6] = along_motion(m, motion[f], x, y, z, dx, dy, dz)
             row[7] = ou if c < 2 else ov
-            for a in range(8):
+            row[8], row[9] = (1.0, 0.0) if c < 2 else (0.0, 1.0)
+            row[10] = (0.5 - (v + 0.5) / height) * row[6]
+            for a in range(11):
                 gradient[f, a] += weight * r * row[a]
-                for b in range(8):
+                for b in range(11):
                     information[f, a, b] += weight * row[a] * row[b]
     return gradient, information
 

@@ -39,13 +39,18 @@ _CLASS_STRIDE = 8  # of the sampled cloud: neighbours say the same
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of F frames, one after the other: frame f has rows start[f]:start[f+1]; lidar frame."""
+    """Points of F frames, one after the other: frame f has rows start[f]:start[f+1]; lidar frame.
+
+    `exposure_s` is how long after the image's middle row their own row saw them, where they were moved to that time
+    (`rolling_shutter.exposed`).
+    """
 
     xyz_m: np.ndarray
     start: np.ndarray
     side: np.ndarray
     kind: np.ndarray
     gap_rad: np.ndarray
+    exposure_s: np.ndarray
 
     def chosen(self, keep: np.ndarray) -> Points:
         """The points of a mask."""
@@ -56,6 +61,7 @@ class Points:
             self.side[keep],
             self.kind[keep],
             self.gap_rad[keep],
+            self.exposure_s[keep],
         )
 
     def of_frames(self, frames: np.ndarray) -> Points:
@@ -69,6 +75,7 @@ class Points:
             self.side[index],
             self.kind[index],
             self.gap_rad[index],
+            self.exposure_s[index],
         )
 
 
@@ -182,4 +189,5 @@ def _gather(
         columns[1].astype(np.uint8),
         columns[2].astype(np.uint8),
         columns[3].astype(np.float32),
+        np.zeros(len(columns[0]), np.float32),
     )

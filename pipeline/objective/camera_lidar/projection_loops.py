@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pipeline.geometry.cameras import Camera
 
 __all__ = [
+    "along_motion",
     "camera_parameters",
     "count_in_view",
     "most_points",
@@ -222,3 +223,29 @@ def project_with_jacobian(
         bb = radial + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a
     aa, ab, ba, bb = c[1] * aa, c[1] * ab, c[2] * ba, c[2] * bb
     return u, v, True, aa * iz, ab * iz, -(aa * a + ab * b) * iz, ba * iz, bb * iz, -(ba * a + bb * b) * iz
+
+
+@no_type_check
+@numba.njit(inline="always", nogil=True)
+def along_motion(
+    pose: np.ndarray,
+    motion: np.ndarray,
+    x: float,
+    y: float,
+    z: float,
+    dx: float,
+    dy: float,
+    dz: float,
+) -> float:
+    """Derivative by the time offset of what depends on a point (x, y, z) of the camera frame by (dx, dy, dz).
+
+    `pose` has the rows of the transform from lidar to camera; `motion` the velocity in camera axes [m/s] of what lies
+    at its translation, and the yaw rate [rad/s], which turns points about the lidar's vertical.
+    """
+    a, b, c = x - pose[3], y - pose[7], z - pose[11]
+    up0, up1, up2, turn = pose[2], pose[6], pose[10], motion[3]
+    return (
+        dx * (motion[0] + turn * (up1 * c - up2 * b))
+        + dy * (motion[1] + turn * (up2 * a - up0 * c))
+        + dz * (motion[2] + turn * (up0 * b - up1 * a))
+    )

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Int8, Int64
 
 from pipeline.objective.camera_lidar.projection_loops import (
+    along_motion,
     most_points,
     project_points,
     project_with_jacobian,
@@ -71,18 +72,18 @@ def marking_gradients(
     start: np.ndarray,
     poses: np.ndarray,
     focal: float,
-    velocity: np.ndarray,
+    motion: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient [F, 8] of each frame's score and its information [F, 8, 8].
+    """Gradient [F, 11] of each frame's score and its information [F, 11, 11].
 
-    By rotation, translation, time offset and focal scale.
+    By rotation, translation, time offset, focal scale, principal point and readout time.
     As in `edge_gradients`. The score is linear in the contrast, so the information is that of the
     likelihood: the outer product of each point's gradient.
     """
     frames = poses.shape[0]
     height, width = contrast.shape[1], contrast.shape[2]
-    gradient, information = np.zeros((frames, 8)), np.zeros((frames, 8, 8))
-    row = np.zeros(8)
+    gradient, information = np.zeros((frames, 11)), np.zeros((frames, 11, 11))
+    row = np.zeros(11)
     for f in range(frames):
         m = poses[f]
         for i in range(start[f], start[f + 1]):
@@ -102,14 +103,16 @@ def marking_gradients(
             top, bottom, left = c01 - c00, c11 - c10, c10 - c00
             gu = weight[i] * (top + b * (bottom - top))
             gv = weight[i] * (left + a * (bottom - top))
+            row[8], row[9] = gu, gv
+            row[7] = gu * ou + gv * ov
             gu, gv = focal * gu, focal * gv
             dx, dy, dz = gu * jux + gv * jvx, gu * juy + gv * jvy, gu * juz + gv * jvz
             row[0], row[1], row[2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
             row[3], row[4], row[5] = dx, dy, dz
-            row[6] = dx * velocity[f, 0] + dy * velocity[f, 1] + dz * velocity[f, 2]
-            row[7] = (gu * ou + gv * ov) / focal
-            for j in range(8):
+            row[6] = along_motion(m, motion[f], x, y, z, dx, dy, dz)
+            row[10] = (0.5 - (v + 0.5) / height) * row[6]
+            for j in range(11):
                 gradient[f, j] += row[j]
-                for k in range(8):
+                for k in range(11):
                     information[f, j, k] += row[j] * row[k]
     return gradient, information

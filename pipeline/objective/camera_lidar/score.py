@@ -36,6 +36,7 @@ from pipeline.objective.camera_lidar.points import (
 )
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, count_in_view
 from pipeline.objective.camera_lidar.reflectivity import marking_gradients, marking_scores
+from pipeline.objective.camera_lidar.rolling_shutter import exposed
 from pipeline.objective.stamp_gaps import camera_gaps_s
 from schemas.observations import Observation
 
@@ -66,6 +67,7 @@ class Terms:
     velocity_lidar: np.ndarray  # F 3, own velocity in lidar axes [m/s]
     yaw_rate: np.ndarray  # F [rad/s]
     gap_s: np.ndarray  # F, image stamp minus lidar stamp
+    readout_s: float = 0.0  # of a rolling shutter, from the first row to the last
 
     @property
     def frames(self) -> int:
@@ -118,20 +120,36 @@ class Terms:
             contrast=self.maps.contrast[:, frames],
             labels=self.maps.labels[frames],
         )
-        return Terms(
-            maps,
-            self.camera,
-            self.edges.of_frames(frames),
-            self.markings.of_frames(frames),
-            self.classes.of_frames(frames),
-            self.velocity_lidar[frames],
-            self.yaw_rate[frames],
-            self.gap_s[frames],
+        return replace(
+            self,
+            maps=maps,
+            edges=self.edges.of_frames(frames),
+            markings=self.markings.of_frames(frames),
+            classes=self.classes.of_frames(frames),
+            velocity_lidar=self.velocity_lidar[frames],
+            yaw_rate=self.yaw_rate[frames],
+            gap_s=self.gap_s[frames],
         )
 
     def gaps_beyond(self, constant_s: float) -> Terms:
         """With gaps less a constant, so that time offsets count from it."""
         return replace(self, gap_s=self.gap_s - constant_s)
+
+    def exposed_at(self, at: Alignments, velocity_lidar: Float[np.ndarray, "F 3"] | None = None) -> Terms:
+        """With points where their image rows saw them at ONE alignment; maybe with other velocities from then on."""
+        velocity = self.velocity_lidar if velocity_lidar is None else velocity_lidar
+        if self.readout_s == 0:
+            return replace(self, velocity_lidar=velocity)
+        moved = self
+        # With other velocities: back to the middle row by the old ones first.
+        for speed, readout_s in ((self.velocity_lidar, 0.0), (velocity, self.readout_s)):
+            moved = replace(moved, velocity_lidar=speed)
+            about = (moved.poses(at)[0], self.maps.camera, speed, self.yaw_rate, readout_s)
+            edges, markings, classes = (
+                exposed(p, *about) for p in (moved.edges, moved.markings, moved.classes)
+            )
+            moved = replace(moved, edges=edges, markings=markings, classes=classes)
+        return moved
 
     def poses(self, at: Alignments) -> Float32[np.ndarray, "P F 12"]:
         """Rows of the transform from each frame's lidar points to its image [P, F, 12].
@@ -198,15 +216,22 @@ class Terms:
 
         By left perturbation of T_camera_lidar, time offset, focal scale.
         """
+        gradient, information = self.camera_gradient(at, settings)
+        return gradient[:, :8], information[:, :8, :8]
+
+    def camera_gradient(
+        self, at: Alignments, settings: KernelSettings
+    ) -> tuple[Float[np.ndarray, "F 11"], Float[np.ndarray, "F 11 11"]]:
+        """As `gradient`, and by principal point (right, down) [px of the label image] and readout time [s]."""
         poses = self.poses(at)[0].astype(np.float64)
-        velocity = self.velocity_lidar @ at.T_camera_lidar[0, :3, :3].T
+        motion = _motion_in_camera(poses, at.T_camera_lidar[0, :3, 3], self.velocity_lidar, self.yaw_rate)
         focal, m = float(at.focal[0]), self.markings
         g_edges, I_edges = edge_gradients(
-            self.camera, self.maps.offsets, self.edges, poses, focal, velocity, settings
+            self.camera, self.maps.offsets, self.edges, poses, focal, motion, settings
         )
         contrast = self.maps.contrast[settings.contrast_level]
         g_marks, I_marks = marking_gradients(
-            self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, poses, focal, velocity
+            self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, poses, focal, motion
         )
         a, b = settings.edge_weight, settings.marking_weight
         return a * g_edges + b * g_marks, a * I_edges + b * I_marks
@@ -259,6 +284,20 @@ def _moving_poses(
     return out
 
 
+def _motion_in_camera(
+    poses: Float[np.ndarray, "F 12"],
+    t_camera_lidar: Float[np.ndarray, " 3"],
+    velocity_lidar: Float[np.ndarray, "F 3"],
+    yaw_rate: Float[np.ndarray, " F"],
+) -> Float[np.ndarray, "F 4"]:
+    """Velocity in camera axes and yaw rate: a point moves by velocity + yaw_rate up x (point - pose's translation)."""
+    rows = poses.reshape(-1, 3, 4)
+    # The turn is about the lidar, which is where the pose's translation was before the way driven.
+    turn = yaw_rate[:, None] * np.cross(rows[:, :, 2], rows[:, :, 3] - t_camera_lidar)
+    velocity = np.einsum("fij,fj->fi", rows[:, :, :3], velocity_lidar) + turn
+    return np.column_stack([velocity, yaw_rate])
+
+
 def _weights(markings: Points, settings: KernelSettings) -> np.ndarray:
     return np.full(len(markings.xyz_m), settings.delta * CONTRAST_STEP, np.float32)
 
@@ -290,13 +329,16 @@ def prepare_terms(
     velocity_lidar: Float[np.ndarray, "F 3"],
     *,
     reach_rad: float,
+    readout_s: float = 0.0,
 ) -> Terms:
-    """Decode maps and gather the points that can come into view within `reach_rad` of a pose."""
+    """Decode maps and gather the points that can come into view within `reach_rad` of a pose.
+
+    `readout_s` is the rolling shutter's, from the first image row to the last; `Terms.exposed_at` brings it to bear.
+    """
     maps = prepare_maps(observations, CONTRAST_BLURS_PX)
     view = (observations, T_camera_lidar, maps.camera, reach_rad)
     edges, markings, classes = gather_edges(*view), gather_markings(*view), gather_classes(*view)
     yaw_rate = np.array([o.ego_yaw_rate_radps or 0.0 for o in observations])
     gap_s = camera_gaps_s(observations)
-    return Terms(
-        maps, camera_parameters(maps.camera), edges, markings, classes, velocity_lidar, yaw_rate, gap_s
-    )
+    camera = camera_parameters(maps.camera)
+    return Terms(maps, camera, edges, markings, classes, velocity_lidar, yaw_rate, gap_s, readout_s)

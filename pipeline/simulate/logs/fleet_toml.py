@@ -22,6 +22,7 @@ def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> 
             f'semantics = {{ source = "topics", labels = "{TOPICS["labels"]}", '
             f'detections = "{TOPICS["detections"]}", label_set = "cityscapes" }}'
         ),
+        *([f"readout_s = {rig.camera.readout_s}"] if rig.camera.readout_s else []),
         "",
         f"[rigs.{rig_name}.lidar]",
         f'points = "{TOPICS["lidar"]}"',

@@ -197,7 +197,8 @@ def true_offset_s(day: Day, pair: str, spoil: str) -> float | None:
 
 def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
     """Calibrate a day as a run says and measure every pair against truth."""
-    prior = prior_of(day, run.prior, run.seed)
+    camera = day.fleet.rig_of(next(iter(day.fleet.vehicles))).camera.known
+    prior = replace(prior_of(day, run.prior, run.seed), camera=camera)
     rows = spoiled(day.rows, run.spoil)
     fleet = _configured(day.fleet, run)
     about = Inputs(Partition(VEHICLE, DATE), run.method, "study", run.seed, ())

@@ -124,12 +124,14 @@ def align_camera_lidar(
         raise SolveError(f"camera-lidar needs {_FEWEST_FRAMES} frames of one camera, the day has {len(used)}")
     frames = [observations[i] for i in used]
     terms = _terms(frames, velocity_lidar[used], prior, config)
+    terms = terms.exposed_at(AlignmentState(prior.T_camera_lidar).alone)
 
     first = KernelSettings.wide(*SCHEDULE.kernels[0])
     sharp = terms.sharp(MAX_GAP_PX)
     limits = search_range(prior, config)
     thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config, limits)
     basin = find_basin(terms, thin, rng)
+    thin = replace(thin, terms=thin.terms.exposed_at(basin.state.alone))
     sharp = sharp.in_view(basin.state.T_camera_lidar, _MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
     # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
     near = prior.translation_sigma_m <= _NEAR_PRIOR_M
@@ -138,6 +140,7 @@ def align_camera_lidar(
     state = refine(thin, state, steps=SCHEDULE.first_steps, fixed=fixed)
     kernel = first
     for sigma_px, contrast in SCHEDULE.kernels[1:]:
+        sharp = sharp.exposed_at(state.alone)
         fitted = sharp.fitted(state.alone, KernelSettings.wide(sigma_px, contrast), rng)
         kernel = weighted(sharp, state, fitted)
         scored = Scored(sharp, kernel, prior, config, limits)
@@ -174,7 +177,7 @@ def analyse_camera_lidar(
         sigma = float(np.hypot(HEADING_SIGMA_RAD, heading[1]))
         problem = replace(
             problem,
-            terms=replace(problem.terms, velocity_lidar=velocity),
+            terms=problem.terms.exposed_at(aligned.state.alone, velocity),
             motion=replace(problem.motion, heading_rad=sigma),
         )
     analysis = analyse_observability(problem, aligned.state, aligned.kernel, rng)
@@ -196,7 +199,8 @@ def _terms(
 ) -> Terms:
     """The terms that the config asks for, with all points that the search range can bring into view."""
     reach = search_range(prior, config).rotation_rad + _MARGIN_RAD
-    terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar, reach_rad=reach)
+    readout_s = prior.camera.readout_s
+    terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar, reach_rad=reach, readout_s=readout_s)
     terms = terms.gaps_beyond(constant_gap_s(terms.gap_s))
     terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
     if "edges" in config.terms and len(terms.edges.xyz_m) < _FEWEST_EDGES * len(frames):
