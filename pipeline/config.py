@@ -254,6 +254,9 @@ class AuditConfig(Section):
     held_sigma_factor: Annotated[float, Field(ge=1)] = (
         2.0  # held days weigh less: held-out frames did not confirm them
     )
+    reference_days: Annotated[int, Field(gt=1)] = (
+        10  # first accepted days that tonight is held against, for good
+    )
     window_days: Annotated[int, Field(gt=2)] = 28  # audited days where the command names no first day
     camera_lidar_limit_deg: Positive = 0.1
     radar_limit_deg: Positive = 0.25

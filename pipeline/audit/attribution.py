@@ -17,16 +17,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
-from pipeline.geometry.se3 import adjoint, inverse, log_se3
+from pipeline.geometry.changes import change_jacobian
+from pipeline.geometry.se3 import adjoint
 
-__all__ = ["SENSORS", "Attribution", "PairShift", "attribute", "independent_pairs", "pair_shift"]
+__all__ = ["SENSORS", "Attribution", "PairShift", "attribute", "pair_shift"]
 
 SENSORS = ("camera", "lidar", "radar")
 _CLEAR_PROBABILITY = 0.95
-_MISFIT_PROBABILITY = 1e-3  # a best motion that explains the shifts worse than this is not the whole story
+_MISFIT_PROBABILITY = (
+    1e-3  # a best motion that explains the shifts worse than this is not the whole story ...
+)
+_WHOLE_STORY = 0.99  # ... unless it explains this share of them (of chi-squared): sigmas are estimates
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,46 +58,50 @@ class Attribution:
 
 
 def pair_shift(
-    T: Float[np.ndarray, "N 4 4"], covariance: Float[np.ndarray, "N 6 6"], is_after: np.ndarray
+    origin: Float[np.ndarray, "4 4"],
+    change: Float[np.ndarray, "N 6"],
+    spread: Float[np.ndarray, "N 6 6"],
+    is_after: Bool[np.ndarray, " N"],
+    autocorrelation: float = 0.0,
 ) -> PairShift:
     """Shift of one pair between the days before and after a change, each side averaged by full covariances.
 
     Args:
-        T: day estimates of T_parent_child.
-        covariance: theirs, of left perturbations.
+        origin: T_parent_child that changes count from.
+        change: of each day (rotation vector, shift of the child's origin).
+        spread: covariances of the changes.
         is_after: True for days with the new value; both sides need a day.
+        autocorrelation: of successive days: a mean of n of them is less sure by that.
     """
-    reference = T[0]
-    xi = np.stack([log_se3(T_day @ inverse(reference)) for T_day in T])
     sides = []
     for side in (~is_after, is_after):
-        information = np.linalg.inv(covariance[side])
+        information = np.linalg.inv(spread[side])
         total = np.linalg.inv(information.sum(axis=0))
-        sides.append((total @ np.einsum("nij,nj->i", information, xi[side]), total))
+        mean = total @ np.einsum("nij,nj->i", information, change[side])
+        sides.append((mean, total * _less_sure(int(side.sum()), autocorrelation)))
     (before, cov_before), (after, cov_after) = sides
-    return PairShift(reference, after - before, cov_before + cov_after)
+    to_twist = np.linalg.inv(change_jacobian(origin))
+    return PairShift(origin, to_twist @ (after - before), to_twist @ (cov_before + cov_after) @ to_twist.T)
 
 
-def independent_pairs(shifts: Mapping[str, PairShift], *, closure: float = 1e-6) -> tuple[str, ...]:
-    """Pairs whose errors are their own: camera_radar is left out where it is composed of the other two."""
-    if len(shifts) < 3:
-        return tuple(shifts)
-    T_cl, T_lr, T_cr = (shifts[p].T for p in ("camera_lidar", "lidar_radar", "camera_radar"))
-    is_composed = np.abs(T_cl @ T_lr - T_cr).max() < closure
-    return ("camera_lidar", "lidar_radar") if is_composed else tuple(shifts)
+def _less_sure(days: int, autocorrelation: float) -> float:
+    """Variance of a mean of AR(1) days in that of independent ones."""
+    lag = np.arange(1, days)
+    return float(1 + 2 * np.sum((1 - lag / days) * autocorrelation**lag))
 
 
 def attribute(shifts: Mapping[str, PairShift]) -> Attribution:
     """Decide between the three sensors.
 
     Args:
-        shifts: by pair; at least two pairs, else nothing can be told apart.
+        shifts: by pair, of pairs whose errors are their own; at least two, else nothing can be told apart.
     """
-    pairs = independent_pairs(shifts)
+    pairs = tuple(shifts)
     if len(pairs) < 2:
         return Attribution(
             None, "only one pair has data, which two sensors share", {}, np.zeros(6), np.eye(6)
         )
+    total = sum(float(s.xi @ np.linalg.solve(s.covariance, s.xi)) for s in shifts.values())
     fits = {sensor: _fit(sensor, {p: shifts[p] for p in pairs}) for sensor in SENSORS}
     cost = {sensor: fit[0] for sensor, fit in fits.items()}
     best = min(cost, key=cost.__getitem__)
@@ -104,7 +112,7 @@ def attribute(shifts: Mapping[str, PairShift]) -> Attribution:
     if probability[best] < _CLEAR_PROBABILITY:
         rivals = [s for s in SENSORS if probability[s] > 1 - _CLEAR_PROBABILITY]
         return Attribution(None, f"cannot tell {' from '.join(rivals)}", probability, motion, covariance)
-    if chi2.sf(cost[best], freedom) < _MISFIT_PROBABILITY:
+    if chi2.sf(cost[best], freedom) < _MISFIT_PROBABILITY and cost[best] > (1 - _WHOLE_STORY) * total:
         text = f"no single sensor explains it ({best} comes nearest): several moved, or sigmas are too small"
         return Attribution(None, text, probability, motion, covariance)
     return Attribution(best, f"the {best} moved", probability, motion, covariance)

@@ -1,97 +1,185 @@
-"""Control charts on day estimates: did a value change, since when, by how much, at once or slowly.
+"""Many control charts at once: did a value change at any split of its days, seen through the noise that days have.
 
-The alarm statistic is the largest standardised difference between the days before and after any split (the
-likelihood ratio of one step against none, Hinkley 1970, Biometrika 57(1)). It needs no reference day and
-works from two days on; with every day's own sigma it uses good and poor days by their worth. The threshold
-is an upper bound, not an approximation: see `alarm_threshold`.
+The statistic is the largest difference between the days after and before a split, in units of its sigma (the
+likelihood ratio of one step against none, Hinkley 1970, Biometrika 57(1)). Three things that real days do are part of
+it: successive days err alike (AR(1), `autocorrelation`), a vehicle's days scatter more than they say (`scale`, known
+to `freedom` degrees of freedom), and single days are far off (`clipped`). All arrays have a row per chart and a column
+per day; a chart's days stand at the left, what is beyond its `count` weighs nothing.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import brentq
 from scipy.special import owens_t
 from scipy.stats import norm
+from scipy.stats import t as student_t
 
-__all__ = [
-    "Change",
-    "Chart",
-    "ChartVerdict",
-    "alarm_threshold",
-    "judge_chart",
-    "pooled_scatter",
-    "ramp_fits",
-    "start_interval",
-    "step_scan",
-]
+__all__ = ["Charts", "Scan", "alarm_threshold", "clipped", "scan", "thresholds"]
 
-# Fall of twice the log-likelihood that bounds the start day's interval. A split is discrete, so the
-# quantile of chi-squared is only a guide; with this value the interval held the true day in 97-99 % of
-# simulated steps (tests/audit).
-_START_DROP = 6.0
-# Twice the log-likelihood by which a lasting change must beat "one day stands out", and a slow drift a
-# step: odds of 20.
-_CLEAR_ODDS = 6.0
-_VISIBLE_SIGMAS = 2.0  # a chart shows a change that is at least this many sigmas of its best-placed split
-_LASTING = "a lasting change of a size that matters"
-_SUSPECT_SIGMAS = 3.0  # from here to the alarm threshold a chart is neither green nor an alarm
-_MIN_SCATTER_DAYS = 6  # successive differences below which their spread says nothing
+# Sigmas by which a day may lie from the median of itself and its neighbours. Two days in a row are believed, one is
+# not: with it, RED false alarms of days that err like Student's t with 4 degrees of freedom are those of normal ones.
+_CLIP_SIGMAS = 3.0
+_MOST_FREEDOM = 200  # beyond which Student's t is the normal distribution for our purpose
 
 
 @dataclass(frozen=True, eq=False)
-class Chart:
-    """Day estimates of one DoF of one pair of one vehicle.
+class Charts:
+    """Day estimates of one degree of freedom each.
 
     Args:
-        day: ordinals (days of the calendar, gaps allowed), rising.
-        value: estimates [rad or m], relative to any fixed reference.
-        sigma: their standard deviations, day biases included.
-        accepted: False for days that were held; None = all accepted.
+        day: ordinals of the calendar, rising along a row; a fixed reference stands first, as if it were one day.
+        value: estimates [rad or m], relative to any fixed value.
+        sigma: what varies from day to day; infinite beyond `count`.
+        accepted: False for days that were held.
+        reference_days: days that the first column of a row stands for where it is a fixed reference (its sigma is that
+            of their mean if they were independent), which is never clipped; 0 where it is a day like the others.
+        count: days of each row.
     """
 
-    day: np.ndarray
-    value: np.ndarray
-    sigma: np.ndarray
-    accepted: np.ndarray | None = None
+    day: Int[np.ndarray, "M N"]
+    value: Float[np.ndarray, "M N"]
+    sigma: Float[np.ndarray, "M N"]
+    accepted: Bool[np.ndarray, "M N"]
+    reference_days: Int[np.ndarray, " M"]
+    count: Int[np.ndarray, " M"]
+
+    @property
+    def has_reference(self) -> Bool[np.ndarray, " M"]:
+        """Rows whose first column is a fixed reference."""
+        return self.reference_days > 0
+
+    def row(self, m: int, first: int = 0, end: int | None = None) -> Charts:
+        """One chart alone, or the part of its days from column `first` to before `end`."""
+        end = int(self.count[m]) if end is None else end
+        part = (slice(m, m + 1), slice(first, end))
+        return Charts(
+            self.day[part],
+            self.value[part],
+            self.sigma[part],
+            self.accepted[part],
+            self.reference_days[m : m + 1] * (first == 0),
+            np.array([end - first]),
+        )
 
 
-@dataclass(frozen=True)
-class Change:
-    """One change: `day` is the first with the new value; the true one is in [earliest, latest] with 95 %."""
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Every split of every chart: split s lies between columns s and s + 1. Sigma is infinite where there is none."""
 
-    day: int
-    earliest: int
-    latest: int
-    kind: str  # 'step' or 'slow drift'
-    size: float
-    size_sigma: float
+    size: Float[np.ndarray, "M S"]
+    sigma: Float[np.ndarray, "M S"]
 
-
-@dataclass(frozen=True)
-class ChartVerdict:
-    """What one chart says; `change` is None where there is no alarm."""
-
-    status: str
-    reason: str
-    days_used: int
-    statistic: float | None
-    threshold: float | None
-    visible_size: float | None  # smallest change of a well-placed step that the chart would show [rad or m]
-    change: Change | None
+    @property
+    def z(self) -> Float[np.ndarray, "M S"]:
+        """Sizes in units of their sigmas."""
+        return self.size / self.sigma
 
 
-def step_scan(chart: Chart) -> Float[np.ndarray, " S"]:
-    """Mean after minus mean before in units of its sigma; split s lies before day s + 1 of the chart."""
-    size, sigma = _step_sizes(chart)
-    return size / sigma
+def clipped(charts: Charts, scale: Float[np.ndarray, " M"]) -> Float[np.ndarray, "M N"]:
+    """Values, none further than some sigmas from the median of itself and its neighbours (at an end: of three)."""
+    M, N = charts.value.shape
+    out = charts.value.copy()
+    if N < 3:
+        return out
+    rows, last = np.arange(M), charts.count - 1
+    median = np.empty_like(out)
+    a, b, c = out[:, :-2], out[:, 1:-1], out[:, 2:]
+    median[:, 1:-1] = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+    median[:, 0] = median[:, 1]
+    median[rows, last] = median[rows, np.maximum(last - 1, 0)]
+    # A reference is worth many days: the day after it stands beside it, not against it.
+    second = charts.has_reference & (charts.count > 3)
+    median[second, 1] = median[second, 2]
+    reach = _CLIP_SIGMAS * scale[:, None] * np.where(np.isfinite(charts.sigma), charts.sigma, 0.0)
+    moved = np.clip(out, median - reach, median + reach)
+    many = (charts.count >= 3)[:, None] & (np.arange(N) < charts.count[:, None])
+    many[:, 0] &= ~charts.has_reference
+    return np.where(many, moved, out)
+
+
+def scan(
+    charts: Charts,
+    value: Float[np.ndarray, "M N"],
+    scale: Float[np.ndarray, " M"],
+    autocorrelation: Float[np.ndarray, " M"],
+) -> Scan:
+    """Mean after minus mean before, at every split.
+
+    Each side's variance counts that its days err alike; that both sides do so too would make the difference surer, and
+    is left out: where the autocorrelation is overstated, that would be wrong the other way.
+
+    Args:
+        charts: the days.
+        value: theirs, clipped or not.
+        scale: factor on the sigmas.
+        autocorrelation: of days that follow each other; it falls with the power of the days between.
+    """
+    a = 1 / charts.sigma
+    held = charts.has_reference
+    if held.any():
+        a[held, 0] /= np.sqrt(_alike(charts.reference_days[held], autocorrelation[held]))
+    weight = a * a
+    total, moment = np.cumsum(weight, axis=1), np.cumsum(weight * value, axis=1)
+    gap = np.diff(charts.day, axis=1).clip(min=0)
+    rho = autocorrelation[:, None] ** gap
+    before = _sum_variance(a, rho)[:, :-1]
+    after = _sum_variance(a[:, ::-1], rho[:, ::-1])[:, ::-1][:, 1:]
+    left, right = total[:, :-1], total[:, -1:] - total[:, :-1]
+    there = np.arange(1, a.shape[1]) < charts.count[:, None]
+    left, right = np.where(there, left, 1.0), np.where(there, right, 1.0)
+    size = (moment[:, -1:] - moment[:, :-1]) / right - moment[:, :-1] / left
+    sigma = scale[:, None] * np.sqrt(before / left**2 + after / right**2)
+    return Scan(np.where(there, size, 0.0), np.where(there, sigma, np.inf))
+
+
+def _alike(days: Int[np.ndarray, " M"], autocorrelation: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
+    """Variance of a mean of AR(1) days in that of independent ones."""
+    lag = np.arange(1, days.max(initial=1))
+    share = np.maximum(1 - lag / days[:, None], 0.0)
+    return np.asarray(1 + 2 * (share * autocorrelation[:, None] ** lag).sum(axis=1))
+
+
+def _sum_variance(a: np.ndarray, rho: np.ndarray) -> np.ndarray:
+    """Variance of the running sum of `a e`, e of variance 1 with correlation rho from one to the next."""
+    out = np.empty_like(a)
+    carried, out[:, 0] = a[:, 0].copy(), a[:, 0] ** 2
+    for k in range(1, a.shape[1]):
+        carried *= rho[:, k - 1]
+        out[:, k] = out[:, k - 1] + a[:, k] * (2 * carried + a[:, k])
+        carried += a[:, k]
+    return out
+
+
+def thresholds(
+    count: Int[np.ndarray, " M"], freedom: Float[np.ndarray, " M"], probability: Float[np.ndarray, " M"]
+) -> Float[np.ndarray, " M"]:
+    """Threshold on max |z| of each chart; infinite where there are fewer than two days.
+
+    Args:
+        count: days.
+        freedom: degrees of freedom that the scale is known to.
+        probability: of an alarm without a change.
+    """
+    keys = np.stack([count, np.clip(np.rint(freedom), 1, _MOST_FREEDOM), probability], axis=1)
+    unique, index = np.unique(keys, axis=0, return_inverse=True)
+    found = [_threshold(int(n), int(f), float(p)) if n > 1 else np.inf for n, f, p in unique]
+    return np.array(found)[index.ravel()]
+
+
+@lru_cache(maxsize=4096)
+def _threshold(count: int, freedom: int, probability: float) -> float:
+    # As many independent splits as the bound for known sigmas says, each with Student's t: the scale is not known.
+    one = norm.sf(alarm_threshold(np.ones(count), probability))
+    return float(student_t.isf(one, freedom))
 
 
 def alarm_threshold(sigma: Float[np.ndarray, " N"], false_alarm_probability: float) -> float:
-    """Threshold on max |step_scan| that a chart without a change exceeds with at most this probability.
+    """Threshold on max |z| that a chart of independent normal days exceeds with at most this probability.
 
     P(max > h) <= P(|z_1| > h) + sum P(|z_s-1| <= h < |z_s|): the first split above h is either the first of
     all or follows one below h. Neighbouring splits share their days, so the second terms are small; they
@@ -117,139 +205,3 @@ def alarm_threshold(sigma: Float[np.ndarray, " N"], false_alarm_probability: flo
     low = norm.isf(false_alarm_probability / 2)
     high = norm.isf(false_alarm_probability / (2 * len(sigma)))
     return float(brentq(excess, low - 1e-9, high + 1e-9)) if len(r) else float(low)
-
-
-def ramp_fits(
-    chart: Chart,
-) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " S"], Float[np.ndarray, " S"]]:
-    """Twice the log-likelihood gain, total size and sigma of a drift from each split on to the last day."""
-    w = chart.sigma**-2.0
-    day = chart.day.astype(np.float64)
-    # A drift that sets in after day s-1 has grown by (day - day[s-1]): column s of the design.
-    shape = np.maximum(day[None, :] - day[:-1, None], 0.0)
-    shape /= shape[:, -1:]
-    centred = shape - (shape @ w)[:, None] / w.sum()
-    information = (centred**2) @ w
-    size = (centred @ (w * chart.value)) / information
-    return size**2 * information, size, information**-0.5
-
-
-def start_interval(gain: Float[np.ndarray, " S"], day: Int[np.ndarray, " N"]) -> tuple[int, int, int]:
-    """First day with the new value, and its interval, from twice the log-likelihood gain of each split.
-
-    Days without an estimate count: the change may lie anywhere after the last day before the earliest
-    likely split.
-    """
-    best = int(np.argmax(gain))
-    likely = np.flatnonzero(gain >= gain[best] - _START_DROP)
-    return int(day[best + 1]), int(day[likely[0]]) + 1, int(day[likely[-1] + 1])
-
-
-def pooled_scatter(charts: list[Chart]) -> float:
-    """Factor >= 1 by which day estimates scatter more than their sigmas, over all charts of a DoF in a fleet.
-
-    The median of successive differences, so that a few real steps do not count. Never below 1: sigmas are
-    not made smaller because a few days happen to agree.
-    """
-    parts = [np.diff(c.value) / np.hypot(c.sigma[1:], c.sigma[:-1]) for c in charts if len(c.value) > 1]
-    differences = np.concatenate(parts) if parts else np.zeros(0)
-    if len(differences) < _MIN_SCATTER_DAYS:
-        return 1.0
-    return max(1.0, float(np.median(np.abs(differences)) / norm.ppf(0.75)))
-
-
-def judge_chart(
-    chart: Chart, limit: float, false_alarm_probability: float, baseline_days: int
-) -> ChartVerdict:
-    """Judge one chart.
-
-    Args:
-        chart: day estimates; sigma already multiplied by the pooled scatter.
-        limit: size of a change that matters [rad or m].
-        false_alarm_probability: of this chart in this audit.
-        baseline_days: the chart says nothing, unless it alarms, until it has one day more than this.
-
-    Returns:
-        RED: a lasting change of at least `limit`. YELLOW: a smaller one, or one that rests on a single day.
-        GREEN: no change, and one of size `limit` would be seen. UNKNOWN: too few days, or sigmas too large
-            to see one.
-    """
-    days = len(chart.day)
-    if days < 2:
-        return ChartVerdict("UNKNOWN", f"{_count(days)} of data", days, None, None, None, None)
-    z = step_scan(chart)
-    statistic, threshold = float(np.max(np.abs(z))), alarm_threshold(chart.sigma, false_alarm_probability)
-    visible = _VISIBLE_SIGMAS * float(np.min(_step_sizes(chart)[1]))
-    if statistic > threshold:
-        change = _describe(chart, z)
-        status, reason = _alarm_status(chart, z, change, limit)
-        return ChartVerdict(status, reason, days, statistic, threshold, visible, change)
-    if days <= baseline_days:
-        reason = f"{_count(days)} of data, {baseline_days + 1} needed"
-        return ChartVerdict("UNKNOWN", reason, days, statistic, threshold, visible, None)
-    size, sigma = _step_sizes(chart)
-    if np.any((np.abs(size) > limit) & (np.abs(size) > _SUSPECT_SIGMAS * sigma)):
-        reason = "a change may have begun, but it is not sure enough for an alarm"
-        return ChartVerdict("UNKNOWN", reason, days, statistic, threshold, visible, None)
-    if visible > limit:
-        reason = _what_could_hide(days, visible / limit)
-        return ChartVerdict("UNKNOWN", reason, days, statistic, threshold, visible, None)
-    return ChartVerdict("GREEN", "no change", days, statistic, threshold, visible, None)
-
-
-def _what_could_hide(days: int, times: float) -> str:
-    """`times`: what a chart of so many days shows, in sizes that matter. It shrinks with the root of the days."""
-    needed = math.ceil(days * times**2)
-    return (
-        f"no change seen, but one of the size that matters could hide: {times:.1f} times as much would show, and "
-        f"that size after about {_count(needed)} like these"
-    )
-
-
-def _step_sizes(chart: Chart) -> tuple[np.ndarray, np.ndarray]:
-    w = chart.sigma**-2.0
-    weight, moment = np.cumsum(w), np.cumsum(w * chart.value)
-    before, after = weight[:-1], weight[-1] - weight[:-1]
-    size = (moment[-1] - moment[:-1]) / after - moment[:-1] / before
-    return size, np.sqrt(1 / before + 1 / after)
-
-
-def _describe(chart: Chart, z: np.ndarray) -> Change:
-    step_gain = z**2
-    ramp_gain, ramp_size, ramp_sigma = ramp_fits(chart)
-    if np.max(ramp_gain) > np.max(step_gain) + _CLEAR_ODDS:
-        s = int(np.argmax(ramp_gain))
-        return Change(
-            *start_interval(ramp_gain, chart.day), "slow drift", float(ramp_size[s]), float(ramp_sigma[s])
-        )
-    s = int(np.argmax(step_gain))
-    size, sigma = _step_sizes(chart)
-    return Change(*start_interval(step_gain, chart.day), "step", float(size[s]), float(sigma[s]))
-
-
-def _alarm_status(chart: Chart, z: np.ndarray, change: Change, limit: float) -> tuple[str, str]:
-    gain = float(np.max(z**2)) if change.kind == "step" else float(np.max(ramp_fits(chart)[0]))
-    if gain < _outlier_gain(chart) + _CLEAR_ODDS:
-        return "YELLOW", "one day stands out: the next day will tell whether it lasts"
-    if abs(change.size) < limit:
-        return "YELLOW", "a change below the size that matters"
-    if chart.accepted is None:
-        return "RED", _LASTING
-    is_after = chart.day >= change.day
-    # Held days agree by chance only within their enlarged sigmas, so two of them stand for an accepted one.
-    doubtful = [side for side in (is_after, ~is_after) if not chart.accepted[side].any()]
-    if any(side.sum() < 2 for side in doubtful):
-        return "YELLOW", "rests on a single day, whose calibration was held"
-    return "RED", _LASTING + ("; rests on days whose calibration was held" if doubtful else "")
-
-
-def _outlier_gain(chart: Chart) -> float:
-    """Twice the log-likelihood gain of "a single day is wrong", for the best such day."""
-    w = chart.sigma**-2.0
-    rest = w.sum() - w
-    mean_of_others = ((w * chart.value).sum() - w * chart.value) / rest
-    return float(np.max((chart.value - mean_of_others) ** 2 / (1 / w + 1 / rest)))
-
-
-def _count(days: int) -> str:
-    return "1 day" if days == 1 else f"{days} days"

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.audit.attribution import Attribution
-from pipeline.audit.charts import ChartVerdict
 from pipeline.audit.status import decide_status
 from pipeline.audit.vehicle import VehicleVerdict, limit_of
+from pipeline.audit.verdicts import ChartVerdict
 from pipeline.config import AuditConfig
 from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
 from schemas.drift import DriftFinding

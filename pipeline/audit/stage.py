@@ -6,19 +6,18 @@ import datetime as dt
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 
-import numpy as np
-
-from pipeline.audit.charts import Chart, pooled_scatter
+from pipeline.audit.days import charted, reference_of
+from pipeline.audit.estimates import days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
-from pipeline.audit.vehicle import PairDays, VehicleVerdict, charts_of, judge_vehicle
+from pipeline.audit.vehicle import VehicleVerdict, judge_fleet
 from pipeline.config import FleetConfig, config_hash
 from pipeline.errors import ConfigError
 from pipeline.results import Progress
-from pipeline.store.current import current_records, transform_of
+from pipeline.store.current import current_records
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.tables import read_records
 from pipeline.work import Records, Task, Told, Window, Work
-from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DriftFinding
 from schemas.versions import CODE_VERSION
 
@@ -44,7 +43,7 @@ def work(task: Task) -> Work:
     first, last = _window(records, task.of.first, task.of.last, fleet.audit.window_days)
     by_vehicle: dict[str, list[CalibrationRecord]] = {v: [] for v in fleet.vehicles}
     for record in records:
-        if first <= record.day <= last:
+        if record.day <= last:
             by_vehicle.setdefault(record.vehicle, []).append(record)
     settings = (fleet.audit, {"from": first, "to": last, "method": method})
     return Work(
@@ -63,15 +62,19 @@ def _judged(
     progress: Progress,
 ) -> Generator[Records, None, None]:
     """The findings of one vehicle after the other."""
+    first, last, method = window
     if not any(by_vehicle.values()):
         return
-    factor = fleet.audit.held_sigma_factor
-    days = {vehicle: _pairs(rows, factor) for vehicle, rows in by_vehicle.items()}
-    scatter = _scatter(list(days.values()))
-    for done, vehicle in enumerate(sorted(by_vehicle)):
-        progress(done, len(by_vehicle), vehicle)
-        verdict = judge_vehicle(days[vehicle], scatter, fleet.audit)
-        yield _findings(fleet, vehicle, by_vehicle[vehicle], verdict, window)
+    config = fleet.audit
+    vehicles = sorted(by_vehicle)
+    ends = dt.date.fromisoformat(first).toordinal(), dt.date.fromisoformat(last).toordinal()
+    days = []
+    for vehicle in vehicles:
+        found = days_of(by_vehicle[vehicle], config.held_sigma_factor)
+        days.append({p: charted(d, *ends, reference_of(d, config.reference_days)) for p, d in found.items()})
+    for done, (vehicle, verdict) in enumerate(zip(vehicles, judge_fleet(days, config), strict=True)):
+        progress(done, len(vehicles), vehicle)
+        yield _findings(fleet, vehicle, by_vehicle[vehicle], verdict, (first, last, method))
     progress(len(by_vehicle), len(by_vehicle), "")
 
 
@@ -95,43 +98,6 @@ def _window(
     if first > last:
         raise ConfigError("command line", "from", f"{first} lies after the window's last day {last}")
     return first, last
-
-
-def _pairs(records: Sequence[CalibrationRecord], held_sigma_factor: float) -> dict[str, PairDays]:
-    """Estimates by pair, with larger sigmas where the day was held; refused and disproved days are gaps."""
-    pairs = {}
-    for pair in PAIRS:
-        rows = [r for r in records if r.pair == pair and _may_be_right(r)]
-        transforms = [transform_of(r) for r in rows]
-        if rows:
-            factor = np.array([1.0 if r.status == "accepted" else held_sigma_factor for r in rows])
-            covariance = np.stack([r.covariance for r in rows if r.covariance is not None])
-            pairs[pair] = PairDays(
-                np.array([dt.date.fromisoformat(r.day).toordinal() for r in rows]),
-                np.stack([T for T in transforms if T is not None]),
-                covariance * factor[:, None, None] ** 2,
-                np.array([r.observable or [True] * 6 for r in rows], dtype=bool),
-                np.array([r.status == "accepted" for r in rows], dtype=bool),
-            )
-    return pairs
-
-
-def _may_be_right(record: CalibrationRecord) -> bool:
-    """Whether a record has a pose that no check disproved: a lost basin is 0.7 m off at a sigma of millimetres."""
-    return (
-        record.status != "refused"
-        and record.covariance is not None
-        and not record.diagnostics.get("disproved", 0.0)
-    )
-
-
-def _scatter(fleet_days: Sequence[dict[str, PairDays]]) -> dict[tuple[str, str], float]:
-    charts: dict[tuple[str, str], list[Chart]] = {}
-    for pairs in fleet_days:
-        for pair, pair_days in pairs.items():
-            for dof, chart in charts_of(pair_days).items():
-                charts.setdefault((pair, dof), []).append(chart)
-    return {key: pooled_scatter(found) for key, found in charts.items()}
 
 
 def _findings(

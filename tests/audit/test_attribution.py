@@ -1,27 +1,29 @@
 """Which sensor moved: motions of one sensor, built by SE(3) algebra, with noise."""
 
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
 import pytest
 
-from pipeline.audit.attribution import PairShift, attribute, independent_pairs, pair_shift
+from pipeline.audit.attribution import PairShift, attribute, pair_shift
+from pipeline.audit.days import PairDays
+from pipeline.audit.estimates import days_of
+from pipeline.audit.vehicle import independent_pairs
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse, log_se3
 
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])  # a turned bracket: yaw and a little sideways
 
 
-def _shifts(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[str, PairShift]:
+def _days(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[str, PairDays]:
     rng = np.random.default_rng(seed)
-    records = maker.vehicle_records("v", 4, rng, motion=lambda day: moved if day > 1 else {})
-    shifts = {}
-    for pair in ("camera_lidar", "lidar_radar", "camera_radar"):
-        rows = [r for r in records if r.pair == pair]
-        from pipeline.store.current import transform_of
+    return days_of(maker.vehicle_records("v", 4, rng, motion=lambda day: moved if day > 1 else {}), 2.0)
 
-        T = np.stack([transform_of(r) for r in rows])
-        shifts[pair] = pair_shift(T, np.stack([r.covariance for r in rows]), np.array([0, 0, 1, 1], bool))
-    return shifts
+
+def _shifts(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[str, PairShift]:
+    days, is_after = _days(maker, moved, seed), np.array([0, 0, 1, 1], bool)
+    own = independent_pairs(days, days["camera_lidar"].day)
+    return {pair: pair_shift(d.origin, d.change, d.spread, is_after) for pair, d in own.items()}
 
 
 @pytest.mark.parametrize(("sensor", "twist"), [
@@ -62,10 +64,27 @@ def test_one_pair_alone_cannot_tell(maker: ModuleType) -> None:
 
 
 def test_a_composed_pair_is_not_counted_as_a_third_witness(maker: ModuleType) -> None:
-    shifts = _shifts(maker, {"radar": KNOCK}, 0)
-    assert independent_pairs(shifts) == ("camera_lidar", "lidar_radar")
-    own = PairShift(exp_se3(np.full(6, 1e-3)) @ shifts["camera_radar"].T, np.zeros(6), np.eye(6))
-    assert len(independent_pairs(shifts | {"camera_radar": own})) == 3
+    days = _days(maker, {"radar": KNOCK}, 0)
+    last = days["camera_lidar"].day
+    assert set(independent_pairs(days, last)) == {"camera_lidar", "lidar_radar"}
+    own = replace(days["camera_radar"], T=exp_se3(np.full(6, 1e-3)) @ days["camera_radar"].T)
+    assert len(independent_pairs(days | {"camera_radar": own}, last)) == 3
+
+
+def test_a_mean_of_days_that_err_alike_is_as_unsure_as_it_is() -> None:
+    rng = np.random.default_rng(3)
+    spread = np.repeat(np.eye(6)[None], 8, axis=0) * 1e-6
+    is_after = np.arange(8) >= 3
+    found = []
+    for _ in range(3000):
+        e = rng.normal(size=(8, 6))
+        for k in range(1, 8):
+            e[k] = 0.6 * e[k - 1] + 0.8 * e[k]
+        found.append(pair_shift(np.eye(4), 1e-3 * e, spread, is_after, 0.6))
+    scatter = np.std([s.xi for s in found])
+    predicted = np.sqrt(found[0].covariance[0, 0])
+    # Both sides err alike too, which makes the difference a little surer than said.
+    assert 0.8 < scatter / predicted < 1.0
 
 
 def test_three_independent_pairs_agree_on_the_sensor() -> None:

@@ -6,13 +6,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from pipeline.audit.vehicle import PairDays, judge_vehicle
+from pipeline.audit.estimates import days_of
+from pipeline.audit.vehicle import judge_fleet
 from pipeline.config import AuditConfig, FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records, write_records
-from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from tests.makers.stages import audit_fleet
 
@@ -64,23 +65,9 @@ def test_a_knocked_radar_is_found_on_its_vehicle_sensor_and_day(tmp_path: Path, 
 def test_a_vehicle_raises_no_more_false_alarms_than_its_budget(maker: ModuleType) -> None:
     rng = np.random.default_rng(2)
     config = AuditConfig(false_alarms_per_1000_vehicle_days=200.0)  # 0.2 per audit: 120 audits can tell
-    from pipeline.store.current import transform_of
-
-    trials, alarms = 120, 0
-    for _ in range(trials):
-        records = maker.vehicle_records("v", 4, rng)
-        pairs = {}
-        for pair in PAIRS:
-            rows = [r for r in records if r.pair == pair]
-            pairs[pair] = PairDays(
-                np.arange(4),
-                np.stack([transform_of(r) for r in rows]),
-                np.stack([r.covariance for r in rows]),
-                np.ones((4, 6), bool),
-                np.ones(4, bool),
-            )
-        verdict = judge_vehicle(pairs, {}, config)
-        alarms += any(v.change for v in verdict.charts.values())
+    trials = 120
+    fleet = [days_of(maker.vehicle_records("v", 8, rng), config.held_sigma_factor) for _ in range(trials)]
+    alarms = sum(any(v.change for v in verdict.charts.values()) for verdict in judge_fleet(fleet, config))
     assert 0 < alarms <= trials * 0.2 + 3 * np.sqrt(trials * 0.2 * 0.8)
 
 

@@ -7,24 +7,53 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.audit.charts import (
-    Chart,
-    alarm_threshold,
-    judge_chart,
-    pooled_scatter,
-    ramp_fits,
-    start_interval,
-    step_scan,
-)
+from pipeline.audit.changes import ramp_fits, start_interval
+from pipeline.audit.charts import Charts, alarm_threshold, clipped, scan, thresholds
+from pipeline.audit.noise import Noise, estimate_noise
+from pipeline.audit.verdicts import ChartVerdict, judge_charts
 
 PROBABILITY = 1e-3 / 18  # one chart's share of one false alarm in 1000 vehicle-days over 18 charts
 
 
-def _chart(value: np.ndarray, sigma: np.ndarray | float = 1.0, day: np.ndarray | None = None) -> Chart:
-    days = np.arange(len(value)) if day is None else day
-    return Chart(
-        days, np.asarray(value, float), np.broadcast_to(np.asarray(sigma, float), np.shape(value)).copy()
-    )
+def _charts(
+    values: list[np.ndarray] | np.ndarray,
+    sigma: np.ndarray | float = 1.0,
+    day: np.ndarray | None = None,
+    accepted: np.ndarray | None = None,
+    reference_days: int = 0,
+) -> Charts:
+    rows = [np.asarray(v, float) for v in values]
+    N = max(1, *(len(v) for v in rows))
+    out = Charts(
+        np.zeros((len(rows), N), np.int64), np.zeros((len(rows), N)), np.full((len(rows), N), np.inf),
+        np.ones((len(rows), N), bool), np.full(len(rows), reference_days), np.array([len(v) for v in rows]),
+    )  # fmt: skip
+    for m, v in enumerate(rows):
+        days = np.arange(len(v)) if day is None else day
+        out.day[m], out.day[m, : len(v)] = days[-1] if len(v) else 0, days
+        out.value[m, : len(v)] = v
+        out.sigma[m, : len(v)] = sigma
+        if accepted is not None:
+            out.accepted[m] = accepted
+    return out
+
+
+def _known(charts: Charts, autocorrelation: float = 0.0) -> Noise:
+    """Noise as the sigmas say it, known for sure."""
+    M = len(charts.count)
+    return Noise(np.ones(M), np.full(M, 1e6), np.full(M, autocorrelation))
+
+
+def _judge(
+    value: np.ndarray | list[float], limit: float, sigma: np.ndarray | float = 1.0, **chart: object
+) -> ChartVerdict:
+    charts = _charts([np.asarray(value)], sigma, **chart)  # type: ignore[arg-type]
+    return judge_charts(charts, _known(charts), np.array([limit]), np.array([PROBABILITY]), 2)[0]
+
+
+def _z(charts: Charts, autocorrelation: float = 0.0) -> np.ndarray:
+    M = len(charts.count)
+    return scan(charts, charts.value, np.ones(M), np.full(M, autocorrelation)).z
 
 
 @pytest.mark.parametrize("days", [2, 4, 28])
@@ -33,8 +62,8 @@ def test_false_alarms_stay_within_the_budget_and_do_not_waste_it(days: int) -> N
     sigma = rng.uniform(0.5, 2.0, days)
     probability, trials = 0.02, 6000
     threshold = alarm_threshold(sigma, probability)
-    noise = rng.normal(size=(trials, days)) * sigma
-    alarms = np.mean([np.abs(step_scan(_chart(v, sigma))).max() > threshold for v in noise])
+    z = _z(_charts(rng.normal(size=(trials, days)) * sigma, sigma))
+    alarms = np.mean(np.abs(z).max(axis=1) > threshold)
     spread = np.sqrt(probability * (1 - probability) / trials)
     assert alarms <= probability + 3 * spread
     assert alarms >= 0.75 * probability - 3 * spread  # a bound that wastes the budget costs power
@@ -48,14 +77,21 @@ def test_the_threshold_lies_between_one_test_and_bonferroni() -> None:
         assert norm.isf(PROBABILITY / 2) < threshold < norm.isf(PROBABILITY / 2 / (days - 1))
 
 
+def test_a_scale_that_is_hardly_known_needs_more_sigmas() -> None:
+    found = thresholds(np.array([10, 10, 1]), np.array([8.0, 1e9, 8.0]), np.full(3, PROBABILITY))
+    assert found[0] > found[1] + 1
+    assert found[1] == pytest.approx(
+        alarm_threshold(np.ones(10), PROBABILITY), rel=0.04
+    )  # 200 are taken for sure
+    assert np.isinf(found[2])
+
+
 @given(st.integers(2, 12), st.floats(-1e3, 1e3), st.integers(0, 2**32 - 1))
 @settings(max_examples=40, deadline=None)
 def test_the_scan_does_not_care_where_zero_lies(days: int, offset: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     value, sigma = rng.normal(size=days), rng.uniform(0.5, 2, days)
-    np.testing.assert_allclose(
-        step_scan(_chart(value + offset, sigma)), step_scan(_chart(value, sigma)), atol=1e-8
-    )
+    np.testing.assert_allclose(_z(_charts([value + offset], sigma)), _z(_charts([value], sigma)), atol=1e-8)
 
 
 @given(st.integers(3, 10), st.integers(0, 2**32 - 1))
@@ -69,7 +105,51 @@ def test_the_squared_scan_is_the_likelihood_gain_of_a_step(days: int, seed: int)
         return float(w @ (v - (w @ v) / w.sum()) ** 2)
 
     gains = [chi2(value, w) - chi2(value[:k], w[:k]) - chi2(value[k:], w[k:]) for k in range(1, days)]
-    np.testing.assert_allclose(step_scan(_chart(value, sigma)) ** 2, gains, atol=1e-9)
+    np.testing.assert_allclose(_z(_charts([value], sigma))[0] ** 2, gains, atol=1e-9)
+
+
+def test_the_scan_of_a_chart_does_not_depend_on_the_others_beside_it() -> None:
+    rng = np.random.default_rng(4)
+    rows = [rng.normal(size=n) for n in (3, 12, 0, 1, 7)]
+    together = _z(_charts(rows), 0.4)
+    for m, row in enumerate(rows):
+        if len(row) > 1:
+            np.testing.assert_allclose(together[m, : len(row) - 1], _z(_charts([row]), 0.4)[0], atol=1e-12)
+        np.testing.assert_array_equal(together[m, max(len(row) - 1, 0) :], 0)
+
+
+def test_each_sides_variance_is_that_of_a_mean_of_ar1_days_with_gaps() -> None:
+    rng = np.random.default_rng(5)
+    day, phi = np.array([0, 1, 2, 5, 6, 9]), 0.6
+    sigma = rng.uniform(0.5, 2, 6)
+    charts = _charts([np.zeros(6)], sigma, day)
+    found = scan(charts, charts.value, np.ones(1), np.array([phi])).sigma[0]
+    correlation = phi ** np.abs(day[:, None] - day[None])
+    w = sigma**-2.0
+    for s in range(5):
+        expected = 0.0
+        for side in (slice(0, s + 1), slice(s + 1, 6)):
+            a = w[side] * sigma[side] / w[side].sum()
+            expected += a @ correlation[side, side] @ a
+        assert found[s] == pytest.approx(np.sqrt(expected))
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_one_day_alone_is_clipped_and_two_in_a_row_are_believed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    at = int(rng.integers(0, 12))
+    alone, lasting = rng.normal(size=12) * 0.3, rng.normal(size=12) * 0.3
+    alone[at] += 50
+    lasting[8:] += 50
+    assert np.abs(clipped(_charts([alone]), np.ones(1))).max() < 5
+    found = clipped(_charts([lasting]), np.ones(1))[0]
+    np.testing.assert_allclose(found, lasting, atol=2.0)
+
+
+def test_a_reference_is_never_clipped_nor_is_the_day_after_it() -> None:
+    value = np.array([0.0, 9, 9, 9, 9, 9])
+    np.testing.assert_array_equal(clipped(_charts([value], reference_days=10), np.ones(1))[0], value)
 
 
 def test_a_knock_on_the_third_of_four_days_is_found_with_its_day_and_size() -> None:
@@ -77,7 +157,7 @@ def test_a_knock_on_the_third_of_four_days_is_found_with_its_day_and_size() -> N
     found, right_day, sizes = 0, 0, []
     for _ in range(400):
         value = rng.normal(size=4) * 0.05 + np.array([0, 0, 0.5, 0.5])
-        verdict = judge_chart(_chart(value, 0.05), 0.25, PROBABILITY, 2)
+        verdict = _judge(value, 0.25, 0.05)
         if verdict.status == "RED":
             assert verdict.change is not None
             found += 1
@@ -96,14 +176,14 @@ def test_the_start_interval_holds_the_true_day(days: int, first: int, size: floa
     for _ in range(trials):
         value = rng.normal(size=days)
         value[first:] += size
-        _, earliest, latest = start_interval(step_scan(_chart(value)) ** 2, np.arange(days))
+        _, earliest, latest = start_interval(_z(_charts([value]))[0] ** 2, np.arange(days))
         held += earliest <= first <= latest
     assert held / trials >= 0.95
 
 
 def test_missing_days_widen_the_start_interval() -> None:
-    chart = _chart(np.array([0, 0, 0, 9.0, 9, 9]), 1.0, np.array([1, 2, 3, 8, 9, 10]))
-    assert start_interval(step_scan(chart) ** 2, chart.day) == (8, 4, 8)
+    charts = _charts([np.array([0, 0, 0, 9.0, 9, 9])], 1.0, np.array([1, 2, 3, 8, 9, 10]))
+    assert start_interval(_z(charts)[0] ** 2, charts.day[0]) == (8, 4, 8)
 
 
 def test_slow_drift_and_step_are_told_apart() -> None:
@@ -113,7 +193,7 @@ def test_slow_drift_and_step_are_told_apart() -> None:
         day = np.arange(20)
         step, drift = np.where(day >= 10, 8.0, 0.0), np.maximum(day - 7, 0.0) * 0.8
         for truth, shape in (("step", step), ("slow drift", drift)):
-            change = judge_chart(_chart(shape + rng.normal(size=20)), 1.0, PROBABILITY, 2).change
+            change = _judge(shape + rng.normal(size=20), 1.0).change
             assert change is not None
             kinds[truth].append(change.kind)
     assert kinds["step"].count("step") >= 196
@@ -123,29 +203,52 @@ def test_slow_drift_and_step_are_told_apart() -> None:
 def test_a_drift_fit_recovers_its_size() -> None:
     day = np.array([0, 1, 2, 3, 5, 8, 9])
     value = np.maximum(day - 2, 0) * 0.1 + 4.0
-    gain, size, sigma = ramp_fits(_chart(value, 0.01, day))
+    gain, size, sigma = ramp_fits(value, np.full(7, 0.01), day)
     best = int(np.argmax(gain))
     assert best == 2
     assert size[best] == pytest.approx(0.7, abs=1e-9)
     assert sigma[best] < 0.02
 
 
-def test_one_bad_day_is_yellow_and_not_a_lasting_change() -> None:
-    for values in ([0, 0, 14, 0, 0, 0], [0, 0, 0, 0, 0, 9]):
-        verdict = judge_chart(_chart(np.array(values)), 1.0, PROBABILITY, 2)
-        assert verdict.status == "YELLOW"
-        assert "one day stands out" in verdict.reason
+def test_a_last_day_that_stands_out_is_yellow_until_the_next_one_tells() -> None:
+    verdict = _judge([0, 0, 0, 0, 0, 9], 1.0, 0.5)
+    assert verdict.status == "YELLOW"
+    assert "one day stands out" in verdict.reason
+    assert verdict.change is not None
+    assert (verdict.change.day, verdict.change.size) == (5, 9.0)
+    assert _judge([0, 0, 0, 0, 0, 9, 9], 1.0, 0.5).status == "RED"
+
+
+def test_a_day_that_stood_out_and_did_not_last_is_no_change() -> None:
+    verdict = _judge([0, 0, 14, 0, 0, 0], 2.0, 0.5)
+    assert (verdict.status, verdict.change) == ("GREEN", None)
+
+
+def test_a_value_that_came_back_is_green_and_one_that_did_not_stays_red() -> None:
+    off = [0.0] * 8 + [9.0] * 6
+    back = _judge([*off, 0.0, 0.0, 0.0], 1.0, 0.3)
+    assert (back.status, back.reason, back.change) == ("GREEN", "back where the reference is", None)
+    assert _judge([*off, 0.0], 1.0, 0.3).status == "RED"  # one day is no repair yet
+    for days in (1, 30, 300):
+        stays = _judge([0.0] + [9.0] * (days + 2), 1.0, 0.3, reference_days=8)
+        assert stays.status == "RED"
+
+
+def test_a_second_change_does_not_move_the_start_of_the_first() -> None:
+    verdict = _judge([0.0] * 8 + [9.0] * 14 + [15.0] * 3, 1.0, 0.3)
+    assert verdict.change is not None
+    assert (verdict.status, verdict.change.day, verdict.change.settled) == ("RED", 8, 22)
+    assert verdict.change.size == pytest.approx(15.0)
 
 
 def test_a_sure_change_below_the_limit_is_yellow() -> None:
-    verdict = judge_chart(_chart(np.array([0, 0, 0, 0.2, 0.2, 0.2]), 0.01), 0.25, PROBABILITY, 2)
+    verdict = _judge([0, 0, 0, 0.2, 0.2, 0.2], 0.25, 0.01)
     assert verdict.status == "YELLOW"
     assert "below" in verdict.reason
 
 
 def test_green_is_only_said_where_a_change_of_the_limit_would_be_seen() -> None:
-    seeing = judge_chart(_chart(np.zeros(4), 0.1), 0.25, PROBABILITY, 2)
-    blind = judge_chart(_chart(np.zeros(4), 0.3), 0.25, PROBABILITY, 2)
+    seeing, blind = _judge(np.zeros(4), 0.25, 0.1), _judge(np.zeros(4), 0.25, 0.3)
     assert (seeing.status, blind.status) == ("GREEN", "UNKNOWN")
     assert "could hide" in blind.reason
 
@@ -153,25 +256,27 @@ def test_green_is_only_said_where_a_change_of_the_limit_would_be_seen() -> None:
 @pytest.mark.parametrize("sigma", [0.13, 0.2, 0.31])
 @pytest.mark.parametrize("days", [3, 4, 9])
 def test_a_chart_that_cannot_tell_yet_says_after_how_many_days_it_can(sigma: float, days: int) -> None:
-    blind = judge_chart(_chart(np.zeros(days), sigma), 0.25, PROBABILITY, 2)
+    blind = _judge(np.zeros(days), 0.25, sigma)
     if blind.status == "GREEN":
         assert days >= 9  # only then is the sigma small enough
         return
-    needed = int(re.search(r"after about (\d+) days", blind.reason)[1])
+    found = re.search(r"after about (\d+) days", blind.reason)
+    assert found is not None
+    needed = int(found[1])
     # An odd number of days splits unevenly, three of them by an eighth of sigma squared: "about".
-    assert judge_chart(_chart(np.zeros(needed + 1), sigma), 0.25, PROBABILITY, 2).status == "GREEN"
-    assert judge_chart(_chart(np.zeros(int(0.8 * needed)), sigma), 0.25, PROBABILITY, 2).status == "UNKNOWN"
+    assert _judge(np.zeros(needed + 1), 0.25, sigma).status == "GREEN"
+    assert _judge(np.zeros(int(0.8 * needed)), 0.25, sigma).status == "UNKNOWN"
 
 
 def test_what_looks_like_a_change_but_is_not_sure_is_not_called_green() -> None:
-    verdict = judge_chart(_chart(np.array([0.0, 0.0, 0.36, 0.36]), 0.1), 0.25, PROBABILITY, 2)
+    verdict = _judge([0.0, 0.0, 0.36, 0.36], 0.25, 0.1)
     assert (verdict.status, verdict.change) == ("UNKNOWN", None)
     assert "may have begun" in verdict.reason
 
 
 @pytest.mark.parametrize("days", [0, 1, 2])
 def test_too_few_days_are_unknown(days: int) -> None:
-    assert judge_chart(_chart(np.zeros(days), 0.01), 0.25, PROBABILITY, 2).status == "UNKNOWN"
+    assert _judge(np.zeros(days), 1.0, 0.01).status == "UNKNOWN"
 
 
 def test_a_threshold_needs_two_days_and_a_probability() -> None:
@@ -180,12 +285,50 @@ def test_a_threshold_needs_two_days_and_a_probability() -> None:
             alarm_threshold(sigma, probability)
 
 
-def test_scatter_is_pooled_over_the_fleet_and_never_shrinks_sigmas() -> None:
+def _fleet_noise(values: np.ndarray) -> Noise:
+    """Of V vehicles with one pair of two DoF: values V 2 N."""
+    return estimate_noise(_charts(values.reshape(-1, values.shape[-1])), 2, 1)
+
+
+def test_scatter_is_the_fleets_and_never_shrinks_sigmas() -> None:
     rng = np.random.default_rng(7)
-    wide = [_chart(rng.normal(size=30) * 2.0) for _ in range(10)]
-    tight = [_chart(rng.normal(size=30) * 0.2) for _ in range(10)]
-    assert pooled_scatter(wide) == pytest.approx(2.0, rel=0.15)
-    assert pooled_scatter(tight) == 1.0
-    knocked = [_chart(np.where(np.arange(30) > 14, 50.0, 0.0) + rng.normal(size=30)) for _ in range(10)]
-    assert pooled_scatter(knocked) < 1.25
-    assert pooled_scatter([]) == 1.0
+    wide, tight = (_fleet_noise(rng.normal(size=(30, 2, 28)) * factor).scale for factor in (2.0, 0.2))
+    assert np.median(wide) == pytest.approx(2.0, rel=0.1)
+    np.testing.assert_array_equal(tight, 1.0)
+
+
+def test_a_vehicle_whose_sigmas_are_too_small_is_told_from_its_fleet() -> None:
+    rng = np.random.default_rng(8)
+    values = rng.normal(size=(30, 2, 28))
+    values[3] *= 1.8
+    scale = _fleet_noise(values).scale.reshape(30, 2)
+    assert scale[3].min() > 1.2
+    assert np.median(scale) < 1.2
+
+
+def test_real_steps_are_no_scatter() -> None:
+    rng = np.random.default_rng(9)
+    values = rng.normal(size=(10, 2, 30))
+    values[..., 15:] += 50
+    assert _fleet_noise(values).scale.max() < 1.6
+    moving = np.arange(4) * 60.0 + rng.normal(
+        size=(1, 2, 4)
+    )  # every day differs from the last: that is no noise
+    assert _fleet_noise(moving).scale.max() < 3
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.3, 0.6])
+def test_autocorrelation_is_found_and_is_not_taken_for_small_scatter(phi: float) -> None:
+    rng = np.random.default_rng(10)
+    e = rng.normal(size=(150, 2, 40))
+    for k in range(1, 40):
+        e[..., k] = phi * e[..., k - 1] + np.sqrt(1 - phi**2) * e[..., k]
+    found = _fleet_noise(e)
+    assert np.median(found.autocorrelation) == pytest.approx(phi, abs=0.08)
+    assert np.median(found.scale) < 1.15
+
+
+def test_a_fleet_that_nobody_has_seen_is_taken_to_err_alike_from_day_to_day() -> None:
+    found = _fleet_noise(np.random.default_rng(11).normal(size=(1, 2, 4)))
+    assert found.autocorrelation.min() > 0.5
+    assert estimate_noise(_charts([np.zeros(0)] * 2), 2, 1).scale.tolist() == [1.0, 1.0]

@@ -1,0 +1,257 @@
+"""A pair's day estimates as numbers to chart, its fixed reference, and the charts of a whole fleet side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.audit.charts import Charts, clipped, scan
+from pipeline.geometry.changes import change_jacobian
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
+from schemas.calibrations import DOF_NAMES, PAIRS
+
+__all__ = [
+    "PairDays",
+    "Reference",
+    "charted",
+    "charts_of_fleet",
+    "clipped_days",
+    "pair_days",
+    "reference_of",
+    "with_reference",
+]
+
+DOFS = len(DOF_NAMES)
+# Autocorrelation of days whose scatter nobody has seen yet: the most that the budget is proved for.
+_ALIKE = 0.6
+# Share of a day's variance that is never taken as common to all days: sigmas are estimates themselves.
+_LEAST_VARYING = 0.01
+# Sigmas of a step among the reference's own days, which then ends before it; of days whose scatter nobody knows yet.
+_MOVED_SIGMAS = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class PairDays:
+    """Day estimates of one pair. Held days are among them: a large knock is just what the verdict holds.
+
+    Args:
+        day: ordinals of the calendar, rising.
+        T: estimates of T_parent_child.
+        change: from the origin to each estimate (rotation vector [rad], shift of the child's origin [m]).
+        spread: covariance of the changes that varies from day to day, larger where a day was held; what a day did not
+            determine has the prior's.
+        observable: per day and DoF; what a day did not determine is not on the charts.
+        accepted: False for held days.
+        origin: T_parent_child that changes count from.
+        reference_days: days that the first one stands for where it is a fixed reference, else 0.
+    """
+
+    day: Int[np.ndarray, " N"]
+    T: Float[np.ndarray, "N 4 4"]
+    change: Float[np.ndarray, "N 6"]
+    spread: Float[np.ndarray, "N 6 6"]
+    observable: Bool[np.ndarray, "N 6"]
+    accepted: Bool[np.ndarray, " N"]
+    origin: Float[np.ndarray, "4 4"]
+    reference_days: int = 0
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "N 6"]:
+        """Of each change."""
+        return np.sqrt(np.einsum("nii->ni", self.spread))
+
+    def between(self, first: int, last: int) -> PairDays:
+        """The days from one ordinal to another, both included."""
+        return self.at(slice(*np.searchsorted(self.day, (first, last + 1))))
+
+    def at(self, rows: slice | np.ndarray) -> PairDays:
+        """Some of the days; a reference among them stays one."""
+        kept = np.zeros(len(self.day), bool)
+        kept[rows] = True
+        return replace(
+            self,
+            day=self.day[rows],
+            T=self.T[rows],
+            change=self.change[rows],
+            spread=self.spread[rows],
+            observable=self.observable[rows],
+            accepted=self.accepted[rows],
+            reference_days=self.reference_days if len(kept) and kept[0] else 0,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Where a pair was when it was last known to be right: the mean of its first accepted days.
+
+    Args:
+        days: ordinals of the days that it rests on.
+        T: their mean pose.
+        spread: covariance of the mean, of changes, if its days were independent.
+        observable: DoF that at least one of them determined.
+    """
+
+    days: tuple[int, ...]
+    T: Float[np.ndarray, "4 4"]
+    spread: Float[np.ndarray, "6 6"]
+    observable: Bool[np.ndarray, " 6"]
+
+
+def pair_days(
+    day: Int[np.ndarray, " N"],
+    T: Float[np.ndarray, "N 4 4"],
+    covariance: Float[np.ndarray, "N 6 6"],
+    common: Float[np.ndarray, "N 6 6"],
+    observable: Bool[np.ndarray, "N 6"],
+    accepted: Bool[np.ndarray, " N"],
+) -> PairDays:
+    """Day estimates of a pair, changes from the first.
+
+    Args:
+        day: ordinals, rising.
+        T: estimates.
+        covariance: theirs, of left perturbations.
+        common: the part of it that all days err by alike; zero where a record does not say.
+        observable: what each day determined.
+        accepted: False for held days.
+    """
+    J = np.zeros((len(T), 6, 6))
+    for k, pose in enumerate(T):
+        J[k] = change_jacobian(pose)
+    total = J @ covariance @ J.swapaxes(1, 2)
+    spread = J @ (covariance - common) @ J.swapaxes(1, 2)
+    varying, all_of_it = np.einsum("nii->ni", spread), np.einsum("nii->ni", total)
+    # A day adds nothing to what it does not determine: there it is as unsure as it says in all.
+    missing = np.where(observable, np.maximum(_LEAST_VARYING * all_of_it - varying, 0.0), all_of_it)
+    spread[:, np.arange(6), np.arange(6)] += missing
+    return PairDays(day, T, _changes(T[0], T), spread, observable, accepted, T[0])
+
+
+def reference_of(days: PairDays, count: int) -> Reference | None:
+    """The first accepted days as one; None where there are fewer than two."""
+    rows = np.flatnonzero(days.accepted)[:count]
+    first = _first_level(days.at(rows))
+    if len(first.day) < 2:
+        return None
+    value, seen = _clipped(first), first.observable
+    weight = 1 / np.where(seen, first.sigma, first.sigma.max(axis=0)) ** 2
+    mean = (weight * value).sum(axis=0) / weight.sum(axis=0)
+    information = np.linalg.inv(first.spread).sum(axis=0)
+    spread = np.linalg.inv(information)
+    return Reference(
+        tuple(int(d) for d in first.day), _moved(days.origin, mean), spread, np.asarray(seen.any(axis=0))
+    )
+
+
+def _first_level(days: PairDays) -> PairDays:
+    """The days before something moved, where it did so among these already."""
+    if len(days.day) < 4:
+        return days
+    ones = np.ones(DOFS)
+    found = scan(_as_charts(days), _clipped(days).T, ones, _ALIKE * ones)
+    z = np.abs(found.z).max(axis=0)
+    return days.at(slice(0, int(np.argmax(z)) + 1)) if z.max() > _MOVED_SIGMAS else days
+
+
+def _as_charts(days: PairDays) -> Charts:
+    """All six DoF, what a day did not determine with the prior's sigma."""
+    N = len(days.day)
+    return Charts(
+        np.broadcast_to(days.day, (DOFS, N)),
+        days.change.T.copy(),
+        days.sigma.T.copy(),
+        np.broadcast_to(days.accepted, (DOFS, N)),
+        np.full(DOFS, days.reference_days),
+        np.full(DOFS, N),
+    )
+
+
+def clipped_days(days: PairDays, scale: Float[np.ndarray, " 6"]) -> PairDays:
+    """Days as the charts see them: no single one far from its neighbours, sigmas by their scatter."""
+    change = clipped(_as_charts(days), scale).T
+    return replace(days, change=change, spread=days.spread * np.outer(scale, scale))
+
+
+def _clipped(days: PairDays) -> Float[np.ndarray, "N 6"]:
+    return clipped(_as_charts(days), np.ones(DOFS)).T
+
+
+def charted(days: PairDays, first: int, last: int, reference: Reference | None) -> PairDays:
+    """The days of a window, beside the fixed reference where the window does not reach back to its first day.
+
+    Args:
+        days: of one pair, since commissioning or the last service event; what the window and the reference take.
+        first: first day of the window, an ordinal.
+        last: its last day.
+        reference: of the pair; None where too few days were accepted.
+    """
+    window = days.between(first, last)
+    return window if reference is None or reference.days[0] >= first else with_reference(window, reference)
+
+
+def with_reference(days: PairDays, reference: Reference) -> PairDays:
+    """The days with the reference as their first, in place of the days that it rests on."""
+    own = days.at(~np.isin(days.day, reference.days))
+    return PairDays(
+        np.concatenate([[reference.days[-1]], own.day]),
+        np.concatenate([reference.T[None], own.T]),
+        np.concatenate([_changes(own.origin, reference.T[None]), own.change]),
+        np.concatenate([reference.spread[None], own.spread]),
+        np.concatenate([reference.observable[None], own.observable]),
+        np.concatenate([[True], own.accepted]),
+        own.origin,
+        reference_days=len(reference.days),
+    )
+
+
+def charts_of_fleet(fleet: Sequence[Mapping[str, PairDays]]) -> Charts:
+    """Charts of all vehicles, in order of vehicle, pair and DoF; one without days is empty."""
+    longest = max((len(d.day) for pairs in fleet for d in pairs.values()), default=0)
+    shape = (len(fleet), len(PAIRS), DOFS, max(longest, 1))
+    day, value = np.zeros(shape, np.int64), np.zeros(shape)
+    sigma, accepted = np.full(shape, np.inf), np.ones(shape, bool)
+    count, reference_days = np.zeros(shape[:3], np.int64), np.zeros(shape[:3], np.int64)
+    for v, pairs in enumerate(fleet):
+        for p, pair in enumerate(PAIRS):
+            days = pairs.get(pair)
+            if days is None or not len(days.day):
+                continue
+            n = len(days.day)
+            if days.observable.all():
+                day[v, p, :, :n], value[v, p, :, :n] = days.day, days.change.T
+                sigma[v, p, :, :n], accepted[v, p, :, :n] = days.sigma.T, days.accepted
+                count[v, p], reference_days[v, p] = n, days.reference_days
+                continue
+            all_sigma = days.sigma
+            for k in range(DOFS):
+                rows = np.flatnonzero(days.observable[:, k])
+                m = len(rows)
+                day[v, p, k, :m], value[v, p, k, :m] = days.day[rows], days.change[rows, k]
+                sigma[v, p, k, :m], accepted[v, p, k, :m] = all_sigma[rows, k], days.accepted[rows]
+                count[v, p, k] = m
+                reference_days[v, p, k] = days.reference_days if m and rows[0] == 0 else 0
+    flat = (-1, shape[3])
+    charts = Charts(
+        day.reshape(flat),
+        value.reshape(flat),
+        sigma.reshape(flat),
+        accepted.reshape(flat),
+        reference_days.ravel(),
+        count.ravel(),
+    )
+    # Beyond its days, a chart's last day goes on, so that no gap is negative.
+    last = np.take_along_axis(charts.day, np.maximum(charts.count - 1, 0)[:, None], 1)
+    beyond = np.arange(flat[1]) >= charts.count[:, None]
+    return replace(charts, day=np.where(beyond, last, charts.day))
+
+
+def _changes(origin: Float[np.ndarray, "4 4"], T: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 6"]:
+    rotation = log_so3(T[:, :3, :3] @ origin[:3, :3].T)
+    return np.concatenate([rotation, T[:, :3, 3] - origin[:3, 3]], axis=1)
+
+
+def _moved(origin: Float[np.ndarray, "4 4"], change: Float[np.ndarray, " 6"]) -> Float[np.ndarray, "4 4"]:
+    return from_rotation_translation(exp_so3(change[:3]) @ origin[:3, :3], origin[:3, 3] + change[3:])

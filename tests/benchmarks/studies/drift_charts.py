@@ -1,0 +1,317 @@
+"""How often the charts of `boresight audit` call a false alarm, and how soon they find what moved, night by night.
+
+Vehicles are day estimates made by SE(3) algebra, with errors of known kind; every night the audit's own functions judge
+the window of that night beside the fixed reference, as `boresight audit` does. False alarms are counted over all
+nights, detections after a step.
+
+    python -m tests.benchmarks.studies.drift_charts [--vehicles 1010] [--nights 100] [--first-seed 50000] [--tune]
+
+A line per kind of errors and case is added to results/drift_charts.jsonl; what stands there already is not run again.
+Seeds 0 to 199 were tuned on (`--tune` runs those and writes nothing); 50000 and up are reported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.audit.days import PairDays, Reference, charted, pair_days, reference_of
+from pipeline.audit.status import decide_status
+from pipeline.audit.vehicle import VehicleVerdict, judge_fleet, limit_of
+from pipeline.config import AuditConfig
+from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse
+from schemas.calibrations import PAIRS
+from schemas.drift import DriftFinding, VehicleStatus
+from tests.benchmarks.studies.commits import commit_now
+
+RESULTS = Path("tests/benchmarks/results/drift_charts.jsonl")
+NOISES = ("white", "ar .3", "ar .6", "t4", "wrong sigmas", "floors")
+T_CAMERA_LIDAR = from_rotation_translation(
+    np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.05, -0.4, -0.6])
+)
+T_LIDAR_RADAR = from_rotation_translation(np.eye(3), np.array([2.1, 0.1, -1.3]))
+# What days vary by (rx ry rz [deg], tx ty tz [m]), as in tests/audit: radar roll and height beyond the size that
+# matters, where the charts live by their statistics alone. And what all days have in common.
+VARYING = {
+    "camera_lidar": (0.02, 0.02, 0.02, 0.015, 0.015, 0.02),
+    "lidar_radar": (0.5, 0.12, 0.05, 0.02, 0.02, 0.2),
+}
+COMMON = {
+    "camera_lidar": (0.03, 0.03, 0.05, 0.01, 0.006, 0.05),
+    "lidar_radar": (0.2, 0.2, 0.01, 0.025, 0.013, 0.02),
+}
+LOG_SD = 0.25  # of what a vehicle's sigmas are wrong by
+
+
+@dataclass(frozen=True)
+class Case:
+    """What happens to every vehicle of a run.
+
+    Args:
+        name: of the case.
+        sensor: that moves; empty where none does.
+        twist: in its own axes [rad, m].
+        on: first day with the new pose.
+        back: first day on which it is repaired; 0 = never.
+        held: share of days that are held, refused and disproved (a lost basin), from two days before on.
+    """
+
+    name: str
+    sensor: str = ""
+    twist: tuple[float, ...] = (0.0,) * 6
+    on: int = 0
+    back: int = 0
+    lost: float = 0.0
+    days: int = 100
+
+
+def _turn(axis: str, deg: float) -> tuple[float, ...]:
+    return tuple(float(np.radians(deg)) if a == axis else 0.0 for a in ("x", "y", "z")) + (0.0, 0.0, 0.0)
+
+
+CASES = (
+    Case("nothing"),
+    Case("camera yaw .3", "camera", _turn("y", 0.3), on=40, days=70),
+    Case("camera pitch .3", "camera", _turn("x", 0.3), on=40, days=70),
+    Case("radar yaw .5", "radar", _turn("z", 0.5), on=40, days=70),
+    Case("radar pitch .5", "radar", _turn("y", 0.5), on=40, days=70),
+    Case("lidar yaw .3", "lidar", _turn("z", 0.3), on=40, days=70),
+    Case("radar knock 1, days lost", "radar", _turn("z", 1.0), on=40, lost=0.3, days=70),
+    Case("camera knock 1, days lost", "camera", _turn("y", 1.0), on=40, lost=0.3, days=70),
+    Case("camera .3 on day 5", "camera", _turn("y", 0.3), on=4, days=80),
+    Case("camera .3, back", "camera", _turn("y", 0.3), on=40, back=50, days=70),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Vehicle:
+    """All days of one vehicle, and the references that froze."""
+
+    pairs: Mapping[str, PairDays]
+    frozen: dict[str, Reference] = field(default_factory=dict)
+
+    def tonight(self, night: int, config: AuditConfig) -> dict[str, PairDays]:
+        """What the audit looks at on a night."""
+        first = night - config.window_days + 1
+        return {pair: self._charted(pair, first, night, config) for pair in self.pairs}
+
+    def _charted(self, pair: str, first: int, night: int, config: AuditConfig) -> PairDays:
+        days = self.pairs[pair]
+        reference = self.frozen.get(pair)
+        if reference is None and first > 0:
+            known = days.between(0, night)
+            reference = reference_of(known, config.reference_days)
+            if reference is not None and known.accepted.sum() >= config.reference_days:
+                self.frozen[pair] = reference
+        return charted(days, first, night, reference)
+
+
+def make_vehicle(noise: str, case: Case, rng: np.random.Generator) -> Vehicle:
+    """A vehicle's days: errors of a kind, and what happens to it."""
+    D = case.days
+    moved = np.zeros((D, 6))
+    moved[case.on : case.back or D] = case.twist
+    M = {s: exp_se3(moved if s == case.sensor else np.zeros((D, 6))) for s in ("camera", "lidar", "radar")}
+    clean = {
+        "camera_lidar": inverse(M["camera"]) @ T_CAMERA_LIDAR @ M["lidar"],
+        "lidar_radar": inverse(M["lidar"]) @ T_LIDAR_RADAR @ M["radar"],
+    }
+    T, varying, common = {}, {}, {}
+    wrong = float(np.exp(rng.normal(0, LOG_SD))) if noise == "wrong sigmas" else 1.0
+    for pair, T_clean in clean.items():
+        sigma, floor = _si(VARYING[pair]), _si(COMMON[pair])
+        # Roll and height are found together.
+        correlation = np.eye(6)
+        correlation[1, 5] = correlation[5, 1] = 0.5
+        varying[pair] = correlation * np.outer(sigma, sigma)
+        common[pair] = np.diag(floor**2) if noise == "floors" else np.zeros((6, 6))
+        error = wrong * _errors(noise, D, rng) @ np.linalg.cholesky(varying[pair]).T
+        error = error + rng.normal(size=6) @ np.sqrt(common[pair])
+        T[pair] = exp_se3(error) @ T_clean
+    T["camera_radar"] = T["camera_lidar"] @ T["lidar_radar"]
+    A = adjoint(T_CAMERA_LIDAR)
+    for part in (varying, common):
+        part["camera_radar"] = part["camera_lidar"] + A @ part["lidar_radar"] @ A.T
+    kept, accepted = _fates(case, rng)
+    return Vehicle(
+        {
+            pair: pair_days(
+                np.arange(D)[kept],
+                T[pair][kept],
+                _held(varying[pair] + common[pair], common[pair], accepted[kept]),
+                np.broadcast_to(common[pair], (int(kept.sum()), 6, 6)),
+                np.ones((int(kept.sum()), 6), bool),
+                accepted[kept],
+            )
+            for pair in PAIRS
+        }
+    )
+
+
+def _si(sigma: tuple[float, ...]) -> np.ndarray:
+    return np.array([*np.radians(sigma[:3]), *sigma[3:]])
+
+
+def _errors(noise: str, days: int, rng: np.random.Generator) -> np.ndarray:
+    """Errors (days, 6) of variance 1."""
+    if noise == "t4":
+        return rng.standard_t(4, size=(days, 6)) / np.sqrt(2)
+    e = rng.normal(size=(days, 6))
+    phi = float(noise.split()[1]) if noise.startswith("ar") else 0.0
+    for k in range(1, days):
+        e[k] = phi * e[k - 1] + np.sqrt(1 - phi**2) * e[k]
+    return e
+
+
+def _fates(case: Case, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Days that enter a chart, and which of them were accepted: a third of the lost days is held, the rest is none."""
+    draw = np.where(np.arange(case.days) >= case.on - 2, rng.uniform(size=case.days), 1.0)
+    return draw >= case.lost * 2 / 3, draw >= case.lost
+
+
+def _held(covariance: np.ndarray, common: np.ndarray, accepted: np.ndarray) -> np.ndarray:
+    factor = np.where(accepted, 1.0, AuditConfig().held_sigma_factor ** 2)
+    return common + factor[:, None, None] * (covariance - common)
+
+
+def status_of_night(verdict: VehicleVerdict, config: AuditConfig) -> VehicleStatus:
+    """The vehicle's status as the audit decides it from its rows."""
+    rows = []
+    for (pair, dof), chart in verdict.charts.items():
+        change, moved = chart.change, verdict.attribution
+        rows.append(
+            DriftFinding(
+                "v", "", "joint", pair, dof, chart.status, chart.reason, chart.days_used, limit_of(pair, dof, config),
+                statistic=chart.statistic, threshold=chart.threshold,
+                start_day=None if change is None else str(change.day),
+                kind=None if change is None else change.kind,
+                moved_sensor=None if change is None or moved is None else moved.sensor,
+            )
+        )  # fmt: skip
+    return decide_status(rows)
+
+
+def nights(
+    fleet: list[Vehicle], which: Iterable[int], config: AuditConfig
+) -> Iterator[tuple[int, list[VehicleVerdict]]]:
+    """Verdicts of every night, all vehicles judged as one fleet."""
+    for night in which:
+        yield night, judge_fleet([v.tonight(night, config) for v in fleet], config)
+
+
+def false_alarms(noise: str, vehicles: int, days: int, seed: int) -> dict[str, Any]:
+    """RED and any alarm per 1,000 vehicle-nights where nothing happens, from the second night on."""
+    config, rng = AuditConfig(), np.random.default_rng([seed, NOISES.index(noise)])
+    fleet = [make_vehicle(noise, Case("nothing", days=days), rng) for _ in range(vehicles)]
+    red = alarm = green = count = 0
+    reds: dict[str, int] = {}
+    for night, verdicts in nights(fleet, range(1, days), config):
+        for verdict in verdicts:
+            count += 1
+            found = [(k, c.status) for k, c in verdict.charts.items() if c.change is not None]
+            alarm += bool(found)
+            red += any(s == "RED" for _, s in found)
+            for (pair, dof), s in found:
+                if s == "RED":
+                    reds[f"{pair} {dof}"] = reds.get(f"{pair} {dof}", 0) + 1
+            if night == days - 1 and not found:
+                green += status_of_night(verdict, config).status == "GREEN"
+    return {
+        "nights": count,
+        "red_per_1000": round(1000 * red / count, 3),
+        "alarm_per_1000": round(1000 * alarm / count, 2),
+        "green_on_the_last_night": round(green / vehicles, 3),
+        "red_charts": reds,
+    }
+
+
+def detection(noise: str, case: Case, vehicles: int, seed: int) -> dict[str, Any]:
+    """Nights until RED, and until RED with the right sensor; where it started; what comes after a repair or never."""
+    config, rng = AuditConfig(), np.random.default_rng([seed, NOISES.index(noise), 7])
+    fleet = [make_vehicle(noise, case, rng) for _ in range(vehicles)]
+    red, right = np.full(vehicles, 99), np.full(vehicles, 99)
+    day_right, wrong = np.zeros(vehicles, bool), np.zeros(vehicles, bool)
+    green_after = np.full(vehicles, 99)
+    red_at_end = np.zeros(vehicles, bool)
+    watched = sorted({*range(case.on, case.on + 12), *range(case.back, case.back + 6), case.days - 1})
+    for night, verdicts in nights(fleet, [n for n in watched if n >= case.on], config):
+        for v, verdict in enumerate(verdicts):
+            if not any(c.change for c in verdict.charts.values()) and (not case.back or green_after[v] < 99):
+                continue
+            status = status_of_night(verdict, config)
+            after = night - case.on + 1
+            if status.status == "RED" and (not case.back or night < case.back):
+                red[v] = min(red[v], after)
+                wrong[v] |= status.sensor not in (case.sensor, None)
+                if status.sensor == case.sensor and right[v] == 99:
+                    right[v], day_right[v] = after, is_right_day(verdict, case.on)
+            red_at_end[v] = night == case.days - 1 and status.status == "RED"
+            if case.back and night >= case.back and status.status == "GREEN":
+                green_after[v] = min(green_after[v], night - case.back + 1)
+    out = {
+        "vehicles": vehicles,
+        "red_within_3": _share(red <= 3),
+        "right_sensor_within_3": _share(right <= 3),
+        "right_sensor_within_5": _share(right <= 5),
+        "right_sensor_within_12": _share(right <= 12),
+        "wrong_sensor_on_some_night": _share(wrong),
+        "median_night": float(np.median(right)),
+        "day_right_within_1": _share(day_right[right < 99]) if (right < 99).any() else None,
+        "red_on_the_last_night": _share(red_at_end),
+    }
+    return out | ({"green_within_5": _share(green_after <= 5)} if case.back else {})
+
+
+def is_right_day(verdict: VehicleVerdict, day: int) -> bool:
+    """Whether the clearest RED chart says the day, to one day or, where days are lost, within its interval."""
+    red = [c for c in verdict.charts.values() if c.status == "RED" and c.change is not None]
+    change = max(red, key=lambda c: (c.statistic or 0) / (c.threshold or 1)).change
+    assert change is not None, "charts without a change were left out"
+    return abs(change.day - day) <= 1 or change.earliest <= day <= change.latest
+
+
+def _share(found: np.ndarray) -> float:
+    return round(float(np.mean(found)), 3)
+
+
+def main() -> None:
+    """Run what is missing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--vehicles", type=int, default=1010)
+    parser.add_argument("--nights", type=int, default=100)
+    parser.add_argument("--first-seed", type=int, default=50_000)
+    parser.add_argument("--tune", action="store_true")
+    parser.add_argument("--only", default="")
+    parser.add_argument("--noise", default="")
+    args = parser.parse_args()
+    seed = 100 if args.tune else args.first_seed
+    known = set()
+    if RESULTS.exists() and not args.tune:
+        lines = [json.loads(line) for line in RESULTS.read_text().splitlines()]
+        known = {(r["noise"], r["case"], r["seed"]) for r in lines}
+    for case in CASES:
+        for noise in NOISES:
+            if args.only not in case.name or args.noise not in noise or (noise, case.name, seed) in known:
+                continue
+            begun = time.process_time()
+            if case.sensor:
+                found = detection(noise, case, max(args.vehicles // 10, 20), seed)
+            else:
+                found = false_alarms(noise, args.vehicles, args.nights, seed)
+            line = {"noise": noise, "case": case.name, "seed": seed, "commit": commit_now(), **found}
+            line["cpu_s"] = round(time.process_time() - begun, 1)
+            print(json.dumps(line), flush=True)
+            if not args.tune:
+                with RESULTS.open("a") as file:
+                    file.write(json.dumps(line) + "\n")
+
+
+if __name__ == "__main__":
+    main()
