@@ -29,7 +29,7 @@ def audit(
         method: method of the audited records; default: audit.method.
         report: also write the fleet page, and a page per vehicle-day beside it.
     """
-    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+    from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
@@ -60,6 +60,7 @@ def audit(
         statuses=count_statuses(findings),
         charts={s: charts.count(s) for s in DRIFT_STATUSES},
         moved=moved_sensors(findings),
+        damaged=left_out(tables),
         report=report,
         outputs=outputs,
     )

@@ -50,6 +50,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "jobs.export:export",
         "Write the tables' contracts as JSON Schema, or a trained network as ONNX.",
     ),
+    "migrate": ("jobs.migrate:migrate", "A lake of an older release to the tables of this one."),
     "simulate": ("jobs.simulate:simulate", "Logs of a synthetic fleet, its truth in a file of its own."),
     "evaluate": ("jobs.evaluate:evaluate", "Compare records with a known truth or a reflector recording."),
 }

@@ -11,6 +11,7 @@ from cyclopts import Parameter
 if TYPE_CHECKING:
     from pipeline.fleet.nightly import DayOutcome, Night
     from pipeline.fleet.pattern import VehicleDay
+    from pipeline.store.partitions import Lake
     from schemas.drift import DriftFinding
 
 __all__ = ["nightly", "watch_night"]
@@ -44,7 +45,7 @@ def nightly(
         seed: of everything random; the configuration's where left out.
         report: HTML page of the fleet; default: report/fleet.html inside the lake.
     """
-    from jobs.terminal.summary import exit_code, print_summary
+    from jobs.terminal.summary import exit_code, left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
@@ -59,6 +60,7 @@ def nightly(
     outcomes = watch_night(night, days, executor, workers)
     page = report or tables.root / "report" / "fleet.html"
     findings, pages = close_night(night, to_day, page) if outcomes else ([], [])
+    tidy(tables)
     code = exit_code([o.status for o in outcomes])
     print_summary(
         "nightly",
@@ -68,9 +70,22 @@ def nightly(
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
+        damaged=left_out(tables),
         report=pages[0] if pages else None,
     )
     return code
+
+
+def tidy(lake: Lake) -> None:
+    """Keep the record tables small after a night: what was done goes into the log, what it cannot do to nobody."""
+    from jobs.terminal.logging import logger
+    from pipeline.store.delta import tidy_table
+    from schemas.versions import TABLES
+
+    for schema in TABLES.values():
+        if schema.is_record_table:
+            for what in tidy_table(lake, schema):
+                logger().info("tidied", table=schema.name, what=what)
 
 
 def watch_night(

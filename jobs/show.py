@@ -31,20 +31,22 @@ def show(
         vehicle: only this vehicle.
         day: only this day, YYYY-MM-DD.
         method: only records of this method.
-        current: only the last record of each vehicle, day, method and pair.
+        current: only the current record of each vehicle, day, method and pair.
         json: print a JSON list and nothing else: oldest record first, names as the columns, and for
             calibrations "T", the 4x4 row-major T_parent_child (null where the day was refused).
     """
+    from jobs.terminal.summary import left_out
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake
 
     tables = Lake.at(lake)
-    if not tables.root.is_dir():
+    if not tables.exists():
         raise ConfigError("command line", "lake", f"no such folder: {lake}")
     if table in ("frames", "observations"):
         rows = _partitions(tables, table, vehicle, day)
     else:
         rows = _records(tables, table, vehicle, day, method, current=current)
+    left_out(tables)
     if json:
         from jobs.terminal.summary import print_json
 
@@ -81,13 +83,18 @@ def _records(
 def _partitions(lake: Lake, table: Table, vehicle: str | None, day: str | None) -> list[dict[str, Any]]:
     from dataclasses import asdict
 
+    from pipeline.errors import ContractError
     from pipeline.store.tables import read_manifest
     from schemas.versions import TABLES
 
     rows = []
     for partition in lake.partitions(table):
         if vehicle in (None, partition.vehicle) and day in (None, partition.day):
-            manifest = read_manifest(lake, TABLES[table], partition)
+            try:
+                manifest = read_manifest(lake, TABLES[table], partition)
+            except ContractError as err:
+                lake.damage.append(str(err))
+                continue
             if manifest is not None:
                 rows.append({"vehicle": partition.vehicle, "day": partition.day} | asdict(manifest))
     return rows

@@ -8,6 +8,7 @@ __all__ = [
     "BoresightError",
     "ConfigError",
     "ContractError",
+    "DamagedError",
     "LogError",
     "MissingExtraError",
     "ModelError",
@@ -56,6 +57,13 @@ class ContractError(BoresightError):
     def __init__(self, path: str, problem: str) -> None:
         self.path, self.problem = path, problem
         super().__init__(f"{path}: {problem}")
+
+
+class DamagedError(ContractError):
+    """A file of a table that cannot be read; out of the way, it is made anew from what it was made of."""
+
+    def __init__(self, path: str, problem: str) -> None:
+        super().__init__(path, f"is damaged, make it anew: {problem}")
 
 
 class MissingExtraError(BoresightError):

@@ -34,11 +34,12 @@ class Outcome:
     rejected: dict[str, int] = field(default_factory=dict)
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
+    damaged: str = ""  # the file that could not be read, where that made it fail
     records: tuple[Any, ...] = field(
         default=(), repr=False
     )  # rows of a record table, those of a cached day too
 
     def counts(self) -> dict[str, Any]:
-        """All but the status and the records, for a command's summary."""
-        left_out = ("status", "records")
+        """All but the status, the records and the damage, for a command's summary."""
+        left_out = ("status", "records", "damaged")
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}

@@ -13,11 +13,12 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from pipeline.config import config_hash
-from pipeline.errors import BoresightError, ContractError
+from pipeline.errors import BoresightError, ContractError, DamagedError
 from pipeline.results import Outcome, Progress
 from pipeline.store.partitions import Partition, work_key
-from pipeline.store.tables import Manifest, read_manifest, read_records, write_partition, write_records
-from pipeline.work import NothingUsable, Records, Run, Task, Work
+from pipeline.store.records import assert_records, commit_records, read_records
+from pipeline.store.tables import Manifest, read_manifest, write_partition
+from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
@@ -25,7 +26,7 @@ from schemas.versions import CODE_VERSION
 
 __all__ = ["Stage", "run_stage", "try_stage"]
 
-# Tables of records: small, added to and never replaced. The others are replaced by whole partitions.
+# Row types of the tables of records: small, added to and never replaced. The others are replaced by whole partitions.
 _RECORD_ROWS: dict[str, type] = {CALIBRATIONS.name: CalibrationRecord, DRIFT.name: DriftFinding}
 # A row group: large enough to compress, small enough that a worker that holds one stays far below 2 GB.
 _GROUP_ROWS = 16
@@ -86,7 +87,7 @@ def run_stage(stage: Stage, task: Task) -> Outcome:
     if not stage.writes:
         return _write_files(stage, task, work, run)
     [schema] = stage.writes
-    if schema.name in _RECORD_ROWS:
+    if schema.is_record_table:
         return _add_records(stage, task, work, run, schema)
     return _replace_partition(stage, task, work, run, schema)
 
@@ -96,7 +97,8 @@ def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
     try:
         return stage.run(replace(task, progress=progress))
     except (BoresightError, OSError) as err:
-        return _outcome(stage, task, "failed", "", reason=str(err))
+        damaged = err.path if isinstance(err, DamagedError) else ""
+        return _outcome(stage, task, "failed", "", reason=str(err), damaged=damaged)
 
 
 def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
@@ -162,28 +164,26 @@ def _partition_outcome(
 
 
 def _add_records(stage: Stage, task: Task, work: Work, run: Run, schema: TableSchema) -> Outcome:
-    """Add the records, each `Records` as one file that appears as a whole."""
+    """Records of work that is not recorded yet; committed here, unless who gave the task does that."""
+    where = [task.lake.table(schema.name)]
     recorded = [] if work.again else _recorded(task, run.work_key, schema)
     if recorded:
-        path = task.lake.folder(schema.name, task.partition) / f"{run.work_key}.parquet"
-        return _record_outcome(stage, task, work, "cached", run.work_key, recorded, [str(path)])
-    written, paths = [], []
+        if task.commit:
+            assert_records(task.lake, schema, recorded)
+        return _record_outcome(stage, task, work, "cached", run.work_key, recorded, where)
+    written: list[Any] = []
     with closing(work.rows(run)) as batches:
         for records in batches:
-            paths.append(_commit(task, schema, records, run))
             written += records.rows
-    return _record_outcome(stage, task, work, "done", run.work_key, written, paths)
-
-
-def _commit(task: Task, schema: TableSchema, records: Records, run: Run) -> str:
-    partition = records.partition or task.partition
-    key = records.work_key or run.work_key
-    inputs = run.inputs if records.inputs is None else records.inputs
-    return str(write_records(task.lake, schema, partition, records.rows, key, CODE_VERSION, inputs))
+    if task.commit:
+        commit_records(task.lake, schema, written)
+    return _record_outcome(stage, task, work, "done", run.work_key, written, where if written else [])
 
 
 def _recorded(task: Task, key: str, schema: TableSchema) -> list[Any]:
     """What the same work has recorded already."""
+    if task.recorded is not None:
+        return [r for r in task.recorded if r.work_key == key]
     vehicle, day = task.partition.vehicle, task.partition.day
     kind: type[Any] = _RECORD_ROWS[schema.name]
     found = read_records(task.lake, schema, kind, vehicle=vehicle, day=day)

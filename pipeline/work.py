@@ -41,6 +41,8 @@ class Task:
         given: what one stage alone is given; its function says what.
         progress: told how far it is.
         inputs: manifests of the tables that the stage reads, by name; the runner fills them in.
+        commit: False where who gave the task commits the outcome's records, together with those of other tasks.
+        recorded: what the lake has of the vehicle-day's records, where the giver of the task has read it already.
     """
 
     fleet: FleetConfig
@@ -53,6 +55,8 @@ class Task:
     given: Any = None
     progress: Progress = silent
     inputs: Mapping[str, Manifest] = field(default_factory=dict)
+    commit: bool = True
+    recorded: Sequence[Any] | None = None
 
     @property
     def partition(self) -> Partition:

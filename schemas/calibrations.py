@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from schemas.columns import TableSchema, array, scalar, transform_columns
+from schemas.columns import DEFAULT_TRIO, TableSchema, array, record_columns, scalar, transform_columns
 
 __all__ = ["CALIBRATIONS", "DOF_NAMES", "FRAMES_OF_PAIR", "METHODS", "PAIRS", "STATUSES", "CalibrationRecord"]
 
@@ -24,7 +24,7 @@ DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 CALIBRATIONS = TableSchema(
     "calibrations",
-    2,
+    3,
     (
         scalar("vehicle", "string", "vehicle id"),
         scalar("day", "string", "YYYY-MM-DD"),
@@ -142,14 +142,15 @@ CALIBRATIONS = TableSchema(
             "numbers behind the verdict (origins of the search, halves, biases), names with units; `disproved` is 1 "
             "where a check shows that the pose is wrong",
         ),
-        scalar("work_key", "string", "hash of code version, config, inputs"),
         scalar("code_version", "string", "boresight version"),
         scalar("seed", "int64", "random seed"),
         scalar("inputs", "list<string>", "work keys or paths of what was read"),
+        *record_columns(),
     ),
     "One row per pair and method. boresight show calibrations --json prints these names plus T, 4x4 row-major.",
     made_by="calibrate",
-    reads_versions=(1,),
+    reads_versions=(1, 2),
+    about=("vehicle", "day", "trio", "method", "pair"),
 )
 
 
@@ -212,3 +213,6 @@ class CalibrationRecord:
     drive_missing: list[str] = field(default_factory=list)
     diagnostics: dict[str, float] = field(default_factory=dict)
     inputs: list[str] = field(default_factory=list)
+    trio: str = DEFAULT_TRIO
+    recorded_at: str = ""  # written when the row is
+    asserted_at: str = ""

@@ -12,7 +12,9 @@ from typing import Any, Literal
 
 import pyarrow as pa
 
-__all__ = ["Column", "TableSchema", "array", "scalar", "transform_columns"]
+__all__ = ["DEFAULT_TRIO", "Column", "TableSchema", "array", "record_columns", "scalar", "transform_columns"]
+
+DEFAULT_TRIO = "default"  # a rig with one camera, one lidar and one radar has one trio of this name
 
 ScalarKind = Literal["int64", "int32", "float64", "string", "bool", "binary", "list<string>", "list<float64>",
                      "list<bool>", "map<string,float64>", "map<string,int64>"]  # fmt: skip
@@ -87,6 +89,14 @@ class TableSchema:
     made_by: str = ""  # stage, and command, that writes it
     # Older versions whose rows are read too: what they lack has a default in the row's dataclass.
     reads_versions: tuple[int, ...] = ()
+    # Of a record table: the columns that say what a row is about. Of all rows about the same, the one that was asserted
+    # last is current; work_key tells them apart. Empty: a table of partitions that are replaced as a whole.
+    about: tuple[str, ...] = ()
+
+    @property
+    def is_record_table(self) -> bool:
+        """True for a table of records, which are added; False for one of partitions, which are replaced."""
+        return bool(self.about)
 
     def arrow_schema(self) -> pa.Schema:
         """The Arrow schema that every file of the table has."""
@@ -126,3 +136,20 @@ def transform_columns(prefix: str, doc: str, *, nullable: bool = False) -> tuple
     """Seven columns `<prefix>qw ... <prefix>tz_m` of one `T_parent_child` (scalar-first quaternion, metres)."""
     names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     return tuple(scalar(f"{prefix}{n}", "float64", doc, nullable=nullable) for n in names)
+
+
+def record_columns() -> tuple[Column, ...]:
+    """The columns of every record table: whose, by which work, and since when it counts."""
+    stamp = "UTC, ISO 8601 with microseconds: "
+    return (
+        scalar(
+            "trio", "string", "camera, lidar and radar of the rig that see the same; default where it has one"
+        ),
+        scalar("work_key", "string", "hash of code version, config, inputs"),
+        scalar("recorded_at", "string", stamp + "when the row was written"),
+        scalar(
+            "asserted_at",
+            "string",
+            stamp + "when a night last made it current: of all rows about the same, the latest is",
+        ),
+    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from schemas.columns import TableSchema, scalar
+from schemas.columns import DEFAULT_TRIO, TableSchema, record_columns, scalar
 
 __all__ = ["DRIFT", "DRIFT_STATUSES", "DriftFinding", "VehicleStatus", "status_of"]
 
@@ -18,7 +18,7 @@ DRIFT_STATUSES = ("RED", "YELLOW", "UNKNOWN", "GREEN")
 
 DRIFT = TableSchema(
     "drift",
-    1,
+    2,
     (
         scalar("vehicle", "string", "vehicle id"),
         scalar("day", "string", "last day of the audited window, YYYY-MM-DD"),
@@ -61,7 +61,6 @@ DRIFT = TableSchema(
             nullable=True,
         ),
         scalar("moved_motion_sigma", "list<float64>", "their sigmas", nullable=True),
-        scalar("work_key", "string", "hash of code version, config, inputs"),
         scalar("inputs", "list<string>", "work keys of the records on the chart"),
         scalar(
             "vehicle_status",
@@ -78,8 +77,11 @@ DRIFT = TableSchema(
         ),
         scalar("vehicle_since", "string", "first day after the vehicle's clearest change", nullable=True),
         scalar("vehicle_reason", "string", "why the vehicle has this status, in words", nullable=True),
+        *record_columns(),
     ),
     made_by="audit",
+    reads_versions=(1,),
+    about=("vehicle", "day", "trio", "method", "pair", "dof"),
 )
 
 
@@ -114,6 +116,9 @@ class DriftFinding:
     vehicle_sensor: str | None = None
     vehicle_since: str | None = None
     vehicle_reason: str | None = None
+    trio: str = DEFAULT_TRIO
+    recorded_at: str = ""  # written when the row is
+    asserted_at: str = ""
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,14 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.results import Progress
 
-__all__ = ["exit_code", "is_terminal", "print_json", "print_summary", "progress_reporter"]
+if TYPE_CHECKING:
+    from pipeline.store.partitions import Lake
+
+__all__ = ["exit_code", "is_terminal", "left_out", "print_json", "print_summary", "progress_reporter"]
 
 _LOG_EVERY_S = 5.0  # without a terminal: often enough for a watchdog, rare enough for a log store
 
@@ -39,6 +42,16 @@ def exit_code(statuses: Iterable[str]) -> int:
     if "failed" in seen:
         return 1
     return 3 if seen & {"held", "refused"} else 0
+
+
+def left_out(lake: Lake) -> list[str]:
+    """What of a lake could not be read and was left out, each told on stderr once: file and reason."""
+    from jobs.terminal.logging import logger
+
+    found = sorted(set(lake.damage))
+    for what in found:
+        logger().warning("left out, damaged", what=what)
+    return found
 
 
 def is_terminal() -> bool:

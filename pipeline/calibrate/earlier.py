@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import datetime as dt
+
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import ContractError
 from pipeline.store.current import current_records, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records
@@ -15,6 +16,9 @@ __all__ = ["accepted_before"]
 
 # Days with records that are looked at: a vehicle that was held for longer has no state worth a look.
 _DAYS_BACK = 10
+# A vehicle that drives once a week has ten days in a quarter; what lies further back is not read.
+_CALENDAR_DAYS_BACK = 92
+_TRANSFORM = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
 def accepted_before(lake: Lake, partition: Partition, method: str) -> Float[np.ndarray, "4 4"] | None:
@@ -23,14 +27,23 @@ def accepted_before(lake: Lake, partition: Partition, method: str) -> Float[np.n
     No information about today's pose, so no part of the work key: the search looks there only where its other origins
     do not agree, and what it finds there is judged like anything else.
     """
-    known = lake.partitions(CALIBRATIONS.name, partition.vehicle)
-    days = sorted({p.day for p in known if p.day < partition.day}, reverse=True)
-    for day in days[:_DAYS_BACK]:
-        try:
-            records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle, day=day)
-        except ContractError:  # a damaged record of another day is that day's matter
-            continue
-        for record in current_records(records):
-            if (record.pair, record.method, record.status) == ("camera_lidar", method, "accepted"):
-                return transform_of(record)
+    found = read_records(
+        lake,
+        CALIBRATIONS,
+        CalibrationRecord,
+        vehicle=partition.vehicle,
+        first=_days_before(partition.day, _CALENDAR_DAYS_BACK),
+        last=_days_before(partition.day, 1),
+        columns=_TRANSFORM,
+    )
+    wanted = ("camera_lidar", method, "accepted")
+    records = current_records(found)
+    days = sorted({r.day for r in records}, reverse=True)[:_DAYS_BACK]
+    for record in reversed(records):
+        if record.day in days and (record.pair, record.method, record.status) == wanted:
+            return transform_of(record)
     return None
+
+
+def _days_before(day: str, days: int) -> str:
+    return (dt.date.fromisoformat(day) - dt.timedelta(days=days)).isoformat()

@@ -8,17 +8,19 @@ failed or whose inputs changed, because every stage answers "cached" to a work k
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 
 from pipeline.config import FleetConfig
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
+from pipeline.fleet.ledger import Ledger
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import Outcome, Progress
 from pipeline.runner import Stage, try_stage
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.store.partitions import Lake, Partition
 from pipeline.work import Task
+from schemas.calibrations import CalibrationRecord
 
 __all__ = ["DayOutcome", "Night", "run_night", "run_vehicle_day"]
 
@@ -49,6 +51,10 @@ class DayOutcome:
     pairs: dict[str, str] = field(default_factory=dict)
     frames: int = 0
     trace: str = ""
+    results: tuple[Outcome, ...] = field(default=(), repr=False)  # of the stages, with the records to commit
+
+
+_Job = tuple[Night, VehicleDay, tuple[CalibrationRecord, ...]]
 
 
 def run_night(
@@ -64,38 +70,82 @@ def run_night(
         watch: told what the i-th of the days known to fleet.toml is doing.
     """
     known = [d for d in days if d.partition.vehicle in night.fleet.vehicles]
-    for unknown in (d.partition for d in days if d not in known):
+    for unknown in (d.partition for d in days if d.partition.vehicle not in night.fleet.vehicles):
         reason = f"{night.fleet.file} has no vehicle {unknown.vehicle!r}"
         yield DayOutcome(unknown.vehicle, unknown.day, "refused", reason)
-    jobs = [(night, day) for day in known]
-    with closing(EXECUTORS[executor](_run_job, jobs, workers, watch)) as results:
-        for finished in results:
-            yield _outcome(finished)
+    ledger = Ledger(night.lake, [d.partition for d in known])
+    jobs = [(_of(night, d.partition.vehicle), d, ledger.recorded(d.partition)) for d in known]
+    try:
+        with closing(EXECUTORS[executor](_run_job, jobs, workers, watch)) as results:
+            for finished in results:
+                outcome = _outcome(finished)
+                for result in outcome.results:
+                    with suppress(OSError):  # the storage may answer again before the night ends
+                        ledger.add(result)
+                yield outcome
+    finally:
+        ledger.commit()
 
 
-def run_vehicle_day(night: Night, work: VehicleDay, progress: Progress) -> DayOutcome:
-    """Ingest, perceive and calibrate one vehicle-day; a stage's refusal ends as a refused record."""
-    partition, done = work.partition, list[Outcome]()
-    task = Task(night.fleet, night.lake, partition, night.method, night.seed, logs=tuple(work.logs))
+def run_vehicle_day(
+    night: Night, work: VehicleDay, recorded: Sequence[CalibrationRecord], progress: Progress
+) -> DayOutcome:
+    """Ingest, perceive and calibrate one vehicle-day; a stage's refusal ends as a refused record.
+
+    Its records are in the outcome, for the caller to commit.
+
+    Args:
+        night: the configuration, as far as this vehicle needs it.
+        work: the day and its logs.
+        recorded: what the lake has of the day's records.
+        progress: told how far it is.
+    """
+    task = Task(
+        night.fleet,
+        night.lake,
+        work.partition,
+        night.method,
+        night.seed,
+        logs=tuple(work.logs),
+        commit=False,
+        recorded=recorded,
+    )
+    outcome = _through_stages(task, progress)
+    damaged = next((r.damaged for r in outcome.results if r.damaged), "")
+    if not damaged:
+        return outcome
+    night.lake.set_aside(damaged)  # what it was made of is there: make it anew, once
+    return _through_stages(task, progress)
+
+
+def _through_stages(task: Task, progress: Progress) -> DayOutcome:
+    partition, done = task.partition, list[Outcome]()
     for stage in (INGEST, PERCEIVE, CALIBRATE):
         done.append(try_stage(stage, task, _named(stage, progress)))
         if done[-1].status == "failed":
             break
         if done[-1].status == "refused" and stage is not CALIBRATE:
-            CALIBRATE.run(replace(task, given=done[-1]))  # records the refusal
-            break
-    return _summarise(partition, done)
+            refusal = CALIBRATE.run(replace(task, given=done[-1]))  # records it
+            return replace(_summarise(partition, done), results=(*done, refusal))
+    return replace(_summarise(partition, done), results=tuple(done))
 
 
-def _run_job(job: tuple[Night, VehicleDay], progress: Progress) -> DayOutcome:
+def _run_job(job: _Job, progress: Progress) -> DayOutcome:
     return run_vehicle_day(*job, progress)
+
+
+def _of(night: Night, vehicle: str) -> Night:
+    """The night as one vehicle needs it: a worker is sent no other vehicle's configuration."""
+    known = night.fleet.vehicles[vehicle]
+    own = {"vehicles": {vehicle: known}, "rigs": {known.rig: night.fleet.rigs[known.rig]}}
+    return replace(night, fleet=night.fleet.model_copy(update=own))
 
 
 def _named(stage: Stage, progress: Progress) -> Progress:
     return lambda done, total, what: progress(done, total, f"{stage.name} {what}")
 
 
-def _outcome(finished: Finished[tuple[Night, VehicleDay], DayOutcome]) -> DayOutcome:
+def _outcome(finished: Finished[_Job, DayOutcome]) -> DayOutcome:
     if finished.value is not None:
         return finished.value
     partition = finished.item[1].partition

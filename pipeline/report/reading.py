@@ -12,7 +12,8 @@ from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.scenes import choose_frames
 from pipeline.store.current import current_drift, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows, read_manifest, read_records
+from pipeline.store.records import last_day, read_records
+from pipeline.store.tables import iterate_rows, read_manifest
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
@@ -28,6 +29,7 @@ __all__ = [
     "states_of",
 ]
 
+_AUDIT_DAYS = 61  # whose findings are older is audited no more: it left fleet.toml, or nobody audits
 _FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 
 
@@ -50,18 +52,30 @@ def day_records(lake: Lake, partition: Partition, method: str) -> dict[str, Cali
 
 def fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:
     """Current records of the last `window_days` days, as an audit sees them."""
-    records = [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
-    if not records:
+    last = last_day(lake, CALIBRATIONS)
+    if last is None:
         return []
-    last = dt.date.fromisoformat(max(r.day for r in records))
-    first = (last - dt.timedelta(days=window_days - 1)).isoformat()
+    first = _days_before(last, window_days - 1)
+    records = [
+        r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, first=first) if r.method == method
+    ]
+    if not records:  # another method's records may be newer by more than a window
+        records = [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
+    first = _days_before(max((r.day for r in records), default=last), window_days - 1)
     return current_records([r for r in records if r.day >= first])
 
 
 def drift_of(lake: Lake, method: str, vehicle: str | None = None) -> list[DriftFinding]:
-    """Current findings of one vehicle, or of all."""
-    findings = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle)
+    """Current findings of one vehicle, or of all, where the lake's last audits, of two months, looked at it."""
+    last = last_day(lake, DRIFT)
+    if last is None:
+        return []
+    findings = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle, first=_days_before(last, _AUDIT_DAYS))
     return current_drift([f for f in findings if f.method == method])
+
+
+def _days_before(day: str, days: int) -> str:
+    return (dt.date.fromisoformat(day) - dt.timedelta(days=days)).isoformat()
 
 
 def states_of(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics, Extrinsics] | None:

@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline.config import FleetConfig
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, DamagedError
 from pipeline.report.day import PairView, answer_for, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import drift_figure, residual_figure, sigma_figure
 from pipeline.report.fleet import drift_panels, finding_views, headline_for, vehicle_rows
@@ -241,6 +241,26 @@ def _pictures(
     """Pictures, residuals, and why there are none; `after` is drawn with the day's time offsets, `before` had none."""
     if before is None or after is None:
         return [], "", "the records carry no prior"
+    try:
+        return _drawn(lake, partition, before, after, labels, offsets)
+    except DamagedError as err:
+        lake.damage.append(str(err))
+        return [], "", "the day's frames or observations cannot be read"
+
+
+def _drawn(
+    lake: Lake,
+    partition: Partition,
+    before: Extrinsics,
+    after: Extrinsics,
+    labels: tuple[str, str],
+    offsets: TimeOffsets,
+) -> tuple[list[Any], Any, str]:
+    """Pictures, residuals, and why there are none.
+
+    Raises:
+        DamagedError: a file cannot be read.
+    """
     if not has_frames(lake, partition):
         return [], "", "the lake no longer has the day's frames and observations"
     spread = spread_observations(lake, partition)

@@ -15,27 +15,29 @@ __all__ = ["current_drift", "current_records", "prior_of", "transform_of"]
 
 
 def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRecord]:
-    """The last record of each (vehicle, day, method, pair), in order of vehicle, day, method and pair.
+    """The current record of each (vehicle, day, trio, method, pair), in this order.
 
     Args:
-        records: as `read_records` returns them, oldest file first within a day.
+        records: as `read_records` returns them, the last asserted last.
     """
-    last = {(r.vehicle, r.day, r.method, r.pair): r for r in records}
+    last = {(r.vehicle, r.day, r.trio, r.method, r.pair): r for r in records}
     return [last[key] for key in sorted(last)]
 
 
 def current_drift(findings: Sequence[DriftFinding]) -> list[DriftFinding]:
-    """The findings of each vehicle and method's latest audited day, the last file of that day, in order.
+    """The current findings of each vehicle and method's latest audited day, in order.
 
     Args:
-        findings: as `read_records` returns them, oldest file first within a day.
+        findings: as `read_records` returns them, the last asserted last.
     """
     newest: dict[tuple[str, str], str] = {}
     for finding in findings:
         key = (finding.vehicle, finding.method)
         newest[key] = max(newest.get(key, ""), finding.day)
     last = {
-        (f.vehicle, f.method, f.pair, f.dof): f for f in findings if f.day == newest[(f.vehicle, f.method)]
+        (f.vehicle, f.method, f.trio, f.pair, f.dof): f
+        for f in findings
+        if f.day == newest[(f.vehicle, f.method)]
     }
     return [last[key] for key in sorted(last)]
 

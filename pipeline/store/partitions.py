@@ -6,8 +6,11 @@ import datetime as dt
 import hashlib
 import json
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 from urllib.parse import quote, unquote
 
 from pipeline.errors import ConfigError
@@ -46,9 +49,17 @@ class Partition:
 
 @dataclass(frozen=True)
 class Lake:
-    """The root of the tables: a folder (an object store comes behind the same methods)."""
+    """The root of the tables: a folder (an object store comes behind the same methods).
+
+    Args:
+        root: the folder.
+        damage: what was left out because it could not be read, as it is found: file and reason, in words.
+        migrating: True for who moves the records of an older release, and meets them beside the new ones.
+    """
 
     root: Path
+    migrating: bool = False
+    damage: list[str] = field(default_factory=list, compare=False, repr=False)
 
     @classmethod
     def at(cls, location: str | Path) -> Lake:
@@ -57,12 +68,15 @@ class Lake:
             raise ConfigError("command line", "lake", "object stores are not supported yet: give a folder")
         return cls(Path(location))
 
+    def __str__(self) -> str:
+        return str(self.root)
+
     def folder(self, table: str, partition: Partition) -> Path:
         """The folder of one partition of one table."""
         return self.root / table / partition.folder
 
     def file(self, table: str, partition: Partition) -> Path:
-        """The file of a partition that is replaced as a whole (records have names of their own)."""
+        """The file of a partition that is replaced as a whole (records have tables of their own)."""
         return self.folder(table, partition) / "part-0.parquet"
 
     def partitions(self, table: str, vehicle: str | None = None, day: str | None = None) -> list[Partition]:
@@ -70,6 +84,48 @@ class Lake:
         vehicles = "*" if vehicle is None else quote(vehicle, safe="")
         pattern = f"{table}/vehicle={vehicles}/day={day or '*'}/*.parquet"
         return sorted({p for f in self.root.glob(pattern) if (p := _partition_of(f.parent)) is not None})
+
+    def set_aside(self, path: str) -> None:
+        """Take a damaged file of a partition out of the readers' sight; it keeps its name and ends in .damaged."""
+        with suppress(FileNotFoundError):
+            Path(path).replace(f"{path}.damaged")
+
+    def table(self, name: str) -> str:
+        """Where a record table lies."""
+        return str(self.root / name)
+
+    def make_folder(self, table: str) -> None:
+        """Make the folder of a table where it is missing."""
+        (self.root / table).mkdir(parents=True, exist_ok=True)
+
+    def exists(self) -> bool:
+        """True where there is such a folder."""
+        return self.root.is_dir()
+
+    def has_record_files(self, table: str) -> bool:
+        """True where a release before 0.6 left records as files in folders of vehicles."""
+        return not self.migrating and any((self.root / table).glob("vehicle=*/day=*/*.parquet"))
+
+    def record_file(self, table: str, name: str) -> Path:
+        """A data file of a record table, by its name in the table's log."""
+        return self.root / table / unquote(name)
+
+    def move_record_file(self, table: str, name: str, aside: str) -> None:
+        """Move a data file to another name in the table's folder, if it is there."""
+        target = self.root / table / aside
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):
+            self.record_file(table, name).replace(target)
+
+    def delta_options(self) -> dict[str, str]:
+        """What `deltalake` is told of the storage."""
+        return {}
+
+    @contextmanager
+    def opened(self, path: Path) -> Iterator[BinaryIO]:
+        """A file, to be read at any place."""
+        with path.open("rb") as stream:
+            yield stream
 
 
 def _partition_of(folder: Path) -> Partition | None:

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from pipeline.errors import ContractError
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table
-from pipeline.store.tables import read_manifest
+from pipeline.store.tables import naming_damage, read_manifest
 from schemas.columns import TableSchema
 
 __all__ = ["RowGroup", "read_columns", "read_group", "row_groups"]
@@ -36,8 +36,10 @@ def read_columns(
 
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
+        DamagedError: its file cannot be read.
     """
-    with pq.ParquetFile(_checked(lake, schema, partition)) as file:
+    path = _checked(lake, schema, partition)
+    with lake.opened(path) as stream, pq.ParquetFile(stream) as file, naming_damage(path):
         table = file.read(columns=list(names))
     return {name: table.column(name).to_pylist() for name in names}
 
@@ -48,7 +50,8 @@ def row_groups(lake: Lake, schema: TableSchema, partition: Partition) -> list[Ro
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
     """
-    metadata = pq.read_metadata(_checked(lake, schema, partition))
+    with lake.opened(_checked(lake, schema, partition)) as stream:
+        metadata = pq.read_metadata(stream)
     return [RowGroup(partition, i, metadata.row_group(i).num_rows) for i in range(metadata.num_row_groups)]
 
 
@@ -60,7 +63,7 @@ def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[
     """
     path = lake.file(schema.name, group.partition)
     try:
-        with pq.ParquetFile(path) as file:
+        with lake.opened(path) as stream, pq.ParquetFile(stream) as file, naming_damage(path):
             return from_table(file.read_row_group(group.index), schema, row_type)
     except FileNotFoundError as err:
         raise ContractError(str(path), "the partition went away while it was read") from err

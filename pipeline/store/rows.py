@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -45,11 +45,20 @@ def from_table(table: pa.Table, schema: TableSchema, row_type: type[Row]) -> lis
     if missing:
         raise ContractError(schema.name, f"columns missing: {', '.join(missing)}")
     values = {
-        c.name: _decode_column(table.column(c.name), c)
+        c.name: _filled(_decode_column(table.column(c.name), c), c, known[c.name])
         for c in schema.columns
         if c.name in known and c.name not in absent
     }
     return [row_type(**{name: values[name][i] for name in values}) for i in range(table.num_rows)]
+
+
+def _filled(values: list[Any], column: Column, field: Field[Any]) -> list[Any]:
+    """The field's default where an older row has null in a column that came later and may not be null."""
+    if column.nullable or column.is_array or None not in values:
+        return values
+    if field.default_factory is MISSING:
+        return [field.default if v is None else v for v in values]
+    return [field.default_factory() if v is None else v for v in values]
 
 
 def _encode(value: Any, column: Column, table: str) -> Any:

@@ -1,4 +1,4 @@
-"""Read and write partitions (replaced atomically as a whole) and records (append-only, named after their work key)."""
+"""Read and write partitions, each replaced atomically as a whole; records have a module of their own."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.errors import ContractError
+from pipeline.errors import ContractError, DamagedError
 from pipeline.store.atomic_write import atomic_write
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import read_records, write_records
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
 
@@ -22,6 +23,7 @@ __all__ = [
     "Manifest",
     "PartitionWriter",
     "iterate_rows",
+    "naming_damage",
     "read_manifest",
     "read_records",
     "read_rows",
@@ -92,23 +94,10 @@ def write_partition(
         parquet.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
 
 
-def write_records(
-    lake: Lake, schema: TableSchema, partition: Partition, rows: Sequence[Any], work_key: str, code_version: str,
-    inputs: Iterable[str] = (),
-) -> Path:  # fmt: skip
-    """Add one record file named after its work key; the same work writes the same file again."""
-    path = lake.folder(schema.name, partition) / f"{work_key}.parquet"
-    with _replacing(path, schema) as parquet:
-        parquet.write_table(to_table(rows, schema))
-        manifest = Manifest(schema.name, schema.version, work_key, code_version, list(inputs), len(rows))
-        parquet.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
-    return path
-
-
 def read_manifest(lake: Lake, schema: TableSchema, partition: Partition) -> Manifest | None:
     """Manifest of a partition, None where there is no such partition."""
     path = lake.file(schema.name, partition)
-    return _manifest(path, schema) if path.exists() else None
+    return _manifest(lake, path, schema) if path.exists() else None
 
 
 def read_rows(lake: Lake, schema: TableSchema, partition: Partition, row_type: type[Row]) -> list[Row]:
@@ -127,15 +116,16 @@ def iterate_rows(
 
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
+        DamagedError: its file cannot be read.
     """
     path = lake.file(schema.name, partition)
     if not path.exists():
         raise ContractError(
             str(path), f"table {schema.name} has no partition for {partition.vehicle} on {partition.day}"
         )
-    _manifest(path, schema)
+    _manifest(lake, path, schema)
     wanted = None if rows is None else set(rows)
-    with pq.ParquetFile(path) as file:
+    with lake.opened(path) as stream, pq.ParquetFile(stream) as file:
         first = 0
         for group in range(file.num_row_groups):
             count = file.metadata.row_group(group).num_rows
@@ -144,27 +134,9 @@ def iterate_rows(
             )
             first += count
             if picked:
-                table = file.read_row_group(group)
+                with naming_damage(path):
+                    table = file.read_row_group(group)
                 yield from_table(table if len(picked) == count else table.take(picked), schema, row_type)
-
-
-def read_records(
-    lake: Lake,
-    schema: TableSchema,
-    row_type: type[Row],
-    *,
-    vehicle: str | None = None,
-    day: str | None = None,
-) -> list[Row]:
-    """Records of a table in order of vehicle, day and file time; `current_records` keeps the last of a kind."""
-    found: list[Row] = []
-    for partition in lake.partitions(schema.name, vehicle, day):
-        folder = lake.folder(schema.name, partition)
-        for path in sorted(folder.glob("*.parquet"), key=lambda p: (p.stat().st_mtime_ns, p.name)):
-            _manifest(path, schema)
-            with pq.ParquetFile(path) as file:
-                found += from_table(file.read(), schema, row_type)
-    return found
 
 
 @contextmanager
@@ -210,11 +182,26 @@ def _writer_options(schema: TableSchema) -> dict[str, Any]:
     return {"compression": compressed, "use_dictionary": False, "write_statistics": flat}
 
 
-def _manifest(path: Path, schema: TableSchema) -> Manifest:
+@contextmanager
+def naming_damage(path: PurePath) -> Iterator[None]:
+    """What a file's content makes readers stumble over, as an error that names the file.
+
+    Raises:
+        DamagedError: the content is not that of a whole file.
+    """
     try:
-        raw = (pq.read_metadata(path).metadata or {}).get(_KEY)
-    except pa.ArrowInvalid as err:
-        raise ContractError(str(path), f"is damaged, make it anew: {err}") from err
+        yield
+    except pa.ArrowException as err:
+        raise DamagedError(str(path), str(err).splitlines()[0]) from err
+    except OSError as err:
+        if err.errno is not None:  # the disk's or the network's trouble, not the file's
+            raise
+        raise DamagedError(str(path), str(err).splitlines()[0]) from err
+
+
+def _manifest(lake: Lake, path: Path, schema: TableSchema) -> Manifest:
+    with lake.opened(path) as stream, naming_damage(path):
+        raw = (pq.read_metadata(stream).metadata or {}).get(_KEY)
     if raw is None:
         raise ContractError(str(path), "was not written by Boresight (no manifest in the footer)")
     values = json.loads(raw)

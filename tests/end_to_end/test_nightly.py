@@ -13,10 +13,10 @@ import pytest
 
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_manifest, read_records
+from pipeline.store.tables import read_manifest, read_records, read_rows
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS
+from schemas.observations import OBSERVATIONS, Observation
 
 BORESIGHT = f"{sys.prefix}/bin/boresight"
 DAYS = ("2026-03-02", "2026-03-03")
@@ -119,6 +119,27 @@ def test_a_second_night_finds_nothing_to_do_and_changes_no_byte(fleet, first_nig
     assert {p: p.read_bytes() for p in before} == before
     after = {p for p in lake.rglob("*.parquet") if "drift" not in p.parts}
     assert after == set(before)
+
+
+@pytest.mark.slow
+def test_damaged_tables_cost_the_fleet_nothing_and_the_next_night_heals_them(fleet, first_night, tmp_path):
+    lake = tmp_path / "lake"
+    shutil.copytree(first_night[0], lake)
+    ill = Partition("vehicle-1", DAYS[0])
+    # Pages of the observations behind a whole footer, and the records' footers.
+    files = dict.fromkeys(lake.glob("calibrations/*/*.parquet"), 0)
+    files[Lake.at(lake).file("observations", ill)] = 4
+    for path, keep in files.items():
+        whole = path.read_bytes()
+        path.write_bytes(whole[:keep] + bytes(len(whole) // 2) + whole[keep + len(whole) // 2 :])
+    told = Lake.at(lake)
+    assert run(BORESIGHT, "audit", "--fleet", f"{fleet}/fleet.toml", "--lake", str(lake))[1]["damaged"]
+    code, summary, _ = run(*command(fleet, lake, "--executor", "inline"))
+    assert (code, summary["failed"]) == (3, 0)
+    assert good_days(lake) == WANTED | {("vehicle-3", DAYS[0])}
+    assert len(read_rows(told, OBSERVATIONS, ill, Observation)) == 12
+    code, summary, _ = run(*command(fleet, lake, "--executor", "inline"))
+    assert (summary["damaged"], summary["done"]) == ([], 0)
 
 
 def nightly_with_workers(fleet, lake):

@@ -4,7 +4,7 @@ import os
 import socket
 import subprocess
 import sys
-from dataclasses import replace
+from collections import Counter
 from pathlib import Path
 
 import duckdb
@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.errors import ContractError
+from pipeline.errors import ContractError, DamagedError
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import (
     iterate_rows,
@@ -23,7 +23,6 @@ from pipeline.store.tables import (
     read_records,
     read_rows,
     write_partition,
-    write_records,
 )
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
@@ -125,57 +124,17 @@ def test_another_version_a_foreign_file_and_a_damaged_one_are_named(lake, rng):
         read_rows(lake, FRAMES, Partition("car", "2026-03-03"), Frame)
 
 
-def test_records_of_an_older_version_are_read_with_the_defaults_of_what_they_lack(lake, rng):
-    row = make_row("calibrations", rng, vehicle="car", seed=1)
-    without = tuple(c for c in CALIBRATIONS.columns if c.name != "common_covariance")
-    write_records(lake, replace(CALIBRATIONS, version=1, columns=without), DAY, [row], "old", "0.5.0")
-    write_records(lake, CALIBRATIONS, DAY, [row], "new", "0.6.0")
-    old, new = read_records(lake, CALIBRATIONS, CalibrationRecord)
-    assert old.common_covariance is None
-    np.testing.assert_array_equal(old.covariance, row.covariance)
-    np.testing.assert_array_equal(new.common_covariance, row.common_covariance)
-    unread = replace(CALIBRATIONS, reads_versions=())
-    with pytest.raises(ContractError, match=r"calibrations/1.*calibrations/2"):
-        read_records(lake, unread, CalibrationRecord)
-
-
-def test_records_are_appended_and_the_same_work_gives_the_same_file(lake, rng):
-    first = make_row("calibrations", rng, vehicle="car", seed=1)
-    second = make_row("calibrations", rng, vehicle="car", seed=2)
-    paths = [
-        write_records(lake, CALIBRATIONS, DAY, [row], key, "0.1")
-        for row, key in ((first, "k1"), (second, "k2"), (first, "k1"))
-    ]
-    assert paths[0] == paths[2]
-    assert len(list(lake.folder("calibrations", DAY).iterdir())) == 2
-    other = Partition("bus", "2026-03-02")
-    write_records(lake, CALIBRATIONS, other, [make_row("calibrations", rng, seed=3)], "k3", "0.1")
-    seeds = [r.seed for r in read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="car")]
-    assert sorted(seeds) == [1, 2]
-    assert len(read_records(lake, CALIBRATIONS, CalibrationRecord)) == 3
-    assert read_records(lake, CALIBRATIONS, CalibrationRecord, day="2026-03-03") == []
-
-
-def test_records_of_a_release_that_knew_fewer_columns_stay_readable(lake, rng):
-    row = make_row("calibrations", rng, vehicle="car", score=0.5, drive_missing=["nothing left"])
-    path = write_records(lake, CALIBRATIONS, DAY, [row], "k1", "0.1")
-    footer = pq.read_metadata(path).metadata
-    whole = pq.read_table(path, partitioning=None).replace_schema_metadata(footer)
-    for gone, readable in ((["score", "drive_missing"], True), (["pair"], False)):
-        pq.write_table(whole.drop_columns(gone), path)
-        if readable:
-            (found,) = read_records(lake, CALIBRATIONS, CalibrationRecord)
-            assert (found.score, found.drive_missing, found.pair) == (None, [], row.pair)
-        else:
-            with pytest.raises(ContractError, match="columns missing: pair"):
-                read_records(lake, CALIBRATIONS, CalibrationRecord)
-
-
-def test_the_newest_record_file_comes_last(lake, rng):
-    for age, key in ((100, "a"), (300, "b"), (200, "c")):
-        path = write_records(lake, CALIBRATIONS, DAY, [make_row("calibrations", rng, seed=age)], key, "0.1")
-        os.utime(path, ns=(0, 10**18 - age))
-    assert [r.seed for r in read_records(lake, CALIBRATIONS, CalibrationRecord)] == [300, 200, 100]
+def test_damage_behind_a_whole_footer_is_named_as_damage(lake, rng):
+    write(lake, [make_row("frames", rng, free=200) for _ in range(4)])
+    path = lake.file("frames", DAY)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:4] + bytes(len(whole) // 2) + whole[4 + len(whole) // 2 :])
+    assert read_manifest(lake, FRAMES, DAY).rows == 4
+    with pytest.raises(DamagedError, match=r"part-0\.parquet.*damaged"):
+        read_rows(lake, FRAMES, DAY, Frame)
+    lake.set_aside(str(path))
+    assert read_manifest(lake, FRAMES, DAY) is None
+    assert lake.partitions("frames") == []
 
 
 def test_files_can_be_read_by_whoever_the_umask_lets(lake, rng):
@@ -216,33 +175,18 @@ def test_duckdb_and_polars_read_the_lake_by_plain_glob(lake, rng):
             np.testing.assert_array_equal(decode(blob, field), rows[vehicle, day][index].lidar_x_m)
 
 
-def test_duckdb_and_polars_read_records_whose_columns_repeat_the_folders_names(lake, rng):
-    row = make_row("calibrations", rng, vehicle="car", day="2026-03-02", status="held")
-    write_records(lake, CALIBRATIONS, DAY, [row], "k1", "0.1")
-    pattern = f"{lake.root}/calibrations/*/*/*.parquet"
-    sql = f"select vehicle, status, diagnostics['x'] from read_parquet('{pattern}', hive_partitioning=true)"
-    assert duckdb.sql(sql).fetchall() == [("car", "held", row.diagnostics["x"])]
-    frame = (
-        pl.scan_parquet(pattern, hive_partitioning=True).select("vehicle", "status", "covariance").collect()
-    )
-    assert frame["vehicle"].to_list() == ["car"]
-    blob = frame["covariance"][0]
-    np.testing.assert_array_equal(
-        decode(blob, CALIBRATIONS.arrow_schema().field("covariance")), row.covariance
-    )
-
-
 # -- faults ------------------------------------------------------------------------------------------
 
 
 def assert_whole(lake):
-    """One generation in the partition, and all three rows of every record file."""
+    """One generation in the partition, and all three rows of every commit of records."""
     manifest = read_manifest(lake, FRAMES, DAY)
     rows = read_rows(lake, FRAMES, DAY, Frame)
     assert len(rows) == 12
     assert {f"key-{r.drive}" for r in rows} == {manifest.work_key}
-    for path in lake.folder("calibrations", DAY).glob("*.parquet"):
-        assert pq.read_metadata(path).num_rows == 3
+    counts = Counter(r.work_key for r in read_records(lake, CALIBRATIONS, CalibrationRecord))
+    assert set(counts.values()) == {3}
+    assert lake.damage == []
 
 
 def test_a_writer_killed_at_any_moment_never_leaves_a_bad_read(lake, rng):

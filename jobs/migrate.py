@@ -1,0 +1,38 @@
+"""`boresight migrate`: a lake of an older release to the tables of this one."""
+
+from __future__ import annotations
+
+__all__ = ["migrate"]
+
+
+def migrate(*, lake: str) -> int:
+    """Take the records of a lake that a release before 0.6 wrote (Parquet files) into record tables.
+
+    Can be run again, and goes on where it was stopped. Frames and observations stay as they are.
+
+    Args:
+        lake: folder of the tables.
+    """
+    from jobs.terminal.summary import print_summary, progress_reporter
+    from pipeline.errors import ConfigError
+    from pipeline.store.migration import migrate_table
+    from pipeline.store.partitions import Lake
+    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+    from schemas.drift import DRIFT, DriftFinding
+
+    tables = Lake.at(lake)
+    if not tables.exists():
+        raise ConfigError("command line", "lake", f"no such folder: {lake}")
+    done = {}
+    with progress_reporter("migrate") as progress:
+        for schema, row_type in ((CALIBRATIONS, CalibrationRecord), (DRIFT, DriftFinding)):
+            done[schema.name] = migrate_table(tables, schema, row_type, progress)
+    files = sum(d.files for d in done.values())
+    print_summary(
+        "migrate",
+        "done" if files else "cached",
+        files=files,
+        rows={name: d.rows for name, d in done.items()},
+        damaged=[name for d in done.values() for name in d.damaged],
+    )
+    return 0

@@ -1,0 +1,247 @@
+"""Record tables as Delta Lake tables: open, create, merge, read their files, and keep them tidy.
+
+One folder per table, partitioned by month of the row's day. A commit is one file of the log that appears as a whole, so
+a killed writer leaves rows or none, and two writers at once both get theirs in.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from deltalake import DeltaTable, Schema, WriterProperties
+from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
+
+from pipeline.errors import ContractError
+from pipeline.store.partitions import Lake
+from schemas.columns import TableSchema
+
+__all__ = [
+    "LiveFile",
+    "live_files",
+    "merge_rows",
+    "open_table",
+    "read_file",
+    "set_aside_damaged",
+    "stored_schema",
+    "tidy_table",
+]
+
+_MONTH = "month"
+_VERSION = "boresight.version"
+# A reader of one vehicle's day reads whole files: 32 MB are some thousand vehicle-days, read in a tenth of a second.
+_FILE_BYTES = 32 << 20
+_FILES_A_MONTH = 8  # more small files than this are put together after the night
+# Old generations stay for readers that began before the compaction: the week that Delta's own tools keep.
+_KEEP_HOURS = 7 * 24
+# Every writer that comes in between costs one more try; none comes in forty times while others wait for seconds.
+_TRIES = 40
+_PAUSE_S = 0.05
+_DAMAGED = "_damaged"  # a name with an underscore: Delta's own tools leave it alone
+
+
+@dataclass(frozen=True)
+class LiveFile:
+    """A data file of a table's newest version; its rows lie between these days and vehicles (None: not known)."""
+
+    name: str
+    days: tuple[str, str] | None = None
+    vehicles: tuple[str, str] | None = None
+
+    def may_hold(self, vehicle: str | None, first: str | None, last: str | None) -> bool:
+        """False where no row of the vehicle (None = any) from day `first` to day `last` can be in it."""
+        if self.days is not None and ((first or "") > self.days[1] or (last or "9999") < self.days[0]):
+            return False
+        return vehicle is None or self.vehicles is None or self.vehicles[0] <= vehicle <= self.vehicles[1]
+
+
+def stored_schema(schema: TableSchema) -> pa.Schema:
+    """The Arrow schema of a record table's files: its columns, and the month.
+
+    All may be null but what a row is about: rows that an older release wrote have none of the columns that came later.
+    """
+    known = {*schema.about, "work_key", "asserted_at"}
+    stored = [f.with_nullable(f.name not in known) for f in schema.arrow_schema()]
+    return pa.schema([*stored, pa.field(_MONTH, pa.string(), nullable=False)])
+
+
+def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
+    """The table as it is now; None where nothing was recorded yet.
+
+    Raises:
+        ContractError: the lake holds records of a release that kept them as Parquet files, or of a newer one.
+    """
+    where = lake.table(schema.name)
+    if lake.has_record_files(schema.name):
+        problem = (
+            f"holds records as files, as releases before 0.6 kept them: run `boresight migrate --lake {lake}`"
+        )
+        raise ContractError(where, problem)
+    try:
+        table = DeltaTable(where, storage_options=lake.delta_options())
+    except TableNotFoundError:
+        return None
+    except DeltaError as err:
+        raise ContractError(where, f"its log is damaged: {err}") from err
+    found = table.metadata().configuration.get(_VERSION, "")
+    readable = {str(v) for v in (schema.version, *schema.reads_versions)}
+    if table.protocol().min_reader_version > 1 or found not in readable:
+        problem = f"holds {schema.name}/{found or '?'}, this version reads {schema.name}/{schema.version}"
+        raise ContractError(where, problem)
+    return table
+
+
+def live_files(table: DeltaTable) -> list[LiveFile]:
+    """The data files of a table, with what its log knows of them."""
+    actions = pa.table(table.get_add_actions(flatten=True))
+    columns = {n: actions.column(n).to_pylist() for n in actions.column_names}
+    nothing = [None] * actions.num_rows
+
+    def span(name: str, i: int) -> tuple[str, str] | None:
+        low, high = (columns.get(f"{end}.{name}", nothing)[i] for end in ("min", "max"))
+        return None if low is None or high is None else (low, high)
+
+    return [LiveFile(name, span("day", i), span("vehicle", i)) for i, name in enumerate(columns["path"])]
+
+
+def read_file(lake: Lake, schema: TableSchema, name: str, columns: Sequence[str]) -> pa.Table | None:
+    """Columns of one data file, those that it has; None where it is damaged or gone, which `lake.damage` then names."""
+    path = lake.record_file(schema.name, name)
+    wanted = schema.arrow_schema()
+    try:
+        with lake.opened(path) as stream, pq.ParquetFile(stream) as file:
+            there = [c for c in columns if c in file.schema_arrow.names]
+            table = file.read(columns=there)
+    except PermissionError:
+        raise
+    except (
+        pa.ArrowException,
+        OSError,
+        EOFError,
+    ) as err:  # a storage that does not answer raises other errors
+        lake.damage.append(f"{path}: {str(err).splitlines()[0]}")
+        return None
+    # The writer may have chosen string views for strings.
+    return table.cast(pa.schema([wanted.field(n).with_nullable(True) for n in there]))
+
+
+def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool = True) -> None:
+    """Add the rows whose work is not recorded; of the others only take over `asserted_at`, where it is later.
+
+    Args:
+        lake: where the table is.
+        schema: of the table.
+        rows: with all columns of `stored_schema`, no two about the same by the same work.
+        insert: False = only take over `asserted_at`.
+
+    Raises:
+        ContractError: see `open_table`.
+        OSError: the storage does not answer, or others commit without end.
+    """
+    for attempt in range(_TRIES):
+        try:
+            table = open_table(lake, schema) or _created(lake, schema)
+            _merge(table, schema, rows, insert=insert)
+        except CommitFailedError:  # another writer was first
+            time.sleep(_PAUSE_S * random.uniform(1, 1 + min(attempt, 10)))
+        except DeltaError as err:
+            # A damaged file must be out of the way, or nothing is ever recorded again.
+            if not set_aside_damaged(lake, schema):
+                raise OSError(f"{lake.table(schema.name)}: {err}") from err
+        else:
+            return
+    raise OSError(f"{lake.table(schema.name)}: {_TRIES} commits of others came in between")
+
+
+def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bool) -> None:
+    days, months = (sorted(set(rows.column(n).to_pylist())) for n in ("day", _MONTH))
+    # Literals, so that only files of these days are looked at; days and months are digits and hyphens.
+    window = f"t.day >= '{days[0]}' and t.day <= '{days[-1]}' and t.{_MONTH} in ({_quoted(months)})"
+    same = " and ".join(f"t.{c} = s.{c}" for c in (*schema.about, "work_key"))
+    known = {f.name for f in table.schema().fields}
+    if table.metadata().configuration.get(_VERSION) != str(schema.version):
+        table.alter.set_table_properties({_VERSION: str(schema.version)}, raise_if_not_exists=False)
+    merging = table.merge(
+        rows,
+        f"{window} and {same}",
+        source_alias="s",
+        target_alias="t",
+        merge_schema=not known >= set(rows.column_names),
+        writer_properties=WriterProperties(compression="ZSTD"),
+    ).when_matched_update({"asserted_at": "s.asserted_at"}, predicate="s.asserted_at > t.asserted_at")
+    (merging.when_not_matched_insert_all() if insert else merging).execute()
+
+
+def _quoted(values: Sequence[str]) -> str:
+    return ", ".join(f"'{v}'" for v in values)
+
+
+def _created(lake: Lake, schema: TableSchema) -> DeltaTable:
+    """An empty table; another writer may have made it meanwhile."""
+    lake.make_folder(schema.name)
+    return DeltaTable.create(
+        lake.table(schema.name),
+        Schema.from_arrow(stored_schema(schema)),
+        mode="ignore",
+        partition_by=[_MONTH],
+        name=schema.name,
+        description=schema.doc or None,
+        configuration={
+            _VERSION: str(schema.version),
+            # The log stays small: of the other columns nobody asks which files to leave out.
+            "delta.dataSkippingStatsColumns": "vehicle,day",
+            "delta.targetFileSize": str(_FILE_BYTES),
+        },
+        storage_options=lake.delta_options(),
+        raise_if_key_not_exists=False,
+    )
+
+
+def set_aside_damaged(lake: Lake, schema: TableSchema) -> list[str]:
+    """Move files that cannot be read out of the table, into `_damaged` beside its months; returns their names.
+
+    What was in them is made anew by the next night that is given the logs.
+    """
+    table = open_table(lake, schema)
+    bad = []
+    for file in live_files(table) if table is not None else []:
+        if read_file(lake, schema, file.name, [c.name for c in schema.columns]) is None:
+            bad.append(file.name)
+            lake.move_record_file(schema.name, file.name, f"{_DAMAGED}/{file.name.replace('/', '_')}")
+    if bad and table is not None:
+        table.repair()  # the log forgets files that are not there
+    return bad
+
+
+def tidy_table(lake: Lake, schema: TableSchema) -> Iterator[str]:
+    """After a night: set damaged files aside, put small files together, remove what no reader can still hold.
+
+    Yields what was done, in words. Another writer at work at the same time costs this time's compaction only.
+    """
+    table = open_table(lake, schema)
+    if table is None:
+        return
+    files = live_files(table)
+    months: dict[str, int] = {}
+    for file in files:
+        month = file.name.partition("/")[0].removeprefix(f"{_MONTH}=")
+        months[month] = months.get(month, 0) + 1
+    try:
+        for month in sorted(m for m, count in months.items() if count > _FILES_A_MONTH):
+            yield from _compacted(table, month)
+        table.vacuum(_KEEP_HOURS, dry_run=False)
+    except CommitFailedError:
+        return
+    except DeltaError:
+        yield from (f"set aside {name}" for name in set_aside_damaged(lake, schema))
+
+
+def _compacted(table: DeltaTable, month: str) -> Iterator[str]:
+    done: dict[str, Any] = table.optimize.compact([(_MONTH, "=", month)], target_size=_FILE_BYTES)
+    if done["numFilesRemoved"]:
+        yield f"{month}: {done['numFilesRemoved']} files are {done['numFilesAdded']} now"

@@ -1,0 +1,200 @@
+"""Records: rows that are added and never replaced, several about the same, one of them current.
+
+Rows come in through `commit_records`, which knows the same work again and never doubles it; they go out through
+`read_records`, which reads the months, files and columns that are asked for and leaves damaged files out.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import MISSING, fields, replace
+from typing import Any, TypeVar
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from pipeline.store.delta import live_files, merge_rows, open_table, read_file, stored_schema
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.rows import from_table, to_table
+from schemas.columns import TableSchema
+
+__all__ = ["assert_records", "commit_records", "last_day", "read_records", "write_records"]
+
+Row = TypeVar("Row")
+
+
+def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
+    """Add records as one commit, and make them the current ones about what they are about.
+
+    A row whose work is recorded already is not added again: where another row became current since, the recorded one
+    becomes current once more. `recorded_at` and `asserted_at` are set here, unless the row has them.
+
+    Returns:
+        How many rows were added or became current again.
+
+    Raises:
+        ContractError: the lake is of another release, or a row breaks its table's contract.
+        OSError: the storage does not answer.
+    """
+    unique = {_key(schema, row) + (row.work_key,): row for row in rows}
+    if not unique:
+        return 0
+    known = _known(lake, schema, unique.values())
+    now = dt.datetime.now(dt.UTC)
+    changed = []
+    for row in unique.values():
+        rivals = known.get(_key(schema, row), {})
+        latest = max(rivals.values(), default="")
+        given = row.asserted_at or row.recorded_at
+        if row.work_key in rivals and max(rivals[row.work_key], given) == latest:
+            continue
+        stamp = given or _after(now, latest)
+        changed.append(replace(row, recorded_at=row.recorded_at or stamp, asserted_at=stamp))
+    if changed:
+        merge_rows(lake, schema, _stored(schema, changed))
+    return len(changed)
+
+
+def assert_records(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
+    """Make recorded rows current again where others about the same became it since; adds nothing.
+
+    Returns:
+        How many became current again.
+    """
+    known = _known(lake, schema, rows)
+    now = dt.datetime.now(dt.UTC)
+    changed = []
+    for row in rows:
+        rivals = known.get(_key(schema, row), {})
+        latest = max(rivals.values(), default="")
+        if row.work_key in rivals and rivals[row.work_key] != latest:
+            changed.append(replace(row, asserted_at=_after(now, latest)))
+    if changed:
+        merge_rows(lake, schema, _stored(schema, changed), insert=False)
+    return len(changed)
+
+
+def write_records(
+    lake: Lake, schema: TableSchema, partition: Partition, rows: Sequence[Any], work_key: str, code_version: str,
+    inputs: Iterable[str] = (),
+) -> str:  # fmt: skip
+    """Commit the records of one vehicle-day under one work key; returns where the table is."""
+    del partition, code_version, inputs  # the rows say it themselves
+    commit_records(lake, schema, [replace(row, work_key=work_key) for row in rows])
+    return lake.table(schema.name)
+
+
+def read_records(
+    lake: Lake,
+    schema: TableSchema,
+    row_type: type[Row],
+    *,
+    vehicle: str | None = None,
+    day: str | None = None,
+    first: str | None = None,
+    last: str | None = None,
+    columns: Sequence[str] | None = None,
+) -> list[Row]:
+    """Records in order of vehicle, day and time of their last assertion; `current_records` keeps the last of a kind.
+
+    Files that are damaged or gone are left out, and `lake.damage` names them.
+
+    Args:
+        lake: where the table is.
+        schema: of the table.
+        row_type: its dataclass.
+        vehicle: only this vehicle's.
+        day: only of this day.
+        first: only from this day on.
+        last: only until this day.
+        columns: of those with a default in `row_type`, which to read; the others keep their default. None = all.
+
+    Raises:
+        ContractError: the lake is of another release, or lacks a column that has no default.
+    """
+    known = {f.name: f for f in fields(row_type)}  # type: ignore[arg-type]
+    required = {n for n, f in known.items() if (f.default, f.default_factory) == (MISSING, MISSING)}
+    always = required | {*schema.about, "work_key", "recorded_at", "asserted_at"}
+    wanted = [c.name for c in schema.columns if columns is None or c.name in always or c.name in columns]
+    found = _rows_of(lake, schema, wanted, vehicle, day or first, day or last)
+    if found is None:
+        return []
+    order = [(name, "ascending") for name in ("vehicle", "day", "asserted_at", *schema.about[2:], "work_key")]
+    return from_table(found.take(pc.sort_indices(found, order)), schema, row_type)
+
+
+def last_day(lake: Lake, schema: TableSchema) -> str | None:
+    """The last day that any record of a table is about, as its log says; None where there is none."""
+    table = open_table(lake, schema)
+    spans = [f.days for f in live_files(table)] if table is not None else []
+    return max((days[1] for days in spans if days is not None), default=None)
+
+
+def _rows_of(
+    lake: Lake,
+    schema: TableSchema,
+    columns: Sequence[str],
+    vehicle: str | None,
+    first: str | None,
+    last: str | None,
+) -> pa.Table | None:
+    table = open_table(lake, schema)
+    files = [f for f in live_files(table) if f.may_hold(vehicle, first, last)] if table is not None else []
+    read = (read_file(lake, schema, file.name, columns) for file in files)
+    parts = [_chosen(part, vehicle, first, last) for part in read if part is not None]
+    parts = [p for p in parts if p.num_rows]
+    return pa.concat_tables(parts, promote_options="default").combine_chunks() if parts else None
+
+
+def _chosen(rows: pa.Table, vehicle: str | None, first: str | None, last: str | None) -> pa.Table:
+    conditions = []
+    if vehicle is not None:
+        conditions.append(pc.equal(rows["vehicle"], vehicle))
+    if first is not None:
+        conditions.append(pc.greater_equal(rows["day"], first))
+    if last is not None:
+        conditions.append(pc.less_equal(rows["day"], last))
+    for condition in conditions[1:]:
+        conditions[0] = pc.and_(conditions[0], condition)
+    return rows.filter(conditions[0]) if conditions else rows
+
+
+def _key(schema: TableSchema, row: Any) -> tuple[str, ...]:
+    return tuple(getattr(row, name) for name in schema.about)
+
+
+def _known(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> Mapping[tuple[str, ...], dict[str, str]]:
+    """What is recorded about the same: work key to `asserted_at`."""
+    rows = list(rows)
+    days = sorted({row.day for row in rows})
+    vehicles = {row.vehicle for row in rows}
+    one = next(iter(vehicles)) if len(vehicles) == 1 else None
+    columns = [*schema.about, "work_key", "asserted_at"]
+    found = _rows_of(lake, schema, columns, one, days[0], days[-1]) if rows else None
+    known: dict[tuple[str, ...], dict[str, str]] = {}
+    if found is not None:
+        values = [found.column(name).to_pylist() for name in columns]
+        for *about, work_key, asserted_at in zip(*values, strict=True):
+            of_work = known.setdefault(tuple(about), {})
+            of_work[work_key] = max(of_work.get(work_key, ""), asserted_at)
+    return known
+
+
+def _after(now: dt.datetime, latest: str) -> str:
+    """Now, or a moment after `latest` where that lies in the future of this machine's clock."""
+    if latest >= _iso(now):
+        return _iso(dt.datetime.fromisoformat(latest) + dt.timedelta(microseconds=1))
+    return _iso(now)
+
+
+def _iso(stamp: dt.datetime) -> str:
+    return stamp.astimezone(dt.UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+
+
+def _stored(schema: TableSchema, rows: Sequence[Any]) -> pa.Table:
+    ordered = sorted(rows, key=lambda r: (r.vehicle, r.day))
+    table = to_table(ordered, schema).append_column(
+        "month", pa.array([r.day[:7] for r in ordered], pa.string())
+    )
+    return table.cast(stored_schema(schema))

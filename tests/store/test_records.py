@@ -1,0 +1,311 @@
+"""Record tables: nothing doubles, nothing is lost, what is current is written down, damage costs its own rows only."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import polars as pl
+import pytest
+from deltalake import DeltaTable
+
+import pipeline.store.delta
+from pipeline.errors import ContractError
+from pipeline.store.current import current_records
+from pipeline.store.delta import tidy_table
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import assert_records, commit_records, last_day, read_records, write_records
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.drift import DRIFT, DriftFinding
+from tests.makers.table_rows import make_row, same
+
+REPO = Path(__file__).resolve().parents[2]
+DAY = Partition("car", "2026-03-02")
+
+
+@pytest.fixture
+def lake(tmp_path):
+    return Lake.at(tmp_path / "lake")
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def record(rng, key, vehicle="car", day="2026-03-02", pair=PAIRS[0], **values):
+    values = {"recorded_at": "", "asserted_at": "", "method": "joint", "trio": "default"} | values
+    return make_row("calibrations", rng, vehicle=vehicle, day=day, pair=pair, work_key=key, **values)
+
+
+def read(lake, **choice):
+    return read_records(lake, CALIBRATIONS, CalibrationRecord, **choice)
+
+
+def version(lake, table="calibrations"):
+    return DeltaTable(str(lake.root / table)).version()
+
+
+def data_files(lake):
+    return sorted(lake.root.glob("calibrations/month=*/*.parquet"))
+
+
+@pytest.mark.parametrize("nulls", [False, True])
+@pytest.mark.parametrize(
+    ("schema", "row_type"), [(CALIBRATIONS, CalibrationRecord), (DRIFT, DriftFinding)], ids=lambda s: s
+)
+def test_rows_of_every_record_table_come_back_as_they_were(nulls, schema, row_type, lake, rng):
+    rows = [
+        make_row(schema.name, rng, nulls=nulls, vehicle="car", day=f"2026-0{i}-02", work_key=str(i))
+        for i in (1, 2, 3)
+    ]
+    commit_records(lake, schema, rows)
+    found = read_records(lake, schema, row_type)
+    assert [r.day for r in found] == [r.day for r in rows]
+    assert all(same(a, b) for a, b in zip(rows, found, strict=True))
+
+
+def test_the_same_work_never_doubles_and_changes_no_byte(lake, rng):
+    rows = [record(rng, "k1", pair=pair) for pair in PAIRS]
+    assert commit_records(lake, CALIBRATIONS, rows + rows) == 3
+    before = version(lake)
+    assert commit_records(lake, CALIBRATIONS, rows) == 0
+    assert assert_records(lake, CALIBRATIONS, rows) == 0
+    assert version(lake) == before
+    assert len(read(lake)) == 3
+
+
+def test_records_say_when_they_were_written_and_file_times_say_nothing(lake, rng):
+    for seed, key in ((3, "c"), (1, "a"), (2, "b")):
+        write_records(lake, CALIBRATIONS, DAY, [record(rng, "", seed=seed)], key, "0")
+    for age, path in enumerate(data_files(lake)):
+        os.utime(path, ns=(0, 10**18 + age * 10**9))
+    found = read(lake)
+    assert [r.seed for r in found] == [3, 1, 2]
+    stamps = [r.recorded_at for r in found]
+    assert stamps == sorted(set(stamps)) == [r.asserted_at for r in found]
+    assert all(s.endswith("Z") and len(s) == 27 for s in stamps)
+
+
+def test_configuration_a_then_b_then_a_again_leaves_a_current(lake, rng):
+    a, b = record(rng, "A"), record(rng, "B")
+    for row in (a, b):
+        commit_records(lake, CALIBRATIONS, [row])
+    assert [r.work_key for r in current_records(read(lake))] == ["B"]
+    recorded = read(lake)[0]
+    assert assert_records(lake, CALIBRATIONS, [a]) == 1
+    assert [r.work_key for r in current_records(read(lake))] == ["A"]
+    again = read(lake)[-1]
+    assert len(read(lake)) == 2
+    assert (again.recorded_at, again.work_key) == (recorded.recorded_at, "A")
+    assert again.asserted_at > recorded.asserted_at
+    assert commit_records(lake, CALIBRATIONS, [b]) == 1  # to write it again is to assert it
+    assert [r.work_key for r in current_records(read(lake))] == ["B"]
+
+
+def test_nothing_is_added_by_an_assertion_of_what_was_never_recorded(lake, rng):
+    commit_records(lake, CALIBRATIONS, [record(rng, "A")])
+    assert assert_records(lake, CALIBRATIONS, [record(rng, "B"), record(rng, "C", vehicle="bus")]) == 0
+    assert [r.work_key for r in read(lake)] == ["A"]
+
+
+def test_a_clock_that_was_in_the_future_does_not_keep_its_record_current(lake, rng):
+    future = "2099-01-01T00:00:00.000000Z"
+    commit_records(lake, CALIBRATIONS, [record(rng, "A", recorded_at=future, asserted_at=future)])
+    commit_records(lake, CALIBRATIONS, [record(rng, "B")])
+    assert [r.work_key for r in current_records(read(lake))] == ["B"]
+
+
+def test_a_trio_of_its_own_has_a_current_record_of_its_own(lake, rng):
+    commit_records(lake, CALIBRATIONS, [record(rng, "A"), record(rng, "A", trio="rear")])
+    assert [r.trio for r in current_records(read(lake))] == ["default", "rear"]
+
+
+def test_a_reader_gets_the_window_the_vehicle_and_the_columns_that_it_asks_for(lake, rng, monkeypatch):
+    rows = [record(rng, v + d, v, d) for v in ("a", "b") for d in ("2026-01-30", "2026-02-01", "2026-02-03")]
+    for row in rows:
+        commit_records(lake, CALIBRATIONS, [row])
+    opened = []
+    real = pipeline.store.delta.pq.ParquetFile
+    monkeypatch.setattr(pipeline.store.delta.pq, "ParquetFile", lambda f: (opened.append(f), real(f))[1])
+    got = read(lake, vehicle="a", first="2026-02-01", columns=("qw",))
+    assert [(r.vehicle, r.day) for r in got] == [("a", "2026-02-01"), ("a", "2026-02-03")]
+    assert len(opened) == 2  # files of other days and vehicles are not opened
+    assert [r.qw for r in got] == [r.qw for r in rows[1:3]]
+    assert got[0].covariance is None
+    assert got[0].diagnostics == {}
+    assert [r.day for r in read(lake, day="2026-02-01")] == ["2026-02-01"] * 2
+    assert len(read(lake, last="2026-01-31")) == 2
+    assert read(lake, vehicle="c") == []
+    assert last_day(lake, CALIBRATIONS) == "2026-02-03"
+
+
+def test_a_lake_without_records_reads_as_empty_and_is_not_made_by_reading(lake):
+    assert read(lake) == []
+    assert last_day(lake, CALIBRATIONS) is None
+    assert commit_records(lake, CALIBRATIONS, []) == 0
+    assert list(tidy_table(lake, CALIBRATIONS)) == []
+    assert not lake.root.exists()
+
+
+def test_a_table_of_another_version_is_named(lake, rng):
+    commit_records(lake, CALIBRATIONS, [record(rng, "A")])
+    newer = replace(CALIBRATIONS, version=CALIBRATIONS.version + 1)
+    with pytest.raises(
+        ContractError, match=rf"holds calibrations/{CALIBRATIONS.version}, this version reads"
+    ):
+        read_records(lake, newer, CalibrationRecord)
+
+
+def test_records_of_a_release_that_knew_fewer_columns_stay_readable_and_more_can_come(lake, rng):
+    later = {"score", "drive_missing", "common_covariance"}
+    columns = tuple(c for c in CALIBRATIONS.columns if c.name not in later)
+    fewer = replace(CALIBRATIONS, version=2, columns=columns)
+    commit_records(lake, fewer, [record(rng, "old", score=0.5, drive_missing=["a"])])
+    [found] = read(lake)
+    assert (found.score, found.drive_missing, found.common_covariance) == (None, [], None)
+    commit_records(lake, CALIBRATIONS, [record(rng, "new", score=0.5, drive_missing=["a"])])
+    old, new = read(lake)
+    assert (old.score, old.drive_missing) == (None, [])
+    assert (new.score, new.drive_missing) == (0.5, ["a"])
+    np.testing.assert_array_equal(old.covariance, found.covariance)
+    assert new.common_covariance.shape == (6, 6)
+    with pytest.raises(ContractError, match=r"holds calibrations/3, this version reads calibrations/2"):
+        read_records(lake, replace(fewer, reads_versions=()), CalibrationRecord)
+
+
+def test_a_row_without_what_its_table_promises_is_not_committed(lake, rng):
+    with pytest.raises(ContractError, match="covariance has shape"):
+        commit_records(lake, CALIBRATIONS, [record(rng, "A"), record(rng, "B", covariance=np.eye(4))])
+    assert read(lake) == []
+
+
+# -- damage ------------------------------------------------------------------------------------------
+
+
+def damage(path, how):
+    whole = path.read_bytes()
+    damaged = {
+        "cut": whole[: len(whole) // 2],
+        "empty": b"",
+        "bits": whole[:4] + bytes(len(whole) - 500) + whole[-496:],
+    }
+    path.unlink() if how == "gone" else path.write_bytes(damaged[how])
+
+
+@pytest.mark.parametrize("how", ["cut", "empty", "gone", "bits"])
+def test_a_damaged_file_is_named_and_left_out_and_healed_when_its_work_is_done_again(how, lake, rng):
+    bad, good = record(rng, "A"), record(rng, "B", vehicle="bus")
+    for row in (bad, good):
+        commit_records(lake, CALIBRATIONS, [row])
+    [path] = [p for p in data_files(lake) if "bus" not in read_vehicles(p)]
+    damage(path, how)
+    assert [r.vehicle for r in read(lake)] == ["bus"]
+    assert path.name in lake.damage[0]
+    commit_records(lake, CALIBRATIONS, [bad])
+    whole = Lake.at(lake.root)
+    assert sorted(r.vehicle for r in read(whole)) == ["bus", "car"]
+    list(tidy_table(whole, CALIBRATIONS))
+    fresh = Lake.at(lake.root)
+    assert sorted(r.vehicle for r in read(fresh)) == ["bus", "car"]
+    assert fresh.damage == []
+    assert how == "gone" or list(lake.root.glob("calibrations/_damaged/*"))
+
+
+def read_vehicles(path):
+    import pyarrow.parquet as pq
+
+    return pq.read_table(path, columns=["vehicle"], partitioning=None)["vehicle"].to_pylist()
+
+
+# -- upkeep ------------------------------------------------------------------------------------------
+
+
+def test_after_the_night_small_files_are_put_together_and_every_row_stays(lake, rng):
+    for i in range(12):
+        commit_records(lake, CALIBRATIONS, [record(rng, f"k{i}", day=f"2026-03-{i + 1:02d}")])
+    before = read(lake)
+    assert any("12 files are 1 now" in what for what in tidy_table(lake, CALIBRATIONS))
+    assert all(same(a, b) for a, b in zip(before, read(lake), strict=True))
+    assert list(tidy_table(lake, CALIBRATIONS)) == []
+
+
+# -- other engines -----------------------------------------------------------------------------------
+
+
+def test_duckdb_and_polars_read_records_by_the_documented_lines(lake, rng):
+    row = record(rng, "A", status="held")
+    commit_records(lake, CALIBRATIONS, [row])
+    where = str(lake.root / "calibrations")
+    records = DeltaTable(where).to_pyarrow_table()  # noqa: F841 - DuckDB finds it by its name
+    sql = "select vehicle, status, diagnostics['x'] from records where day >= '2026-03-01'"
+    assert duckdb.sql(sql).fetchall() == [("car", "held", row.diagnostics["x"])]
+    frame = pl.scan_delta(where).filter(pl.col("vehicle") == "car").select("status", "covariance").collect()
+    assert frame["status"].to_list() == ["held"]
+    about = CALIBRATIONS.arrow_schema().field("covariance").metadata
+    shape = [int(s) for s in about[b"shape"].split(b",")]
+    found = np.frombuffer(frame["covariance"][0], about[b"dtype"].decode()).reshape(shape)
+    np.testing.assert_array_equal(found, row.covariance)
+
+
+# -- many writers, and dead ones ---------------------------------------------------------------------
+
+
+def write_many(root, name, times):
+    lake, rng = Lake.at(root), np.random.default_rng(1)
+    for i in range(times):
+        commit_records(lake, CALIBRATIONS, [record(rng, f"{name}{i}"), record(rng, "shared", vehicle="bus")])
+
+
+def test_two_writers_at_once_both_get_their_records_in(lake):
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=write_many, args=(lake.root, name, 8)) for name in "ab"]
+    for process in writers:
+        process.start()
+    for process in writers:
+        process.join(60)
+    assert [p.exitcode for p in writers] == [0, 0]
+    assert sorted(r.work_key for r in read(lake, vehicle="car")) == sorted(
+        f"{n}{i}" for n in "ab" for i in range(8)
+    )
+    assert [r.work_key for r in read(lake, vehicle="bus")] == ["shared"]
+
+
+_COMMITS = """
+import sys, numpy as np
+from pipeline.store.partitions import Lake
+from pipeline.store.records import commit_records
+from schemas.calibrations import CALIBRATIONS, PAIRS
+from tests.store.test_records import record
+lake, rng, turn = Lake.at(sys.argv[1]), np.random.default_rng(0), int(sys.argv[2])
+for i in range(10_000):
+    commit_records(lake, CALIBRATIONS, [record(rng, f"{turn}-{i}", pair=pair) for pair in PAIRS])
+    print(f"{turn}-{i}", flush=True)
+"""
+
+
+def test_a_killed_writer_loses_nothing_that_it_committed_and_leaves_no_half(lake, rng):
+    told, env = [], os.environ | {"PYTHONPATH": str(REPO)}
+    for turn in range(4):
+        writer = subprocess.Popen(
+            [sys.executable, "-c", _COMMITS, str(lake.root), str(turn)],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=env,
+        )
+        with writer:
+            told.append(writer.stdout.readline().strip())
+            time.sleep(rng.uniform(0, 0.3))
+            writer.send_signal(signal.SIGKILL)
+            told += writer.stdout.read().split()
+        found = read(lake)
+        pairs = {k: sorted(r.pair for r in found if r.work_key == k) for k in {r.work_key for r in found}}
+        assert all(p == sorted(PAIRS) for p in pairs.values())
+        assert set(told) <= set(pairs)
+    assert lake.damage == []
