@@ -26,7 +26,7 @@ _ANGLES = {"camera_lidar": ("az_deg", "el_deg"), "lidar_radar": ("az_deg",)}
 def main() -> None:
     """Run what is missing, then print the table."""
     args = study_arguments(__doc__ or "", "basin").parse_args()
-    days = SETS["dev-rigs" if args.tuning else "basin"]
+    days = SETS["dev-basin" if args.tuning else "basin"]
     run_study([Run(day, prior=start, seed=day.seed) for start in STARTS for day in days], args, summary)
 
 

@@ -220,6 +220,18 @@ SETS: dict[str, list[DaySpec]] = {
             for fault in ("camera:centre:4", "camera:dusk:1", "camera:night:1")
         ),
     ],
+    # Rigs, worlds and dusk combined in another order than in the test set `basin`.
+    "dev-basin": [
+        DaySpec(
+            184 + i,
+            ("highway", "urban", "mixed")[i % 3],
+            rig=rig,
+            fault="camera:dusk:1" if i % 4 == 1 else "",
+        )
+        for i, rig in enumerate(
+            2 * ("ring16", "spin128", "demo", "fisheye", "pinhole", "rosette", "truck", "paper")
+        )
+    ],
     "table1": [DaySpec(4600 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
     "one-clock": [
         DaySpec(4620 + i, "urban" if i < 5 else "highway", 100, "paper-one-clock") for i in range(10)

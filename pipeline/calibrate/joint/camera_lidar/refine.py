@@ -28,6 +28,7 @@ __all__ = [
 
 _SURFACE_SIZE = 1.8  # radius of the response surface in kernel widths: the score is rough below one
 _SHRINK = 0.75  # of that radius, after a step that stays within it
+_SHRINK_AFTER_LOSS = 0.5  # likewise, after a step that would have lowered the score: its surface was too wide
 _CONVERGED = 0.05  # a step of this share of the radius changes nothing that matters
 _LEAST_PREDICTED = 0.5  # share of the curvature that the gradients' scatter predicts
 _WEIGHTS = (0.02, 1.0)  # range of a term's weight
@@ -128,19 +129,32 @@ def refine(
     scale = _SURFACE_SIZE * scales(scored.terms, scored.kernel)
     free = np.flatnonzero(~fixed)
     state = state.with_fixed(scored.prior, fixed)
+    value = _value(scored, state)
     for _ in range(steps):
         gradient, curvature = _surface(scored, state, scale)
         step = np.zeros(8)
         step[free] = np.linalg.solve(curvature[np.ix_(free, free)], gradient[free])
         length = float(np.linalg.norm(step))
-        state = state.stepped(step / max(length, 1.0) * scale).with_fixed(scored.prior, fixed)
+        there = state.stepped(step / max(length, 1.0) * scale).with_fixed(scored.prior, fixed)
         if scored.limits is not None:
-            state = state.within(scored.prior, scored.limits)
+            there = there.within(scored.prior, scored.limits)
+        value_there = _value(scored, there)
+        if value_there < value:
+            scale = scale * _SHRINK_AFTER_LOSS
+            continue
+        state, value = there, value_there
         if length < _CONVERGED:
             break
         if length < 1.0:
             scale = scale * _SHRINK
     return state
+
+
+def _value(scored: Scored, state: AlignmentState) -> float:
+    """Score and prior of a state."""
+    at = state.alone
+    score = float(scored.terms.score(at, scored.kernel).sum(dtype=np.float64))
+    return score + float(prior_value(at, scored.prior, scored.config)[0])
 
 
 def _surface(

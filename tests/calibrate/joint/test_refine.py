@@ -1,0 +1,55 @@
+"""Refinement of the camera-lidar score: where its steps may lead."""
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.joint.camera_lidar import refine as module
+from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine, scales
+from pipeline.config import SolveConfig
+from pipeline.extrinsics.estimates import Prior
+from pipeline.objective.camera_lidar.score import KernelSettings, lidar_velocities, prepare_terms
+from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
+
+SHARP = KernelSettings.wide(1.5, 2)
+
+
+@pytest.fixture(scope="module")
+def scored():
+    day = traced_day(DENSE, 8, seed=5)
+    terms = prepare_terms(day, T_TRUE, lidar_velocities(day, np.eye(4)), reach_rad=np.radians(8.0))
+    return Scored(terms, SHARP, Prior(T_TRUE, np.eye(4), np.radians(2.0), 0.05), SolveConfig())
+
+
+def value(scored, state):
+    score = float(scored.terms.score(state.alone, scored.kernel).sum())
+    return score + float(prior_value(state.alone, scored.prior, scored.config)[0])
+
+
+@pytest.mark.parametrize("radius", [1.8, 8.0])
+def test_a_refinement_never_ends_lower_than_it_began_however_wide_its_surface(scored, radius, monkeypatch):
+    monkeypatch.setattr(module, "_SURFACE_SIZE", radius)
+    rng = np.random.default_rng(1)
+    scale = scales(scored.terms, scored.kernel)
+    for steps in (1, 5):
+        for _ in range(4):
+            start = AlignmentState(T_TRUE).stepped(rng.normal(size=8) * scale)
+            end = refine(scored, start, steps=steps)
+            assert value(scored, end) >= value(scored, start)
+
+
+def test_a_surface_much_too_wide_is_narrowed_until_its_steps_climb(scored, monkeypatch):
+    rng = np.random.default_rng(2)
+    start = AlignmentState(T_TRUE).stepped(rng.normal(size=8) * 0.5 * scales(scored.terms, scored.kernel))
+    usual = value(scored, refine(scored, start, steps=8)) - value(scored, start)
+    monkeypatch.setattr(module, "_SURFACE_SIZE", 8.0)
+    found = value(scored, refine(scored, start, steps=8)) - value(scored, start)
+    assert usual > 0
+    assert found > 0.5 * usual
+
+
+def test_what_is_fixed_stays_at_the_prior(scored):
+    fixed = np.isin(np.arange(8), (5, 6, 7))
+    start = AlignmentState(T_TRUE).stepped(0.3 * scales(scored.terms, scored.kernel))
+    end = refine(scored, start, steps=3, fixed=fixed)
+    assert end.T_camera_lidar[2, 3] == scored.prior.T_camera_lidar[2, 3]
+    assert (end.dt_s, end.focal) == (start.dt_s, start.focal)
