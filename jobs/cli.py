@@ -46,6 +46,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
     "report": ("jobs.report:report", "HTML pages of vehicle-days and of the fleet."),
     "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),
+    "status": ("jobs.status:status", "What is done, held, refused, failed or missing, and why."),
     "export": (
         "jobs.export:export",
         "Write the tables' contracts as JSON Schema, or a trained network as ONNX.",

@@ -30,6 +30,7 @@ def nightly(
     method: str | None = None,
     seed: int | None = None,
     report: Path | None = None,
+    dry_run: bool = False,
 ) -> int:
     """Take every vehicle-day of a pattern through all stages; one bad day never stops the fleet.
 
@@ -44,6 +45,7 @@ def nightly(
         method: calibration method; default: audit.method, so that calibration and charts agree.
         seed: of everything random; the configuration's where left out.
         report: HTML page of the fleet; default: report/fleet.html inside the lake.
+        dry_run: only say what would run, and why.
     """
     from jobs.terminal.summary import exit_code, left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
@@ -57,6 +59,8 @@ def nightly(
     tables = Lake.at(lake)
     night = Night(config, tables, method_named(method or config.audit.method).name, seed)
     days = find_vehicle_days(logs, from_day, to_day)
+    if dry_run:
+        return _print_plan(night, days)
     outcomes = watch_night(night, days, executor, workers)
     page = report or tables.root / "report" / "fleet.html"
     findings, pages = close_night(night, to_day, page) if outcomes else ([], [])
@@ -74,6 +78,28 @@ def nightly(
         report=pages[0] if pages else None,
     )
     return code
+
+
+def _print_plan(night: Night, days: Sequence[VehicleDay]) -> int:
+    """What the night would do with each vehicle-day, as lines for people and as the summary."""
+    import sys
+    from dataclasses import asdict
+
+    from jobs.terminal.summary import left_out, print_summary
+    from pipeline.fleet.plan import plan_night
+
+    plans = list(plan_night(night, days))
+    for plan in plans:
+        sys.stderr.write(f"{plan.vehicle} {plan.day}: {', '.join(plan.stages) or 'nothing'} ({plan.why})\n")
+    print_summary(
+        "nightly",
+        "planned",
+        vehicle_days=len(plans),
+        would_run=sum(bool(p.stages) for p in plans),
+        damaged=left_out(night.lake),
+        plan=[asdict(p) for p in plans],
+    )
+    return 0
 
 
 def tidy(lake: Lake) -> None:

@@ -1,19 +1,34 @@
-"""What every stage returns, and how it says how far it is."""
+"""What every stage returns, what it cost, and how it says how far it is."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import datetime as dt
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
-__all__ = ["Outcome", "Progress", "silent"]
+__all__ = ["Effort", "Outcome", "Progress", "measured", "silent"]
 
+_COUNTERS = Path("/proc/self/io")  # Linux: every read and write of the process, from the page cache too
 # progress(done, total, what): total 0 = unknown. Stages call it often; the job decides what a person sees.
 Progress = Callable[[int, int, str], None]
 
 
 def silent(done: int, total: int, what: str) -> None:
     """Progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """When work began (UTC, ISO 8601), how long it took, and the bytes that the process read and wrote meanwhile."""
+
+    began_at: str = ""
+    seconds: float = 0.0
+    bytes_read: int | None = None
+    bytes_written: int | None = None
 
 
 @dataclass(frozen=True)
@@ -35,11 +50,36 @@ class Outcome:
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
     damaged: str = ""  # the file that could not be read, where that made it fail
+    inputs: tuple[str, ...] = ()
+    effort: Effort = field(default=Effort(), compare=False, repr=False)
     records: tuple[Any, ...] = field(
         default=(), repr=False
     )  # rows of a record table, those of a cached day too
 
     def counts(self) -> dict[str, Any]:
-        """All but the status, the records and the damage, for a command's summary."""
-        left_out = ("status", "records", "damaged")
+        """What a command's summary says beside the status."""
+        left_out = ("status", "records", "damaged", "inputs", "effort")
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
+
+
+@contextmanager
+def measured() -> Iterator[Callable[[], Effort]]:
+    """A function that says the effort since the block began."""
+    began_at = dt.datetime.now(dt.UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    began, before = time.perf_counter(), _bytes()
+
+    def effort() -> Effort:
+        after = _bytes()
+        read, written = (
+            None if a is None or b is None else a - b for a, b in zip(after, before, strict=True)
+        )
+        return Effort(began_at, time.perf_counter() - began, read, written)
+
+    yield effort
+
+
+def _bytes() -> tuple[int | None, int | None]:
+    with suppress(OSError, ValueError, KeyError):
+        counts = dict(line.split(": ") for line in _COUNTERS.read_text().splitlines())
+        return int(counts["rchar"]), int(counts["wchar"])
+    return None, None

@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.config import config_hash
 from pipeline.errors import BoresightError, ContractError, DamagedError
-from pipeline.results import Outcome, Progress
+from pipeline.results import Outcome, Progress, measured
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.records import assert_records, commit_records, read_records
 from pipeline.store.tables import Manifest, read_manifest, write_partition
@@ -24,7 +24,7 @@ from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
 from schemas.versions import CODE_VERSION
 
-__all__ = ["Stage", "run_stage", "try_stage"]
+__all__ = ["Stage", "run_stage", "try_stage", "why_to_run"]
 
 # Row types of the tables of records: small, added to and never replaced. The others are replaced by whole partitions.
 _RECORD_ROWS: dict[str, type] = {CALIBRATIONS.name: CalibrationRecord, DRIFT.name: DriftFinding}
@@ -75,15 +75,38 @@ def run_stage(stage: Stage, task: Task) -> Outcome:
         ConfigError: unknown vehicle, or what the stage says of its configuration.
         ContractError: a vehicle-day without what the stage reads; a row without what its table promises.
     """
-    if isinstance(task.of, Partition):
-        task.fleet.rig_of(task.of.vehicle)
-    if stage.per_vehicle_day and stage.needs_inputs:
-        task = replace(task, inputs=_inputs(stage, task))
-    work = stage.load()(task)
-    known = tuple(m.work_key for m in task.inputs.values())
-    inputs = known if work.inputs is None else work.inputs
-    key = work_key(stage.name, CODE_VERSION, config_hash(*work.settings), list(inputs))
-    run = Run(key, inputs, task.progress)
+    with measured() as effort:
+        outcome = _run_stage(stage, task)
+    return replace(outcome, effort=effort())
+
+
+def why_to_run(stage: Stage, task: Task) -> str:
+    """What a stage of a vehicle-day that writes a table would run for; empty where its work is done already.
+
+    Raises:
+        ConfigError, ContractError: see `run_stage`.
+    """
+    task, _, run = _prepared(stage, task)
+    [schema] = stage.writes
+    if _refused_before(stage, task, run) is not None:
+        return ""
+    if schema.is_record_table:
+        made = [(r.work_key, r.code_version, tuple(r.inputs)) for r in task.recorded or ()]
+    else:
+        done = _readable(task, schema)
+        made = [(done.work_key, done.code_version, tuple(done.inputs))] if done is not None else []
+    if run.work_key in {key for key, _, _ in made}:
+        return ""
+    if not made:
+        return f"no {schema.name} yet"
+    _, version, inputs = made[-1]
+    if version != CODE_VERSION:
+        return f"{schema.name} are of version {version}, this is {CODE_VERSION}"
+    return "other configuration" if sorted(inputs) == sorted(run.inputs) else "other inputs"
+
+
+def _run_stage(stage: Stage, task: Task) -> Outcome:
+    task, work, run = _prepared(stage, task)
     if not stage.writes:
         return _write_files(stage, task, work, run)
     [schema] = stage.writes
@@ -92,13 +115,27 @@ def run_stage(stage: Stage, task: Task) -> Outcome:
     return _replace_partition(stage, task, work, run, schema)
 
 
+def _prepared(stage: Stage, task: Task) -> tuple[Task, Work, Run]:
+    """The task with its inputs, what the stage answers, and the run with its work key."""
+    if isinstance(task.of, Partition):
+        task.fleet.rig_of(task.of.vehicle)
+    if stage.per_vehicle_day and stage.needs_inputs:
+        task = replace(task, inputs=_inputs(stage, task))
+    work = stage.load()(task)
+    known = tuple(m.work_key for m in task.inputs.values())
+    inputs = known if work.inputs is None else work.inputs
+    key = work_key(stage.name, CODE_VERSION, config_hash(*work.settings), list(inputs))
+    return task, work, Run(key, inputs, task.progress)
+
+
 def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
     """`run_stage` whose errors are outcomes: one vehicle-day's trouble never stops the others."""
-    try:
-        return stage.run(replace(task, progress=progress))
-    except (BoresightError, OSError) as err:
-        damaged = err.path if isinstance(err, DamagedError) else ""
-        return _outcome(stage, task, "failed", "", reason=str(err), damaged=damaged)
+    with measured() as effort:
+        try:
+            return stage.run(replace(task, progress=progress))
+        except (BoresightError, OSError) as err:
+            damaged = err.path if isinstance(err, DamagedError) else ""
+            return _outcome(stage, task, "failed", "", reason=str(err), damaged=damaged, effort=effort())
 
 
 def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
@@ -117,7 +154,10 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
     """Stream the rows into the partition, which appears as a whole or not at all."""
     done = _readable(task, schema)
     if done is not None and done.work_key == run.work_key and not work.again:
-        return _partition_outcome(stage, task, work, "cached", done)
+        return replace(_partition_outcome(stage, task, work, "cached", done), inputs=run.inputs)
+    refused = _refused_before(stage, task, run)
+    if refused is not None:
+        return refused
     try:
         with (
             closing(work.rows(run)) as rows,
@@ -128,10 +168,24 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
             out.describe(kept={"frames": out.rows, **run.kept}, rejected=dict(run.rejected), **run.extra)
     except NothingUsable as refusal:
         counts = {"kept": {"frames": 0}, "rejected": dict(run.rejected)}
-        return _outcome(stage, task, "refused", run.work_key, reason=str(refusal), **counts)
+        return _outcome(
+            stage, task, "refused", run.work_key, reason=str(refusal), inputs=run.inputs, **counts
+        )
     written = read_manifest(task.lake, schema, task.partition)
     assert written is not None, "the partition was just written"
-    return _partition_outcome(stage, task, work, "done", written, run.remarks)
+    outcome = _partition_outcome(stage, task, work, "done", written, run.remarks)
+    return replace(outcome, inputs=run.inputs)
+
+
+def _refused_before(stage: Stage, task: Task, run: Run) -> Outcome | None:
+    """What was said of the same inputs before, if they were refused: nothing would be written now either."""
+    for row in task.before:
+        if (row.stage, row.status, row.work_key) == (stage.name, "refused", run.work_key):
+            counts = {"rows": row.rows, "kept": row.kept, "rejected": row.rejected}
+            return _outcome(
+                stage, task, "refused", run.work_key, reason=row.reason, inputs=run.inputs, **counts
+            )
+    return None
 
 
 def _readable(task: Task, schema: TableSchema) -> Manifest | None:
@@ -170,14 +224,16 @@ def _add_records(stage: Stage, task: Task, work: Work, run: Run, schema: TableSc
     if recorded:
         if task.commit:
             assert_records(task.lake, schema, recorded)
-        return _record_outcome(stage, task, work, "cached", run.work_key, recorded, where)
+        cached = _record_outcome(stage, task, work, "cached", run.work_key, recorded, where)
+        return replace(cached, inputs=run.inputs)
     written: list[Any] = []
     with closing(work.rows(run)) as batches:
         for records in batches:
             written += records.rows
     if task.commit:
         commit_records(task.lake, schema, written)
-    return _record_outcome(stage, task, work, "done", run.work_key, written, where if written else [])
+    outcome = _record_outcome(stage, task, work, "done", run.work_key, written, where if written else [])
+    return replace(outcome, inputs=run.inputs)
 
 
 def _recorded(task: Task, key: str, schema: TableSchema) -> list[Any]:

@@ -14,6 +14,7 @@ from pipeline.config import FleetConfig
 from pipeline.results import Progress, silent
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import Manifest
+from schemas.outcomes import OutcomeRow
 
 __all__ = ["NothingUsable", "Records", "Run", "Task", "Told", "Window", "Work"]
 
@@ -43,6 +44,7 @@ class Task:
         inputs: manifests of the tables that the stage reads, by name; the runner fills them in.
         commit: False where who gave the task commits the outcome's records, together with those of other tasks.
         recorded: what the lake has of the vehicle-day's records, where the giver of the task has read it already.
+        before: what became of the vehicle-day's stages before: a refusal of the same inputs is not worked out again.
     """
 
     fleet: FleetConfig
@@ -57,6 +59,7 @@ class Task:
     inputs: Mapping[str, Manifest] = field(default_factory=dict)
     commit: bool = True
     recorded: Sequence[Any] | None = None
+    before: Sequence[OutcomeRow] = ()
 
     @property
     def partition(self) -> Partition:

@@ -10,6 +10,7 @@ from schemas.columns import TableSchema
 from schemas.drift import DRIFT
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS
+from schemas.outcomes import OUTCOMES
 from schemas.training import TRAINING
 
 __all__ = ["CODE_VERSION", "TABLES", "write_json_schemas"]
@@ -17,7 +18,9 @@ __all__ = ["CODE_VERSION", "TABLES", "write_json_schemas"]
 # Enters every work key: raise it with every change that alters a number, so that stale partitions are made anew.
 CODE_VERSION = "0.5.0"
 
-TABLES: dict[str, TableSchema] = {t.name: t for t in (FRAMES, OBSERVATIONS, TRAINING, CALIBRATIONS, DRIFT)}
+TABLES: dict[str, TableSchema] = {
+    t.name: t for t in (FRAMES, OBSERVATIONS, TRAINING, CALIBRATIONS, DRIFT, OUTCOMES)
+}
 
 
 def write_json_schemas(folder: Path) -> list[Path]:

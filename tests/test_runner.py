@@ -13,10 +13,11 @@ import pytest
 import pipeline.runner
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError, ContractError, LogError
+from pipeline.fleet.ledger import outcome_row
 from pipeline.learn.prepare.split import SplitPlan
 from pipeline.report.stage import Pages
 from pipeline.results import Outcome
-from pipeline.runner import Stage, try_stage
+from pipeline.runner import Stage, try_stage, why_to_run
 from pipeline.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_records, read_rows, write_partition
@@ -205,6 +206,44 @@ def test_where_nothing_is_usable_nothing_is_written_and_the_day_is_refused(task,
     assert (outcome.status, outcome.rows, outcome.outputs) == ("refused", 0, [])
     assert (outcome.reason, outcome.rejected) == ("no usable message on /points", {"damaged": 4})
     assert len(kept(task)) == 2
+
+
+def test_inputs_that_were_refused_are_not_worked_out_again_and_others_are(task, stage):
+    def rows(_run):
+        raise NothingUsable("no usable message on /points")
+        yield
+
+    refusing, made = stage(rows)
+    first = refusing.run(task)
+    task = replace(task, before=[outcome_row(first, "")])
+    again = refusing.run(task)
+    assert (again, made.asked) == (first, 1)
+    assert why_to_run(refusing, task) == ""
+    other, made = stage(rows, {"voxel_m": 0.5})
+    assert why_to_run(other, task) == "no observations yet"
+    assert (other.run(task).status, made.asked) == ("refused", 1)
+
+
+def test_why_a_stage_would_run_names_what_changed(task, stage, monkeypatch):
+    def why(settings=None, inputs=("a",)):
+        return why_to_run(stage(some(1), settings, inputs=inputs)[0], task)
+
+    assert why() == "no observations yet"
+    stage(some(1), inputs=("a",))[0].run(task)
+    assert why() == ""
+    assert why({"voxel_m": 0.5}) == "other configuration"
+    assert why(inputs=("b",)) == "other inputs"
+    monkeypatch.setattr(pipeline.runner, "CODE_VERSION", "another")
+    assert "this is another" in why()
+
+
+def test_an_outcome_says_when_it_began_how_long_it_took_and_what_it_read_and_wrote(task, stage):
+    effort = stage(some(3))[0].run(task).effort
+    assert effort.began_at.endswith("Z")
+    assert 0 < effort.seconds < 60
+    if effort.bytes_written is not None:  # known on Linux
+        [file] = task.lake.folder("observations", DAY).glob("*.parquet")
+        assert effort.bytes_written >= file.stat().st_size
 
 
 def test_a_damaged_partition_is_made_anew(task, stage):

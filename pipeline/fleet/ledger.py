@@ -5,19 +5,40 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.results import Outcome
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.records import assert_records, commit_records, read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.columns import TableSchema
+from schemas.outcomes import OUTCOMES, OutcomeRow
+from schemas.versions import CODE_VERSION
 
-__all__ = ["Ledger"]
+__all__ = ["Known", "Ledger", "outcome_row"]
 
 # A commit takes some tenths of a second. Every half minute is one hundredth of the time, and what a killed night has to
 # calibrate again is what ended in the last half minute.
 _EVERY_S = 30.0
 _ROWS = 3000
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the lake has of one vehicle-day: its records (without what outcomes do not say), and what became of it."""
+
+    records: tuple[CalibrationRecord, ...] = ()
+    outcomes: tuple[OutcomeRow, ...] = ()
+
+
+@dataclass
+class _Waiting:
+    """Rows of one table that are not committed yet, and those that shall be current again."""
+
+    schema: TableSchema
+    new: list[Any] = field(default_factory=list)
+    again: list[Any] = field(default_factory=list)
 
 
 class Ledger:
@@ -30,56 +51,94 @@ class Ledger:
 
     def __init__(self, lake: Lake, partitions: Sequence[Partition]) -> None:
         self._lake = lake
-        self._recorded: dict[tuple[str, str], list[CalibrationRecord]] = defaultdict(list)
-        self._new: list[Any] = []
-        self._again: list[Any] = []
+        self._waiting = [_Waiting(CALIBRATIONS), _Waiting(OUTCOMES)]
         self._committed_at = time.monotonic()
         days = sorted({p.day for p in partitions})
-        if days:
-            columns = ("frames_rejected",)  # besides the columns that every record has: what an outcome says
-            found = read_records(
-                lake, CALIBRATIONS, CalibrationRecord, first=days[0], last=days[-1], columns=columns
-            )
-            for record in found:
-                self._recorded[record.vehicle, record.day].append(record)
+        self._records = self._read(CALIBRATIONS, CalibrationRecord, days, ("frames_rejected",))
+        self._outcomes = self._read(OUTCOMES, OutcomeRow, days, ("rows", "kept", "rejected"))
 
-    def recorded(self, partition: Partition) -> tuple[CalibrationRecord, ...]:
-        """The day's records, the current one of a kind last; without what an outcome does not say."""
-        return tuple(self._recorded.get((partition.vehicle, partition.day), ()))
+    def known(self, partition: Partition) -> Known:
+        """What the lake had of a vehicle-day when the night began; the current one of a kind comes last."""
+        key = (partition.vehicle, partition.day)
+        return Known(tuple(self._records.get(key, ())), tuple(self._outcomes.get(key, ())))
 
-    def add(self, outcome: Outcome) -> None:
-        """Take the records of an outcome; commit those that came together, if it is time.
+    def add(self, outcome: Outcome, method: str) -> None:
+        """Take an outcome and its records; commit those that came together, if it is time.
 
         Raises:
-            OSError: the storage does not answer; the records are kept, and the next commit has them too.
+            OSError: the storage does not answer; the rows are kept, and the next commit has them too.
         """
-        if outcome.status == "cached":
-            self._again += self._not_current(outcome.records)
-        else:
-            self._new += outcome.records
-        waiting = len(self._new) + len(self._again)
+        records, outcomes = self._waiting
+        key = (outcome.vehicle, outcome.day)
+        _sort(records, outcome.records, self._records.get(key, ()))
+        _sort(outcomes, [outcome_row(outcome, method)], self._outcomes.get(key, ()))
+        waiting = sum(len(w.new) + len(w.again) for w in self._waiting)
         if waiting >= _ROWS or (waiting and time.monotonic() - self._committed_at > _EVERY_S):
             self.commit()
 
     def commit(self) -> None:
-        """Commit what has not been yet.
+        """Commit what has not been yet: records first, so that no outcome tells of records that are not there.
 
         Raises:
-            OSError: the storage does not answer; the records are kept.
+            OSError: the storage does not answer; the rows are kept.
         """
         self._committed_at = time.monotonic()
-        if self._new:
-            commit_records(self._lake, CALIBRATIONS, self._new)
-            self._new = []
-        if self._again:
-            assert_records(self._lake, CALIBRATIONS, self._again)
-            self._again = []
+        for waiting in self._waiting:
+            if waiting.new:
+                commit_records(self._lake, waiting.schema, waiting.new)
+                waiting.new = []
+            if waiting.again:
+                assert_records(self._lake, waiting.schema, waiting.again)
+                waiting.again = []
 
-    def _not_current(self, records: Sequence[CalibrationRecord]) -> list[CalibrationRecord]:
-        """Of recorded rows those that others about the same came after: they are to be current again."""
-        if not records:
-            return []
-        last = {}
-        for row in self._recorded.get((records[0].vehicle, records[0].day), ()):
-            last[row.trio, row.method, row.pair] = row.work_key
-        return [r for r in records if last.get((r.trio, r.method, r.pair)) != r.work_key]
+    def _read(
+        self, schema: TableSchema, row_type: type[Any], days: Sequence[str], columns: tuple[str, ...]
+    ) -> dict[tuple[str, str], list[Any]]:
+        found: dict[tuple[str, str], list[Any]] = defaultdict(list)
+        if days:
+            rows = read_records(self._lake, schema, row_type, first=days[0], last=days[-1], columns=columns)
+            for row in rows:
+                found[row.vehicle, row.day].append(row)
+        return found
+
+
+def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
+    """The row of table `outcomes` that an outcome is.
+
+    Args:
+        outcome: of a stage on a vehicle-day.
+        method: of the calibration; other stages have none.
+    """
+    effort = outcome.effort
+    return OutcomeRow(
+        outcome.vehicle,
+        outcome.day,
+        outcome.stage,
+        method if outcome.stage == CALIBRATIONS.made_by else "",
+        "done" if outcome.status == "cached" else outcome.status,
+        outcome.reason,
+        # What fails has no key: the same failure is the same row, however often it is tried.
+        outcome.work_key or work_key(outcome.stage, CODE_VERSION, outcome.reason, []),
+        outcome.rows,
+        outcome.kept,
+        outcome.rejected,
+        effort.began_at,
+        effort.seconds,
+        effort.bytes_read,
+        effort.bytes_written,
+        CODE_VERSION,
+        list(outcome.inputs),
+    )
+
+
+def _sort(waiting: _Waiting, rows: Sequence[Any], recorded: Sequence[Any]) -> None:
+    """Rows that are not recorded are new; those that others about the same came after are to be current again."""
+    about = waiting.schema.about
+    last = {tuple(getattr(r, name) for name in about): r.work_key for r in recorded}
+    keys = {(tuple(getattr(r, name) for name in about), r.work_key) for r in recorded}
+    for row in rows:
+        key = tuple(getattr(row, name) for name in about)
+        if (key, row.work_key) not in keys:
+            waiting.new.append(row)
+        elif last[key] != row.work_key:
+            waiting.again.append(row)

@@ -13,16 +13,15 @@ from dataclasses import dataclass, field, replace
 
 from pipeline.config import FleetConfig
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
-from pipeline.fleet.ledger import Ledger
+from pipeline.fleet.ledger import Known, Ledger
 from pipeline.fleet.pattern import VehicleDay
-from pipeline.results import Outcome, Progress
+from pipeline.results import Outcome, Progress, silent
 from pipeline.runner import Stage, try_stage
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.store.partitions import Lake, Partition
 from pipeline.work import Task
-from schemas.calibrations import CalibrationRecord
 
-__all__ = ["DayOutcome", "Night", "run_night", "run_vehicle_day"]
+__all__ = ["DayOutcome", "Night", "run_night", "run_vehicle_day", "task_of"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class DayOutcome:
     results: tuple[Outcome, ...] = field(default=(), repr=False)  # of the stages, with the records to commit
 
 
-_Job = tuple[Night, VehicleDay, tuple[CalibrationRecord, ...]]
+_Job = tuple[Night, VehicleDay, Known]
 
 
 def run_night(
@@ -74,22 +73,20 @@ def run_night(
         reason = f"{night.fleet.file} has no vehicle {unknown.vehicle!r}"
         yield DayOutcome(unknown.vehicle, unknown.day, "refused", reason)
     ledger = Ledger(night.lake, [d.partition for d in known])
-    jobs = [(_of(night, d.partition.vehicle), d, ledger.recorded(d.partition)) for d in known]
+    jobs = [(_of(night, d.partition.vehicle), d, ledger.known(d.partition)) for d in known]
     try:
         with closing(EXECUTORS[executor](_run_job, jobs, workers, watch)) as results:
             for finished in results:
                 outcome = _outcome(finished)
                 for result in outcome.results:
                     with suppress(OSError):  # the storage may answer again before the night ends
-                        ledger.add(result)
+                        ledger.add(result, night.method)
                 yield outcome
     finally:
         ledger.commit()
 
 
-def run_vehicle_day(
-    night: Night, work: VehicleDay, recorded: Sequence[CalibrationRecord], progress: Progress
-) -> DayOutcome:
+def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Progress) -> DayOutcome:
     """Ingest, perceive and calibrate one vehicle-day; a stage's refusal ends as a refused record.
 
     Its records are in the outcome, for the caller to commit.
@@ -97,25 +94,32 @@ def run_vehicle_day(
     Args:
         night: the configuration, as far as this vehicle needs it.
         work: the day and its logs.
-        recorded: what the lake has of the day's records.
+        known: what the lake has of the day's records and outcomes.
         progress: told how far it is.
     """
-    task = Task(
-        night.fleet,
-        night.lake,
-        work.partition,
-        night.method,
-        night.seed,
-        logs=tuple(work.logs),
-        commit=False,
-        recorded=recorded,
-    )
+    task = task_of(night, work, known, progress)
     outcome = _through_stages(task, progress)
     damaged = next((r.damaged for r in outcome.results if r.damaged), "")
     if not damaged:
         return outcome
     night.lake.set_aside(damaged)  # what it was made of is there: make it anew, once
     return _through_stages(task, progress)
+
+
+def task_of(night: Night, work: VehicleDay, known: Known, progress: Progress = silent) -> Task:
+    """A vehicle-day as the stages are asked to do it; what they record is left to the caller to commit."""
+    return Task(
+        night.fleet,
+        night.lake,
+        work.partition,
+        night.method,
+        night.seed,
+        logs=tuple(work.logs),
+        progress=progress,
+        commit=False,
+        recorded=tuple(r for r in known.records if r.method == night.method),
+        before=known.outcomes,
+    )
 
 
 def _through_stages(task: Task, progress: Progress) -> DayOutcome:

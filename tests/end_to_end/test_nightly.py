@@ -122,6 +122,37 @@ def test_a_second_night_finds_nothing_to_do_and_changes_no_byte(fleet, first_nig
 
 
 @pytest.mark.slow
+def test_status_and_a_dry_run_say_how_every_day_stands_and_why(fleet, first_night, tmp_path):
+    lake, _, summary, _ = first_night
+    code, told, _ = run(BORESIGHT, "status", "--lake", str(lake), "--json")
+    days = {(d["vehicle"], d["day"]): d for d in told["days"]}
+    assert code == 0
+    assert (told["failed"], told["missing"]) == (0, 1)  # the poisoned vehicle has logs of one day
+    assert {days[key]["status"] for key in WANTED} <= {"done", "held", "refused"}
+    assert (
+        sum(told[s] for s in ("done", "held", "refused")) == summary["vehicle_days"] - 1
+    )  # but the stranger
+    assert days["vehicle-3", DAYS[1]]["status"] == "missing"
+    assert days["vehicle-3", DAYS[0]]["stage"] == "ingest"
+    assert days["vehicle-3", DAYS[0]]["reason"].startswith("no usable message")
+    assert all(days[key]["seconds"] > 0.1 and days[key]["pairs"] for key in WANTED)
+    assert run(BORESIGHT, "status", "--lake", str(lake))[1]["done"] == told["done"]
+    before = sorted(lake.rglob("*"))
+    code, plan, stderr = run(*command(fleet, lake, "--dry-run"))
+    why = {(p["vehicle"], p["day"]): (p["stages"], p["why"]) for p in plan["plan"]}
+    assert (code, plan["status"], plan["would_run"]) == (0, "planned", 0)
+    assert all(why[key] == ([], "up to date") for key in WANTED)
+    assert why["vehicle-3", DAYS[0]][1].startswith("refused by ingest: ")
+    assert "stranger" in stderr
+    assert sorted(lake.rglob("*")) == before
+    _, plan, _ = run(*command(fleet, tmp_path / "lake", "--dry-run"))
+    assert {(*p["stages"], p["why"]) for p in plan["plan"] if p["vehicle"] == "vehicle-1"} == {
+        ("ingest", "perceive", "calibrate", "no frames yet")
+    }
+    assert not (tmp_path / "lake").exists()
+
+
+@pytest.mark.slow
 def test_damaged_tables_cost_the_fleet_nothing_and_the_next_night_heals_them(fleet, first_night, tmp_path):
     lake = tmp_path / "lake"
     shutil.copytree(first_night[0], lake)

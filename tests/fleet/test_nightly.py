@@ -5,15 +5,18 @@ from pathlib import Path
 
 import pytest
 
+import pipeline.fleet.ledger
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, LogError
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
+from pipeline.fleet.status import day_statuses
 from pipeline.results import Outcome
 from pipeline.runner import Stage
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records, write_records
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.outcomes import OUTCOMES, OutcomeRow
 
 DAY = "2026-03-02"
 FLEET = FleetConfig.model_validate(
@@ -56,7 +59,9 @@ class StagesThatSay:
         if name == "calibrate":
             status = "cached" if answer == "cached" else "refused" if answer == "refused" else "done"
             rows = self.record(partition, answer)
-            return Outcome(name, partition.vehicle, partition.day, status, "key", records=tuple(rows))
+            kept = {s: sum(r.status == s for r in rows) for s in ("accepted", "held", "refused")}
+            records = tuple(rows)
+            return Outcome(name, partition.vehicle, partition.day, status, "key", kept=kept, records=records)
         return Outcome(name, partition.vehicle, partition.day, answer, "key", rows=7, reason="no frame")
 
     def record(self, partition, answer):
@@ -125,6 +130,49 @@ def test_a_refused_day_leaves_refused_records_with_the_reason(stage, night, monk
         (pair, "refused", f"{stage}: no frame") for pair in PAIRS
     }
     assert len(records(night)) == 3
+
+
+def test_a_night_says_what_became_of_each_stage_and_a_second_one_adds_nothing(night, monkeypatch):
+    StagesThatSay(monkeypatch, night.lake, perceive="cached", calibrate="held")
+    outcomes(night, ("car", "bus"))
+    rows = read_records(night.lake, OUTCOMES, OutcomeRow)
+    assert {(r.vehicle, r.stage, r.method, r.status) for r in rows} == {
+        (vehicle, stage, "joint" if stage == "calibrate" else "", "done")
+        for vehicle in ("car", "bus")
+        for stage in ("ingest", "perceive", "calibrate")
+    }
+    log = sorted((night.lake.root / "outcomes" / "_delta_log").iterdir())
+    outcomes(night, ("car", "bus"))
+    assert sorted((night.lake.root / "outcomes" / "_delta_log").iterdir()) == log
+
+
+def test_a_failure_that_is_over_is_no_more_the_current_outcome(night, monkeypatch):
+    with monkeypatch.context() as patch:
+        StagesThatSay(patch, night.lake, perceive=LogError("a.mcap", "is empty"))
+        for _ in range(2):
+            outcomes(night)
+    rows = read_records(night.lake, OUTCOMES, OutcomeRow)
+    assert [(r.stage, r.status) for r in rows] == [("ingest", "done"), ("perceive", "failed")]
+    assert [s.status for s in day_statuses(rows)] == ["failed"]
+    StagesThatSay(monkeypatch, night.lake)
+    outcomes(night)
+    assert [s.status for s in day_statuses(read_records(night.lake, OUTCOMES, OutcomeRow))] == ["done"]
+
+
+def test_records_wait_for_a_storage_that_does_not_answer(night, monkeypatch):
+    StagesThatSay(monkeypatch, night.lake)
+    monkeypatch.setattr(pipeline.fleet.ledger, "_EVERY_S", 0.0)
+    real, calls = pipeline.fleet.ledger.commit_records, []
+
+    def failing(*arguments):
+        calls.append(arguments)
+        if len(calls) < 4:
+            raise OSError("503")
+        return real(*arguments)
+
+    monkeypatch.setattr(pipeline.fleet.ledger, "commit_records", failing)
+    assert outcomes(night, ("car", "bus"))["bus"].status == "done"
+    assert len(read_records(night.lake, OUTCOMES, OutcomeRow)) == 6
 
 
 @pytest.mark.parametrize("error", [LogError("a.mcap", "is empty"), OSError(28, "No space left on device")])

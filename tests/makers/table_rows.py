@@ -6,12 +6,14 @@ from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
+from schemas.outcomes import OUTCOMES, OutcomeRow
 
 ROW_TYPES = {
     FRAMES.name: (FRAMES, Frame),
     OBSERVATIONS.name: (OBSERVATIONS, Observation),
     CALIBRATIONS.name: (CALIBRATIONS, CalibrationRecord),
     DRIFT.name: (DRIFT, DriftFinding),
+    OUTCOMES.name: (OUTCOMES, OutcomeRow),
 }
 
 

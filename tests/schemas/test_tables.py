@@ -11,6 +11,7 @@ from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
+from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.training import TRAINING, TrainingRow
 from schemas.versions import TABLES, write_json_schemas
 
@@ -20,6 +21,7 @@ ROW_TYPES = {
     TRAINING.name: TrainingRow,
     CALIBRATIONS.name: CalibrationRecord,
     DRIFT.name: DriftFinding,
+    OUTCOMES.name: OutcomeRow,
 }
 
 

@@ -1,0 +1,59 @@
+"""What a night would do, and why, without doing it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from pipeline.errors import BoresightError
+from pipeline.fleet.ledger import Ledger
+from pipeline.fleet.nightly import Night, task_of
+from pipeline.fleet.pattern import VehicleDay
+from pipeline.runner import why_to_run
+from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
+from pipeline.work import Task
+
+__all__ = ["DayPlan", "plan_night"]
+
+_ORDER = (INGEST, PERCEIVE, CALIBRATE)
+
+
+@dataclass(frozen=True)
+class DayPlan:
+    """Stages that would run on a vehicle-day, in order, and why the first of them would; none: it is up to date."""
+
+    vehicle: str
+    day: str
+    stages: tuple[str, ...]
+    why: str
+
+
+def plan_night(night: Night, days: Sequence[VehicleDay]) -> Iterator[DayPlan]:
+    """The plan of every vehicle-day, in order; logs are looked at as far as their identity needs it.
+
+    What runs anew may turn out as before, and then what follows it is up to date after all.
+    """
+    known = [d for d in days if d.partition.vehicle in night.fleet.vehicles]
+    ledger = Ledger(night.lake, [d.partition for d in known])
+    for day in days:
+        vehicle, date = day.partition.vehicle, day.partition.day
+        if vehicle not in night.fleet.vehicles:
+            yield DayPlan(vehicle, date, (), f"{night.fleet.file} has no vehicle {vehicle!r}: refused")
+            continue
+        task = task_of(night, day, ledger.known(day.partition))
+        try:
+            yield DayPlan(vehicle, date, *_would_run(task))
+        except (BoresightError, OSError) as err:
+            yield DayPlan(vehicle, date, (), f"would fail: {err}")
+
+
+def _would_run(task: Task) -> tuple[tuple[str, ...], str]:
+    for at, stage in enumerate(_ORDER):
+        before = next((r for r in reversed(task.before) if r.stage == stage.name), None)
+        why = why_to_run(stage, task)
+        if why:
+            failed = f", failed before: {before.reason}" if before and before.status == "failed" else ""
+            return tuple(s.name for s in _ORDER[at:]), why + failed
+        if before is not None and before.status == "refused" and stage is not CALIBRATE:
+            return (), f"refused by {stage.name}: {before.reason}"
+    return (), "up to date"

@@ -1,0 +1,112 @@
+"""How every vehicle-day of a lake stands: done, held, refused, failed or missing, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from schemas.outcomes import OutcomeRow
+
+__all__ = ["DAY_STATUSES", "DayStatus", "day_statuses"]
+
+# What a person should look at first comes first.
+DAY_STATUSES = ("failed", "missing", "refused", "held", "done")
+_LAST_STAGE = "calibrate"
+
+
+@dataclass(frozen=True)
+class DayStatus:
+    """One vehicle-day and method.
+
+    Args:
+        vehicle: vehicle id.
+        day: YYYY-MM-DD.
+        method: of the calibration; empty where none came to it.
+        status: one of DAY_STATUSES.
+        stage: where it ended; empty where no stage ran.
+        reason: why, in words.
+        pairs: how many pairs are accepted, held, refused.
+        asserted_at: when a night last said so.
+        seconds: that its stages took when they last ran.
+        bytes_read: by them; None where unknown.
+        bytes_written: likewise.
+    """
+
+    vehicle: str
+    day: str
+    method: str
+    status: str
+    stage: str = ""
+    reason: str = ""
+    pairs: dict[str, int] = field(default_factory=dict)
+    asserted_at: str = ""
+    seconds: float = 0.0
+    bytes_read: int | None = None
+    bytes_written: int | None = None
+
+
+def day_statuses(rows: Sequence[OutcomeRow]) -> list[DayStatus]:
+    """Every vehicle on every day that any vehicle was run on, in order of day, vehicle and method.
+
+    A vehicle that has no outcome on a day on which others have is missing there: no logs of it were found. So is a day
+    whose night ended before its last stage.
+
+    Args:
+        rows: as `read_records` returns them, the last asserted last.
+    """
+    stages: dict[tuple[str, str], dict[tuple[str, str], OutcomeRow]] = {}
+    for row in rows:
+        stages.setdefault((row.day, row.vehicle), {})[row.stage, row.method] = row
+    days, vehicles = {d for d, _ in stages}, {v for _, v in stages}
+    found = []
+    for day in sorted(days):
+        for vehicle in sorted(vehicles):
+            current = stages.get((day, vehicle))
+            if current is None:
+                reason = "no logs of this vehicle were found on a day of which others have some"
+                found.append(DayStatus(vehicle, day, "", "missing", reason=reason))
+                continue
+            methods = sorted({method for stage, method in current if stage == _LAST_STAGE}) or [""]
+            found += [_of_method(vehicle, day, method, list(current.values())) for method in methods]
+    return found
+
+
+def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) -> DayStatus:
+    own = [r for r in rows if r.method in ("", method)]
+    failed = next((r for r in own if r.status == "failed"), None)
+    last = next((r for r in own if r.stage == _LAST_STAGE), None)
+    # The reason of the stage that refused, not what calibrate recorded of it for every pair.
+    refused = next((r for r in own if r.status == "refused" and r.stage != _LAST_STAGE), None)
+    said = failed or (refused if last is not None and last.status == "refused" else None) or last
+    if said is None:
+        latest = max(own, key=lambda r: r.asserted_at)
+        status, reason, stage = "missing", f"no {_LAST_STAGE} after {latest.stage} yet", latest.stage
+    else:
+        status, reason, stage = _status(said), said.reason, said.stage
+    return DayStatus(
+        vehicle,
+        day,
+        method,
+        status,
+        stage,
+        reason,
+        {} if last is None else {k: n for k, n in last.kept.items() if n},
+        max(r.asserted_at for r in own),
+        sum(r.seconds for r in own),
+        _total([r.bytes_read for r in own]),
+        _total([r.bytes_written for r in own]),
+    )
+
+
+def _status(row: OutcomeRow) -> str:
+    if row.status != "done":
+        return row.status
+    for status in ("held", "refused"):
+        if row.kept.get(status):
+            return status
+    return "done"
+
+
+def _total(values: Sequence[int | None]) -> int | None:
+    known = [v for v in values if v is not None]
+    return sum(known) if known else None

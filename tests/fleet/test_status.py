@@ -1,0 +1,65 @@
+"""How a vehicle-day stands, from what its stages said."""
+
+import itertools
+
+from pipeline.fleet.status import day_statuses
+from schemas.outcomes import OutcomeRow
+
+CLOCK = itertools.count()
+
+
+def row(vehicle, day, stage, status="done", method="", reason="", **values):
+    stamp = f"2026-04-01T00:00:{next(CLOCK):02d}.000000Z"
+    method = "joint" if stage == "calibrate" and not method else method
+    return OutcomeRow(vehicle, day, stage, method, status, reason, "key", asserted_at=stamp, **values)
+
+
+def statuses(*rows):
+    return {(s.vehicle, s.day, s.method): (s.status, s.reason) for s in day_statuses(rows)}
+
+
+def test_a_day_is_what_its_calibration_says():
+    found = statuses(
+        row("a", "d1", "ingest"), row("a", "d1", "calibrate", kept={"accepted": 3, "held": 0}),
+        row("b", "d1", "calibrate", kept={"accepted": 2, "held": 1}, reason="lidar_radar: too wide"),
+        row("c", "d1", "ingest", "refused", reason="no image"),
+        row("c", "d1", "calibrate", "refused", reason="ingest: no image"),
+        row("d", "d1", "calibrate", kept={"accepted": 2, "refused": 1}),
+    )  # fmt: skip
+    assert found == {
+        ("a", "d1", "joint"): ("done", ""),
+        ("b", "d1", "joint"): ("held", "lidar_radar: too wide"),
+        ("c", "d1", "joint"): ("refused", "no image"),
+        ("d", "d1", "joint"): ("refused", ""),
+    }
+
+
+def test_what_failed_last_is_failed_until_it_succeeds():
+    rows = [
+        row("a", "d1", "calibrate", kept={"accepted": 3}),
+        row("a", "d1", "ingest", "failed", reason="disk full"),
+    ]
+    assert statuses(*rows) == {("a", "d1", "joint"): ("failed", "disk full")}
+    assert statuses(*rows, row("a", "d1", "ingest")) == {("a", "d1", "joint"): ("done", "")}
+
+
+def test_a_vehicle_that_others_drove_without_and_a_night_that_ended_early_are_missing():
+    found = statuses(row("a", "d1", "calibrate"), row("b", "d2", "ingest"))
+    assert found["b", "d1", ""][0] == "missing"
+    assert "no logs" in found["b", "d1", ""][1]
+    assert found["b", "d2", ""] == ("missing", "no calibrate after ingest yet")
+
+
+def test_methods_stand_apart_and_efforts_add_up():
+    [joint, ssl] = day_statuses([
+        row("a", "d1", "ingest", seconds=2.0, bytes_read=5),
+        row("a", "d1", "calibrate", seconds=3.0, bytes_read=7),
+        row("a", "d1", "calibrate", method="joint-ssl", status="refused", seconds=1.0),
+    ])  # fmt: skip
+    assert (joint.method, joint.status, joint.seconds, joint.bytes_read) == ("joint", "done", 5.0, 12)
+    assert (ssl.method, ssl.status, ssl.seconds, ssl.bytes_read) == ("joint-ssl", "refused", 3.0, 5)
+    assert joint.bytes_written is None
+
+
+def test_nothing_was_run_nothing_is_said():
+    assert day_statuses([]) == []
