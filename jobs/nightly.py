@@ -62,8 +62,7 @@ def nightly(
     if dry_run:
         return _print_plan(night, days)
     outcomes = watch_night(night, days, executor, workers)
-    page = report or tables.root / "report" / "fleet.html"
-    findings, pages = close_night(night, to_day, page) if outcomes else ([], [])
+    findings, pages = _closed(night, to_day, report) if outcomes else ([], [])
     tidy(tables)
     code = exit_code([o.status for o in outcomes])
     print_summary(
@@ -78,6 +77,16 @@ def nightly(
         report=pages[0] if pages else None,
     )
     return code
+
+
+def _closed(night: Night, to_day: str | None, report: Path | None) -> tuple[list[DriftFinding], list[str]]:
+    """`close_night`, with the pages in the lake where no other place is given."""
+    if report is not None:
+        return close_night(night, to_day, report)
+    files, place = night.lake.files, night.lake.root / "report"
+    with files.in_folder(place) as folder:
+        findings, pages = close_night(night, to_day, folder / "fleet.html")
+    return findings, [files.uri(place / Path(p).relative_to(folder)) for p in pages]
 
 
 def _print_plan(night: Night, days: Sequence[VehicleDay]) -> int:

@@ -6,10 +6,12 @@ a killed writer leaves rows or none, and two writers at once both get theirs in.
 
 from __future__ import annotations
 
+import errno
 import random
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -83,11 +85,13 @@ def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
         )
         raise ContractError(where, problem)
     try:
-        table = DeltaTable(where, storage_options=lake.delta_options())
+        table = DeltaTable(where, storage_options=lake.files.delta_options())
     except TableNotFoundError:
         return None
     except DeltaError as err:
         raise ContractError(where, f"its log is damaged: {err}") from err
+    except OSError as err:  # says neither what it is nor where
+        raise OSError(errno.EIO, " ".join(str(err).split()), where) from err
     found = table.metadata().configuration.get(_VERSION, "")
     readable = {str(v) for v in (schema.version, *schema.reads_versions)}
     if table.protocol().min_reader_version > 1 or found not in readable:
@@ -114,16 +118,14 @@ def read_file(lake: Lake, schema: TableSchema, name: str, columns: Sequence[str]
     path = lake.record_file(schema.name, name)
     wanted = schema.arrow_schema()
     try:
-        with lake.opened(path) as stream, pq.ParquetFile(stream) as file:
+        with lake.files.opened(path) as stream, pq.ParquetFile(stream) as file:
             there = [c for c in columns if c in file.schema_arrow.names]
             table = file.read(columns=there)
     except PermissionError:
         raise
-    except (
-        pa.ArrowException,
-        OSError,
-        EOFError,
-    ) as err:  # a storage that does not answer raises other errors
+    except (pa.ArrowException, OSError, EOFError) as err:
+        if not isinstance(lake.root, Path) and getattr(err, "errno", None) == errno.EIO:
+            raise  # the store does not answer: that says nothing of the file
         lake.damage.append(f"{path}: {str(err).splitlines()[0]}")
         return None
     # The writer may have chosen string views for strings.
@@ -149,7 +151,7 @@ def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool 
             _merge(table, schema, rows, insert=insert)
         except CommitFailedError:  # another writer was first
             time.sleep(_PAUSE_S * random.uniform(1, 1 + min(attempt, 10)))
-        except DeltaError as err:
+        except (DeltaError, OSError) as err:
             # A damaged file must be out of the way, or nothing is ever recorded again.
             if not set_aside_damaged(lake, schema):
                 raise OSError(f"{lake.table(schema.name)}: {err}") from err
@@ -183,7 +185,8 @@ def _quoted(values: Sequence[str]) -> str:
 
 def _created(lake: Lake, schema: TableSchema) -> DeltaTable:
     """An empty table; another writer may have made it meanwhile."""
-    lake.make_folder(schema.name)
+    if isinstance(lake.root, Path):
+        (lake.root / schema.name).mkdir(parents=True, exist_ok=True)
     return DeltaTable.create(
         lake.table(schema.name),
         Schema.from_arrow(stored_schema(schema)),
@@ -197,7 +200,7 @@ def _created(lake: Lake, schema: TableSchema) -> DeltaTable:
             "delta.dataSkippingStatsColumns": "vehicle,day",
             "delta.targetFileSize": str(_FILE_BYTES),
         },
-        storage_options=lake.delta_options(),
+        storage_options=lake.files.delta_options(),
         raise_if_key_not_exists=False,
     )
 
@@ -212,7 +215,8 @@ def set_aside_damaged(lake: Lake, schema: TableSchema) -> list[str]:
     for file in live_files(table) if table is not None else []:
         if read_file(lake, schema, file.name, [c.name for c in schema.columns]) is None:
             bad.append(file.name)
-            lake.move_record_file(schema.name, file.name, f"{_DAMAGED}/{file.name.replace('/', '_')}")
+            path = lake.record_file(schema.name, file.name)
+            lake.files.move(path, lake.root / schema.name / _DAMAGED / file.name.replace("/", "_"))
     if bad and table is not None:
         table.repair()  # the log forgets files that are not there
     return bad

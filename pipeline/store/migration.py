@@ -46,7 +46,7 @@ def migrate_table(lake: Lake, schema: TableSchema, row_type: type[Any], progress
         OSError: the storage does not answer.
     """
     lake = replace(lake, migrating=True)
-    done, folder = Migrated(), lake.root / schema.name
+    done, folder = Migrated(), lake.local_root / schema.name
     files = sorted(
         folder.glob("vehicle=*/day=*/*.parquet"), key=lambda p: (*p.parts[:-1], p.stat().st_mtime_ns, p.name)
     )

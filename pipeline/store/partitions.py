@@ -6,14 +6,13 @@ import datetime as dt
 import hashlib
 import json
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import BinaryIO
+from pathlib import Path, PurePath, PurePosixPath
 from urllib.parse import quote, unquote
 
 from pipeline.errors import ConfigError
+from pipeline.store.files import Files, LocalFiles
+from pipeline.store.object_store import Bucket
 
 __all__ = ["Lake", "Partition", "is_day", "work_key"]
 
@@ -49,86 +48,86 @@ class Partition:
 
 @dataclass(frozen=True)
 class Lake:
-    """The root of the tables: a folder (an object store comes behind the same methods).
+    """The root of the tables: a folder, or a prefix of a bucket.
 
     Args:
-        root: the folder.
-        damage: what was left out because it could not be read, as it is found: file and reason, in words.
+        root: the folder, a `Path`; or the prefix, which is no path of this machine.
+        files: where its files are.
         migrating: True for who moves the records of an older release, and meets them beside the new ones.
+        damage: what was left out because it could not be read, as it is found: file and reason, in words.
     """
 
-    root: Path
+    root: PurePath
+    files: Files = field(default_factory=LocalFiles)
     migrating: bool = False
     damage: list[str] = field(default_factory=list, compare=False, repr=False)
 
     @classmethod
     def at(cls, location: str | Path) -> Lake:
-        """The lake at a folder; created on first write."""
-        if str(location).startswith("s3://"):
-            raise ConfigError("command line", "lake", "object stores are not supported yet: give a folder")
-        return cls(Path(location))
+        """The lake at a folder or at "s3://BUCKET/PREFIX"; made by the first write.
+
+        Raises:
+            ConfigError: an object store without a bucket or a prefix, or one that is not S3.
+        """
+        scheme, separator, rest = str(location).partition("://")
+        if not separator:
+            return cls(Path(location))
+        bucket, _, prefix = rest.strip("/").partition("/")
+        if scheme != "s3" or not bucket or not prefix:
+            raise ConfigError("command line", "lake", f"{location!r} is no folder and no s3://BUCKET/PREFIX")
+        return cls(PurePosixPath(prefix), Bucket(bucket))
 
     def __str__(self) -> str:
-        return str(self.root)
+        return self.files.uri(self.root)
 
-    def folder(self, table: str, partition: Partition) -> Path:
+    @property
+    def local_root(self) -> Path:
+        """The folder, for what works on folders only.
+
+        Raises:
+            ConfigError: the lake is in an object store.
+        """
+        if not isinstance(self.root, Path):
+            raise ConfigError("command line", "lake", f"{self} is no folder, and this command needs one")
+        return self.root
+
+    def folder(self, table: str, partition: Partition) -> PurePath:
         """The folder of one partition of one table."""
         return self.root / table / partition.folder
 
-    def file(self, table: str, partition: Partition) -> Path:
+    def file(self, table: str, partition: Partition) -> PurePath:
         """The file of a partition that is replaced as a whole (records have tables of their own)."""
         return self.folder(table, partition) / "part-0.parquet"
 
     def partitions(self, table: str, vehicle: str | None = None, day: str | None = None) -> list[Partition]:
         """Partitions of a table that hold at least one file, in order; only those of a vehicle or day if given."""
         vehicles = "*" if vehicle is None else quote(vehicle, safe="")
-        pattern = f"{table}/vehicle={vehicles}/day={day or '*'}/*.parquet"
-        return sorted({p for f in self.root.glob(pattern) if (p := _partition_of(f.parent)) is not None})
+        found = self.files.find(self.root / table, f"vehicle={vehicles}/day={day or '*'}/*.parquet")
+        return sorted({p for f in found if (p := _partition_of(f.parent)) is not None})
 
     def set_aside(self, path: str) -> None:
         """Take a damaged file of a partition out of the readers' sight; it keeps its name and ends in .damaged."""
-        with suppress(FileNotFoundError):
-            Path(path).replace(f"{path}.damaged")
+        self.files.move(type(self.root)(path), type(self.root)(f"{path}.damaged"))
 
     def table(self, name: str) -> str:
         """Where a record table lies."""
-        return str(self.root / name)
-
-    def make_folder(self, table: str) -> None:
-        """Make the folder of a table where it is missing."""
-        (self.root / table).mkdir(parents=True, exist_ok=True)
+        return self.files.uri(self.root / name)
 
     def exists(self) -> bool:
         """True where there is such a folder."""
-        return self.root.is_dir()
+        return self.files.exists(self.root)
 
     def has_record_files(self, table: str) -> bool:
         """True where a release before 0.6 left records as files in folders of vehicles."""
-        return not self.migrating and any((self.root / table).glob("vehicle=*/day=*/*.parquet"))
+        found = self.files.find(self.root / table, "vehicle=*/day=*/*.parquet")
+        return not self.migrating and isinstance(self.root, Path) and any(True for _ in found)
 
-    def record_file(self, table: str, name: str) -> Path:
+    def record_file(self, table: str, name: str) -> PurePath:
         """A data file of a record table, by its name in the table's log."""
         return self.root / table / unquote(name)
 
-    def move_record_file(self, table: str, name: str, aside: str) -> None:
-        """Move a data file to another name in the table's folder, if it is there."""
-        target = self.root / table / aside
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with suppress(FileNotFoundError):
-            self.record_file(table, name).replace(target)
 
-    def delta_options(self) -> dict[str, str]:
-        """What `deltalake` is told of the storage."""
-        return {}
-
-    @contextmanager
-    def opened(self, path: Path) -> Iterator[BinaryIO]:
-        """A file, to be read at any place."""
-        with path.open("rb") as stream:
-            yield stream
-
-
-def _partition_of(folder: Path) -> Partition | None:
+def _partition_of(folder: PurePath) -> Partition | None:
     """The partition that a folder is; None for one that nobody could have written through here."""
     try:
         return Partition(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import PurePath
 from typing import Any, TypeVar
 
 import pyarrow.parquet as pq
@@ -39,7 +39,7 @@ def read_columns(
         DamagedError: its file cannot be read.
     """
     path = _checked(lake, schema, partition)
-    with lake.opened(path) as stream, pq.ParquetFile(stream) as file, naming_damage(path):
+    with lake.files.opened(path) as stream, pq.ParquetFile(stream) as file, naming_damage(path):
         table = file.read(columns=list(names))
     return {name: table.column(name).to_pylist() for name in names}
 
@@ -50,7 +50,7 @@ def row_groups(lake: Lake, schema: TableSchema, partition: Partition) -> list[Ro
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
     """
-    with lake.opened(_checked(lake, schema, partition)) as stream:
+    with lake.files.opened(_checked(lake, schema, partition)) as stream:
         metadata = pq.read_metadata(stream)
     return [RowGroup(partition, i, metadata.row_group(i).num_rows) for i in range(metadata.num_row_groups)]
 
@@ -63,13 +63,13 @@ def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[
     """
     path = lake.file(schema.name, group.partition)
     try:
-        with lake.opened(path) as stream, pq.ParquetFile(stream) as file, naming_damage(path):
+        with lake.files.opened(path) as stream, pq.ParquetFile(stream) as file, naming_damage(path):
             return from_table(file.read_row_group(group.index), schema, row_type)
     except FileNotFoundError as err:
         raise ContractError(str(path), "the partition went away while it was read") from err
 
 
-def _checked(lake: Lake, schema: TableSchema, partition: Partition) -> Path:
+def _checked(lake: Lake, schema: TableSchema, partition: Partition) -> PurePath:
     path = lake.file(schema.name, partition)
     if read_manifest(lake, schema, partition) is None:
         raise ContractError(str(path), f"table {schema.name} has no such partition")

@@ -6,14 +6,13 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import Any, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import ContractError, DamagedError
-from pipeline.store.atomic_write import atomic_write
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records, write_records
 from pipeline.store.rows import from_table, to_table
@@ -79,7 +78,7 @@ def write_partition(
     inputs: Iterable[str] = (),
 ) -> Iterator[PartitionWriter]:
     """Replace one partition as a whole, atomically; on an error the old file stays."""
-    with _replacing(lake.file(schema.name, partition), schema) as parquet:
+    with _replacing(lake, lake.file(schema.name, partition), schema) as parquet:
         writer = PartitionWriter(parquet, schema)
         yield writer
         manifest = Manifest(
@@ -97,7 +96,10 @@ def write_partition(
 def read_manifest(lake: Lake, schema: TableSchema, partition: Partition) -> Manifest | None:
     """Manifest of a partition, None where there is no such partition."""
     path = lake.file(schema.name, partition)
-    return _manifest(lake, path, schema) if path.exists() else None
+    try:
+        return _manifest(lake, path, schema)
+    except FileNotFoundError:
+        return None
 
 
 def read_rows(lake: Lake, schema: TableSchema, partition: Partition, row_type: type[Row]) -> list[Row]:
@@ -119,13 +121,11 @@ def iterate_rows(
         DamagedError: its file cannot be read.
     """
     path = lake.file(schema.name, partition)
-    if not path.exists():
-        raise ContractError(
-            str(path), f"table {schema.name} has no partition for {partition.vehicle} on {partition.day}"
-        )
-    _manifest(lake, path, schema)
+    if read_manifest(lake, schema, partition) is None:
+        problem = f"table {schema.name} has no partition for {partition.vehicle} on {partition.day}"
+        raise ContractError(str(path), problem)
     wanted = None if rows is None else set(rows)
-    with lake.opened(path) as stream, pq.ParquetFile(stream) as file:
+    with lake.files.opened(path) as stream, pq.ParquetFile(stream) as file:
         first = 0
         for group in range(file.num_row_groups):
             count = file.metadata.row_group(group).num_rows
@@ -140,10 +140,9 @@ def iterate_rows(
 
 
 @contextmanager
-def _replacing(path: Path, schema: TableSchema) -> Iterator[pq.ParquetWriter]:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def _replacing(lake: Lake, path: PurePath, schema: TableSchema) -> Iterator[pq.ParquetWriter]:
     with (
-        atomic_write(path) as stream,
+        lake.files.replacing(path) as stream,
         pq.ParquetWriter(stream, schema.arrow_schema(), **_writer_options(schema)) as parquet,
     ):
         yield parquet
@@ -199,8 +198,8 @@ def naming_damage(path: PurePath) -> Iterator[None]:
         raise DamagedError(str(path), str(err).splitlines()[0]) from err
 
 
-def _manifest(lake: Lake, path: Path, schema: TableSchema) -> Manifest:
-    with lake.opened(path) as stream, naming_damage(path):
+def _manifest(lake: Lake, path: PurePath, schema: TableSchema) -> Manifest:
+    with lake.files.opened(path) as stream, naming_damage(path):
         raw = (pq.read_metadata(stream).metadata or {}).get(_KEY)
     if raw is None:
         raise ContractError(str(path), "was not written by Boresight (no manifest in the footer)")

@@ -88,7 +88,7 @@ def alike(
 
 def write_inventory(lake: Lake, inventory: Inventory, about: dict[str, Any]) -> Path:
     """Write `training/manifest.json` beside the partitions; `about` adds what the run knows."""
-    path = lake.root / TRAINING.name / MANIFEST_FILE
+    path = lake.local_root / TRAINING.name / MANIFEST_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     content = about | inventory.__dict__
     with atomic_write(path) as stream:
@@ -98,7 +98,7 @@ def write_inventory(lake: Lake, inventory: Inventory, about: dict[str, Any]) -> 
 
 def read_leaks(lake: Lake) -> dict[Partition, set[int]]:
     """Frames that must not be used, by partition; empty where no inventory was written."""
-    path = lake.root / TRAINING.name / MANIFEST_FILE
+    path = lake.local_root / TRAINING.name / MANIFEST_FILE
     out: dict[Partition, set[int]] = {}
     if path.exists():
         for vehicle, day, index in json.loads(path.read_text())["leaks"]:

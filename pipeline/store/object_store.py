@@ -1,0 +1,173 @@
+"""Objects of an S3 bucket as files: whole writes, reads at any place, listings; transient faults are tried again.
+
+Credentials, region and endpoint come from the environment alone (`AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`,
+`AWS_REGION`, `AWS_ENDPOINT_URL`, `AWS_ALLOW_HTTP`, ...), as `obstore` and `deltalake` read them.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import timedelta
+from fnmatch import fnmatchcase
+from functools import cache
+from itertools import takewhile
+from pathlib import Path, PurePath, PurePosixPath
+from typing import Any, BinaryIO, cast
+
+import obstore
+from obstore.exceptions import BaseError, NotFoundError
+from obstore.store import S3Store
+
+__all__ = ["Bucket"]
+
+# A request that takes longer than this is tried anew: a healthy store answers one of 8 MiB within a second.
+REQUEST_S = 30.0
+CONNECT_S = 5.0
+# S3 asks clients to back off for seconds when it answers 503; what is down for longer is down.
+RETRIES = 10
+RETRY_S = 180.0
+_BUFFER_BYTES = 1 << 20  # of a reader: a Parquet footer and the pages of a small column in one request
+
+_ABSENT = (NotFoundError, FileNotFoundError)  # the client raises either
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """A bucket whose objects are read and written as files; a `Files`."""
+
+    name: str
+
+    def uri(self, key: PurePath) -> str:
+        """What a person calls the object."""
+        return f"s3://{self.name}/{key}"
+
+    def exists(self, key: PurePath) -> bool:
+        """Whether there is such an object, or any below that key."""
+        with self._as_os_errors(key):
+            try:
+                obstore.head(_store(self.name), str(key))
+            except _ABSENT:
+                return next(self.find(key, "**/*"), None) is not None
+        return True
+
+    def find(self, folder: PurePath, pattern: str) -> Iterator[PurePath]:
+        """Keys below a folder that match a pattern of as many parts; all where the pattern begins with **."""
+        parts = pattern.split("/")
+        literal = list(takewhile(lambda part: not set(part) & set("*?["), parts))
+        prefix = folder.joinpath(*literal)
+        with self._as_os_errors(prefix):
+            for page in obstore.list(_store(self.name), f"{prefix}/", chunk_size=1000):
+                for item in page:
+                    below = PurePosixPath(str(item["path"])).relative_to(folder).parts
+                    if parts[0] == "**" or (len(below) == len(parts) and all(map(fnmatchcase, below, parts))):
+                        yield folder.joinpath(*below)
+
+    @contextmanager
+    def opened(self, key: PurePath) -> Iterator[BinaryIO]:
+        """A reader of an object; only what is asked for is fetched.
+
+        Raises:
+            FileNotFoundError: no such object.
+            OSError: the store does not answer.
+        """
+        with self._as_os_errors(key):
+            reader = obstore.open_reader(_store(self.name), str(key), buffer_size=_BUFFER_BYTES)
+        yield cast("BinaryIO", io.BufferedReader(_Reader(self, key, reader), _BUFFER_BYTES))
+
+    @contextmanager
+    def replacing(self, key: PurePath) -> Iterator[BinaryIO]:
+        """A stream whose content becomes the object when the block ends; on an error the object stays as it was.
+
+        It goes through a local file, so that readers of the store see the whole object or none.
+        """
+        with tempfile.TemporaryFile() as stream:
+            yield cast("BinaryIO", stream)
+            stream.seek(0)
+            with self._as_os_errors(key):
+                obstore.put(_store(self.name), str(key), stream)
+
+    def move(self, key: PurePath, to: PurePath) -> None:
+        """Give an object another key, if it is there."""
+        with suppress(FileNotFoundError), self._as_os_errors(key):
+            obstore.rename(_store(self.name), str(key), str(to))
+
+    def delete(self, key: PurePath) -> None:
+        """Remove an object, if it is there."""
+        with suppress(FileNotFoundError), self._as_os_errors(key):
+            obstore.delete(_store(self.name), str(key))
+
+    def delta_options(self) -> dict[str, str]:
+        """The same patience for `deltalake`."""
+        return {
+            "timeout": f"{REQUEST_S:g}s",
+            "connect_timeout": f"{CONNECT_S:g}s",
+            "max_retries": str(RETRIES),
+            "retry_timeout": f"{RETRY_S:g}s",
+        }
+
+    @contextmanager
+    def in_folder(self, key: PurePath) -> Iterator[Path]:
+        """A local folder whose files are put below a key when the block ends."""
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            yield folder
+            for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+                target = key / path.relative_to(folder).as_posix()
+                with self._as_os_errors(target):
+                    obstore.put(_store(self.name), str(target), path)
+
+    @contextmanager
+    def _as_os_errors(self, key: PurePath) -> Iterator[None]:
+        """The store's errors as those of files: with a number, so that nobody takes them for damage."""
+        try:
+            yield
+        except _ABSENT as err:
+            raise FileNotFoundError(errno.ENOENT, "no such object", self.uri(key)) from err
+        except BaseError as err:
+            raise OSError(errno.EIO, str(err).splitlines()[0], self.uri(key)) from err
+
+
+class _Reader(io.RawIOBase):
+    """obstore's reader as Python and Arrow know readers."""
+
+    def __init__(self, bucket: Bucket, key: PurePath, reader: Any) -> None:
+        super().__init__()
+        self._bucket, self._key, self._reader = bucket, key, reader
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return int(self._reader.seek(offset, whence))
+
+    def tell(self) -> int:
+        return int(self._reader.tell())
+
+    def readinto(self, buffer: Any) -> int:
+        with self._bucket._as_os_errors(self._key):  # noqa: SLF001 - of this module
+            got = bytes(self._reader.read(len(buffer)))
+        buffer[: len(got)] = got
+        return len(got)
+
+
+@cache
+def _store(bucket: str) -> S3Store:
+    return S3Store(
+        bucket,
+        client_options={
+            "timeout": timedelta(seconds=REQUEST_S),
+            "connect_timeout": timedelta(seconds=CONNECT_S),
+            # Given any option, the client asks the environment for none of them.
+            "allow_http": os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true"),
+        },
+        retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRY_S)},
+    )

@@ -1,0 +1,113 @@
+"""A server that speaks S3 on loopback, in a process of its own, with faults that a test asks for.
+
+    python -m tests.makers.s3_server
+
+Prints its port. `POST /faults {"fail": N, "stall": N, "stall_s": S}` makes the next N requests of objects answer 503, the N
+after them wait; `GET /faults` says how many requests came and how many were failed or stalled.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+
+REPO = Path(__file__).resolve().parents[2]
+BUCKET = "fleet"
+
+
+class Faults:
+    """WSGI middleware in front of moto."""
+
+    def __init__(self, app):
+        self.app, self.lock = app, threading.Lock()
+        self.plan = {"fail": 0, "stall": 0, "stall_s": 0.0, "every": 1}
+        self.counts = {"requests": 0, "failed": 0, "stalled": 0}
+
+    def __call__(self, environ, start_response):
+        if environ["PATH_INFO"] == "/faults":
+            return self.control(environ, start_response)
+        with self.lock:
+            self.counts["requests"] += 1
+            hit = self.counts["requests"] % self.plan["every"] == 0
+            fail = hit and self.plan["fail"] > 0
+            stall = hit and not fail and self.plan["stall"] > 0
+            self.plan["fail"] -= fail
+            self.plan["stall"] -= stall
+            self.counts["failed"] += fail
+            self.counts["stalled"] += stall
+        if fail:
+            # The body must be read, or the connection ends before the client has sent it.
+            environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
+            start_response("503 Slow Down", [("Content-Type", "application/xml")])
+            return [b"<Error><Code>SlowDown</Code></Error>"]
+        if stall:
+            time.sleep(self.plan["stall_s"])
+        return self.app(environ, start_response)
+
+    def control(self, environ, start_response):
+        if environ["REQUEST_METHOD"] == "POST":
+            asked = json.loads(environ["wsgi.input"].read(int(environ["CONTENT_LENGTH"])))
+            self.plan |= {"every": 1} | asked
+        start_response("200 OK", [("Content-Type", "application/json")])
+        return [json.dumps(self.counts).encode()]
+
+
+def main():
+    from moto.server import DomainDispatcherApplication, create_backend_app
+    from werkzeug.serving import WSGIRequestHandler, make_server
+
+    class Quiet(WSGIRequestHandler):
+        def log_request(self, *_args):
+            """Nothing."""
+
+    app = Faults(DomainDispatcherApplication(create_backend_app))
+    server = make_server("127.0.0.1", 0, app, threaded=True, request_handler=Quiet)
+    print(server.server_port, flush=True)
+    server.serve_forever()
+
+
+class S3:
+    """A running server: where it is, and its faults."""
+
+    def __init__(self, port):
+        self.url = f"http://127.0.0.1:{port}"
+        self.environment = {
+            "AWS_ACCESS_KEY_ID": "test",
+            "AWS_SECRET_ACCESS_KEY": "test",
+            "AWS_REGION": "us-east-1",
+            "AWS_ENDPOINT_URL": self.url,
+            "AWS_ALLOW_HTTP": "true",
+        }
+
+    def faults(self, **plan):
+        """Ask for faults; the counts so far."""
+        body = json.dumps(plan).encode() if plan else None
+        with urllib.request.urlopen(urllib.request.Request(f"{self.url}/faults", body)) as answer:
+            return json.load(answer)
+
+
+@contextmanager
+def running():
+    """A server with an empty bucket, gone when the block ends."""
+    environment = os.environ | {"PYTHONPATH": str(REPO), "AWS_EC2_METADATA_DISABLED": "true"}
+    command = [sys.executable, "-m", "tests.makers.s3_server"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment
+    )
+    try:
+        s3 = S3(int(process.stdout.readline()))
+        urllib.request.urlopen(urllib.request.Request(f"{s3.url}/{BUCKET}", method="PUT")).close()
+        yield s3
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+if __name__ == "__main__":
+    main()
