@@ -47,6 +47,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "report": ("jobs.report:report", "HTML pages of vehicle-days and of the fleet."),
     "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),
     "status": ("jobs.status:status", "What is done, held, refused, failed or missing, and why."),
+    "gc": ("jobs.gc:gc", "Take images, and pages that show them, out of a lake after their time."),
     "export": (
         "jobs.export:export",
         "Write the tables' contracts as JSON Schema, or a trained network as ONNX.",

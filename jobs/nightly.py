@@ -30,6 +30,7 @@ def nightly(
     method: str | None = None,
     seed: int | None = None,
     report: Path | None = None,
+    pictures: bool = True,
     dry_run: bool = False,
 ) -> int:
     """Take every vehicle-day of a pattern through all stages; one bad day never stops the fleet.
@@ -45,6 +46,7 @@ def nightly(
         method: calibration method; default: audit.method, so that calibration and charts agree.
         seed: of everything random; the configuration's where left out.
         report: HTML page of the fleet; default: report/fleet.html inside the lake.
+        pictures: --no-pictures draws pages without images of public roads.
         dry_run: only say what would run, and why.
     """
     from jobs.terminal.summary import exit_code, left_out, print_summary
@@ -62,7 +64,7 @@ def nightly(
     if dry_run:
         return _print_plan(night, days)
     outcomes = watch_night(night, days, executor, workers)
-    findings, pages = _closed(night, to_day, report) if outcomes else ([], [])
+    findings, pages = _closed(night, to_day, report, pictures=pictures) if outcomes else ([], [])
     tidy(tables)
     code = exit_code([o.status for o in outcomes])
     print_summary(
@@ -79,13 +81,15 @@ def nightly(
     return code
 
 
-def _closed(night: Night, to_day: str | None, report: Path | None) -> tuple[list[DriftFinding], list[str]]:
+def _closed(
+    night: Night, to_day: str | None, report: Path | None, *, pictures: bool
+) -> tuple[list[DriftFinding], list[str]]:
     """`close_night`, with the pages in the lake where no other place is given."""
     if report is not None:
-        return close_night(night, to_day, report)
+        return close_night(night, to_day, report, pictures=pictures)
     files, place = night.lake.files, night.lake.root / "report"
     with files.in_folder(place) as folder:
-        findings, pages = close_night(night, to_day, folder / "fleet.html")
+        findings, pages = close_night(night, to_day, folder / "fleet.html", pictures=pictures)
     return findings, [files.uri(place / Path(p).relative_to(folder)) for p in pages]
 
 
@@ -143,7 +147,7 @@ def watch_night(
 
 
 def close_night(
-    night: Night, to_day: str | None, report: Path, truth: Any = None
+    night: Night, to_day: str | None, report: Path, truth: Any = None, *, pictures: bool = True
 ) -> tuple[list[DriftFinding], list[str]]:
     """Audit the fleet and write its pages; returns the findings and the pages, the fleet's first.
 
@@ -161,7 +165,7 @@ def close_night(
         return [], []
     with progress_reporter("report") as progress:
         progress(0, 0, "pages")
-        task = Task(night.fleet, night.lake, Window(), night.method, given=Pages(report, truth))
+        task = Task(night.fleet, night.lake, Window(), night.method, given=Pages(report, truth, pictures))
         pages = REPORT.run(task).outputs
     return findings, pages
 

@@ -17,6 +17,7 @@ def report(
     method: str | None = None,
     truth: Path | None = None,
     picture: Path | None = None,
+    pictures: bool = True,
 ) -> int:
     """Write self-contained HTML: one day with --vehicle and --day, else the fleet with all its days.
 
@@ -30,6 +31,7 @@ def report(
         truth: JSON with the true extrinsics of a simulated fleet, shown beside the estimates.
         picture: also write the day's richest frame to a file: .jpg or .png is a still, its left half at the prior, its
             right half at the result; .webp or .gif moves from one to the other. Needs --vehicle and --day.
+        pictures: --no-pictures draws pages without images of public roads.
     """
     from jobs.terminal.summary import print_summary
     from pipeline.config import load_fleet
@@ -46,7 +48,7 @@ def report(
         raise ConfigError("command line", "picture", "a picture is of one day: give --vehicle and --day")
     config, tables = load_fleet(fleet), Lake.at(lake)
     of = Partition(vehicle, day) if vehicle is not None and day is not None else Window()
-    pages = Pages(out, read_truth(truth) if truth is not None else None)
+    pages = Pages(out, read_truth(truth) if truth is not None else None, pictures)
     outcome = REPORT.run(Task(config, tables, of, method, given=pages))
     outputs = [*outcome.outputs]
     if picture is not None and isinstance(of, Partition):

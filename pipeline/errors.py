@@ -6,6 +6,7 @@ from typing import Any
 
 __all__ = [
     "BoresightError",
+    "CollectedError",
     "ConfigError",
     "ContractError",
     "DamagedError",
@@ -64,6 +65,13 @@ class DamagedError(ContractError):
 
     def __init__(self, path: str, problem: str) -> None:
         super().__init__(path, f"is damaged, make it anew: {problem}")
+
+
+class CollectedError(DamagedError):
+    """A partition whose rows left the lake after their time; out of the way, they are made anew from the logs."""
+
+    def __init__(self, path: str, day: str) -> None:
+        ContractError.__init__(self, path, f"its rows left the lake on {day}: ingest the day's logs again")
 
 
 class MissingExtraError(BoresightError):

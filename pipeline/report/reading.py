@@ -13,7 +13,7 @@ from pipeline.report.scenes import choose_frames
 from pipeline.store.current import current_drift, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import last_day, read_records
-from pipeline.store.tables import iterate_rows, read_manifest
+from pipeline.store.tables import COLLECTED, iterate_rows, read_manifest
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
@@ -94,7 +94,8 @@ def states_of(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics, Ext
 
 def has_frames(lake: Lake, partition: Partition) -> bool:
     """Whether the lake still holds what pictures are drawn from."""
-    return all(read_manifest(lake, table, partition) is not None for table in (FRAMES, OBSERVATIONS))
+    found = [read_manifest(lake, table, partition) for table in (FRAMES, OBSERVATIONS)]
+    return all(manifest is not None and COLLECTED not in manifest.extra for manifest in found)
 
 
 def spread_observations(lake: Lake, partition: Partition) -> list[Observation]:

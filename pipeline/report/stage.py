@@ -47,10 +47,17 @@ _CHARTS = 24  # vehicles without an alarm whose charts still go on the fleet pag
 
 @dataclass(frozen=True)
 class Pages:
-    """What a task of this stage is given: the HTML file to write, and the truth of a simulated fleet."""
+    """What a task of this stage is given.
+
+    Args:
+        out: the HTML file to write.
+        truth: of a simulated fleet.
+        pictures: False = pages without images of public roads.
+    """
 
     out: Path
     truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]] | None = None
+    pictures: bool = True
 
 
 def work(task: Task) -> Work:
@@ -60,10 +67,18 @@ def work(task: Task) -> Work:
 
     def rows(run: Run) -> Generator[Path, None, None]:
         if isinstance(task.of, Partition):
-            yield write_day_page(task.lake, task.of, task.fleet, pages.out, task.method)
+            yield write_day_page(
+                task.lake, task.of, task.fleet, pages.out, task.method, pictures=pages.pictures
+            )
         else:
             yield from write_fleet_report(
-                task.lake, task.fleet, pages.out, task.method, truth=pages.truth, progress=run.progress
+                task.lake,
+                task.fleet,
+                pages.out,
+                task.method,
+                truth=pages.truth,
+                pictures=pages.pictures,
+                progress=run.progress,
             )
 
     return Work(settings, rows, inputs=())
@@ -77,6 +92,7 @@ def write_day_page(
     method: str | None = None,
     *,
     fleet_link: str = "",
+    pictures: bool = True,
 ) -> Path:
     """Write the page of one vehicle-day.
 
@@ -87,6 +103,7 @@ def write_day_page(
         out: the HTML file.
         method: None = `fleet.audit.method`.
         fleet_link: relative link to the fleet page; empty = none.
+        pictures: False = none, and none of what is drawn from frames.
 
     Raises:
         ConfigError: the day has no record of the method.
@@ -98,7 +115,11 @@ def write_day_page(
     before, after = states_of(records) or (None, None)
     labels = ("prior", _after_label(views))
     offsets = time_offsets_of(records)
-    pictures, residual_svg, no_pictures = _pictures(lake, partition, before, after, labels, offsets)
+    drawn, residual_svg, no_pictures = (
+        _pictures(lake, partition, before, after, labels, offsets)
+        if pictures
+        else ([], "", "this page was asked for without pictures")
+    )
     html = render(
         "day.html",
         vehicle=partition.vehicle,
@@ -111,7 +132,7 @@ def write_day_page(
         drift=status_sentence(findings),
         pairs=views,
         labels=labels,
-        scenes=pictures,
+        scenes=drawn,
         no_pictures=no_pictures,
         offsets=offsets.in_words(),
         sigma_svg=_sigma_svg(records),
@@ -205,6 +226,7 @@ def write_fleet_report(
     method: str | None = None,
     *,
     truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]] | None = None,
+    pictures: bool = True,
     progress: Progress = silent,
 ) -> list[Path]:
     """Write the fleet page and, in a folder beside it, the page of every vehicle-day; the fleet page comes first."""
@@ -218,7 +240,8 @@ def write_fleet_report(
         progress(done, len(partitions), f"{partition.vehicle} {partition.day}")
         name = f"{re.sub(r'[^A-Za-z0-9._-]', '_', partition.vehicle)}_{partition.day}.html"
         path = folder / name
-        pages.append(write_day_page(lake, partition, fleet, path, method, fleet_link=f"../{quote(out.name)}"))
+        link = f"../{quote(out.name)}"
+        pages.append(write_day_page(lake, partition, fleet, path, method, fleet_link=link, pictures=pictures))
         links[(partition.vehicle, partition.day)] = f"{quote(folder.name)}/{quote(name)}"
     return [write_fleet_page(lake, fleet, out, method, truth=truth, links=links), *pages]
 

@@ -44,6 +44,10 @@ class Files(Protocol):
         """Remove a file, if it is there."""
         ...
 
+    def size(self, path: PurePath) -> int:
+        """Bytes of a file; 0 where there is none."""
+        ...
+
     def in_folder(self, path: PurePath) -> AbstractContextManager[Path]:
         """A local folder whose files are below `path` when the block ends."""
         ...
@@ -90,6 +94,10 @@ class LocalFiles:
     def delete(self, path: PurePath) -> None:
         """Remove a file, if it is there."""
         Path(path).unlink(missing_ok=True)
+
+    def size(self, path: PurePath) -> int:
+        """Bytes of a file; 0 where there is none."""
+        return Path(path).stat().st_size if Path(path).is_file() else 0
 
     @contextmanager
     def in_folder(self, path: PurePath) -> Iterator[Path]:

@@ -102,6 +102,12 @@ class Bucket:
         with suppress(FileNotFoundError), self._as_os_errors(key):
             obstore.delete(_store(self.name), str(key))
 
+    def size(self, key: PurePath) -> int:
+        """Bytes of an object; 0 where there is none."""
+        with suppress(FileNotFoundError), self._as_os_errors(key):
+            return int(obstore.head(_store(self.name), str(key))["size"])
+        return 0
+
     def delta_options(self) -> dict[str, str]:
         """The same patience for `deltalake`."""
         return {

@@ -9,10 +9,10 @@ from typing import Any, TypeVar
 
 import pyarrow.parquet as pq
 
-from pipeline.errors import ContractError
+from pipeline.errors import CollectedError, ContractError
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table
-from pipeline.store.tables import naming_damage, read_manifest
+from pipeline.store.tables import COLLECTED, naming_damage, read_manifest
 from schemas.columns import TableSchema
 
 __all__ = ["RowGroup", "read_columns", "read_group", "row_groups"]
@@ -71,6 +71,9 @@ def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[
 
 def _checked(lake: Lake, schema: TableSchema, partition: Partition) -> PurePath:
     path = lake.file(schema.name, partition)
-    if read_manifest(lake, schema, partition) is None:
+    manifest = read_manifest(lake, schema, partition)
+    if manifest is None:
         raise ContractError(str(path), f"table {schema.name} has no such partition")
+    if COLLECTED in manifest.extra:
+        raise CollectedError(str(path), manifest.extra[COLLECTED])
     return path

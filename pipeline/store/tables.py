@@ -12,13 +12,14 @@ from typing import Any, TypeVar
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.errors import ContractError, DamagedError
+from pipeline.errors import CollectedError, ContractError, DamagedError
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records, write_records
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
 
 __all__ = [
+    "COLLECTED",
     "Manifest",
     "PartitionWriter",
     "iterate_rows",
@@ -26,12 +27,14 @@ __all__ = [
     "read_manifest",
     "read_records",
     "read_rows",
+    "write_manifest",
     "write_partition",
     "write_records",
 ]
 
 Row = TypeVar("Row")
 _KEY = b"boresight"
+COLLECTED = "collected"  # among a manifest's extra: the day on which the partition's rows left the lake
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,12 @@ def write_partition(
         parquet.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
 
 
+def write_manifest(lake: Lake, schema: TableSchema, partition: Partition, manifest: Manifest) -> None:
+    """Replace a partition by its manifest alone."""
+    with _replacing(lake, lake.file(schema.name, partition), schema) as parquet:
+        parquet.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
+
+
 def read_manifest(lake: Lake, schema: TableSchema, partition: Partition) -> Manifest | None:
     """Manifest of a partition, None where there is no such partition."""
     path = lake.file(schema.name, partition)
@@ -119,11 +128,15 @@ def iterate_rows(
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
         DamagedError: its file cannot be read.
+        CollectedError: its rows left the lake after their time.
     """
     path = lake.file(schema.name, partition)
-    if read_manifest(lake, schema, partition) is None:
+    manifest = read_manifest(lake, schema, partition)
+    if manifest is None:
         problem = f"table {schema.name} has no partition for {partition.vehicle} on {partition.day}"
         raise ContractError(str(path), problem)
+    if COLLECTED in manifest.extra:
+        raise CollectedError(str(path), manifest.extra[COLLECTED])
     wanted = None if rows is None else set(rows)
     with lake.files.opened(path) as stream, pq.ParquetFile(stream) as file:
         first = 0

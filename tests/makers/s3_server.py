@@ -2,8 +2,8 @@
 
     python -m tests.makers.s3_server
 
-Prints its port. `POST /faults {"fail": N, "stall": N, "stall_s": S}` makes the next N requests of objects answer 503, the N
-after them wait; `GET /faults` says how many requests came and how many were failed or stalled.
+Prints its port. `POST /faults {"fail": N, "stall": N, "stall_s": S}` makes the next N requests answer 503, the N after
+them wait; `GET /faults` says how many requests came and how many were failed or stalled.
 """
 
 import json

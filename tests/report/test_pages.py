@@ -138,6 +138,16 @@ def test_a_day_page_answers_first_whether_its_numbers_can_be_trusted(
     assert body.index("answer") < body.index("axis by axis") < body.index("Provenance")
 
 
+def test_a_page_that_is_asked_for_without_pictures_has_none_and_says_so(fleet, tmp_path: Path) -> None:
+    lake = fleet[0]
+    shown = write_day_page(lake, Partition("b", "2026-03-01"), _config(), tmp_path / "a.html").read_text()
+    page = write_day_page(lake, Partition("b", "2026-03-01"), _config(), tmp_path / "b.html", pictures=False)
+    text = page.read_text()
+    assert "without pictures" in text
+    assert "data:image" not in text
+    assert "without pictures" not in shown
+
+
 def test_a_held_day_after_a_move_says_that_nothing_is_safe(maker: ModuleType, tmp_path: Path) -> None:
     lake = Lake.at(tmp_path / "lake")
     records = maker.vehicle_records(

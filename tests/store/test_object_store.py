@@ -47,6 +47,7 @@ def s3(server, monkeypatch):
 
 @pytest.fixture
 def lake(s3, request):
+    assert s3.url  # its environment comes first
     return Lake.at(f"s3://{BUCKET}/lakes/{abs(hash(request.node.name))}")
 
 
@@ -105,7 +106,7 @@ def test_an_error_while_writing_leaves_the_old_partition_and_nothing_else(lake, 
     assert objects(lake) == before
 
 
-def test_only_what_is_asked_for_is_fetched(lake, rng, s3):
+def test_only_what_is_asked_for_is_fetched(lake, rng):
     write(lake, [make_row("frames", rng, image=rng.bytes(3 << 20)) for _ in range(8)])
     fetched = []
     real = pipeline.store.object_store._Reader.readinto
@@ -154,7 +155,7 @@ def test_records_are_committed_once_asserted_compacted_and_healed(lake, rng):
     assert len(read(Lake.at(str(lake)))) == 10
 
 
-def test_other_engines_read_the_bucket_by_the_documented_lines(lake, rng, s3):
+def test_other_engines_read_the_bucket_by_the_documented_lines(lake, rng):
     commit_records(lake, CALIBRATIONS, [record(rng, "k")])
     where = lake.table("calibrations")
     records = DeltaTable(where).to_pyarrow_table()  # noqa: F841 - DuckDB finds it by its name
@@ -208,7 +209,7 @@ for i in range(4):
 """
 
 
-def test_two_writers_at_once_both_get_their_records_in(lake, s3):
+def test_two_writers_at_once_both_get_their_records_in(lake):
     environment = os.environ | {"PYTHONPATH": str(REPO)}
     commands = [[sys.executable, "-c", _COMMITS, str(lake), name] for name in "ab"]
     writers = [subprocess.Popen(command, env=environment) for command in commands]
@@ -225,6 +226,6 @@ def test_a_place_that_is_no_folder_and_no_prefix_of_a_bucket_is_a_usage_error(pl
         Lake.at(place)
 
 
-def test_what_works_on_folders_only_says_so(s3):
+def test_what_works_on_folders_only_says_so():
     with pytest.raises(ConfigError, match="is no folder"):
         _ = Lake.at(f"s3://{BUCKET}/lake").local_root

@@ -1,0 +1,82 @@
+"""What leaves a lake after a time: frames, with their images of public roads. Records stay."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from pipeline.errors import ContractError
+from pipeline.store.partitions import Lake, Partition, is_day
+from pipeline.store.tables import COLLECTED, read_manifest, write_manifest
+from schemas.columns import TableSchema
+
+__all__ = ["Collected", "collect", "collect_pages", "first_day_kept"]
+
+
+@dataclass(frozen=True)
+class Collected:
+    """A partition whose rows left the lake, and how many bytes that gave back."""
+
+    partition: Partition
+    freed_bytes: int
+
+
+def collect(
+    lake: Lake, schema: TableSchema, before: str, today: str, *, dry_run: bool = False
+) -> Iterator[Collected]:
+    """Take the rows of partitions of days before `before` out of the lake.
+
+    The manifest stays, so that the same logs are not taken for new ones: who needs the rows gets an error that says
+    when they left, and a night that is given the logs again makes them anew. Damaged files go as a whole.
+
+    Args:
+        lake: where the tables are.
+        schema: of a table of partitions.
+        before: first day that stays, YYYY-MM-DD.
+        today: written down as the day on which they left.
+        dry_run: only say what would go.
+    """
+    for partition in lake.partitions(schema.name):
+        if partition.day >= before:
+            continue
+        path = lake.file(schema.name, partition)
+        try:
+            manifest = read_manifest(lake, schema, partition)
+        except (
+            ContractError
+        ) as err:  # of another release, or damaged: nothing is known of it that would have to stay
+            lake.damage.append(str(err))
+            size = lake.files.size(path)
+            if not dry_run:
+                lake.files.delete(path)
+            yield Collected(partition, size)
+            continue
+        if manifest is None or COLLECTED in manifest.extra:
+            continue
+        size = lake.files.size(path)
+        if not dry_run:
+            write_manifest(
+                lake, schema, partition, replace(manifest, extra=manifest.extra | {COLLECTED: today})
+            )
+        yield Collected(partition, size)
+    for aside in lake.files.find(lake.root / schema.name, "vehicle=*/day=*/*.damaged"):
+        if aside.parent.name.removeprefix("day=") < before and not dry_run:
+            lake.files.delete(aside)
+
+
+def collect_pages(lake: Lake, before: str, *, dry_run: bool = False) -> list[str]:
+    """Remove pages of vehicle-days before `before` from the lake's reports; returns what they were called."""
+    gone = []
+    for page in lake.files.find(lake.root / "report", "*_days/*.html"):
+        day = page.stem[-len("YYYY-MM-DD") :]
+        if is_day(day) and day < before:
+            gone.append(page.name)
+            if not dry_run:
+                lake.files.delete(page)
+    return gone
+
+
+def first_day_kept(today: dt.date, days: int) -> str:
+    """The first day that stays where `days` days are kept, today among them."""
+    return (today - dt.timedelta(days=days - 1)).isoformat()

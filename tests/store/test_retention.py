@@ -1,0 +1,118 @@
+"""Images leave the lake after their time; what rests on them stays, and the same logs are not taken for new ones."""
+
+import datetime as dt
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jobs.gc import gc
+from pipeline.config import load_fleet
+from pipeline.errors import CollectedError, ConfigError
+from pipeline.report.reading import has_frames
+from pipeline.runner import Stage
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.retention import collect, first_day_kept
+from pipeline.store.row_groups import read_columns
+from pipeline.store.tables import read_manifest, read_rows, write_partition
+from pipeline.work import Task, Work
+from schemas.frames import FRAMES, Frame
+from schemas.observations import OBSERVATIONS
+from tests.makers.fleet_files import fleet_toml
+from tests.makers.table_rows import make_row
+
+OLD, NEW = Partition("car", "2026-03-02"), Partition("car", "2026-03-20")
+
+
+@pytest.fixture
+def lake(tmp_path):
+    lake, rng = Lake.at(tmp_path / "lake"), np.random.default_rng(0)
+    for partition in (OLD, NEW):
+        for schema in (FRAMES, OBSERVATIONS):
+            with write_partition(lake, schema, partition, "key", "0", ["in"]) as writer:
+                writer.append([make_row(schema.name, rng, free=400) for _ in range(3)])
+                writer.describe(kept={"frames": 3}, rejected={"dark": 1})
+    return lake
+
+
+def frames_before(lake, day="2026-03-10", **options):
+    return list(collect(lake, FRAMES, day, "2026-04-01", **options))
+
+
+def test_old_frames_leave_with_their_bytes_and_nothing_else_does(lake):
+    size = lake.file("frames", OLD).stat().st_size
+    [gone] = frames_before(lake)
+    assert (gone.partition, gone.freed_bytes) == (OLD, size)
+    assert lake.file("frames", OLD).stat().st_size < size
+    with pytest.raises(CollectedError, match=r"left the lake on 2026-04-01: ingest the day's logs again"):
+        read_rows(lake, FRAMES, OLD, Frame)
+    with pytest.raises(CollectedError):
+        read_columns(lake, FRAMES, OLD, ["frame_index"])
+    assert len(read_rows(lake, FRAMES, NEW, Frame)) == 3
+    manifest = read_manifest(lake, FRAMES, OLD)
+    assert (manifest.rows, manifest.work_key, manifest.kept) == (3, "key", {"frames": 3})
+    assert read_manifest(lake, OBSERVATIONS, OLD).extra == {}
+    assert not has_frames(lake, OLD)
+    assert has_frames(lake, NEW)
+    assert frames_before(lake) == []
+
+
+def test_a_dry_run_says_what_would_go_and_takes_nothing(lake):
+    assert [c.partition for c in frames_before(lake, dry_run=True)] == [OLD]
+    assert len(read_rows(lake, FRAMES, OLD, Frame)) == 3
+
+
+def test_damaged_files_go_as_a_whole_after_the_same_time(lake):
+    path = lake.file("frames", OLD)
+    path.write_bytes(path.read_bytes()[:50])
+    aside = path.parent / "part-0.parquet.damaged"
+    aside.write_bytes(b"x")
+    frames_before(lake)
+    assert not path.exists()
+    assert not aside.exists()
+    assert "damaged" in lake.damage[0]
+
+
+def test_the_same_logs_are_up_to_date_after_their_images_left(lake, tmp_path, monkeypatch):
+    (tmp_path / "fleet.toml").write_text(fleet_toml("car"))
+    task = Task(load_fleet(tmp_path / "fleet.toml"), lake, OLD)
+    rng = np.random.default_rng(1)
+    made = Work(({"a": 1},), lambda _run: (make_row("frames", rng) for _ in range(2)))
+    monkeypatch.setattr(Stage, "load", lambda _: lambda _task: replace(made))
+    stage = Stage("ingest", (), (FRAMES,), "")
+    done = stage.run(task)
+    frames_before(lake)
+    cached = stage.run(task)
+    assert (cached.status, cached.rows, cached.kept) == ("cached", 2, done.kept)
+
+
+def test_the_command_takes_images_and_pages_and_says_how_much(lake, capsys):
+    today = dt.datetime.now(dt.UTC).date()
+    recent = first_day_kept(today, 30)
+    pages = lake.root / "report" / "fleet_days"
+    pages.mkdir(parents=True)
+    for name in ("car_2026-03-02.html", f"car_{recent}.html", "index.html"):
+        (pages / name).touch()
+    assert gc(lake=str(lake.root), dry_run=True) == 0
+    planned = json.loads(capsys.readouterr().out)
+    assert gc(lake=str(lake.root)) == 0
+    done = json.loads(capsys.readouterr().out)
+    assert (planned["status"], done["status"]) == ("planned", "done")
+    assert {k: planned[k] for k in ("partitions", "freed_bytes", "pages")} == {
+        k: done[k] for k in ("partitions", "freed_bytes", "pages")
+    }
+    assert (done["partitions"], done["pages"]) == ({"frames": 2}, 1)
+    assert done["freed_bytes"] > 0
+    assert sorted(p.name for p in pages.iterdir()) == [f"car_{recent}.html", "index.html"]
+    assert gc(lake=str(lake.root), observations_days=1) == 0
+    assert json.loads(capsys.readouterr().out)["partitions"] == {"frames": 0, "observations": 2}
+    with pytest.raises(ConfigError, match="images-days"):
+        gc(lake=str(lake.root), images_days=0)
+    with pytest.raises(ConfigError, match="no such folder"):
+        gc(lake=str(lake.root / "x"))
+
+
+def test_a_month_kept_is_thirty_days_with_today():
+    assert first_day_kept(dt.date(2026, 3, 31), 30) == "2026-03-02"
+    assert first_day_kept(dt.date(2026, 3, 31), 1) == "2026-03-31"
