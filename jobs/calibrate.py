@@ -45,6 +45,7 @@ def calibrate(
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
+    from pipeline.extrinsics.prior import require_named_files
     from pipeline.store.partitions import Lake, Partition
     from pipeline.work import Task
 
@@ -54,6 +55,7 @@ def calibrate(
         )
     method_named(method)
     config = load_fleet(fleet)
+    require_named_files(config)
     if polish:
         config = config.changed(solve={"polish": True})
     task = Task(config, Lake.at(lake), Partition(vehicle, day), method, seed, parse_perturb(perturb))

@@ -28,10 +28,12 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
     from jobs.terminal.summary import print_json, print_summary, progress_reporter
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
+    from pipeline.extrinsics.prior import require_named_files
     from pipeline.ingest.check import check_logs
     from pipeline.perceive.models.source import check_models
 
     config = load_fleet(fleet)
+    require_named_files(config)
     name = rig or (next(iter(config.rigs)) if len(config.rigs) == 1 else "default")
     if name not in config.rigs:
         raise ConfigError(

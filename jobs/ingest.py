@@ -20,6 +20,7 @@ def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
+    from pipeline.extrinsics.prior import require_named_files
     from pipeline.stages import INGEST
     from pipeline.store.partitions import Lake, Partition
     from pipeline.work import Task
@@ -27,6 +28,7 @@ def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the day")
     config = load_fleet(fleet)
+    require_named_files(config)
     with progress_reporter(f"ingest {vehicle} {day}") as progress:
         task = Task(config, Lake.at(lake), Partition(vehicle, day), logs=logs, progress=progress)
         outcome = INGEST.run(task)

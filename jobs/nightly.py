@@ -53,11 +53,13 @@ def nightly(
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
+    from pipeline.extrinsics.prior import require_named_files
     from pipeline.fleet.nightly import Night
     from pipeline.fleet.pattern import find_vehicle_days
     from pipeline.store.partitions import Lake
 
     config = load_fleet(fleet)
+    require_named_files(config)
     tables = Lake.at(lake)
     night = Night(config, tables, method_named(method or config.audit.method).name, seed)
     days = find_vehicle_days(logs, from_day, to_day)

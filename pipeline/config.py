@@ -6,6 +6,7 @@ import difflib
 import hashlib
 import json
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
@@ -19,7 +20,8 @@ from pydantic import (
 )
 
 from pipeline.errors import ConfigError
-from pipeline.rigs import Positive, Rig, Section
+from pipeline.names import is_vehicle
+from pipeline.rigs import OnnxSemantics, Positive, Rig, Section
 from schemas.calibrations import METHODS
 
 __all__ = [
@@ -88,7 +90,7 @@ class IngestConfig(Section):
 class PerceiveConfig(Section):
     """Feature extraction."""
 
-    label_scale: Annotated[float, Field(gt=0, le=1)] = 0.5
+    label_scale: Annotated[float, Field(ge=0.05, le=1)] = 0.5  # below it nothing is left of a car's image
     voxel_m: Positive = 0.25
     cluster_eps_m: Positive = 0.7
     cluster_min_points: Annotated[int, Field(gt=1)] = 8
@@ -175,7 +177,7 @@ class PrepareConfig(Section):
     duplicate_bits: Annotated[int, Field(ge=0, le=128)] = (
         16  # of 256 fingerprint bits: fewer differ = same view
     )
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
     def _splits_make_sense(self) -> PrepareConfig:
@@ -257,7 +259,9 @@ class AuditConfig(Section):
     reference_days: Annotated[int, Field(gt=1)] = (
         10  # first accepted days that tonight is held against, for good
     )
-    window_days: Annotated[int, Field(gt=2)] = 28  # audited days where the command names no first day
+    window_days: Annotated[int, Field(gt=2, le=3660)] = (
+        28  # audited days where the command names no first day
+    )
     camera_lidar_limit_deg: Positive = 0.1
     radar_limit_deg: Positive = 0.25
     translation_limit_m: Positive = 0.05
@@ -283,6 +287,10 @@ class FleetConfig(Section):
     @model_validator(mode="after")
     def _vehicles_name_known_rigs(self) -> FleetConfig:
         for name, vehicle in self.vehicles.items():
+            if not is_vehicle(name):
+                raise ValueError(
+                    f"{name!r} cannot be a vehicle's name: it names folders, so no / or =, and not as long"
+                )
             if vehicle.rig not in self.rigs:
                 raise ValueError(
                     f"vehicles.{name}.rig = {vehicle.rig!r}, but rigs has only {sorted(self.rigs)}"
@@ -293,6 +301,32 @@ class FleetConfig(Section):
     def file(self) -> Path:
         """The file that this was read from; "fleet.toml" of the working folder where it came from no file."""
         return self._file
+
+    def require_files(self) -> None:
+        """Raise ConfigError, naming the key, for the first file that the vehicles' rigs or [learn] name and is missing.
+
+        For commands that read logs: before the first one is opened, not after a night.
+        """
+        for key, name in self._named_files():
+            if not self.path_of(name).is_file():
+                raise ConfigError(str(self._file), key, f"no such file: {self.path_of(name)}")
+
+    def _named_files(self) -> Iterator[tuple[str, str]]:
+        for name in sorted({v.rig for v in self.vehicles.values()}):
+            rig, key = self.rigs[name], f"rigs.{name}"
+            if isinstance(rig.camera.semantics, OnnxSemantics):
+                yield f"{key}.camera.semantics.segmenter", rig.camera.semantics.segmenter
+                yield f"{key}.camera.semantics.detector", rig.camera.semantics.detector
+            if rig.lidar.semantics is not None:
+                yield f"{key}.lidar.semantics.segmenter", rig.lidar.semantics.segmenter
+            if rig.radar.drivable is not None:
+                yield f"{key}.radar.drivable.model", rig.radar.drivable.model
+            if rig.prior.file is not None:
+                yield f"{key}.prior.file", rig.prior.file
+        if self.learn.model is not None:
+            yield "learn.model", self.learn.model
+        for pair, model in self.learn.pairwise_models.items():
+            yield f"learn.pairwise_models.{pair}", model
 
     def path_of(self, name: str) -> Path:
         """A path that the file names: relative to the file's folder unless absolute."""

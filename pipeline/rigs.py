@@ -138,3 +138,14 @@ class Rig(Section):
     radar: RadarTopics
     ego: EgoTopics | None = None
     prior: PriorConfig = PriorConfig()
+
+    @model_validator(mode="after")
+    def _topics_differ(self) -> Rig:
+        semantics = self.camera.semantics
+        topics = [self.camera.image, self.camera.info, self.lidar.points, self.radar.points]
+        topics += [semantics.labels, semantics.detections] if isinstance(semantics, TopicSemantics) else []
+        topics += [] if self.ego is None else [self.ego.odometry]
+        twice = sorted({topic for topic in topics if topics.count(topic) > 1})
+        if twice:
+            raise ValueError(f"one topic stands for two things: {', '.join(twice)}")
+        return self

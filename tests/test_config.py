@@ -1,10 +1,13 @@
+import json
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.config import config_hash, load_fleet
 from pipeline.errors import ConfigError
+from pipeline.extrinsics.prior import require_named_files
 from pipeline.rigs import PriorConfig
 from tests.makers.fleet_files import fleet_toml
 
@@ -41,6 +44,17 @@ def test_a_small_file_is_enough_and_defaults_are_physical(tmp_path):
         (("[fleet]", "[select]\nholdout_fraction = 1.0\n[fleet]"), "select.holdout_fraction"),
         (("[fleet]", "[rigs.default.prior]\nsource = 'file'\n[fleet]"), "prior"),
         (('name = "tests"', ""), "fleet.name"),
+        (("[fleet]", "[audit]\nmethod = 'best'\n[fleet]"), "audit.method"),
+        (("[fleet]", "[audit]\nwindow_days = 1_000_000_000\n[fleet]"), "audit.window_days"),
+        (("[fleet]", "[perceive]\nlabel_scale = 1e-9\n[fleet]"), "perceive.label_scale"),
+        (("[fleet]", "[solve]\nseed = -1\n[fleet]"), "solve.seed"),
+        (("[fleet]", "[prepare]\nseed = -1\n[fleet]"), "prepare.seed"),
+        (('points = "/radar/points"', 'points = "/lidar/points"'), "/lidar/points"),
+        (('[vehicles."car-1"]', '[vehicles."a/b"]'), "a/b"),
+        (('[vehicles."car-1"]', '[vehicles."a=b"]'), "a=b"),
+        (('[vehicles."car-1"]', '[vehicles.""]'), "vehicle's name"),
+        (('[vehicles."car-1"]', '[vehicles."../../etc"]'), "../../etc"),
+        (('[vehicles."car-1"]', f'[vehicles."{300 * "v"}"]'), "vehicle's name"),
     ],
 )
 def test_what_cannot_be_right_is_refused_by_the_name_of_its_key(change, key, tmp_path):
@@ -138,3 +152,35 @@ def test_what_calibration_takes_as_known_of_a_camera_is_no_reason_to_ingest_its_
     assert plain.model_dump() == rolling.model_dump()
     with pytest.raises(ConfigError, match="readout_s"):
         load(tmp_path, GOOD.replace(info, f"{info}\nreadout_s = 30", 1))
+
+
+@pytest.mark.parametrize(
+    ("section", "key"),
+    [
+        ('[rigs.default.prior]\nsource = "file"\nfile = "prior.json"', "rigs.default.prior.file"),
+        (
+            '[rigs.default.lidar.semantics]\nsource = "onnx"\nsegmenter = "points.toml"',
+            "lidar.semantics.segmenter",
+        ),
+        ('[rigs.default.radar.drivable]\nsource = "onnx"\nmodel = "drivable.toml"', "radar.drivable.model"),
+        ('[learn]\nmodel = "network.onnx"', "learn.model"),
+        ('[learn.pairwise_models]\ncamera_lidar = "pair.onnx"', "learn.pairwise_models.camera_lidar"),
+    ],
+)
+def test_a_file_that_the_configuration_names_is_missed_before_any_log_is_opened(section, key, tmp_path):
+    fleet = load(tmp_path, f"{GOOD}\n{section}\n")
+    with pytest.raises(ConfigError, match="no such file") as caught:
+        require_named_files(fleet)
+    assert key in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_a_prior_that_is_not_finite_is_refused_before_any_log_is_opened(tmp_path):
+    fleet = load(tmp_path, f'{GOOD}\n[rigs.default.prior]\nsource = "file"\nfile = "prior.json"\n')
+    T = np.eye(4).tolist()
+    (tmp_path / "prior.json").write_text(json.dumps({"T_camera_lidar": T, "T_lidar_radar": T}))
+    require_named_files(fleet)
+    T[0][3] = float("nan")
+    (tmp_path / "prior.json").write_text(json.dumps({"T_camera_lidar": T, "T_lidar_radar": T}))
+    with pytest.raises(ConfigError, match="not finite"):
+        require_named_files(fleet)

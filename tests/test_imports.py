@@ -15,7 +15,18 @@ from schemas.versions import TABLES
 
 REPO = Path(__file__).resolve().parent.parent
 LAYERS = ("schemas", "pipeline", "jobs")
-FOUNDATIONS = {"config", "errors", "results", "geometry", "store", "objective", "extrinsics", "rigs", "work"}
+FOUNDATIONS = {
+    "config",
+    "errors",
+    "names",
+    "results",
+    "geometry",
+    "store",
+    "objective",
+    "extrinsics",
+    "rigs",
+    "work",
+}
 # Folders of commands.
 ROOMS = {"ingest", "perceive", "calibrate", "evaluate", "audit", "report", "fleet", "simulate", "learn"}
 # Beside the rooms: the table of contents, which knows them all, and what runs a stage of it.

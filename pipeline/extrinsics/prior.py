@@ -18,7 +18,7 @@ from pipeline.geometry.se3 import from_quaternion, inverse, log_se3, perturb_exa
 from pipeline.rigs import PriorConfig
 from schemas.observations import Observation
 
-__all__ = ["logged_prior", "perturbed", "prior_key", "read_prior", "read_transforms"]
+__all__ = ["logged_prior", "perturbed", "prior_key", "read_prior", "read_transforms", "require_named_files"]
 
 _QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
 _SAME = 1e-6  # rad and m: tf_static repeats numbers, it does not measure
@@ -83,6 +83,18 @@ def prior_key(fleet: FleetConfig, vehicle: str) -> str:
         raise ConfigError(str(fleet.file), "prior.file", f"cannot read {path}: {err.strerror}") from err
 
 
+def require_named_files(fleet: FleetConfig) -> None:
+    """Raise ConfigError for a model or prior that the configuration names and that is missing, or a prior that is none.
+
+    For commands that read logs: before the first one is opened, not after a night.
+    """
+    fleet.require_files()
+    for rig in {v.rig for v in fleet.vehicles.values()}:
+        file = fleet.rigs[rig].prior.file
+        if file is not None:
+            read_transforms(fleet.path_of(file))
+
+
 def read_transforms(path: Path) -> dict[str, Float[np.ndarray, "4 4"]]:
     """The three transforms from a JSON file with T_camera_lidar and T_lidar_radar (or T_radar_lidar), 4x4 row-major.
 
@@ -128,6 +140,8 @@ def _rigid(path: Path, key: str, value: object) -> np.ndarray:
         T = np.array(value, np.float64)
     except (TypeError, ValueError) as err:
         raise ConfigError(str(path), key, "is no 4x4 matrix") from err
+    if not np.all(np.isfinite(T)):
+        raise ConfigError(str(path), key, "holds a number that is not finite")
     if T.shape != (4, 4) or not np.allclose(T[3], [0, 0, 0, 1]):
         raise ConfigError(str(path), key, "is no 4x4 matrix with the last row 0 0 0 1")
     R = T[:3, :3]

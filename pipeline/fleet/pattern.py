@@ -1,10 +1,17 @@
-"""Which logs belong to which vehicle-day: "logs/{vehicle}/{day}/*.mcap" against what is there."""
+"""Which logs belong to which vehicle-day: "logs/{vehicle}/{day}/*.mcap" against what is there.
+
+Paths are strings here: a fleet's night looks at a hundred thousand of them.
+"""
+
+# ruff: noqa: PTH116, PTH118, PTH120, PTH207
 
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +21,8 @@ from pipeline.store.partitions import Partition, is_day
 __all__ = ["VehicleDay", "check_day", "find_vehicle_days"]
 
 _SUFFIXES = (".mcap", ".bag", ".db3", ".zstd")
+_ROS2_FILES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")  # as `ingest` reads them from a folder
+_Owner = tuple[str, str]  # day, vehicle
 _GROUPS = {"{vehicle}": "vehicle", "{day}": "day"}
 _GROUP_PATTERNS = {"vehicle": r"[^/=]+?", "day": r"\d{4}-\d{2}-\d{2}"}
 _TOKEN = re.compile(r"\{[^{}]*\}|\*\*/|\*\*|\*|\?|\[[^\]]+\]|[^{*?\[]+|.")
@@ -35,7 +44,8 @@ def find_vehicle_days(
     Args:
         pattern: a path with {vehicle} and {day} (YYYY-MM-DD), each as often as wanted, also inside file
             names; besides *, ?, [abc] and ** as in a shell. A match is an .mcap, .bag or .db3 file, a ROS 2
-            bag folder, or a folder of such logs; other files are passed over.
+            bag folder, or a folder of such logs; other files are passed over. A bag folder is one log where all
+            of its files match for the same vehicle-day; in a folder that vehicles or days share, each file is.
         from_day: first day wanted, None = from the beginning.
         to_day: last day wanted.
 
@@ -46,17 +56,9 @@ def find_vehicle_days(
         check_day(name, day)
     if from_day and to_day and from_day > to_day:
         raise ConfigError("command line", "--from", f"{from_day} is after --to {to_day}")
-    matcher = _matcher(pattern)
-    shell = re.sub(r"\{(vehicle|day)\}", "*", pattern)
-    found: dict[tuple[str, str], set[Path]] = defaultdict(set)
-    for name in glob.iglob(shell, recursive=True, include_hidden=False):  # noqa: PTH207 - patterns may be absolute
-        match = matcher.fullmatch(name.rstrip("/"))
-        if match and is_day(match["day"]):
-            found[match["day"], match["vehicle"]].update(_logs_at(Path(name)))
     days = [
         VehicleDay(Partition(vehicle, day), tuple(sorted(logs)))
-        for (day, vehicle), logs in sorted(found.items())
-        if logs
+        for (day, vehicle), logs in sorted(_logs_by_owner(_owned(pattern)).items())
     ]
     if not days:
         raise ConfigError("command line", "--logs", f"no log matches {pattern!r}")
@@ -94,21 +96,85 @@ def _shell_token(token: str) -> str:
     return wildcards.get(token) or ("[^/]" if token[0] == "[" and len(token) > 1 else re.escape(token))
 
 
-def _logs_at(path: Path) -> list[Path]:
-    """The logs that a match stands for."""
-    if path.is_dir():
-        if _is_bag_folder(path):
+def _owned(pattern: str) -> dict[str, _Owner]:
+    """Whose each log file and bag folder is that matches, or that lies in a folder that does.
+
+    Folders are listed once each, so the work grows with the number of files. What a link leads to a second time is
+    passed over: a link to its own parent would show every log forty times.
+    """
+    matcher, listings = _matcher(pattern), _Listings()
+    shell = re.sub(r"\{(vehicle|day)\}", "*", pattern)
+    owner: dict[str, _Owner] = {}
+    seen: dict[tuple[int, int], str] = {}
+    for name in sorted(glob.iglob(shell, recursive=True, include_hidden=False)):
+        path = name.rstrip("/")
+        match = matcher.fullmatch(path)
+        if not match or not is_day(match["day"]):
+            continue
+        for log in listings.logs_at(path):
+            about = os.stat(log)
+            if seen.setdefault((about.st_dev, about.st_ino), log) == log:
+                owner[log] = (match["day"], match["vehicle"])
+    return owner
+
+
+def _logs_by_owner(owner: dict[str, _Owner]) -> dict[_Owner, set[Path]]:
+    """Logs of each vehicle-day: a recording's folder as one where all of its files are that vehicle-day's."""
+    folders: dict[str, list[str]] = defaultdict(list)
+    for log in owner:
+        folders[os.path.dirname(log)].append(log)
+    listings = _Listings()
+    found: dict[_Owner, set[Path]] = defaultdict(set)
+    for folder, logs in folders.items():
+        files = listings.bag_files(folder)
+        together = bool(files) and files <= set(logs) and len({owner[f] for f in files}) == 1
+        for log in logs:
+            found[owner[log]].add(Path(folder if together and log in files else log))
+    return found
+
+
+class _Listings:
+    """What lies in folders, each listed once."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, tuple[dict[str, None], list[str]]] = {}
+
+    def logs_at(self, path: str) -> list[str]:
+        """The log files that a match stands for: itself, or those in it and in the recordings in it."""
+        if path.endswith(_SUFFIXES) and path in self._listed(os.path.dirname(path))[0]:
             return [path]
-        return sorted(p for p in path.iterdir() if _is_log(p) or (p.is_dir() and _is_bag_folder(p)))
-    if not _is_log(path):
-        return []
-    return [path.parent] if _is_bag_folder(path.parent) else [path]
+        files, folders = self._listed(path)
+        if os.path.join(path, "metadata.yaml") in files and not self.bag_files(path):
+            return [path]  # a recording that lost its files: `ingest` says so
+        logs = [f for f in files if f.endswith(_SUFFIXES)]
+        return logs + [f for inner in folders for f in sorted(self.bag_files(inner))]
+
+    def bag_files(self, folder: str) -> set[str]:
+        """Files that ROS 2's recorder wrote into a folder: with its metadata, or databases that lost theirs."""
+        files, _ = self._listed(folder)
+        recorded = {f for f in files if f.endswith(_ROS2_FILES)}
+        is_recording = os.path.join(folder, "metadata.yaml") in files or any(
+            f.endswith(".db3") for f in recorded
+        )
+        return recorded if is_recording else set()
+
+    def _listed(self, folder: str) -> tuple[dict[str, None], list[str]]:
+        """Regular files and folders, by name; both empty for what is no folder that can be read."""
+        if folder not in self._of:
+            try:
+                with os.scandir(folder or ".") as entries:
+                    inside = sorted(entries, key=lambda e: e.name)
+            except OSError:
+                inside = []
+            start = os.path.join(folder, "")
+            files = dict.fromkeys(start + e.name for e in inside if _is(e.is_file))
+            self._of[folder] = (files, [start + e.name for e in inside if _is(e.is_dir)])
+        return self._of[folder]
 
 
-def _is_log(path: Path) -> bool:
-    return path.is_file() and path.suffix in _SUFFIXES
-
-
-def _is_bag_folder(path: Path) -> bool:
-    """A ROS 2 recording: metadata beside its files, or database files whose metadata was lost."""
-    return (path / "metadata.yaml").is_file() or any(path.glob("*.db3"))
+def _is(kind: Callable[[], bool]) -> bool:
+    """What an entry says of itself; no for a link that leads nowhere or round in a circle."""
+    try:
+        return kind()
+    except OSError:
+        return False

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import resource
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,6 +34,7 @@ ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
     "odometry": ("nav_msgs/msg/Odometry",),
     "tf_static": ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
 }
+_MOST_OPEN_FILES = 65536  # as many minutes are 45 days: more than one vehicle-day has
 _MOST_CAMERAS = 1000  # distinct camera_info contents remembered: a bound where a driver writes noise into it
 # Roles without which there is no frame.
 NEEDED = ("image", "info", "lidar", "radar")
@@ -121,6 +124,7 @@ def index_logs(paths: Sequence[Path], rig: Rig, *, survey: bool = False) -> DayI
     With `survey` every topic is counted in `surveyed`, for those who ask what a log holds at all.
     """
     index, topics, cache = DayIndex(), topics_of(rig), ChunkCache()
+    _allow_open_files()
     for path in paths:
         try:
             index.logs.append(open_log(path, cache))
@@ -143,6 +147,16 @@ def index_logs(paths: Sequence[Path], rig: Rig, *, survey: bool = False) -> DayI
             tree.fill_from(other)
     index.cameras.sort(key=lambda c: c[1])
     return index
+
+
+def _allow_open_files() -> None:
+    """Raise this process's soft limit of open files to its hard one: a day in a thousand logs has them all open."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = _MOST_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_OPEN_FILES)
+    with suppress(
+        ValueError, OSError
+    ):  # where that is not allowed, logs that cannot be opened are counted and named
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def _index_log(index: DayIndex, number: int, topics: dict[str, str], *, survey: bool) -> None:

@@ -5,18 +5,16 @@ from __future__ import annotations
 import datetime as dt
 import hashlib
 import json
-import re
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath, PurePosixPath
 from urllib.parse import quote, unquote
 
 from pipeline.errors import ConfigError
+from pipeline.names import is_vehicle
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.object_store import Bucket
 
 __all__ = ["Lake", "Partition", "is_day", "work_key"]
-
-_VEHICLE = re.compile(r"[^/\0=]+")
 
 
 def is_day(text: str) -> bool:
@@ -35,7 +33,7 @@ class Partition:
     day: str
 
     def __post_init__(self) -> None:
-        if not _VEHICLE.fullmatch(self.vehicle) or self.vehicle in (".", ".."):
+        if not is_vehicle(self.vehicle):
             raise ConfigError("command line", "vehicle", f"{self.vehicle!r} cannot be a vehicle's name")
         if not is_day(self.day):
             raise ConfigError("command line", "day", f"{self.day!r} is no day of the form YYYY-MM-DD")

@@ -1,8 +1,10 @@
+import os
 from pathlib import Path
 
 import pytest
 
 from pipeline.errors import ConfigError
+from pipeline.fleet import pattern as pattern_module
 from pipeline.fleet.pattern import find_vehicle_days
 
 
@@ -94,6 +96,53 @@ def test_relative_patterns_work(tmp_path, monkeypatch):
     touch(tmp_path / "logs/car/2026-03-02/a.mcap")
     monkeypatch.chdir(tmp_path)
     assert find_vehicle_days("logs/{vehicle}/{day}/*")[0].logs == (Path("logs/car/2026-03-02/a.mcap"),)
+
+
+@pytest.mark.parametrize("stray", ["metadata.yaml", "notes.db3"])
+def test_vehicles_that_share_a_folder_are_never_mixed_whatever_else_lies_there(stray, tmp_path):
+    names = [f"car-{i}_2026-03-0{d}.{kind}" for i in (1, 2) for d in (2, 3) for kind in ("mcap", "db3")]
+    touch(*(tmp_path / name for name in names), tmp_path / stray)
+    assert found("{vehicle}_{day}.*", tmp_path) == {
+        (f"car-{i}", f"2026-03-0{d}"): [f"car-{i}_2026-03-0{d}.db3", f"car-{i}_2026-03-0{d}.mcap"]
+        for i in (1, 2)
+        for d in (2, 3)
+    }
+
+
+def test_a_bag_beside_a_ros2_recording_is_a_log_of_its_own(tmp_path):
+    day = tmp_path / "car/2026-03-02"
+    touch(*(day / name for name in ("metadata.yaml", "rec_0.mcap", "rec_1.mcap", "older.bag")))
+    assert found("{vehicle}/{day}", tmp_path) == {
+        ("car", "2026-03-02"): ["car/2026-03-02", "car/2026-03-02/older.bag"]
+    }
+
+
+def test_half_of_a_recording_that_matches_is_read_file_by_file(tmp_path):
+    touch(*(tmp_path / "car/2026-03-02/rec" / n for n in ("metadata.yaml", "rec_0.db3", "rec_1.db3")))
+    assert found("{vehicle}/{day}/rec/*_0.db3", tmp_path) == {
+        ("car", "2026-03-02"): ["car/2026-03-02/rec/rec_0.db3"]
+    }
+
+
+def test_a_recording_that_lost_its_files_stays_to_be_refused(tmp_path):
+    touch(tmp_path / "car/2026-03-02/rec/metadata.yaml")
+    assert found("{vehicle}/{day}/rec", tmp_path) == {("car", "2026-03-02"): ["car/2026-03-02/rec"]}
+
+
+def test_links_that_lead_round_in_a_circle_show_a_log_once_and_pipes_are_no_logs(tmp_path):
+    touch(tmp_path / "car/2026-03-02/a.mcap")
+    (tmp_path / "car/2026-03-02/again").symlink_to(tmp_path / "car/2026-03-02")
+    os.mkfifo(tmp_path / "car/2026-03-02/pipe.mcap")
+    assert found("{vehicle}/{day}/**/*.mcap", tmp_path) == {("car", "2026-03-02"): ["car/2026-03-02/a.mcap"]}
+
+
+def test_each_folder_is_listed_once_however_many_logs_it_holds(tmp_path, monkeypatch):
+    touch(*(tmp_path / f"car-{i:03d}_2026-03-02.mcap" for i in range(300)))
+    listed = []
+    scandir = os.scandir
+    monkeypatch.setattr(pattern_module.os, "scandir", lambda path: listed.append(path) or scandir(path))
+    assert len(found("{vehicle}_{day}.mcap", tmp_path)) == 300
+    assert len([path for path in listed if Path(path) == tmp_path]) <= 3  # glob, owners, recordings
 
 
 @pytest.mark.parametrize(

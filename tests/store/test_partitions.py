@@ -8,7 +8,7 @@ from pipeline.errors import ConfigError
 from pipeline.store.partitions import Lake, Partition, work_key
 
 names = st.text(
-    st.characters(exclude_categories=["Cs", "Cc"], exclude_characters="/=\0"), min_size=1, max_size=20
+    st.characters(exclude_categories=["Cs", "Cc"], exclude_characters="/=\0"), min_size=1, max_size=16
 )
 
 

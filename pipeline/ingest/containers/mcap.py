@@ -13,7 +13,6 @@ from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
 
-import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -21,6 +20,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import ChunkIndex, Footer, Schema
 
 from pipeline.errors import LogError
+from pipeline.ingest.containers.bounded import unpack_lz4, unpack_zstd
 from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
 
 __all__ = ["McapLog"]
@@ -222,9 +222,9 @@ def _decompress(compression: str, data: memoryview, size: int) -> bytes:
     if size > _MAX_CHUNK_BYTES:
         raise ValueError("damaged length")
     if compression == "zstd":
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        return unpack_zstd(data, size)
     if compression == "lz4":
-        return lz4.frame.decompress(data)
+        return unpack_lz4(data, size)
     if compression:
         raise ValueError(f"compression {compression}")
     return bytes(data)

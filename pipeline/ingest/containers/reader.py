@@ -126,6 +126,8 @@ def content_identity(path: Path) -> str:
     in them (an appended, recovered, re-indexed or re-recorded log) changes size, head or tail. Modification
     times are left out: copies differ in them.
     """
+    if path.exists() and not (path.is_dir() or path.is_file()):
+        raise LogError(str(path), "is neither a file nor a folder")
     digest = hashlib.sha256(path.name.encode())
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     try:
@@ -172,6 +174,8 @@ class ChunkCache:
 def _kind(path: Path) -> str:
     if path.is_dir():
         return "folder"
+    if path.exists() and not path.is_file():
+        raise LogError(str(path), "is neither a file nor a folder")  # to open a pipe would wait for ever
     try:
         with path.open("rb") as stream:
             head = stream.read(16)

@@ -5,16 +5,14 @@ Source: http://wiki.ros.org/Bags/Format/2.0
 
 from __future__ import annotations
 
-import bz2
 import struct
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-import lz4.frame
-
 from pipeline.errors import LogError
+from pipeline.ingest.containers.bounded import unpack_bz2, unpack_lz4
 from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
 
 __all__ = ["BagLog"]
@@ -222,9 +220,9 @@ def _fields(data: bytes) -> dict[str, bytes] | None:
 
 def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
     if compression == b"lz4":
-        return lz4.frame.decompress(data)
+        return unpack_lz4(data, size)
     if compression == b"bz2":
-        return bz2.BZ2Decompressor().decompress(data, size + 1)
+        return unpack_bz2(data, size)
     if compression == b"none":
         return data
     raise ValueError(f"compression {compression!r}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections import Counter
@@ -15,6 +16,7 @@ from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, R
 
 __all__ = ["CompressedLog", "FolderLog"]
 
+_UNPACKED = "boresight-unpacked-"  # then the process that unpacked it
 _FILES = ("*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd")
 
 
@@ -62,7 +64,8 @@ class CompressedLog:
 
     def __init__(self, path: Path, cache: ChunkCache) -> None:
         self.path = path
-        self._folder = tempfile.TemporaryDirectory(prefix="boresight-")
+        _remove_left_behind()
+        self._folder = tempfile.TemporaryDirectory(prefix=f"{_UNPACKED}{os.getpid()}-")
         try:
             plain = Path(self._folder.name) / path.with_suffix("").name
             with path.open("rb") as source, plain.open("wb") as target:
@@ -85,3 +88,21 @@ class CompressedLog:
         """See LogReader."""
         self._log.close()
         self._folder.cleanup()
+
+
+def _remove_left_behind() -> None:
+    """Remove what killed processes of this machine unpacked: nothing of theirs could clean up after them."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_UNPACKED}*-*"):
+        pid = folder.name.removeprefix(_UNPACKED).partition("-")[0]
+        if pid.isdigit() and not _is_running(int(pid)):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # somebody else's
+        return True
+    return True

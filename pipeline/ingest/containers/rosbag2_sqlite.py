@@ -16,6 +16,7 @@ import apsw
 import zstandard
 
 from pipeline.errors import LogError
+from pipeline.ingest.containers.bounded import unpack_zstd
 from pipeline.ingest.containers.reader import Channel, ChunkCache, Position, RawMessage
 
 __all__ = ["Db3Log"]
@@ -164,6 +165,6 @@ def _payload(data: object) -> bytes | None:
     if data[:4] != _ZSTD_MAGIC:
         return data
     try:
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=_MAX_MESSAGE_BYTES)
-    except zstandard.ZstdError:
+        return unpack_zstd(data, _MAX_MESSAGE_BYTES)
+    except (zstandard.ZstdError, ValueError):
         return None

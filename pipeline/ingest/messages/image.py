@@ -53,6 +53,9 @@ _CHANNELS = {
     "yuv422_yuy2": 2,
     "yuyv": 2,
 }
+_LEAST_FOCAL_PX = 10.0  # a fisheye of 190 deg on 64 pixels has 20
+# Twelve times what cars' cameras have (8 Mpx): to decode what a forged header claims takes minutes and all memory.
+_MAX_PIXELS = 100_000_000
 _BYTES = {"mono16": 2, "16uc1": 2}
 
 
@@ -73,10 +76,10 @@ def inspect_image(data: bytes) -> EncodedImage:
         ValueError: neither JPEG nor PNG, or cut off, or damaged where the structure shows it.
     """
     if data[:3] == b"\xff\xd8\xff":
-        return EncodedImage(data, "jpeg", *_jpeg_size(data))
+        return EncodedImage(data, "jpeg", *_possible(*_jpeg_size(data)))
     if data[:8] == _PNG_MAGIC:
         width, height, *_ = _png_header(data)
-        return EncodedImage(data, "png", width, height)
+        return EncodedImage(data, "png", *_possible(width, height))
     raise ValueError("neither JPEG nor PNG")
 
 
@@ -103,7 +106,8 @@ def label_image(message: Any) -> bytes:
         data = bytes(message.data)
         if data[:8] != _PNG_MAGIC:
             raise ValueError("label images must be PNG: a lossy format blends labels")
-        _, _, depth, colour = _png_header(data)
+        width, height, depth, colour = _png_header(data)
+        _possible(width, height)
         if (depth, colour) != (8, 0):
             raise ValueError("label images must be 8 bit grey PNG: colours and palettes say no label")
         return data
@@ -129,6 +133,10 @@ def read_camera_info(message: Any) -> Camera:
         raise ValueError("camera_info gives no image size")
     if not np.any(K[:2, :2]):
         raise ValueError("camera_info has a zero K: the camera is not calibrated")
+    if not np.all(np.isfinite(K)) or 0 < min(K[0, 0], K[1, 1]) < _LEAST_FOCAL_PX:
+        raise ValueError(
+            f"camera_info has a focal length of {K[0, 0]:.4g} px: K must be in pixels, not normalised by the image size"
+        )
     if not np.all(np.isfinite(D)):
         raise ValueError("camera_info has a distortion that is not finite")
     if name == "" and not np.any(D):  # what rectifying drivers write
@@ -168,6 +176,12 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
             return size
         position += 2 + max(length, 2)
     raise ValueError("JPEG holds no picture")
+
+
+def _possible(width_px: int, height_px: int) -> tuple[int, int]:
+    if width_px * height_px > _MAX_PIXELS:
+        raise ValueError(f"{width_px} x {height_px} pixels are more than a camera has: a damaged header")
+    return width_px, height_px
 
 
 def _png_header(data: bytes) -> tuple[int, int, int, int]:

@@ -1,5 +1,6 @@
 """Images pass untouched or become the PNG of their pixels; intrinsics are taken or refused, never made up."""
 
+import zlib
 from types import SimpleNamespace
 
 import cv2
@@ -138,6 +139,7 @@ def test_intrinsics_that_say_nothing_are_refused(kit):
         "is not supported": kit.Kit().info(0, model="rational_polynomial", D=[0.1] * 12),
         "not finite": kit.Kit().info(0, D=[np.nan] * 5),
         "no image size": SimpleNamespace(**{**kit.Kit().info(0).__dict__, "width": 0}),
+        "not normalised": kit.Kit().info(0, focal_px=0.8),
         "positive focal": kit.Kit().info(0, focal_px=-3.0),
     }
     for reason, message in cases.items():
@@ -157,3 +159,17 @@ def test_raw_image_and_label_topics_go_through_the_whole_stage(kit, tmp_path, ru
     assert frames[1].image_format == "png"
     np.testing.assert_array_equal(decode(frames[1].image), pixels[..., ::-1])
     np.testing.assert_array_equal(decode(frames[1].labels_png), labels)
+
+
+def test_a_header_that_claims_more_pixels_than_a_camera_has_is_refused_before_they_are_decoded():
+    jpeg = bytearray(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+    at = jpeg.index(b"\xff\xc0") + 5
+    jpeg[at : at + 4] = (32430).to_bytes(2) + (62928).to_bytes(2)
+    with pytest.raises(ValueError, match="62928 x 32430 pixels"):
+        inspect_image(bytes(jpeg))
+    png = bytearray(cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes())
+    png[16:24] = (100_000).to_bytes(4) * 2
+    png[29:33] = zlib.crc32(png[12:29]).to_bytes(4)
+    for reads in (inspect_image, lambda data: label_image(SimpleNamespace(format="png", data=data))):
+        with pytest.raises(ValueError, match="100000 x 100000 pixels"):
+            reads(bytes(png))

@@ -1,0 +1,96 @@
+"""Damaged and forged sizes: what is announced wrongly costs a chunk, never the machine's memory."""
+
+import bz2
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import lz4.frame
+import pytest
+import zstandard
+
+from pipeline.errors import LogError
+from pipeline.ingest.containers import rosbag2_folder
+from pipeline.ingest.containers.bounded import unpack_bz2, unpack_lz4, unpack_zstd
+from pipeline.ingest.containers.reader import content_identity, open_log
+
+CONTENT = bytes(range(256)) * 40
+PACKED = {
+    unpack_zstd: zstandard.ZstdCompressor().compress(CONTENT),
+    unpack_lz4: lz4.frame.compress(CONTENT),
+    unpack_bz2: bz2.compress(CONTENT),
+}
+
+
+@pytest.mark.parametrize("unpack", PACKED)
+def test_content_of_the_size_announced_comes_back_and_more_is_refused(unpack):
+    assert unpack(PACKED[unpack], len(CONTENT)) == CONTENT
+    with pytest.raises(ValueError, match="announced"):
+        unpack(PACKED[unpack], len(CONTENT) - 1)
+
+
+def test_a_zstd_frame_that_does_not_say_its_size_is_read_up_to_the_limit():
+    frame = zstandard.ZstdCompressor(write_content_size=False).compress(CONTENT)
+    assert unpack_zstd(frame, len(CONTENT)) == CONTENT
+    assert unpack_zstd(frame, 1 << 30) == CONTENT
+    with pytest.raises(ValueError, match="announced"):
+        unpack_zstd(frame, len(CONTENT) - 1)
+
+
+def test_a_frame_that_claims_terabytes_is_refused_before_memory_is_taken():
+    frame = bytearray(zstandard.ZstdCompressor().compress(bytes(1 << 20)))
+    # Frame header (RFC 8878, 3.1.1): magic, descriptor, window or single segment, then the content size.
+    assert zstandard.get_frame_parameters(bytes(frame)).content_size == 1 << 20
+    at = bytes(frame).index(struct.pack("<I", 1 << 20))
+    frame[at : at + 4] = struct.pack("<I", 0xFFFFFFF0)
+    with pytest.raises(ValueError, match="4294967280"):
+        unpack_zstd(bytes(frame), 1 << 20)
+
+
+def test_a_forged_chunk_costs_that_chunk_and_the_rest_of_the_day_is_read(kit, tmp_path, run_ingest):
+    path = kit.Kit().drive().mcap(tmp_path / "day.mcap")
+    data = bytearray(path.read_bytes())
+    first = data.index(b"\x28\xb5\x2f\xfd")
+    descriptor = data[first + 4]
+    size_at = first + 5 + (0 if descriptor & 0x20 else 1)
+    width = (1 if descriptor & 0x20 else 0, 2, 4, 8)[descriptor >> 6]
+    data[size_at : size_at + width] = b"\xff" * width
+    path.write_bytes(data)
+    assert sum(log_damage(path).values()) >= 1
+    result, _ = run_ingest(path)
+    assert result.status in {"done", "refused"}  # and no MemoryError
+
+
+def log_damage(path):
+    log = open_log(path)
+    list(log.scan())
+    log.close()
+    return log.damage
+
+
+def test_a_pipe_is_named_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.mcap")
+    for reads in (open_log, content_identity):
+        with pytest.raises(LogError, match="neither a file nor a folder"):
+            reads(tmp_path / "pipe.mcap")
+
+
+def test_what_a_killed_process_unpacked_is_removed_by_the_next_one(kit, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    ended = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True
+    )
+    name = rosbag2_folder._UNPACKED
+    left, mine = (tmp_path / f"{name}{pid}-x" for pid in (ended.stdout.decode().strip(), os.getpid()))
+    for folder in (left, mine):
+        folder.mkdir()
+    folder = kit.Kit().drive().folder(tmp_path / "bag")
+    plain = next(folder.glob("*.db3"))
+    packed = Path(f"{plain}.zstd")
+    packed.write_bytes(zstandard.ZstdCompressor().compress(plain.read_bytes()))
+    open_log(packed).close()
+    assert not left.exists()
+    assert mine.exists()
