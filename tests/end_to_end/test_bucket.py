@@ -1,0 +1,50 @@
+"""The night on a lake in a bucket, while the store now and then answers 503: the same records as on a folder."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from tests.makers.s3_server import BUCKET, running
+
+BORESIGHT = f"{sys.prefix}/bin/boresight"
+
+
+def run(environment, *arguments):
+    done = subprocess.run(
+        [BORESIGHT, *arguments], env=environment, capture_output=True, text=True, check=False, timeout=300
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.slow
+def test_a_night_on_a_bucket_records_what_a_night_on_a_folder_does(tmp_path):
+    simulate_fleet(FleetSpec(vehicles=1, days=1, frames=12, drives=2), tmp_path)
+    logs = f"{tmp_path}/logs/{{vehicle}}/{{day}}/*"
+    common = ["--fleet", f"{tmp_path}/fleet.toml", "--executor", "inline", "--logs", logs, "--no-pictures"]
+    records = {}
+    with running() as s3:
+        environment = os.environ | s3.environment
+        for lake in (f"{tmp_path}/lake", f"s3://{BUCKET}/night/lake"):
+            s3.faults(fail=20, every=5)
+            code, out, stderr = run(environment, "nightly", "--lake", lake, *common)
+            assert code in (0, 3), stderr
+            summary = json.loads(out.splitlines()[-1])
+            assert summary["vehicle_days"] == 1
+            assert summary["damaged"] == []
+            assert summary["report"].startswith(lake)
+            records[lake] = json.loads(run(environment, "show", "calibrations", "--lake", lake, "--json")[1])
+            again = json.loads(run(environment, "nightly", "--lake", lake, *common)[1].splitlines()[-1])
+            assert again["done"] == 0
+            status = json.loads(run(environment, "status", "--lake", lake)[1].splitlines()[-1])
+            assert status["failed"] + status["missing"] == 0
+        assert s3.faults()["failed"] > 0
+    here, there = records.values()
+    assert len(here) == 3
+    for a, b in zip(here, there, strict=True):
+        for name in set(a) - {"recorded_at", "asserted_at"}:
+            np.testing.assert_equal(a[name], b[name], err_msg=name)
