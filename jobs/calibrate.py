@@ -69,10 +69,12 @@ def _calibrate_day(task: Task) -> int:
     from dataclasses import replace
 
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+    from pipeline.fleet.ledger import record_outcome
     from pipeline.stages import CALIBRATE
 
     with progress_reporter(f"calibrate {task.partition.vehicle} {task.partition.day}") as progress:
         outcome = CALIBRATE.run(replace(task, progress=progress))
+    record_outcome(task.lake, outcome, task.method or "")
     print_summary(
         "calibrate",
         outcome.status,

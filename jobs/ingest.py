@@ -21,6 +21,7 @@ def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.extrinsics.prior import require_named_files
+    from pipeline.fleet.ledger import record_outcome
     from pipeline.stages import INGEST
     from pipeline.store.partitions import Lake, Partition
     from pipeline.work import Task
@@ -29,8 +30,10 @@ def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
         raise ConfigError("command line", "LOG", "name at least one log of the day")
     config = load_fleet(fleet)
     require_named_files(config)
+    tables = Lake.at(lake)
     with progress_reporter(f"ingest {vehicle} {day}") as progress:
-        task = Task(config, Lake.at(lake), Partition(vehicle, day), logs=logs, progress=progress)
+        task = Task(config, tables, Partition(vehicle, day), logs=logs, progress=progress)
         outcome = INGEST.run(task)
+    record_outcome(tables, outcome)
     print_summary("ingest", outcome.status, **outcome.counts())
     return exit_code([outcome.status])

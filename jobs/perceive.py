@@ -19,13 +19,16 @@ def perceive(*, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from pipeline.config import load_fleet
     from pipeline.extrinsics.prior import require_named_files
+    from pipeline.fleet.ledger import record_outcome
     from pipeline.stages import PERCEIVE
     from pipeline.store.partitions import Lake, Partition
     from pipeline.work import Task
 
     config = load_fleet(fleet)
     require_named_files(config)
+    tables = Lake.at(lake)
     with progress_reporter(f"perceive {vehicle} {day}") as progress:
-        outcome = PERCEIVE.run(Task(config, Lake.at(lake), Partition(vehicle, day), progress=progress))
+        outcome = PERCEIVE.run(Task(config, tables, Partition(vehicle, day), progress=progress))
+    record_outcome(tables, outcome)
     print_summary("perceive", outcome.status, **outcome.counts())
     return exit_code([outcome.status])

@@ -16,7 +16,7 @@ from schemas.columns import TableSchema
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.versions import CODE_VERSION
 
-__all__ = ["Known", "Ledger", "outcome_row"]
+__all__ = ["Known", "Ledger", "outcome_row", "record_outcome"]
 
 # A commit takes some tenths of a second. Every half minute is one hundredth of the time, and what a killed night has to
 # calibrate again is what ended in the last half minute.
@@ -100,6 +100,15 @@ class Ledger:
             for row in rows:
                 found[row.vehicle, row.day].append(row)
         return found
+
+
+def record_outcome(lake: Lake, outcome: Outcome, method: str = "") -> None:
+    """Add the outcome of a stage that a command ran by itself.
+
+    Raises:
+        OSError: the storage does not answer.
+    """
+    commit_records(lake, OUTCOMES, [outcome_row(outcome, method)])
 
 
 def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:

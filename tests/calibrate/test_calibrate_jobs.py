@@ -7,12 +7,15 @@ import pytest
 
 from jobs.calibrate import calibrate, parse_perturb
 from jobs.evaluate import evaluate
+from jobs.status import status
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import read_records
 from pipeline.store.tables import write_partition
 from schemas.observations import OBSERVATIONS
+from schemas.outcomes import OUTCOMES, OutcomeRow
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
@@ -60,6 +63,17 @@ def test_calibrate_ends_with_one_summary_and_the_code_of_its_verdicts(workplace,
     assert code == (3 if summary["pairs"]["held"] else 0)
     assert run(workplace) == code
     assert last_line(capsys)["status"] == "cached"
+
+
+def test_a_command_by_itself_says_what_became_of_the_day_too(workplace, capsys):
+    for _ in range(2):
+        run(workplace)
+    [row] = read_records(Lake.at(workplace / "lake"), OUTCOMES, OutcomeRow, day="2024-05-06")
+    assert (row.stage, row.method, row.status) == ("calibrate", "pairwise-optimisation", "done")
+    capsys.readouterr()
+    assert status(lake=str(workplace / "lake"), json=True) == 0
+    days = {d["day"]: d for d in last_line(capsys)["days"]}
+    assert sum(days["2024-05-06"]["pairs"].values()) == 3
 
 
 def test_a_day_without_observations_returns_3(workplace, capsys):
