@@ -71,10 +71,13 @@ def vehicle_rows(
 ) -> list[VehicleRow]:
     """The table vehicles x days, alarmed vehicles first."""
     found = _by_vehicle(findings)
+    statuses: dict[tuple[str, str], list[str]] = {}
+    for record in records:
+        statuses.setdefault((record.vehicle, record.day), []).append(record.status)
     rows = []
     for vehicle in sorted({r.vehicle for r in records} | set(found)):
         status, sentence = status_sentence(found.get(vehicle, []))
-        cells = [_cell(records, vehicle, day, links.get((vehicle, day), "")) for day in days]
+        cells = [_cell(statuses.get((vehicle, d), []), d, links.get((vehicle, d), "")) for d in days]
         rows.append(VehicleRow(vehicle, status, sentence, cells))
     return sorted(rows, key=lambda r: (DRIFT_STATUSES.index(r.status), r.vehicle))
 
@@ -154,16 +157,14 @@ def _panel(
     )  # fmt: skip
 
 
-def _cell(records: Sequence[CalibrationRecord], vehicle: str, day: str, link: str) -> DayCell:
-    found = [r for r in records if (r.vehicle, r.day) == (vehicle, day)]
-    if not found:
+def _cell(statuses: Sequence[str], day: str, link: str) -> DayCell:
+    if not statuses:
         return DayCell(day, "none", "-", link)
-    statuses = [r.status for r in found]
     accepted = statuses.count("accepted")
-    if accepted == len(found):
+    if accepted == len(statuses):
         return DayCell(day, "accepted", "accepted", link)
     if accepted:
-        return DayCell(day, "partly", f"{accepted} of {len(found)} accepted", link)
+        return DayCell(day, "partly", f"{accepted} of {len(statuses)} accepted", link)
     worst = next(s for s in _WORST if s in statuses)
     return DayCell(day, worst, worst, link)
 

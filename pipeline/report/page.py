@@ -11,7 +11,9 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-__all__ = ["render", "write_page"]
+__all__ = ["is_drawn", "mark_drawn", "render", "write_page"]
+
+_MARK = "<!-- drawn from {} -->\n"  # the last line of a page that is not drawn again while it stays true
 
 
 def render(template: str, **values: Any) -> str:
@@ -39,6 +41,23 @@ def write_page(path: Path, html: str) -> Path:
         Path(aside).unlink(missing_ok=True)
         raise
     return path
+
+
+def is_drawn(path: Path, stamp: str) -> bool:
+    """Whether a page is there whose mark says that it was drawn from the same."""
+    mark = _MARK.format(stamp).encode()
+    try:
+        with path.open("rb") as stream:
+            stream.seek(-len(mark), os.SEEK_END)
+            return stream.read() == mark
+    except OSError:  # not there, or shorter than a mark
+        return False
+
+
+def mark_drawn(path: Path, stamp: str) -> None:
+    """Say at a page's end what it was drawn from."""
+    with path.open("ab") as stream:
+        stream.write(_MARK.format(stamp).encode())
 
 
 def _safe_json(text: str) -> Markup:

@@ -12,7 +12,7 @@ from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.scenes import choose_frames
 from pipeline.store.current import current_drift, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import last_day, read_records
+from pipeline.store.records import last_day, read_latest, read_records
 from pipeline.store.tables import COLLECTED, iterate_rows, read_manifest
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
@@ -24,11 +24,14 @@ __all__ = [
     "drift_of",
     "fleet_records",
     "has_frames",
+    "records_of_day",
     "scenes_among",
     "spread_observations",
     "states_of",
 ]
 
+_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_CHARTED = (*_POSE, *(f"prior_{name}" for name in _POSE), "covariance", "observable", "determined")
 _AUDIT_DAYS = 61  # whose findings are older is audited no more: it left fleet.toml, or nobody audits
 _FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 
@@ -51,18 +54,31 @@ def day_records(lake: Lake, partition: Partition, method: str) -> dict[str, Cali
 
 
 def fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:
-    """Current records of the last `window_days` days, as an audit sees them."""
+    """Current records of the last `window_days` days, with what charts, the table and the truth ask for.
+
+    A chart needs no margins, diagnostics or notes; those of a day are on its page (`records_of_day`).
+    """
     last = last_day(lake, CALIBRATIONS)
     if last is None:
         return []
-    first = _days_before(last, window_days - 1)
-    records = [
-        r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, first=first) if r.method == method
-    ]
-    if not records:  # another method's records may be newer by more than a window
-        records = [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
+
+    def records_from(first: str | None) -> list[CalibrationRecord]:
+        found = read_records(lake, CALIBRATIONS, CalibrationRecord, first=first, columns=_CHARTED)
+        return [r for r in found if r.method == method]
+
+    # Another method's records may be newer by more than a window.
+    records = records_from(_days_before(last, window_days - 1)) or records_from(None)
     first = _days_before(max((r.day for r in records), default=last), window_days - 1)
     return current_records([r for r in records if r.day >= first])
+
+
+def records_of_day(lake: Lake, method: str, day: str) -> dict[str, dict[str, CalibrationRecord]]:
+    """Current records of a day, whole, by vehicle and pair."""
+    found = [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, day=day) if r.method == method]
+    records: dict[str, dict[str, CalibrationRecord]] = {}
+    for record in current_records(found):
+        records.setdefault(record.vehicle, {})[record.pair] = record
+    return records
 
 
 def drift_of(lake: Lake, method: str, vehicle: str | None = None) -> list[DriftFinding]:
@@ -70,7 +86,8 @@ def drift_of(lake: Lake, method: str, vehicle: str | None = None) -> list[DriftF
     last = last_day(lake, DRIFT)
     if last is None:
         return []
-    findings = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle, first=_days_before(last, _AUDIT_DAYS))
+    first = _days_before(last, _AUDIT_DAYS)
+    findings = read_latest(lake, DRIFT, DriftFinding, first=first, vehicle=vehicle)
     return current_drift([f for f in findings if f.method == method])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import re
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,13 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pipeline.config import FleetConfig
+from pipeline.config import FleetConfig, config_hash
 from pipeline.errors import ConfigError, DamagedError
 from pipeline.report.day import PairView, answer_for, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import drift_figure, residual_figure, sigma_figure
 from pipeline.report.fleet import drift_panels, finding_views, headline_for, vehicle_rows
 from pipeline.report.overlays import Extrinsics
-from pipeline.report.page import render, write_page
+from pipeline.report.page import is_drawn, mark_drawn, render, write_page
 from pipeline.report.picture_file import write_picture
 from pipeline.report.pictures import scene_pictures
 from pipeline.report.reading import (
@@ -26,6 +26,7 @@ from pipeline.report.reading import (
     drift_of,
     fleet_records,
     has_frames,
+    records_of_day,
     scenes_among,
     spread_observations,
     states_of,
@@ -38,6 +39,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.work import Run, Task, Work
 from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
 from schemas.drift import DriftFinding
+from schemas.versions import CODE_VERSION
 
 __all__ = ["Pages", "work", "write_day_page", "write_day_picture", "write_fleet_page", "write_fleet_report"]
 
@@ -58,6 +60,14 @@ class Pages:
     out: Path
     truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]] | None = None
     pictures: bool = True
+
+
+@dataclass(frozen=True)
+class DayRead:
+    """What the page of a vehicle-day tells: its current records by pair, and the vehicle's current findings."""
+
+    records: Mapping[str, CalibrationRecord]
+    findings: Sequence[DriftFinding]
 
 
 def work(task: Task) -> Work:
@@ -93,6 +103,7 @@ def write_day_page(
     *,
     fleet_link: str = "",
     pictures: bool = True,
+    read: DayRead | None = None,
 ) -> Path:
     """Write the page of one vehicle-day.
 
@@ -104,13 +115,15 @@ def write_day_page(
         method: None = `fleet.audit.method`.
         fleet_link: relative link to the fleet page; empty = none.
         pictures: False = none, and none of what is drawn from frames.
+        read: the day's records and the vehicle's findings, where the caller has read them; None = read here.
 
     Raises:
         ConfigError: the day has no record of the method.
     """
     method = method or fleet.audit.method
-    records = day_records(lake, partition, method)
-    findings = drift_of(lake, method, partition.vehicle)
+    if read is None:
+        read = DayRead(day_records(lake, partition, method), drift_of(lake, method, partition.vehicle))
+    records, findings = read.records, read.findings
     views = [pair_view(records[p]) for p in PAIRS if p in records]
     before, after = states_of(records) or (None, None)
     labels = ("prior", _after_label(views))
@@ -229,21 +242,54 @@ def write_fleet_report(
     pictures: bool = True,
     progress: Progress = silent,
 ) -> list[Path]:
-    """Write the fleet page and, in a folder beside it, the page of every vehicle-day; the fleet page comes first."""
+    """Write the fleet page and, in a folder beside it, the page of every vehicle-day; the fleet page comes first.
+
+    A day's page that lies there already, of the same records and the same status, is not drawn again.
+    """
     method = method or fleet.audit.method
-    partitions = sorted(
-        {Partition(r.vehicle, r.day) for r in fleet_records(lake, method, fleet.audit.window_days)}
-    )
-    folder = out.parent / f"{out.stem}_days"
-    links, pages = {}, []
-    for done, partition in enumerate(partitions):
-        progress(done, len(partitions), f"{partition.vehicle} {partition.day}")
-        name = f"{re.sub(r'[^A-Za-z0-9._-]', '_', partition.vehicle)}_{partition.day}.html"
-        path = folder / name
-        link = f"../{quote(out.name)}"
-        pages.append(write_day_page(lake, partition, fleet, path, method, fleet_link=link, pictures=pictures))
-        links[(partition.vehicle, partition.day)] = f"{quote(folder.name)}/{quote(name)}"
-    return [write_fleet_page(lake, fleet, out, method, truth=truth, links=links), *pages]
+    records, findings = fleet_records(lake, method, fleet.audit.window_days), drift_of(lake, method)
+    by_vehicle: dict[str, list[DriftFinding]] = {}
+    for finding in findings:
+        by_vehicle.setdefault(finding.vehicle, []).append(finding)
+    keys: dict[Partition, list[str]] = {}
+    for record in records:
+        keys.setdefault(Partition(record.vehicle, record.day), []).append(record.work_key)
+    names, folder = _page_names(keys), out.parent / f"{out.stem}_days"
+    stamps = {
+        p: config_hash({"keys": sorted(of), "drift": status_sentence(by_vehicle.get(p.vehicle, [])),
+                        "pictures": pictures, "link": out.name, "code": CODE_VERSION})
+        for p, of in keys.items()
+    }  # fmt: skip
+    stale = [
+        p
+        for p in sorted(keys, key=lambda p: (p.day, p.vehicle))
+        if not is_drawn(folder / names[p], stamps[p])
+    ]
+    of_day: tuple[str, dict[str, dict[str, CalibrationRecord]]] = ("", {})
+    for done, partition in enumerate(stale):
+        progress(done, len(stale), f"{partition.vehicle} {partition.day}")
+        if of_day[0] != partition.day:
+            of_day = (partition.day, records_of_day(lake, method, partition.day))
+        if partition.vehicle not in of_day[1]:  # its file went bad meanwhile: `lake.damage` says so
+            continue
+        read = DayRead(of_day[1][partition.vehicle], by_vehicle.get(partition.vehicle, []))
+        path, link = folder / names[partition], f"../{quote(out.name)}"
+        write_day_page(lake, partition, fleet, path, method, fleet_link=link, pictures=pictures, read=read)
+        mark_drawn(path, stamps[partition])
+    pages = {p: folder / names[p] for p in sorted(keys) if (folder / names[p]).exists()}
+    links = {(p.vehicle, p.day): f"{quote(folder.name)}/{quote(path.name)}" for p, path in pages.items()}
+    return [write_fleet_page(lake, fleet, out, method, truth=truth, links=links), *pages.values()]
+
+
+def _page_names(partitions: Iterable[Partition]) -> dict[Partition, str]:
+    """A file name for each vehicle-day: readable, and no two alike ("a b" and "a_b" are two vehicles)."""
+    names = {}
+    for partition in partitions:
+        readable = re.sub(r"[^A-Za-z0-9._-]", "_", partition.vehicle)
+        if readable != partition.vehicle:
+            readable += f"-{config_hash({'vehicle': partition.vehicle})[:8]}"
+        names[partition] = f"{readable}_{partition.day}.html"
+    return names
 
 
 def _after_label(views: Sequence[PairView]) -> str:

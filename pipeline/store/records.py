@@ -19,7 +19,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
 
-__all__ = ["assert_records", "commit_records", "last_day", "read_records", "write_records"]
+__all__ = ["assert_records", "commit_records", "last_day", "read_latest", "read_records", "write_records"]
 
 Row = TypeVar("Row")
 
@@ -122,6 +122,35 @@ def read_records(
         return []
     order = [(name, "ascending") for name in ("vehicle", "day", "asserted_at", *schema.about[2:], "work_key")]
     return from_table(found.take(pc.sort_indices(found, order)), schema, row_type)
+
+
+def read_latest(
+    lake: Lake, schema: TableSchema, row_type: type[Row], *, first: str, vehicle: str | None = None
+) -> list[Row]:
+    """Records of the last day that each vehicle and method has any of, in order as `read_records` gives them.
+
+    Which day that is, is found from three columns; of the others only those days are read.
+
+    Args:
+        lake: where the table is.
+        schema: of the table.
+        row_type: its dataclass.
+        first: days before this one are not looked at.
+        vehicle: only this vehicle's.
+    """
+    keys = _rows_of(lake, schema, ["vehicle", "method", "day"], vehicle, first, None)
+    if keys is None:
+        return []
+    latest = keys.group_by(["vehicle", "method"]).aggregate([("day", "max")])
+    day_of = {
+        (v, m): day
+        for v, m, day in zip(*(latest[n].to_pylist() for n in ("vehicle", "method", "day_max")), strict=True)
+    }
+    found: list[Any] = []
+    for day in sorted(set(day_of.values())):
+        of_day: list[Any] = read_records(lake, schema, row_type, vehicle=vehicle, day=day)
+        found += [row for row in of_day if day_of[row.vehicle, row.method] == day]
+    return sorted(found, key=lambda row: row.vehicle)
 
 
 def last_day(lake: Lake, schema: TableSchema) -> str | None:

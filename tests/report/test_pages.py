@@ -2,10 +2,12 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from pipeline.errors import ConfigError
 from pipeline.report.stage import write_day_page, write_fleet_page, write_fleet_report
 from pipeline.report.truth import read_truth
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import commit_records, read_records
 from pipeline.store.tables import write_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.makers.stages import audit_fleet
@@ -269,3 +272,33 @@ def test_a_page_can_be_used_by_keyboard_alone(
     assert browser.evaluate("document.activeElement.dataset.copy") == "json-camera_lidar"
     browser.press("Enter")
     assert browser.evaluate("document.activeElement.textContent") in ("Copied", "Press Ctrl+C")
+
+
+def test_pages_of_days_that_did_not_change_are_not_drawn_again(fleet, tmp_path: Path) -> None:
+    lake = Lake.at(tmp_path / "lake")
+    shutil.copytree(fleet[0].root, lake.root)
+    pages = write_fleet_report(lake, _config(), tmp_path / "out" / "fleet.html")
+    before = {p: p.stat().st_mtime_ns for p in pages[1:]}
+    assert write_fleet_report(lake, _config(), tmp_path / "out" / "fleet.html") == pages
+    assert {p: p.stat().st_mtime_ns for p in pages[1:]} == before
+    changed = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="b", day="2026-03-01")
+    again = [replace(r, work_key="again", recorded_at="", asserted_at="") for r in changed]
+    commit_records(lake, CALIBRATIONS, again)
+    pages[2].unlink()
+    write_fleet_report(lake, _config(), tmp_path / "out" / "fleet.html")
+    drawn = {p.name for p in pages[1:] if p.stat().st_mtime_ns != before[p]}
+    assert drawn == {"b_2026-03-01.html", pages[2].name}
+
+
+def test_vehicles_whose_names_look_alike_have_pages_of_their_own(tmp_path: Path, maker: ModuleType) -> None:
+    lake, rng = Lake.at(tmp_path / "lake"), np.random.default_rng(8)
+    for vehicle in ("a b", "a_b", "ä b"):
+        _store(lake, maker.vehicle_records(vehicle, 1, rng))
+    pages = write_fleet_report(lake, _config(), tmp_path / "fleet.html")
+    assert len(set(pages)) == len(pages) == 4
+    titles = {
+        vehicle for vehicle in ("a b", "a_b", "ä b") for p in pages[1:] if f"{vehicle}" in p.read_text()
+    }
+    assert titles == {"a b", "a_b", "ä b"}
+    for page in pages[1:]:
+        assert quote(page.name) in (tmp_path / "fleet.html").read_text()
