@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.joint.lidar_radar.normal_equations import tempered
+from pipeline.calibrate.joint.lidar_radar.tilt_floors import tempered
 from pipeline.calibrate.numerics.bias_floors import (
     BOX_ELEVATION_GATES_RAD,
     BOX_ROLL_FLOOR_CAMERA_RAD,
@@ -233,7 +233,7 @@ def _equations(seen: _Seen, T: np.ndarray, bias: np.ndarray, step: int) -> _Equa
     # yaw, for boxes were matched by azimuth at this pose.
     only_yaw, only_elevation = about_radar.copy(), about_radar.copy()
     only_yaw[:, [0, 2]], only_elevation[:, 1] = 0.0, 0.0
-    Hb, gb = tempered(only_elevation.T @ Hb @ only_elevation, gb @ only_elevation, _BOX_FLOOR)
+    Hb, gb = tempered(only_elevation.T @ Hb @ only_elevation, gb @ only_elevation, np.diag(_BOX_FLOOR**2))
     A = only_yaw[:6, :6]
     Hb[:, :6, :6] += A.T @ Ha @ A
     gb[:, :6] += ga @ A

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin
+from pipeline.calibrate.joint.lidar_radar.tilt_floors import radar_tilt_axes
 from pipeline.extrinsics.estimates import PairEstimate
 
 __all__ = ["lidar_radar_failures", "open_loop", "unvouched_basin"]
@@ -49,9 +50,11 @@ def lidar_radar_failures(estimate: PairEstimate) -> list[str]:
         key = f"halves_{_KEYS[k]}"
         if estimate.observable[k] and abs(d[key]) > _SIGMAS * _HALVES_FACTOR * sigma[k]:
             failed.append(f"disjoint halves disagree in {name} by {_size(k, d[key])}")
-    for k, name in ((0, "roll"), (1, "pitch")):
+    for axis, name in zip(radar_tilt_axes(estimate.T).T, ("roll", "pitch"), strict=True):
         offset, floor = d[f"registration_{name}_offset_rad"], d[f"registration_{name}_sigma_rad"]
-        if estimate.observable[k] and abs(offset) > _SIGMAS * np.hypot(floor, sigma[k]):
+        known = estimate.observable[int(np.argmax(np.abs(axis)))]
+        own = float(np.sqrt(axis @ estimate.covariance[:2, :2] @ axis))
+        if known and abs(offset) > _SIGMAS * np.hypot(floor, own):
             failed.append(
                 f"the registration would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
             )

@@ -78,11 +78,22 @@ def test_a_radar_without_elevation_leaves_roll_and_pitch_to_the_prior():
     assert abs(error_of(found)[2]) < np.radians(0.2)
     assert any("roll, pitch" in note for note in found.notes)
     assert any("measures no elevation" in note for note in found.notes)
-    # What rests on the prior is the same every day; yaw, which the day determines, varies.
+    # What rests on the prior is the same every day, and so is what yaw errs by through roll; what streets leave varies.
     varying = np.diag(change_covariance(found.T, found.covariance - found.common_covariance))
     total = np.diag(change_covariance(found.T, found.covariance))
     assert np.allclose(varying[[0, 1, 5]], 0, atol=1e-3 * total[[0, 1, 5]].max())
-    assert varying[2] > 0.2 * total[2]
+    assert varying[2] > np.radians(0.01) ** 2
+
+
+@pytest.mark.parametrize("roll_deg", [-3.0, 3.0])
+def test_a_roll_that_nobody_measures_leaves_yaw_as_open_as_its_errors_show(roll_deg):
+    off = T_LIDAR_RADAR.copy()
+    off[:3, :3] = exp_so3(np.array([np.radians(roll_deg), 0.0, 0.0])) @ off[:3, :3]
+    found = solve(street_day(24, elevation=False), Prior(T_CAMERA_LIDAR, off, SIGMA_ROTATION, SIGMA_SHIFT))
+    error = change_between(T_LIDAR_RADAR, found.T)
+    assert abs(error[2]) > np.radians(0.06)  # a roll of 3 deg does that much
+    assert abs(error[2]) < 3 * np.sqrt(found.covariance[2, 2])
+    assert np.sqrt(found.covariance[2, 2]) < np.radians(0.2)
 
 
 def test_a_height_that_the_day_cannot_tell_stays_while_a_knock_aside_is_found(day):

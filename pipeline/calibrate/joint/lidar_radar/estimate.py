@@ -19,7 +19,7 @@ from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, 
 from pipeline.calibrate.joint.lidar_radar.normal_equations import (
     AZIMUTH_RANGE_DOF,
     DT,
-    PITCH,
+    ELEVATION_DOF,
     STEP_LIMIT,
     UNKNOWNS,
     Linear,
@@ -31,6 +31,7 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import (
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, anneal, finish, last_step, scan
+from pipeline.calibrate.joint.lidar_radar.tilt_floors import following_tilt, radar_tilt_axes
 from pipeline.calibrate.joint.lidar_radar.time_offset import better_time_offset, comparison_cost
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction
 from pipeline.calibrate.numerics.bias_floors import (
@@ -178,17 +179,16 @@ def _with_witnesses(
     """The analysis with what witnesses say of its pitch, which is less sure where they contradict each other."""
     if witnesses is None:
         return analysis
-    moved = float(change_between(asked_at.T_lidar_radar, analysis.state.T_lidar_radar)[PITCH])
+    axes = radar_tilt_axes(analysis.state.T_lidar_radar)
+    turn = change_between(asked_at.T_lidar_radar, analysis.state.T_lidar_radar)[:2]
+    moved = float(turn @ axes[:, 1])
     witnesses = tuple(replace(w, offset_rad=w.offset_rad - moved) for w in witnesses)
-    covariance, common, disagreement = (
-        analysis.covariance.copy(),
-        analysis.common.copy(),
-        contradiction(witnesses),
-    )
-    if disagreement is not None and not analysis.fixed[PITCH]:
-        for part in (covariance, common):
-            part[PITCH] *= disagreement.factor
-            part[:, PITCH] *= disagreement.factor
+    covariance, common, disagreement = analysis.covariance, analysis.common, contradiction(witnesses)
+    if disagreement is not None and not analysis.fixed[int(np.argmax(np.abs(axes[:, 1])))]:
+        # The record's axes are the lidar's: only the radar's own pitch gets less sure.
+        wider = np.eye(len(covariance))
+        wider[:2, :2] += (disagreement.factor - 1) * np.outer(axes[:, 1], axes[:, 1])
+        covariance, common = (wider @ part @ wider for part in (covariance, common))
     return replace(analysis, witnesses=witnesses, covariance=covariance, common=common)
 
 
@@ -243,6 +243,8 @@ def _analyse_observability(
         variance[: DT + 1] = np.where(fixed[: DT + 1], before, variance[: DT + 1])
         full = covariance_with_fixed(information, linear.g, variance, curvature, fixed, block, rng)
         full[:2, :2] += _camera_share(camera) * ~(fixed[:2, None] | fixed[:2])
+        follow = _following_tilt(linear, fixed)
+        full = follow @ full @ follow.T
         free = ~fixed[: DT + 1]
         dt_bias = LIDAR_RADAR_DT_FLOOR_S**2 + _remaining_dt(linear, state, fixed) ** 2
         bias = np.where(free, [*LIDAR_RADAR_BIAS**2, dt_bias], 0.0)
@@ -255,10 +257,18 @@ def _analyse_observability(
         # fixed, they contradict the scene by metres, and yaw follows.
         unknown[DT] &= not np.any(unknown[:DT] & ~fixed[:DT])
         fixed[: DT + 1] |= unknown
-    common = _floors(linear, curvature, fixed) + prior_share(full, np.diag(1 / variance))
+    common = follow @ _floors(linear, curvature, fixed) @ follow.T + prior_share(full, np.diag(1 / variance))
     for covariance in (full, common):
         covariance[np.arange(DT + 1), np.arange(DT + 1)] += bias
     return ObservabilityAnalysis(state, linear, full, common, fixed, observability, linear.witnesses)
+
+
+def _following_tilt(linear: Linear, fixed: Bool[np.ndarray, " P"]) -> Float[np.ndarray, "P P"]:
+    """How yaw, x, y, dt and range bias follow errors of roll, pitch and z, which their equations take as exact."""
+    H = np.zeros_like(linear.prior_information)
+    H[:8, :8] = linear.registration.H[0].sum(0)
+    follows = AZIMUTH_RANGE_DOF[~fixed[AZIMUTH_RANGE_DOF]]
+    return following_tilt(H, linear.prior_information, follows, ELEVATION_DOF)
 
 
 def _floors(

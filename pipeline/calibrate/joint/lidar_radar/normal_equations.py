@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
+from pipeline.calibrate.joint.lidar_radar.tilt_floors import along_radar, floor_scatter, tempered, tilt_of
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_opinion
 from pipeline.calibrate.numerics.bias_floors import (
     BOX_ROLL_FLOOR_LIDAR_RAD,
@@ -47,7 +48,7 @@ from schemas.observations import Observation
 __all__ = [
     "AZIMUTH_RANGE_DOF",
     "DT",
-    "PITCH",
+    "ELEVATION_DOF",
     "RANGE",
     "STEP_LIMIT",
     "UNKNOWNS",
@@ -55,15 +56,14 @@ __all__ = [
     "RadarProblem",
     "RadarState",
     "linearise",
-    "tempered",
     "travel_opinion",
 ]
 
-PITCH, DT, RANGE = 1, 6, 7
+DT, RANGE = 6, 7
 UNKNOWNS = 8 + len(BOX_CLASSES)
 STEP_LIMIT = np.array([0.05] * 3 + [0.15] * 3 + [0.03, 0.1] + [0.05] * len(BOX_CLASSES))
 AZIMUTH_RANGE_DOF = np.array([2, 3, 4, 6, 7])
-_ELEVATION_DOF = np.array([0, 1, 5])
+ELEVATION_DOF = np.array([0, 1, 5])
 # Roll and pitch of the boxes, and their constants: pitch has unknowns of its own.
 _BOX_FLOOR = np.array([BOX_ROLL_FLOOR_LIDAR_RAD, 0.0] + [0.0] * len(BOX_CLASSES))
 
@@ -150,7 +150,8 @@ class Linear:
     box_sigma_rad: float
     boxes: int
     mover_sigma_rad: float
-    registration_step: np.ndarray  # 3: where the registration's elevations alone would move roll, pitch, z
+    # 3: where the registration's elevations alone would move roll, pitch (about the radar's own axes), z
+    registration_step: np.ndarray
     floor: np.ndarray  # 3: sigma that those elevations leave of roll, pitch [rad] and z [m]
     witnesses: tuple[Witness, ...]  # of pitch
     travel_frames: int
@@ -193,7 +194,7 @@ def linearise(
     equations = _registration(problem, state, widen, stride, about_radar)
     _add_azimuths_and_ranges(problem, equations, stride, sums)
     floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
-    registration_step = _add_elevations(problem, equations, stride, floor, sums)
+    registration_step = _add_elevations(problem, state, equations, stride, floor, sums)
     box_sigma, box_witness = _add_boxes(problem, state, pairs, about_radar, sums)
     travel_scatter, travel_witness = _add_travel(problem, state, sums)
     own = Witness("registration", float(registration_step[1]), float(floor[1]))
@@ -300,11 +301,11 @@ def _add_boxes(
     own = np.array([0, 1, *range(6, 6 + len(BOX_CLASSES))])
     Hb, gb = Hb[:, own[:, None], own], gb[:, own]
     prior = np.diag([0.0, *[1 / BIAS_SIGMA_RAD**2] * len(BOX_CLASSES)])
-    witness = own_opinion(
-        "boxes", Hb[:, 1:, 1:].sum(0) + prior, gb[:, 1:].sum(0) + prior @ [0.0, *state.bias_rad], 0.0
-    )
-    Hb, gb = tempered(Hb, gb, _BOX_FLOOR)
-    sums.floors[np.ix_(columns, columns)] += _floor_scatter(Hb, _BOX_FLOOR)
+    H_own, g_own = tilt_of(state.T_lidar_radar, Hb.sum(0), gb.sum(0))
+    witness = own_opinion("boxes", H_own[1:, 1:] + prior, g_own[1:] + prior @ [0.0, *state.bias_rad], 0.0)
+    floor = along_radar(state.T_lidar_radar, _BOX_FLOOR)
+    Hb, gb = tempered(Hb, gb, floor)
+    sums.floors[np.ix_(columns, columns)] += floor_scatter(Hb, floor)
     for array in (sums.H, sums.information):
         array[np.ix_(np.arange(F), columns, columns)] += Hb
     sums.g[:, columns] += gb
@@ -317,9 +318,9 @@ def _add_travel(problem: RadarProblem, state: RadarState, sums: _Sums) -> tuple[
         return float("nan"), None
     H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
     witness = travel_opinion(problem, state)
-    floor = np.full(2, DOPPLER_PITCH_FLOOR_RAD)
+    floor = DOPPLER_PITCH_FLOOR_RAD**2 * np.eye(2)
     H, g = tempered(H, g, floor)
-    sums.floors[:2, :2] += _floor_scatter(H, floor)
+    sums.floors[:2, :2] += floor_scatter(H, floor)
     for array in (sums.H, sums.information):
         array[:, :2, :2] += H
     sums.g[:, :2] += g
@@ -331,11 +332,13 @@ def travel_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
     if problem.travel is None:
         return None
     H, g, _ = pitch_equations(problem.travel, state.T_lidar_radar, len(problem.observations))
-    return own_opinion("doppler", H[:, 1:, 1:].sum(0), g[:, 1:].sum(0), DOPPLER_PITCH_FLOOR_RAD)
+    H_own, g_own = tilt_of(state.T_lidar_radar, H.sum(0), g.sum(0))
+    return own_opinion("doppler", H_own[1:, 1:], g_own[1:], DOPPLER_PITCH_FLOOR_RAD)
 
 
 def _add_elevations(
     problem: RadarProblem,
+    state: RadarState,
     equations: NormalEquations,
     stride: int,
     floor: np.ndarray,
@@ -343,37 +346,21 @@ def _add_elevations(
 ) -> np.ndarray:
     """Roll, pitch and z from the registration's elevations as one measurement with covariance `H^-1 + floor^2`.
 
-    Returns where these elevations alone would move roll, pitch and z.
+    Floors and what is returned, where these elevations alone would move roll, pitch and z, are along the radar's axes.
     """
-    block = np.ix_(np.arange(len(problem.frames.frame)), _ELEVATION_DOF, _ELEVATION_DOF)
+    block = np.ix_(np.arange(len(problem.frames.frame)), ELEVATION_DOF, ELEVATION_DOF)
     He, Ie = stride * equations.H[1][block], stride * equations.information[1][block]
-    ge = stride * equations.g[1][:, _ELEVATION_DOF]
+    ge = stride * equations.g[1][:, ELEVATION_DOF]
     at = problem.frames.frame
-    where = np.ix_(at, _ELEVATION_DOF, _ELEVATION_DOF)
-    He_t, ge_t = tempered(He, ge, floor)
+    where = np.ix_(at, ELEVATION_DOF, ELEVATION_DOF)
+    floors = along_radar(state.T_lidar_radar, floor)
+    He_t, ge_t = tempered(He, ge, floors)
     sums.H[where] += He_t
-    sums.information[where] += tempered(Ie, ge, floor)[0]
-    sums.floors[np.ix_(_ELEVATION_DOF, _ELEVATION_DOF)] += _floor_scatter(He_t, floor)
-    sums.g[np.ix_(at, _ELEVATION_DOF)] += ge_t
-    return -np.linalg.pinv(He.sum(0), rcond=1e-6) @ ge.sum(0)
-
-
-def tempered(
-    H: Float[np.ndarray, "F P P"], g: Float[np.ndarray, "F P"], floor: Float[np.ndarray, " P"]
-) -> tuple[Float[np.ndarray, "F P P"], Float[np.ndarray, "F P"]]:
-    """Equations of all frames as one measurement with covariance `H^-1 + floor^2`, shared out among the frames."""
-    # (H^-1 + F)^-1 = (1 + H F)^-1 H, which also holds where H is singular (a radar without elevation).
-    W = np.linalg.inv(np.eye(len(floor)) + H.sum(0) @ np.diag(floor**2))
-    product = W @ H
-    return 0.5 * (product + np.swapaxes(product, 1, 2)), g @ W.T
-
-
-def _floor_scatter(
-    H_tempered: Float[np.ndarray, "F P P"], floor: Float[np.ndarray, " P"]
-) -> Float[np.ndarray, "P P"]:
-    """Covariance of a measurement's total gradient by its floor alone: `J floor^2 J`, with J as `tempered` left it."""
-    J = H_tempered.sum(0)
-    return J @ np.diag(floor**2) @ J
+    sums.information[where] += tempered(Ie, ge, floors)[0]
+    sums.floors[np.ix_(ELEVATION_DOF, ELEVATION_DOF)] += floor_scatter(He_t, floors)
+    sums.g[np.ix_(at, ELEVATION_DOF)] += ge_t
+    H_own, g_own = tilt_of(state.T_lidar_radar, He.sum(0), ge.sum(0))
+    return np.asarray(-np.linalg.pinv(H_own, rcond=1e-6) @ g_own)
 
 
 def _prior_equations(problem: RadarProblem, state: RadarState) -> tuple[np.ndarray, np.ndarray]:
