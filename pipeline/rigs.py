@@ -55,6 +55,10 @@ class CameraPrior:
     """What is known of a camera beside its CameraInfo."""
 
     readout_s: float = 0.0
+    # Target calibrations repeated with other pictures of the same camera scatter by some tenths of a percent and by one
+    # or two pixels (Zhang 2000, table 2); the better ones of these.
+    focal_sigma: float = 0.003
+    centre_sigma_px: float = 1.0
 
 
 class CameraTopics(Section):
@@ -68,10 +72,19 @@ class CameraTopics(Section):
     # dumps: it is calibration's, and no reason to ingest a rig's logs again.
     readout_s: Annotated[float, Field(ge=0, le=0.1)] = Field(default=0.0, exclude=True)
 
+    # How surely CameraInfo is right (1 sigma): focal length, and principal point in either direction.
+    # 0 = surely: the day then needs no more than its own sigma to contradict it.
+    focal_sigma_relative: Annotated[float, Field(ge=0, le=0.05)] = Field(
+        default=CameraPrior.focal_sigma, exclude=True
+    )
+    centre_sigma_px: Annotated[float, Field(ge=0, le=100)] = Field(
+        default=CameraPrior.centre_sigma_px, exclude=True
+    )
+
     @property
     def known(self) -> CameraPrior:
         """What calibration takes as known of the camera."""
-        return CameraPrior(self.readout_s)
+        return CameraPrior(self.readout_s, self.focal_sigma_relative, self.centre_sigma_px)
 
 
 class OnnxPointSemantics(Section):

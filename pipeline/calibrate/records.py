@@ -27,7 +27,6 @@ __all__ = ["Inputs", "Judged", "SolvedDay", "environment_of", "record_of", "refu
 # Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
 _FAST_MPS = 20.0
 _MOVING_MPS = 1.0
-_DOUBTFUL_FOCAL = 0.009  # three sigmas of what intrinsics are known to
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         alignment_after=test.after if test else None,
         time_offset_s=estimate.time_offset_s,
         time_offset_sigma_s=estimate.time_offset_sigma_s,
-        notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable), *_focal(estimate)],
+        notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable)],
         assumptions=[*_assumed(pair, day.observations), *estimate.notes],
         drive_missing=selection.missing.get(pair, []),
         diagnostics=dict(estimate.diagnostics)
@@ -166,7 +165,7 @@ def _assumed(pair: str, observations: Sequence[Observation]) -> list[str]:
         *assumed,
         (
             f"camera intrinsics as logged: a focal length wrong by 0.1 % puts the image's edge {worth:.2f} deg off, a "
-            f"principal point wrong by 1 px is a camera turned by {turn:.2f} deg: no alignment tells the two apart"
+            f"principal point wrong by 1 px is a camera turned by {turn:.2f} deg: alignments hardly tell the two apart"
         ),
     ]
 
@@ -175,14 +174,6 @@ def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
     out = np.array(K, np.float64)
     out[[0, 1], [0, 1]] *= factor
     return out
-
-
-def _focal(estimate: PairEstimate) -> list[str]:
-    """A focal length that the images contradict is worth a sentence: the pose allows for it, its users may not."""
-    scale = estimate.diagnostics.get("focal_scale", 1.0)
-    if abs(scale - 1) < _DOUBTFUL_FOCAL:
-        return []
-    return [f"the images look as if the focal length were {100 * (scale - 1):+.1f} % off the logged one"]
 
 
 def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:

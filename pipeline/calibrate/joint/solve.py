@@ -11,7 +11,7 @@ solves again whatever rested on it.
 
 A loop that is closed by construction checks nothing, so estimates that took no part are compared with it: camera-radar
 without the lidar, disjoint halves of the day, other origins of the search, and the registration's own roll and pitch
-(`failed_checks`).
+(`failed_checks`). A CameraInfo that the day contradicts holds camera-lidar: with a better one its pose is another.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.calibrate.joint.camera_lidar.estimate import Aligned, align_camera_lidar, analyse_camera_lidar
+from pipeline.calibrate.joint.camera_lidar.intrinsics import contradictions
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
 from pipeline.calibrate.joint.composition import compose_pairs
 from pipeline.calibrate.joint.failed_checks import lidar_radar_failures, unvouched_basin
@@ -168,7 +169,10 @@ class _Day:
             return _unchanged("camera_lidar", self.prior), [self.aligned] if self.aligned else []
         heading = None if lidar_radar is None else _heading(lidar_radar)
         found = analyse_camera_lidar(self.aligned, np.random.default_rng([self.seed, 3]), heading=heading)
-        return replace(found, disproved=unvouched_basin(self.aligned.basin)), []
+        found = replace(found, disproved=unvouched_basin(self.aligned.basin))
+        # Of a basin that is lost, nobody knows what its intrinsics are worth.
+        told = [] if found.disproved else contradictions(self.aligned.intrinsics, self.prior.camera)
+        return found, told
 
 
 def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfig]:

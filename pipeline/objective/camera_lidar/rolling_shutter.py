@@ -49,14 +49,15 @@ def exposed(
         camera: at the size of the label images.
         velocity_lidar: own velocity in lidar axes [m/s]; the one that an earlier call had.
         yaw_rate: own [rad/s].
-        readout_s: from the first row to the last; 0 puts the points back to the time of the middle row.
+        readout_s: from the first row to the last (negative: from the last to the first); 0 puts the points back to the
+            time of the middle row.
     """
     frame = np.repeat(np.arange(len(poses)), np.diff(points.start))
     velocity, turn = velocity_lidar[frame], yaw_rate[frame]
     still = _turned(points.xyz_m.astype(np.float64), turn * points.exposure_s)
     still += velocity * points.exposure_s[:, None]
     exposure_s, moved = np.zeros(len(frame)), still
-    for _ in range(_ROUNDS if readout_s > 0 else 0):
+    for _ in range(_ROUNDS if readout_s else 0):
         rows = poses[frame].reshape(-1, 3, 4).astype(np.float64)
         uv, valid = camera.project(np.einsum("nij,nj->ni", rows[:, :, :3], moved) + rows[:, :, 3])
         exposure_s = np.where(valid, row_delays_s(uv[:, 1], camera.height_px, readout_s), 0.0)

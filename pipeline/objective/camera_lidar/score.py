@@ -226,15 +226,19 @@ class Terms:
         poses = self.poses(at)[0].astype(np.float64)
         motion = _motion_in_camera(poses, at.T_camera_lidar[0, :3, 3], self.velocity_lidar, self.yaw_rate)
         focal, m = float(at.focal[0]), self.markings
-        g_edges, I_edges = edge_gradients(
-            self.camera, self.maps.offsets, self.edges, poses, focal, motion, settings
-        )
-        contrast = self.maps.contrast[settings.contrast_level]
-        g_marks, I_marks = marking_gradients(
-            self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, poses, focal, motion
-        )
-        a, b = settings.edge_weight, settings.marking_weight
-        return a * g_edges + b * g_marks, a * I_edges + b * I_marks
+        gradient, information = np.zeros((self.frames, 11)), np.zeros((self.frames, 11, 11))
+        if settings.edge_weight > 0:
+            g, H = edge_gradients(self.camera, self.maps.offsets, self.edges, poses, focal, motion, settings)
+            gradient += settings.edge_weight * g
+            information += settings.edge_weight * H
+        if settings.marking_weight > 0:
+            contrast = self.maps.contrast[settings.contrast_level]
+            g, H = marking_gradients(
+                self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, poses, focal, motion
+            )
+            gradient += settings.marking_weight * g
+            information += settings.marking_weight * H
+        return gradient, information
 
     def mean_match(self, settings: KernelSettings) -> Float[np.ndarray, " 4"]:
         """Share of matching edges by direction, over the edges that there are."""

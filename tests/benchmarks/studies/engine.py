@@ -65,6 +65,11 @@ _DIAGNOSTICS = {
     "holdout_z",
     "loop_rotation_sigma_rad",
     "focal_scale",
+    "day_focal_scale",
+    "day_focal_sigma",
+    *(f"day_centre_{axis}{what}_px" for axis in "uv" for what in ("", "_sigma")),
+    "mounting_yaw_sigma_rad",
+    "mounting_pitch_sigma_rad",
     "doppler_frames",
     *(
         f"{who}_pitch_{what}_rad"

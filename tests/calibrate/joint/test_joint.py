@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.calibrate.joint.camera_lidar.estimate import Aligned, AlignmentState
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin
+from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics
 from pipeline.calibrate.joint.composition import compose_pairs
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.config import SolveConfig
@@ -113,6 +114,8 @@ def solved_with_camera(monkeypatch, day, vouched_by):
     aligned = object.__new__(Aligned)  # without the terms and frames that nothing here looks at
     object.__setattr__(aligned, "basin", basin)
     object.__setattr__(aligned, "state", AlignmentState(T_CAMERA_LIDAR))
+    agreeing = DayIntrinsics(1.0, 0.004, np.zeros(2), np.ones(2), (900.0, 900.0))
+    object.__setattr__(aligned, "intrinsics", agreeing)
     monkeypatch.setattr(Aligned, "covariance", covariance)
     monkeypatch.setattr("pipeline.calibrate.joint.solve.align_camera_lidar", lambda *_: aligned)
     headings = []

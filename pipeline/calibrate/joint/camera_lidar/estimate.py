@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, sweep_s_per_rad
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
+from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics, measure_intrinsics
 from pipeline.calibrate.joint.camera_lidar.observability import (
     IS_TZ,
     CameraLidarProblem,
@@ -28,7 +29,7 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
 from pipeline.calibrate.joint.camera_lidar.refine import NONE_FIXED, AlignmentState, Scored, refine, weighted
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, s_per_metre
-from pipeline.calibrate.numerics.bias_floors import FOCAL_SIGMA, HEADING_SIGMA_RAD, MAX_GAP_PX
+from pipeline.calibrate.numerics.bias_floors import HEADING_SIGMA_RAD, MAX_GAP_PX
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
@@ -66,6 +67,7 @@ class Aligned:
     state: AlignmentState
     kernel: KernelSettings
     expected_dt_s: float  # the state's time offset counts from it: the constant part of the stamps' gaps
+    intrinsics: DayIntrinsics
 
     @property
     def T_camera_lidar(self) -> Float[np.ndarray, "4 4"]:
@@ -154,7 +156,9 @@ def align_camera_lidar(
         prior.translation_sigma_m**2,
         MotionSigmas(heading_sigma, sweep_s_per_rad(frames)),
     )
-    return Aligned(problem, frames, rejected, basin, state, kernel, constant_gap_s(camera_gaps_s(frames)))
+    intrinsics = measure_intrinsics(problem, state, kernel, frames[0].label_scale, rng)
+    expected_dt_s = constant_gap_s(camera_gaps_s(frames))
+    return Aligned(problem, frames, rejected, basin, state, kernel, expected_dt_s, intrinsics)
 
 
 def analyse_camera_lidar(
@@ -277,9 +281,8 @@ def _conclude(
 ) -> PairEstimate:
     """The estimate, its covariance by left perturbation, notes."""
     dt_sigma = float(np.sqrt(analysis.covariance[6, 6]))
-    notes = [
-        f"focal length {analysis.state.focal - 1:+.2%} off the log's, where {FOCAL_SIGMA:.1%} was expected (1 sigma)"
-    ]
+    known = analysis.prior.camera
+    notes = aligned.intrinsics.notes(known)
     if dt_sigma > _UNKNOWN_SHARE * config.time_offset_sigma_s:
         notes.append("camera time offset: the day's speeds do not determine it")
     to_left = np.linalg.inv(change_jacobian(analysis.state.T_camera_lidar))
@@ -293,7 +296,7 @@ def _conclude(
         frames_rejected=aligned.rejected,
         time_offset_s=aligned.expected_dt_s + analysis.state.dt_s,
         time_offset_sigma_s=dt_sigma,
-        diagnostics=diagnostics,
+        diagnostics=diagnostics | aligned.intrinsics.diagnostics(known),
         notes=notes,
         common_covariance=common_part(
             to_left @ analysis.common[:6, :6] @ to_left.T, to_left @ analysis.covariance[:6, :6] @ to_left.T

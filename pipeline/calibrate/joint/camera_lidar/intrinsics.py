@@ -1,0 +1,262 @@
+"""What the day says of the camera's focal length and principal point: for report and alarm, not for the pose.
+
+Freeing them in the pose costs more than it gains: focal length, tz and the time offset share a valley, and a principal
+point wrong by d pixels is, over most of an image, a camera turned by d/f. So the pose stays that of CameraInfo, which
+is right for whoever uses image directions with the same CameraInfo, and the intrinsics are measured beside it: all
+unknowns free together, Gauss-Newton on the points' re-weighted residuals from the aligned pose. Response surfaces,
+which solve for the pose, lose themselves in that valley; analytic slopes, which do not see the steps of the maps, do
+not. They still end in a maximum of their own, so they begin twice, at CameraInfo's focal length and the expected clock
+and where the alignment had both, and the edges say which end is better: from the first alone, a highway whose camera
+was 60 ms late showed a focal length 6 % off.
+
+Edges alone say the focal length, with the principal point held. Markings run along the car's way and grow with it as
+with the focal length: with them it was 0.8 % off where edges were 0.5 % off. The principal point needs them, for they
+reach the image's lower corners.
+
+Source: Triggs et al. 2000, section 4 (Gauss-Newton with robust weights); the sigmas are measured, see their constants.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.calibrate.joint.camera_lidar.observability import CameraLidarProblem
+from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
+from pipeline.calibrate.numerics.bias_floors import (
+    DAY_CENTRE_SIGMAS,
+    DAY_FOCAL_FLOOR,
+    DAY_FOCAL_SIGMAS,
+    INTRINSICS_CONTRADICTION_SIGMAS,
+)
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.changes import change_between, change_jacobian
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms
+from pipeline.rigs import CameraPrior
+
+__all__ = ["DayIntrinsics", "contradictions", "measure_intrinsics"]
+
+_KERNELS = ((2.5, 1), (1.5, 2))  # px and contrast level: the alignment's last two
+_STEPS = 8  # at each kernel: from a focal length 3 % off, later steps are less than a tenth of the sigma
+_POINTS = 9000  # twice as many change nothing
+# A marking's score is linear in the contrast, so its information is no curvature; steps by it overshoot, to and fro by
+# 10 px on the simulated rig `demo`. Three times as much settles them.
+_MARKING_DAMPING = 3.0
+# Weak priors that keep undetermined directions in place: focal scale, and principal point in shares of the image.
+_FOCAL_REACH, _CENTRE_REACH = 0.05, 0.13
+_HELD_PX = 1e-3  # sigma of a principal point that stays
+_DECIDED_SIGMAS = 3.0  # of the frames' scatter: where two ends score alike, half of their distance is sigma
+_FOCAL, _CENTRE, _UNKNOWNS = 7, slice(8, 10), 10
+
+
+@dataclass(frozen=True, eq=False)
+class DayIntrinsics:
+    """The day's own measurement, with sigmas in which CameraInfo does not count.
+
+    Focal length in units of CameraInfo's; principal point (right, down) less CameraInfo's [px of the full image].
+    """
+
+    focal: float
+    focal_sigma: float
+    centre_px: Float[np.ndarray, " 2"]
+    centre_sigma_px: Float[np.ndarray, " 2"]
+    focal_px: tuple[float, float]
+
+    def diagnostics(self, known: CameraPrior) -> dict[str, float]:
+        """Numbers of the record; `mounting_*` is what the principal point leaves open in the camera's turn."""
+        centre = _together(self.centre_sigma_px, known.centre_sigma_px)
+        return {
+            "day_focal_scale": self.focal,
+            "day_focal_sigma": self.focal_sigma,
+            "day_focal_observable": float(self.focal_sigma <= known.focal_sigma),
+            **{f"day_centre_{n}_px": float(v) for n, v in zip("uv", self.centre_px, strict=True)},
+            **{f"day_centre_{n}_sigma_px": float(v) for n, v in zip("uv", self.centre_sigma_px, strict=True)},
+            **{
+                f"day_centre_{n}_observable": float(v <= known.centre_sigma_px)
+                for n, v in zip("uv", self.centre_sigma_px, strict=True)
+            },
+            "mounting_yaw_sigma_rad": float(centre[0] / self.focal_px[0]),
+            "mounting_pitch_sigma_rad": float(centre[1] / self.focal_px[1]),
+        }
+
+    def notes(self, known: CameraPrior) -> list[str]:
+        """In words: what was assumed, and what the day could have told."""
+        u, v = _together(self.centre_sigma_px, known.centre_sigma_px)
+        yaw, pitch = np.degrees([u / self.focal_px[0], v / self.focal_px[1]])
+        (right, down), (right_sigma, down_sigma) = self.centre_px, self.centre_sigma_px
+        return [
+            (
+                "azimuth and elevation hold with CameraInfo's principal point, which is known to "
+                f"{u:.1f} px right and {v:.1f} px down (1 sigma): of the camera's mounting that leaves "
+                f"{yaw:.2f} deg of yaw and {pitch:.2f} deg of pitch"
+            ),
+            (
+                f"by the day alone the focal length is {self.focal - 1:+.1%} +- {self.focal_sigma:.1%} off "
+                f"CameraInfo's, the principal point {right:+.0f} +- {right_sigma:.0f} px right and "
+                f"{down:+.0f} +- {down_sigma:.0f} px down of it"
+            ),
+            # Freed, the readout time of 40 ms or none came out 25 to 40 ms off: see study `intrinsics.py`.
+            f"image rows are exposed within {1e3 * known.readout_s:.0f} ms (readout_s): a day does not tell",
+        ]
+
+
+def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[str]:
+    """Sentences, one for each intrinsic of CameraInfo that the day shows wrong."""
+    limit = INTRINSICS_CONTRADICTION_SIGMAS
+    found = []
+    if abs(day.focal - 1) > limit * np.hypot(day.focal_sigma, known.focal_sigma):
+        found.append(
+            f"CameraInfo's focal length is contradicted by the day: measured {day.focal - 1:+.1%} "
+            f"+- {day.focal_sigma:.1%}"
+        )
+    off, sigma = day.centre_px, np.hypot(day.centre_sigma_px, known.centre_sigma_px)
+    if (np.abs(off) > limit * sigma).any():
+        u, v = day.centre_sigma_px
+        found.append(
+            f"CameraInfo's principal point is contradicted by the day: measured {off[0]:+.1f} +- {u:.1f} px right, "
+            f"{off[1]:+.1f} +- {v:.1f} px down"
+        )
+    return found
+
+
+def measure_intrinsics(
+    problem: CameraLidarProblem,
+    state: AlignmentState,
+    kernel: KernelSettings,
+    label_scale: float,
+    rng: np.random.Generator,
+) -> DayIntrinsics:
+    """Solve for pose, time offset, focal length and principal point together, from an aligned pose.
+
+    Args:
+        problem: sharp points of the day, and the prior.
+        state: aligned.
+        kernel: whose weights edges and markings have.
+        label_scale: label pixels per image pixel.
+        rng: draws points and chance densities.
+    """
+    some = replace(problem, terms=problem.terms.at_most(_POINTS, rng))
+    expected, aligned = (
+        _focal_end(some, start, kernel, rng) for start in (AlignmentState(state.T_camera_lidar), state)
+    )
+    lead, is_decided = _lead(some, aligned, expected)
+    best, other = (aligned, expected) if lead > 0 else (expected, aligned)
+    focal, dt_s = best.at.alignment.focal, best.at.alignment.dt_s
+    apart = 0.0 if is_decided else focal - other.at.alignment.focal
+    reach_px = _CENTRE_REACH * problem.terms.maps.camera.width_px
+    # From the aligned pose again: the edges of 16 rings know nothing of pitch.
+    begin = _State(AlignmentState(state.T_camera_lidar, dt_s, focal), np.zeros(2))
+    end = _solved(some, begin, kernel, reach_px, rng)
+    centre_sigma = DAY_CENTRE_SIGMAS * np.sqrt(np.diag(np.linalg.inv(end.information))[_CENTRE])
+    formal = float(np.linalg.inv(best.information)[_FOCAL, _FOCAL])
+    fx, fy = problem.terms.maps.camera.focal_px
+    return DayIntrinsics(
+        focal,
+        float(np.sqrt(DAY_FOCAL_SIGMAS**2 * formal + DAY_FOCAL_FLOOR**2 + apart**2 / 4)),
+        end.at.centre_px / label_scale,
+        centre_sigma / label_scale,
+        (fx / label_scale, fy / label_scale),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """An alignment and a shift of the principal point [label px]."""
+
+    alignment: AlignmentState
+    centre_px: np.ndarray
+
+    def off(self, prior: Prior) -> Float[np.ndarray, " 10"]:
+        """All unknowns, in the coordinates of `AlignmentState.changed`, less what is expected of them."""
+        a = self.alignment
+        pose = change_between(prior.T_camera_lidar, a.T_camera_lidar)
+        return np.concatenate([pose, [a.dt_s, a.focal - 1], self.centre_px])
+
+    def stepped(self, x: Float[np.ndarray, " 10"]) -> _State:
+        """The state one change on."""
+        return _State(self.alignment.stepped(x[:8]), self.centre_px + x[_CENTRE])
+
+    def seen(self, terms: Terms) -> Terms:
+        """The terms with the principal point where this state has it."""
+        camera = terms.camera.copy()
+        camera[3:5] += self.centre_px.astype(np.float32)
+        return replace(terms, camera=camera)
+
+
+@dataclass(frozen=True, eq=False)
+class _End:
+    """Where steps ended, the information there, prior included, and the kernel of the last of them."""
+
+    at: _State
+    information: np.ndarray
+    kernel: KernelSettings
+
+
+def _focal_end(
+    problem: CameraLidarProblem, start: AlignmentState, weights: KernelSettings, rng: np.random.Generator
+) -> _End:
+    """By the edges alone, with the principal point held."""
+    only_edges = replace(weights, marking_weight=0.0)
+    return _solved(problem, _State(start, np.zeros(2)), only_edges, _HELD_PX, rng)
+
+
+def _lead(problem: CameraLidarProblem, end: _End, other: _End) -> tuple[float, bool]:
+    """By how much the edges score better at one end than at another, and whether the frames agree that they do."""
+    apart = np.zeros(problem.terms.frames)
+    for kernel in (end.kernel, other.kernel):  # each was fitted at its own end
+        here, there = (
+            problem.terms.edge_score(e.at.alignment.alone, kernel)[0].astype(np.float64) for e in (end, other)
+        )
+        apart += 0.5 * kernel.edge_weight * (here - there)
+    scatter = float(np.sqrt(np.sum((apart - apart.mean()) ** 2)))
+    return float(apart.sum()), abs(float(apart.sum())) > _DECIDED_SIGMAS * scatter
+
+
+def _solved(
+    problem: CameraLidarProblem,
+    at: _State,
+    weights: KernelSettings,
+    centre_sigma_px: float,
+    rng: np.random.Generator,
+) -> _End:
+    """Gauss-Newton steps at each kernel."""
+    terms, prior = problem.terms, problem.prior
+    sigma = np.array(
+        [prior.rotation_sigma_rad] * 3
+        + [prior.translation_sigma_m] * 3
+        + [problem.config.time_offset_sigma_s, _FOCAL_REACH]
+        + [centre_sigma_px] * 2
+    )
+    for sigma_px, contrast in _KERNELS:
+        fitted = at.seen(terms).fitted(at.alignment.alone, KernelSettings.wide(sigma_px, contrast), rng)
+        kernel = replace(fitted, edge_weight=weights.edge_weight, marking_weight=weights.marking_weight)
+        for _ in range(_STEPS):
+            gradient, information = _equations(terms, at, kernel)
+            information = information + np.diag(1 / sigma**2)
+            at = at.stepped(np.linalg.solve(information, gradient - at.off(prior) / sigma**2))
+    return _End(at, information, kernel)
+
+
+def _equations(
+    terms: Terms, at: _State, kernel: KernelSettings
+) -> tuple[Float[np.ndarray, " 10"], Float[np.ndarray, "10 10"]]:
+    """Gradient and information of the score, in the coordinates of `AlignmentState.changed`."""
+    seen, alone = at.seen(terms), at.alignment.alone
+    gradient, information = np.zeros(_UNKNOWNS), np.zeros((_UNKNOWNS, _UNKNOWNS))
+    for only, damping in (
+        (replace(kernel, marking_weight=0.0), 1.0),
+        (replace(kernel, edge_weight=0.0), _MARKING_DAMPING),
+    ):
+        by_frame, of_frame = seen.camera_gradient(alone, only)
+        gradient += by_frame.sum(0)[:_UNKNOWNS]
+        information += damping * of_frame.sum(0)[:_UNKNOWNS, :_UNKNOWNS]
+    to_left = np.eye(_UNKNOWNS)
+    to_left[:6, :6] = np.linalg.inv(change_jacobian(at.alignment.T_camera_lidar))
+    return gradient @ to_left, to_left.T @ information @ to_left
+
+
+def _together(day_px: Float[np.ndarray, " 2"], known_px: float) -> Float[np.ndarray, " 2"]:
+    """Sigma of the principal point by CameraInfo and day together."""
+    return known_px * day_px / np.hypot(known_px, day_px)

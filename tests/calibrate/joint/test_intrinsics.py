@@ -1,0 +1,105 @@
+"""Focal length and principal point by the day: measured where they are wrong, told, and silent where they are right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar
+from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics, contradictions
+from pipeline.calibrate.joint.solve import solve_joint
+from pipeline.config import SolveConfig
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.se3 import perturb_exactly
+from pipeline.rigs import CameraPrior
+from schemas.calibrations import PAIRS
+from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
+
+FOCAL, CENTRE = "focal length is contradicted", "principal point is contradicted"
+
+
+def wrong(day, factor=1.0, right_px=0.0, down_px=0.0):
+    """The day with a CameraInfo whose focal length and principal point are wrong."""
+    K = day[0].camera_K.copy()
+    K[[0, 1], [0, 1]] *= factor
+    K[:2, 2] += right_px, down_px
+    return [replace(o, camera_K=K) for o in day]
+
+
+def prior(camera=None):
+    T = perturb_exactly(T_TRUE, np.radians(1.0), 0.03, np.random.default_rng(0))
+    return Prior(T, np.eye(4), float(np.radians(2.0)), 0.05, camera=camera or CameraPrior())
+
+
+@pytest.fixture(scope="module")
+def day():
+    return traced_day(DENSE, 9, seed=1, dt_s=0.02)
+
+
+def measured(day):
+    return align_camera_lidar(day, prior(), SolveConfig(), np.random.default_rng(0)).intrinsics
+
+
+def test_right_intrinsics_are_found_right_and_alarm_nobody(day):
+    found = measured(day)
+    assert abs(found.focal - 1) < 2.5 * found.focal_sigma
+    assert (np.abs(found.centre_px) < 2.5 * found.centre_sigma_px).all()
+    assert contradictions(found, CameraPrior()) == []
+
+
+@pytest.mark.parametrize("factor", [1.03, 0.97])
+def test_a_focal_length_that_is_three_percent_off_is_measured_and_told(day, factor):
+    found = measured(wrong(day, factor))
+    assert found.focal == pytest.approx(1 / factor, abs=0.008)
+    (told,) = [sentence for sentence in contradictions(found, CameraPrior()) if FOCAL in sentence]
+    assert f"{found.focal - 1:+.1%}" in told
+
+
+def test_a_principal_point_that_is_wrong_downwards_is_measured_to_its_sigma(day):
+    right = measured(day)
+    found = measured(wrong(day, down_px=30.0))
+    moved = found.centre_px - right.centre_px
+    assert moved[1] == pytest.approx(-30.0, abs=2 * found.centre_sigma_px[1])
+    assert moved[1] < -10.0
+
+
+def test_a_contradicted_camera_info_holds_camera_lidar_with_the_measured_value(day):
+    for rows, is_told in ((day, False), (wrong(day, 0.97), True)):
+        observations = dict.fromkeys(PAIRS, rows)
+        solution = solve_joint(observations, prior(), SolveConfig(), seed=0, triggered=["camera_lidar"])
+        assert any(FOCAL in check for check in solution.failed_checks.get("camera_lidar", [])) == is_told
+        d = solution.pairs["camera_lidar"].diagnostics
+        assert (d["day_focal_scale"] > 1.02) == is_told
+        # What the principal point leaves open in the mounting: at most what CameraInfo alone would.
+        one_px_rad = 1 / rows[0].camera_K[0, 0]
+        assert 0.5 * one_px_rad < d["mounting_yaw_sigma_rad"] <= one_px_rad
+        assert any("CameraInfo's principal point" in note for note in solution.pairs["camera_lidar"].notes)
+
+
+def day_of(focal=1.0, focal_sigma=0.004, centre_px=(0.0, 0.0), centre_sigma_px=(20.0, 3.0)):
+    return DayIntrinsics(focal, focal_sigma, np.array(centre_px), np.array(centre_sigma_px), (900.0, 900.0))
+
+
+def test_contradictions_need_three_sigmas_of_day_and_camera_info_together():
+    known = CameraPrior(focal_sigma=0.003, centre_sigma_px=4.0)  # sigmas of both together: 0.5 % and 5 px
+    assert contradictions(day_of(1.0149, centre_px=(60.0, 14.9)), known) == []
+    (told,) = contradictions(day_of(0.9849), known)
+    assert FOCAL in told
+    (told,) = contradictions(day_of(centre_px=(0.0, -15.1)), known)
+    assert CENTRE in told
+    assert "-15.1 +- 3.0 px down" in told
+    assert len(contradictions(day_of(1.0149, centre_px=(0.0, 14.9)), CameraPrior(0.0, 0.0, 0.0))) == 2
+
+
+def test_diagnostics_say_what_the_day_determined_and_what_stays_open_in_the_mounting():
+    known = CameraPrior(focal_sigma=0.003, centre_sigma_px=4.0)
+    d = day_of(1.01, 0.002, (5.0, -2.0)).diagnostics(known)
+    assert (d["day_focal_observable"], d["day_centre_u_observable"], d["day_centre_v_observable"]) == (
+        1,
+        0,
+        1,
+    )
+    assert (d["day_centre_u_px"], d["day_centre_v_px"]) == (5.0, -2.0)
+    assert d["mounting_pitch_sigma_rad"] == pytest.approx(2.4 / 900)  # 3 px and 4 px together
+    sure = day_of().diagnostics(CameraPrior(centre_sigma_px=0.0))
+    assert sure["mounting_yaw_sigma_rad"] == 0.0
