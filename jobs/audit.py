@@ -33,7 +33,7 @@ def audit(
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
-    from pipeline.stages import AUDIT, REPORT
+    from pipeline.stages import AUDIT, REPORT, STATE
     from pipeline.store.partitions import Lake
     from pipeline.work import Task, Window
     from schemas.drift import DRIFT_STATUSES
@@ -45,6 +45,7 @@ def audit(
     with progress_reporter("audit") as progress:
         task = Task(config, tables, Window(from_day, to_day), method, progress=progress)
         outcome = AUDIT.run(task)
+        STATE.run(task)
     findings = outcome.records
     charts = [f.status for f in findings]
     outputs = []

@@ -44,6 +44,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "A small range-image network for lidar points, taught by the camera.",
     ),
     "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
+    "service": ("jobs.service:service", "Note a repair, a re-mount or a release: charts begin anew."),
+    "state": ("jobs.state:state", "What each vehicle should load tonight, with its sigma."),
     "report": ("jobs.report:report", "HTML pages of vehicle-days and of the fleet."),
     "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),
     "status": ("jobs.status:status", "What is done, held, refused, failed or missing, and why."),

@@ -151,18 +151,19 @@ def watch_night(
 def close_night(
     night: Night, to_day: str | None, report: Path, truth: Any = None, *, pictures: bool = True
 ) -> tuple[list[DriftFinding], list[str]]:
-    """Audit the fleet and write its pages; returns the findings and the pages, the fleet's first.
+    """Audit the fleet, say what vehicles should load, and write the pages; returns the findings and the pages.
 
     However few days the night was about, the charts look back over `audit.window_days`.
     """
     from jobs.terminal.summary import progress_reporter
     from pipeline.report.stage import Pages
-    from pipeline.stages import AUDIT, REPORT
+    from pipeline.stages import AUDIT, REPORT, STATE
     from pipeline.work import Task, Window
 
     with progress_reporter("audit") as progress:
         task = Task(night.fleet, night.lake, Window(None, to_day), night.method, progress=progress)
         findings = list(AUDIT.run(task).records)
+        STATE.run(task)
     if not findings:
         return [], []
     with progress_reporter("report") as progress:

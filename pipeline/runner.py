@@ -22,12 +22,17 @@ from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
+from schemas.states import STATES, StateRow
 from schemas.versions import CODE_VERSION
 
 __all__ = ["Stage", "run_stage", "try_stage", "why_to_run"]
 
 # Row types of the tables of records: small, added to and never replaced. The others are replaced by whole partitions.
-_RECORD_ROWS: dict[str, type] = {CALIBRATIONS.name: CalibrationRecord, DRIFT.name: DriftFinding}
+_RECORD_ROWS: dict[str, type] = {
+    CALIBRATIONS.name: CalibrationRecord,
+    DRIFT.name: DriftFinding,
+    STATES.name: StateRow,
+}
 # A row group: large enough to compress, small enough that a worker that holds one stays far below 2 GB.
 _GROUP_ROWS = 16
 _GROUP_BYTES = 24 << 20

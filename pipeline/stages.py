@@ -11,9 +11,10 @@ from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DRIFT
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS
+from schemas.states import STATES
 from schemas.training import TRAINING
 
-__all__ = ["AUDIT", "CALIBRATE", "INGEST", "PERCEIVE", "PREPARE", "REPORT", "STAGES"]
+__all__ = ["AUDIT", "CALIBRATE", "INGEST", "PERCEIVE", "PREPARE", "REPORT", "STAGES", "STATE"]
 
 INGEST = Stage("ingest", (), (FRAMES,), "pipeline.ingest.stage:work")
 PERCEIVE = Stage("perceive", (FRAMES,), (OBSERVATIONS,), "pipeline.perceive.stage:work")
@@ -26,6 +27,9 @@ CALIBRATE = Stage(
     needs_inputs=False,
 )
 AUDIT = Stage("audit", (CALIBRATIONS,), (DRIFT,), "pipeline.audit.stage:work", per_vehicle_day=False)
+STATE = Stage(
+    "state", (CALIBRATIONS, DRIFT), (STATES,), "pipeline.audit.state_stage:work", per_vehicle_day=False
+)
 REPORT = Stage(
     "report",
     (FRAMES, OBSERVATIONS, CALIBRATIONS, DRIFT),
@@ -34,4 +38,4 @@ REPORT = Stage(
     per_vehicle_day=False,
 )
 
-STAGES = (INGEST, PERCEIVE, PREPARE, CALIBRATE, AUDIT, REPORT)
+STAGES = (INGEST, PERCEIVE, PREPARE, CALIBRATE, AUDIT, STATE, REPORT)

@@ -25,7 +25,9 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    cells = {"calibrations": _calibration_cells, "drift": _drift_cells}.get(table, _partition_cells)
+    cells = {"calibrations": _calibration_cells, "drift": _drift_cells, "states": _state_cells}.get(
+        table, _partition_cells
+    )
     lines = [cells(row) for row in rows]
     view = Table(title=f"{table}: {len(rows)} row{'' if len(rows) == 1 else 's'}", title_justify="left")
     for name in lines[0]:
@@ -80,6 +82,25 @@ def _drift_cells(row: dict[str, Any]) -> dict[str, str]:
         "limit": f"{row['limit'] * scale:.3g} {unit}",
         "since": row["start_day"] or "",
         "moved": row["moved_sensor"] or "",
+        "reason": row["reason"],
+    }
+
+
+def _state_cells(row: dict[str, Any]) -> dict[str, str]:
+    import numpy as np
+
+    def degrees(sigma_rad: float | None) -> str:
+        return "" if sigma_rad is None else f"{np.degrees(sigma_rad):.3f}"
+
+    days = row["days"]
+    return {
+        "vehicle": row["vehicle"],
+        "pair": row["pair"],
+        "state": row["status"],
+        "sigma azimuth [deg]": degrees(row["azimuth_sigma_rad"]),
+        "elevation [deg]": degrees(row["elevation_sigma_rad"]),
+        "certified": ", ".join(row["determined"]),
+        "days": f"{len(days)}: {days[0]} to {days[-1]}" if days else "0",
         "reason": row["reason"],
     }
 

@@ -31,6 +31,7 @@ _ALIKE = 0.6
 _LEAST_VARYING = 0.01
 # Sigmas of a step among the reference's own days, which then ends before it; of days whose scatter nobody knows yet.
 _MOVED_SIGMAS = 6.0
+_FEWEST_DAYS = 14  # of a window, however far back they lie
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +181,10 @@ def _clipped(days: PairDays) -> Float[np.ndarray, "N 6"]:
 
 
 def charted(days: PairDays, first: int, last: int, reference: Reference | None) -> PairDays:
-    """The days of a window, beside the fixed reference where the window does not reach back to its first day.
+    """The days of a window, beside the fixed reference where that lies before it.
+
+    A vehicle that drives once a week has four days in a window of four weeks: its window reaches back to as many days
+    as tell something. Where it reaches into the reference, that is not one day but those that it rests on.
 
     Args:
         days: of one pair, since commissioning or the last service event; what the window and the reference take.
@@ -188,8 +192,15 @@ def charted(days: PairDays, first: int, last: int, reference: Reference | None) 
         last: its last day.
         reference: of the pair; None where too few days were accepted.
     """
-    window = days.between(first, last)
-    return window if reference is None or reference.days[0] >= first else with_reference(window, reference)
+    until = days.between(0, last)
+    if len(until.day) <= _FEWEST_DAYS:
+        return until
+    first = min(first, int(until.day[-_FEWEST_DAYS]))
+    if reference is None:
+        return until.between(first, last)
+    if reference.days[-1] >= first:
+        return until.between(min(first, reference.days[0]), last)
+    return with_reference(until.between(first, last), reference)
 
 
 def with_reference(days: PairDays, reference: Reference) -> PairDays:

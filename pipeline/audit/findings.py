@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,7 +32,12 @@ class VehicleAudit:
 
 
 def vehicle_findings(
-    audit: VehicleAudit, records: Sequence[CalibrationRecord], verdict: VehicleVerdict, config: AuditConfig
+    audit: VehicleAudit,
+    records: Sequence[CalibrationRecord],
+    verdict: VehicleVerdict,
+    config: AuditConfig,
+    remarks: Mapping[tuple[str, str], str],
+    before: Mapping[tuple[str, str], DriftFinding] | None = None,
 ) -> list[DriftFinding]:
     """Rows in order of pair and DoF; a DoF without a chart says why it has none.
 
@@ -41,12 +46,18 @@ def vehicle_findings(
         records: the vehicle's current records of the window, in order of day.
         verdict: on its charts.
         config: limits.
+        remarks: by pair and DoF, what a chart's reason says besides.
+        before: by pair and DoF, the latest earlier audit's rows: they knew days that have left the window since.
     """
     findings = []
     for pair in PAIRS:
         for dof in DOF_NAMES:
             chart = verdict.charts.get((pair, dof)) or _without_data(records, pair)
             chart = _with_last_day(chart, records, pair)
+            if (pair, dof) in remarks:
+                chart = replace(chart, reason=f"{chart.reason}; {remarks[pair, dof]}")
+            if before is not None:
+                chart = _begun_before(chart, before.get((pair, dof)))
             base = DriftFinding(
                 audit.vehicle, audit.day, audit.method, pair, dof, chart.status, chart.reason, chart.days_used,
                 limit_of(pair, dof, config), audit.work_key, chart.statistic, chart.threshold, inputs=audit.inputs,
@@ -88,6 +99,20 @@ def _change_columns(chart: ChartVerdict, moved: Attribution | None) -> dict[str,
         "moved_motion": moved.motion.tolist(),
         "moved_motion_sigma": np.sqrt(np.diag(moved.covariance)).tolist(),
     }
+
+
+def _begun_before(chart: ChartVerdict, before: DriftFinding | None) -> ChartVerdict:
+    """The start that an earlier audit found, where the window has moved past it and tonight's interval allows it."""
+    change = chart.change
+    if change is None or before is None or before.start_day is None or change.kind != before.kind:
+        return chart
+    day, earliest, latest = (
+        dt.date.fromisoformat(d).toordinal()
+        for d in (before.start_day, before.start_day_earliest or "", before.start_day_latest or "")
+    )
+    if not (change.earliest <= day <= change.latest and day < change.day):
+        return chart
+    return replace(chart, change=replace(change, day=day, earliest=earliest, latest=latest))
 
 
 def _with_last_day(chart: ChartVerdict, records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:

@@ -49,10 +49,11 @@ def estimate_noise(charts: Charts, dofs: int, pairs: int) -> Noise:
         pairs: pairs of a vehicle.
     """
     shape = (len(charts.count) // (pairs * dofs), pairs, dofs)
-    autocorrelation = _autocorrelation(charts, shape)
-    phi = np.repeat(autocorrelation.ravel(), dofs)
+    phi = np.repeat(_autocorrelation(charts, shape, _PRIOR_AUTOCORRELATION).ravel(), dofs)
+    # Days that err alike differ less from each other than they scatter; that counts only as far as it was seen.
+    alike = np.repeat(_autocorrelation(charts, shape, 0.0).ravel(), dofs)[:, None]
     size, gap, spread = _differences(charts, 1)
-    expected = np.sqrt(np.maximum(spread[0] - 2 * phi[:, None] ** gap * spread[1], 1e-12 * spread[0]))
+    expected = np.sqrt(np.maximum(spread[0] - 2 * alike**gap * spread[1], 1e-12 * spread[0]))
     sizes = (np.abs(size) / expected / norm.ppf(0.75)).reshape(*shape, -1)
     found, seen = _median(np.moveaxis(sizes, 0, 2).reshape(pairs, dofs, -1))
     of_fleet = np.maximum(np.sqrt(_shrunk(found, seen, np.ones_like(found), _PRIOR_FREEDOM)[0]), 1.0)
@@ -68,7 +69,7 @@ def estimate_noise(charts: Charts, dofs: int, pairs: int) -> Noise:
     return Noise(scale.ravel(), freedom.ravel().copy(), phi)
 
 
-def _autocorrelation(charts: Charts, shape: tuple[int, ...]) -> Float[np.ndarray, "V P"]:
+def _autocorrelation(charts: Charts, shape: tuple[int, ...], prior: float) -> Float[np.ndarray, "V P"]:
     """By vehicle and pair, from how much more two days differ that lie two days apart: by 1 + phi in variance."""
     logs, counts = [], []
     V, P = shape[:2]
@@ -81,7 +82,7 @@ def _autocorrelation(charts: Charts, shape: tuple[int, ...]) -> Float[np.ndarray
         counts.append((of_fleet[1], of_vehicle[1]))
     with np.errstate(invalid="ignore", divide="ignore"):
         fleet, vehicle = ((logs[1][k] / logs[0][k]) ** 2 - 1 for k in (0, 1))
-    fleet = _drawn(fleet, np.minimum(counts[0][0], counts[1][0]), np.full(P, _PRIOR_AUTOCORRELATION))
+    fleet = _drawn(fleet, np.minimum(counts[0][0], counts[1][0]), np.full(P, prior))
     seen = np.minimum(counts[0][1], counts[1][1])
     return _drawn(vehicle, seen, np.broadcast_to(fleet, vehicle.shape))
 

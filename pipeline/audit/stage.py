@@ -5,23 +5,37 @@ from __future__ import annotations
 import datetime as dt
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass
 
-from pipeline.audit.days import charted, reference_of
-from pipeline.audit.estimates import days_of
+from pipeline.audit.days import PairDays, charted, reference_of
+from pipeline.audit.estimates import days_of, fault_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
-from pipeline.audit.vehicle import VehicleVerdict, judge_fleet
-from pipeline.config import FleetConfig, config_hash
+from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
+from pipeline.audit.service import restart_of, what_was_done
+from pipeline.audit.vehicle import VehicleVerdict
+from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.errors import ConfigError
 from pipeline.results import Progress
-from pipeline.store.current import current_records
-from pipeline.store.partitions import Partition, work_key
-from pipeline.store.tables import read_records
+from pipeline.store.current import current_drift, current_records
+from pipeline.store.partitions import Lake, Partition, work_key
+from pipeline.store.records import read_records
 from pipeline.work import Records, Task, Told, Window, Work
-from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from schemas.drift import DriftFinding
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES, CalibrationRecord
+from schemas.drift import DRIFT, DriftFinding
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.versions import CODE_VERSION
 
 __all__ = ["work"]
+
+_NAMED = 5  # records that an outcome names where they were left out; the others it counts
+
+
+@dataclass(frozen=True)
+class _Vehicle:
+    """What the audit looks at: sound records until the window's end, and what was done to the vehicle."""
+
+    records: Sequence[CalibrationRecord]
+    events: Sequence[ServiceEvent]
 
 
 def work(task: Task) -> Work:
@@ -30,6 +44,7 @@ def work(task: Task) -> Work:
     The window ends with its last day (None = the last day that any vehicle has a record for) and begins with its first
     (None = `audit.window_days` before its end). The configuration's vehicles are audited even where they have no
     record. One finding per vehicle, pair and DoF, in that order; none where the lake has no record in the window.
+    Records that nothing can be made of, and those of days to come, are named in the outcome and left out.
 
     Raises:
         ConfigError: a day is no day, or the window is empty.
@@ -37,51 +52,79 @@ def work(task: Task) -> Work:
     """
     assert isinstance(task.of, Window), "an audit looks at all vehicles"
     fleet, method = task.fleet, task.method or task.fleet.audit.method
-    records = current_records(
+    found = current_records(
         [r for r in read_records(task.lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
     )
+    # Drives of tomorrow are days to come, but not everywhere on earth.
+    tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
+    faults = {
+        id(r): why for r in found if (why := fault_of(r, max(tomorrow, task.of.last or ""))) is not None
+    }
+    records = [r for r in found if id(r) not in faults]
     first, last = _window(records, task.of.first, task.of.last, fleet.audit.window_days)
-    by_vehicle: dict[str, list[CalibrationRecord]] = {v: [] for v in fleet.vehicles}
-    for record in records:
-        if record.day <= last:
-            by_vehicle.setdefault(record.vehicle, []).append(record)
-    settings = (fleet.audit, {"from": first, "to": last, "method": method})
+    vehicles = _by_vehicle(fleet, records, read_records(task.lake, SERVICE_EVENTS, ServiceEvent), last)
+    events = [[e.vehicle, e.day, e.sensor, e.kind] for v in vehicles.values() for e in v.events]
+    settings = (fleet.audit, {"from": first, "to": last, "method": method, "events": sorted(events)})
+    left_out = [f"{r.vehicle} {r.day} {r.pair} {faults[id(r)]}" for r in found if id(r) in faults]
     return Work(
         settings,
-        lambda run: _judged(fleet, by_vehicle, (first, last, method), run.progress),
-        inputs=tuple(sorted({r.work_key for rows in by_vehicle.values() for r in rows})),
-        tell=_told,
+        lambda run: _judged(task, vehicles, (first, last, method), run.progress),
+        inputs=tuple(sorted({r.work_key for v in vehicles.values() for r in v.records})),
+        tell=lambda rows: _told(rows, left_out),
         again=True,
     )
 
 
+def _by_vehicle(
+    fleet: FleetConfig, records: Sequence[CalibrationRecord], events: Sequence[ServiceEvent], last: str
+) -> dict[str, _Vehicle]:
+    """In order of name: the configuration's vehicles, and others that have records."""
+    rows: dict[str, list[CalibrationRecord]] = {v: [] for v in fleet.vehicles}
+    for record in records:
+        if record.day <= last:
+            rows.setdefault(record.vehicle, []).append(record)
+    done: dict[str, list[ServiceEvent]] = {}
+    for event in events:
+        done.setdefault(event.vehicle, []).append(event)
+    return {vehicle: _Vehicle(rows[vehicle], done.get(vehicle, ())) for vehicle in sorted(rows)}
+
+
 def _judged(
-    fleet: FleetConfig,
-    by_vehicle: Mapping[str, list[CalibrationRecord]],
-    window: tuple[str, str, str],
-    progress: Progress,
+    task: Task, vehicles: Mapping[str, _Vehicle], window: tuple[str, str, str], progress: Progress
 ) -> Generator[Records, None, None]:
-    """The findings of one vehicle after the other."""
-    first, last, method = window
-    if not any(by_vehicle.values()):
+    """The findings of one vehicle after the other; all of them are judged side by side."""
+    fleet, (first, _, method) = task.fleet, window
+    if not any(r.day >= first for v in vehicles.values() for r in v.records):
         return
-    config = fleet.audit
-    vehicles = sorted(by_vehicle)
-    ends = dt.date.fromisoformat(first).toordinal(), dt.date.fromisoformat(last).toordinal()
-    days = []
-    for vehicle in vehicles:
-        found = days_of(by_vehicle[vehicle], config.held_sigma_factor)
-        days.append({p: charted(d, *ends, reference_of(d, config.reference_days)) for p, d in found.items()})
-    for done, (vehicle, verdict) in enumerate(zip(vehicles, judge_fleet(days, config), strict=True)):
-        progress(done, len(vehicles), vehicle)
-        yield _findings(fleet, vehicle, by_vehicle[vehicle], verdict, (first, last, method))
-    progress(len(by_vehicle), len(by_vehicle), "")
+    days = [_charted(vehicle, window, fleet.audit) for vehicle in vehicles.values()]
+    verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit)
+    for done, ((name, vehicle), verdict) in enumerate(zip(vehicles.items(), verdicts, strict=True)):
+        progress(done, len(vehicles), name)
+        before = _found_before(task.lake, name, method, verdict, first)
+        yield _findings(fleet, name, vehicle, verdict, window, (shifts, before))
+    progress(len(vehicles), len(vehicles), "")
 
 
-def _told(findings: Sequence[DriftFinding]) -> Told:
+def _charted(vehicle: _Vehicle, window: tuple[str, str, str], config: AuditConfig) -> dict[str, PairDays]:
+    """The window's days of each pair beside its reference, none from before what was last done to it."""
+    first, last = (dt.date.fromisoformat(day).toordinal() for day in window[:2])
+    charts = {}
+    for pair, days in days_of(vehicle.records, config.held_sigma_factor).items():
+        restart = restart_of(vehicle.events, pair, window[1])
+        since = 0 if restart is None else dt.date.fromisoformat(restart.day).toordinal() + 1
+        own = days.between(since, last)
+        charts[pair] = charted(own, first, last, reference_of(own, config.reference_days))
+    return charts
+
+
+def _told(findings: Sequence[DriftFinding], left_out: Sequence[str]) -> Told:
     counts = Counter(f.status for f in findings)
-    reason = "" if findings else "no calibration record in the window"
-    return Told(dict(counts), reason=reason, refused=not findings)
+    reasons = [] if findings else ["no calibration record in the window"]
+    if left_out:
+        more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
+        reasons.append(f"left out: {'; '.join(left_out[:_NAMED])}{more}")
+    rejected = {"record that nothing can be made of": len(left_out)} if left_out else {}
+    return Told(dict(counts), rejected, "; ".join(reasons), refused=not findings)
 
 
 def _window(
@@ -102,16 +145,44 @@ def _window(
 
 def _findings(
     fleet: FleetConfig,
-    vehicle: str,
-    records: Sequence[CalibrationRecord],
+    name: str,
+    vehicle: _Vehicle,
     verdict: VehicleVerdict,
     window: tuple[str, str, str],
+    known: tuple[Mapping[tuple[str, str], FleetShift], Mapping[tuple[str, str], DriftFinding]],
 ) -> Records:
-    first, last, method = window
-    inputs = sorted({r.work_key for r in records})
+    (first, last, method), (shifts, before) = window, known
+    inputs = sorted({r.work_key for r in vehicle.records if r.day >= first})
     config = config_hash(fleet.audit, {"from": first, "to": last, "method": method})
     key = work_key("audit", CODE_VERSION, config, inputs)
-    audit = VehicleAudit(vehicle, last, method, key, inputs)
-    return Records(
-        vehicle_findings(audit, records, verdict, fleet.audit), Partition(vehicle, last), key, inputs
-    )
+    audit = VehicleAudit(name, last, method, key, inputs)
+    records = [r for r in vehicle.records if r.day >= first]
+    rows = vehicle_findings(audit, records, verdict, fleet.audit, _remarks(vehicle, last, shifts), before)
+    return Records(rows, Partition(name, last), key, inputs)
+
+
+def _found_before(
+    lake: Lake, vehicle: str, method: str, verdict: VehicleVerdict, first: str
+) -> dict[tuple[str, str], DriftFinding]:
+    """The latest earlier audit's rows, where a change may have begun before the window did."""
+    window = dt.date.fromisoformat(first).toordinal()
+    if not any(c.change is not None and c.change.earliest < window for c in verdict.charts.values()):
+        return {}
+    rows = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle, first=first)
+    return {(f.pair, f.dof): f for f in current_drift([f for f in rows if f.method == method])}
+
+
+def _remarks(
+    vehicle: _Vehicle, last: str, shifts: Mapping[tuple[str, str], FleetShift]
+) -> dict[tuple[str, str], str]:
+    """What a reader of a chart should know besides: where it begins, and what was taken out of it."""
+    remarks: dict[tuple[str, str], str] = {}
+    for pair in {r.pair for r in vehicle.records}:
+        restart = restart_of(vehicle.events, pair, last)
+        if restart is not None:
+            remarks |= {(pair, dof): f"since the {what_was_done(restart)}" for dof in DOF_NAMES}
+    for key, shift in shifts.items():
+        day = dt.date.fromordinal(shift.day).isoformat()
+        text = f"without what {shift.vehicles} of {shift.of} vehicles show since {day}"
+        remarks[key] = f"{remarks[key]}; {text}" if key in remarks else text
+    return remarks

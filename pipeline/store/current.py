@@ -10,8 +10,9 @@ from jaxtyping import Float
 from pipeline.geometry.se3 import from_quaternion
 from schemas.calibrations import CalibrationRecord
 from schemas.drift import DriftFinding
+from schemas.states import StateRow
 
-__all__ = ["current_drift", "current_records", "prior_of", "transform_of"]
+__all__ = ["current_drift", "current_records", "current_states", "prior_of", "transform_of"]
 
 
 def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRecord]:
@@ -42,8 +43,24 @@ def current_drift(findings: Sequence[DriftFinding]) -> list[DriftFinding]:
     return [last[key] for key in sorted(last)]
 
 
-def transform_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
-    """T_parent_child of a record; None where the day was refused."""
+def current_states(states: Sequence[StateRow]) -> list[StateRow]:
+    """The current states of each vehicle and method's latest night, in order.
+
+    Args:
+        states: as `read_records` returns them, the last asserted last.
+    """
+    newest: dict[tuple[str, str], str] = {}
+    for state in states:
+        key = (state.vehicle, state.method)
+        newest[key] = max(newest.get(key, ""), state.day)
+    last = {
+        (s.vehicle, s.method, s.trio, s.pair): s for s in states if s.day == newest[(s.vehicle, s.method)]
+    }
+    return [last[key] for key in sorted(last)]
+
+
+def transform_of(record: CalibrationRecord | StateRow) -> Float[np.ndarray, "4 4"] | None:
+    """T_parent_child of a record or state; None where the day was refused, or no day was accepted."""
     return _transform(record.qw, record.qx, record.qy, record.qz, record.tx_m, record.ty_m, record.tz_m)
 
 

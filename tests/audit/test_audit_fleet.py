@@ -1,5 +1,7 @@
 """The audit from table calibrations to table drift."""
 
+import datetime as dt
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -10,13 +12,17 @@ from pipeline.audit.estimates import days_of
 from pipeline.audit.vehicle import judge_fleet
 from pipeline.config import AuditConfig, FleetConfig
 from pipeline.errors import ConfigError
+from pipeline.stages import AUDIT
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records, write_records
+from pipeline.store.records import commit_records, read_records, write_records
+from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from tests.makers.stages import audit_fleet
 
+NOTHING = np.zeros(6)
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])
 
 
@@ -33,10 +39,7 @@ def _fleet(*vehicles: str) -> FleetConfig:
 
 
 def _write(lake: Lake, records: list[CalibrationRecord], suffix: str = "") -> None:
-    for vehicle, day in sorted({(r.vehicle, r.day) for r in records}):
-        rows = [r for r in records if (r.vehicle, r.day) == (vehicle, day)]
-        key = rows[0].work_key + suffix
-        write_records(lake, CALIBRATIONS, Partition(vehicle, day), rows, key, "0.1.0")
+    commit_records(lake, CALIBRATIONS, [replace(r, work_key=r.work_key + suffix) for r in records])
 
 
 def _alarms(findings: list[DriftFinding]) -> list[DriftFinding]:
@@ -178,3 +181,97 @@ def test_an_impossible_window_names_its_key(tmp_path: Path, maker: ModuleType) -
         audit_fleet(lake, _fleet("v"), "2026-03-09", "2026-03-01")
     with pytest.raises(ConfigError, match="yesterday"):
         audit_fleet(lake, _fleet("v"), None, "yesterday")
+
+
+def _status(findings: list[DriftFinding], vehicle: str = "v") -> tuple[str | None, str | None, str | None]:
+    row = next(f for f in findings if f.vehicle == vehicle)
+    return row.vehicle_status, row.vehicle_sensor, row.vehicle_since
+
+
+def _day(k: int) -> str:
+    return (dt.date(2026, 3, 1) + dt.timedelta(days=k)).isoformat()
+
+
+def _service(lake: Lake, day: int, sensor: str = "radar", vehicle: str = "v") -> None:
+    event = ServiceEvent(vehicle, _day(day), sensor, "repair", "", f"{vehicle}-{day}-{sensor}")
+    write_records(lake, SERVICE_EVENTS, Partition(vehicle, _day(day)), [event], event.work_key, "0.6.0")
+
+
+def test_a_vehicle_that_was_never_repaired_stays_red_when_its_window_holds_nothing_else(
+    tmp_path: Path, maker: ModuleType
+) -> None:
+    lake = Lake.at(tmp_path)
+    rng = np.random.default_rng(21)
+    _write(lake, maker.vehicle_records("v", 60, rng, motion=lambda d: {"radar": KNOCK} if d > 14 else {}))
+    for last in (17, 32, 45, 59):
+        assert _status(audit_fleet(lake, _fleet("v"), None, _day(last))) == ("RED", "radar", _day(15)), last
+
+
+def test_a_repaired_vehicle_is_green_within_five_nights_with_a_service_event_and_without(
+    tmp_path: Path, maker: ModuleType
+) -> None:
+    # Re-mounted elsewhere: only the event tells that this is where the radar belongs now.
+    elsewhere = -2 * KNOCK
+    for name, after in (("told", elsewhere), ("back", NOTHING)):
+        lake, rng = Lake.at(tmp_path / name), np.random.default_rng(22)
+        motion = lambda d, a=after: {"radar": KNOCK if 10 < d < 20 else a if d >= 20 else NOTHING}  # noqa: E731
+        _write(lake, maker.vehicle_records("v", 30, rng, motion=motion))
+        if name == "told":
+            assert _status(audit_fleet(lake, _fleet("v"), None, _day(29)))[0] == "RED"
+            _service(lake, 19)
+        assert _status(audit_fleet(lake, _fleet("v"), None, _day(18)))[:2] == ("RED", "radar")
+        assert _status(audit_fleet(lake, _fleet("v"), None, _day(24)))[0] == "GREEN", name
+        findings = audit_fleet(lake, _fleet("v"), None, _day(29))
+        yaw = next(f for f in findings if (f.pair, f.dof) == ("lidar_radar", "rz"))
+        assert ("since the repair of the radar on 2026-03-20" in yaw.reason) == (name == "told")
+        camera = next(f for f in findings if (f.pair, f.dof) == ("camera_lidar", "ry"))
+        assert (camera.days_used, camera.status) == (30, "GREEN")  # of other sensors, nothing begins anew
+
+
+def test_a_change_of_most_vehicles_on_one_day_is_told_from_that_of_one(
+    tmp_path: Path, maker: ModuleType
+) -> None:
+    lake, rng = Lake.at(tmp_path), np.random.default_rng(23)
+    release = {"camera": np.array([0, np.radians(0.3), 0, 0, 0, 0])}
+    for k in range(8):
+        both = release | ({"radar": KNOCK} if k == 3 else {})
+        _write(lake, maker.vehicle_records(f"v{k}", 16, rng, motion=lambda d, m=both: m if d > 9 else {}))
+    findings = audit_fleet(lake, _fleet(*(f"v{k}" for k in range(8))))
+    statuses = {f"v{k}": _status(findings, f"v{k}")[0] for k in range(8)}
+    assert statuses.pop("v3") == "RED"
+    assert set(statuses.values()) == {"GREEN"}
+    assert _status(findings, "v3")[1:] == ("radar", _day(10))
+    yaw = next(f for f in findings if (f.vehicle, f.pair, f.dof) == ("v0", "camera_lidar", "ry"))
+    assert "without what 8 of 8 vehicles show since 2026-03-11" in yaw.reason
+
+
+def test_a_record_of_a_day_to_come_and_one_of_nonsense_are_named_and_left_out(
+    tmp_path: Path, maker: ModuleType
+) -> None:
+    lake, rng = Lake.at(tmp_path), np.random.default_rng(24)
+    records = maker.vehicle_records("v", 8, rng)
+    _write(lake, records + maker.vehicle_records("w", 8, rng))
+    whole = [f.status for f in audit_fleet(lake, _fleet("v", "w"))]
+    wrong = np.full((6, 6), np.nan)
+    spoiled = [replace(records[0], day="2099-01-01", work_key="k1"), replace(records[6], covariance=wrong)]
+    _write(lake, spoiled, suffix="-again")
+    outcome = AUDIT.run(Task(_fleet("v", "w"), lake, Window()))
+    assert "v 2099-01-01 camera_lidar is of a day that has not come yet" in outcome.reason
+    assert f"v {records[6].day} camera_lidar holds no covariance" in outcome.reason
+    assert {f.day for f in outcome.records} == {_day(7)}
+    assert sum(a == f.status for a, f in zip(whole, outcome.records, strict=True)) >= 34
+
+
+def test_a_vehicle_that_drives_weekly_and_one_after_months_have_sensible_statuses(
+    tmp_path: Path, maker: ModuleType
+) -> None:
+    lake, rng = Lake.at(tmp_path), np.random.default_rng(25)
+    weekly = maker.vehicle_records("v", 64, rng, motion=lambda d: {"radar": KNOCK} if d > 49 else {})
+    _write(lake, [r for r in weekly if int(r.work_key.split("-")[1]) % 7 == 0])
+    assert _status(audit_fleet(lake, _fleet("v"), None, _day(49)))[0] == "GREEN"
+    assert _status(audit_fleet(lake, _fleet("v"), None, _day(63))) == ("RED", "radar", _day(56))
+    lake = Lake.at(tmp_path / "gap")
+    days = maker.vehicle_records("v", 124, rng, motion=lambda d: {"radar": KNOCK} if d > 60 else {})
+    _write(lake, [r for r in days if not 10 < int(r.work_key.split("-")[1]) < 120])
+    assert _status(audit_fleet(lake, _fleet("v"), None, _day(10)))[0] == "GREEN"
+    assert _status(audit_fleet(lake, _fleet("v"), None, _day(123)))[:2] == ("RED", "radar")

@@ -7,6 +7,8 @@ from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.outcomes import OUTCOMES, OutcomeRow
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.states import STATES, StateRow
 
 ROW_TYPES = {
     FRAMES.name: (FRAMES, Frame),
@@ -14,6 +16,8 @@ ROW_TYPES = {
     CALIBRATIONS.name: (CALIBRATIONS, CalibrationRecord),
     DRIFT.name: (DRIFT, DriftFinding),
     OUTCOMES.name: (OUTCOMES, OutcomeRow),
+    STATES.name: (STATES, StateRow),
+    SERVICE_EVENTS.name: (SERVICE_EVENTS, ServiceEvent),
 }
 
 

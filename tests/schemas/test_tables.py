@@ -12,6 +12,8 @@ from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.outcomes import OUTCOMES, OutcomeRow
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.states import STATES, StateRow
 from schemas.training import TRAINING, TrainingRow
 from schemas.versions import TABLES, write_json_schemas
 
@@ -22,6 +24,8 @@ ROW_TYPES = {
     CALIBRATIONS.name: CalibrationRecord,
     DRIFT.name: DriftFinding,
     OUTCOMES.name: OutcomeRow,
+    STATES.name: StateRow,
+    SERVICE_EVENTS.name: ServiceEvent,
 }
 
 

@@ -17,14 +17,11 @@ from scipy.special import ndtr, ndtri
 
 from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
 from pipeline.calibrate.verify.limits import VerdictLimits
-from pipeline.geometry.se3 import exp_se3, transform_points
-from pipeline.geometry.spherical import camera_direction_angles, to_spherical, wrap_angle
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
 
 __all__ = ["DIRECTIONS", "Claim", "claims_of", "target_jacobian", "target_sigmas"]
 
 DIRECTIONS = ("azimuth", "elevation")
-_STEP = 1e-5  # of central differences [rad and m]
 
 
 @dataclass(frozen=True)
@@ -70,27 +67,6 @@ def _quantile(shift: float, sigma: float, probability: float) -> float:
     # Between one tail (all of it on the side of the shift) and two (no shift at all).
     low, high = m + float(ndtri(1 - tail)), m + float(ndtri(1 - tail / 2))
     return sigma * float(brentq(lambda x: ndtr(m - x) + ndtr(-m - x) - tail, low - 1e-9, high + 1e-9))
-
-
-def target_jacobian(
-    pair: str, T: Float[np.ndarray, "4 4"], targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS
-) -> Float[np.ndarray, "2 N 6"]:
-    """d(azimuth, elevation of each target) / d(left perturbation of T) [rad per rad and m]."""
-    angles = to_spherical if pair == "lidar_radar" else camera_direction_angles
-    points = transform_points(T, targets)
-    columns = []
-    for axis in np.eye(6):
-        ahead, behind = (angles(transform_points(exp_se3(sign * _STEP * axis), points)) for sign in (1, -1))
-        columns.append(wrap_angle(ahead[:, :2] - behind[:, :2]) / (2 * _STEP))
-    return np.stack(columns, -1).transpose(1, 0, 2)
-
-
-def target_sigmas(
-    pair: str, T: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
-) -> Float[np.ndarray, " 2"]:
-    """One sigma of azimuth and elevation [rad] at the targets, root mean square over them."""
-    J = target_jacobian(pair, T)
-    return np.sqrt(np.einsum("dni,ij,dnj->dn", J, covariance, J).mean(axis=1))
 
 
 def claims_of(

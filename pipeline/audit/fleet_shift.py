@@ -1,0 +1,96 @@
+"""A change that most vehicles of a fleet show on the same day: a release, or something else that no bracket did.
+
+It is taken out of all vehicles' days, and they are judged again by what is left: a vehicle that was knocked on that day
+too still stands out.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.audit.days import PairDays
+from pipeline.audit.vehicle import VehicleVerdict, judge_fleet
+from pipeline.config import AuditConfig
+from schemas.calibrations import DOF_NAMES
+
+__all__ = ["FleetShift", "judge_without_fleet_shifts"]
+
+# Fewer vehicles are no fleet: three knocked on one day may have met the same kerb.
+_FEWEST_VEHICLES = 6
+_SHARE = 0.5  # of the vehicles with days on both sides, that show the change
+_DAYS_APART = 1  # of the days on which they show it: not all drive daily
+
+
+@dataclass(frozen=True)
+class FleetShift:
+    """One chart of most vehicles changed on one day: first ordinal with the new value, median size [rad or m]."""
+
+    day: int
+    size: float
+    vehicles: int
+    of: int
+
+
+def judge_without_fleet_shifts(
+    fleet: Sequence[Mapping[str, PairDays]], config: AuditConfig
+) -> tuple[list[VehicleVerdict], dict[tuple[str, str], FleetShift]]:
+    """Verdicts on all vehicles, and by (pair, dof) what was taken out of all of them before.
+
+    Args:
+        fleet: by vehicle, day estimates by pair.
+        config: limits and the false-alarm budget.
+    """
+    verdicts = judge_fleet(fleet, config)
+    shifts = _shifts(fleet, verdicts)
+    if not shifts:
+        return verdicts, {}
+    return judge_fleet([_without(pairs, shifts) for pairs in fleet], config), shifts
+
+
+def _shifts(
+    fleet: Sequence[Mapping[str, PairDays]], verdicts: Sequence[VehicleVerdict]
+) -> dict[tuple[str, str], FleetShift]:
+    found = {}
+    for key in sorted({k for v in verdicts for k, chart in v.charts.items() if chart.change is not None}):
+        changes = [v.charts[key].change for v in verdicts if key in v.charts]
+        starts = Counter((c.day, c.size > 0) for c in changes if c is not None and c.kind == "step")
+        if not starts:
+            continue
+        day, up = max(starts, key=lambda start: (starts[start], start))
+        vehicles = sum(n for (d, u), n in starts.items() if u == up and abs(d - day) <= _DAYS_APART)
+        sizes = [s for pairs in fleet if (s := _size(pairs, key, day)) is not None]
+        if vehicles >= max(_FEWEST_VEHICLES, _SHARE * len(sizes)):
+            found[key] = FleetShift(day, float(np.median(sizes)), vehicles, len(sizes))
+    return found
+
+
+def _size(pairs: Mapping[str, PairDays], key: tuple[str, str], day: int) -> float | None:
+    """Median after less median before of one vehicle; None where it has no two days on either side."""
+    days = pairs.get(key[0])
+    if days is None:
+        return None
+    k = DOF_NAMES.index(key[1])
+    seen = days.observable[:, k]
+    value, is_after = days.change[seen, k], days.day[seen] >= day
+    enough = is_after.sum() > 1 and ((~is_after).sum() > 1 or days.reference_days > 0)
+    if not enough or is_after.all():
+        return None
+    return float(np.median(value[is_after]) - np.median(value[~is_after]))
+
+
+def _without(
+    pairs: Mapping[str, PairDays], shifts: Mapping[tuple[str, str], FleetShift]
+) -> dict[str, PairDays]:
+    out = {}
+    for pair, days in pairs.items():
+        change = days.change.copy()
+        for k, dof in enumerate(DOF_NAMES):
+            shift = shifts.get((pair, dof))
+            if shift is not None:
+                change[days.day >= shift.day, k] -= shift.size
+        out[pair] = replace(days, change=change)
+    return out

@@ -1,0 +1,112 @@
+"""What a vehicle should load tonight: the accepted days since its last change as one estimate.
+
+What varies from day to day averages down, less where days err alike; what all days have in common does not.
+
+    x = sum_i G_i x_i,   G_i = (sum_j V_j^-1)^-1 V_i^-1,   covariance = f (sum_j V_j^-1)^-1 + sum_i G_i B_i
+
+with V_i what varies, scaled by the vehicle's own scatter, B_i what is common and f what AR(1) leaves of a mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.geometry.se3 import exp_se3, inverse, log_se3
+
+__all__ = ["DayEstimate", "State", "fuse"]
+
+_MOST_SIGMAS = 4.0  # of one DoF, beyond which a day does not belong to the others and is left out
+
+
+@dataclass(frozen=True, eq=False)
+class DayEstimate:
+    """One accepted day: T_parent_child, covariance (left perturbation), what of it is common, what it determined."""
+
+    day: str
+    T: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]
+    common: Float[np.ndarray, "6 6"]
+    observable: Bool[np.ndarray, " 6"]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The days as one: transform, covariance, its common part, DoF that at least one day determined, and the days."""
+
+    T: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]
+    common: Float[np.ndarray, "6 6"]
+    observable: Bool[np.ndarray, " 6"]
+    days: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def fuse(days: Sequence[DayEstimate], *, scale: float = 1.0, autocorrelation: float = 0.0) -> State | None:
+    """One estimate from several days; None where there is no day.
+
+    Args:
+        days: accepted ones since the last change, rising.
+        scale: factor by which days scatter more than they say.
+        autocorrelation: of successive days.
+    """
+    if not days:
+        return None
+    kept = _belonging(days)
+    own = [days[i] for i in kept]
+    origin = own[0].T
+    x = np.stack([log_se3(d.T @ inverse(origin)) for d in own])
+    varying = np.stack([_varying(d) for d in own]) * scale**2
+    information = np.linalg.inv(varying)
+    total = np.linalg.inv(information.sum(axis=0))
+    G = total @ information
+    mean = np.einsum("nij,nj->i", G, x)
+    common = _positive(np.einsum("nij,njk->ik", G, np.stack([d.common for d in own])))
+    lag = np.arange(1, len(own))
+    alike = 1 + 2 * float(np.sum((1 - lag / len(own)) * autocorrelation**lag))
+    covariance = total * alike + common
+    return State(
+        exp_se3(mean) @ origin,
+        0.5 * (covariance + covariance.T),
+        common,
+        np.any([d.observable for d in own], axis=0),
+        tuple(d.day for d in own),
+        tuple(d.day for i, d in enumerate(days) if i not in kept),
+    )
+
+
+def _belonging(days: Sequence[DayEstimate]) -> list[int]:
+    """Days that lie no further from the median of all than their sigmas allow; all of them where there are two."""
+    if len(days) < 3:
+        return list(range(len(days)))
+    origin = days[0].T
+    x = np.stack([log_se3(d.T @ inverse(origin)) for d in days])
+    sigma = np.sqrt(np.stack([np.diag(_varying(d)) for d in days]))
+    sigma = np.maximum(sigma, np.median(sigma, axis=0))
+    seen = np.stack([d.observable for d in days])
+    median = np.array([np.median(x[seen[:, k], k]) if seen[:, k].any() else 0.0 for k in range(6)])
+    spread = np.array(
+        [np.median(np.abs(x[seen[:, k], k] - median[k])) if seen[:, k].any() else 0.0 for k in range(6)]
+    )
+    reach = _MOST_SIGMAS * np.maximum(sigma, 1.4826 * spread)
+    far = (np.abs(x - median) > reach) & seen
+    kept = [i for i in range(len(days)) if not far[i].any()]
+    return kept or list(range(len(days)))
+
+
+def _varying(day: DayEstimate) -> Float[np.ndarray, "6 6"]:
+    """What varies; what the day did not determine has all of its variance, so that it does not weigh."""
+    varying = day.covariance - day.common
+    floor = 0.01 * np.diag(day.covariance)  # sigmas are estimates themselves
+    missing = np.where(day.observable, np.maximum(floor - np.diag(varying), 0.0), np.diag(day.covariance))
+    return varying + np.diag(missing)
+
+
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    """The nearest symmetric matrix without negative directions, in units in which its diagonal is 1."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-18))
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T) / np.outer(scale, scale))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale))

@@ -1,0 +1,176 @@
+"""Stage state: calibrations, and what the audit said of them, to what each vehicle should load tonight."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from scipy.special import ndtri
+
+from pipeline.audit.estimates import fault_of
+from pipeline.audit.service import restart_of, what_was_done
+from pipeline.audit.state import DayEstimate, State, fuse
+from pipeline.config import FleetConfig, VerifyConfig, config_hash
+from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.target_sigmas import target_sigmas
+from pipeline.store.current import current_drift, current_records, transform_of
+from pipeline.store.partitions import Partition, work_key
+from pipeline.store.records import last_day, read_records
+from pipeline.work import Records, Run, Task, Told, Window, Work
+from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.drift import DRIFT, DriftFinding
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.states import StateRow
+from schemas.versions import CODE_VERSION
+
+__all__ = ["work"]
+
+# Days that a state looks back: beyond, its common part is nearly all of it, and seasons and tyres are others.
+_DAYS_BACK = 60
+# What `work` reads of a record besides what identifies it.
+_COLUMNS = (
+    *("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"),
+    "covariance", "common_covariance", "observable", "diagnostics",
+)  # fmt: skip
+# Of successive accepted days: the most that the charts' budget is proved for. A state promises no more than such days
+# can give.
+_AUTOCORRELATION = 0.6
+
+
+_Row = TypeVar("_Row", CalibrationRecord, ServiceEvent, DriftFinding)
+
+
+def work(task: Task) -> Work:
+    """The state of every vehicle that has a record in the window, one row per pair.
+
+    A state rests on the accepted days since the last of: the vehicle's first day, a service event, a change that the
+    latest audit found. The window ends as the audit's does.
+
+    Raises:
+        ContractError: a record was written with another schema version.
+    """
+    assert isinstance(task.of, Window), "states are of all vehicles"
+    fleet, method = task.fleet, task.method or task.fleet.audit.method
+    tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
+    last = task.of.last or min(last_day(task.lake, CALIBRATIONS) or "", tomorrow)
+    first = (dt.date.fromisoformat(last) - dt.timedelta(days=_DAYS_BACK - 1)).isoformat() if last else ""
+    records = _by_vehicle(
+        r
+        for r in current_records(
+            read_records(task.lake, CALIBRATIONS, CalibrationRecord, first=first, last=last, columns=_COLUMNS)
+        )
+        if r.method == method and fault_of(r, last) is None
+    )
+    events = _by_vehicle(read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last or None))
+    found = read_records(task.lake, DRIFT, DriftFinding, first=first, last=last)
+    changes = _by_vehicle(current_drift([f for f in found if f.method == method]))
+
+    def rows(run: Run) -> Generator[Records, None, None]:
+        for done, (vehicle, own) in enumerate(sorted(records.items())):
+            run.progress(done, len(records), vehicle)
+            since = {p: _since(p, events.get(vehicle, ()), changes.get(vehicle, ()), last) for p in PAIRS}
+            yield _states(fleet, (vehicle, last, method), own, since)
+
+    settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
+    keys = {r.work_key for own in records.values() for r in own}
+    return Work(settings, rows, inputs=tuple(sorted(keys)), tell=_told, again=True)
+
+
+def _by_vehicle(rows: Iterable[_Row]) -> dict[str, list[_Row]]:
+    found: dict[str, list[_Row]] = {}
+    for row in rows:
+        found.setdefault(row.vehicle, []).append(row)
+    return found
+
+
+def _since(
+    pair: str, events: Sequence[ServiceEvent], findings: Sequence[DriftFinding], last: str
+) -> tuple[str, str]:
+    """First day that may count for a pair, and why; empty where all days may."""
+    first, why = "", ""
+    event = restart_of(events, pair, last)
+    if event is not None:
+        first = (dt.date.fromisoformat(event.day) + dt.timedelta(days=1)).isoformat()
+        why = f"after the {what_was_done(event)}"
+    for finding in findings:
+        changed = finding.pair == pair and finding.status in ("RED", "YELLOW") and finding.start_day
+        if changed and (finding.start_day_latest or "") > first:
+            first = finding.start_day_latest or ""
+            why = f"after a change that the audit found since {finding.start_day}"
+    return first, why
+
+
+def _states(
+    fleet: FleetConfig,
+    about: tuple[str, str, str],
+    records: Sequence[CalibrationRecord],
+    since: Mapping[str, tuple[str, str]],
+) -> Records:
+    vehicle, last, method = about
+    inputs = sorted({r.work_key for r in records})
+    config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method, "since": since})
+    key = work_key("state", CODE_VERSION, config, inputs)
+    rows = []
+    for pair in PAIRS:
+        first, why = since[pair]
+        own = [r for r in records if r.pair == pair and r.status == "accepted" and r.day >= first]
+        days = [day for r in own if (day := _estimate(r)) is not None]
+        found = fuse(days, autocorrelation=_AUTOCORRELATION)
+        parent, child = FRAMES_OF_PAIR[pair]
+        words = _words(why, found)
+        base = StateRow(vehicle, last, method, pair, parent, child, "none", words, key, since=first or None)
+        rows.append(base if found is None else _with_state(base, found, own, fleet.verify))
+    return Records(rows, Partition(vehicle, last), key, inputs)
+
+
+def _words(why: str, found: State | None) -> str:
+    """Why the state rests on the days that it rests on."""
+    if found is None:
+        return f"no accepted day {why}".rstrip()
+    left = f"left out, far from the others: {', '.join(found.left_out)}" if found.left_out else ""
+    return "; ".join(text for text in (why, left) if text)
+
+
+def _estimate(record: CalibrationRecord) -> DayEstimate | None:
+    """A record as a day to fuse; one of an older release does not say what varies, so nothing of it averages down."""
+    T, C = transform_of(record), record.covariance
+    if T is None or C is None:
+        return None
+    common = C if record.common_covariance is None else record.common_covariance
+    return DayEstimate(record.day, T, C, common, np.array(record.observable or [True] * 6, bool))
+
+
+def _with_state(
+    base: StateRow, found: State, records: Sequence[CalibrationRecord], verify: VerifyConfig
+) -> StateRow:
+    sigma = target_sigmas(base.pair, found.T, found.covariance)
+    azimuth, elevation = (
+        (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
+        if base.pair == "camera_lidar"
+        else (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
+    )
+    reach = float(ndtri(0.5 + verify.confidence / 2)) * np.degrees(sigma)
+    names = ("azimuth", "elevation")
+    T, q = found.T, to_quaternion(found.T)
+    return replace(
+        base,
+        status="current",
+        qw=float(q[0]), qx=float(q[1]), qy=float(q[2]), qz=float(q[3]),
+        tx_m=float(T[0, 3]), ty_m=float(T[1, 3]), tz_m=float(T[2, 3]),
+        covariance=found.covariance,
+        common_covariance=found.common,
+        observable=[bool(v) for v in found.observable],
+        determined=[n for n, r, limit in zip(names, reach, (azimuth, elevation), strict=True) if r <= limit],
+        azimuth_sigma_rad=float(sigma[0]),
+        elevation_sigma_rad=float(sigma[1]),
+        days=list(found.days),
+        inputs=sorted({r.work_key for r in records if r.day in found.days}),
+    )  # fmt: skip
+
+
+def _told(rows: Sequence[StateRow]) -> Told:
+    counts = {s: sum(r.status == s for r in rows) for s in ("current", "none")}
+    return Told(counts, reason="" if rows else "no calibration record", refused=not rows)

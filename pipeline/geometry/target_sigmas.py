@@ -1,0 +1,35 @@
+"""How far a pose's errors move targets 15 to 40 m away: sigmas of their azimuth and elevation."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import exp_se3, transform_points
+from pipeline.geometry.spherical import camera_direction_angles, to_spherical, wrap_angle
+from pipeline.geometry.targets import DEFAULT_TARGETS
+
+__all__ = ["target_jacobian", "target_sigmas"]
+
+_STEP = 1e-5  # of central differences [rad and m]
+
+
+def target_jacobian(
+    pair: str, T: Float[np.ndarray, "4 4"], targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS
+) -> Float[np.ndarray, "2 N 6"]:
+    """d(azimuth, elevation of each target) / d(left perturbation of T) [rad per rad and m]."""
+    angles = to_spherical if pair == "lidar_radar" else camera_direction_angles
+    points = transform_points(T, targets)
+    columns = []
+    for axis in np.eye(6):
+        ahead, behind = (angles(transform_points(exp_se3(sign * _STEP * axis), points)) for sign in (1, -1))
+        columns.append(wrap_angle(ahead[:, :2] - behind[:, :2]) / (2 * _STEP))
+    return np.stack(columns, -1).transpose(1, 0, 2)
+
+
+def target_sigmas(
+    pair: str, T: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
+) -> Float[np.ndarray, " 2"]:
+    """One sigma of azimuth and elevation [rad] at the targets, root mean square over them."""
+    J = target_jacobian(pair, T)
+    return np.sqrt(np.einsum("dni,ij,dnj->dn", J, covariance, J).mean(axis=1))
