@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.results import Outcome
 from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.records import assert_records, commit_records, read_records
+from pipeline.store.records import RecordIndex, assert_records, commit_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.outcomes import OUTCOMES, OutcomeRow
@@ -54,13 +53,17 @@ class Ledger:
         self._waiting = [_Waiting(CALIBRATIONS), _Waiting(OUTCOMES)]
         self._committed_at = time.monotonic()
         days = sorted({p.day for p in partitions})
-        self._records = self._read(CALIBRATIONS, CalibrationRecord, days, ("frames_rejected",))
-        self._outcomes = self._read(OUTCOMES, OutcomeRow, days, ("rows", "kept", "rejected"))
+        # A night without a vehicle-day asks for none.
+        span = (days[0], days[-1]) if days else ("9999-12-31", "0001-01-01")
+        self._records = RecordIndex(
+            lake, CALIBRATIONS, CalibrationRecord, *span, ("frames_rejected", "inputs")
+        )
+        self._outcomes = RecordIndex(lake, OUTCOMES, OutcomeRow, *span, ("rows", "kept", "rejected"))
 
     def known(self, partition: Partition) -> Known:
         """What the lake had of a vehicle-day when the night began; the current one of a kind comes last."""
-        key = (partition.vehicle, partition.day)
-        return Known(tuple(self._records.get(key, ())), tuple(self._outcomes.get(key, ())))
+        of = (partition.vehicle, partition.day)
+        return Known(tuple(self._records.of(*of)), tuple(self._outcomes.of(*of)))
 
     def add(self, outcome: Outcome, method: str) -> None:
         """Take an outcome and its records; commit those that came together, if it is time.
@@ -69,9 +72,10 @@ class Ledger:
             OSError: the storage does not answer; the rows are kept, and the next commit has them too.
         """
         records, outcomes = self._waiting
-        key = (outcome.vehicle, outcome.day)
-        _sort(records, outcome.records, self._records.get(key, ()))
-        _sort(outcomes, [outcome_row(outcome, method)], self._outcomes.get(key, ()))
+        of = (outcome.vehicle, outcome.day)
+        if outcome.records:
+            _sort(records, outcome.records, self._records.of(*of))
+        _sort(outcomes, [outcome_row(outcome, method)], self._outcomes.of(*of))
         waiting = sum(len(w.new) + len(w.again) for w in self._waiting)
         if waiting >= _ROWS or (waiting and time.monotonic() - self._committed_at > _EVERY_S):
             self.commit()
@@ -90,16 +94,6 @@ class Ledger:
             if waiting.again:
                 assert_records(self._lake, waiting.schema, waiting.again)
                 waiting.again = []
-
-    def _read(
-        self, schema: TableSchema, row_type: type[Any], days: Sequence[str], columns: tuple[str, ...]
-    ) -> dict[tuple[str, str], list[Any]]:
-        found: dict[tuple[str, str], list[Any]] = defaultdict(list)
-        if days:
-            rows = read_records(self._lake, schema, row_type, first=days[0], last=days[-1], columns=columns)
-            for row in rows:
-                found[row.vehicle, row.day].append(row)
-        return found
 
 
 def record_outcome(lake: Lake, outcome: Outcome, method: str = "") -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from typing import overload
 
 from pipeline.config import FleetConfig
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
@@ -73,7 +74,7 @@ def run_night(
         reason = f"{night.fleet.file} has no vehicle {unknown.vehicle!r}"
         yield DayOutcome(unknown.vehicle, unknown.day, "refused", reason)
     ledger = Ledger(night.lake, [d.partition for d in known])
-    jobs = [(_of(night, d.partition.vehicle), d, ledger.known(d.partition)) for d in known]
+    jobs = _Jobs(night, known, ledger)
     try:
         with closing(EXECUTORS[executor](_run_job, jobs, workers, watch)) as results:
             for finished in results:
@@ -132,6 +133,26 @@ def _through_stages(task: Task, progress: Progress) -> DayOutcome:
             refusal = CALIBRATE.run(replace(task, given=done[-1]))  # records it
             return replace(_summarise(partition, done), results=(*done, refusal))
     return replace(_summarise(partition, done), results=tuple(done))
+
+
+class _Jobs(Sequence[_Job]):
+    """What the workers are sent, each put together when its turn comes: thousands wait, and a few are in work."""
+
+    def __init__(self, night: Night, days: Sequence[VehicleDay], ledger: Ledger) -> None:
+        self._night, self._days, self._ledger = night, days, ledger
+
+    def __len__(self) -> int:
+        return len(self._days)
+
+    @overload
+    def __getitem__(self, index: int) -> _Job: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[_Job]: ...
+    def __getitem__(self, index: int | slice) -> _Job | list[_Job]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        day = self._days[index]
+        return _of(self._night, day.partition.vehicle), day, self._ledger.known(day.partition)
 
 
 def _run_job(job: _Job, progress: Progress) -> DayOutcome:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import datetime as dt
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
-from typing import Any, TypeVar
+from itertools import groupby
+from operator import itemgetter
+from typing import Any, Generic, TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -19,7 +21,15 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
 
-__all__ = ["assert_records", "commit_records", "last_day", "read_latest", "read_records", "write_records"]
+__all__ = [
+    "RecordIndex",
+    "assert_records",
+    "commit_records",
+    "last_day",
+    "read_latest",
+    "read_records",
+    "write_records",
+]
 
 Row = TypeVar("Row")
 
@@ -113,15 +123,68 @@ def read_records(
     Raises:
         ContractError: the lake is of another release, or lacks a column that has no default.
     """
-    known = {f.name: f for f in fields(row_type)}  # type: ignore[arg-type]
+    found = _sorted_rows(lake, schema, row_type, vehicle, day or first, day or last, columns)
+    return [] if found is None else from_table(found, schema, row_type)
+
+
+class RecordIndex(Generic[Row]):
+    """Records of a window of days, as they were when it was made: those of a vehicle-day become rows when asked for.
+
+    A year of a thousand vehicles is a few hundred megabytes as columns, and gigabytes as rows.
+
+    Args:
+        lake: where the table is.
+        schema: of the table.
+        row_type: its dataclass.
+        first: first day.
+        last: last day.
+        columns: see `read_records`.
+    """
+
+    def __init__(
+        self,
+        lake: Lake,
+        schema: TableSchema,
+        row_type: type[Row],
+        first: str,
+        last: str,
+        columns: Sequence[str] | None = None,
+    ) -> None:
+        self._schema, self._row_type = schema, row_type
+        self._rows = _sorted_rows(lake, schema, row_type, None, first, last, columns)
+        self._spans: dict[tuple[str, str], tuple[int, int]] = {}
+        if self._rows is not None:
+            owners = zip(*(self._rows[name].to_pylist() for name in ("vehicle", "day")), strict=True)
+            for owner, group in groupby(enumerate(owners), key=itemgetter(1)):
+                places = [at for at, _ in group]
+                self._spans[owner] = (places[0], len(places))
+
+    def of(self, vehicle: str, day: str) -> list[Row]:
+        """The rows of a vehicle-day, the last asserted last."""
+        if self._rows is None or (vehicle, day) not in self._spans:
+            return []
+        return from_table(self._rows.slice(*self._spans[vehicle, day]), self._schema, self._row_type)
+
+
+def _sorted_rows(
+    lake: Lake,
+    schema: TableSchema,
+    row_type: type[Any],
+    vehicle: str | None,
+    first: str | None,
+    last: str | None,
+    columns: Sequence[str] | None,
+) -> pa.Table | None:
+    """Columns as `read_records` promises them, in its order; None where there is no row."""
+    known = {f.name: f for f in fields(row_type)}
     required = {n for n, f in known.items() if (f.default, f.default_factory) == (MISSING, MISSING)}
     always = required | {*schema.about, "work_key", "recorded_at", "asserted_at"}
     wanted = [c.name for c in schema.columns if columns is None or c.name in always or c.name in columns]
-    found = _rows_of(lake, schema, wanted, vehicle, day or first, day or last)
+    found = _rows_of(lake, schema, wanted, vehicle, first, last)
     if found is None:
-        return []
+        return None
     order = [(name, "ascending") for name in ("vehicle", "day", "asserted_at", *schema.about[2:], "work_key")]
-    return from_table(found.take(pc.sort_indices(found, order)), schema, row_type)
+    return found.take(pc.sort_indices(found, order))
 
 
 def read_latest(

@@ -20,7 +20,15 @@ from pipeline.errors import ContractError
 from pipeline.store.current import current_records
 from pipeline.store.delta import tidy_table
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import assert_records, commit_records, last_day, read_records, write_records
+from pipeline.store.records import (
+    RecordIndex,
+    assert_records,
+    commit_records,
+    last_day,
+    read_latest,
+    read_records,
+    write_records,
+)
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from tests.makers.table_rows import make_row, same
@@ -144,6 +152,39 @@ def test_a_reader_gets_the_window_the_vehicle_and_the_columns_that_it_asks_for(l
     assert len(read(lake, last="2026-01-31")) == 2
     assert read(lake, vehicle="c") == []
     assert last_day(lake, CALIBRATIONS) == "2026-02-03"
+
+
+def test_an_index_gives_each_vehicle_day_what_reading_it_gives(lake, rng):
+    for key in ("A", "B"):
+        for vehicle in ("a", "b"):
+            days = ("2026-01-30", "2026-02-01", "2026-02-03")
+            commit_records(lake, CALIBRATIONS, [record(rng, key, vehicle, d, p) for d in days for p in PAIRS])
+    index = RecordIndex(lake, CALIBRATIONS, CalibrationRecord, "2026-01-31", "2026-02-28")
+    for vehicle, day in (("a", "2026-02-01"), ("b", "2026-02-03")):
+        expected = read(lake, vehicle=vehicle, day=day)
+        assert len(expected) == 6
+        assert all(same(x, y) for x, y in zip(index.of(vehicle, day), expected, strict=True))
+    assert index.of("a", "2026-01-30") == []
+    assert index.of("c", "2026-02-01") == []
+    assert RecordIndex(lake, CALIBRATIONS, CalibrationRecord, "9999-12-31", "0001-01-01").of("a", "b") == []
+
+
+def test_the_last_day_of_each_vehicle_and_method_is_read_and_no_other(lake, rng):
+    days = {
+        ("a", "joint"): ("2026-01-30", "2026-02-01"),
+        ("b", "joint"): ("2026-01-05",),
+        ("a", "tracking"): ("2026-01-30",),
+    }
+    for (vehicle, method), of in days.items():
+        rows = [replace(record(rng, "k", vehicle, d, p), method=method) for d in of for p in PAIRS]
+        commit_records(lake, CALIBRATIONS, rows)
+    found = read_latest(lake, CALIBRATIONS, CalibrationRecord, first="2026-01-01")
+    assert {(r.vehicle, r.method, r.day) for r in found} == {(*key, of[-1]) for key, of in days.items()}
+    assert len(found) == 9
+    assert {r.vehicle for r in read_latest(lake, CALIBRATIONS, CalibrationRecord, first="2026-01-06")} == {
+        "a"
+    }
+    assert read_latest(lake, CALIBRATIONS, CalibrationRecord, first="2026-03-01") == []
 
 
 def test_a_lake_without_records_reads_as_empty_and_is_not_made_by_reading(lake):
