@@ -14,6 +14,8 @@ from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
 from schemas.calibrations import DOF_NAMES, PAIRS
 
 __all__ = [
+    "DOFS",
+    "FEWEST_DAYS",
     "PairDays",
     "Reference",
     "charted",
@@ -31,7 +33,7 @@ _ALIKE = 0.6
 _LEAST_VARYING = 0.01
 # Sigmas of a step among the reference's own days, which then ends before it; of days whose scatter nobody knows yet.
 _MOVED_SIGMAS = 6.0
-_FEWEST_DAYS = 14  # of a window, however far back they lie
+FEWEST_DAYS = 14  # of a window, however far back they lie
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,9 +195,9 @@ def charted(days: PairDays, first: int, last: int, reference: Reference | None) 
         reference: of the pair; None where too few days were accepted.
     """
     until = days.between(0, last)
-    if len(until.day) <= _FEWEST_DAYS:
+    if len(until.day) <= FEWEST_DAYS:
         return until
-    first = min(first, int(until.day[-_FEWEST_DAYS]))
+    first = min(first, int(until.day[-FEWEST_DAYS]))
     if reference is None:
         return until.between(first, last)
     if reference.days[-1] >= first:

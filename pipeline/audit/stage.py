@@ -7,16 +7,17 @@ from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.audit.days import PairDays, charted, reference_of
+from pipeline.audit.days import FEWEST_DAYS, PairDays, charted, reference_of
 from pipeline.audit.estimates import days_of, fault_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
+from pipeline.audit.history import last_audited_day, read_history
 from pipeline.audit.service import restart_of, what_was_done
 from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.errors import ConfigError
 from pipeline.results import Progress
-from pipeline.store.current import current_drift, current_records
+from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.records import read_records
 from pipeline.work import Records, Task, Told, Window, Work
@@ -52,20 +53,28 @@ def work(task: Task) -> Work:
     """
     assert isinstance(task.of, Window), "an audit looks at all vehicles"
     fleet, method = task.fleet, task.method or task.fleet.audit.method
-    found = current_records(
-        [r for r in read_records(task.lake, CALIBRATIONS, CalibrationRecord) if r.method == method]
-    )
     # Drives of tomorrow are days to come, but not everywhere on earth.
     tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
-    faults = {
-        id(r): why for r in found if (why := fault_of(r, max(tomorrow, task.of.last or ""))) is not None
-    }
-    records = [r for r in found if id(r) not in faults]
-    first, last = _window(records, task.of.first, task.of.last, fleet.audit.window_days)
-    vehicles = _by_vehicle(fleet, records, read_records(task.lake, SERVICE_EVENTS, ServiceEvent), last)
-    events = [[e.vehicle, e.day, e.sensor, e.kind] for v in vehicles.values() for e in v.events]
-    settings = (fleet.audit, {"from": first, "to": last, "method": method, "events": sorted(events)})
-    left_out = [f"{r.vehicle} {r.day} {r.pair} {faults[id(r)]}" for r in found if id(r) in faults]
+    latest = max(tomorrow, task.of.last or "")
+    first, last = _window(task, last_audited_day(task.lake, latest))
+    left_out: list[str] = []
+
+    def sound(record: CalibrationRecord) -> bool:
+        why = fault_of(record, latest)
+        if why is not None:
+            left_out.append(f"{record.vehicle} {record.day} {record.pair} {why}")
+        return why is None
+
+    for record in read_records(task.lake, CALIBRATIONS, CalibrationRecord, first=_after(latest), columns=()):
+        sound(record)
+    events: dict[str, list[ServiceEvent]] = {}
+    for event in read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last):
+        events.setdefault(event.vehicle, []).append(event)
+    enough = (FEWEST_DAYS, fleet.audit.reference_days)
+    records = read_history(task.lake, (first, last, method), events, enough, sound)
+    vehicles = _by_vehicle(fleet, records, events)
+    done = sorted([e.vehicle, e.day, e.sensor, e.kind] for v in vehicles.values() for e in v.events)
+    settings = (fleet.audit, {"from": first, "to": last, "method": method, "events": done})
     return Work(
         settings,
         lambda run: _judged(task, vehicles, (first, last, method), run.progress),
@@ -76,17 +85,13 @@ def work(task: Task) -> Work:
 
 
 def _by_vehicle(
-    fleet: FleetConfig, records: Sequence[CalibrationRecord], events: Sequence[ServiceEvent], last: str
+    fleet: FleetConfig, records: Sequence[CalibrationRecord], events: Mapping[str, Sequence[ServiceEvent]]
 ) -> dict[str, _Vehicle]:
     """In order of name: the configuration's vehicles, and others that have records."""
     rows: dict[str, list[CalibrationRecord]] = {v: [] for v in fleet.vehicles}
     for record in records:
-        if record.day <= last:
-            rows.setdefault(record.vehicle, []).append(record)
-    done: dict[str, list[ServiceEvent]] = {}
-    for event in events:
-        done.setdefault(event.vehicle, []).append(event)
-    return {vehicle: _Vehicle(rows[vehicle], done.get(vehicle, ())) for vehicle in sorted(rows)}
+        rows.setdefault(record.vehicle, []).append(record)
+    return {vehicle: _Vehicle(rows[vehicle], events.get(vehicle, ())) for vehicle in sorted(rows)}
 
 
 def _judged(
@@ -127,20 +132,25 @@ def _told(findings: Sequence[DriftFinding], left_out: Sequence[str]) -> Told:
     return Told(dict(counts), rejected, "; ".join(reasons), refused=not findings)
 
 
-def _window(
-    records: Sequence[CalibrationRecord], from_day: str | None, to_day: str | None, days: int
-) -> tuple[str, str]:
-    for name, day in (("from", from_day), ("to", to_day)):
+def _window(task: Task, audited: str | None) -> tuple[str, str]:
+    """First and last day; `audited` is the last one that has a record."""
+    assert isinstance(task.of, Window), "an audit looks at all vehicles"
+    for name, day in (("from", task.of.first), ("to", task.of.last)):
         if day is not None:
             try:
                 dt.date.fromisoformat(day)
             except ValueError as err:
                 raise ConfigError("command line", name, f"{day!r} is no day of the form YYYY-MM-DD") from err
-    last = to_day or max((r.day for r in records), default="9999-12-31")
-    first = from_day or (dt.date.fromisoformat(last) - dt.timedelta(days=days - 1)).isoformat()
+    last = task.of.last or audited or "9999-12-31"
+    days = task.fleet.audit.window_days
+    first = task.of.first or (dt.date.fromisoformat(last) - dt.timedelta(days=days - 1)).isoformat()
     if first > last:
         raise ConfigError("command line", "from", f"{first} lies after the window's last day {last}")
     return first, last
+
+
+def _after(day: str) -> str:
+    return (dt.date.fromisoformat(day) + dt.timedelta(days=1)).isoformat()
 
 
 def _findings(

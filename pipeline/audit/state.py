@@ -24,12 +24,16 @@ _MOST_SIGMAS = 4.0  # of one DoF, beyond which a day does not belong to the othe
 
 @dataclass(frozen=True, eq=False)
 class DayEstimate:
-    """One accepted day: T_parent_child, covariance (left perturbation), what of it is common, what it determined."""
+    """One accepted day: T_parent_child, covariance (left perturbation), what of it is common, what it determined.
+
+    `common` None: the record does not say. All of it then counts as varying where days are weighed, and as common where
+    the result's covariance is stated.
+    """
 
     day: str
     T: Float[np.ndarray, "4 4"]
     covariance: Float[np.ndarray, "6 6"]
-    common: Float[np.ndarray, "6 6"]
+    common: Float[np.ndarray, "6 6"] | None
     observable: Bool[np.ndarray, " 6"]
 
 
@@ -64,10 +68,12 @@ def fuse(days: Sequence[DayEstimate], *, scale: float = 1.0, autocorrelation: fl
     total = np.linalg.inv(information.sum(axis=0))
     G = total @ information
     mean = np.einsum("nij,nj->i", G, x)
-    common = _positive(np.einsum("nij,njk->ik", G, np.stack([d.common for d in own])))
+    shared = np.stack([d.covariance if d.common is None else d.common for d in own])
+    common = _positive(np.einsum("nij,njk->ik", G, shared))
     lag = np.arange(1, len(own))
     alike = 1 + 2 * float(np.sum((1 - lag / len(own)) * autocorrelation**lag))
-    covariance = total * alike + common
+    said = all(d.common is not None for d in own)
+    covariance = total * alike * said + common
     return State(
         exp_se3(mean) @ origin,
         0.5 * (covariance + covariance.T),
@@ -99,7 +105,7 @@ def _belonging(days: Sequence[DayEstimate]) -> list[int]:
 
 def _varying(day: DayEstimate) -> Float[np.ndarray, "6 6"]:
     """What varies; what the day did not determine has all of its variance, so that it does not weigh."""
-    varying = day.covariance - day.common
+    varying = day.covariance if day.common is None else day.covariance - day.common
     floor = 0.01 * np.diag(day.covariance)  # sigmas are estimates themselves
     missing = np.where(day.observable, np.maximum(floor - np.diag(varying), 0.0), np.diag(day.covariance))
     return varying + np.diag(missing)

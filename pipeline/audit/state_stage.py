@@ -135,12 +135,13 @@ def _words(why: str, found: State | None) -> str:
 
 
 def _estimate(record: CalibrationRecord) -> DayEstimate | None:
-    """A record as a day to fuse; one of an older release does not say what varies, so nothing of it averages down."""
+    """A record as a day to fuse."""
     T, C = transform_of(record), record.covariance
     if T is None or C is None:
         return None
-    common = C if record.common_covariance is None else record.common_covariance
-    return DayEstimate(record.day, T, C, common, np.array(record.observable or [True] * 6, bool))
+    return DayEstimate(
+        record.day, T, C, record.common_covariance, np.array(record.observable or [True] * 6, bool)
+    )
 
 
 def _with_state(

@@ -25,6 +25,7 @@ __all__ = [
     "RecordIndex",
     "assert_records",
     "commit_records",
+    "first_day",
     "last_day",
     "read_latest",
     "read_records",
@@ -214,6 +215,13 @@ def read_latest(
         of_day: list[Any] = read_records(lake, schema, row_type, vehicle=vehicle, day=day)
         found += [row for row in of_day if day_of[row.vehicle, row.method] == day]
     return sorted(found, key=lambda row: row.vehicle)
+
+
+def first_day(lake: Lake, schema: TableSchema) -> str | None:
+    """The first day that any record of a table is about, as its log says; None where there is none."""
+    table = open_table(lake, schema)
+    spans = [f.days for f in live_files(table)] if table is not None else []
+    return min((days[0] for days in spans if days is not None), default=None)
 
 
 def last_day(lake: Lake, schema: TableSchema) -> str | None:
