@@ -7,7 +7,7 @@ import pytest
 
 import pipeline.fleet.ledger
 from pipeline.config import FleetConfig
-from pipeline.errors import ConfigError, LogError
+from pipeline.errors import CollectedError, ConfigError, DamagedError, LogError
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.fleet.status import day_statuses
@@ -190,6 +190,27 @@ def test_a_surprise_fails_its_day_with_a_traceback(night, monkeypatch):
     outcome = outcomes(night)["car"]
     assert (outcome.status, outcome.reason) == ("failed", "ZeroDivisionError: x")
     assert "Traceback" in outcome.trace
+
+
+@pytest.mark.parametrize("error", [DamagedError, CollectedError])
+def test_what_is_damaged_or_left_the_lake_is_set_aside_and_made_anew_at_once(error, night, monkeypatch):
+    path = Path(night.lake.file("frames", Partition("car", DAY)))
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"damaged")
+    script = StagesThatSay(monkeypatch, night.lake)
+    answer = script.answer
+
+    def stumbling(name, partition):
+        if name == "perceive" and path.exists():
+            script.called.append((name, partition.vehicle))
+            raise error(str(path), "2026-04-01")
+        return answer(name, partition)
+
+    script.answer = stumbling
+    assert outcomes(night)["car"].status == "done"
+    stages = [name for name, _ in script.called]
+    assert stages == ["ingest", "perceive", "ingest", "perceive", "calibrate"]
+    assert [p.name for p in path.parent.iterdir()] == ["part-0.parquet.damaged"]
 
 
 def test_unknown_vehicles_are_refused_and_the_others_go_on(night, monkeypatch):
