@@ -1,10 +1,21 @@
 """The radar's time offset: dips of the registration's cost beside slopes that have nothing to do with time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pipeline.calibrate.joint.lidar_radar import time_offset
+from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
+from pipeline.calibrate.joint.lidar_radar.normal_equations import RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.time_offset import dips
+from pipeline.extrinsics.estimates import Prior
+from pipeline.objective.radar.moving_clusters import moving_clusters
+from pipeline.objective.radar.registration import registration_frames
+from pipeline.objective.radar.vehicle_boxes import BOX_CLASSES, vehicle_boxes
+from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
+from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 
 def test_a_slope_has_no_dip_wherever_it_leads():
@@ -22,3 +33,26 @@ def test_a_dip_is_deepest_where_it_is_however_steep_the_slope(slope):
     cost = slope * steps - 20.0 * np.exp(-0.5 * ((steps - 37) / 1.2) ** 2)
     assert int(np.argmin(dips(cost[:, None])[:, 0])) == 37
     assert (int(np.argmin(cost)) == 37) == (slope == 0.0)  # which its lowest value would not show
+
+
+def test_the_radars_own_sigmas_bring_back_an_offset_that_wider_ones_do_not_see(monkeypatch):
+    prior = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2), 0.05)
+    rows, rng = street_day(16, seed=5), np.random.default_rng(0)
+    problem = RadarProblem(
+        rows,
+        registration_frames(rows, T_LIDAR_RADAR, rng),
+        moving_clusters(rows, with_boxes=False),
+        vehicle_boxes(rows),
+        None,
+        prior,
+        0.05,
+        np.radians(0.4),
+        ElevationSpread(0.1, 0.5),
+    )
+    right = RadarState(T_LIDAR_RADAR, DT_S, 0.0, np.zeros(len(BOX_CLASSES)), SIGMA, 0.0)
+    slid = replace(right, dt_s=DT_S + 0.04)
+    monkeypatch.setattr(time_offset, "comparison_cost", lambda problem, _: np.zeros(problem.frames.count))
+    found = time_offset.better_time_offset(problem, slid)
+    assert found is not None
+    assert abs(found.dt_s - DT_S) < 0.012  # half a step of 0.2 m
+    assert time_offset.better_time_offset(problem, right) is None
