@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("--root", type=Path, required=True, help="days that days.py generated")
     parser.add_argument("--out", type=Path, default=RESULTS / "intrinsics.md")
     args = parser.parse_args()
-    results, readouts = [], []
+    results, readouts, commit = [], [], commit_now()
     for spec in (*DAYS, *ROLLING):
         day = load_day(spec, args.root)
         for fault in FAULTS if spec in DAYS else ("",):
@@ -78,9 +78,7 @@ def main() -> None:
             print(*_line(result), sep=" | ", flush=True)
             if not fault:
                 readouts.append((spec, readout_s(aligned)))
-    text = "\n".join(
-        [f"Calibrated by commit {commit_now()}.", "", *_tables(results), "", *_readouts(readouts)]
-    )
+    text = "\n".join([f"Calibrated by commit {commit}.", "", *_tables(results), "", *_readouts(readouts)])
     args.out.write_text(text + "\n")
     print(text)
 

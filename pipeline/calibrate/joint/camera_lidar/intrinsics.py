@@ -97,7 +97,7 @@ class DayIntrinsics:
                 f"CameraInfo's, the principal point {right:+.0f} +- {right_sigma:.0f} px right and "
                 f"{down:+.0f} +- {down_sigma:.0f} px down of it"
             ),
-            # Freed, the readout time of 40 ms or none came out 25 to 40 ms off: see study `intrinsics.py`.
+            # By a profile like the time offset's it errs by tens of ms: study `intrinsics.py`.
             f"image rows are exposed within {1e3 * known.readout_s:.0f} ms (readout_s): a day does not tell",
         ]
 
