@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.charts import Charts, clipped, scan
-from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, hat, log_so3
 from schemas.calibrations import DOF_NAMES, PAIRS
 
 __all__ = [
@@ -121,9 +120,8 @@ def pair_days(
         observable: what each day determined.
         accepted: False for held days.
     """
-    J = np.zeros((len(T), 6, 6))
-    for k, pose in enumerate(T):
-        J[k] = change_jacobian(pose)
+    J = np.tile(np.eye(6), (len(T), 1, 1))
+    J[:, 3:, :3] = -hat(T[:, :3, 3])  # `change_jacobian` of each
     total = J @ covariance @ J.swapaxes(1, 2)
     spread = J @ (covariance - common) @ J.swapaxes(1, 2)
     varying, all_of_it = np.einsum("nii->ni", spread), np.einsum("nii->ni", total)

@@ -9,10 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.audit.days import PairDays, pair_days
-from pipeline.store.current import transform_of
+from pipeline.geometry.se3 import from_quaternion
 from schemas.calibrations import PAIRS, CalibrationRecord
 
-__all__ = ["days_of", "fault_of"]
+__all__ = ["days_of", "fault_of", "transforms_of"]
+
+_ROUNDING = 1e-3  # of what should be 1
 
 
 def days_of(records: Sequence[CalibrationRecord], held_sigma_factor: float) -> dict[str, PairDays]:
@@ -35,7 +37,7 @@ def days_of(records: Sequence[CalibrationRecord], held_sigma_factor: float) -> d
             covariance[k, :3, :3] += np.eye(3) * _shown_wrong_rad(rows[k]) ** 2
         pairs[pair] = pair_days(
             np.array([dt.date.fromisoformat(r.day).toordinal() for r in rows]),
-            np.stack([T for r in rows if (T := transform_of(r)) is not None]),
+            transforms_of(rows),
             covariance,
             common,
             np.array([r.observable or [True] * 6 for r in rows], dtype=bool),
@@ -55,10 +57,11 @@ def fault_of(record: CalibrationRecord, latest_day: str) -> str | None:  # noqa:
         return "is of a day that has not come yet"
     if record.status == "refused":
         return None
-    T, C = transform_of(record), record.covariance
-    if T is None or C is None:
+    pose, C = _pose(record), record.covariance
+    if None in pose or C is None:
         return None if record.status == "held" else "has no pose"
-    if not (np.isfinite(T).all() and abs(np.linalg.det(T[:3, :3]) - 1) < 1e-3):
+    norm = sum(float(v or 0) ** 2 for v in pose)
+    if not np.isfinite(norm) or abs(sum(float(v or 0) ** 2 for v in pose[:4]) - 1) > _ROUNDING:
         return "holds no rigid transform"
     if np.shape(C) != (6, 6) or not np.isfinite(C).all() or np.diag(C).min() <= 0 or not _is_positive(C):
         return "holds no covariance"
@@ -68,9 +71,20 @@ def fault_of(record: CalibrationRecord, latest_day: str) -> str | None:  # noqa:
     return None
 
 
+def transforms_of(records: Sequence[CalibrationRecord]) -> Float[np.ndarray, "N 4 4"]:
+    """T_parent_child of records that have one, all at once."""
+    poses = np.array([_pose(r) for r in records], float)
+    return from_quaternion(poses[:, :4], poses[:, 4:])
+
+
+def _pose(record: CalibrationRecord) -> tuple[float | None, ...]:
+    return record.qw, record.qx, record.qy, record.qz, record.tx_m, record.ty_m, record.tz_m
+
+
 def _is_positive(C: np.ndarray) -> bool:
+    """Whether no correlation is beyond 1: what a damaged covariance fails, at a fraction of what eigenvalues cost."""
     scale = 1 / np.sqrt(np.diag(C))
-    return bool(np.linalg.eigvalsh(C * np.outer(scale, scale))[0] > -1e-6)
+    return bool(np.abs(C * np.outer(scale, scale)).max() < 1 + _ROUNDING)
 
 
 def _may_be_right(record: CalibrationRecord) -> bool:

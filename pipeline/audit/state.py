@@ -59,11 +59,12 @@ def fuse(days: Sequence[DayEstimate], *, scale: float = 1.0, autocorrelation: fl
     """
     if not days:
         return None
-    kept = _belonging(days)
-    own = [days[i] for i in kept]
-    origin = own[0].T
-    x = np.stack([log_se3(d.T @ inverse(origin)) for d in own])
-    varying = np.stack([_varying(d) for d in own]) * scale**2
+    origin = days[0].T
+    changes = log_se3(np.stack([d.T for d in days]) @ inverse(origin))
+    spread = np.stack([_varying(d) for d in days])
+    kept = _belonging(changes, spread, np.stack([d.observable for d in days]))
+    own, x = [days[i] for i in kept], changes[kept]
+    varying = spread[kept] * scale**2
     information = np.linalg.inv(varying)
     total = np.linalg.inv(information.sum(axis=0))
     G = total @ information
@@ -84,23 +85,22 @@ def fuse(days: Sequence[DayEstimate], *, scale: float = 1.0, autocorrelation: fl
     )
 
 
-def _belonging(days: Sequence[DayEstimate]) -> list[int]:
+def _belonging(
+    x: Float[np.ndarray, "N 6"], varying: Float[np.ndarray, "N 6 6"], seen: Bool[np.ndarray, "N 6"]
+) -> list[int]:
     """Days that lie no further from the median of all than their sigmas allow; all of them where there are two."""
-    if len(days) < 3:
-        return list(range(len(days)))
-    origin = days[0].T
-    x = np.stack([log_se3(d.T @ inverse(origin)) for d in days])
-    sigma = np.sqrt(np.stack([np.diag(_varying(d)) for d in days]))
+    if len(x) < 3:
+        return list(range(len(x)))
+    sigma = np.sqrt(np.einsum("nii->ni", varying))
     sigma = np.maximum(sigma, np.median(sigma, axis=0))
-    seen = np.stack([d.observable for d in days])
     median = np.array([np.median(x[seen[:, k], k]) if seen[:, k].any() else 0.0 for k in range(6)])
     spread = np.array(
         [np.median(np.abs(x[seen[:, k], k] - median[k])) if seen[:, k].any() else 0.0 for k in range(6)]
     )
     reach = _MOST_SIGMAS * np.maximum(sigma, 1.4826 * spread)
     far = (np.abs(x - median) > reach) & seen
-    kept = [i for i in range(len(days)) if not far[i].any()]
-    return kept or list(range(len(days)))
+    kept = [i for i in range(len(x)) if not far[i].any()]
+    return kept or list(range(len(x)))
 
 
 def _varying(day: DayEstimate) -> Float[np.ndarray, "6 6"]:

@@ -8,15 +8,16 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Float
 from scipy.special import ndtri
 
-from pipeline.audit.estimates import fault_of
+from pipeline.audit.estimates import fault_of, transforms_of
 from pipeline.audit.service import restart_of, what_was_done
 from pipeline.audit.state import DayEstimate, State, fuse
 from pipeline.config import FleetConfig, VerifyConfig, config_hash
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.target_sigmas import target_sigmas
-from pipeline.store.current import current_drift, current_records, transform_of
+from pipeline.store.current import current_drift, current_records
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.records import last_day, read_records
 from pipeline.work import Records, Run, Task, Told, Window, Work
@@ -117,7 +118,7 @@ def _states(
     for pair in PAIRS:
         first, why = since[pair]
         own = [r for r in records if r.pair == pair and r.status == "accepted" and r.day >= first]
-        days = [day for r in own if (day := _estimate(r)) is not None]
+        days = [_estimate(r, T) for r, T in zip(own, transforms_of(own), strict=True)] if own else []
         found = fuse(days, autocorrelation=_AUTOCORRELATION)
         parent, child = FRAMES_OF_PAIR[pair]
         words = _words(why, found)
@@ -134,14 +135,11 @@ def _words(why: str, found: State | None) -> str:
     return "; ".join(text for text in (why, left) if text)
 
 
-def _estimate(record: CalibrationRecord) -> DayEstimate | None:
-    """A record as a day to fuse."""
-    T, C = transform_of(record), record.covariance
-    if T is None or C is None:
-        return None
-    return DayEstimate(
-        record.day, T, C, record.common_covariance, np.array(record.observable or [True] * 6, bool)
-    )
+def _estimate(record: CalibrationRecord, T: Float[np.ndarray, "4 4"]) -> DayEstimate:
+    """An accepted record as a day to fuse."""
+    assert record.covariance is not None, "records without one were left out"
+    observable = np.array(record.observable or [True] * 6, bool)
+    return DayEstimate(record.day, T, record.covariance, record.common_covariance, observable)
 
 
 def _with_state(
