@@ -9,10 +9,12 @@ from schemas.observations import OBSERVATIONS, Observation
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import STATES, StateRow
+from schemas.training import TRAINING, TrainingRow
 
 ROW_TYPES = {
     FRAMES.name: (FRAMES, Frame),
     OBSERVATIONS.name: (OBSERVATIONS, Observation),
+    TRAINING.name: (TRAINING, TrainingRow),
     CALIBRATIONS.name: (CALIBRATIONS, CalibrationRecord),
     DRIFT.name: (DRIFT, DriftFinding),
     OUTCOMES.name: (OUTCOMES, OutcomeRow),

@@ -31,7 +31,7 @@ from pipeline.store.records import (
 )
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
-from tests.makers.table_rows import make_row, same
+from tests.makers.table_rows import ROW_TYPES, make_row, same
 
 REPO = Path(__file__).resolve().parents[2]
 DAY = Partition("car", "2026-03-02")
@@ -293,6 +293,20 @@ def test_duckdb_and_polars_read_records_by_the_documented_lines(lake, rng):
     shape = [int(s) for s in about[b"shape"].split(b",")]
     found = np.frombuffer(frame["covariance"][0], about[b"dtype"].decode()).reshape(shape)
     np.testing.assert_array_equal(found, row.covariance)
+
+
+@pytest.mark.parametrize("name", [n for n, (schema, _) in ROW_TYPES.items() if schema.is_record_table])
+def test_duckdb_and_polars_read_every_record_table(name, lake, rng):
+    schema, _ = ROW_TYPES[name]
+    stamps = {"recorded_at": "", "asserted_at": ""}
+    rows = [make_row(name, rng, vehicle=v, day="2026-03-02", work_key="k", **stamps) for v in ("a", "b")]
+    commit_records(lake, schema, rows)
+    where = str(lake.root / name)
+    records = DeltaTable(where).to_pyarrow_table()  # noqa: F841 - DuckDB finds it by its name
+    assert duckdb.sql("select vehicle from records order by vehicle").fetchall() == [("a",), ("b",)]
+    frame = pl.scan_delta(where).filter(pl.col("day") == "2026-03-02").collect()
+    assert set(frame.columns) == {*(c.name for c in schema.columns), "month"}
+    assert frame.height == 2
 
 
 # -- many writers, and dead ones ---------------------------------------------------------------------

@@ -175,6 +175,18 @@ def test_duckdb_and_polars_read_the_lake_by_plain_glob(lake, rng):
             np.testing.assert_array_equal(decode(blob, field), rows[vehicle, day][index].lidar_x_m)
 
 
+@pytest.mark.parametrize("name", [n for n, (schema, _) in ROW_TYPES.items() if not schema.is_record_table])
+def test_duckdb_and_polars_read_every_table_of_partitions_by_plain_glob(name, lake, rng):
+    schema, _ = ROW_TYPES[name]
+    write(lake, [make_row(name, rng) for _ in range(3)], schema=schema)
+    pattern = f"{lake.root}/{name}/*/*/*.parquet"
+    sql = f"select count(*) from read_parquet('{pattern}', hive_partitioning=true)"
+    assert duckdb.sql(sql).fetchall() == [(3,)]
+    frame = pl.scan_parquet(pattern, hive_partitioning=True).collect()
+    assert {c.name for c in schema.columns} <= set(frame.columns)
+    assert frame.height == 3
+
+
 # -- faults ------------------------------------------------------------------------------------------
 
 
