@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.rigs import CameraPrior
+
 __all__ = [
     "BOX_ELEVATION_GATES_RAD",
     "BOX_ROLL_FLOOR_CAMERA_RAD",
@@ -55,7 +57,7 @@ CAMERA_LIDAR_BIAS = np.array([np.radians(0.03)] * 3 + [0.01, 0.006, 0.01])
 CAMERA_LIDAR_DT_FLOOR_S = 0.004
 # Relative sigma of the logged focal length. The solver leaves the focal length free within it, so that the position
 # along the optical axis is no surer than the intrinsics.
-FOCAL_SIGMA = 0.003
+FOCAL_SIGMA = CameraPrior.focal_sigma
 # Focal length and principal point by the day alone, on 61 simulated days of seeds 110 to 199 (20 to 40 frames, 10 rigs,
 # dusk and night among them): beside what its two starts leave open the focal length erred by 0.4 % RMS, hardly more
 # where its formal sigma was 0.2 %, and the principal point by 3.3 formal sigmas.
