@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -10,7 +11,7 @@ if TYPE_CHECKING:
 
 __all__ = ["show"]
 
-Table = Literal["calibrations", "drift", "frames", "observations"]
+Table = Literal["calibrations", "drift", "states", "outcomes", "service_events", "frames", "observations"]
 
 
 def show(
@@ -23,7 +24,7 @@ def show(
     current: bool = False,
     json: bool = False,
 ) -> int:
-    """Show records (calibrations, drift) or partitions (frames, observations).
+    """Show records (calibrations, drift, states, ...) or partitions (frames, observations).
 
     Args:
         table: what to show.
@@ -31,7 +32,7 @@ def show(
         vehicle: only this vehicle.
         day: only this day, YYYY-MM-DD.
         method: only records of this method.
-        current: only the current record of each vehicle, day, method and pair.
+        current: only the current record of each vehicle, day, method and pair; of outcomes and events, all are.
         json: print a JSON list and nothing else: oldest record first, names as the columns, and for
             calibrations "T", the 4x4 row-major T_parent_child (null where the day was refused).
     """
@@ -63,21 +64,31 @@ def show(
 def _records(
     lake: Lake, table: Table, vehicle: str | None, day: str | None, method: str | None, *, current: bool
 ) -> list[dict[str, Any]]:
-    from pipeline.store.current import current_drift, current_records, transform_of
-    from pipeline.store.tables import read_records
-    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-    from schemas.drift import DRIFT, DriftFinding
+    from pipeline.store.current import current_drift, current_records, current_states, transform_of
+    from pipeline.store.records import read_records
+    from schemas.calibrations import CalibrationRecord
+    from schemas.drift import DriftFinding
+    from schemas.outcomes import OutcomeRow
+    from schemas.service_events import ServiceEvent
+    from schemas.states import StateRow
+    from schemas.versions import TABLES
 
+    kinds: dict[str, tuple[type[Any], Callable[[list[Any]], list[Any]]]] = {
+        "calibrations": (CalibrationRecord, current_records),
+        "drift": (DriftFinding, current_drift),
+        "states": (StateRow, current_states),
+        "outcomes": (OutcomeRow, list),
+        "service_events": (ServiceEvent, list),
+    }
+    kind, current_of = kinds[table]
+    rows = read_records(lake, TABLES[table], kind, vehicle=vehicle, day=day)
+    rows = [r for r in rows if method in (None, getattr(r, "method", None))]
+    names = [c.name for c in TABLES[table].columns]
+    chosen = current_of(rows) if current else rows
+    shown = [{n: getattr(r, n) for n in names} for r in chosen]
     if table == "calibrations":
-        records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day)
-        records = [r for r in records if method in (None, r.method)]
-        chosen = current_records(records) if current else records
-        names = [c.name for c in CALIBRATIONS.columns]
-        return [{n: getattr(r, n) for n in names} | {"T": transform_of(r)} for r in chosen]
-    findings = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle, day=day)
-    findings = [f for f in findings if method in (None, f.method)]
-    kept = current_drift(findings) if current else findings
-    return [{c.name: getattr(f, c.name) for c in DRIFT.columns} for f in kept]
+        return [row | {"T": transform_of(r)} for row, r in zip(shown, chosen, strict=True)]
+    return shown
 
 
 def _partitions(lake: Lake, table: Table, vehicle: str | None, day: str | None) -> list[dict[str, Any]]:

@@ -40,13 +40,18 @@ def status(
     from jobs.terminal.summary import left_out, print_summary
     from pipeline.errors import ConfigError
     from pipeline.fleet.status import DAY_STATUSES, day_statuses
+    from pipeline.store.delta import open_table
     from pipeline.store.partitions import Lake
     from pipeline.store.records import last_day, read_records
+    from schemas.calibrations import CALIBRATIONS
     from schemas.outcomes import OUTCOMES, OutcomeRow
 
     tables = Lake.at(lake)
     if not tables.exists():
         raise ConfigError("command line", "lake", f"no such folder: {lake}")
+    open_table(
+        tables, CALIBRATIONS
+    )  # records that a release before 0.6 wrote are named, and how to move them
     last = to_day or last_day(tables, OUTCOMES)
     first = from_day or (None if last is None else _month_before(last))
     rows = read_records(tables, OUTCOMES, OutcomeRow, first=first, last=last)

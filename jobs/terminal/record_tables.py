@@ -20,14 +20,18 @@ _PIPE_WIDTH = 200  # characters; into a pipe or file nothing needs to fit a wind
 
 
 def print_table(table: str, rows: list[dict[str, Any]]) -> None:
-    """Print rows of calibrations, drift, frames or observations, named as their columns; at least one row."""
+    """Print rows of a table, named as their columns; at least one row."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    cells = {"calibrations": _calibration_cells, "drift": _drift_cells, "states": _state_cells}.get(
-        table, _partition_cells
-    )
+    cells = {
+        "calibrations": _calibration_cells,
+        "drift": _drift_cells,
+        "states": _state_cells,
+        "outcomes": _outcome_cells,
+        "service_events": _event_cells,
+    }.get(table, _partition_cells)
     lines = [cells(row) for row in rows]
     view = Table(title=f"{table}: {len(rows)} row{'' if len(rows) == 1 else 's'}", title_justify="left")
     for name in lines[0]:
@@ -103,6 +107,24 @@ def _state_cells(row: dict[str, Any]) -> dict[str, str]:
         "days": f"{len(days)}: {days[0]} to {days[-1]}" if days else "0",
         "reason": row["reason"],
     }
+
+
+def _outcome_cells(row: dict[str, Any]) -> dict[str, str]:
+    return {
+        "vehicle": row["vehicle"],
+        "day": row["day"],
+        "stage": row["stage"],
+        "method": row["method"],
+        "status": row["status"],
+        "began": row["began_at"],
+        "seconds": f"{row['seconds']:.1f}",
+        "rows": str(row["rows"]),
+        "reason": row["reason"],
+    }
+
+
+def _event_cells(row: dict[str, Any]) -> dict[str, str]:
+    return {name: row[name] for name in ("vehicle", "day", "sensor", "kind", "note")}
 
 
 def _partition_cells(row: dict[str, Any]) -> dict[str, str]:

@@ -1,0 +1,42 @@
+"""`boresight show` and `boresight status` on tables that are not calibrations."""
+
+import json
+
+import pytest
+
+from jobs.show import show
+from jobs.status import status
+from pipeline.errors import ContractError
+from pipeline.store.partitions import Lake
+from pipeline.store.records import commit_records
+from schemas.outcomes import OUTCOMES, OutcomeRow
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+
+
+def test_every_record_table_is_shown_for_people_and_for_machines(tmp_path, capsys):
+    lake = Lake.at(tmp_path)
+    commit_records(
+        lake, OUTCOMES, [OutcomeRow("car", "2026-03-02", "ingest", "", "refused", "no [radar]", "k")]
+    )
+    commit_records(
+        lake, SERVICE_EVENTS, [ServiceEvent("car", "2026-03-03", "radar", "repair", "new bracket")]
+    )
+    for table, column, value in (
+        ("outcomes", "reason", "no [radar]"),
+        ("service_events", "note", "new bracket"),
+    ):
+        assert show(table, lake=str(tmp_path)) == 0
+        assert value in capsys.readouterr().out
+        assert show(table, lake=str(tmp_path), vehicle="car", json=True) == 0
+        [row] = json.loads(capsys.readouterr().out)
+        assert row[column] == value
+        assert show(table, lake=str(tmp_path), vehicle="bus", json=True) == 0
+        assert json.loads(capsys.readouterr().out) == []
+
+
+def test_status_names_the_command_that_moves_records_of_older_releases(tmp_path):
+    old = tmp_path / "calibrations/vehicle=car/day=2026-03-02"
+    old.mkdir(parents=True)
+    (old / "joint-abc.parquet").touch()
+    with pytest.raises(ContractError, match="boresight migrate"):
+        status(lake=str(tmp_path))
