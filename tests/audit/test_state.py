@@ -1,6 +1,7 @@
 """What a vehicle should load: its error falls with the days as its sigma says."""
 
 import datetime as dt
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -8,6 +9,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from jobs.service import service
+from jobs.state import state
 from pipeline.audit.state import DayEstimate, fuse
 from pipeline.config import FleetConfig
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
@@ -128,3 +131,22 @@ def test_a_state_rests_on_the_accepted_days_since_the_last_change(tmp_path: Path
     states = _states(lake)
     assert {(s.status, tuple(s.days)) for s in states.values()} == {("none", ())}
     assert "no accepted day after the repair of all sensors on 2026-03-22" in states["lidar_radar"].reason
+
+
+def test_a_service_event_and_the_state_after_it_are_commands(
+    tmp_path: Path, maker: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lake = Lake.at(tmp_path)
+    _write(lake, maker.vehicle_records("v", 6, np.random.default_rng(6)))
+    for day in (_day(2), _day(3)):
+        assert service(lake=str(tmp_path), vehicle="v", day=day, kind="repair", sensor="radar") == 0
+    _states(lake)
+    capsys.readouterr()
+    assert state(lake=str(tmp_path), vehicle="v", json=True) == 0
+    found = {row["pair"]: row for row in json.loads(capsys.readouterr().out)}
+    assert found["lidar_radar"]["days"] == [_day(4), _day(5)]
+    assert "repair of the radar on 2026-03-04" in found["lidar_radar"]["reason"]
+    assert len(found["camera_lidar"]["days"]) == 6
+    assert np.shape(found["camera_lidar"]["T"]) == (4, 4)
+    assert state(lake=str(tmp_path)) == 0
+    assert "certified" in capsys.readouterr().out
