@@ -65,6 +65,8 @@ def test_work_keys_change_with_every_input_and_only_then():
     assert len({base, *others}) == 6
 
 
-def test_object_stores_are_refused_in_words():
-    with pytest.raises(ConfigError, match="folder"):
-        Lake.at("s3://bucket/lake")
+@pytest.mark.parametrize("location", ["s3://", "s3://bucket", "gs://bucket/lake", "https://example.com/lake"])
+def test_what_is_neither_a_folder_nor_a_place_in_s3_is_refused_in_words(location):
+    with pytest.raises(ConfigError, match="no folder and no s3://"):
+        Lake.at(location)
+    assert str(Lake.at("s3://bucket/fleet/lake")) == "s3://bucket/fleet/lake"
