@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import zstandard
@@ -17,6 +19,7 @@ from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, R
 __all__ = ["CompressedLog", "FolderLog"]
 
 _UNPACKED = "boresight-unpacked-"  # then the process that unpacked it
+_LEFT_BEHIND_S = 86400.0  # longer than any log is open
 _FILES = ("*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd")
 
 
@@ -91,11 +94,16 @@ class CompressedLog:
 
 
 def _remove_left_behind() -> None:
-    """Remove what killed processes of this machine unpacked: nothing of theirs could clean up after them."""
+    """Remove what killed processes unpacked a day ago: nothing of theirs could clean up after them.
+
+    Not sooner: containers may share the folder, and a process of another one is not seen running here.
+    """
     for folder in Path(tempfile.gettempdir()).glob(f"{_UNPACKED}*-*"):
         pid = folder.name.removeprefix(_UNPACKED).partition("-")[0]
-        if pid.isdigit() and not _is_running(int(pid)):
-            shutil.rmtree(folder, ignore_errors=True)
+        with suppress(FileNotFoundError):  # another process removed it first
+            is_old = time.time() - folder.stat().st_mtime > _LEFT_BEHIND_S
+            if pid.isdigit() and is_old and not _is_running(int(pid)):
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def _is_running(pid: int) -> bool:

@@ -78,19 +78,24 @@ def test_a_pipe_is_named_and_not_waited_for(tmp_path):
             reads(tmp_path / "pipe.mcap")
 
 
-def test_what_a_killed_process_unpacked_is_removed_by_the_next_one(kit, tmp_path, monkeypatch):
+def test_what_a_killed_process_unpacked_a_day_ago_is_removed_by_the_next_one(kit, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     ended = subprocess.run(
         [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True
     )
-    name = rosbag2_folder._UNPACKED
-    left, mine = (tmp_path / f"{name}{pid}-x" for pid in (ended.stdout.decode().strip(), os.getpid()))
-    for folder in (left, mine):
+    name, ended_pid = rosbag2_folder._UNPACKED, ended.stdout.decode().strip()
+    left, new, mine = (
+        tmp_path / f"{name}{pid}" for pid in (f"{ended_pid}-x", f"{ended_pid}-y", f"{os.getpid()}-x")
+    )
+    for folder in (left, new, mine):
         folder.mkdir()
+    for folder in (left, mine):
+        os.utime(folder, (0, 0))
     folder = kit.Kit().drive().folder(tmp_path / "bag")
     plain = next(folder.glob("*.db3"))
     packed = Path(f"{plain}.zstd")
     packed.write_bytes(zstandard.ZstdCompressor().compress(plain.read_bytes()))
     open_log(packed).close()
     assert not left.exists()
+    assert new.exists()  # another container's process may have it open
     assert mine.exists()
