@@ -19,6 +19,7 @@ FOUNDATIONS = {
     "config",
     "errors",
     "names",
+    "sections",
     "results",
     "geometry",
     "store",
