@@ -41,7 +41,7 @@ def audit(
     if method is not None:
         method_named(method)
     config = load_fleet(fleet)
-    tables = Lake.at(lake)
+    tables = Lake.existing(lake)
     with progress_reporter("audit") as progress:
         task = Task(config, tables, Window(from_day, to_day), method, progress=progress)
         outcome = AUDIT.run(task)

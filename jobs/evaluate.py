@@ -59,7 +59,7 @@ def evaluate(
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
     _check(truth, reflectors, recording_lake or recording_day, out)
-    tables = Lake.at(lake)
+    tables = Lake.existing(lake)
     records = [r for r in read_records(tables, CALIBRATIONS, CalibrationRecord) if method in (None, r.method)]
     recording = (recording_lake or lake, recording_day) if recording_lake or recording_day else None
     files = ReflectorFiles(reflectors, recording)

@@ -32,9 +32,7 @@ def gc(
     for name, days in (("images-days", images_days), ("observations-days", observations_days)):
         if days is not None and days < 1:
             raise ConfigError("command line", name, f"{days} is less than one")
-    tables, today = Lake.at(lake), dt.datetime.now(dt.UTC).date()
-    if not tables.exists():
-        raise ConfigError("command line", "lake", f"no such folder: {lake}")
+    tables, today = Lake.existing(lake), dt.datetime.now(dt.UTC).date()
     kept = {FRAMES: images_days} | ({} if observations_days is None else {OBSERVATIONS: observations_days})
     gone = {
         schema.name: list(

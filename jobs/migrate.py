@@ -14,15 +14,12 @@ def migrate(*, lake: str) -> int:
         lake: folder of the tables.
     """
     from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.errors import ConfigError
     from pipeline.store.migration import migrate_table
     from pipeline.store.partitions import Lake
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
     from schemas.drift import DRIFT, DriftFinding
 
-    tables = Lake.at(lake)
-    if not tables.exists():
-        raise ConfigError("command line", "lake", f"no such folder: {lake}")
+    tables = Lake.existing(lake)
     done = {}
     with progress_reporter("migrate") as progress:
         for schema, row_type in ((CALIBRATIONS, CalibrationRecord), (DRIFT, DriftFinding)):

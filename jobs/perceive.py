@@ -26,7 +26,7 @@ def perceive(*, fleet: Path, lake: str, vehicle: str, day: str) -> int:
 
     config = load_fleet(fleet)
     require_named_files(config)
-    tables = Lake.at(lake)
+    tables = Lake.existing(lake)
     with progress_reporter(f"perceive {vehicle} {day}") as progress:
         outcome = PERCEIVE.run(Task(config, tables, Partition(vehicle, day), progress=progress))
     record_outcome(tables, outcome)

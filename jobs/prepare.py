@@ -45,7 +45,7 @@ def prepare(
     from pipeline.learn.prepare.inventory import take_inventory, write_inventory
     from pipeline.store.partitions import Lake
 
-    config, tables = load_fleet(fleet), Lake.at(lake)
+    config, tables = load_fleet(fleet), Lake.existing(lake)
     days = _days(config, tables, from_day, to_day, vehicles)
     results = _run(_plan(config, tables, days), executor, workers)
     with progress_reporter("inventory") as progress:

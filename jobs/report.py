@@ -46,7 +46,7 @@ def report(
         raise ConfigError("command line", "vehicle, day", "a day's page needs both --vehicle and --day")
     if picture is not None and day is None:
         raise ConfigError("command line", "picture", "a picture is of one day: give --vehicle and --day")
-    config, tables = load_fleet(fleet), Lake.at(lake)
+    config, tables = load_fleet(fleet), Lake.existing(lake)
     of = Partition(vehicle, day) if vehicle is not None and day is not None else Window()
     pages = Pages(out, read_truth(truth) if truth is not None else None, pictures)
     outcome = REPORT.run(Task(config, tables, of, method, given=pages))

@@ -38,6 +38,6 @@ def service(
     of = Partition(vehicle, day)
     key = work_key("service", "", f"{vehicle} {day} {sensor} {kind}", [note])
     event = ServiceEvent(vehicle, day, sensor, kind, note, key)
-    path = write_records(Lake.at(lake), SERVICE_EVENTS, of, [event], key, CODE_VERSION)
+    path = write_records(Lake.existing(lake), SERVICE_EVENTS, of, [event], key, CODE_VERSION)
     print_summary("service", "done", vehicle=vehicle, day=day, sensor=sensor, kind=kind, outputs=[path])
     return exit_code(["done"])

@@ -37,12 +37,9 @@ def show(
             calibrations "T", the 4x4 row-major T_parent_child (null where the day was refused).
     """
     from jobs.terminal.summary import left_out
-    from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake
 
-    tables = Lake.at(lake)
-    if not tables.exists():
-        raise ConfigError("command line", "lake", f"no such folder: {lake}")
+    tables = Lake.existing(lake)
     if table in ("frames", "observations"):
         rows = _partitions(tables, table, vehicle, day)
     else:

@@ -21,15 +21,12 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
             T_parent_child (null where there is no accepted day).
     """
     from jobs.terminal.summary import left_out, print_json
-    from pipeline.errors import ConfigError
     from pipeline.store.current import current_states, transform_of
     from pipeline.store.partitions import Lake
     from pipeline.store.records import read_records
     from schemas.states import STATES, StateRow
 
-    tables = Lake.at(lake)
-    if not tables.exists():
-        raise ConfigError("command line", "lake", f"no such folder: {lake}")
+    tables = Lake.existing(lake)
     found = [r for r in read_records(tables, STATES, StateRow, vehicle=vehicle) if r.method == method]
     left_out(tables)
     names = [c.name for c in STATES.columns]

@@ -38,7 +38,6 @@ def status(
     from dataclasses import asdict
 
     from jobs.terminal.summary import left_out, print_summary
-    from pipeline.errors import ConfigError
     from pipeline.fleet.status import DAY_STATUSES, day_statuses
     from pipeline.store.delta import open_table
     from pipeline.store.partitions import Lake
@@ -46,9 +45,7 @@ def status(
     from schemas.calibrations import CALIBRATIONS
     from schemas.outcomes import OUTCOMES, OutcomeRow
 
-    tables = Lake.at(lake)
-    if not tables.exists():
-        raise ConfigError("command line", "lake", f"no such folder: {lake}")
+    tables = Lake.existing(lake)
     open_table(
         tables, CALIBRATIONS
     )  # records that a release before 0.6 wrote are named, and how to move them

@@ -75,6 +75,18 @@ class Lake:
             raise ConfigError("command line", "lake", f"{location!r} is no folder and no s3://BUCKET/PREFIX")
         return cls(PurePosixPath(prefix), Bucket(bucket))
 
+    @classmethod
+    def existing(cls, location: str | Path) -> Lake:
+        """The lake at a place where there is one, for commands that read: a mistyped name is no empty lake.
+
+        Raises:
+            ConfigError: there is none, or it cannot be a lake's place (see `at`).
+        """
+        lake = cls.at(location)
+        if not lake.exists():
+            raise ConfigError("command line", "lake", f"no such folder: {location}")
+        return lake
+
     def __str__(self) -> str:
         return self.files.uri(self.root)
 

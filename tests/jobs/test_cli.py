@@ -8,6 +8,7 @@ import pytest
 
 from jobs import cli
 from pipeline.errors import ConfigError, LogError, SolveError
+from tests.makers.fleet_files import fleet_toml
 
 
 @pytest.fixture
@@ -90,6 +91,35 @@ def test_wrong_usage_exits_with_2_and_says_why(arguments, tmp_path, monkeypatch,
         signal.signal(signal.SIGTERM, handler)
     assert json.loads(capsys.readouterr().err.splitlines()[-1])["event"]
     assert list(tmp_path.iterdir()) == []
+
+
+READERS = {
+    "audit": [],
+    "report": ["--out", "x.html"],
+    "perceive": ["--vehicle", "v", "--day", "2026-03-02"],
+    "prepare": [],
+    "service": ["--vehicle", "v", "--day", "2026-03-02", "--kind", "repair"],
+    "show": ["calibrations"],
+    "state": [],
+    "status": [],
+    "gc": ["--images-days", "30"],
+    "migrate": [],
+}
+
+
+@pytest.mark.parametrize("command_name", READERS)
+def test_a_mistyped_lake_is_wrong_usage_and_no_empty_lake(command_name, tmp_path, capsys):
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text(fleet_toml("v"))
+    with_fleet = command_name in ("audit", "report", "perceive", "prepare")
+    arguments = [command_name, *READERS[command_name], "--lake", str(tmp_path / "lkae")]
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        assert cli.main([*arguments, *(["--fleet", str(fleet)] if with_fleet else [])]) == 2
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    assert "lkae" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["fleet.toml"]
 
 
 def test_the_installed_command_exports_schemas(tmp_path):
