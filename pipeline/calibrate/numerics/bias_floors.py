@@ -31,6 +31,7 @@ __all__ = [
     "HEADING_SIGMA_RAD",
     "HELD_OUT_BIAS",
     "INTRINSICS_CONTRADICTION_SIGMAS",
+    "INTRINSICS_HALF_SIGMAS",
     "LIDAR_RADAR_BIAS",
     "LIDAR_RADAR_DT_FLOOR_S",
     "MAX_GAP_PX",
@@ -64,6 +65,8 @@ FOCAL_SIGMA = CameraPrior.focal_sigma
 DAY_FOCAL_FLOOR, DAY_FOCAL_SIGMAS, DAY_CENTRE_SIGMAS = 0.004, 2.0, 3.5
 # Beyond so many sigmas of day and CameraInfo together an intrinsic is contradicted: none of those days did.
 INTRINSICS_CONTRADICTION_SIGMAS = 3.0
+# ... and beyond so many of its own each half of the frames has to be: a whole at three is two halves at 2.1.
+INTRINSICS_HALF_SIGMAS = 2.0
 # Position along the optical axis: RMS distance of tz from the reference on halves of a real day (16 rings), where edges
 # and markings do not check each other ...
 TZ_UNCHECKED_BIAS_M = 0.18

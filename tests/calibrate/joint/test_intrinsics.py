@@ -91,6 +91,21 @@ def test_contradictions_need_three_sigmas_of_day_and_camera_info_together():
     assert len(contradictions(day_of(1.0149, centre_px=(0.0, 14.9)), CameraPrior(0.0, 0.0, 0.0))) == 2
 
 
+def test_what_one_half_of_the_frames_does_not_show_is_no_contradiction():
+    known, whole = CameraPrior(0.0, 0.0, 0.0), day_of(1.02, centre_px=(0.0, -12.0))
+    agree = (day_of(1.025, 0.006, (0.0, -14.0)), day_of(1.015, 0.006, (0.0, -10.0)))
+    assert len(contradictions(replace(whole, halves=agree), known)) == 2
+    for silent in (day_of(1.011, 0.006, (0.0, -5.0)), day_of(0.98, centre_px=(0.0, 12.0))):
+        assert contradictions(replace(whole, halves=(agree[0], silent)), known) == []
+
+
+def test_a_contradicted_camera_info_was_asked_of_both_halves(day):
+    assert measured(day).halves == ()
+    first, second = measured(wrong(day, 0.97)).halves
+    assert first.focal > 1.015
+    assert second.focal > 1.015
+
+
 def test_diagnostics_say_what_the_day_determined_and_what_stays_open_in_the_mounting():
     known = CameraPrior(focal_sigma=0.003, centre_sigma_px=4.0)
     d = day_of(1.01, 0.002, (5.0, -2.0)).diagnostics(known)
