@@ -187,15 +187,17 @@ def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
 
 
 def _claim_numbers(judged: Judged) -> dict[str, float]:
-    """Score, which directions are certified, what held-out frames would change and the sigma that they leave."""
+    """Score, what is certified and what nothing checks, what held-out frames would change, the sigma they leave."""
     certified = judged.verdict.determined
-    return {
+    numbers = {
         "confidence": judged.verdict.score,
         "disproved": float(judged.verdict.disproved),
         "vouched_az": float("azimuth" in certified),
         "vouched_el": float("elevation" in certified),
         "elevation_limit_rad": judged.claims["elevation"].limit_rad,
-    } | {
+    }
+    numbers |= {f"unchecked_{dof}_sigmas": sigmas for dof, sigmas in judged.verdict.unchecked.items()}
+    return numbers | {
         f"holdout_{name}_{what}_rad": value
         for name, claim in judged.claims.items()
         for what, value in (

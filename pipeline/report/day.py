@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.report.words import PAIR_TITLES, dof_title, motion_in_words, scaled, unit_of
+from pipeline.report.words import AXIS_NAMES, PAIR_TITLES, dof_title, motion_in_words, scaled, unit_of
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
 from schemas.drift import DriftFinding, status_of
@@ -62,6 +62,7 @@ class PairView:
     time_offset: str
     loop: str
     certified: str
+    unchecked: str  # of an accepted record, what contradicts the prior and nothing checks
     notes: list[str]
     assumptions: list[str]
     missing: list[str]
@@ -112,6 +113,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
         time_offset=_time_offset(record),
         loop=_loop(record),
         certified=_certified(record),
+        unchecked=_unchecked(record),
         notes=[note for note in record.notes if not note.startswith(_SAID_BY_THE_AXES)],
         assumptions=list(record.assumptions),
         missing=list(record.drive_missing),
@@ -132,6 +134,13 @@ def _certified(record: CalibrationRecord) -> str:
     together = f"{' and '.join(record.determined)} within {np.degrees(record.limit_rad):.2g} deg"
     what = f"{together if same else ' and '.join(each)} at 15 to 40 m"
     return f"{what if record.determined else 'nothing'}; score {record.score:.2f}"
+
+
+def _unchecked(record: CalibrationRecord) -> str:
+    """As `roll (3.1 sigma)`: axes of an accepted record that left the prior clearly and that nothing checks."""
+    names = AXIS_NAMES[record.parent_frame]
+    moves = {k: record.diagnostics.get(f"unchecked_{dof}_sigmas") for k, dof in enumerate(DOF_NAMES)}
+    return ", ".join(f"{names[k]} ({sigmas:.1f} sigma)" for k, sigmas in moves.items() if sigmas is not None)
 
 
 def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFinding]) -> tuple[str, str]:
@@ -159,10 +168,19 @@ def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFind
     if not accepted:
         return "bad", "No. Nothing was accepted: keep the transforms that the car has."
     if not other:
-        sentence = "Yes. All pairs are accepted: they may go on the car, with the sigmas below."
-        return "good", sentence + _azimuth_only(views)
-    sentence = f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."
+        unchecked = _not_in(views)
+        sentence = f"Yes{unchecked}. All pairs are accepted: they may go on the car, with the sigmas below."
+        return "partly" if unchecked else "good", sentence + _azimuth_only(views)
+    sentence = f"Partly. Accepted: {', '.join(accepted)}{_not_in(views)}. Keep what the car has for {', '.join(other)}."
     return "partly", sentence + _azimuth_only(views)
+
+
+def _not_in(views: Sequence[PairView]) -> str:
+    """As `, but not in lidar-radar's roll (...)`: what accepted pairs say without anything to check it."""
+    parts = [f"{v.title}'s {v.unchecked}" for v in views if v.status == "accepted" and v.unchecked]
+    if not parts:
+        return ""
+    return f", but not in {' and '.join(parts)}: far from the prior, checked by nothing, not certified"
 
 
 def _azimuth_only(views: Sequence[PairView]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
-from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.calibrate.verify.limits import UNCHECKED_MOVE_SIGMAS, VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_covariance
@@ -33,6 +33,12 @@ _SCORED = {
     "camera_lidar": np.ones(6, bool),
     "camera_radar": np.array([False, True, False, False, False, False]),
     "lidar_radar": np.array([False, False, True, True, True, False]),
+}
+# What nothing vouches for where elevation is not certified, by index.
+_UNCHECKED = {
+    "camera_lidar": {},
+    "camera_radar": {0: "pitch", 2: "roll"},
+    "lidar_radar": {0: "roll", 1: "pitch", 5: "height"},
 }
 _FAILED = -1.0  # margin of a check that yields no number
 
@@ -55,6 +61,8 @@ class Verdict:
     score: float = 0.0
     determined: tuple[str, ...] = field(default=())
     disproved: bool = False  # a check shows that the pose is wrong, not only unproved: nobody should use it
+    # Of an accepted record: degrees of freedom that contradict the prior and that nothing checks, how far in sigmas.
+    unchecked: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -114,7 +122,10 @@ def judge(
         disproved = any(c.disproves for c in checks if c.margin < 0) or any(f.disproved for f in factors)
         return Verdict("held", "; ".join(reasons), score, disproved=disproved)
     certified = tuple(name for name, claim in evidence.claims.items() if claim.margin >= 0)
-    return Verdict("accepted", _reservations(estimate, evidence.claims), score, certified)
+    unchecked = _unchecked(estimate, prior, certified)
+    reason = "; ".join([*_reservations(estimate, evidence.claims), *_differences(estimate.pair, unchecked)])
+    named = {DOF_NAMES[k]: sigmas for k, sigmas in unchecked.items()}
+    return Verdict("accepted", reason, score, certified, unchecked=named)
 
 
 def _moves_little(
@@ -181,12 +192,27 @@ def _aligns_no_worse(
 
 def _largest_move(estimate: PairEstimate, prior: Prior) -> tuple[str, float]:
     """Of the degrees of freedom that held-out frames score, the one that moved most, in sigmas of the result."""
-    sigma = np.sqrt(np.diag(change_covariance(estimate.T, estimate.covariance)))
-    scored = estimate.observable & _SCORED[estimate.pair]
-    step = change_between(prior.of(estimate.pair), estimate.T)
-    ratio = np.where(scored, np.abs(step) / sigma, 0.0)
+    ratio = np.where(_SCORED[estimate.pair], _moves(estimate, prior), 0.0)
     worst = int(np.argmax(ratio))
     return DOF_NAMES[worst], float(ratio[worst])
+
+
+def _moves(estimate: PairEstimate, prior: Prior) -> np.ndarray:
+    """How far each degree of freedom moved from the prior, in sigmas of the result; 0 where it was not determined."""
+    sigma = np.sqrt(np.diag(change_covariance(estimate.T, estimate.covariance)))
+    step = change_between(prior.of(estimate.pair), estimate.T)
+    return np.asarray(np.where(estimate.observable, np.abs(step) / sigma, 0.0))
+
+
+def _unchecked(estimate: PairEstimate, prior: Prior, certified: Sequence[str]) -> dict[int, float]:
+    """What clearly left the prior in a record that is good for its azimuth alone, by index: how many sigmas it moved.
+
+    Where elevation is certified its witnesses are sure, and right rolls move by many of their sigmas.
+    """
+    if "elevation" in certified:
+        return {}
+    moves = _moves(estimate, prior)
+    return {k: float(moves[k]) for k in _UNCHECKED[estimate.pair] if moves[k] > UNCHECKED_MOVE_SIGMAS}
 
 
 def _worse(test: HeldOutTest) -> str:
@@ -217,13 +243,18 @@ def _known(claim: Claim) -> str:
     return f"{off}known to {_deg(claim.remaining_sigma_rad)} (1 sigma), {within}"
 
 
-def _reservations(estimate: PairEstimate, claims: Mapping[str, Claim]) -> str:
+def _differences(pair: str, unchecked: Mapping[int, float]) -> list[str]:
+    far = "sigma from the prior, and no held-out frame checks it: not certified"
+    return [f"{_UNCHECKED[pair][k]} lies {sigmas:.1f} {far}" for k, sigmas in unchecked.items()]
+
+
+def _reservations(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[str]:
     """What an accepted record does not certify."""
     open_claims = [
         f"{name} not certified: {_known(claim)}" for name, claim in claims.items() if claim.margin < 0
     ]
     kept = [name for name, seen in zip(DOF_NAMES, estimate.observable, strict=True) if not seen]
-    return "; ".join([*open_claims, *([f"not determined by the day: {', '.join(kept)}"] if kept else [])])
+    return [*open_claims, *([f"not determined by the day: {', '.join(kept)}"] if kept else [])]
 
 
 def _deg(angle_rad: float) -> str:

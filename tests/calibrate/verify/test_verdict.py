@@ -154,6 +154,28 @@ def test_a_radar_is_accepted_for_its_azimuth_and_says_that_elevation_is_not_cert
     assert "elevation not certified: known to 0.50 deg" in found.reason
 
 
+def rolled(sigmas, pair="lidar_radar"):
+    turn = exp_so3(np.array([sigmas * SIGMA[0], 0, 0]))
+    return replace(estimate(pair=pair), T=from_rotation_translation(turn, np.zeros(3)))
+
+
+def test_a_roll_that_contradicts_the_prior_and_that_nothing_checks_is_named_in_an_accepted_record():
+    azimuth_only = SURE | {"elevation": claim(0.5)}
+    found = verdict(rolled(3.3), BETTER, claims=azimuth_only)
+    assert (found.status, found.unchecked) == ("accepted", {"rx": pytest.approx(3.3)})
+    assert (
+        "roll lies 3.3 sigma from the prior, and no held-out frame checks it: not certified" in found.reason
+    )
+    assert verdict(rolled(2.9), BETTER, claims=azimuth_only).unchecked == {}
+    pitched = verdict(estimate(1.0, pair="lidar_radar"), BETTER, claims=azimuth_only)
+    assert list(pitched.unchecked) == ["ry"]
+
+
+def test_where_elevation_is_certified_a_move_of_roll_or_pitch_needs_no_warning():
+    assert verdict(rolled(3.3), BETTER).unchecked == {}
+    assert verdict(estimate(1.0, pair="lidar_radar"), BETTER).unchecked == {}
+
+
 def test_held_out_frames_that_lie_elsewhere_by_more_than_their_sigma_hold():
     off = SURE | {"elevation": claim(0.01, shift_deg=0.15, shift_sigma_deg=0.04)}
     found = verdict(estimate(1.5, pair="lidar_radar"), BETTER, claims=off)
