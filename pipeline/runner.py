@@ -172,7 +172,7 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
                 out.append(group)
             out.describe(kept={"frames": out.rows, **run.kept}, rejected=dict(run.rejected), **run.extra)
     except NothingUsable as refusal:
-        counts = {"kept": {"frames": 0}, "rejected": dict(run.rejected)}
+        counts = {"kept": {"frames": 0, **run.kept}, "rejected": dict(run.rejected)}
         return _outcome(
             stage, task, "refused", run.work_key, reason=str(refusal), inputs=run.inputs, **counts
         )

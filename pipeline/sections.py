@@ -47,11 +47,19 @@ class IngestConfig(Section):
     sync_gate_s: Positive | None = None
     sync_gate_m: Positive = 2.5  # 45 ms at 55 m/s; 55 ms, the most that 30, 10 and 13 Hz leave, at 45 m/s
     sync_gate_deg: Positive = 2.0  # 55 ms at 36 deg/s
-    max_frames: Annotated[int, Field(gt=0)] | None = None  # per vehicle-day, evenly spread; None = all
+    # Sweeps of a vehicle-day that are read, a longer one in bursts. A calibration takes 100 frames (`select.frames`)
+    # and is judged by a fifth of the day; four times as many leave it a choice.
+    read_sweeps: Annotated[int, Field(gt=0)] | Literal["all"] = 400
+    max_frames: Annotated[int, Field(gt=0)] | None = None  # of those read, evenly spread; None = all
     min_lidar_points: Annotated[int, Field(ge=0)] = 500
     min_radar_points: Annotated[int, Field(ge=0)] = 1
     max_lidar_range_m: Positive = 120.0
     deskew: bool = True
+
+    @property
+    def read_budget(self) -> int | None:
+        """`read_sweeps` as a number, None = no limit."""
+        return None if self.read_sweeps == "all" else self.read_sweeps
 
 
 class PerceiveConfig(Section):

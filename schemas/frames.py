@@ -9,7 +9,11 @@ from jaxtyping import Float32
 
 from schemas.columns import TableSchema, array, scalar, transform_columns
 
-__all__ = ["FRAMES", "Frame"]
+__all__ = ["FRAMES", "SWEEPS_LOGGED", "SWEEPS_PLANNED", "SWEEPS_READ", "Frame"]
+
+# Among the manifest's kept, of a day that was read in bursts: sweeps that its logs hold by their indices, that the
+# plan was about, and that were read.
+SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ = "sweeps_in_logs", "sweeps_planned", "sweeps_read"
 
 FRAMES = TableSchema(
     "frames",

@@ -15,6 +15,7 @@ from pipeline.errors import ConfigError
 from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.geometry.spherical import to_spherical
+from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected
 from pipeline.ingest.index import ACCEPTED_TYPES, NEEDED, DayIndex, index_logs, topics_of
 from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
@@ -24,11 +25,10 @@ from pipeline.results import Progress, silent
 from pipeline.rigs import OnnxSemantics, Rig
 from schemas.frames import Frame
 
-__all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs", "doppler_speed"]
+__all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
 
 _SAMPLE = 40  # frames looked into; the rest only by their stamps
 _MOVING_MPS = 1.0
-_FIT_MPS = 0.35  # static points fit the ego speed this well in Doppler, quantisation included
 
 
 @dataclass(frozen=True)
@@ -126,24 +126,6 @@ def check_logs(
         problems=index.problems,
         advice=_advice(frames, rig, topics, usable),
     )
-
-
-def doppler_speed(
-    directions: Float[np.ndarray, "N 3"], range_rate_mps: Float[np.ndarray, " N"], period_mps: float | None
-) -> tuple[float, float]:
-    """Forward speed [m/s] whose static world fits most detections of a scan, and the share that it fits.
-
-    The directions' x axis is taken to point along the driving direction; a share below a third says that this is not
-    so, or that the Doppler is not what the configuration says. Negative = its sign is wrong, or the car reverses.
-    """
-    speeds = np.arange(-45.0, 45.01, 0.15)
-    misfit = range_rate_mps + speeds[:, None] * directions[:, 0]
-    if period_mps is not None:
-        misfit = (misfit + period_mps / 2) % period_mps - period_mps / 2
-    share = np.mean(np.abs(misfit) < _FIT_MPS, axis=1)
-    # Equal fits (aliases, or no detection off the axis) go to the slowest speed.
-    best = int(np.lexsort((np.abs(speeds), -np.round(share, 2)))[0])
-    return float(speeds[best]), float(share[best])
 
 
 def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:

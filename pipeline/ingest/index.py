@@ -1,4 +1,7 @@
-"""First pass over a day's logs: when and where each message lies, and the small messages that frames need."""
+"""First pass over a day's logs: when and where each message lies, and the small messages that frames need.
+
+Of a day that is longer than asked for, only the stretches that a plan names are read (`reading_plan.py`).
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,12 @@ from jaxtyping import Int64
 from pipeline.errors import LogError
 from pipeline.geometry.cameras import Camera
 from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
+from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stamp_ns
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.messages.transforms import TransformTree
+from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
 from pipeline.rigs import Rig, TopicSemantics
 
 __all__ = ["ACCEPTED_TYPES", "NEEDED", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]
@@ -47,6 +52,7 @@ class Located:
     log: int
     channel: Channel
     position: Position
+    logged_ns: int = 0
 
 
 @dataclass(eq=False)
@@ -77,6 +83,14 @@ class DayIndex:
     problems: list[str] = field(default_factory=list)
     damage: Counter[str] = field(default_factory=Counter)
     camera_of_bytes: dict[bytes, Camera | str] = field(default_factory=dict)
+    reading: Reading | None = None  # None: all of the day is read
+
+    def sweeps_in_bursts(self) -> Int64[np.ndarray, " N"]:
+        """Places of the sweeps that may become trios: all, or those that the plan is about."""
+        located = self.stream("lidar").located
+        if self.reading is None:
+            return np.arange(len(located), dtype=np.int64)
+        return np.array([i for i, at in enumerate(located) if at.logged_ns in self.reading.bursts], np.int64)
 
     def stream(self, role: str) -> Stream:
         """Messages of a role; empty where there are none."""
@@ -118,27 +132,31 @@ def topics_of(rig: Rig) -> dict[str, str]:
     return topics
 
 
-def index_logs(paths: Sequence[Path], rig: Rig, *, survey: bool = False) -> DayIndex:
+def index_logs(
+    paths: Sequence[Path], rig: Rig, *, survey: bool = False, budget: int | None = None
+) -> DayIndex:
     """Scan the logs once; of images and clouds only the stamp is read. Unreadable logs become problems.
 
-    With `survey` every topic is counted in `surveyed`, for those who ask what a log holds at all.
+    Args:
+        paths: the day's logs.
+        rig: whose topics are looked for.
+        survey: every topic is counted in `surveyed`, for those who ask what a log holds at all.
+        budget: sweeps beyond which a day is read in bursts, None = it is read whole.
     """
-    index, topics, cache = DayIndex(), topics_of(rig), ChunkCache()
+    index, topics = DayIndex(), topics_of(rig)
     _allow_open_files()
-    for path in paths:
-        try:
-            index.logs.append(open_log(path, cache))
-        except LogError as err:
-            index.complain(str(err))
-            index.damage["unreadable_logs"] += 1
-            continue
-        index.log_names.append(path.name)
-        index.trees.append(TransformTree())
-        try:
-            _index_log(index, len(index.logs) - 1, topics, survey=survey)
-        except OSError as err:  # a disk or share that fails half-way: what was read so far counts
-            index.complain(f"{path}: cannot be read further: {err}")
-            index.damage["logs_lost_while_reading"] += 1
+    _open_logs(index, paths)
+    timelines = [None if budget is None else log.timeline() for log in index.logs]
+    if budget is not None:
+        logs = dict(zip(index.logs, timelines, strict=True))
+        index.reading = plan_reading(logs, rig, topics, budget)
+    for number, timeline in enumerate(timelines):
+        if index.reading is None:
+            _read_log(index, number, topics, survey=survey)
+        else:
+            _read_bursts(index, number, topics, timeline, index.reading.around)
+    if budget is not None and index.reading is None and len(index.stream("lidar").stamps) > budget:
+        _take_bursts(index, timelines, budget)
     for topic, role in topics.items():
         if role in NEEDED and topic not in index.topics_seen:
             index.complain(f"topic {topic} ({role}) has no message in any log")
@@ -147,6 +165,61 @@ def index_logs(paths: Sequence[Path], rig: Rig, *, survey: bool = False) -> DayI
             tree.fill_from(other)
     index.cameras.sort(key=lambda c: c[1])
     return index
+
+
+def _open_logs(index: DayIndex, paths: Sequence[Path]) -> None:
+    cache = ChunkCache()
+    for path in paths:
+        try:
+            index.logs.append(open_log(path, cache))
+        except LogError as err:
+            index.complain(str(err))
+            index.damage["unreadable_logs"] += 1
+        else:
+            index.log_names.append(path.name)
+            index.trees.append(TransformTree())
+
+
+def _read_log(
+    index: DayIndex,
+    number: int,
+    topics: dict[str, str],
+    within: Stretches | None = None,
+    *,
+    survey: bool = False,
+) -> None:
+    try:
+        _index_log(index, number, topics, within, survey=survey)
+    except OSError as err:  # a disk or share that fails half-way: what was read so far counts
+        index.complain(f"{index.logs[number].path}: cannot be read further: {err}")
+        index.damage["logs_lost_while_reading"] += 1
+
+
+def _read_bursts(
+    index: DayIndex, number: int, topics: dict[str, str], timeline: Timeline | None, around: Stretches
+) -> None:
+    """What a log has of the stretches to read, and before it what a driver may log but once."""
+    if timeline is None:
+        index.complain(f"{index.log_names[number]}: left unread, for it has no usable index and others do")
+        index.damage["logs_left_unread"] += 1
+        return
+    rare, first = rare_topics(timeline, topics)
+    known = {"tf_static": any(tree.edges for tree in index.trees), "info": bool(index.cameras)}
+    is_wanted = any(timeline.recorded.touch(*span) for span in around.spans_ns)
+    if is_wanted or any(not known[role] for role in rare.values()):
+        _read_log(index, number, rare, first)
+    if is_wanted:
+        _read_log(index, number, topics, around)
+
+
+def _take_bursts(index: DayIndex, timelines: Sequence[Timeline | None], budget: int) -> None:
+    """Of a long day that had to be read whole, the bursts that become frames; and which logs made it so."""
+    lidar = index.stream("lidar")
+    logged_ns = np.array([at.logged_ns for at in lidar.located], np.int64)
+    index.reading = plan_sweeps(logged_ns, lidar.stamps_ns, index.ego, budget)
+    unusable = [n for n, t in zip(index.log_names, timelines, strict=True) if t is None]
+    why = f"{', '.join(unusable[:3])}: no usable index" if unusable else "log times do not follow the stamps"
+    index.complain(f"{why}, so all of the day's {len(lidar.stamps)} sweeps were read to take some")
 
 
 def _allow_open_files() -> None:
@@ -159,9 +232,11 @@ def _allow_open_files() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
-def _index_log(index: DayIndex, number: int, topics: dict[str, str], *, survey: bool) -> None:
+def _index_log(
+    index: DayIndex, number: int, topics: dict[str, str], within: Stretches | None, *, survey: bool
+) -> None:
     log = index.logs[number]
-    for message in log.scan(None if survey else topics):
+    for message in log.scan(None if survey else topics, within):
         if survey:
             index.surveyed[message.channel.topic, message.channel.msgtype] += 1
         role = topics.get(message.channel.topic)
@@ -185,7 +260,8 @@ def _index_log(index: DayIndex, number: int, topics: dict[str, str], *, survey: 
             _take_odometry(index, stamp, message)
         else:
             index.stream(role).stamps.append(stamp)
-            index.stream(role).located.append(Located(number, message.channel, message.position))
+            where = Located(number, message.channel, message.position, message.log_time_ns)
+            index.stream(role).located.append(where)
     for name, count in log.damage.items():
         index.damage[name] += count
         what = "is cut off" if name == "truncated" else f"{count} {name.replace('_', ' ')}"

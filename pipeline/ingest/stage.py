@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Int64
@@ -26,7 +27,7 @@ from pipeline.ingest.sync import (
 from pipeline.results import Progress
 from pipeline.rigs import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
-from schemas.frames import Frame
+from schemas.frames import SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ, Frame
 
 __all__ = ["find_trios", "pick_trios", "read_file_prior", "work"]
 
@@ -73,7 +74,7 @@ def _rows(
     """The day's frames in order of time, one at a time."""
     config = task.fleet.ingest
     run.progress(0, 0, "reading the index")
-    index = index_logs(task.logs, rig)
+    index = index_logs(task.logs, rig, budget=config.read_budget)
     try:
         builder = FrameBuilder(index, rig, config, file_prior)
         trios, rejected = pick_trios(index, config)
@@ -82,6 +83,7 @@ def _rows(
             made += 1
             yield frame
         run.rejected.update(_all_counts(rejected, index, builder))
+        run.kept.update(_reading_counts(index))
         if not made:
             raise NothingUsable(refusal(index, rig, rejected, config))
         run.extra |= {"problems": index.problems, "logs": index.log_names}
@@ -112,13 +114,17 @@ def pick_trios(index: DayIndex, config: IngestConfig) -> tuple[list[Trio], Count
 
 
 def find_trios(index: DayIndex, config: IngestConfig) -> Trios:
-    """All trios of the day within the gate that the configuration asks for."""
+    """All trios of the day, or of its bursts, within the gate that the configuration asks for."""
     lidar, camera, radar = (index.stream(role).stamps_ns for role in ("lidar", "image", "radar"))
+    wanted = index.sweeps_in_bursts()
+    lidar = lidar[wanted]
     if config.sync_gate_s is not None:
-        return match_trios(lidar, camera, radar, round(config.sync_gate_s * 1e9))
-    speed, yaw_rate = index.ego.motion_at(lidar)
-    gates = motion_gates_ns(speed, yaw_rate, config.sync_gate_m, float(np.radians(config.sync_gate_deg)))
-    return match_by_motion(lidar, camera, radar, gates)
+        found = match_trios(lidar, camera, radar, round(config.sync_gate_s * 1e9))
+    else:
+        speed, yaw_rate = index.ego.motion_at(lidar)
+        gates = motion_gates_ns(speed, yaw_rate, config.sync_gate_m, float(np.radians(config.sync_gate_deg)))
+        found = match_by_motion(lidar, camera, radar, gates)
+    return replace(found, lidar=wanted[found.lidar])
 
 
 def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig) -> str:
@@ -198,6 +204,14 @@ def _frames(
 
 def _all_counts(rejected: Counter[str], index: DayIndex, builder: FrameBuilder) -> dict[str, int]:
     return {str(k): int(v) for k, v in (rejected + index.damage + builder.counts).items() if v}
+
+
+def _reading_counts(index: DayIndex) -> dict[str, int]:
+    """Of a day that was read in bursts: sweeps that its logs hold, that the plan is about, and that were read."""
+    if index.reading is None:
+        return {}
+    read = len(index.sweeps_in_bursts())
+    return {SWEEPS_LOGGED: index.reading.sweeps, SWEEPS_PLANNED: index.reading.planned, SWEEPS_READ: read}
 
 
 def _shorten(problems: list[str]) -> str:

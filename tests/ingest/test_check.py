@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from jobs.check import check
 from pipeline.errors import ConfigError, ModelError
-from pipeline.ingest.check import check_logs, doppler_speed
+from pipeline.ingest.check import check_logs
+from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.ingest.readiness import Evidence, judge, overall
 from tests.makers.fleet_files import fleet_toml
 

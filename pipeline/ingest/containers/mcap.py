@@ -17,11 +17,12 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
-from mcap.records import ChunkIndex, Footer, Schema
+from mcap.records import ChunkIndex, Footer, Schema, Statistics
 
 from pipeline.errors import LogError
 from pipeline.ingest.containers.bounded import unpack_lz4, unpack_zstd
 from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
+from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
 
 __all__ = ["McapLog"]
 
@@ -48,11 +49,28 @@ class McapLog:
         self._resolved: dict[int, Channel] = {}
         # True where the summary's checksum is right: its schemas and channels win over the data section's.
         self._trusted = False
-        self._chunk_starts = self._read_summary()
+        self._messages: dict[int, int] = {}  # of each channel, by the summary's statistics
+        self._chunks = self._read_summary()
+        self._chunk_starts = [c.position for c in self._chunks]
 
-    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+    def timeline(self) -> Timeline | None:
+        """See LogReader."""
+        if not self._chunks or not self._messages:
+            return None
+        topics = {number: channel.topic for number, channel in self._channels.items()}
+        return timeline_of_chunks(self._chunks, topics, self._messages)
+
+    def scan(
+        self, topics: Collection[str] | None = None, within: Stretches | None = None
+    ) -> Iterator[RawMessage]:
         """See LogReader."""
         self.damage.clear()
+        if within is None:
+            return self._scan_all(topics)
+        found = self._scan_in(topics, within) if self._chunks else self._scan_all(topics)
+        return (m for m in found if m.log_time_ns in within)
+
+    def _scan_all(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
         for opcode, start, length in self._records():
             content = self._content(start, length)
             if opcode == Opcode.CHUNK:
@@ -72,6 +90,28 @@ class McapLog:
                     )
             else:
                 self._learn(opcode, content)
+
+    def _scan_in(self, topics: Collection[str] | None, within: Stretches) -> Iterator[RawMessage]:
+        wanted = {n for n, channel in self._channels.items() if topics is None or channel.topic in topics}
+        for indexed in self._chunks:
+            if not within.touch(indexed.start_ns, indexed.end_ns):
+                continue
+            if indexed.channels is not None and not indexed.channels & wanted:
+                continue
+            start = indexed.position + _RECORD.size
+            chunk = self._cache.get((str(self.path), start)) or self._indexed_chunk(indexed)
+            if chunk is not None:
+                self._cache.offer((str(self.path), start), chunk)
+                yield from self._scan_chunk(chunk, start, topics)
+
+    def _indexed_chunk(self, indexed: Chunk) -> bytes | None:
+        """The records of a chunk that the summary names, in one read; None (and counted) where it is damaged."""
+        record = self._content(indexed.position, indexed.length)
+        is_chunk = len(record) > _RECORD.size and record[0] == Opcode.CHUNK
+        if not is_chunk or _RECORD.unpack_from(record)[1] != indexed.length - _RECORD.size:
+            self.damage["damaged_records"] += 1
+            return None
+        return self._open_chunk(record[_RECORD.size :], check=True)
 
     def read(self, position: Position) -> memoryview:
         """See LogReader."""
@@ -130,8 +170,8 @@ class McapLog:
         i = bisect_right(self._chunk_starts, position)
         return self._chunk_starts[i] if i < len(self._chunk_starts) else None
 
-    def _read_summary(self) -> list[int]:
-        """Chunk positions from the summary, none where it is lost or damaged; learns schemas and channels."""
+    def _read_summary(self) -> list[Chunk]:
+        """Chunks by the summary, none where it is lost or damaged; learns schemas, channels and counts."""
         try:
             tail = self._content(max(self._size - _FOOTER_SIZE - _MAGIC_SIZE, 0), _FOOTER_SIZE)
             footer = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :])))
@@ -141,14 +181,16 @@ class McapLog:
             summary = self._content(footer.summary_start, summary_end - footer.summary_start)
             if footer.summary_crc and zlib.crc32(summary + tail[: _FOOTER_SIZE - 4]) != footer.summary_crc:
                 return []
-            starts = []
+            chunks = []
             for opcode, start, end in _inner_records(summary):
                 content = summary[start:end]
                 self._learn(opcode, content)
                 if opcode == Opcode.CHUNK_INDEX:
-                    starts.append(ChunkIndex.read(ReadDataStream(BytesIO(content))).chunk_start_offset)
+                    chunks.append(_chunk_of(ChunkIndex.read(ReadDataStream(BytesIO(content)))))
+                elif opcode == Opcode.STATISTICS:
+                    self._messages = _counts_of(content)
             self._trusted = footer.summary_crc != 0
-            return sorted(s for s in starts if s < footer.summary_start)
+            return sorted((c for c in chunks if c.position < footer.summary_start), key=lambda c: c.position)
         except _DAMAGED:
             return []
 
@@ -205,6 +247,25 @@ class McapLog:
                 return None
             channel = self._resolved[channel_id] = _channel(record, self._schemas.get(record.schema_id))
         return channel if topics is None or channel.topic in topics else None
+
+
+def _chunk_of(index: ChunkIndex) -> Chunk:
+    channels = frozenset(index.message_index_offsets) or None  # a writer may leave message indexes out
+    return Chunk(
+        index.chunk_start_offset,
+        index.chunk_length,
+        index.message_start_time,
+        index.message_end_time,
+        channels,
+    )
+
+
+def _counts_of(statistics: bytes) -> dict[int, int]:
+    """Messages of each channel, none where the record is damaged."""
+    try:
+        return dict(Statistics.read(ReadDataStream(BytesIO(statistics))).channel_message_counts)
+    except _DAMAGED:
+        return {}
 
 
 def _inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from pipeline.errors import LogError
+from pipeline.ingest.containers.timeline import Stretches, Timeline
 
 __all__ = [
     "BACKENDS",
@@ -65,8 +66,16 @@ class LogReader(Protocol):
     path: Path
     damage: Counter[str]
 
-    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """All whole messages of the topics (None = every topic) in file order."""
+    def timeline(self) -> Timeline | None:
+        """What the log's own index says, without reading messages; None where it has none that can be trusted."""
+
+    def scan(
+        self, topics: Collection[str] | None = None, within: Stretches | None = None
+    ) -> Iterator[RawMessage]:
+        """All whole messages of the topics (None = every topic) in file order.
+
+        With `within`, those logged in these stretches; where the log has an index, only their chunks are read.
+        """
 
     def read(self, position: Position) -> memoryview:
         """The payload of a message that a scan has given.

@@ -14,6 +14,7 @@ from pathlib import Path
 from pipeline.errors import LogError
 from pipeline.ingest.containers.bounded import unpack_bz2, unpack_lz4
 from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
+from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
 
 __all__ = ["BagLog"]
 
@@ -21,6 +22,7 @@ _FIRST_RECORD = 13  # after "#ROSBAG V2.0\n"
 _MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 _KNOWN = (_MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION)
 _U32 = struct.Struct("<I")
+_PAIR = struct.Struct("<II")
 _MAX_HEADER_BYTES = 1 << 20
 _MAX_CHUNK_BYTES = 1 << 30
 _DAMAGED = (*READ_ERRORS, struct.error)
@@ -34,11 +36,28 @@ class BagLog:
         self._cache, self._file = cache, path.open("rb")
         self._size = path.stat().st_size
         self._channels: dict[int, Channel] = {}
-        self._chunk_starts = self._read_index()
+        self._messages: Counter[int] = Counter()  # of each connection, by the index
+        self._chunks = self._read_index()
+        self._chunk_starts = [c.position for c in self._chunks]
 
-    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+    def timeline(self) -> Timeline | None:
+        """See LogReader."""
+        if not self._chunks:
+            return None
+        topics = {number: channel.topic for number, channel in self._channels.items()}
+        return timeline_of_chunks(self._chunks, topics, self._messages)
+
+    def scan(
+        self, topics: Collection[str] | None = None, within: Stretches | None = None
+    ) -> Iterator[RawMessage]:
         """See LogReader."""
         self.damage.clear()
+        if within is None:
+            return self._scan_all(topics)
+        found = self._scan_in(topics, within) if self._chunks else self._scan_all(topics)
+        return (m for m in found if m.log_time_ns in within)
+
+    def _scan_all(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
         for position, header, start, length in self._records():
             if header["op"] == bytes([_CHUNK]):
                 chunk = self._open_chunk(header, start, length)
@@ -53,6 +72,27 @@ class BagLog:
                     )
             elif header["op"] == bytes([_CONNECTION]):
                 self._learn(header, self._content(start, length))
+
+    def _scan_in(self, topics: Collection[str] | None, within: Stretches) -> Iterator[RawMessage]:
+        wanted = {n for n, channel in self._channels.items() if topics is None or channel.topic in topics}
+        for indexed in self._chunks:
+            if not within.touch(indexed.start_ns, indexed.end_ns):
+                continue
+            if indexed.channels is not None and not indexed.channels & wanted:
+                continue
+            position = indexed.position
+            chunk = self._cache.get((str(self.path), position)) or self._chunk_at(position)
+            if chunk is not None:
+                self._cache.offer((str(self.path), position), chunk)
+                yield from self._scan_records(chunk, position, topics)
+
+    def _chunk_at(self, position: int) -> bytes | None:
+        """The records of a chunk that the index names; None (and counted) where it is damaged."""
+        record = self._record(position)
+        if record is None or record[0]["op"] != bytes([_CHUNK]):
+            self.damage["damaged_records"] += 1
+            return None
+        return self._open_chunk(*record)
 
     def read(self, position: Position) -> memoryview:
         """See LogReader."""
@@ -112,9 +152,9 @@ class BagLog:
         i = bisect_right(self._chunk_starts, position)
         return self._chunk_starts[i] if i < len(self._chunk_starts) else None
 
-    def _read_index(self) -> list[int]:
-        """Chunk positions from the index at the bag's end, empty where it is lost; learns its connections."""
-        starts: list[int] = []
+    def _read_index(self) -> list[Chunk]:
+        """Chunks by the index at the bag's end, none where it is lost; learns its connections and their counts."""
+        chunks: list[Chunk] = []
         try:
             first = self._record(_FIRST_RECORD)
             position = struct.unpack("<Q", first[0]["index_pos"])[0] if first is not None else 0
@@ -124,13 +164,24 @@ class BagLog:
                     return []
                 header, start, length = record
                 if header["op"] == bytes([_CHUNK_INFO]):
-                    starts.append(struct.unpack("<Q", header["chunk_pos"])[0])
+                    chunks.append(self._indexed(header, self._content(start, length)))
                 elif header["op"] == bytes([_CONNECTION]):
                     self._learn(header, self._content(start, length))
                 position = start + length
         except _DAMAGED:
             return []
-        return sorted(starts)
+        return sorted(chunks, key=lambda c: c.position)
+
+    def _indexed(self, header: dict[str, bytes], counts: bytes) -> Chunk:
+        """The chunk of an index record, whose messages are counted; one that is damaged still says where it lies."""
+        position = struct.unpack("<Q", header["chunk_pos"])[0]
+        try:
+            messages = dict(_PAIR.iter_unpack(counts))
+            start, end = _time_ns(header["start_time"]), _time_ns(header["end_time"])
+        except _DAMAGED:
+            return Chunk(position, 0, 0, 0, None)
+        self._messages.update(messages)
+        return Chunk(position, 0, start, end, frozenset(messages))
 
     def _learn(self, header: dict[str, bytes], data: bytes) -> None:
         fields = _fields(data)
@@ -191,14 +242,19 @@ class BagLog:
     ) -> tuple[Channel | None, int]:
         try:
             channel = self._channels.get(_U32.unpack(header["conn"])[0])
-            seconds, nanoseconds = struct.unpack("<II", header["time"])
+            stamp = _time_ns(header["time"])
         except _DAMAGED:
             self.damage["damaged_records"] += 1
             return None, 0
         if channel is None:
             self.damage["messages_of_unknown_channel"] += 1
             return None, 0
-        return (channel if topics is None or channel.topic in topics else None), seconds * 10**9 + nanoseconds
+        return (channel if topics is None or channel.topic in topics else None), stamp
+
+
+def _time_ns(data: bytes) -> int:
+    seconds, nanoseconds = _PAIR.unpack(data)
+    return int(seconds) * 10**9 + int(nanoseconds)
 
 
 def _fields(data: bytes) -> dict[str, bytes] | None:

@@ -15,6 +15,7 @@ import zstandard
 
 from pipeline.errors import LogError
 from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, RawMessage, open_log
+from pipeline.ingest.containers.timeline import Stretches, Timeline
 
 __all__ = ["CompressedLog", "FolderLog"]
 
@@ -42,11 +43,19 @@ class FolderLog:
                 str(path), "; ".join(problems) or "holds no .db3 or .mcap file, so it is no ROS 2 bag"
             )
 
-    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+    def timeline(self) -> Timeline | None:
+        """See LogReader."""
+        parts = [log.timeline() for log in self._logs]
+        known = [part for part in parts if part is not None]
+        return Timeline.joined(known) if len(known) == len(parts) else None
+
+    def scan(
+        self, topics: Collection[str] | None = None, within: Stretches | None = None
+    ) -> Iterator[RawMessage]:
         """See LogReader."""
         self.damage.clear()
         for i, log in enumerate(self._logs):
-            for m in log.scan(topics):
+            for m in log.scan(topics, within):
                 yield RawMessage(m.channel, m.log_time_ns, (i, *m.position), m.data)
             self.damage.update(log.damage)
         if self._lost:
@@ -79,9 +88,15 @@ class CompressedLog:
             raise LogError(str(path), f"cannot be unpacked: {err}") from err
         self.damage = self._log.damage
 
-    def scan(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+    def timeline(self) -> Timeline | None:
         """See LogReader."""
-        return self._log.scan(topics)
+        return self._log.timeline()
+
+    def scan(
+        self, topics: Collection[str] | None = None, within: Stretches | None = None
+    ) -> Iterator[RawMessage]:
+        """See LogReader."""
+        return self._log.scan(topics, within)
 
     def read(self, position: Position) -> memoryview:
         """See LogReader."""

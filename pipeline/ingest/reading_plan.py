@@ -1,0 +1,214 @@
+"""What of a long day's logs is read: planned by their indices, and by a glance at how the car moved here and there."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.errors import LogError
+from pipeline.ingest.bursts import BURST_TRIOS, BurstMotion, choose_bursts, possible_bursts
+from pipeline.ingest.containers.reader import LogReader, RawMessage
+from pipeline.ingest.containers.timeline import Stretches, Timeline
+from pipeline.ingest.doppler_speed import doppler_speed
+from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stamp_ns
+from pipeline.ingest.messages.odometry import EgoTrack
+from pipeline.ingest.messages.radar import read_radar
+from pipeline.rigs import Rig
+
+__all__ = ["Reading", "plan_reading", "plan_sweeps", "rare_topics"]
+
+_GLANCE_NS = 250_000_000  # to either side: odometry comes at 10 Hz or more, and a chunk often holds a second
+_LATENCY_GLANCES = 3  # at the day's begin, middle and end: clocks drift by some hundred ppm
+# A sensor's messages are logged after their stamps, one sensor's later than another's: the read stretch is longer than
+# the burst by the largest difference seen and by this, within which odometry of 2 Hz comes too.
+_MARGIN_NS = 500_000_000
+_MOST_MARGIN_NS = 10 * 10**9  # beyond it log time says nothing of when a message was measured
+_FIT_SHARE = 1 / 3  # of a scan, below which its Doppler speed is none
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What is read of a day.
+
+    Args:
+        bursts: log time of the sweeps that become trios.
+        around: log time of everything that is read: images and scans of the bursts' sweeps may be logged beside them.
+        sweeps: sweeps that the logs hold, by their indices.
+        planned: sweeps of as many bursts, had each its full length.
+    """
+
+    bursts: Stretches
+    around: Stretches
+    sweeps: int
+    planned: int
+
+
+@dataclass(frozen=True)
+class _Day:
+    """The logs that have an index."""
+
+    logs: tuple[LogReader, ...]
+    rig: Rig
+    roles: Mapping[str, str]  # of topics
+
+    def messages(self, roles: Collection[str], within: Stretches) -> Iterator[tuple[str, RawMessage]]:
+        """Messages of some roles with their role; a log that cannot be read now is read, and counted, later."""
+        topics = {topic for topic, role in self.roles.items() if role in roles}
+        for log in self.logs:
+            with suppress(OSError):
+                for message in log.scan(topics, within):
+                    yield self.roles[message.channel.topic], message
+
+
+def plan_reading(
+    logs: Mapping[LogReader, Timeline | None], rig: Rig, roles: Mapping[str, str], budget: int
+) -> Reading | None:
+    """The bursts to read, None where the day is to be read whole.
+
+    It is where it holds no more sweeps than the budget; where most logs have no index; and where log time says nothing
+    of stamps.
+
+    Args:
+        logs: with what their indices say.
+        rig: for Doppler, where there is no odometry.
+        roles: of the rig's topics.
+        budget: sweeps that shall be read.
+    """
+    lidar = next(topic for topic, role in roles.items() if role == "lidar")
+    indexed = {log: t for log, t in logs.items() if t is not None}
+    timeline = Timeline.joined(t for t in indexed.values() if t.messages.get(lidar))
+    sweeps = timeline.messages.get(lidar, 0)
+    if sweeps <= budget or 2 * len(indexed) < len(logs) or not timeline.recorded.length_ns:
+        return None
+    day = _Day(tuple(indexed), rig, roles)
+    by = next((r for r in ("odometry", "radar") if any(_holds(t, r, roles) for t in indexed.values())), "")
+    possible = possible_bursts(timeline.recorded, sweeps, budget, is_motion_known=bool(by))
+    motion = _motion_at(day, possible.mean(axis=1).astype(np.int64), by)
+    needed = {r for r in ("image", "lidar", "radar") if any(_holds(t, r, roles) for t in indexed.values())}
+    margin_ns = _margin_ns(day, possible.mean(axis=1).astype(np.int64), needed)
+    if margin_ns is None:
+        return None
+    return _reading(possible, motion, sweeps, budget, margin_ns)
+
+
+def plan_sweeps(
+    logged_ns: Int64[np.ndarray, " N"], stamps_ns: Int64[np.ndarray, " N"], ego: EgoTrack, budget: int
+) -> Reading:
+    """The bursts to take of a day that had to be read whole, because its logs have no index.
+
+    Args:
+        logged_ns: when each sweep was logged.
+        stamps_ns: their stamps.
+        ego: the day's odometry.
+        budget: sweeps that shall be taken.
+    """
+    order = np.argsort(logged_ns, kind="stable")
+    recorded = Stretches.of_times(logged_ns[order])
+    possible = possible_bursts(recorded, len(order), budget, is_motion_known=len(ego) > 0)
+    middle = np.searchsorted(logged_ns[order], possible.mean(axis=1))
+    stamps = stamps_ns[order][np.minimum(middle, len(order) - 1)]
+    return _reading(possible, _ego_motion(ego, stamps), len(order), budget, 0)
+
+
+def rare_topics(timeline: Timeline, roles: Mapping[str, str]) -> tuple[dict[str, str], Stretches]:
+    """Topics that a driver may log once, at the beginning, with their roles; and where their first messages lie."""
+    rare = {
+        topic: role
+        for topic, role in roles.items()
+        if role in ("tf_static", "info") and topic in timeline.first
+    }
+    return rare, Stretches.merged(timeline.first[topic] for topic in rare)
+
+
+def _reading(
+    possible: Int64[np.ndarray, "M 2"], motion: BurstMotion, sweeps: int, budget: int, margin_ns: int
+) -> Reading:
+    chosen = choose_bursts(motion, -(-budget // BURST_TRIOS))
+    bursts = Stretches.merged((int(start), int(end)) for start, end in possible[chosen])
+    return Reading(bursts, bursts.widened(margin_ns), sweeps, min(sweeps, BURST_TRIOS * len(chosen)))
+
+
+def _holds(timeline: Timeline, role: str, roles: Mapping[str, str]) -> bool:
+    return any(timeline.messages.get(topic) for topic, its in roles.items() if its == role)
+
+
+def _motion_at(day: _Day, times_ns: Int64[np.ndarray, " M"], by: str) -> BurstMotion:
+    """Motion of the car at these moments of log time, by odometry or by a radar scan's Doppler."""
+    motion = BurstMotion.unknown(len(times_ns))
+    if not by:
+        return motion
+    edges = (times_ns[1:] + times_ns[:-1]) // 2
+    for _, message in day.messages({by}, _glances(times_ns, _GLANCE_NS)):
+        i = int(np.searchsorted(edges, message.log_time_ns))
+        if not np.isnan(motion.speed_mps[i]):
+            continue
+        with suppress(LogError, *DECODE_ERRORS):
+            if by == "radar":
+                motion.speed_mps[i] = _speed_by_doppler(message, day.rig)
+            else:
+                numbers = _by_odometry(message)
+                motion.speed_mps[i], motion.yaw_rate_radps[i], *motion.position_m[i] = numbers
+    return motion
+
+
+def _by_odometry(message: RawMessage) -> Float[np.ndarray, " 4"]:
+    """Speed, yaw rate, x and y, NaN where the message holds no motion."""
+    track = EgoTrack()
+    track.add(0, decode(message.channel, message.data))
+    state = track.at(0)
+    if state is None:
+        return np.full(4, np.nan)
+    return np.array([state.speed_mps, state.yaw_rate_radps, *state.T_odom_vehicle[:2, 3]])
+
+
+def _speed_by_doppler(message: RawMessage, rig: Rig) -> float:
+    """Speed by a scan, NaN where it shows no static world."""
+    cloud = read_radar(decode(message.channel, message.data), message.channel.msgtype, rig.radar)
+    distance = np.linalg.norm(cloud.xyz_m, axis=1, keepdims=True)
+    directions = (cloud.xyz_m / np.maximum(distance, 1e-3)).astype(np.float64)
+    rates = cloud.range_rate_mps.astype(np.float64)
+    speed, share = doppler_speed(directions, rates, rig.radar.doppler_period_mps)
+    return speed if share >= _FIT_SHARE else np.nan
+
+
+def _ego_motion(ego: EgoTrack, stamps_ns: Int64[np.ndarray, " M"]) -> BurstMotion:
+    states = [ego.at(int(stamp)) for stamp in stamps_ns]
+    motion = BurstMotion.unknown(len(states))
+    for i, state in enumerate(states):
+        if state is not None:
+            motion.speed_mps[i], motion.yaw_rate_radps[i] = state.speed_mps, state.yaw_rate_radps
+            motion.position_m[i] = state.T_odom_vehicle[:2, 3]
+    return motion
+
+
+def _margin_ns(day: _Day, times_ns: Int64[np.ndarray, " M"], needed: set[str]) -> int | None:
+    """By how much longer than a burst the stretch must be that is read for it.
+
+    None where that is too much, or where of the needed roles one is never logged when the lidar is.
+    """
+    glances = times_ns[np.unique(np.linspace(0, len(times_ns) - 1, _LATENCY_GLANCES).round().astype(int))]
+    edges = (glances[1:] + glances[:-1]) // 2
+    late: dict[tuple[int, str], list[int]] = {}
+    measured = set(day.roles.values()) - {"tf_static", "info"}
+    for role, message in day.messages(measured, _glances(glances, _MARGIN_NS)):
+        stamp = header_stamp_ns(message.channel, message.data)
+        if stamp is not None:
+            glance = int(np.searchsorted(edges, message.log_time_ns))
+            late.setdefault((glance, role), []).append(message.log_time_ns - stamp)
+    median = {key: int(np.median(values)) for key, values in late.items()}
+    apart = [
+        abs(value - median[glance, "lidar"])
+        for (glance, _), value in median.items()
+        if (glance, "lidar") in median
+    ]
+    seen = {role for glance, role in median if (glance, "lidar") in median}
+    margin_ns = _MARGIN_NS + max(apart, default=0)
+    return margin_ns if needed <= seen and margin_ns <= _MOST_MARGIN_NS else None
+
+
+def _glances(times_ns: Int64[np.ndarray, " M"], half_ns: int) -> Stretches:
+    return Stretches.merged((int(t) - half_ns, int(t) + half_ns) for t in times_ns)
