@@ -26,6 +26,10 @@ FAILED, USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("jobs.demo:demo", "Synthetic fleet to HTML report, in minutes: what all of this does."),
     "check": ("jobs.check:check", "Can these logs be calibrated, and which degrees of freedom?"),
+    "verify": (
+        "jobs.verify:verify",
+        "Is the calibration that the car uses now still right? One log's answer.",
+    ),
     "nightly": (
         "jobs.nightly:nightly",
         "Ingest, perceive, calibrate and audit all vehicle-days of a pattern.",

@@ -162,6 +162,13 @@ class FleetConfig(Section):
             raise ConfigError(str(self._file), f"vehicles.{vehicle}", problem)
         return self.rigs[self.vehicles[vehicle].rig]
 
+    def with_prior_file(self, vehicle: str, file: Path) -> FleetConfig:
+        """The same configuration, with the prior of a vehicle's rig from a file, as far to be trusted as before."""
+        name = self.vehicles[vehicle].rig
+        rig = self.rigs[name]
+        prior = rig.prior.model_copy(update={"source": "file", "file": str(file.resolve())})
+        return self.model_copy(update={"rigs": self.rigs | {name: rig.model_copy(update={"prior": prior})}})
+
 
 def load_fleet(path: Path) -> FleetConfig:
     """Read and validate fleet.toml.

@@ -29,7 +29,9 @@ FOUNDATIONS = {
     "work",
 }
 # Folders of commands.
-ROOMS = {"ingest", "perceive", "calibrate", "evaluate", "audit", "report", "fleet", "simulate", "learn"}
+ROOMS = {
+    "ingest", "perceive", "calibrate", "evaluate", "audit", "report", "fleet", "simulate", "learn", "in_use"
+}  # fmt: skip
 # Beside the rooms: the table of contents, which knows them all, and what runs a stage of it.
 JOINTS = {"stages", "runner"}
 

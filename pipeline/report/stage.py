@@ -17,6 +17,7 @@ from pipeline.errors import ConfigError, DamagedError
 from pipeline.report.day import PairView, answer_for, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import drift_figure, residual_figure, sigma_figure
 from pipeline.report.fleet import drift_panels, finding_views, headline_for, vehicle_rows
+from pipeline.report.in_use import InUseView
 from pipeline.report.overlays import Extrinsics
 from pipeline.report.page import is_drawn, mark_drawn, render, write_page
 from pipeline.report.picture_file import write_picture
@@ -104,6 +105,7 @@ def write_day_page(
     fleet_link: str = "",
     pictures: bool = True,
     read: DayRead | None = None,
+    in_use: InUseView | None = None,
 ) -> Path:
     """Write the page of one vehicle-day.
 
@@ -116,6 +118,7 @@ def write_day_page(
         fleet_link: relative link to the fleet page; empty = none.
         pictures: False = none, and none of what is drawn from frames.
         read: the day's records and the vehicle's findings, where the caller has read them; None = read here.
+        in_use: what `boresight verify` found: the page then answers its question first.
 
     Raises:
         ConfigError: the day has no record of the method.
@@ -134,7 +137,8 @@ def write_day_page(
         else ([], "", "this page was asked for without pictures")
     )
     html = render(
-        "day.html",
+        "day.html" if in_use is None else "in_use.html",
+        in_use=in_use,
         vehicle=partition.vehicle,
         day=partition.day,
         fleet=fleet.fleet.name,

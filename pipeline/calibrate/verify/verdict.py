@@ -63,6 +63,7 @@ class Verdict:
     disproved: bool = False  # a check shows that the pose is wrong, not only unproved: nobody should use it
     # Of an accepted record: degrees of freedom that contradict the prior and that nothing checks, how far in sigmas.
     unchecked: Mapping[str, float] = field(default_factory=dict)
+    unsure_only: bool = False  # held, but for nothing more than a sigma that is too large for the limits
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,9 @@ class _Check:
     margin: float
     reason: str
     disproves: bool = False  # where it fails, the pose is wrong, not only unproved
+    of_sigma: bool = (
+        False  # where it fails, the pose may be as good as its sigma says; that is not good enough
+    )
 
 
 def judge(
@@ -108,7 +112,8 @@ def judge(
     if factors:
         good = all(f.status == "accepted" for f in factors)
         margin = min(f.score for f in factors) if good else _FAILED
-        checks.append(_Check(margin, "composed of a pair that is not accepted"))
+        of_sigma = all(f.status == "accepted" or f.unsure_only for f in factors)
+        checks.append(_Check(margin, "composed of a pair that is not accepted", of_sigma=of_sigma))
         checks += _aligns_no_worse(estimate, prior, evidence.held_out, limits)
     else:
         checks += _moves_little(estimate, prior, search, limits)
@@ -117,10 +122,12 @@ def judge(
     if not estimate.observable.any():
         checks.append(_Check(_FAILED, "the day determines no degree of freedom"))
     score = min(1.0, *(c.margin for c in checks))
-    reasons = [c.reason for c in checks if c.margin < 0]
-    if reasons:
-        disproved = any(c.disproves for c in checks if c.margin < 0) or any(f.disproved for f in factors)
-        return Verdict("held", "; ".join(reasons), score, disproved=disproved)
+    failed = [c for c in checks if c.margin < 0]
+    if failed:
+        disproved = any(c.disproves for c in failed) or any(f.disproved for f in factors)
+        unsure_only = all(c.of_sigma for c in failed)
+        reasons = "; ".join(c.reason for c in failed)
+        return Verdict("held", reasons, score, disproved=disproved, unsure_only=unsure_only)
     certified = tuple(name for name, claim in evidence.claims.items() if claim.margin >= 0)
     unchecked = _unchecked(estimate, prior, certified)
     reason = "; ".join([*_reservations(estimate, evidence.claims), *_differences(estimate.pair, unchecked)])
@@ -232,7 +239,7 @@ def _claims_hold(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[_C
             )
         )
         if name in _NEEDED[estimate.pair]:
-            checks.append(_Check(claim.margin, f"{name} is {_known(claim)}"))
+            checks.append(_Check(claim.margin, f"{name} is {_known(claim)}", of_sigma=True))
     return checks
 
 

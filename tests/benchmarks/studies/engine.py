@@ -29,11 +29,12 @@ from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import logged_prior, perturbed
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.geometry.targets import loop_errors
+from pipeline.in_use.axes import check_axes, limits_of
 from pipeline.learn.perception.radar_drivable.samples import scan_of
 from pipeline.perceive.models.radar_drivable import RadarDrivable
 from pipeline.rigs import PriorConfig
 from pipeline.store.partitions import Partition
-from schemas.calibrations import PAIRS
+from schemas.calibrations import PAIRS, CalibrationRecord
 from schemas.observations import Observation
 from tests.benchmarks.studies.commits import accept_argument, commit_now, is_accepted
 from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, load_day
@@ -57,6 +58,7 @@ __all__ = [
 # The default sigmas of `rigs.*.prior` in fleet.toml: what a user has who says nothing.
 ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M = 2.0, 0.05
 RESULTS = Path("tests/benchmarks/results")
+IN_USE_ASKED_DEG = (0.5, 1.0)  # of camera-lidar and of pairs with the radar: defaults of `boresight verify`
 DRIVABLE_MODEL = Path("radar_drivable") / "radar_drivable.toml"  # under the days' folder
 _DIAGNOSTICS = {
     "confidence",
@@ -85,9 +87,10 @@ class Run:
 
     `prior` is how the prior differs from truth: ("exact", deg, m) turns and shifts both transforms by exactly so much
     in random directions, and its sigmas allow for it; ("hidden", deg, m) does the same and its sigmas know nothing of
-    it; ("drawn", deg, m) draws every angle and shift from the normal distribution that its sigmas state; ("logged",
-    deg, m) is tf_static with these sigmas. `solve` and `select` replace fields of the configuration. `spoil` is what is
-    done to the observations on the way (see `spoiled`).
+    it; ("in use", deg, 0) turns the lidar by deg across the camera's axis and the radar by twice that to a side, as the
+    calibration that a car uses goes wrong; ("drawn", deg, m) draws every angle and shift from the normal distribution
+    that its sigmas state; ("logged", deg, m) is tf_static with these sigmas. `solve` and `select` replace fields of the
+    configuration. `spoil` is what is done to the observations on the way (see `spoiled`).
     """
 
     day: DaySpec
@@ -115,6 +118,8 @@ def prior_of(day: Day, how: tuple[str, float, float], seed: int) -> Prior:
     default = (float(np.radians(ROTATION_SIGMA_DEG)), TRANSLATION_SIGMA_M)
     stated = (float(np.radians(deg)), shift_m)
     true = Prior(day.true_of("camera_lidar"), day.true_of("lidar_radar"), *default)
+    if kind == "in use":
+        return _turned(true, deg, seed)
     if kind in {"exact", "hidden"}:
         moved = perturbed(true, (deg, shift_m), seed)
         return moved if kind == "exact" else Prior(moved.T_camera_lidar, moved.T_lidar_radar, *default)
@@ -129,6 +134,18 @@ def prior_of(day: Day, how: tuple[str, float, float], seed: int) -> Prior:
         for T in (true.T_camera_lidar, true.T_lidar_radar)
     ]
     return Prior(drawn[0], drawn[1], *stated)
+
+
+def _turned(true: Prior, deg: float, seed: int) -> Prior:
+    """The truth with the lidar turned by `deg` across the camera's axis, the radar by twice that to a side."""
+    rng = np.random.default_rng([seed, 11])
+    across, side = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
+    turns = np.radians(deg) * np.array([[np.cos(across), np.sin(across), 0.0], [0.0, 0.0, 2 * side]])
+    moved = [
+        from_rotation_translation(exp_so3(turn) @ T[:3, :3], T[:3, 3])
+        for turn, T in zip(turns, (true.T_camera_lidar, true.T_lidar_radar), strict=True)
+    ]
+    return replace(true, T_camera_lidar=moved[0], T_lidar_radar=moved[1])
 
 
 def search_range(how: tuple[str, float, float]) -> dict[str, float]:
@@ -215,6 +232,7 @@ def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
     measured = {
         r.pair: measure(r, reference(day, r.pair, run.spoil), prior, true_offset_s(day, r.pair, run.spoil))
         | mounting_error(r, day.true_of(r.pair))
+        | ({"in_use": _axes(r, fleet)} if run.prior[0] == "in use" else {})
         for r in records
     }
     out = {"cpu_s": round(time.process_time() - began, 1), "pairs": measured}
@@ -223,6 +241,15 @@ def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
         azimuth, elevation, range_m = loop_errors(found)
         out["loop"] = [round(float(v), 5) for v in (np.degrees(azimuth), np.degrees(elevation), range_m)]
     return out
+
+
+def _axes(record: CalibrationRecord, fleet: FleetConfig) -> dict[str, tuple[str, float, float, float]]:
+    """What `boresight verify` would say of the prior, by axis: status, distance and sigma [deg], power."""
+    checks = check_axes(record, limits_of(record.pair, fleet.verify, IN_USE_ASKED_DEG))
+    return {
+        c.axis: (c.status, float(np.degrees(c.off_rad)), float(np.degrees(c.sigma_rad)), c.power)
+        for c in checks
+    }
 
 
 def run_study(

@@ -1,0 +1,172 @@
+"""`boresight verify`: is the calibration that the car uses now still right?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipeline.config import FleetConfig
+    from pipeline.in_use.axes import AxisCheck
+    from pipeline.results import Progress
+    from pipeline.store.partitions import Lake, Partition
+    from schemas.calibrations import CalibrationRecord
+
+__all__ = ["verify"]
+
+_COLOUR = {"pass": "green", "warn": "yellow", "fail": "red", "inconclusive": "dim"}
+_DAY = "2000-01-01"  # of the one vehicle-day of a lake that nobody keeps
+# Enough for camera-lidar to be known to 0.05 deg on simulated days, few enough for a minute on two cores.
+_FRAMES = 60
+
+
+# A command's parameters are its options: more than eight, because each is one that a user sets.
+def verify(
+    *logs: Path,
+    fleet: Path,
+    calibration: Path | None = None,
+    vehicle: str | None = None,
+    camera_lidar_deg: float = 0.5,
+    radar_deg: float = 1.0,
+    frames: int = _FRAMES,
+    page: Path | None = None,
+    json: bool = False,
+) -> int:
+    """Check the calibration in use against one log: per pair and axis pass, warn, fail or inconclusive.
+
+    Exit 0: all that the pairs are good for passes or warns; 3: something fails, or the log cannot tell.
+
+    Args:
+        logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of one drive.
+        fleet: fleet.toml: topics, and from where on an error matters ([verify]).
+        calibration: what the car uses, as JSON {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}; default: the prior that
+            fleet.toml names (tf_static of the log, or its file).
+        vehicle: whose rig the log is of; default: the only one of fleet.toml.
+        camera_lidar_deg: an error of this size must not go unseen: a pass says that it would have failed.
+        radar_deg: the same for pairs with the radar.
+        frames: how many of the log to look at.
+        page: HTML page with pictures of both calibrations.
+        json: print every axis as one JSON object on stdout, and nothing else.
+    """
+    from jobs.terminal.summary import print_json, print_summary, progress_reporter
+    from pipeline.config import load_fleet
+    from pipeline.errors import ConfigError
+    from pipeline.extrinsics.prior import require_named_files
+    from pipeline.in_use.axes import answer_of
+
+    if not logs:
+        raise ConfigError("command line", "LOG", "name at least one log of the car")
+    config = load_fleet(fleet)
+    name = _vehicle(config, vehicle)
+    config = _for_one_look(config, name, calibration, frames)
+    require_named_files(config)
+    with progress_reporter(f"verify {name}") as progress:
+        checks, reason = _checked(config, name, logs, (camera_lidar_deg, radar_deg), page, progress)
+    answer = answer_of(checks)
+    told = [_told(c) for c in checks]
+    if json:
+        print_json({"answer": answer, "reason": reason, "vehicle": name, "page": page, "axes": told})
+    else:
+        _print_table(checks, answer)
+        print_summary("verify", answer, vehicle=name, reason=reason, page=page, axes=told)
+    return 0 if answer == "right" else 3
+
+
+def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
+    from pipeline.errors import ConfigError
+
+    if vehicle is not None:
+        config.rig_of(vehicle)  # raises, naming the vehicles there are
+        return vehicle
+    if len(config.vehicles) != 1:
+        raise ConfigError("command line", "vehicle", f"name one of {sorted(config.vehicles)} with --vehicle")
+    return next(iter(config.vehicles))
+
+
+def _for_one_look(config: FleetConfig, vehicle: str, calibration: Path | None, frames: int) -> FleetConfig:
+    """Few frames, spread over the log; every pair is estimated; the calibration in use is the prior."""
+    from pipeline.extrinsics.prior import read_transforms
+
+    changed = config.changed(
+        ingest={"max_frames": frames}, select={"frames": frames}, trigger={"when": "always"}
+    )
+    if calibration is None:
+        return changed
+    read_transforms(calibration)  # raises before the first log is opened
+    return changed.with_prior_file(vehicle, calibration)
+
+
+def _checked(
+    config: FleetConfig,
+    vehicle: str,
+    logs: tuple[Path, ...],
+    asked_deg: tuple[float, float],
+    page: Path | None,
+    progress: Progress,
+) -> tuple[list[AxisCheck], str]:
+    """Every axis of every pair, and why there is none where the log could not be used at all."""
+    from tempfile import TemporaryDirectory
+
+    from pipeline.in_use.axes import check_axes, limits_of
+    from pipeline.store.partitions import Lake, Partition
+
+    with TemporaryDirectory(prefix="boresight-verify-") as folder:
+        lake, partition = Lake.at(folder), Partition(vehicle, _DAY)
+        records = _records(config, lake, partition, logs, progress)
+        checks = [c for r in records for c in check_axes(r, limits_of(r.pair, config.verify, asked_deg))]
+        if page is not None:
+            _write_page(config, lake, partition, checks, page)
+    reasons = {r.reason for r in records if r.status == "refused"}
+    return checks, "; ".join(sorted(reasons))
+
+
+def _records(
+    config: FleetConfig, lake: Lake, partition: Partition, logs: tuple[Path, ...], progress: Progress
+) -> list[CalibrationRecord]:
+    """The log's own calibration, from the one in use."""
+    from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
+    from pipeline.store.records import read_records
+    from pipeline.work import Task
+    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+
+    task = Task(config, lake, partition, method="joint", logs=logs, progress=progress)
+    for stage in (INGEST, PERCEIVE):
+        stage.run(task)
+    CALIBRATE.run(task)
+    return read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle)
+
+
+def _write_page(
+    config: FleetConfig, lake: Lake, partition: Partition, checks: list[AxisCheck], page: Path
+) -> None:
+    from pipeline.in_use.axes import answer_of
+    from pipeline.report.in_use import in_use_view
+    from pipeline.report.stage import write_day_page
+
+    view = in_use_view(answer_of(checks), [_told(c) for c in checks])
+    write_day_page(lake, partition, config, page, "joint", in_use=view)
+
+
+def _told(check: AxisCheck) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return asdict(check)
+
+
+def _print_table(checks: list[AxisCheck], answer: str) -> None:
+    from numpy import degrees
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="The calibration in use", title_justify="left")
+    for heading in ("pair", "axis", "", "off [deg]", "sigma [deg]", "shows from [deg]"):
+        table.add_column(heading, justify="right" if "deg" in heading else "left")
+    for c in checks:
+        numbers = [f"{degrees(v):.2f}" for v in (c.off_rad, c.sigma_rad, c.shown_rad)]
+        table.add_row(c.pair, c.axis, f"[{_COLOUR[c.status]}]{c.status}[/]", *numbers)
+    console = Console(stderr=True)
+    console.print(table)
+    for c in checks:
+        if c.status == "inconclusive":
+            console.print(f"  - {c.pair} {c.axis}: {c.reason}", markup=False, highlight=False)
+    console.print(f"Is the calibration in use right: [bold]{answer}[/]")

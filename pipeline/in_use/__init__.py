@@ -1,0 +1,1 @@
+"""Is the calibration that a car uses still right? One log answers, axis by axis."""

@@ -1,0 +1,174 @@
+"""Pass, warn, fail or inconclusive: what one log says of the calibration in use, per pair and axis.
+
+The log is calibrated by itself, from the calibration in use; `off` is how far that one lies from the answer, `sigma`
+how surely the answer is known. An axis fails where the distance is both measured (beyond three sigmas, once in 370
+right calibrations by chance) and of a size that matters (beyond the limit of `[verify]`). What a pass is worth is the
+detection power: the probability with which an error of the size asked for would have failed. An axis without it is
+inconclusive, however small its distance.
+
+Azimuth and elevation are those of targets 15 to 40 m away (root mean square); roll is the camera's about its own axis,
+which turns pictures without moving their middle. Everything else of a pose is told by the record, not judged here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtr, ndtri
+
+from pipeline.config import VerifyConfig
+from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
+from pipeline.store.current import prior_of, transform_of
+from schemas.calibrations import CalibrationRecord
+
+__all__ = ["NEEDED_AXES", "AxisCheck", "AxisLimits", "answer_of", "check_axes", "limits_of"]
+
+# Once in 370 right calibrations by chance; rarer where the limit, which has to be passed too, is the larger one.
+CONTRADICTION_SIGMAS = 3.0
+# The smallest error that a log can show is the one that it would have failed with this probability.
+SHOWN_POWER = 0.95
+_SHOWN_SIGMAS = float(ndtri(SHOWN_POWER))
+_ROLL = 2  # of a camera pose's change: about the optical axis
+
+# What a pair is good for; a radar need not know its elevation.
+NEEDED_AXES: Mapping[str, tuple[str, ...]] = {
+    "camera_lidar": ("azimuth", "elevation"),
+    "camera_radar": ("azimuth",),
+    "lidar_radar": ("azimuth",),
+}
+
+
+@dataclass(frozen=True)
+class AxisLimits:
+    """Of one axis: an error from which on the calibration is wrong, and one that must not go unseen [rad].
+
+    A pass promises that an error of `asked_rad` would have failed with probability `confidence`.
+    """
+
+    limit_rad: float
+    asked_rad: float
+    confidence: float
+
+
+@dataclass(frozen=True)
+class AxisCheck:
+    """One axis of one pair; angles [rad] are nan where the log gives no estimate."""
+
+    pair: str
+    axis: str
+    status: str  # pass, warn, fail or inconclusive
+    reason: str
+    off_rad: float
+    sigma_rad: float
+    limit_rad: float
+    asked_rad: float
+    power: float  # probability with which an error of `asked_rad` would have failed
+    shown_rad: float  # smallest error that would have failed with probability SHOWN_POWER
+
+
+def limits_of(pair: str, verify: VerifyConfig, asked_deg: tuple[float, float]) -> dict[str, AxisLimits]:
+    """What is judged of a pair: azimuth and elevation, and the camera's roll beside the lidar.
+
+    Args:
+        pair: which one.
+        verify: from where on an error matters, and the confidence.
+        asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go unseen.
+    """
+    has_radar = pair.endswith("radar")
+    azimuth = verify.radar_limit_deg if has_radar else verify.camera_lidar_limit_deg
+    elevation = verify.radar_elevation_limit_deg if has_radar else verify.camera_lidar_limit_deg
+    limits = {"azimuth": azimuth, "elevation": elevation} | ({} if has_radar else {"roll": azimuth})
+    asked_rad = float(np.radians(asked_deg[has_radar]))
+    return {
+        axis: AxisLimits(float(np.radians(deg)), asked_rad, verify.confidence) for axis, deg in limits.items()
+    }
+
+
+def check_axes(record: CalibrationRecord, limits: Mapping[str, AxisLimits]) -> list[AxisCheck]:
+    """Every axis that `limits` names, from the log's record whose prior is the calibration in use."""
+    in_use, found = prior_of(record), transform_of(record)
+    blocked = _why_not(record)
+    if in_use is None or found is None or record.covariance is None:
+        return [_silent(record.pair, axis, of, blocked or record.reason) for axis, of in limits.items()]
+    off = _off(record.pair, in_use, found, np.asarray(record.covariance))
+    return [_checked(record.pair, axis, limits[axis], *off[axis], blocked) for axis in limits if axis in off]
+
+
+def answer_of(checks: Sequence[AxisCheck]) -> str:
+    """Of all pairs: "wrong" where an axis fails, "right" where all that the pairs are good for passes or warns."""
+    if any(c.status == "fail" for c in checks):
+        return "wrong"
+    needed = [c for c in checks if c.axis in NEEDED_AXES[c.pair]]
+    return "right" if needed and all(c.status in {"pass", "warn"} for c in needed) else "inconclusive"
+
+
+def _off(
+    pair: str,
+    in_use: Float[np.ndarray, "4 4"],
+    found: Float[np.ndarray, "4 4"],
+    covariance: Float[np.ndarray, "6 6"],
+) -> dict[str, tuple[float, float]]:
+    """Distance of the calibration in use from the answer, and the answer's sigma, by axis [rad]."""
+    xi = log_se3(in_use @ inverse(found))
+    distance = np.sqrt(np.mean((target_jacobian(pair, found) @ xi) ** 2, axis=1))
+    sigma = target_sigmas(pair, found, covariance)
+    off = {name: (float(distance[i]), float(sigma[i])) for i, name in enumerate(("azimuth", "elevation"))}
+    if pair.startswith("camera"):
+        roll_sigma = np.sqrt(change_covariance(found, covariance)[_ROLL, _ROLL])
+        off["roll"] = abs(float(change_between(found, in_use)[_ROLL])), float(roll_sigma)
+    return off
+
+
+def _checked(
+    pair: str, axis: str, limits: AxisLimits, off_rad: float, sigma_rad: float, blocked: str
+) -> AxisCheck:
+    threshold = max(limits.limit_rad, CONTRADICTION_SIGMAS * sigma_rad)
+    power = float(ndtr((limits.asked_rad - threshold) / sigma_rad))
+    shown = threshold + _SHOWN_SIGMAS * sigma_rad
+    status, reason = _status(off_rad, sigma_rad, limits, power, blocked)
+    numbers = (off_rad, sigma_rad, limits.limit_rad, limits.asked_rad)
+    return AxisCheck(pair, axis, status, reason, *numbers, 0.0 if blocked else power, shown)
+
+
+def _status(
+    off_rad: float, sigma_rad: float, limits: AxisLimits, power: float, blocked: str
+) -> tuple[str, str]:
+    if blocked:
+        return "inconclusive", blocked
+    measured = off_rad > CONTRADICTION_SIGMAS * sigma_rad
+    distance = f"{_deg(off_rad)} off, known to {_deg(sigma_rad)}"
+    if measured and off_rad > limits.limit_rad:
+        return "fail", f"{distance}: beyond {_deg(limits.limit_rad)} and beyond chance"
+    if power < limits.confidence:
+        return "inconclusive", (
+            f"{distance}: an error of {_deg(limits.asked_rad)} would have been seen with probability {power:.1%}"
+        )
+    if measured:
+        return "warn", f"{distance}: beyond chance, within {_deg(limits.limit_rad)}"
+    return "pass", distance
+
+
+def _silent(pair: str, axis: str, limits: AxisLimits, reason: str) -> AxisCheck:
+    nan = float("nan")
+    return AxisCheck(
+        pair, axis, "inconclusive", reason, nan, nan, limits.limit_rad, limits.asked_rad, 0.0, nan
+    )
+
+
+def _why_not(record: CalibrationRecord) -> str:
+    """Why the log's answer cannot be held against anything; empty where it can.
+
+    A record that is held only because its sigma is too large for its own limits is as good as that sigma says.
+    """
+    if record.status == "accepted" or (record.status == "held" and record.diagnostics.get("unsure_only")):
+        return ""
+    return f"the log gives no answer of its own: {record.reason}"
+
+
+def _deg(angle_rad: float) -> str:
+    return f"{np.degrees(angle_rad):.2f} deg"

@@ -1,0 +1,118 @@
+"""What one log may say of the calibration in use: fail, warn, pass, or that it cannot tell."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.config import VerifyConfig
+from pipeline.geometry.se3 import exp_se3, to_quaternion
+from pipeline.in_use.axes import answer_of, check_axes, limits_of
+from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
+from tests.makers.solve_scenes import T_CAMERA_LIDAR
+
+ASKED_DEG = (0.5, 1.0)
+DEG = np.pi / 180
+NAMES = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+
+
+def columns(T, prefix=""):
+    return {f"{prefix}{n}": float(v) for n, v in zip(NAMES, (*to_quaternion(T), *T[:3, 3]), strict=True)}
+
+
+def record(off_deg=0.0, sigma_deg=0.04, pair="camera_lidar", axis=1, status="accepted", **fields):
+    """A log's record; the calibration in use lies `off_deg` from its answer, about one axis of the parent."""
+    found = T_CAMERA_LIDAR if pair.startswith("camera") else np.eye(4)
+    turn = np.zeros(6)
+    turn[axis] = off_deg * DEG
+    parent, child = FRAMES_OF_PAIR[pair]
+    return CalibrationRecord(
+        vehicle="car", day="2026-03-02", method="joint", pair=pair, parent_frame=parent, child_frame=child,
+        status=status, reason=fields.pop("reason", ""), work_key="k", code_version="v", seed=0, inputs=[],
+        frames_total=40, covariance=np.diag([*[(sigma_deg * DEG) ** 2] * 3, *[1e-8] * 3]),
+        **columns(found), **columns(exp_se3(turn) @ found, "prior_"), **fields,
+    )  # fmt: skip
+
+
+def axes(of):
+    return {c.axis: c for c in check_axes(of, limits_of(of.pair, VerifyConfig(), ASKED_DEG))}
+
+
+def test_a_calibration_that_agrees_passes_with_what_the_pass_is_worth():
+    azimuth = axes(record(0.03))["azimuth"]
+    assert azimuth.status == "pass"
+    assert azimuth.off_rad == pytest.approx(0.03 * DEG, rel=0.05)
+    assert azimuth.power > 0.999
+    assert azimuth.shown_rad == pytest.approx((0.2 + 1.645 * 0.04) * DEG, rel=0.05)
+
+
+def test_an_error_beyond_chance_and_limit_fails_on_its_own_axis_alone():
+    of_yaw, of_pitch, of_roll = (axes(record(0.5, axis=a)) for a in (1, 0, 2))
+    assert {a for a, c in of_yaw.items() if c.status == "fail"} == {"azimuth"}
+    assert {a for a, c in of_pitch.items() if c.status == "fail"} == {"elevation"}
+    assert {a for a, c in of_roll.items() if c.status == "fail"} == {"roll"}
+    assert "0.50 deg off" in of_yaw["azimuth"].reason
+
+
+def test_an_error_that_is_measured_but_does_not_matter_is_a_warning():
+    assert axes(record(0.15, 0.03))["azimuth"].status == "warn"
+
+
+def test_a_log_that_would_not_have_shown_the_error_asked_for_is_inconclusive_and_never_passes():
+    azimuth = axes(record(0.0, 0.2))["azimuth"]
+    assert azimuth.status == "inconclusive"
+    assert "would have been seen with probability" in azimuth.reason
+
+
+def test_a_radars_limits_are_its_own():
+    assert axes(record(0.5, pair="lidar_radar", axis=2))["azimuth"].status == "fail"
+    assert axes(record(0.35, pair="lidar_radar", axis=2))["azimuth"].status == "warn"
+    assert axes(record(0.5, pair="lidar_radar", axis=1))["elevation"].status == "warn"
+    assert "roll" not in axes(record(pair="lidar_radar"))
+
+
+@pytest.mark.parametrize("off_deg", [0.0, 0.5])
+def test_a_log_whose_own_answer_failed_a_check_says_nothing_of_the_one_in_use(off_deg):
+    held = record(off_deg, status="held", reason="restarts disagree", diagnostics={"unsure_only": 0.0})
+    assert {c.status for c in axes(held).values()} == {"inconclusive"}
+    assert all("restarts disagree" in c.reason for c in axes(held).values())
+    refused = replace(held, status="refused", qw=None, covariance=None, reason="no observations")
+    assert {c.status for c in axes(refused).values()} == {"inconclusive"}
+    assert "no observations" in axes(refused)["azimuth"].reason
+
+
+def test_a_record_held_for_its_sigma_alone_is_believed_as_far_as_that_goes():
+    wide = record(
+        0.5, 0.09, status="held", reason="azimuth is known to 0.09 deg", diagnostics={"unsure_only": 1.0}
+    )
+    assert axes(wide)["azimuth"].status == "fail"
+    assert (
+        axes(record(0.5, 0.2, status="held", diagnostics={"unsure_only": 1.0}))["azimuth"].status
+        == "inconclusive"
+    )
+
+
+def test_the_answer_needs_every_axis_that_a_pair_is_good_for():
+    good = [c for p in FRAMES_OF_PAIR for c in axes(record(0.01, pair=p)).values()]
+    assert answer_of(good) == "right"
+    coarse = [replace(c, status="inconclusive") if c.axis == "elevation" else c for c in good]
+    assert (
+        answer_of([c for c in coarse if c.pair != "camera_lidar"]) == "right"
+    )  # a radar need not know its own
+    assert answer_of(coarse) == "inconclusive"
+    assert answer_of([*good[1:], replace(good[0], status="fail")]) == "wrong"
+    assert answer_of([]) == "inconclusive"
+
+
+def test_right_calibrations_fail_and_wrong_ones_pass_as_rarely_as_promised():
+    rng = np.random.default_rng(3)
+    answers = {0.0: [], 0.5: []}
+    for off_deg, found in answers.items():
+        for _ in range(300):
+            sigma_deg = rng.uniform(0.03, 0.2)
+            off = record(off_deg + rng.normal(0, sigma_deg), sigma_deg)
+            found.append((axes(off)["azimuth"].status, axes(off)["azimuth"].power))
+    assert sum(status == "fail" for status, _ in answers[0.0]) <= 3
+    assert not any(status in {"pass", "warn"} for status, _ in answers[0.5])
+    could = [status for status, power in answers[0.5] if power >= 0.95]
+    assert sum(status == "fail" for status in could) >= 0.95 * len(could)

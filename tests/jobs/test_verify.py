@@ -1,0 +1,78 @@
+"""`boresight verify` on a simulated log: the true calibration passes, a wrong one fails, nonsense is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jobs.cli import main
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from tests.makers.simulated_days import simulated_day
+
+FRAMES = 30
+
+
+@pytest.fixture(scope="module")
+def car(tmp_path_factory):
+    """One log of a car, its fleet.toml and its true calibration."""
+    folder = tmp_path_factory.mktemp("car")
+    made = simulated_day(folder, frames=FRAMES, seed=23)
+    return made.fleet_file, sorted((folder / "logs").rglob("*.mcap")), made.truth
+
+
+def calibration(path, truth, turned_deg=0.0):
+    turn = from_rotation_translation(exp_so3(np.radians([0.0, turned_deg, 0.0])), np.zeros(3))
+    T = {"T_camera_lidar": turn @ truth["camera_lidar"], "T_lidar_radar": truth["lidar_radar"]}
+    path.write_text(json.dumps({name: matrix.tolist() for name, matrix in T.items()}))
+    return path
+
+
+def verify(car, file, capsys, *more):
+    fleet, logs, _ = car
+    code = main(
+        ["verify", *map(str, logs), "--fleet", str(fleet), "--calibration", str(file), "--json", *more]
+    )
+    return code, json.loads(capsys.readouterr().out)
+
+
+def status_of(answer, pair, axis):
+    (found,) = [a for a in answer["axes"] if (a["pair"], a["axis"]) == (pair, axis)]
+    return found["status"]
+
+
+@pytest.mark.slow
+def test_a_right_calibration_passes_and_a_camera_turned_by_half_a_degree_fails(car, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    code, answer = verify(car, calibration(tmp_path / "true.json", car[2]), capsys, "--page", str(page))
+    assert (code, answer["answer"]) == (0, "right")
+    assert status_of(answer, "camera_lidar", "azimuth") in {"pass", "warn"}
+    assert "is the calibration in use right?" in page.read_text()
+    assert "Yes, as far as it matters" in page.read_text()
+    assert page.read_text().count("data:image/jpeg") >= 3  # overlays of both calibrations
+
+    code, answer = verify(car, calibration(tmp_path / "off.json", car[2], turned_deg=0.5), capsys)
+    assert (code, answer["answer"]) == (3, "wrong")
+    assert status_of(answer, "camera_lidar", "azimuth") == "fail"
+    assert status_of(answer, "lidar_radar", "azimuth") in {"pass", "warn"}
+
+
+@pytest.mark.slow
+def test_a_log_with_a_few_frames_is_inconclusive_with_the_reason(car, tmp_path, capsys):
+    file = calibration(tmp_path / "true.json", car[2])
+    code, answer = verify(car, file, capsys, "--frames", "3")
+    assert (code, answer["answer"]) == (3, "inconclusive")
+    assert {a["status"] for a in answer["axes"]} == {"inconclusive"}
+    assert "frames" in answer["reason"]
+
+
+def test_nonsense_is_refused_before_a_log_is_opened(car, tmp_path, capsys):
+    fleet = car[0]
+    (tmp_path / "empty.json").write_text("{}")
+    calls = {
+        "T_camera_lidar": ["no.mcap", "--calibration", str(tmp_path / "empty.json")],
+        "unknown vehicle": ["no.mcap", "--vehicle", "nobody"],
+        "name at least one log": [],
+    }
+    for said, arguments in calls.items():
+        assert main(["verify", *arguments, "--fleet", str(fleet)]) == 2
+        assert said in capsys.readouterr().out
