@@ -52,7 +52,9 @@ def audit(
     if report is not None:
         from pipeline.report.stage import Pages
 
-        outputs = REPORT.run(Task(config, tables, Window(), method, given=Pages(report))).outputs
+        with progress_reporter("report") as progress:
+            task = Task(config, tables, Window(), method, given=Pages(report), progress=progress)
+            outputs = REPORT.run(task).outputs
     print_summary(
         "audit",
         outcome.status,

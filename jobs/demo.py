@@ -46,7 +46,7 @@ def demo(
         workers: processes at a time; default: one per CPU that this process may use.
         seed: another seed is another fleet.
     """
-    from jobs.nightly import close_night, usable_cpus
+    from jobs.nightly import Drawing, close_night, usable_cpus
     from jobs.terminal.demo_table import print_comparison, print_methods
     from pipeline.config import load_fleet
     from pipeline.fleet.nightly import Night
@@ -63,7 +63,8 @@ def demo(
     outcomes = _calibrate(night, out / "logs", dates, workers or usable_cpus())
     _say("[bold]3/3[/]  the audit: which sensor moved, and since when")
     truth = read_truth(out / "truth")
-    findings, pages = close_night(night, None, out / "report" / "fleet.html", truth)
+    drawing = Drawing(out / "report" / "fleet.html", True, "process", workers or usable_cpus(), truth)
+    findings, pages = close_night(night, None, drawing, outcomes)
     errors = print_comparison(night.lake, night.method, truth, dates[-1], findings)
     errors += print_methods(night.lake, (night.method, _NETWORK), truth, dates[-1])[_NETWORK]
     (out / "comparison.json").write_text(json.dumps(errors, indent=1) + "\n")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import dataclass
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from pipeline.store.partitions import Lake
     from schemas.drift import DriftFinding
 
-__all__ = ["nightly", "watch_night"]
+__all__ = ["Drawing", "close_night", "nightly", "tidy", "usable_cpus", "watch_night"]
 
 
 # A command's parameters are its options: more than eight, because each is one that a user sets.
@@ -66,7 +67,8 @@ def nightly(
     if dry_run:
         return _print_plan(night, days)
     outcomes = watch_night(night, days, executor, workers)
-    findings, pages = _closed(night, to_day, report, pictures=pictures) if outcomes else ([], [])
+    drawing = Drawing(report, pictures, executor, workers or usable_cpus())
+    findings, pages = close_night(night, to_day, drawing, outcomes) if outcomes else ([], [])
     tidy(tables)
     code = exit_code([o.status for o in outcomes])
     print_summary(
@@ -81,18 +83,6 @@ def nightly(
         report=pages[0] if pages else None,
     )
     return code
-
-
-def _closed(
-    night: Night, to_day: str | None, report: Path | None, *, pictures: bool
-) -> tuple[list[DriftFinding], list[str]]:
-    """`close_night`, with the pages in the lake where no other place is given."""
-    if report is not None:
-        return close_night(night, to_day, report, pictures=pictures)
-    files, place = night.lake.files, night.lake.root / "report"
-    with files.in_folder(place) as folder:
-        findings, pages = close_night(night, to_day, folder / "fleet.html", pictures=pictures)
-    return findings, [files.uri(place / Path(p).relative_to(folder)) for p in pages]
 
 
 def _print_plan(night: Night, days: Sequence[VehicleDay]) -> int:
@@ -148,16 +138,39 @@ def watch_night(
     return outcomes
 
 
+@dataclass(frozen=True)
+class Drawing:
+    """How a night's pages are drawn.
+
+    Args:
+        report: HTML page of the fleet; None = report/fleet.html inside the lake.
+        pictures: False = pages without images of public roads.
+        executor: where pages of days are drawn.
+        workers: processes at a time.
+        truth: of a simulated fleet.
+    """
+
+    report: Path | None = None
+    pictures: bool = True
+    executor: str = "inline"
+    workers: int = 1
+    truth: Any = None
+
+
 def close_night(
-    night: Night, to_day: str | None, report: Path, truth: Any = None, *, pictures: bool = True
+    night: Night, to_day: str | None, drawing: Drawing, outcomes: Sequence[DayOutcome] = ()
 ) -> tuple[list[DriftFinding], list[str]]:
     """Audit the fleet, say what vehicles should load, and write the pages; returns the findings and the pages.
 
-    However few days the night was about, the charts look back over `audit.window_days`.
+    However few days the night was about, the charts look back over `audit.window_days`; its own days get a page
+    however long ago they were.
     """
     from jobs.terminal.summary import progress_reporter
+    from pipeline.fleet.pages import OnWorkers
     from pipeline.report.stage import Pages
     from pipeline.stages import AUDIT, REPORT, STATE
+    from pipeline.store.files import LocalFiles
+    from pipeline.store.partitions import Partition
     from pipeline.work import Task, Window
 
     with progress_reporter("audit") as progress:
@@ -166,11 +179,20 @@ def close_night(
         STATE.run(task)
     if not findings:
         return [], []
+    files = night.lake.files if drawing.report is None else LocalFiles()
     with progress_reporter("report") as progress:
         progress(0, 0, "pages")
-        task = Task(night.fleet, night.lake, Window(), night.method, given=Pages(report, truth, pictures))
-        pages = REPORT.run(task).outputs
-    return findings, pages
+        pages = Pages(
+            drawing.report or night.lake.root / "report" / "fleet.html",
+            drawing.truth,
+            drawing.pictures,
+            files,
+            [Partition(o.vehicle, o.day) for o in outcomes if o.pairs],
+            OnWorkers(drawing.executor, drawing.workers),
+        )
+        task = Task(night.fleet, night.lake, Window(), night.method, given=pages, progress=progress)
+        outputs = REPORT.run(task).outputs
+    return findings, [files.uri(PurePath(path)) for path in outputs]
 
 
 def usable_cpus() -> int:

@@ -16,23 +16,23 @@ __all__ = ["change_between", "change_covariance", "change_jacobian"]
 
 
 def change_between(
-    T_before: Float[np.ndarray, "4 4"], T_after: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, " 6"]:
+    T_before: Float[np.ndarray, "*batch 4 4"], T_after: Float[np.ndarray, "*batch 4 4"]
+) -> Float[np.ndarray, "*batch 6"]:
     """Change (rx ry rz [rad], tx ty tz [m]) that leads from one estimate of T_parent_child to another."""
-    rotation = log_so3(T_after[:3, :3] @ T_before[:3, :3].T)
-    return np.concatenate([rotation, T_after[:3, 3] - T_before[:3, 3]])
+    rotation = log_so3(T_after[..., :3, :3] @ np.swapaxes(T_before[..., :3, :3], -1, -2))
+    return np.concatenate([rotation, T_after[..., :3, 3] - T_before[..., :3, 3]], axis=-1)
 
 
-def change_jacobian(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+def change_jacobian(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 6 6"]:
     """d(change)/d(xi) for a left perturbation exp(xi) T: t moves by rho + omega x t (first order)."""
-    J = np.eye(6)
-    J[3:, :3] = -hat(T[:3, 3])
+    J = np.broadcast_to(np.eye(6), (*T.shape[:-2], 6, 6)).copy()
+    J[..., 3:, :3] = -hat(T[..., :3, 3])
     return J
 
 
 def change_covariance(
-    T: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
-) -> Float[np.ndarray, "6 6"]:
+    T: Float[np.ndarray, "*batch 4 4"], covariance: Float[np.ndarray, "*batch 6 6"]
+) -> Float[np.ndarray, "*batch 6 6"]:
     """Covariance of (rotation vector, origin) of an estimate, given that of its left perturbation."""
     J = change_jacobian(T)
-    return J @ covariance @ J.T
+    return J @ covariance @ np.swapaxes(J, -1, -2)

@@ -1,9 +1,8 @@
-"""The charts of the pages: sigmas per axis, agreement per frame, control charts."""
+"""The figures of a day's page: sigmas per axis, agreement per frame (control charts: `templates/fleet.js`)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from markupsafe import Markup
@@ -13,26 +12,9 @@ from pipeline.report.svg import MUTED, Plot, document, nice_step
 from pipeline.report.words import PAIR_TITLES, dof_title, scaled, unit_of
 from schemas.calibrations import DOF_NAMES, PAIRS
 
-__all__ = ["DriftPanel", "drift_figure", "residual_figure", "sigma_figure"]
+__all__ = ["residual_figure", "sigma_figure"]
 
 BEFORE, AFTER = "#e0813a", "#3b82c4"
-STATUS_COLOURS = {"RED": "#d64550", "YELLOW": "#c8920f", "GREEN": "#2f9e6a", "UNKNOWN": MUTED}
-
-
-@dataclass(frozen=True)
-class DriftPanel:
-    """One chart: day ordinals and values in radians or metres, relative to the level before the change."""
-
-    pair: str
-    dof: str
-    status: str
-    day: Sequence[int]
-    value: Sequence[float]
-    sigma: Sequence[float]
-    limit: float
-    start: tuple[int, int, int] | None = None  # first day with the new value, earliest, latest
-    missing: Sequence[int] = field(default=())  # refused or undetermined days
-    held: Sequence[int] = field(default=())  # days whose calibration was held
 
 
 def sigma_figure(
@@ -133,57 +115,6 @@ def _residual_dots(plot: Plot, values: np.ndarray, colour: str, label: str, lege
         plot.dot(float(i), y, colour, f"{label}: {values[i]:.3g}", radius=2.3, opacity=0.65)
     plot.line((plot.x[0], min(level, plot.y[1])), (plot.x[1], min(level, plot.y[1])), colour, 1.6)
     plot.text(legend_u, 186.0, f"{label}: median {level:.2g}", colour=colour, bold=True)
-
-
-def drift_figure(panels: Sequence[DriftPanel], day_labels: Mapping[int, str], vehicle: str) -> Markup:
-    """All charts of a vehicle: pairs down, DoFs across; bars are one sigma, the band is what matters."""
-    parts: list[str] = []
-    days = sorted(day_labels)
-    ticks = days if len(days) <= 4 else [days[0], days[len(days) // 2], days[-1]]
-    for row, pair in enumerate(PAIRS):
-        parts.append(
-            f'<text x="0" y="{row * 150 + 12}" font-weight="600" font-size="12.5">{PAIR_TITLES[pair]}</text>'
-        )
-    for panel in panels:
-        row, column = PAIRS.index(panel.pair), DOF_NAMES.index(panel.dof)
-        plot = Plot(
-            column * 206 + 40, row * 150 + 36, 158, 84, (days[0] - 0.6, days[-1] + 0.6), _reach(panel)
-        )
-        _drift_panel(plot, panel, [(float(d), day_labels[d]) for d in ticks], day_labels)
-        parts += plot.parts
-    return document(1236.0, 446.0, parts, f"Control charts of {vehicle}")
-
-
-def _drift_panel(
-    plot: Plot, panel: DriftPanel, ticks: Sequence[tuple[float, str]], day_labels: Mapping[int, str]
-) -> None:
-    colour = STATUS_COLOURS[panel.status]
-    alarmed = panel.status in ("RED", "YELLOW")
-    unit, limit = unit_of(panel.dof), min(scaled(panel.limit, panel.dof), plot.y[1])
-    title = f"{dof_title(panel.pair, panel.dof)} [{unit}]" + (f" {panel.status}" if alarmed else "")
-    plot.text(plot.left, plot.top - 6, title, colour=colour if alarmed else "currentColor", bold=alarmed)
-    plot.area((plot.x[0], -limit), (plot.x[1], limit), STATUS_COLOURS["GREEN"], 0.14)
-    step = nice_step(plot.y[1] * 1.6)
-    plot.frame(ticks, [(y, f"{y:g}") for y in (-step, 0.0, step)], colour, 2.0 if alarmed else 1.0)
-    if panel.start is not None:
-        first, earliest, latest = panel.start
-        plot.area((earliest - 0.5, plot.y[0]), (max(latest - 0.5, earliest - 0.45), plot.y[1]), colour, 0.22)
-        plot.line((first - 0.5, plot.y[0]), (first - 0.5, plot.y[1]), colour, 1.2, "4 3")
-    for day, value, sigma in zip(panel.day, panel.value, panel.sigma, strict=True):
-        v, s = scaled(value, panel.dof), scaled(sigma, panel.dof)
-        note = " (held)" if day in panel.held else ""
-        tooltip = f"{day_labels.get(day, '')}: {v:+.3f} ± {s:.3f} {unit}{note}"
-        plot.dot(float(day), v, colour, tooltip, bar=s, opacity=0.45 if note else 1.0)
-    for day in panel.missing:
-        plot.cross(float(day), 0.0, f"{day_labels.get(day, '')}: refused or not determined")
-    if not len(panel.day):
-        plot.text(plot.left + plot.width / 2, plot.top + 26, "not determined", anchor="middle", colour=MUTED)
-
-
-def _reach(panel: DriftPanel) -> tuple[float, float]:
-    ends = [abs(v) + s for v, s in zip(panel.value, panel.sigma, strict=True)]
-    reach = 1.15 * scaled(max([*ends, panel.limit]), panel.dof)
-    return -reach, reach
 
 
 def _page_units(sigma: np.ndarray, dofs: Sequence[str]) -> list[float]:

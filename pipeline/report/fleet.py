@@ -3,50 +3,65 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
-from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.report.day import clearest_alarm, status_sentence
-from pipeline.report.figures import DriftPanel
+from pipeline.report.names import page_stem
+from pipeline.report.verdicts import FleetVerdicts
+from pipeline.report.window import FleetWindow
 from pipeline.report.words import PAIR_TITLES, motion_in_words, with_sigma
-from pipeline.store.current import transform_of
-from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.calibrations import STATUSES
 from schemas.drift import DRIFT_STATUSES, DriftFinding, status_of
 
 __all__ = [
-    "DayCell",
+    "DAY_WORDS",
     "FindingView",
     "VehicleRow",
-    "drift_panels",
     "finding_views",
+    "fleet_rows",
     "headline_for",
-    "vehicle_rows",
+    "index_row",
 ]
 
-_WORST = ("refused", "held", "accepted")
-
-
-@dataclass(frozen=True)
-class DayCell:
-    """One vehicle-day of the table; `link` is relative to the fleet page, empty where there is no page."""
-
-    day: str
-    status: str
-    text: str
-    link: str
+# How a vehicle-day is shown: letter of the index, sign and words. Capitals in the index: the day has a page.
+DAY_WORDS = {
+    "a": ("accepted", "✓", "accepted (use it)"),
+    "p": ("partly", "◐", "accepted in part (of some pairs)"),
+    "h": ("held", "○", "held (computed, the prior stays current)"),
+    "r": ("refused", "✕", "refused (nothing computed)"),
+    ".": ("none", "·", "no record"),
+}
+_COLUMNS = 28  # days that the table has: four weeks; a vehicle's older ones are with its charts
 
 
 @dataclass(frozen=True)
 class VehicleRow:
-    """One vehicle of the table."""
+    """One vehicle of the table.
+
+    Args:
+        vehicle: its name.
+        status: of DRIFT_STATUSES.
+        sentence: why.
+        sensor: that moved; empty where none did or nobody knows.
+        since: first day after the change; empty where there was none.
+        days: a letter of DAY_WORDS per day of the table, capital where the day has a page.
+        last_day: the last one with a record; empty where there is none.
+        older: days before those of the table, with their letters.
+    """
 
     vehicle: str
     status: str
     sentence: str
-    cells: list[DayCell]
+    sensor: str
+    since: str
+    days: str
+    last_day: str
+    older: list[tuple[str, str]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -63,38 +78,81 @@ class FindingView:
     charts: list[str]
 
 
-def vehicle_rows(
-    records: Sequence[CalibrationRecord],
-    findings: Sequence[DriftFinding],
-    days: Sequence[str],
-    links: Mapping[tuple[str, str], str],
-) -> list[VehicleRow]:
-    """The table vehicles x days, alarmed vehicles first."""
-    found = _by_vehicle(findings)
-    statuses: dict[tuple[str, str], list[str]] = {}
-    for record in records:
-        statuses.setdefault((record.vehicle, record.day), []).append(record.status)
+def fleet_rows(
+    window: FleetWindow, verdicts: FleetVerdicts, pages: Collection[tuple[str, str]]
+) -> tuple[list[str], list[VehicleRow]]:
+    """The table's days, and its vehicles: what a person should look at first comes first.
+
+    RED before YELLOW, UNKNOWN and GREEN; what changed last before what has been known for long.
+
+    Args:
+        window: records.
+        verdicts: of the last audit.
+        pages: vehicle-days that have a page.
+    """
+    ordinals, letters = _letters(window)
+    names = [dt.date.fromordinal(day).isoformat() for day in ordinals.tolist()]
+    place = {vehicle: v for v, vehicle in enumerate(window.vehicles)}
+    first = max(0, len(names) - _COLUMNS)
     rows = []
-    for vehicle in sorted({r.vehicle for r in records} | set(found)):
-        status, sentence = status_sentence(found.get(vehicle, []))
-        cells = [_cell(statuses.get((vehicle, d), []), d, links.get((vehicle, d), "")) for d in days]
-        rows.append(VehicleRow(vehicle, status, sentence, cells))
-    return sorted(rows, key=lambda r: (DRIFT_STATUSES.index(r.status), r.vehicle))
+    for vehicle in sorted({*window.vehicles, *verdicts.vehicles}):
+        status, sentence = status_sentence(verdicts.findings.get(vehicle, []))
+        stored = status_of(verdicts.findings.get(vehicle, []))
+        shown = letters[place[vehicle]] if vehicle in place else "." * len(names)
+        marked = [
+            letter.upper() if letter != "." and (vehicle, day) in pages else letter
+            for day, letter in zip(names, shown, strict=True)
+        ]
+        known = [(day, letter) for day, letter in zip(names, marked, strict=True) if letter != "."]
+        rows.append(
+            VehicleRow(
+                vehicle,
+                status,
+                sentence,
+                stored.sensor or "",
+                stored.since or "",
+                "".join(marked[first:]),
+                known[-1][0] if known else "",
+                [(day, letter) for day, letter in known if first and day < names[first]],
+            )
+        )
+    return names[first:], sorted(rows, key=_attention)
 
 
-def finding_views(findings: Sequence[DriftFinding]) -> list[FindingView]:
-    """What changed, vehicle by vehicle: RED before YELLOW."""
+def index_row(row: VehicleRow, sentences: dict[str, int], finding: FindingView | None) -> list[Any]:
+    """A vehicle as `templates/fleet.js` reads it; sentences are told once, by their place."""
+    stem = page_stem(row.vehicle)
+    said = sentences.setdefault(row.sentence, len(sentences))
+    change = [finding.kind, finding.motion, finding.sure, finding.charts] if finding is not None else 0
+    status = DRIFT_STATUSES.index(row.status)
+    own = stem if stem != row.vehicle else 0
+    return [
+        row.vehicle,
+        status,
+        row.sensor,
+        row.since,
+        said,
+        row.days,
+        row.last_day,
+        own,
+        row.older or 0,
+        change,
+    ]
+
+
+def finding_views(findings: Mapping[str, Sequence[DriftFinding]]) -> list[FindingView]:
+    """What changed, vehicle by vehicle: RED before YELLOW, the latest change first."""
     views = []
-    for vehicle, own in _by_vehicle(findings).items():
+    for vehicle, own in findings.items():
         clearest = clearest_alarm(own)
         if clearest is not None:
             views.append(_finding_view(vehicle, clearest, own))
-    return sorted(views, key=lambda v: (DRIFT_STATUSES.index(v.status), v.vehicle))
+    return sorted(views, key=_attention)
 
 
-def headline_for(findings: Sequence[DriftFinding], views: Sequence[FindingView]) -> tuple[str, str]:
+def headline_for(verdicts: FleetVerdicts, views: Sequence[FindingView]) -> tuple[str, str]:
     """(the most urgent status in the fleet; the page's first sentence)."""
-    statuses = [status_of(own).status for own in _by_vehicle(findings).values()]
+    statuses = [status_of(own).status for own in verdicts.findings.values()]
     vehicles = _count(len(statuses), "vehicle")
     if not statuses:
         return "UNKNOWN", "No audit yet: run boresight audit."
@@ -104,76 +162,35 @@ def headline_for(findings: Sequence[DriftFinding], views: Sequence[FindingView])
     if worst == "UNKNOWN":
         where = f"on {statuses.count(worst)} of {vehicles}"
         return worst, f"No change seen, but {where} the days so far could hide one that matters."
-    named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in views if v.status == worst][:3]
-    more = "" if len(views) <= 3 else f" and {len(views) - 3} more"
+    of_these = [v for v in views if v.status == worst]
+    named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in of_these[:3]]
+    more = "" if len(of_these) <= 3 else f" and {len(of_these) - 3} more"
     verb = "A sensor moved" if worst == "RED" else "Something may have moved"
-    return worst, f"{verb} on {len(views)} of {vehicles}: {'; '.join(named)}{more}."
+    said = f"{verb} on {statuses.count(worst)} of {vehicles}: {'; '.join(named)}{more}."
+    if worst == "RED" and "YELLOW" in statuses:
+        said += f" Something may have moved on {statuses.count('YELLOW')} more."
+    return worst, said
 
 
-def drift_panels(
-    vehicle: str, records: Sequence[CalibrationRecord], findings: Sequence[DriftFinding]
-) -> list[DriftPanel]:
-    """The vehicle's charts with the day estimates they rest on, each relative to its level before the change."""
-    panels = []
-    for pair in PAIRS:
-        rows = [r for r in records if (r.vehicle, r.pair) == (vehicle, pair)]
-        used = [r for r in rows if r.status != "refused" and r.covariance is not None]
-        for k, dof in enumerate(DOF_NAMES):
-            finding = next((f for f in findings if (f.vehicle, f.pair, f.dof) == (vehicle, pair, dof)), None)
-            if finding is not None:
-                panels.append(_panel(finding, rows, used, k))
-    return panels
+def _attention(row: VehicleRow | FindingView) -> tuple[int, int, str]:
+    since = row.since[: len("YYYY-MM-DD")]
+    newest = -dt.date.fromisoformat(since).toordinal() if since else 0
+    return DRIFT_STATUSES.index(row.status), newest, row.vehicle
 
 
-def _panel(
-    finding: DriftFinding, rows: Sequence[CalibrationRecord], used: Sequence[CalibrationRecord], k: int
-) -> DriftPanel:
-    seen = [r for r in used if r.observable is None or r.observable[k]]
-    start = None
-    if finding.start_day and finding.start_day_earliest and finding.start_day_latest:
-        start = (
-            _ordinal(finding.start_day),
-            _ordinal(finding.start_day_earliest),
-            _ordinal(finding.start_day_latest),
-        )
-    day = [_ordinal(r.day) for r in seen]
-    T = [t for t in map(transform_of, seen) if t is not None]
-    value = np.array([change_between(T[0], t)[k] for t in T])
-    sigma = np.array(
-        [
-            np.sqrt(change_covariance(t, r.covariance)[k, k])
-            for t, r in zip(T, seen, strict=True)
-            if r.covariance is not None
-        ]
-    )
-    before = np.array([start is None or d < start[0] for d in day], dtype=bool)
-    if before.any():
-        value = value - np.average(value[before], weights=sigma[before] ** -2)
-    missing = sorted({_ordinal(r.day) for r in rows} - set(day))
-    held = [_ordinal(r.day) for r in seen if r.status == "held"]
-    values, sigmas = value.tolist(), sigma.tolist()
-    return DriftPanel(
-        finding.pair, finding.dof, finding.status, day, values, sigmas, finding.limit, start, missing, held
-    )  # fmt: skip
-
-
-def _cell(statuses: Sequence[str], day: str, link: str) -> DayCell:
-    if not statuses:
-        return DayCell(day, "none", "-", link)
-    accepted = statuses.count("accepted")
-    if accepted == len(statuses):
-        return DayCell(day, "accepted", "accepted", link)
-    if accepted:
-        return DayCell(day, "partly", f"{accepted} of {len(statuses)} accepted", link)
-    worst = next(s for s in _WORST if s in statuses)
-    return DayCell(day, worst, worst, link)
-
-
-def _by_vehicle(findings: Sequence[DriftFinding]) -> dict[str, list[DriftFinding]]:
-    found: dict[str, list[DriftFinding]] = {}
-    for finding in findings:
-        found.setdefault(finding.vehicle, []).append(finding)
-    return found
+def _letters(window: FleetWindow) -> tuple[Int[np.ndarray, " D"], list[str]]:
+    """Days that any vehicle has a record of, and each vehicle's letters of DAY_WORDS on them."""
+    days, column = np.unique(window.day, return_inverse=True)
+    cell = window.owner * len(days) + column
+    size = len(window.vehicles) * len(days)
+    of = {name: np.bincount(cell[window.status == s], minlength=size) for s, name in enumerate(STATUSES)}
+    total = sum(of.values())
+    letters = np.full(size, ".")
+    letters[of["refused"] > 0] = "r"
+    letters[of["held"] > 0] = "h"
+    letters[of["accepted"] > 0] = "p"
+    letters[(of["accepted"] == total) & (total > 0)] = "a"
+    return days, ["".join(row) for row in letters.reshape(len(window.vehicles), len(days))]
 
 
 def _finding_view(vehicle: str, clearest: DriftFinding, own: Sequence[DriftFinding]) -> FindingView:
@@ -215,7 +232,3 @@ def _chart_words(finding: DriftFinding) -> str:
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" + ("" if number == 1 else "s")
-
-
-def _ordinal(day: str) -> int:
-    return dt.date.fromisoformat(day).toordinal()

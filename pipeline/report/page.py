@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
-from pathlib import Path
-from typing import Any
+from pathlib import PurePath
+from typing import Any, TypeVar
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-__all__ = ["is_drawn", "mark_drawn", "render", "write_page"]
+from pipeline.store.files import Files, LocalFiles
 
-_MARK = "<!-- drawn from {} -->\n"  # the last line of a page that is not drawn again while it stays true
+__all__ = ["render", "write_page"]
+
+P = TypeVar("P", bound=PurePath)
 
 
 def render(template: str, **values: Any) -> str:
@@ -28,36 +28,17 @@ def render(template: str, **values: Any) -> str:
     return environment.get_template(template).render(**values)
 
 
-def write_page(path: Path, html: str) -> Path:
-    """Write a page aside and rename it, so that nobody opens half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, aside = tempfile.mkstemp(dir=path.parent, prefix=".writing-", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(html)
-        Path(aside).chmod(0o644)
-        Path(aside).replace(path)
-    except BaseException:
-        Path(aside).unlink(missing_ok=True)
-        raise
+def write_page(path: P, html: str, files: Files | None = None) -> P:
+    """Write a page aside and give it its name, so that nobody opens half of it.
+
+    Args:
+        path: of the page.
+        html: its content.
+        files: where it is; None = this machine.
+    """
+    with (files or LocalFiles()).replacing(path) as stream:
+        stream.write(html.encode())
     return path
-
-
-def is_drawn(path: Path, stamp: str) -> bool:
-    """Whether a page is there whose mark says that it was drawn from the same."""
-    mark = _MARK.format(stamp).encode()
-    try:
-        with path.open("rb") as stream:
-            stream.seek(-len(mark), os.SEEK_END)
-            return stream.read() == mark
-    except OSError:  # not there, or shorter than a mark
-        return False
-
-
-def mark_drawn(path: Path, stamp: str) -> None:
-    """Say at a page's end what it was drawn from."""
-    with path.open("ab") as stream:
-        stream.write(_MARK.format(stamp).encode())
 
 
 def _safe_json(text: str) -> Markup:

@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-_CHARTED = (*_POSE, *(f"prior_{name}" for name in _POSE), "covariance", "observable", "determined")
+_COMPARED = (*_POSE, *(f"prior_{name}" for name in _POSE), "covariance", "observable", "determined")
 _AUDIT_DAYS = 61  # whose findings are older is audited no more: it left fleet.toml, or nobody audits
 _FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 
@@ -54,16 +54,13 @@ def day_records(lake: Lake, partition: Partition, method: str) -> dict[str, Cali
 
 
 def fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:
-    """Current records of the last `window_days` days, with what charts, the table and the truth ask for.
-
-    A chart needs no margins, diagnostics or notes; those of a day are on its page (`records_of_day`).
-    """
+    """Current records of the last `window_days` days, with what a comparison with the truth asks for."""
     last = last_day(lake, CALIBRATIONS)
     if last is None:
         return []
 
     def records_from(first: str | None) -> list[CalibrationRecord]:
-        found = read_records(lake, CALIBRATIONS, CalibrationRecord, first=first, columns=_CHARTED)
+        found = read_records(lake, CALIBRATIONS, CalibrationRecord, first=first, columns=_COMPARED)
         return [r for r in found if r.method == method]
 
     # Another method's records may be newer by more than a window.
@@ -81,8 +78,8 @@ def records_of_day(lake: Lake, method: str, day: str) -> dict[str, dict[str, Cal
     return records
 
 
-def drift_of(lake: Lake, method: str, vehicle: str | None = None) -> list[DriftFinding]:
-    """Current findings of one vehicle, or of all, where the lake's last audits, of two months, looked at it."""
+def drift_of(lake: Lake, method: str, vehicle: str) -> list[DriftFinding]:
+    """Current findings of a vehicle, where the lake's last audits, of two months, looked at it."""
     last = last_day(lake, DRIFT)
     if last is None:
         return []

@@ -5,14 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from jaxtyping import Float
 
 from pipeline.geometry.se3 import from_quaternion
 from schemas.calibrations import CalibrationRecord
+from schemas.columns import TableSchema
 from schemas.drift import DriftFinding
 from schemas.states import StateRow
 
-__all__ = ["current_drift", "current_records", "current_states", "prior_of", "transform_of"]
+__all__ = [
+    "current_drift",
+    "current_records",
+    "current_rows",
+    "current_states",
+    "prior_of",
+    "transform_of",
+]
 
 
 def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRecord]:
@@ -23,6 +33,33 @@ def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRec
     """
     last = {(r.vehicle, r.day, r.trio, r.method, r.pair): r for r in records}
     return [last[key] for key in sorted(last)]
+
+
+def current_rows(table: pa.Table, schema: TableSchema) -> pa.Table:
+    """The current row of each thing that rows of a record table are about, as columns, in order of what they are about.
+
+    Args:
+        table: with the columns `schema.about`, `asserted_at` and `work_key`, in any order of rows.
+        schema: of the table.
+    """
+    if not table.num_rows:
+        return table
+    columns = [
+        table[name].combine_chunks().dictionary_encode()
+        for name in (*schema.about, "asserted_at", "work_key")
+    ]
+    ranks = [_ranks(column) for column in columns]
+    order = np.lexsort(ranks[::-1])
+    about = np.stack([rank[order] for rank in ranks[:-2]])
+    is_last = np.append((about[:, 1:] != about[:, :-1]).any(axis=0), True)
+    return table.take(pa.array(order[is_last]))
+
+
+def _ranks(column: pa.DictionaryArray) -> np.ndarray:
+    """For each row, the place of its value among the sorted values."""
+    places = np.empty(len(column.dictionary), np.int64)
+    places[np.asarray(pc.sort_indices(column.dictionary))] = np.arange(len(places))
+    return places[np.asarray(column.indices)]
 
 
 def current_drift(findings: Sequence[DriftFinding]) -> list[DriftFinding]:

@@ -48,10 +48,6 @@ class Files(Protocol):
         """Bytes of a file; 0 where there is none."""
         ...
 
-    def in_folder(self, path: PurePath) -> AbstractContextManager[Path]:
-        """A local folder whose files are below `path` when the block ends."""
-        ...
-
     def delta_options(self) -> dict[str, str]:
         """What `deltalake` is told of the storage."""
         ...
@@ -98,11 +94,6 @@ class LocalFiles:
     def size(self, path: PurePath) -> int:
         """Bytes of a file; 0 where there is none."""
         return Path(path).stat().st_size if Path(path).is_file() else 0
-
-    @contextmanager
-    def in_folder(self, path: PurePath) -> Iterator[Path]:
-        """The folder itself."""
-        yield Path(path)
 
     def delta_options(self) -> dict[str, str]:
         """Nothing."""

@@ -17,7 +17,7 @@ from datetime import timedelta
 from fnmatch import fnmatchcase
 from functools import cache
 from itertools import takewhile
-from pathlib import Path, PurePath, PurePosixPath
+from pathlib import PurePath, PurePosixPath
 from typing import Any, BinaryIO, cast
 
 import obstore
@@ -116,17 +116,6 @@ class Bucket:
             "max_retries": str(RETRIES),
             "retry_timeout": f"{RETRY_S:g}s",
         }
-
-    @contextmanager
-    def in_folder(self, key: PurePath) -> Iterator[Path]:
-        """A local folder whose files are put below a key when the block ends."""
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            yield folder
-            for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-                target = key / path.relative_to(folder).as_posix()
-                with self._as_os_errors(target):
-                    obstore.put(_store(self.name), str(target), path)
 
     @contextmanager
     def _as_os_errors(self, key: PurePath) -> Iterator[None]:

@@ -68,10 +68,12 @@ def collect(
 def collect_pages(lake: Lake, before: str, *, dry_run: bool = False) -> list[str]:
     """Remove pages of vehicle-days before `before` from the lake's reports; returns what they were called."""
     gone = []
-    for page in lake.files.find(lake.root / "report", "*_days/*.html"):
-        day = page.stem[-len("YYYY-MM-DD") :]
+    report, wide = lake.root / "report", len("YYYY-MM-DD")
+    pages = [(page.parent.name, page) for page in lake.files.find(report, "*_days/*/*.html")]
+    pages += [(page.stem[-wide:], page) for page in lake.files.find(report, "*_days/*.html")]  # before 0.7
+    for day, page in pages:
         if is_day(day) and day < before:
-            gone.append(page.name)
+            gone.append(str(page.relative_to(report)))
             if not dry_run:
                 lake.files.delete(page)
     return gone

@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
-from pipeline.report.stage import write_day_page, write_fleet_page, write_fleet_report
+from pipeline.report.stage import Pages, write_day_page, write_fleet_page, write_fleet_report
 from pipeline.report.truth import read_truth
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records, read_records
@@ -66,7 +66,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, maker: ModuleType) -> tuple[
         }
         path.write_text(json.dumps({f"T_{pair}": value.tolist() for pair, value in T.items()}))
     page = root / "fleet page.html"
-    write_fleet_report(lake, _config(), page, truth=read_truth(truth))
+    write_fleet_report(lake, _config(), Pages(page, read_truth(truth)))
     return lake, page, truth
 
 
@@ -96,13 +96,13 @@ def test_the_fleet_page_links_every_day_page_by_a_relative_path(fleet: tuple[Lak
     for link in links:
         page = fleet[1].parent / unquote(link)
         assert page.is_file()
-        back = re.search(r'href="(\.\./[^"]+)"', page.read_text())
+        back = re.search(r'href="(\.\./\.\./[^"]+)"', page.read_text())
         assert back is not None
         assert (page.parent / unquote(back[1])).resolve() == fleet[1].resolve()
 
 
 def test_pages_have_no_outside_resources(fleet: tuple[Lake, Path, Path]) -> None:
-    for page in [fleet[1], *fleet[1].parent.glob("*_days/*.html")]:
+    for page in [fleet[1], *fleet[1].parent.glob("*_days/*/*.html")]:
         text = page.read_text()
         assert not re.search(r'(src|href|url)\s*[=(]\s*["\']?(https?:)?//', text)
         assert '<link rel="stylesheet' not in text
@@ -171,7 +171,7 @@ def test_a_held_day_after_a_move_says_that_nothing_is_safe(maker: ModuleType, tm
 def test_the_fleet_page_shows_the_window_and_not_all_of_history(maker: ModuleType, tmp_path: Path) -> None:
     lake = Lake.at(tmp_path / "lake")
     _store(lake, maker.vehicle_records("v", 31, np.random.default_rng(5)))
-    pages = write_fleet_report(lake, _config(), tmp_path / "fleet.html")
+    pages = write_fleet_report(lake, _config(), Pages(tmp_path / "fleet.html"))
     assert len(pages) == 1 + 28
     assert "2026-03-03" not in pages[0].read_text()
     assert "2026-03-04" in pages[0].read_text()
@@ -277,24 +277,24 @@ def test_a_page_can_be_used_by_keyboard_alone(
 def test_pages_of_days_that_did_not_change_are_not_drawn_again(fleet, tmp_path: Path) -> None:
     lake = Lake.at(tmp_path / "lake")
     shutil.copytree(fleet[0].root, lake.root)
-    pages = write_fleet_report(lake, _config(), tmp_path / "out" / "fleet.html")
+    pages = write_fleet_report(lake, _config(), Pages(tmp_path / "out" / "fleet.html"))
     before = {p: p.stat().st_mtime_ns for p in pages[1:]}
-    assert write_fleet_report(lake, _config(), tmp_path / "out" / "fleet.html") == pages
+    assert write_fleet_report(lake, _config(), Pages(tmp_path / "out" / "fleet.html")) == pages
     assert {p: p.stat().st_mtime_ns for p in pages[1:]} == before
     changed = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="b", day="2026-03-01")
     again = [replace(r, work_key="again", recorded_at="", asserted_at="") for r in changed]
     commit_records(lake, CALIBRATIONS, again)
     pages[2].unlink()
-    write_fleet_report(lake, _config(), tmp_path / "out" / "fleet.html")
-    drawn = {p.name for p in pages[1:] if p.stat().st_mtime_ns != before[p]}
-    assert drawn == {"b_2026-03-01.html", pages[2].name}
+    write_fleet_report(lake, _config(), Pages(tmp_path / "out" / "fleet.html"))
+    drawn = {p for p in pages[1:] if p.stat().st_mtime_ns != before[p]}
+    assert drawn == {tmp_path / "out" / "fleet_days" / "2026-03-01" / "b.html", pages[2]}
 
 
 def test_vehicles_whose_names_look_alike_have_pages_of_their_own(tmp_path: Path, maker: ModuleType) -> None:
     lake, rng = Lake.at(tmp_path / "lake"), np.random.default_rng(8)
     for vehicle in ("a b", "a_b", "ä b"):
         _store(lake, maker.vehicle_records(vehicle, 1, rng))
-    pages = write_fleet_report(lake, _config(), tmp_path / "fleet.html")
+    pages = write_fleet_report(lake, _config(), Pages(tmp_path / "fleet.html"))
     assert len(set(pages)) == len(pages) == 4
     titles = {
         vehicle for vehicle in ("a b", "a_b", "ä b") for p in pages[1:] if f"{vehicle}" in p.read_text()

@@ -62,7 +62,9 @@ def test_terminal_page_and_show_say_of_every_vehicle_what_the_table_says(
     lake: Lake, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
-    in_table = dict(re.findall(r'<tr><td>(\w+)</td><td class="status (\w+)">', page))
+    in_table = dict(
+        re.findall(r'<tr><td><a href="#charts-\w+">(\w+)</a></td><td class="status (\w+)">', page)
+    )
     on_charts = dict(re.findall(r'id="charts-(\w+)".*?<span class="pill (\w+)">', page))
     rows = [f for own in stored(lake).values() for f in own]
     on_terminal = {

@@ -91,8 +91,8 @@ def test_the_command_takes_images_and_pages_and_says_how_much(lake, capsys):
     today = dt.datetime.now(dt.UTC).date()
     recent = first_day_kept(today, 30)
     pages = lake.root / "report" / "fleet_days"
-    pages.mkdir(parents=True)
-    for name in ("car_2026-03-02.html", f"car_{recent}.html", "index.html"):
+    for name in ("2026-03-02/car.html", f"{recent}/car.html", "index.html", "car_2026-03-02.html"):
+        (pages / name).parent.mkdir(parents=True, exist_ok=True)
         (pages / name).touch()
     assert gc(lake=str(lake.root), dry_run=True) == 0
     planned = json.loads(capsys.readouterr().out)
@@ -102,9 +102,9 @@ def test_the_command_takes_images_and_pages_and_says_how_much(lake, capsys):
     assert {k: planned[k] for k in ("partitions", "freed_bytes", "pages")} == {
         k: done[k] for k in ("partitions", "freed_bytes", "pages")
     }
-    assert (done["partitions"], done["pages"]) == ({"frames": 2}, 1)
+    assert (done["partitions"], done["pages"]) == ({"frames": 2}, 2)
     assert done["freed_bytes"] > 0
-    assert sorted(p.name for p in pages.iterdir()) == [f"car_{recent}.html", "index.html"]
+    assert sorted(p for p in pages.rglob("*.html")) == [pages / recent / "car.html", pages / "index.html"]
     assert gc(lake=str(lake.root), observations_days=1) == 0
     assert json.loads(capsys.readouterr().out)["partitions"] == {"frames": 0, "observations": 2}
     with pytest.raises(ConfigError, match="images-days"):

@@ -1,0 +1,114 @@
+"""The numbers of a fleet's control charts, which the page draws when somebody looks at a vehicle.
+
+Ten thousand vehicles have 180,000 charts: drawn, they are hundreds of megabytes that nobody opens; as numbers they are
+some ten kilobytes per vehicle, in files that hold a few dozen vehicles each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.geometry.changes import change_between
+from pipeline.report.verdicts import ChartVerdicts, FleetVerdicts
+from pipeline.report.window import FleetWindow
+from schemas.calibrations import DOF_NAMES, PAIRS
+
+__all__ = ["fleet_charts"]
+
+# Of a value as the page gets it: 1e-4 deg and 0.1 mm are a hundredth of the smallest sigma of a day.
+_PER_UNIT = 1e4
+_STATUS_LETTERS = "ahr"  # of schemas.calibrations.STATUSES
+_DOFS = len(DOF_NAMES)
+
+
+def fleet_charts(window: FleetWindow, verdicts: FleetVerdicts) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every audited vehicle with its charts, for `templates/fleet.js`.
+
+    A chart is [pair, dof, status, limit, start, values, sigmas]: places in PAIRS, DOF_NAMES and DRIFT_STATUSES; the
+    limit, and per day value and sigma, in 1e-4 deg or 1e-4 m, null where the day does not say; the start as days of the
+    calendar (first, earliest, latest), null where nothing changed. Values are relative to the level before the change.
+    `days` are ordinals of the calendar; `pairs` has a letter per pair and day: accepted, held, refused, "." none.
+    """
+    first = _spans(window.owner, len(window.vehicles))
+    of_chart = _spans(verdicts.charts.owner, len(verdicts.vehicles))
+    place = {vehicle: v for v, vehicle in enumerate(window.vehicles)}
+    values = _values(window, verdicts)
+    for c, vehicle in enumerate(verdicts.vehicles):
+        v = place.get(vehicle)
+        if v is not None:
+            rows, charts = slice(*first[v : v + 2]), slice(*of_chart[c : c + 2])
+            yield vehicle, _vehicle(window, verdicts.charts, values, rows, charts)
+
+
+def _vehicle(
+    window: FleetWindow, verdicts: ChartVerdicts, values: Float[np.ndarray, "N 6"], rows: slice, charts: slice
+) -> dict[str, Any]:
+    days, column = np.unique(window.day[rows], return_inverse=True)
+    pair = window.pair[rows]
+    letters = np.full((len(PAIRS), len(days)), ".")
+    letters[pair, column] = np.array(list(_STATUS_LETTERS))[window.status[rows]]
+    scale = np.repeat([np.degrees(_PER_UNIT), _PER_UNIT], 3)
+    grid = np.full((2, len(PAIRS), len(days), _DOFS), np.nan)
+    grid[0, pair, column] = values[rows] * scale
+    grid[1, pair, column] = window.sigma[rows] * scale
+    seen = np.isfinite(grid).all(axis=0)
+    told = np.round(np.where(seen, grid, 0.0)).astype(np.int64).astype(object)
+    told[:, ~seen] = None
+    listed = []
+    for k in range(charts.start, charts.stop):
+        p, dof = int(verdicts.pair[k]), int(verdicts.dof[k])
+        value, sigma = told[:, p, :, dof].tolist()
+        start = verdicts.start[k].tolist()
+        limit = round(float(verdicts.limit[k] * scale[dof]))
+        listed.append([p, dof, int(verdicts.status[k]), limit, start if start[0] else None, value, sigma])
+    return {"days": days.tolist(), "pairs": ["".join(row) for row in letters], "charts": listed}
+
+
+def _values(window: FleetWindow, verdicts: FleetVerdicts) -> Float[np.ndarray, "N 6"]:
+    """Changes [rad, m] of every record from its pair's level before the change; not finite where it does not say."""
+    seen = np.isfinite(window.sigma) & window.observable
+    group = window.owner * len(PAIRS) + window.pair
+    origin = _first_of_each(group, seen.any(axis=1))[group]
+    change = np.full(seen.shape, np.nan)
+    there = origin >= 0
+    change[there] = change_between(window.T[origin[there]], window.T[there])
+    change[~seen] = np.nan
+    start = _starts(window, verdicts)[group]
+    weight = np.where(seen & (window.day[:, None] < start), window.sigma, np.inf) ** -2.0
+    groups = int(group.max(initial=-1)) + 1
+    level = np.zeros((groups, _DOFS))
+    for k in range(_DOFS):
+        total = np.bincount(group, weight[:, k], groups)
+        moment = np.bincount(group, weight[:, k] * np.where(seen[:, k], change[:, k], 0.0), groups)
+        level[:, k] = np.divide(moment, total, out=np.zeros(groups), where=total > 0)
+    return change - level[group]
+
+
+def _starts(window: FleetWindow, verdicts: FleetVerdicts) -> Int[np.ndarray, "G 6"]:
+    """First day with the new value per vehicle and pair, and DoF; far in the future where nothing changed."""
+    starts = np.full((len(window.vehicles) * len(PAIRS), _DOFS), np.iinfo(np.int64).max)
+    place = {vehicle: v for v, vehicle in enumerate(window.vehicles)}
+    own = np.array([place.get(vehicle, -1) for vehicle in verdicts.vehicles], np.int64)
+    charts = verdicts.charts
+    owner = own[charts.owner] if len(own) else charts.owner
+    changed = (owner >= 0) & (charts.start[:, 0] > 0)
+    rows = owner[changed] * len(PAIRS) + charts.pair[changed]
+    starts[rows, charts.dof[changed]] = charts.start[changed, 0]
+    return starts
+
+
+def _first_of_each(group: Int[np.ndarray, " N"], usable: Bool[np.ndarray, " N"]) -> Int[np.ndarray, " G"]:
+    """The first usable row of each group, -1 where it has none; rows of a group are in order of day."""
+    first = np.full(int(group.max(initial=-1)) + 1, -1)
+    rows = np.flatnonzero(usable)[::-1]
+    first[group[rows]] = rows
+    return first
+
+
+def _spans(owner: Int[np.ndarray, " N"], count: int) -> list[int]:
+    """Where each owner's rows begin, and where the last one's end; rows are in order of owner."""
+    return [int(i) for i in np.searchsorted(owner, np.arange(count + 1))]

@@ -1,0 +1,217 @@
+"""The page of one vehicle-day, and its richest frame as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any, TypeVar
+
+from pipeline.config import FleetConfig
+from pipeline.errors import ConfigError, DamagedError
+from pipeline.report.day import PairView, answer_for, pair_view, sigmas_of, status_sentence
+from pipeline.report.figures import residual_figure, sigma_figure
+from pipeline.report.in_use import InUseView
+from pipeline.report.overlays import Extrinsics
+from pipeline.report.page import render, write_page
+from pipeline.report.picture_file import write_picture
+from pipeline.report.pictures import scene_pictures
+from pipeline.report.reading import (
+    day_records,
+    drift_of,
+    has_frames,
+    scenes_among,
+    spread_observations,
+    states_of,
+)
+from pipeline.report.residuals import frame_residuals
+from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
+from pipeline.store.files import Files, LocalFiles
+from pipeline.store.partitions import Lake, Partition
+from schemas.calibrations import PAIRS, CalibrationRecord
+from schemas.drift import DriftFinding
+
+__all__ = ["DayRead", "write_day_page", "write_day_picture"]
+
+_SCENES = 3
+P = TypeVar("P", bound=PurePath)
+
+
+@dataclass(frozen=True)
+class DayRead:
+    """What the page of a vehicle-day tells: its current records by pair, and the vehicle's current findings."""
+
+    records: Mapping[str, CalibrationRecord]
+    findings: Sequence[DriftFinding]
+
+
+def write_day_page(
+    lake: Lake,
+    partition: Partition,
+    fleet: FleetConfig,
+    out: P,
+    method: str | None = None,
+    *,
+    fleet_link: str = "",
+    pictures: bool = True,
+    read: DayRead | None = None,
+    in_use: InUseView | None = None,
+    files: Files | None = None,
+) -> P:
+    """Write the page of one vehicle-day.
+
+    Args:
+        lake: holds calibrations; observations and frames where there shall be pictures.
+        partition: the vehicle-day.
+        fleet: names the fleet and the default method.
+        out: the HTML file.
+        method: None = `fleet.audit.method`.
+        fleet_link: relative link to the fleet page; empty = none.
+        pictures: False = none, and none of what is drawn from frames.
+        read: the day's records and the vehicle's findings, where the caller has read them; None = read here.
+        in_use: what `boresight verify` found: the page then answers its question first.
+        files: where `out` is; None = this machine.
+
+    Raises:
+        ConfigError: the day has no record of the method.
+    """
+    method = method or fleet.audit.method
+    if read is None:
+        read = DayRead(day_records(lake, partition, method), drift_of(lake, method, partition.vehicle))
+    records, findings = read.records, read.findings
+    views = [pair_view(records[p]) for p in PAIRS if p in records]
+    before, after = states_of(records) or (None, None)
+    labels = ("prior", _after_label(views))
+    offsets = time_offsets_of(records)
+    drawn, residual_svg, no_pictures = (
+        _pictures(lake, partition, before, after, labels, offsets)
+        if pictures
+        else ([], "", "this page was asked for without pictures")
+    )
+    html = render(
+        "day.html" if in_use is None else "in_use.html",
+        in_use=in_use,
+        vehicle=partition.vehicle,
+        day=partition.day,
+        fleet=fleet.fleet.name,
+        fleet_link=fleet_link,
+        method=method,
+        environment=next(iter(records.values())).environment,
+        answer=answer_for(views, partition.day, findings),
+        drift=_as_of(findings),
+        pairs=views,
+        labels=labels,
+        scenes=drawn,
+        no_pictures=no_pictures,
+        offsets=offsets.in_words(),
+        sigma_svg=_sigma_svg(records),
+        residual_svg=residual_svg,
+        provenance=_provenance(list(records.values())),
+    )
+    return write_page(out, html, files or LocalFiles())
+
+
+def write_day_picture(
+    lake: Lake, partition: Partition, fleet: FleetConfig, out: Path, method: str | None = None
+) -> Path:
+    """Write the day's richest frame as a picture: a still of prior and result, or one that moves between them.
+
+    Args:
+        lake: holds calibrations, observations and frames.
+        partition: the vehicle-day.
+        fleet: names the default method.
+        out: .jpg or .png: still; .webp (smaller) or .gif: moving.
+        method: None = `fleet.audit.method`.
+
+    Raises:
+        ConfigError: the day has no record of the method, nothing to draw, or `out` has another suffix.
+    """
+    records = day_records(lake, partition, method or fleet.audit.method)
+    states = states_of(records)
+    spread = spread_observations(lake, partition) if has_frames(lake, partition) else []
+    if states is None or not spread:
+        problem = f"{partition.vehicle} has no frame with a prior on {partition.day}"
+        raise ConfigError("command line", "picture", problem)
+    before, after = states
+    scene = scenes_among(lake, partition, spread, after.T_camera_lidar, 1)[0]
+    stamped = as_stamped(after, scene.observation, time_offsets_of(records))
+    labels = ("prior", _after_label([pair_view(r) for r in records.values()]))
+    return write_picture(out, scene, before, stamped, labels)
+
+
+def _as_of(findings: Sequence[DriftFinding]) -> tuple[str, str]:
+    """The vehicle's status, and the audit that said so: pages of days are not drawn anew for every audit."""
+    status, sentence = status_sentence(findings)
+    return status, f"{sentence} (Audit until {findings[0].day}.)" if findings else sentence
+
+
+def _after_label(views: Sequence[PairView]) -> str:
+    statuses = {v.status for v in views}
+    if statuses == {"accepted"}:
+        return "calibrated"
+    return "result, partly held" if "accepted" in statuses else "result, held"
+
+
+def _pictures(
+    lake: Lake,
+    partition: Partition,
+    before: Extrinsics | None,
+    after: Extrinsics | None,
+    labels: tuple[str, str],
+    offsets: TimeOffsets,
+) -> tuple[list[Any], Any, str]:
+    """Pictures, residuals, and why there are none; `after` is drawn with the day's time offsets, `before` had none."""
+    if before is None or after is None:
+        return [], "", "the records carry no prior"
+    try:
+        return _drawn(lake, partition, before, after, labels, offsets)
+    except DamagedError as err:
+        lake.damage.append(str(err))
+        return [], "", "the day's frames or observations cannot be read"
+
+
+def _drawn(
+    lake: Lake,
+    partition: Partition,
+    before: Extrinsics,
+    after: Extrinsics,
+    labels: tuple[str, str],
+    offsets: TimeOffsets,
+) -> tuple[list[Any], Any, str]:
+    """Pictures, residuals, and why there are none.
+
+    Raises:
+        DamagedError: a file cannot be read.
+    """
+    if not has_frames(lake, partition):
+        return [], "", "the lake no longer has the day's frames and observations"
+    spread = spread_observations(lake, partition)
+    if not spread:
+        return [], "", "no frame of the day could be used"
+    residuals = residual_figure(*frame_residuals(spread, (before, after), (TimeOffsets(), offsets)))
+    scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, _SCENES)
+    pictures = [
+        scene_pictures([s], before, as_stamped(after, s.observation, offsets), labels)[0] for s in scenes
+    ]
+    return pictures, residuals, "no frame of the day could be drawn"
+
+
+def _sigma_svg(records: Mapping[str, CalibrationRecord]) -> str:
+    prior, sigma, observable = {}, {}, {}
+    for pair, record in records.items():
+        before, after = sigmas_of(record)
+        if before is not None:
+            prior[pair] = before
+        if after is not None:
+            sigma[pair] = after
+            observable[pair] = record.observable or [True] * 6
+    return sigma_figure(prior, sigma, observable)
+
+
+def _provenance(records: Sequence[CalibrationRecord]) -> list[tuple[str, str]]:
+    return [
+        ("work keys", ", ".join(sorted({r.work_key for r in records}))),
+        ("code version", ", ".join(sorted({r.code_version for r in records}))),
+        ("seed", ", ".join(sorted({str(r.seed) for r in records}))),
+        ("inputs", ", ".join(sorted({i for r in records for i in r.inputs}))),
+    ]

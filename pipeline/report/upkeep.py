@@ -1,0 +1,206 @@
+"""Pages of vehicle-days kept up to date: which are to be drawn, and drawing them, here or by workers."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import PurePath
+from typing import Any, Protocol, overload, runtime_checkable
+from urllib.parse import quote
+
+from pipeline.config import FleetConfig, config_hash
+from pipeline.report.day_page import DayRead, write_day_page
+from pipeline.report.names import page_name
+from pipeline.report.reading import records_of_day
+from pipeline.results import Progress, silent
+from pipeline.store.files import Files
+from pipeline.store.partitions import Lake, Partition
+from schemas.calibrations import CalibrationRecord
+from schemas.drift import DriftFinding, status_of
+from schemas.versions import CODE_VERSION
+
+__all__ = ["Album", "DayJob", "FanOut", "draw_days", "one_by_one", "stamp_of"]
+
+_DRAWN = "drawn.json"  # of each day's folder: what its pages were drawn from, by file name
+
+
+@runtime_checkable
+class FanOut(Protocol):
+    """Runs a function on many items, wherever; ends of items come in any order."""
+
+    def __call__(
+        self, function: Callable[[Any, Progress], Any], items: Sequence[Any], progress: Progress
+    ) -> Iterator[tuple[Any, Any, str]]:
+        """Yield (item, value, error): value or error of each item."""
+        ...
+
+
+def one_by_one(
+    function: Callable[[Any, Progress], Any], items: Sequence[Any], progress: Progress
+) -> Iterator[tuple[Any, Any, str]]:
+    """In this process; an error ends it."""
+    for done, item in enumerate(items):
+        progress(done, len(items), str(item))
+        yield item, function(item, silent), ""
+
+
+@dataclass(frozen=True)
+class Album:
+    """The pages of a report's vehicle-days: `LAKE/report/fleet_days/2026-03-01/car-1.html`.
+
+    Args:
+        lake: what they are drawn from.
+        fleet: names the fleet.
+        method: of the records.
+        page: the fleet page beside whose folder they lie.
+        files: where it is.
+        pictures: False = pages without images of public roads.
+    """
+
+    lake: Lake
+    fleet: FleetConfig
+    method: str
+    page: PurePath
+    files: Files
+    pictures: bool = True
+
+    @property
+    def folder(self) -> PurePath:
+        """Where the pages are."""
+        return self.page.parent / f"{self.page.stem}_days"
+
+    def path(self, vehicle: str, day: str) -> PurePath:
+        """A vehicle-day's page."""
+        return self.folder / page_name(vehicle, day)
+
+
+@dataclass(frozen=True)
+class DayJob:
+    """A page to draw: all that a worker needs to know."""
+
+    album: Album
+    partition: Partition
+    read: DayRead = field(repr=False)
+
+    def __str__(self) -> str:
+        return f"{self.partition.vehicle} {self.partition.day}"
+
+
+def draw_days(
+    album: Album,
+    stamps: Mapping[tuple[str, str], str],
+    findings: Mapping[str, Sequence[DriftFinding]],
+    fan_out: FanOut,
+    progress: Progress,
+) -> dict[tuple[str, str], PurePath]:
+    """Draw the pages that are not there or were drawn from something else; returns all that are there then.
+
+    What could not be drawn is named in `lake.damage`.
+
+    Args:
+        album: the pages.
+        stamps: what each vehicle-day's page would be drawn from (`stamp_of`).
+        findings: of the last audit, by vehicle.
+        fan_out: where drawing is done.
+        progress: told how far it is.
+    """
+    by_day: dict[str, dict[str, str]] = {}
+    for (vehicle, day), stamp in stamps.items():
+        by_day.setdefault(day, {})[vehicle] = stamp
+    drawn = {day: _drawn(album, day) for day in by_day}
+    stale = [
+        (vehicle, day)
+        for day, vehicles in sorted(by_day.items())
+        for vehicle, stamp in sorted(vehicles.items())
+        if drawn[day].get(album.path(vehicle, day).name) != stamp
+    ]
+    open_pages = Counter(day for _, day in stale)
+    jobs = _Jobs(album, stale, findings)
+    for job, found, error in fan_out(_draw, jobs, progress):
+        vehicle, day = job.partition.vehicle, job.partition.day
+        album.lake.damage.extend([f"page of {job}: {error}"] if error else found)
+        if not error and job.read.records:
+            drawn[day][album.path(vehicle, day).name] = stamps[vehicle, day]
+        open_pages[day] -= 1
+        if not open_pages[day]:  # a killed night draws the day's pages once more
+            with album.files.replacing(album.folder / day / _DRAWN) as stream:
+                stream.write(json.dumps(drawn[day], sort_keys=True).encode())
+    there = {(v, day): album.path(v, day) for v, day in sorted(stamps)}
+    return {of: path for of, path in there.items() if path.name in drawn[of[1]]}
+
+
+def stamp_of(album: Album, work_keys: Iterable[str], findings: Sequence[DriftFinding]) -> str:
+    """What a day's page is drawn from: it is drawn again where that changed.
+
+    A sensor that moved is among it, since it makes the numbers of days before unsafe; what else an audit says of the
+    vehicle changes nightly and is on the fleet page.
+    """
+    stored = status_of(findings)
+    moved = [stored.sensor, stored.since] if stored.status == "RED" else None
+    settings = {"pictures": album.pictures, "link": album.page.name, "code": CODE_VERSION}
+    return config_hash({"keys": sorted(work_keys), "moved": moved, **settings})
+
+
+def _drawn(album: Album, day: str) -> dict[str, str]:
+    """What the day's pages were drawn from, as far as they are there."""
+    folder = album.folder / day
+    known: dict[str, str] = {}
+    with suppress(OSError, ValueError), album.files.opened(folder / _DRAWN) as stream:
+        known = json.loads(stream.read())
+    there = {path.name for path in album.files.find(folder, "*.html")} if known else set()
+    return {name: stamp for name, stamp in known.items() if name in there}
+
+
+def _draw(job: DayJob, progress: Progress) -> list[str]:
+    """Draw one page; returns what could not be read for it."""
+    progress(0, 1, str(job))
+    album = job.album
+    if not job.read.records:  # its file went bad meanwhile: whoever read it has said so
+        return []
+    link = f"../../{quote(album.page.name)}"
+    path = album.path(job.partition.vehicle, job.partition.day)
+    before = len(album.lake.damage)
+    write_day_page(
+        album.lake, job.partition, album.fleet, path, album.method,
+        fleet_link=link, pictures=album.pictures, read=job.read, files=album.files,
+    )  # fmt: skip
+    found = album.lake.damage[before:]
+    del album.lake.damage[before:]
+    return found
+
+
+class _Jobs(Sequence[DayJob]):
+    """Pages to draw, each put together when its turn comes; records are read a day at a time."""
+
+    def __init__(
+        self,
+        album: Album,
+        vehicle_days: Sequence[tuple[str, str]],
+        findings: Mapping[str, Sequence[DriftFinding]],
+    ) -> None:
+        # A worker is sent no vehicle's configuration: a page needs the fleet's name.
+        fleet = album.fleet.model_copy(update={"vehicles": {}, "rigs": {}})
+        self._album = Album(album.lake, fleet, album.method, album.page, album.files, album.pictures)
+        self._days, self._findings = vehicle_days, findings
+        self._records = lru_cache(maxsize=2)(self._read)  # workers end a day while others begin the next
+
+    def _read(self, day: str) -> dict[str, dict[str, CalibrationRecord]]:
+        return records_of_day(self._album.lake, self._album.method, day)
+
+    def __len__(self) -> int:
+        return len(self._days)
+
+    @overload
+    def __getitem__(self, index: int) -> DayJob: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[DayJob]: ...
+    def __getitem__(self, index: int | slice) -> DayJob | list[DayJob]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        vehicle, day = self._days[index]
+        read = DayRead(self._records(day).get(vehicle, {}), self._findings.get(vehicle, ()))
+        return DayJob(self._album, Partition(vehicle, day), read)

@@ -1,0 +1,138 @@
+"""What the last audit said of a whole fleet, as columns; whole rows only of the vehicles where something changed."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Float, Int
+
+from pipeline.store.current import current_rows
+from pipeline.store.partitions import Lake
+from pipeline.store.records import last_day, read_columns
+from pipeline.store.rows import from_table
+from schemas.calibrations import DOF_NAMES, PAIRS
+from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding
+
+__all__ = ["ChartVerdicts", "FleetVerdicts", "read_verdicts"]
+
+# `inputs` is most of a row and says nothing that a page shows.
+_COLUMNS = tuple(c.name for c in DRIFT.columns if c.name not in {"inputs", "recorded_at"})
+_AUDIT_DAYS = 61  # whose findings are older is audited no more: it left fleet.toml, or nobody audits
+_ALARMS = ("RED", "YELLOW")
+
+
+@dataclass(frozen=True, eq=False)
+class ChartVerdicts:
+    """Charts in order of vehicle; start days are ordinals of the calendar, 0 where nothing changed.
+
+    Args:
+        owner: place in `FleetVerdicts.vehicles`.
+        pair: place in PAIRS.
+        dof: place in DOF_NAMES.
+        status: place in DRIFT_STATUSES.
+        limit: size of a change that matters [rad or m].
+        start: first day with the new value, its earliest and its latest.
+    """
+
+    owner: Int[np.ndarray, " N"]
+    pair: Int[np.ndarray, " N"]
+    dof: Int[np.ndarray, " N"]
+    status: Int[np.ndarray, " N"]
+    limit: Float[np.ndarray, " N"]
+    start: Int[np.ndarray, "N 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class FleetVerdicts:
+    """Findings of every vehicle's last audit.
+
+    Args:
+        vehicles: audited ones, in order of name.
+        findings: by vehicle: all of its findings where something changed, else one, which has the vehicle's status.
+        charts: all of them.
+        audited: days that the audits ended with.
+        work_keys: of the audits.
+    """
+
+    vehicles: list[str]
+    findings: Mapping[str, Sequence[DriftFinding]]
+    charts: ChartVerdicts
+    audited: list[str] = field(default_factory=list)
+    work_keys: list[str] = field(default_factory=list)
+
+
+def read_verdicts(lake: Lake, method: str, latest: str) -> FleetVerdicts:
+    """The current findings of the last audit that looked at the method; audits look at all vehicles.
+
+    Args:
+        lake: where they are.
+        method: of the audited records.
+        latest: audits of days after it are left out.
+    """
+    last = min(last_day(lake, DRIFT) or "", latest)
+    found = _of_method(lake, method, last, last) if last else None
+    if found is None and last:  # audits of another method are newer, or one was of days to come
+        first = (dt.date.fromisoformat(last) - dt.timedelta(days=_AUDIT_DAYS)).isoformat()
+        found = _of_method(lake, method, first, last)
+        if found is not None:
+            found = found.filter(pc.equal(found["day"], pc.max(found["day"])))
+    if found is None:
+        none = np.zeros(0, np.int64)
+        empty = ChartVerdicts(none, none, none, none, np.zeros(0), np.zeros((0, 3), np.int64))
+        return FleetVerdicts([], {}, empty)
+    found = current_rows(found, DRIFT)
+    names = found["vehicle"].combine_chunks().dictionary_encode()
+    vehicles, owner = names.dictionary.to_pylist(), np.asarray(names.indices).astype(np.int64)
+    return FleetVerdicts(
+        vehicles,
+        _findings(found, owner),
+        _charts(found, owner),
+        sorted(found["day"].unique().to_pylist()),
+        sorted(found["work_key"].unique().to_pylist()),
+    )
+
+
+def _of_method(lake: Lake, method: str, first: str, last: str) -> pa.Table | None:
+    found = read_columns(lake, DRIFT, _COLUMNS, first=first, last=last)
+    if found is not None:
+        found = found.filter(pc.equal(found["method"], method))
+    return found if found is not None and found.num_rows else None
+
+
+def _findings(found: pa.Table, owner: Int[np.ndarray, " N"]) -> dict[str, list[DriftFinding]]:
+    alarmed = np.asarray(pc.is_in(found["vehicle_status"], pa.array(_ALARMS)).combine_chunks())
+    wanted = np.asarray(alarmed, bool) | np.append(True, owner[1:] != owner[:-1])
+    by_vehicle: dict[str, list[DriftFinding]] = {}
+    for finding in from_table(found.filter(pa.array(wanted)), DRIFT, DriftFinding):
+        by_vehicle.setdefault(finding.vehicle, []).append(finding)
+    return by_vehicle
+
+
+def _charts(found: pa.Table, owner: Int[np.ndarray, " N"]) -> ChartVerdicts:
+    names = ("start_day", "start_day_earliest", "start_day_latest")
+    starts = np.stack([_ordinals(found[name]) for name in names], axis=1)
+    return ChartVerdicts(
+        owner,
+        _places(found["pair"], PAIRS),
+        _places(found["dof"], DOF_NAMES),
+        _places(found["status"], DRIFT_STATUSES),
+        found["limit"].to_numpy(),
+        np.where((starts > 0).all(axis=1, keepdims=True), starts, 0),
+    )
+
+
+def _ordinals(days: pa.ChunkedArray) -> Int[np.ndarray, " N"]:
+    coded = pc.fill_null(days, "").combine_chunks().dictionary_encode()
+    known = [dt.date.fromisoformat(day).toordinal() if day else 0 for day in coded.dictionary.to_pylist()]
+    return np.array(known, np.int64)[np.asarray(coded.indices)]
+
+
+def _places(column: pa.ChunkedArray, names: tuple[str, ...]) -> Int[np.ndarray, " N"]:
+    coded = column.combine_chunks().dictionary_encode()
+    place = np.array([names.index(name) for name in coded.dictionary.to_pylist()], np.int64)
+    return place[np.asarray(coded.indices)]

@@ -1,0 +1,187 @@
+"""The last days of a whole fleet as columns: what the fleet page and its charts are made of.
+
+Ten thousand vehicles have a million records in four weeks: as rows they would be gigabytes, as columns they are some
+hundred megabytes.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Bool, Float, Int
+
+from pipeline.geometry.changes import change_covariance
+from pipeline.geometry.se3 import from_quaternion
+from pipeline.store.current import current_rows
+from pipeline.store.partitions import Lake
+from pipeline.store.records import first_day, last_day, read_columns
+from schemas.calibrations import CALIBRATIONS, PAIRS, STATUSES
+
+__all__ = ["FEWEST_DAYS", "FleetWindow", "read_window"]
+
+FEWEST_DAYS = (
+    14  # of a vehicle, however far back they lie: as many as its charts reach back to (audit/days.py)
+)
+_MONTHS_BACK = 4  # and no further, as charts do (audit/history.py)
+_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_COLUMNS = ("status", *_POSE, "covariance", "observable", "code_version")
+
+
+@dataclass(frozen=True, eq=False)
+class FleetWindow:
+    """Current records of a method, in order of vehicle, day and pair.
+
+    Args:
+        vehicles: names, in order.
+        owner: which of them a record is of.
+        day: ordinals of the calendar.
+        pair: places in PAIRS.
+        status: places in STATUSES.
+        T: T_parent_child; not finite where the day was refused.
+        sigma: of (rotation vector [rad], origin [m]); not finite where the day was refused.
+        observable: per DoF, whether the day determined it.
+        work_key: of each record.
+        code_versions: of all of them.
+    """
+
+    vehicles: list[str]
+    owner: Int[np.ndarray, " N"]
+    day: Int[np.ndarray, " N"]
+    pair: Int[np.ndarray, " N"]
+    status: Int[np.ndarray, " N"]
+    T: Float[np.ndarray, "N 4 4"]
+    sigma: Float[np.ndarray, "N 6"]
+    observable: Bool[np.ndarray, "N 6"]
+    work_key: list[str]
+    code_versions: list[str]
+
+    def vehicle_days(self) -> dict[tuple[str, str], list[str]]:
+        """Work keys of every vehicle-day's records, in order of vehicle and day."""
+        found: dict[tuple[str, str], list[str]] = {}
+        name = {day: dt.date.fromordinal(day).isoformat() for day in np.unique(self.day).tolist()}
+        for owner, day, key in zip(self.owner.tolist(), self.day.tolist(), self.work_key, strict=True):
+            found.setdefault((self.vehicles[owner], name[day]), []).append(key)
+        return found
+
+
+def read_window(lake: Lake, method: str, window_days: int, latest: str) -> FleetWindow:
+    """The last `window_days` days that have a record of the method, and of vehicles that drive rarely more.
+
+    Args:
+        lake: where the records are.
+        method: of them.
+        window_days: days of the calendar.
+        latest: days after it are to come, and left out.
+    """
+    last = last_day(lake, CALIBRATIONS)
+    if last is None:
+        return _window_of(None)
+    first = _days_before(min(last, latest), window_days - 1)
+    found = _read(lake, method, first, latest)
+    if found is None:  # another method's records are newer by more than a window, or all of them are to come
+        found = _read(lake, method, None, latest)
+        if found is None:
+            return _window_of(None)
+        first = _days_before(pc.max(found["day"]).as_py(), window_days - 1)
+        found = found.filter(pc.greater_equal(found["day"], first))
+    parts, begun = [found], first_day(lake, CALIBRATIONS) or first
+    for month, end in _months_before(first):
+        rare = _rare(parts)
+        if not rare or end < begun:
+            break
+        more = _read(lake, method, month, end, rare)
+        parts += [] if more is None else [more]
+    return _window_of(pa.concat_tables(parts))
+
+
+def _read(
+    lake: Lake, method: str, first: str | None, last: str | None, vehicles: Collection[str] | None = None
+) -> pa.Table | None:
+    found = read_columns(lake, CALIBRATIONS, _COLUMNS, first=first, last=last)
+    if found is None:
+        return None
+    chosen = pc.equal(found["method"], method)
+    if vehicles is not None:
+        chosen = pc.and_(chosen, pc.is_in(found["vehicle"], pa.array(sorted(vehicles))))
+    found = found.filter(chosen)
+    return found if found.num_rows else None
+
+
+def _rare(parts: list[pa.Table]) -> list[str]:
+    """Vehicles of whose days there are too few."""
+    keys = pa.concat_tables([part.select(["vehicle", "day"]) for part in parts])
+    days = keys.group_by(["vehicle"]).aggregate([("day", "count_distinct")])
+    few: list[str] = days.filter(pc.less(days["day_count_distinct"], FEWEST_DAYS))["vehicle"].to_pylist()
+    return few
+
+
+def _window_of(table: pa.Table | None) -> FleetWindow:
+    if table is None:
+        none = np.zeros(0, np.int64)
+        T, sigma = np.zeros((0, 4, 4)), np.zeros((0, 6))
+        return FleetWindow([], none, none, none, none, T, sigma, np.zeros((0, 6), bool), [], [])
+    found = current_rows(table, CALIBRATIONS)
+    names = found["vehicle"].combine_chunks().dictionary_encode()
+    days = found["day"].combine_chunks().dictionary_encode()
+    ordinals = np.array([dt.date.fromisoformat(day).toordinal() for day in days.dictionary.to_pylist()])
+    T, sigma = _estimates(found)
+    return FleetWindow(
+        names.dictionary.to_pylist(),  # rows are in order of vehicle, and so is what they are first met in
+        np.asarray(names.indices).astype(np.int64),
+        ordinals[np.asarray(days.indices)],
+        _places(found["pair"], PAIRS),
+        _places(found["status"], STATUSES),
+        T,
+        sigma,
+        _observable(found["observable"]),
+        found["work_key"].to_pylist(),
+        sorted(set(found["code_version"].unique().to_pylist())),
+    )
+
+
+def _estimates(found: pa.Table) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "N 6"]]:
+    """Poses and the sigmas of what a mechanic can measure; not finite where a record has none."""
+    pose = np.stack([found[name].to_numpy() for name in _POSE], axis=1)
+    covariance = found["covariance"].combine_chunks()
+    there = np.isfinite(pose).all(axis=1) & np.asarray(covariance.is_valid())
+    T, sigma = np.full((len(pose), 4, 4), np.nan), np.full((len(pose), 6), np.nan)
+    if there.any():
+        T[there] = from_quaternion(pose[there, :4], pose[there, 4:])
+        blobs = covariance.filter(pa.array(there)).to_pylist()
+        of_change = change_covariance(T[there], np.frombuffer(b"".join(blobs), "<f8").reshape(-1, 6, 6))
+        sigma[there] = np.sqrt(np.maximum(np.diagonal(of_change, axis1=1, axis2=2), 0.0))
+    return T, sigma
+
+
+def _observable(column: pa.ChunkedArray) -> Bool[np.ndarray, "N 6"]:
+    """Per DoF; a record that does not say has determined them all."""
+    values = column.combine_chunks()
+    seen = np.ones((len(values), 6), bool)
+    said = np.asarray(values.is_valid()) & (pc.list_value_length(values).fill_null(0).to_numpy() == 6)
+    if said.any():
+        flat = values.filter(pa.array(said)).flatten()
+        seen[said] = np.asarray(flat.to_numpy(zero_copy_only=False)).astype(bool).reshape(-1, 6)
+    return seen
+
+
+def _places(column: pa.ChunkedArray, names: tuple[str, ...]) -> Int[np.ndarray, " N"]:
+    coded = column.combine_chunks().dictionary_encode()
+    place = np.array([names.index(name) for name in coded.dictionary.to_pylist()], np.int64)
+    return place[np.asarray(coded.indices)]
+
+
+def _months_before(day: str) -> Iterator[tuple[str, str]]:
+    """First and last day of what lies before a day, by month, the latest first."""
+    end = dt.date.fromisoformat(day) - dt.timedelta(days=1)
+    for _ in range(_MONTHS_BACK):
+        yield end.replace(day=1).isoformat(), end.isoformat()
+        end = end.replace(day=1) - dt.timedelta(days=1)
+
+
+def _days_before(day: str, days: int) -> str:
+    return (dt.date.fromisoformat(day) - dt.timedelta(days=days)).isoformat()
