@@ -56,8 +56,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "gc": ("jobs.gc:gc", "Take images, and pages that show them, out of a lake after their time."),
     "export": (
         "jobs.export:export",
-        "Write the tables' contracts as JSON Schema, or a trained network as ONNX.",
+        "Write a calibration for ROS 2, Autoware, KITTI, ...; the tables' JSON Schema; a network as ONNX.",
     ),
+    "import": ("jobs.import_prior:import_prior", "Calibration files of other programs to a prior file."),
     "migrate": ("jobs.migrate:migrate", "A lake of an older release to the tables of this one."),
     "simulate": ("jobs.simulate:simulate", "Logs of a synthetic fleet, its truth in a file of its own."),
     "evaluate": ("jobs.evaluate:evaluate", "Compare records with a known truth or a reflector recording."),

@@ -1,21 +1,54 @@
-"""`boresight export`: the tables' contracts as JSON Schema, or a trained network as ONNX."""
+"""`boresight export`: a calibration for the car; the tables' contracts as JSON Schema; a trained network as ONNX."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+from jobs.frame_options import FrameOptions
+
+if TYPE_CHECKING:
+    from pipeline.export.calibration import ExportedCalibration
 
 __all__ = ["export"]
 
+What = Literal[
+    "schemas", "onnx", "ros2", "tf-static", "urdf", "xacro", "autoware", "kitti", "nuscenes", "t4", "kalibr", "opencv",
+    "apollo", "openlabel", "matlab",
+]  # fmt: skip
+
 
 def export(
-    what: Literal["schemas", "onnx"], *, out: Path, run: Path | None = None, notes: Path | None = None
+    what: What,
+    *,
+    out: Path,
+    lake: str | None = None,
+    vehicle: str | None = None,
+    day: str | None = None,
+    method: str = "joint",
+    force: bool = False,
+    mount: str | None = None,
+    frames: FrameOptions | None = None,
+    run: Path | None = None,
+    notes: Path | None = None,
 ) -> int:
-    """Write what others read without Boresight.
+    """Write what others read without Boresight: a calibration in one of many formats, schemas, or a network.
+
+    A calibration is a vehicle's state, or with --day that day's records. Pairs that are held or refused are left out.
+    Exit code 3 where not all of it is accepted and certified; the file and the summary say what.
 
     Args:
-        what: "schemas", one JSON Schema (2020-12) of a row per table; or "onnx", a trained network with its card.
-        out: folder to write schemas into, made where it is missing; or the .onnx file, its card beside it.
+        what: format of a calibration; or "schemas", one JSON Schema (2020-12) of a row per table; or "onnx", a trained
+            network with its card.
+        out: folder, made where it is missing; or the file, of a format that is one.
+        lake: folder of the tables.
+        vehicle: whose calibration.
+        day: YYYY-MM-DD: this day's records; default: the vehicle's state.
+        method: of the calibration.
+        force: write held pairs too, marked as such; the exit code stays 3.
+        mount: FORMAT:FILE that says where the lidar sits on the car (frames --base-frame and --lidar-frame), as
+            tf-static:log.mcap; default: the lidar is the root of the tree.
+        frames: names of the frames.
         run: folder of `boresight train`; needed for "onnx".
         notes: JSON object for the card: what was measured, what the data was.
     """
@@ -26,9 +59,51 @@ def export(
 
         print_summary("export", "done", what=what, outputs=write_json_schemas(out))
         return 0
-    paths = _export_onnx(out, run, notes)
-    print_summary("export", "done", what=what, outputs=paths, bytes=out.stat().st_size)
-    return 0
+    if what == "onnx":
+        paths = _export_onnx(out, run, notes)
+        print_summary("export", "done", what=what, outputs=paths, bytes=out.stat().st_size)
+        return 0
+    calibration = _calibration(lake, vehicle, day, method, force, mount, frames or FrameOptions())
+    return _export_calibration(what, out, calibration)
+
+
+def _calibration(
+    lake: str | None,
+    vehicle: str | None,
+    day: str | None,
+    method: str,
+    force: bool,
+    mount: str | None,
+    frames: FrameOptions,
+) -> ExportedCalibration:
+    from jobs.calibration_sources import mounting, read_calibration
+    from pipeline.errors import ConfigError
+
+    if lake is None or vehicle is None:
+        raise ConfigError("command line", "lake, vehicle", "a calibration needs --lake and --vehicle")
+    names = frames.names()
+    T_base_lidar = None if mount is None else mounting(mount, names)
+    return read_calibration(lake, vehicle, day, method, force=force, names=names, T_base_lidar=T_base_lidar)
+
+
+def _export_calibration(what: str, out: Path, calibration: ExportedCalibration) -> int:
+    from jobs.terminal.logging import logger
+    from jobs.terminal.summary import print_summary
+    from pipeline.export.files import write_files, written_files
+    from pipeline.export.formats import format_named
+    from pipeline.export.provenance import not_certified, warnings_of
+    from pipeline.export.tree import ESTIMATED_PAIRS
+
+    doubts = not_certified(calibration)
+    for words in warnings_of(calibration):
+        logger().warning(words, vehicle=calibration.vehicle, source=calibration.source)
+    written = [pair for pair in ESTIMATED_PAIRS if pair in calibration.pairs]
+    files = written_files(format_named(what), calibration, out) if written else {}
+    write_files(files)
+    status = ("held" if doubts else "done") if written else "refused"
+    told = {"vehicle": calibration.vehicle, "source": calibration.source, "pairs": written}
+    print_summary("export", status, what=what, **told, not_certified=doubts, outputs=list(files))
+    return 3 if doubts or not written else 0
 
 
 def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:

@@ -16,7 +16,7 @@ from jobs.cli import COMMANDS
 REPO = Path(__file__).resolve().parent.parent
 PACKAGES = ("jobs", "pipeline", "schemas")
 PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
-DISTRIBUTION_OF = {"cv2": "opencv-python-headless"}  # where the import name differs
+DISTRIBUTION_OF = {"cv2": "opencv-python-headless", "ruamel": "ruamel.yaml"}  # where the import name differs
 # Commands beyond the night, and the extra that each needs.
 NEEDS = {
     "demo": "simulate",

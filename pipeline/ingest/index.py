@@ -17,12 +17,12 @@ from jaxtyping import Int64
 
 from pipeline.errors import LogError
 from pipeline.geometry.cameras import Camera
+from pipeline.geometry.transform_tree import TransformTree
 from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stamp_ns
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
-from pipeline.ingest.messages.transforms import TransformTree
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
 from pipeline.rigs import Rig, TopicSemantics
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.se3 import exp_se3, inverse, to_quaternion
-from pipeline.ingest.messages.transforms import TransformTree
+from pipeline.geometry.transform_tree import TransformTree
 
 
 def test_transforms_are_found_along_the_tree_in_both_directions():

@@ -48,8 +48,12 @@ class TransformTree:
         is_rigid = np.all(np.isfinite(numbers)) and abs(np.linalg.norm(numbers[:4]) - 1) < _UNIT_TOLERANCE
         if not is_rigid or not parent or not child or parent == child:
             return False
-        self._parent_of[child] = (parent, from_quaternion(numbers[:4], numbers[4:]))
+        self.add_transform(parent, child, from_quaternion(numbers[:4], numbers[4:]))
         return True
+
+    def add_transform(self, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]) -> None:
+        """One edge, known to be rigid and between two frames."""
+        self._parent_of[child] = (parent, T_parent_child)
 
     def fill_from(self, other: TransformTree) -> None:
         """Take edges of frames that this tree lacks: a split recording logs them in its first file only."""

@@ -1,0 +1,113 @@
+"""Autoware's sensor kit: sensor_kit_calibration.yaml, sensors_calibration.yaml, and a xacro that loads the first.
+
+Children of the kit are links: a camera's link looks along x, its optics hang below it in the camera's own xacro, and a
+lidar's `*_base_link` may lie apart from the frame of its points by what its description says.
+
+Source: autowarefoundation/sample_sensor_kit_launch and tier4/aip_launcher (config/*.yaml, urdf/sensor_kit.xacro).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import ExportedCalibration
+from pipeline.export.formats import Files, Format
+from pipeline.export.provenance import comment_lines
+from pipeline.export.rotations import T_LINK_OPTICAL, pose_of_rpy, rpy_of
+from pipeline.export.texts import load_yaml, number_of, to_yaml
+from pipeline.export.tree import require_frames
+from pipeline.export.urdf import xml_of
+from pipeline.geometry.se3 import inverse
+from pipeline.geometry.transform_tree import TransformTree
+
+__all__ = ["AUTOWARE"]
+
+_KIT = "sensor_kit_base_link"
+_FIELDS = ("x", "y", "z", "roll", "pitch", "yaw")
+_KIT_FILE, _CAR_FILE, _XACRO_FILE = (
+    "sensor_kit_calibration.yaml",
+    "sensors_calibration.yaml",
+    "sensor_kit.xacro",
+)
+
+
+def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
+    """The kit sits at the lidar unless the base frame is the kit itself."""
+    names, T_base_lidar = calibration.names, calibration.T_base_lidar
+    is_kit_known = T_base_lidar is not None and names.base == _KIT
+    T_kit_lidar = T_base_lidar if is_kit_known and T_base_lidar is not None else np.eye(4)
+    poses = {names.lidar: T_kit_lidar}
+    pairs = calibration.pairs
+    if "camera_lidar" in pairs:
+        T_lidar_camera = inverse(pairs["camera_lidar"].T)
+        poses[names.camera] = T_kit_lidar @ T_lidar_camera @ inverse(T_LINK_OPTICAL)
+    if "lidar_radar" in pairs:
+        poses[names.radar] = T_kit_lidar @ pairs["lidar_radar"].T
+    comments = comment_lines(calibration, "the camera's link, not its optical frame: x forward, y left, z up")
+    if not is_kit_known:
+        comments.append(f"{_KIT} sits at {names.lidar}")
+    children = {child: _entry(T) for child, T in poses.items()}
+    files = {
+        _KIT_FILE: to_yaml({_KIT: children}, comments),
+        _XACRO_FILE: xml_of(_xacro(list(poses)), comments),
+    }
+    if T_base_lidar is not None and not is_kit_known:
+        files[_CAR_FILE] = to_yaml({names.base: {_KIT: _entry(T_base_lidar)}}, comments)
+    return files
+
+
+def _entry(T: np.ndarray) -> dict[str, float]:
+    values = [*T[:3, 3], *rpy_of(T[:3, :3])]
+    return {name: float(v) + 0.0 for name, v in zip(_FIELDS, values, strict=True)}
+
+
+def _xacro(children: list[str]) -> ET.Element:
+    """`sensor_kit_macro` as Autoware's vehicles include it, of links and joints alone."""
+    robot = ET.Element("robot", {"xmlns:xacro": "http://ros.org/wiki/xacro"})
+    macro = ET.SubElement(
+        robot, "xacro:macro", name="sensor_kit_macro", params="parent x y z roll pitch yaw config_dir:=."
+    )
+    ET.SubElement(
+        macro,
+        "xacro:property",
+        name="calibration",
+        value=f"${{xacro.load_yaml(config_dir + '/{_KIT_FILE}')}}",
+    )
+    _joint(macro, "${parent}", _KIT, "${x} ${y} ${z}", "${roll} ${pitch} ${yaw}")
+    for child in children:
+        given = [f"${{calibration['{_KIT}']['{child}']['{name}']}}" for name in _FIELDS]
+        _joint(macro, _KIT, child, " ".join(given[:3]), " ".join(given[3:]))
+    return robot
+
+
+def _joint(macro: ET.Element, parent: str, child: str, xyz: str, rpy: str) -> None:
+    ET.SubElement(macro, "link", name=child)
+    joint = ET.SubElement(macro, "joint", name=f"{child}_joint", type="fixed")
+    ET.SubElement(joint, "origin", rpy=rpy, xyz=xyz)
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+
+
+def _tree(files: Files) -> TransformTree:
+    tree = TransformTree()
+    for file, content in files.items():
+        if file.endswith(".xacro"):
+            continue  # it loads the numbers from beside it
+        held: Any = load_yaml(file, content)
+        if not isinstance(held, dict):
+            raise ConfigError(file, "", "is no map of parent frames")
+        for parent, children in held.items():
+            if not isinstance(children, dict):
+                raise ConfigError(file, str(parent), "is no map of child frames")
+            for child in children:
+                names = require_frames(file, parent, child)
+                values = np.array([number_of(file, held, parent, child, name) for name in _FIELDS])
+                tree.add_transform(*names, pose_of_rpy(values[:3], values[3:]))
+    return tree
+
+
+AUTOWARE = Format("autoware", _write, tree=_tree, T_frame_camera=T_LINK_OPTICAL)

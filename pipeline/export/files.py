@@ -1,0 +1,83 @@
+"""Files of a format on disk: where they go, the side file beside them, and the prior that an import makes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import ExportedCalibration
+from pipeline.export.formats import Format
+from pipeline.export.provenance import provenance_of
+from pipeline.export.texts import to_json
+from pipeline.export.tree import ESTIMATED_PAIRS
+from pipeline.store.atomic_write import atomic_write
+
+__all__ = ["SIDE_FILE", "prior_text", "read_files", "write_files", "written_files"]
+
+SIDE_FILE = ".provenance.json"
+_MOST_BYTES = 1 << 30  # a calibration is kilobytes; a log that is read for /tf_static may be larger
+
+
+def written_files(form: Format, calibration: ExportedCalibration, out: Path) -> dict[Path, bytes]:
+    """Content by path: PATH itself where the format is one file and PATH has a suffix, else files in the folder PATH.
+
+    Raises:
+        ConfigError: the format is only read, or cannot hold the calibration.
+    """
+    if form.write is None:
+        raise ConfigError("command line", "format", f"{form.name} is only read")
+    files = form.write(calibration)
+    is_one = len(files) == 1 and out.suffix != "" and not out.is_dir()
+    first = out if is_one else out / next(iter(files))
+    found = {first: next(iter(files.values()))} if is_one else {out / n: text for n, text in files.items()}
+    if not form.holds_provenance:
+        notes = {"format": form.name, "notes": list(form.notes)}
+        stem = first.name.partition(".")[0]
+        found[first.with_name(stem + SIDE_FILE)] = to_json(provenance_of(calibration) | notes)
+    return found
+
+
+def write_files(files: Mapping[Path, bytes]) -> None:
+    """Write each at once and whole; folders are made."""
+    for path, content in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as stream:
+            stream.write(content)
+
+
+def read_files(paths: Sequence[Path]) -> dict[str, bytes]:
+    """Content by path as given, side files left out.
+
+    Raises:
+        ConfigError: one of them cannot be read.
+    """
+    found = {}
+    for path in paths:
+        if path.name.endswith(SIDE_FILE):
+            continue
+        try:
+            if path.stat().st_size > _MOST_BYTES:
+                raise ConfigError(str(path), "", f"is larger than {_MOST_BYTES >> 30} GiB")
+            found[str(path)] = path.read_bytes()
+        except OSError as err:
+            raise ConfigError(str(path), "", f"cannot be read: {err.strerror}") from err
+    if not found:
+        raise ConfigError("command line", "files", "none given")
+    return found
+
+
+def prior_text(pairs: Mapping[str, np.ndarray], form: str, files: Sequence[str]) -> bytes:
+    """A prior file (`[rigs.*.prior] source = "file"`) of both transforms, their bits unchanged.
+
+    Raises:
+        ConfigError: one of them is missing.
+    """
+    missing = [pair for pair in ESTIMATED_PAIRS if pair not in pairs]
+    if missing:
+        problem = "missing, and a prior needs it: give a prior file that has it with --also"
+        raise ConfigError(", ".join(files), f"T_{missing[0]}", problem)
+    transforms = {f"T_{pair}": np.asarray(pairs[pair]).tolist() for pair in ESTIMATED_PAIRS}
+    return to_json(transforms | {"imported_from": {"format": form, "files": list(files)}})

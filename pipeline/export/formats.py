@@ -1,0 +1,91 @@
+"""The formats by name: what each writes, and how it is read back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import ExportedCalibration, FrameNames
+from pipeline.export.tree import pairs_of_tree
+from pipeline.geometry.se3 import inverse
+from pipeline.geometry.transform_tree import TransformTree
+
+__all__ = ["FORMATS", "Files", "Format", "format_named"]
+
+Files = Mapping[str, bytes]  # by name (when written, relative to --out)
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format as a value.
+
+    Args:
+        name: on the command line.
+        write: files of a calibration; None of a format that is only read. Raises ConfigError where the format cannot
+            hold it.
+        tree: frames that files hold, where the format names frames.
+        read: transforms by pair that files hold, where it has names of its own for them. Both raise ConfigError that
+            names file and field.
+        T_frame_camera: of a format whose camera frame is not the optical one: from the optical frame to its own.
+        holds_provenance: the files say all that the side file would.
+        notes: for the side file, what the format cannot say or takes for granted.
+    """
+
+    name: str
+    write: Callable[[ExportedCalibration], dict[str, bytes]] | None = None
+    tree: Callable[[Files], TransformTree] | None = None
+    read: Callable[[Files, FrameNames], dict[str, np.ndarray]] | None = None
+    T_frame_camera: np.ndarray | None = None
+    holds_provenance: bool = False
+    notes: tuple[str, ...] = ()
+
+    def pairs(self, files: Files, names: FrameNames) -> dict[str, np.ndarray]:
+        """T_camera_lidar and T_lidar_radar, those of them that the files hold, by pair.
+
+        Raises:
+            ConfigError: neither, or the files cannot be read; it names file and field.
+        """
+        if self.read is not None:
+            return self.read(files, names)
+        assert self.tree is not None, "a format names frames or pairs"
+        found = pairs_of_tree(", ".join(files), self.tree(files), names)
+        if self.T_frame_camera is not None and "camera_lidar" in found:
+            found["camera_lidar"] = inverse(self.T_frame_camera) @ found["camera_lidar"]
+        return found
+
+
+# Name -> where its value is (resolved on use: some bring OpenCV or the ROS message types).
+FORMATS = {
+    "ros2": "pipeline.export.ros2:ROS2",
+    "tf-static": "pipeline.export.tf_static:TF_STATIC",
+    "urdf": "pipeline.export.urdf:URDF",
+    "xacro": "pipeline.export.urdf:XACRO",
+    "autoware": "pipeline.export.autoware:AUTOWARE",
+    "kitti": "pipeline.export.kitti:KITTI",
+    "vod": "pipeline.export.kitti:VOD",
+    "nuscenes": "pipeline.export.nuscenes:NUSCENES",
+    "t4": "pipeline.export.nuscenes:T4",
+    "kalibr": "pipeline.export.kalibr:KALIBR",
+    "opencv": "pipeline.export.opencv:OPENCV",
+    "apollo": "pipeline.export.apollo:APOLLO",
+    "openlabel": "pipeline.export.openlabel:OPENLABEL",
+    "matlab": "pipeline.export.matlab:MATLAB",
+}
+
+
+def format_named(name: str) -> Format:
+    """The format of a name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if name not in FORMATS:
+        raise ConfigError("command line", "format", f"{name!r} is none of {', '.join(FORMATS)}")
+    module, value = FORMATS[name].split(":")
+    found = getattr(import_module(module), value)
+    assert isinstance(found, Format)
+    return found

@@ -1,0 +1,73 @@
+"""Kalibr's camera chain of one camera, with T_cam_lidar and T_cam_radar beside Kalibr's own keys.
+
+Source: ethz-asl/kalibr wiki "Yaml formats" and kalibr_common/ConfigReader.py (which counts the keys of the file as
+cameras, so all stands under cam0); T_cam_lidar as in Oxford Spires.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import ExportedCalibration, FrameNames, needed_camera, needed_pair
+from pipeline.export.formats import Files, Format
+from pipeline.export.provenance import comment_lines
+from pipeline.export.texts import field_of, load_yaml, matrix_of, to_yaml
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import inverse
+
+__all__ = ["KALIBR"]
+
+_RADTAN = 4  # k1 k2 p1 p2
+
+
+def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
+    camera = needed_camera(calibration, "kalibr")
+    model, coefficients = _distortion(camera)
+    fx, fy = camera.focal_px
+    cx, cy = camera.centre_px
+    T_camera_lidar = needed_pair(calibration, "camera_lidar", "kalibr").T
+    cam: dict[str, Any] = {
+        "camera_model": "pinhole",
+        "intrinsics": [fx, fy, cx, cy],
+        "distortion_model": model,
+        "distortion_coeffs": coefficients,
+        "resolution": [camera.width_px, camera.height_px],
+        "rostopic": f"/{calibration.names.camera}/image_raw",
+        "cam_overlaps": [],
+        "T_cam_lidar": T_camera_lidar.tolist(),
+    }
+    if "lidar_radar" in calibration.pairs:
+        cam["T_cam_radar"] = (T_camera_lidar @ calibration.pairs["lidar_radar"].T).tolist()
+    comments = [
+        *comment_lines(calibration),
+        "T_cam_x takes coordinates in x to the camera's optical frame; rostopic is a name only",
+    ]
+    return {"camchain.yaml": to_yaml({"cam0": cam}, comments)}
+
+
+def _distortion(camera: Camera) -> tuple[str, list[float]]:
+    D = [float(v) for v in camera.D]
+    if camera.model == "equidistant":
+        return "equidistant", D or [0.0] * 4
+    if any(D[_RADTAN:]):
+        problem = f"{camera.model} with more than k1 k2 p1 p2 is none of Kalibr's models"
+        raise ConfigError("export kalibr", "distortion", problem)
+    return "radtan", [*D[:_RADTAN], *[0.0] * (_RADTAN - len(D))]
+
+
+def _read(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
+    del names
+    found: dict[str, np.ndarray] = {}
+    for file, content in files.items():
+        cam = field_of(file, load_yaml(file, content), "cam0")
+        T = matrix_of(file, "cam0.T_cam_lidar", field_of(file, {"cam0": cam}, "cam0", "T_cam_lidar"))
+        found["camera_lidar"] = T
+        if "T_cam_radar" in cam:
+            found["lidar_radar"] = inverse(T) @ matrix_of(file, "cam0.T_cam_radar", cam["T_cam_radar"])
+    return found
+
+
+KALIBR = Format("kalibr", _write, read=_read)

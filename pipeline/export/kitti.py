@@ -1,0 +1,112 @@
+"""KITTI's calibration of one frame (object benchmark), with the radar's line of V2X-Radar and View-of-Delft's kin.
+
+Row-major numbers after a name: P0 to P3 (3x4), R0_rect (3x3), Tr_velo_to_cam, Tr_imu_to_velo, Tr_radar_to_velo (3x4);
+Tr_a_to_b takes coordinates in a to b, so Tr_velo_to_cam = T_camera_lidar.
+
+Source: KITTI object development kit, readme and matlab/; V2X-Radar (Tr_radar_to_velo).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import ExportedCalibration, FrameNames, needed_camera, needed_pair
+from pipeline.export.formats import Files, Format
+from pipeline.export.texts import matrix_of, text_of
+from pipeline.geometry.se3 import inverse
+
+__all__ = ["KITTI", "VOD"]
+
+_CAMERA, _RADAR, _RECTIFIED = "Tr_velo_to_cam", "Tr_radar_to_velo", "R0_rect"
+_NOTES = (
+    "P0 to P3 are all K [I | 0] of the one camera: undistort its images before they are used with them.",
+    "R0_rect is the identity: the camera's optical frame counts as rectified.",
+    (
+        "Tr_imu_to_velo is the inverse of the lidar's pose on the car where that is known, else the identity is in its "
+        "place: no IMU is calibrated here."
+    ),
+)
+
+
+def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
+    camera = needed_camera(calibration, "kitti")
+    P = np.hstack([camera.K, np.zeros((3, 1))])
+    T_lidar_base = np.eye(4) if calibration.T_base_lidar is None else inverse(calibration.T_base_lidar)
+    values = {f"P{k}": P for k in range(4)} | {
+        _RECTIFIED: np.eye(3),
+        _CAMERA: needed_pair(calibration, "camera_lidar", "kitti").T[:3],
+        "Tr_imu_to_velo": T_lidar_base[:3],
+    }
+    if "lidar_radar" in calibration.pairs:
+        values[_RADAR] = calibration.pairs["lidar_radar"].T[:3]
+    # KITTI prints 12 digits after the point; 16 give every float64 back.
+    lines = (f"{name}: {' '.join(f'{v:.16e}' for v in M.reshape(-1))}\n" for name, M in values.items())
+    return {"calib.txt": "".join(lines).encode()}  # KITTI's own blank line at the end stops some readers
+
+
+def _read(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
+    del names
+    found: dict[str, np.ndarray] = {}
+    for file, content in files.items():
+        lines = _lines(file, content)
+        if _CAMERA in lines:
+            found["camera_lidar"] = _rectified(file, lines) @ matrix_of(file, _CAMERA, lines[_CAMERA])
+        if _RADAR in lines:
+            found["lidar_radar"] = matrix_of(file, _RADAR, lines[_RADAR])
+    if not found:
+        raise ConfigError(", ".join(files), _CAMERA, "missing")
+    return found
+
+
+def _read_vod(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
+    """View-of-Delft has a file per sensor, and calls either one's transform into the camera Tr_velo_to_cam."""
+    del names
+    if len(files) != 2:
+        problem = (
+            "give two files: the lidar's calibration, then the radar's (lidar/.../calib, radar/.../calib)"
+        )
+        raise ConfigError("command line", "files", problem)
+    lidar, radar = (
+        _rectified(file, lines) @ matrix_of(file, _CAMERA, lines.get(_CAMERA, ()))
+        for file, lines in ((f, _lines(f, content)) for f, content in files.items())
+    )
+    return {"camera_lidar": lidar, "lidar_radar": inverse(lidar) @ radar}
+
+
+def _lines(file: str, content: bytes) -> dict[str, list[float]]:
+    found = {}
+    for line in text_of(file, content).splitlines():
+        name, colon, numbers = line.partition(":")
+        if not line.strip():
+            continue
+        if not colon:
+            raise ConfigError(file, line.split()[0], "is no line of the form NAME: NUMBERS")
+        found[name.strip()] = _numbers(file, name.strip(), numbers.split())
+    return found
+
+
+def _numbers(file: str, name: str, words: Iterable[str]) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as err:
+        if name in (_CAMERA, _RADAR, _RECTIFIED):
+            raise ConfigError(file, name, f"holds what is no number: {err}") from err
+        return []  # a line of others, as calib_time
+
+
+def _rectified(file: str, lines: dict[str, list[float]]) -> np.ndarray:
+    """What takes the camera's coordinates to the rectified camera's, which the images are of."""
+    values = lines.get(_RECTIFIED)
+    if values is None:
+        return np.eye(4)
+    if len(values) != 9:
+        raise ConfigError(file, _RECTIFIED, f"needs 9 numbers and has {len(values)}")
+    R = np.reshape(values, (3, 3))
+    return matrix_of(file, _RECTIFIED, np.hstack([R, np.zeros((3, 1))]))
+
+
+KITTI = Format("kitti", _write, read=_read, notes=_NOTES)
+VOD = Format("vod", read=_read_vod)

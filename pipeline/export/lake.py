@@ -1,0 +1,119 @@
+"""A calibration out of the lake: a day's records, or a vehicle's state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from pipeline.errors import ConfigError, ContractError
+from pipeline.export.calibration import USABLE, ExportedPair
+from pipeline.geometry.cameras import Camera, camera_of
+from pipeline.store.current import current_records, current_states, transform_of
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import read_records
+from pipeline.store.tables import iterate_rows, read_manifest
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.observations import OBSERVATIONS, Observation
+from schemas.states import STATES, StateRow
+
+__all__ = ["choose_pairs", "pairs_of_day", "pairs_of_state", "read_camera"]
+
+# What a record or state says of itself beside its numbers, as far as it has it.
+_DETAILS = (
+    *("day", "days", "since", "work_key", "recorded_at", "inputs", "notes", "assumptions"),
+    *("time_offset_s", "time_offset_sigma_s", "azimuth_sigma_rad", "elevation_sigma_rad"),
+)
+
+
+def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:
+    """By pair what the day's current records say: an estimate, or why there is none.
+
+    Raises:
+        ConfigError: there is no record of that vehicle, day and method; it names those that there are.
+    """
+    Partition(vehicle, day)  # refuses what is no vehicle or day
+    records = current_records(read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day))
+    found = [r for r in records if r.method == method]
+    if not found:
+        methods = sorted({r.method for r in records})
+        there = f"; there are records of {', '.join(methods)}" if methods else ""
+        raise ConfigError(
+            "command line", "day", f"the lake has no record of {vehicle} {day} by {method}{there}"
+        )
+    return _pairs(found)
+
+
+def pairs_of_state(lake: Lake, vehicle: str, method: str) -> dict[str, ExportedPair | str]:
+    """By pair what a vehicle should load tonight, or why nothing.
+
+    Raises:
+        ConfigError: no state of that vehicle and method is stored.
+    """
+    rows = current_states(read_records(lake, STATES, StateRow, vehicle=vehicle))
+    found = [r for r in rows if r.method == method]
+    if not found:
+        problem = f"the lake has no state of {vehicle} by {method}: run `boresight audit`, or give --day"
+        raise ConfigError("command line", "vehicle", problem)
+    return _pairs(found)
+
+
+def _pairs(rows: Sequence[CalibrationRecord] | Sequence[StateRow]) -> dict[str, ExportedPair | str]:
+    of_pair = {row.pair: _pair(row) for row in rows}
+    return {pair: of_pair[pair] for pair in PAIRS if pair in of_pair}
+
+
+def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
+    T = transform_of(row)
+    if T is None:
+        return f"{row.status}: {row.reason}"
+    details = {name: value for name in _DETAILS if (value := getattr(row, name, None)) not in (None, "", [])}
+    return ExportedPair(
+        row.pair,
+        T,
+        row.covariance,
+        row.status,
+        row.reason,
+        tuple(row.observable or [True] * 6),
+        tuple(row.determined),
+        row.common_covariance,
+        details,
+    )
+
+
+def choose_pairs(
+    found: Mapping[str, ExportedPair | str], *, force: bool
+) -> tuple[dict[str, ExportedPair], dict[str, str]]:
+    """Those that may be loaded (with `force` all that have a transform), and why the others are left out."""
+    chosen: dict[str, ExportedPair] = {}
+    left_out: dict[str, str] = {}
+    for name, pair in found.items():
+        if isinstance(pair, str):
+            left_out[name] = pair
+        elif pair.status in USABLE or force:
+            chosen[name] = pair
+        else:
+            left_out[name] = f"{pair.status}: {pair.reason}"
+    return chosen, left_out
+
+
+def read_camera(lake: Lake, vehicle: str, days: Iterable[str]) -> Camera | None:
+    """Intrinsics of the latest of these days whose observations are in the lake; None where none are."""
+    for day in sorted(days, reverse=True):
+        partition = Partition(vehicle, day)
+        try:
+            if read_manifest(lake, OBSERVATIONS, partition) is None:
+                continue
+            for rows in iterate_rows(lake, OBSERVATIONS, partition, Observation):
+                if rows:
+                    camera = camera_of(rows[0])
+                    return Camera(
+                        camera.model,
+                        np.array(camera.K),
+                        np.array(camera.D),
+                        camera.width_px,
+                        camera.height_px,
+                    )
+        except ContractError as err:  # damaged, or collected after its time
+            lake.damage.append(str(err))
+    return None

@@ -1,0 +1,53 @@
+"""JSON for MATLAB's jsondecode: matrices as rows of equal length, names that are identifiers; also a prior file.
+
+`rigidtform3d(s.T_camera_lidar)` (R2022b and later) takes columns of coordinates as the matrix does; the older
+`rigid3d` takes rows: give it the transpose.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import ExportedCalibration, FrameNames
+from pipeline.export.formats import Files, Format
+from pipeline.export.provenance import provenance_of
+from pipeline.export.texts import load_json, matrix_of, to_json
+from pipeline.export.tree import ESTIMATED_PAIRS
+
+__all__ = ["MATLAB"]
+
+
+def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
+    content: dict[str, Any] = {f"T_{name}": pair.T.tolist() for name, pair in calibration.pairs.items()}
+    for name, pair in calibration.pairs.items():
+        if pair.covariance is not None:
+            content[f"covariance_{name}"] = pair.covariance.tolist()
+    camera = calibration.camera
+    if camera is not None:
+        content["camera"] = {
+            "model": camera.model,
+            "K": camera.K.tolist(),
+            "D": camera.D.tolist(),
+            "image_size_px": [camera.height_px, camera.width_px],  # rows first, as MATLAB's ImageSize
+        }
+    content["provenance"] = provenance_of(calibration)
+    return {"calibration.json": to_json(content)}
+
+
+def _read(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
+    del names
+    found: dict[str, np.ndarray] = {}
+    for file, content in files.items():
+        held = load_json(file, content)
+        if not isinstance(held, dict):
+            raise ConfigError(file, "", "holds no object")
+        found |= {p: matrix_of(file, f"T_{p}", held[f"T_{p}"]) for p in ESTIMATED_PAIRS if f"T_{p}" in held}
+    if not found:
+        raise ConfigError(", ".join(files), "T_camera_lidar", "missing")
+    return found
+
+
+MATLAB = Format("matlab", _write, read=_read, holds_provenance=True)

@@ -1,0 +1,58 @@
+"""OpenCV's FileStorage (YAML): transforms, covariances and intrinsics under the names that OpenCV's samples use.
+
+Source: OpenCV core/persistence; samples/cpp/tutorial_code/calib3d (image_width, camera_matrix, ...).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import ExportedCalibration, FrameNames
+from pipeline.export.formats import Files, Format
+from pipeline.export.provenance import comment_lines
+from pipeline.export.texts import matrix_of, text_of
+from pipeline.export.tree import ESTIMATED_PAIRS
+
+__all__ = ["OPENCV"]
+
+
+def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
+    storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+    for line in comment_lines(calibration):
+        storage.writeComment(line)
+    storage.write("vehicle", calibration.vehicle)
+    storage.write("calibration_source", calibration.source)
+    for name, pair in calibration.pairs.items():
+        storage.write(f"T_{name}", pair.T)
+        storage.write(f"status_{name}", pair.status)
+        if pair.covariance is not None:
+            storage.write(f"covariance_{name}", pair.covariance)
+    camera = calibration.camera
+    if camera is not None:
+        storage.write("image_width", camera.width_px)
+        storage.write("image_height", camera.height_px)
+        storage.write("camera_matrix", camera.K)
+        storage.write("distortion_model", camera.model)
+        storage.write("distortion_coefficients", (camera.D if len(camera.D) else np.zeros(4)).reshape(1, -1))
+    return {"calibration.yaml": storage.releaseAndGetString().encode()}
+
+
+def _read(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
+    del names
+    found: dict[str, np.ndarray] = {}
+    for file, content in files.items():
+        try:
+            storage = cv2.FileStorage(text_of(file, content), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+            nodes = {pair: storage.getNode(f"T_{pair}") for pair in ESTIMATED_PAIRS}
+            values = {pair: node.mat() for pair, node in nodes.items() if not node.empty()}
+        except (cv2.error, SystemError) as err:
+            raise ConfigError(file, "", f"no readable FileStorage: {' '.join(str(err).split())}") from err
+        found |= {pair: matrix_of(file, f"T_{pair}", value) for pair, value in values.items()}
+    if not found:
+        raise ConfigError(", ".join(files), "T_camera_lidar", "missing")
+    return found
+
+
+OPENCV = Format("opencv", _write, read=_read)

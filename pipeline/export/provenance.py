@@ -1,0 +1,132 @@
+"""What a file says of itself: its frames, how sure it is, where it comes from, and what must not be overlooked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.export.calibration import USABLE, Edge, ExportedCalibration, ExportedPair, edges_of, sigmas_of
+from schemas.calibrations import FRAMES_OF_PAIR
+
+__all__ = ["comment_lines", "not_certified", "provenance_of", "warnings_of"]
+
+_AXES = {
+    "camera": "optical: x right, y down, z forward",
+    "lidar": "x forward, y left, z up",
+    "radar": "x forward, y left, z up",
+}
+_CONVENTION = (
+    "T_a_b takes coordinates in frame b to frame a: p_a = T_a_b p_b. Metres, radians. Covariances are of the left "
+    "perturbation exp(xi) T, xi = rx ry rz tx ty tz along the axes of a; sigmas of the rotation about these axes and "
+    "of the position of b's origin."
+)
+_DIRECTIONS = ("azimuth", "elevation")
+
+
+def provenance_of(calibration: ExportedCalibration) -> dict[str, Any]:
+    """All that is known of a calibration as plain values, for a side file or a format's own place."""
+    return {
+        "written_by": f"Boresight {calibration.code_version}",
+        "vehicle": calibration.vehicle,
+        "source": calibration.source,
+        "method": calibration.method,
+        "warnings": warnings_of(calibration),
+        "convention": _CONVENTION,
+        "frames": _frames(calibration),
+        "poses": [_pose(edge) for edge in edges_of(calibration)],
+        "pairs": {name: _pair(pair) for name, pair in calibration.pairs.items()},
+        "left_out": dict(calibration.left_out),
+    }
+
+
+def warnings_of(calibration: ExportedCalibration) -> list[str]:
+    """What a reader must not overlook, a sentence each: pairs left out or not accepted, and what is not certified."""
+    found = [f"{pair} is left out: {reason}" for pair, reason in calibration.left_out.items()]
+    for pair in calibration.pairs.values():
+        if pair.status not in USABLE:
+            found.append(f"{pair.pair} is {pair.status.upper()}, do not load it unseen: {pair.reason}")
+        elif missing := [d for d in _DIRECTIONS if d not in pair.certified]:
+            found.append(f"{pair.pair}: {' and '.join(missing)} not certified")
+        if pair.at_prior:
+            found.append(
+                f"{pair.pair}: {', '.join(pair.at_prior)} not determined by the data, kept at the prior"
+            )
+    return [" ".join(words.split()) for words in found]
+
+
+def not_certified(calibration: ExportedCalibration) -> dict[str, str]:
+    """By pair, why not all of it may be relied on; empty where everything is accepted and certified."""
+    found = dict(calibration.left_out)
+    for name, pair in calibration.pairs.items():
+        if pair.status not in USABLE:
+            found[name] = f"{pair.status}: {pair.reason}"
+        elif missing := [d for d in _DIRECTIONS if d not in pair.certified]:
+            found[name] = f"{' and '.join(missing)} not certified"
+    return found
+
+
+def comment_lines(calibration: ExportedCalibration, camera_axes: str | None = None) -> list[str]:
+    """The same in short, for formats with comments: one line each, printable.
+
+    Args:
+        calibration: what is written.
+        camera_axes: of a format whose camera frame is not the optical one.
+    """
+    frames = _frames(calibration)
+    if camera_axes is not None:
+        frames[calibration.names.camera] = camera_axes
+    lines = [
+        f"Boresight {calibration.code_version}: {calibration.vehicle}, {calibration.source}, {calibration.method}",
+        *(f"WARNING: {words}" for words in warnings_of(calibration)),
+        *(f"frame {name}: {axes}" for name, axes in frames.items()),
+    ]
+    for edge in edges_of(calibration):
+        sure = "as given" if edge.covariance is None else f"sigma {_in_words(edge)}"
+        lines.append(f"{edge.parent} -> {edge.child}: pose of {edge.child} in {edge.parent}; {sure}")
+    return ["".join(c if c.isprintable() else " " for c in line) for line in lines]
+
+
+def _frames(calibration: ExportedCalibration) -> dict[str, str]:
+    names = calibration.names
+    axes = {names.of(sensor): words for sensor, words in _AXES.items()}
+    if calibration.T_base_lidar is None:
+        axes[names.lidar] += "; the root: where it sits on the car is not known here"
+    else:
+        axes[names.base] = "x forward, y left, z up; the root"
+    return axes
+
+
+def _in_words(edge: Edge) -> str:
+    sigmas = list((sigmas_of(edge.T, edge.covariance) or {}).values())
+    turn = " ".join(f"{v:.4f}" for v in np.degrees(sigmas[:3]))
+    shift = " ".join(f"{v:.4f}" for v in sigmas[3:])
+    return f"{turn} deg about and {shift} m along the axes of {edge.parent}"
+
+
+def _pose(edge: Edge) -> dict[str, Any]:
+    sigma = sigmas_of(edge.T, edge.covariance)
+    return {"parent": edge.parent, "child": edge.child, "T_parent_child": edge.T.tolist(), "sigma": sigma}
+
+
+def _pair(pair: ExportedPair) -> dict[str, Any]:
+    parent, child = FRAMES_OF_PAIR[pair.pair]
+    return {
+        "status": pair.status,
+        "reason": pair.reason,
+        "certified": list(pair.certified),
+        "kept_at_prior": pair.at_prior,
+        f"T_{parent}_{child}": pair.T.tolist(),
+        "sigma": sigmas_of(pair.T, pair.covariance),
+        "covariance": None if pair.covariance is None else pair.covariance.tolist(),
+        **_plain(pair.details),
+    }
+
+
+def _plain(details: Mapping[str, object]) -> dict[str, Any]:
+    """Values that JSON has."""
+    return {
+        name: list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+        for name, value in details.items()
+    }

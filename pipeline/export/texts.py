@@ -1,0 +1,183 @@
+"""JSON and YAML as text and back: floats with all their digits, errors that name the file and the field."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import ScalarNode
+from ruamel.yaml.representer import RoundTripRepresenter
+
+from pipeline.errors import ConfigError
+from pipeline.geometry.se3 import from_quaternion
+
+__all__ = [
+    "field_of",
+    "load_json",
+    "load_yaml",
+    "matrix_of",
+    "number_of",
+    "pose_of_quaternion",
+    "text_of",
+    "to_json",
+    "to_yaml",
+]
+
+# As in `extrinsics.prior`: calibrations shipped with three or four digits are still meant as rotations.
+_ROTATION_TOLERANCE = 1e-3
+_NORM_TOLERANCE = 0.01  # as `TransformTree`: a quaternion farther from unit length is no rotation
+
+
+def text_of(file: str, content: bytes) -> str:
+    """Text of a file.
+
+    Raises:
+        ConfigError: it is not UTF-8.
+    """
+    try:
+        return content.decode()
+    except UnicodeDecodeError as err:
+        raise ConfigError(file, "", f"is no text (UTF-8): {err.reason} at byte {err.start}") from err
+
+
+def to_json(value: Any) -> bytes:
+    """Indented JSON; floats as Python prints them, so that reading gives the same bits."""
+    return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
+
+
+def load_json(file: str, content: bytes) -> Any:
+    """Value of a JSON file.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        return json.loads(text_of(file, content))
+    except (ValueError, RecursionError) as err:
+        raise ConfigError(file, "", f"no readable JSON: {err}") from err
+
+
+def to_yaml(value: Mapping[str, Any], comments: Sequence[str]) -> bytes:
+    """Block-style YAML under comment lines; lists of numbers on one line, floats with all their digits."""
+    stream = io.StringIO()
+    yaml = YAML()
+    yaml.Representer = _Representer
+    yaml.default_flow_style = False
+    yaml.width = 4096  # a row of numbers stays a row
+    yaml.dump(_styled(value), stream)
+    return ("".join(f"# {line}\n" for line in comments) + stream.getvalue()).encode()
+
+
+def load_yaml(file: str, content: bytes) -> Any:
+    """Value of a YAML file; OpenCV's `%YAML:1.0` in front, which strict readers refuse, is passed over.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    text = text_of(file, content)
+    if text.startswith("%YAML:"):
+        text = text.partition("\n")[2]
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except (YAMLError, ValueError, RecursionError) as err:
+        raise ConfigError(file, "", f"no readable YAML: {' '.join(str(err).split())[:200]}") from err
+
+
+def field_of(file: str, value: Any, *path: str | int) -> Any:
+    """What lies under a path of keys and indices.
+
+    Raises:
+        ConfigError: there is nothing; it names the path up to what is missing.
+    """
+    for depth, key in enumerate(path):
+        where = ".".join(str(p) for p in path[: depth + 1])
+        try:
+            value = value[key]
+        except (KeyError, IndexError, TypeError) as err:
+            raise ConfigError(file, where, "missing") from err
+    return value
+
+
+def number_of(file: str, value: Any, *path: str | int) -> float:
+    """The finite number under a path.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    found = field_of(file, value, *path)
+    where = ".".join(str(p) for p in path)
+    if isinstance(found, bool) or not isinstance(found, int | float):
+        raise ConfigError(file, where, f"{found!r} is no number")
+    if not np.isfinite(found):
+        raise ConfigError(file, where, f"{found!r} is not finite")
+    return float(found)
+
+
+def matrix_of(file: str, key: str, values: Any) -> Float[np.ndarray, "4 4"]:
+    """T of 3x4 or 4x4 numbers, nested or flat, row-major, bit for bit.
+
+    Raises:
+        ConfigError: these are no rigid transform.
+    """
+    try:
+        flat = np.array(values, np.float64).reshape(-1)
+    except (TypeError, ValueError) as err:
+        raise ConfigError(file, key, "is no matrix of numbers") from err
+    if flat.size not in (12, 16) or not np.all(np.isfinite(flat)):
+        raise ConfigError(file, key, f"needs 12 or 16 finite numbers, row by row, and has {flat.size}")
+    T = np.vstack([flat[:12].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    if flat.size == 16 and not np.array_equal(flat[12:], [0, 0, 0, 1]):
+        raise ConfigError(file, key, "its last row is not 0 0 0 1")
+    R = T[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE) or np.linalg.det(R) < 0:
+        raise ConfigError(file, key, "its 3x3 part is no rotation")
+    return T
+
+
+def pose_of_quaternion(
+    file: str, key: str, q_wxyz: Sequence[float], t_m: Sequence[float]
+) -> Float[np.ndarray, "4 4"]:
+    """T of a quaternion, scalar first, and a translation.
+
+    Raises:
+        ConfigError: the quaternion is no rotation, or a number is not finite.
+    """
+    q, t = np.array(q_wxyz, np.float64), np.array(t_m, np.float64)
+    if q.shape != (4,) or t.shape != (3,) or not np.all(np.isfinite([*q, *t])):
+        raise ConfigError(file, key, "needs four and three finite numbers")
+    if abs(np.linalg.norm(q) - 1) > _NORM_TOLERANCE:
+        raise ConfigError(file, key, f"its quaternion has length {np.linalg.norm(q):.4g}, not 1")
+    return from_quaternion(q, t)
+
+
+class _Representer(RoundTripRepresenter):
+    """Floats with a point always: YAML 1.1, which most cars read, takes 1e-17 for a word."""
+
+
+def _float(representer: RoundTripRepresenter, value: float) -> ScalarNode:
+    text = repr(float(value))
+    if "e" in text and "." not in text:
+        text = text.replace("e", ".0e")
+    return representer.represent_scalar("tag:yaml.org,2002:float", text)
+
+
+_Representer.add_representer(float, _float)
+
+
+def _styled(value: Any) -> Any:
+    """The same with maps in blocks and rows of numbers in flow style."""
+    if isinstance(value, Mapping):
+        return CommentedMap((key, _styled(v)) for key, v in value.items())
+    if isinstance(value, (list, tuple)):
+        styled = CommentedSeq(_styled(v) for v in value)
+        if all(isinstance(v, int | float) for v in value):
+            styled.fa.set_flow_style()
+        return styled
+    return value

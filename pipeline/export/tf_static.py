@@ -1,0 +1,113 @@
+"""MCAP with one tf2_msgs/TFMessage on /tf_static, as a ROS 2 recording has it; provenance is in its metadata.
+
+Source: rosbag2_storage_mcap (channel metadata `offered_qos_profiles`), tf2_ros StaticTransformBroadcaster (QoS).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from typing import Any
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import Edge, ExportedCalibration, edges_of
+from pipeline.export.formats import Files, Format
+from pipeline.export.provenance import provenance_of
+from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.transform_tree import TransformTree
+
+__all__ = ["TF_STATIC"]
+
+_TYPE = "tf2_msgs/msg/TFMessage"
+_TOPIC = "/tf_static"
+# Who comes late gets the message too: transient local (1), reliable (1), keep last (1), as the static broadcaster.
+_QOS = (
+    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
+    "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  liveliness: 1\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  avoid_ros_namespace_conventions: false\n"
+)
+_MOST_BYTES = 1 << 30  # /tf_static comes first in a log; of a larger one, give the split's first file
+
+
+def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    message = store.types[_TYPE](transforms=[_stamped(store, edge) for edge in edges_of(calibration)])
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=CompressionType.NONE)
+    writer.start(profile="ros2", library=f"boresight {calibration.code_version}")
+    text = store.generate_msgdef(_TYPE, ros_version=2)[0]
+    schema = writer.register_schema(name=_TYPE, encoding="ros2msg", data=text.encode())
+    channel = writer.register_channel(
+        topic=_TOPIC,
+        message_encoding="cdr",
+        schema_id=schema,
+        metadata={"offered_qos_profiles": _QOS},
+    )
+    data = bytes(store.serialize_cdr(message, _TYPE))
+    writer.add_message(channel, log_time=0, publish_time=0, data=data)
+    writer.add_metadata("boresight", {"provenance": json.dumps(provenance_of(calibration))})
+    writer.finish()
+    return {"tf_static.mcap": stream.getvalue()}
+
+
+def _stamped(store: Any, edge: Edge) -> Any:
+    def new(kind: str, **fields: Any) -> Any:
+        return store.types[kind](**fields)
+
+    q, t = to_quaternion(edge.T), edge.T[:3, 3]
+    header = new(
+        "std_msgs/msg/Header",
+        stamp=new("builtin_interfaces/msg/Time", sec=0, nanosec=0),
+        frame_id=edge.parent,
+    )
+    rotation = new("geometry_msgs/msg/Quaternion", x=float(q[1]), y=float(q[2]), z=float(q[3]), w=float(q[0]))
+    translation = new("geometry_msgs/msg/Vector3", x=float(t[0]), y=float(t[1]), z=float(t[2]))
+    transform = new("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
+    return new(
+        "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=edge.child, transform=transform
+    )
+
+
+def _tree(files: Files) -> TransformTree:
+    tree = TransformTree()
+    for file, content in files.items():
+        read_static_transforms(file, content, tree)
+    return tree
+
+
+def read_static_transforms(file: str, content: bytes, tree: TransformTree) -> None:
+    """Put every transform on /tf_static of a ROS 2 MCAP into a tree.
+
+    Raises:
+        ConfigError: it is no such file.
+    """
+    if len(content) > _MOST_BYTES:
+        raise ConfigError(
+            file, "", f"is larger than {_MOST_BYTES >> 30} GiB: give a file with /tf_static alone"
+        )
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    seen = 0
+    try:
+        for schema, _, message in make_reader(io.BytesIO(content)).iter_messages(topics=[_TOPIC]):
+            if schema is None or schema.name != _TYPE:
+                raise ConfigError(
+                    file, _TOPIC, f"holds {schema.name if schema else 'no schema'}, not {_TYPE}"
+                )
+            bad = tree.add_message(store.deserialize_cdr(message.data, _TYPE))
+            if bad:
+                raise ConfigError(file, _TOPIC, f"{bad} of its entries are no rigid transforms")
+            seen += 1
+    except (McapError, struct.error, ValueError, IndexError, AssertionError) as err:
+        raise ConfigError(file, _TOPIC, f"no readable MCAP: {err}") from err
+    if not seen:
+        raise ConfigError(file, _TOPIC, "no message")
+
+
+TF_STATIC = Format("tf-static", _write, tree=_tree, holds_provenance=True)

@@ -1,0 +1,73 @@
+"""Files that cannot be right end in one error that names the file and the field."""
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import FrameNames
+from pipeline.export.formats import FORMATS, format_named
+
+LAUNCH = "launch:\n- node: {exec: static_transform_publisher, args: "
+APOLLO = "header: {frame_id: lidar}\nchild_frame_id: camera\ntransform: "
+QUATERNION = "{translation: {x: 1, y: 0, z: 0}, rotation: {w: 0.5, x: 0, y: 0, z: 0}}"
+LABEL = '{"openlabel": {"coordinate_systems": {"lidar": {"parent": ""}, "camera": {"parent": "lidar", '
+BAD = [
+    ("ros2", {"a.launch.py": "Node(executable='static_transform_publisher', arguments=['--x', '1'])"},
+     r"a\.launch\.py: --y"),
+    ("ros2", {"a.launch.py": "def ("}, r"a\.launch\.py: is no Python"),
+    ("ros2", {"a.launch.yaml": LAUNCH + "--x one}"}, "--x: 'one' is no number"),
+    ("ros2", {"a.launch.yaml": "nodes: []"}, r"a\.launch\.yaml: launch: missing"),
+    ("tf-static", {"a.mcap": "no mcap"}, r"a\.mcap: /tf_static"),
+    ("urdf", {"a.urdf": "<robot>"}, r"a\.urdf: no readable XML"),
+    ("urdf", {"a.urdf": '<robot><joint name="j" type="fixed"><origin xyz="0 0"/><parent link="lidar"/>'
+              '<child link="camera"/></joint></robot>'}, "joint 'j': xyz"),
+    ("urdf", {"a.urdf": '<robot><joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint></robot>'},
+     r"the file has: a, b\. Name them with --camera-frame"),
+    ("xacro", {"a.xacro": '<robot><joint name="j" type="fixed"><origin xyz="${x} 0 0"/><parent link="lidar"/>'
+               '<child link="camera"/></joint></robot>'}, "expand xacro"),
+    ("autoware", {"k.yaml": "kit:\n  camera: {x: 0, y: 0, z: 0, roll: 0, pitch: 0}\n"},
+     r"k\.yaml: kit\.camera\.yaw: missing"),
+    ("autoware", {"k.yaml": "- 1"}, r"k\.yaml: is no map"),
+    ("autoware", {"k.yaml": "kit:\n  camera: {x: .nan, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}\n"},
+     r"kit\.camera\.x: nan is not finite"),
+    ("kitti", {"c.txt": "Tr_velo_to_cam: 1 0 0\n"}, r"c\.txt: Tr_velo_to_cam: needs 12 or 16"),
+    ("kitti", {"c.txt": "Tr_velo_to_cam: 2 0 0 0 0 1 0 0 0 0 1 0\n"}, "Tr_velo_to_cam: its 3x3 part is no rotation"),
+    ("kitti", {"c.txt": "Tr_velo_to_cam: 1 0 0 0 0 1 0 0 0 0 x 0\n"}, "Tr_velo_to_cam: holds what is no number"),
+    ("kitti", {"c.txt": "P2: 1 0 0 0 0 1 0 0 0 0 1 0\n"}, "Tr_velo_to_cam: missing"),
+    ("vod", {"c.txt": ""}, "give two files"),
+    ("nuscenes", {"sensor.json": "[]"}, r"calibrated_sensor\.json: missing"),
+    ("nuscenes", {"sensor.json": "[]", "calibrated_sensor.json": '[{"sensor_token": "x"}]'}, r"0\.sensor_token"),
+    ("t4", {"sensor.json": '[{"token": "a", "channel": "camera"}]', "calibrated_sensor.json":
+            '[{"sensor_token": "a", "rotation": [1, 0, 0], "translation": [0, 0, 0]}]'}, r"0\.rotation\.3: missing"),
+    ("kalibr", {"k.yaml": "cam0: {camera_model: pinhole}"}, r"k\.yaml: cam0\.T_cam_lidar: missing"),
+    ("kalibr", {"k.yaml": "cam0: ["}, r"k\.yaml: no readable YAML"),
+    ("opencv", {"o.yaml": "%YAML:1.0\n---\nx: 1\n"}, r"o\.yaml: T_camera_lidar: missing"),
+    ("opencv", {"o.yaml": "not a storage"}, r"o\.yaml"),
+    ("apollo", {"a.yaml": APOLLO + QUATERNION}, r"transform\.rotation: its quaternion has length 0\.5"),
+    ("apollo", {"a.yaml": "child_frame_id: camera"}, r"a\.yaml: header: missing"),
+    ("openlabel", {"o.json": LABEL + '"pose_wrt_parent": {"euler_angles": [0, 0, 0]}}}}}'},
+     "euler_angles: is not read"),
+    ("openlabel", {"o.json": LABEL + '"pose_wrt_parent": {"matrix4x4": [1]}}}}}'},
+     r"camera\.pose_wrt_parent: needs 12 or 16"),
+    ("openlabel", {"o.json": '{"vcd": {}}'}, "drafts before OpenLABEL"),
+    ("matlab", {"m.json": "{"}, r"m\.json: no readable JSON"),
+    ("matlab", {"m.json": '{"T_camera_lidar": [[1, 0], [0]]}'}, r"m\.json: T_camera_lidar: is no matrix"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "files", "words"), BAD)
+def test_a_bad_file_is_named_with_its_field(name, files, words):
+    with pytest.raises(ConfigError, match=words) as caught:
+        format_named(name).pairs({file: text.encode() for file, text in files.items()}, FrameNames())
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00", b"null", b"[]", b"{}", b"0", b"a: b", b"<a/>"])
+def test_nonsense_is_refused_by_every_format_in_words(name, content):
+    files = (
+        {"sensor.json": content, "calibrated_sensor.json": content}
+        if name in ("nuscenes", "t4")
+        else {"f": content}
+    )
+    with pytest.raises(ConfigError):
+        format_named(name).pairs(files, FrameNames())

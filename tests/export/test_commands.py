@@ -1,0 +1,219 @@
+"""`boresight export` and `import` on a lake: what is not accepted never goes out unsaid, and exit codes say it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jobs.cli import main
+from pipeline.extrinsics.prior import read_transforms
+from pipeline.store.current import transform_of
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import commit_records, read_records
+from pipeline.store.tables import write_partition
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.observations import OBSERVATIONS
+from schemas.states import STATES, StateRow
+from tests.audit.fleet_records import vehicle_records
+from tests.makers.calibrations import CAMERA
+from tests.makers.table_rows import make_row
+
+BOTH = ["azimuth", "elevation"]
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory):
+    """Days of vehicle v: the first accepted and certified, then radar elevation not certified, radar held, refused."""
+    folder = tmp_path_factory.mktemp("lake")
+    records = [
+        replace(r, determined=BOTH)
+        for r in vehicle_records("v", 4, np.random.default_rng(1), unobservable=(3,))
+    ]
+    days = sorted({r.day for r in records})
+    changed = {
+        (days[1], "lidar_radar"): {"determined": ["azimuth"]},
+        (days[2], "lidar_radar"): {"status": "held", "reason": "halves disagree", "determined": []},
+        (days[2], "camera_radar"): {
+            "status": "held",
+            "reason": "lidar-radar: halves disagree",
+            "determined": [],
+        },
+    }
+    nothing = dict.fromkeys(("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m", "covariance"))
+    refused = {"status": "refused", "reason": "12 frames", "determined": [], **nothing}
+    rows = [replace(r, **changed.get((r.day, r.pair), refused if r.day == days[3] else {})) for r in records]
+    tables = Lake.at(folder)
+    commit_records(tables, CALIBRATIONS, rows)
+    first = [r for r in rows if r.day == days[0]]
+    shared = (
+        "vehicle",
+        "method",
+        "pair",
+        "parent_frame",
+        "child_frame",
+        "qw",
+        "qx",
+        "qy",
+        "qz",
+        "tx_m",
+        "ty_m",
+        "tz_m",
+    )
+    states = [
+        StateRow(
+            **{name: getattr(r, name) for name in shared}, day=days[3], status="current", reason="",
+            work_key="state", covariance=r.covariance, common_covariance=0.5 * r.covariance, observable=[True] * 6,
+            determined=BOTH, days=[days[0]],
+        )
+        for r in first
+    ]  # fmt: skip
+    commit_records(tables, STATES, states)
+    row = make_row(
+        "observations", np.random.default_rng(2), nulls=True, camera_model=CAMERA.model, camera_K=CAMERA.K,
+        camera_D=CAMERA.D, image_width_px=CAMERA.width_px, image_height_px=CAMERA.height_px,
+    )  # fmt: skip
+    with write_partition(tables, OBSERVATIONS, Partition("v", days[0]), "k", "0.7.0") as writer:
+        writer.append([row])
+        writer.describe(kept={}, rejected={})
+    return folder, days
+
+
+def run(capsys, *arguments):
+    """Exit code, summary, and what stderr says."""
+    code = main([str(a) for a in arguments])
+    said = capsys.readouterr()
+    return code, json.loads(said.out.splitlines()[-1]), said.err
+
+
+def test_an_accepted_day_and_a_state_go_out_and_come_back_as_a_prior(lake, tmp_path, capsys):
+    folder, days = lake
+    of_v = ["--lake", folder, "--vehicle", "v"]
+    code, summary, _ = run(capsys, "export", "kitti", *of_v, "--day", days[0], "--out", tmp_path / "a.txt")
+    assert (code, summary["status"], summary["pairs"]) == (0, "done", ["camera_lidar", "lidar_radar"])
+    assert [tmp_path / n for n in ("a.txt", "a.provenance.json")] == [
+        tmp_path / o for o in summary["outputs"]
+    ]
+    said = json.loads((tmp_path / "a.provenance.json").read_text())
+    assert said["pairs"]["camera_lidar"]["work_key"] == "v-0"
+    assert said["pairs"]["camera_lidar"]["kept_at_prior"] == ["tx"]
+    code, summary, _ = run(capsys, "import", "kitti", tmp_path / "a.txt", "--out", tmp_path / "prior.json")
+    assert code == 0
+    # A prior's rotation is made orthogonal to the last bit when it is read; the file holds the record's own bits.
+    held = json.loads((tmp_path / "prior.json").read_text())
+    for r in read_records(Lake.at(folder), CALIBRATIONS, CalibrationRecord, vehicle="v", day=days[0]):
+        if r.pair != "camera_radar":
+            assert held[f"T_{r.pair}"] == transform_of(r).tolist()
+    np.testing.assert_allclose(
+        read_transforms(tmp_path / "prior.json")["camera_lidar"], held["T_camera_lidar"], atol=1e-14
+    )
+    code, summary, _ = run(capsys, "export", "ros2", *of_v, "--out", tmp_path / "ros")
+    assert (code, summary["source"]) == (0, f"state of {days[3]}")
+    assert (tmp_path / "ros" / "static_transforms.launch.py").is_file()
+
+
+def test_a_direction_that_is_not_certified_is_said_in_the_file_on_stderr_and_by_exit_code_3(
+    lake, tmp_path, capsys
+):
+    folder, days = lake
+    code, summary, said = run(
+        capsys, "export", "urdf", "--lake", folder, "--vehicle", "v", "--day", days[1], "--out", tmp_path
+    )
+    assert (code, summary["status"]) == (3, "held")
+    assert summary["not_certified"] == {"lidar_radar": "elevation not certified"}
+    assert "elevation not certified" in said
+    assert "WARNING: lidar_radar: elevation not certified" in (tmp_path / "sensors.urdf").read_text()
+
+
+def test_a_held_pair_is_left_out_unless_forced_and_then_marked(lake, tmp_path, capsys):
+    folder, days = lake
+    call = ["export", "autoware", "--lake", folder, "--vehicle", "v", "--day", days[2], "--out", tmp_path]
+    code, summary, said = run(capsys, *call)
+    assert (code, summary["status"], summary["pairs"]) == (3, "held", ["camera_lidar"])
+    assert "halves disagree" in said
+    kit = tmp_path / "sensor_kit_calibration.yaml"
+    assert "WARNING: lidar_radar is left out: held: halves disagree" in kit.read_text()
+    assert "\n  radar:" not in kit.read_text()
+    code, summary, _ = run(capsys, *call, "--force")
+    assert (code, summary["pairs"]) == (3, ["camera_lidar", "lidar_radar"])
+    assert "WARNING: lidar_radar is HELD, do not load it unseen: halves disagree" in kit.read_text()
+    assert "\n  radar:" in kit.read_text()
+
+
+def test_a_refused_day_writes_nothing_even_when_forced(lake, tmp_path, capsys):
+    folder, days = lake
+    call = [
+        "export",
+        "matlab",
+        "--lake",
+        folder,
+        "--vehicle",
+        "v",
+        "--day",
+        days[3],
+        "--out",
+        tmp_path / "x.json",
+    ]
+    code, summary, _ = run(capsys, *call, "--force")
+    assert (code, summary["status"], summary["outputs"]) == (3, "refused", [])
+    assert "12 frames" in summary["not_certified"]["camera_lidar"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(lake, tmp_path, capsys):
+    folder, days = lake
+    mount = tmp_path / "car.urdf"
+    mount.write_text(
+        '<robot name="r"><link name="base_link"/><link name="top"/><joint name="j" type="fixed">'
+        '<origin xyz="0.9 0 2" rpy="0 0 0"/><parent link="base_link"/><child link="top"/></joint></robot>'
+    )
+    named = ["--lidar-frame", "top", "--camera-frame", "front_optical", "--mount", f"urdf:{mount}"]
+    call = ["export", "apollo", "--lake", folder, "--vehicle", "v", "--day", days[0], "--out", tmp_path / "o"]
+    assert run(capsys, *call, *named)[0] == 0
+    assert {p.name for p in (tmp_path / "o").iterdir()} == {
+        *("top_extrinsics.yaml", "front_optical_extrinsics.yaml", "radar_extrinsics.yaml"),
+        *("front_optical_intrinsics.yaml", "top_extrinsics.provenance.json"),
+    }
+    text = (tmp_path / "o" / "top_extrinsics.yaml").read_text()
+    assert "frame_id: base_link" in text
+    assert "x: 0.9" in text
+    files = sorted((tmp_path / "o").iterdir())
+    assert run(capsys, "import", "apollo", *files, *named[:4], "--out", tmp_path / "p.json")[0] == 0
+    assert run(capsys, *call, "--lidar-frame", "side", "--mount", f"urdf:{mount}")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["kitti"], "needs --lake and --vehicle"),
+        (["kitti", "--lake", "{lake}", "--vehicle", "w"], "no state of w by joint"),
+        (["kitti", "--lake", "{lake}", "--vehicle", "v", "--day", "2020-01-01"], "no record of v 2020-01-01"),
+        (["kitti", "--lake", "{lake}", "--vehicle", "v", "--day", "yesterday"], "is no day"),
+        (["urdf", "--lake", "{lake}", "--vehicle", "v", "--lidar-frame", "a b"], "is no frame name"),
+        (["urdf", "--lake", "{lake}", "--vehicle", "v", "--lidar-frame", "radar"], "must differ"),
+        (["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "car.urdf"], "is not FORMAT:FILE"),
+        (["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "urdf:none.urdf"], "cannot be read"),
+        (["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "kitti:none"], "knows no frames of a car"),
+        (["stl", "--lake", "{lake}", "--vehicle", "v"], "stl"),
+    ],
+)
+def test_what_cannot_be_exported_is_a_usage_error_in_one_line(lake, tmp_path, capsys, arguments, words):
+    given = [str(a).replace("{lake}", str(lake[0])) for a in arguments]
+    code, summary, _ = run(capsys, "export", *given, "--out", tmp_path / "o")
+    assert code == 2
+    assert words in summary["reason"]
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_prior_takes_from_another_file_what_the_calibration_lacks(tmp_path, capsys):
+    (tmp_path / "calib.txt").write_text("Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0.5 1 0 0 -1\n")
+    known = {"T_camera_lidar": np.eye(4).tolist(), "T_lidar_radar": np.diag([-1.0, -1, 1, 1]).tolist()}
+    (tmp_path / "old.json").write_text(json.dumps(known))
+    call = ["import", "kitti", tmp_path / "calib.txt", "--out", tmp_path / "new.json"]
+    code, summary, _ = run(capsys, *call)
+    assert code == 2
+    assert "T_lidar_radar: missing" in summary["reason"]
+    assert run(capsys, *call, "--also", tmp_path / "old.json")[0] == 0
+    made = read_transforms(tmp_path / "new.json")
+    assert made["camera_lidar"][1, 3] == 0.5
+    assert made["lidar_radar"][0, 0] == -1
