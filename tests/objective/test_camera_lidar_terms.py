@@ -91,7 +91,7 @@ def test_gradients_agree_with_differences_of_the_score(camera):
         np.float32
     )
     none, start = np.zeros(n, np.float32), np.array([0, 150, n])
-    points = Points(xyz, start, np.zeros(n, np.uint8), np.zeros(n, np.uint8), none, none)
+    points = Points(xyz, start, np.zeros(n, np.uint8), np.zeros(n, np.uint8), none, none, np.arange(F))
     labels = np.full((camera.height_px, camera.width_px), SKY, np.uint8)
     labels[:, :200] = CAR
     offsets = np.stack([boundary_offsets(labels)] * F)
@@ -161,6 +161,20 @@ def test_a_gap_between_the_stamps_is_a_time_offset_of_its_frame_the_other_way_ro
         np.testing.assert_allclose(gapped[f], without[0, f], atol=1e-6)
     kept = replace(terms, gap_s=gaps).of_frames(np.array([1, 0]))
     np.testing.assert_array_equal(kept.gap_s, gaps[[1, 0]])
+
+
+def test_some_frames_score_as_in_the_whole_without_copies_of_their_maps(terms):
+    at, level = AlignmentState(T_TRUE, 0.03).alone, KernelSettings.wide(3.0, 1)
+    chosen = np.array([3, 1])
+    some = terms.of_frames(chosen).of_frames(np.array([1, 0]))
+    assert some.maps is terms.maps
+    for name in ("edge_score", "marking_score"):
+        whole, part = (getattr(t, name)(at, level) for t in (terms, some))
+        assert np.ptp(whole) > 0
+        np.testing.assert_array_equal(part, whole[:, [1, 3]])
+    for whole, part in zip(terms.gradient(at, level), some.gradient(at, level), strict=True):
+        np.testing.assert_array_equal(part, whole[[1, 3]])
+    assert some.class_information(at) != terms.class_information(at)
 
 
 def test_information_is_positive_semidefinite(terms):

@@ -11,9 +11,11 @@ from pipeline.objective.radar.registration import (
     SIGMA_START,
     RegistrationFrames,
     normal_equations,
+    registration_cost,
     registration_frames,
     updated_sigma,
 )
+from tests.benchmarks import numpy_objectives
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
 
 RADAR = np.array([12.0, -4.0, 1.1])
@@ -165,3 +167,25 @@ def test_a_subset_gives_the_same_equations_as_its_frames_in_the_whole():
     whole, part = (normal_equations(f, T, 0.0, SIGMA_START) for f in (frames, frames.subset(index)))
     assert np.array_equal(whole.H[:, index], part.H)
     assert np.array_equal(whole.cost[index], part.cost)
+
+
+def test_the_cost_alone_is_that_of_the_equations():
+    frames = registration_frames(street_day(5), T_LIDAR_RADAR, np.random.default_rng(0))
+    for sigma in (SIGMA_START, 0.3 * SIGMA_START):
+        equations = normal_equations(frames, T_LIDAR_RADAR, DT_S, sigma, 0.0, 0.2, 2, 0.05)
+        cost = registration_cost(frames, T_LIDAR_RADAR, DT_S, sigma, 0.2, 2, 0.05)
+        np.testing.assert_allclose(cost, equations.cost, rtol=1e-12)
+
+
+@pytest.mark.parametrize("widen", [0.2, 1.0, 4.0])
+def test_every_lidar_point_in_reach_takes_part(widen):
+    """Against every pair of detection and point in plain NumPy, at sigmas sharper and wider than the cells."""
+    frames = registration_frames(street_day(3), T_LIDAR_RADAR, np.random.default_rng(0))
+    about = (T_LIDAR_RADAR, 0.04, widen * SIGMA_START, 0.12, 0.2)
+    ours, plain = normal_equations(frames, *about), numpy_objectives.registration(frames, *about)
+    for a, b in zip((ours.H, ours.g, ours.information, ours.cost), plain, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(b).max())
+    turning = replace(frames, yaw_rate_radps=np.full(frames.count, YAW_RATE))
+    cost = normal_equations(turning, *about).cost
+    assert np.abs(cost - ours.cost).max() > 1e-3
+    np.testing.assert_allclose(cost, numpy_objectives.registration_cost(turning, *about), atol=1e-7)

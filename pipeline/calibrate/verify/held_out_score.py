@@ -39,7 +39,12 @@ from pipeline.objective.camera_lidar.score import (
     prepare_terms,
 )
 from pipeline.objective.radar.moving_clusters import azimuth_equations_camera, moving_clusters
-from pipeline.objective.radar.registration import RegistrationFrames, normal_equations, registration_frames
+from pipeline.objective.radar.registration import (
+    RegistrationFrames,
+    normal_equations,
+    registration_cost,
+    registration_frames,
+)
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s, radar_gaps_s
 from schemas.observations import Observation
 
@@ -150,15 +155,8 @@ def _lidar_radar(
     )
 
     def value(T: np.ndarray) -> np.ndarray:
-        return normal_equations(
-            frames,
-            T,
-            dt_s,
-            REGISTRATION_COMPARISON_SIGMA,
-            0.0,
-            OUTLIER_DENSITY,
-            range_bias_m=range_bias_m,
-        ).cost
+        sigma = REGISTRATION_COMPARISON_SIGMA
+        return registration_cost(frames, T, dt_s, sigma, OUTLIER_DENSITY, range_bias_m=range_bias_m)
 
     trend_per_m = _trend_along_axis(estimate.T, value)
 

@@ -32,7 +32,7 @@ _FEWEST_OF_KIND = 40  # fewer tell no share from chance
 
 def edge_scores(
     camera: Float32[np.ndarray, " 18"],
-    offsets: Int8[np.ndarray, "F 4 H W"],
+    offsets: Int8[np.ndarray, "I 4 H W"],
     edges: Points,
     poses: Float32[np.ndarray, "P F 12"],
     focal: Float32[np.ndarray, " P"],
@@ -63,6 +63,7 @@ def edge_scores(
         edges.kind,
         1 / width_px,
         edges.start,
+        edges.image,
         poses,
         focal,
         1 - settings.match,
@@ -72,7 +73,7 @@ def edge_scores(
 
 def edge_gradients(
     camera: Float32[np.ndarray, " 18"],
-    offsets: Int8[np.ndarray, "F 4 H W"],
+    offsets: Int8[np.ndarray, "I 4 H W"],
     edges: Points,
     poses: Float64[np.ndarray, "F 12"],
     focal: float,
@@ -102,6 +103,7 @@ def edge_gradients(
         edges.kind,
         edges.gap_rad,
         edges.start,
+        edges.image,
         poses,
         focal,
         motion,
@@ -113,7 +115,7 @@ def edge_gradients(
 
 def edge_residuals(
     camera: Float32[np.ndarray, " 18"],
-    offsets: Int8[np.ndarray, "F 4 H W"],
+    offsets: Int8[np.ndarray, "I 4 H W"],
     edges: Points,
     poses: Float32[np.ndarray, "F 12"],
     focal: np.float32,
@@ -123,7 +125,8 @@ def edge_residuals(
 
     NaN outside the image, 127 where no boundary is in reach.
     """
-    return _residual_loop(camera, offsets, edges.xyz_m, edges.side, edges.start, poses, focal, shift_px)
+    at = (edges.xyz_m, edges.side, edges.start, edges.image)
+    return _residual_loop(camera, offsets, *at, poses, focal, shift_px)
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
@@ -136,6 +139,7 @@ def _edge_loop(
     kind: np.ndarray,
     sharpness: np.ndarray,
     start: np.ndarray,
+    image: np.ndarray,
     poses: np.ndarray,
     focal: np.ndarray,
     base: np.ndarray,
@@ -159,7 +163,7 @@ def _edge_loop(
                     continue
                 c, n = side[i], kind[i]
                 iu, iv = i4(u + half), i4(v + half)
-                k = offsets[f, c, iv, iu]
+                k = offsets[image[f], c, iv, iu]
                 ratio = base[n]
                 if k != -128:
                     r = f4(k) + half + (f4(iu) - u if c < 2 else f4(iv) - v)
@@ -186,6 +190,7 @@ def _gradient_loop(
     kind: np.ndarray,
     gap_rad: np.ndarray,
     start: np.ndarray,
+    image: np.ndarray,
     poses: np.ndarray,
     focal: float,
     motion: np.ndarray,
@@ -213,7 +218,7 @@ def _gradient_loop(
                 continue
             c = side[i]
             iu, iv = int(u + 0.5), int(v + 0.5)
-            k = offsets[f, c, iv, iu]
+            k = offsets[image[f], c, iv, iu]
             if k == -128:
                 continue
             r = k + 0.5 + (iu - u if c < 2 else iv - v)
@@ -246,6 +251,7 @@ def _residual_loop(
     points: np.ndarray,
     side: np.ndarray,
     start: np.ndarray,
+    image: np.ndarray,
     poses: np.ndarray,
     focal: float,
     shift_px: np.ndarray,
@@ -266,7 +272,7 @@ def _residual_loop(
             if not valid or u < 0 or v < 0 or u > width - 1 or v > height - 1:
                 continue
             iu, iv = int(u + 0.5), int(v + 0.5)
-            k = offsets[f, side[i], iv, iu]
+            k = offsets[image[f], side[i], iv, iu]
             out[i] = 127.0 if k == -128 else k + 0.5 + (iu - u if side[i] < 2 else iv - v)
     return out
 

@@ -25,10 +25,11 @@ _LABELS = 20  # 19 Cityscapes classes and void
 @numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def class_information(
     camera: Float32[np.ndarray, " 18"],
-    labels: UInt8[np.ndarray, "F H W"],
+    labels: UInt8[np.ndarray, "I H W"],
     points: Float32[np.ndarray, "N 3"],
     kind: UInt8[np.ndarray, " N"],
     start: Int64[np.ndarray, " G"],
+    image: Int64[np.ndarray, " F"],
     poses: Float32[np.ndarray, "P F 12"],
     kinds: int,
 ) -> Float64[np.ndarray, " P"]:
@@ -48,7 +49,9 @@ def class_information(
             for i in range(start[f], start[f + 1]):
                 u, v = us[i - start[f]], vs[i - start[f]]
                 if u >= f4(0) and v >= f4(0) and u <= u_max and v <= v_max:
-                    table[p, kind[i], min(labels[f, int(v + f4(0.5)), int(u + f4(0.5))], _LABELS - 1)] += 1.0
+                    table[
+                        p, kind[i], min(labels[image[f], int(v + f4(0.5)), int(u + f4(0.5))], _LABELS - 1)
+                    ] += 1.0
     for p in range(count):
         out[p] = _information(table[p]) / points.shape[0]
     return out

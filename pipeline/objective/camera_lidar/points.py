@@ -41,6 +41,8 @@ _CLASS_STRIDE = 8  # of the sampled cloud: neighbours say the same
 class Points:
     """Points of F frames, one after the other: frame f has rows start[f]:start[f+1]; lidar frame.
 
+    Frame f looks at the maps of row image[f]: of some frames of a day the maps need not be copied.
+
     `exposure_s` is how long after the image's middle row their own row saw them, where they were moved to that time
     (`rolling_shutter.exposed`).
     """
@@ -51,6 +53,7 @@ class Points:
     kind: np.ndarray
     gap_rad: np.ndarray
     exposure_s: np.ndarray
+    image: np.ndarray
 
     def chosen(self, keep: np.ndarray) -> Points:
         """The points of a mask."""
@@ -62,6 +65,7 @@ class Points:
             self.kind[keep],
             self.gap_rad[keep],
             self.exposure_s[keep],
+            self.image,
         )
 
     def of_frames(self, frames: np.ndarray) -> Points:
@@ -76,6 +80,7 @@ class Points:
             self.kind[index],
             self.gap_rad[index],
             self.exposure_s[index],
+            self.image[frames],
         )
 
 
@@ -190,4 +195,5 @@ def _gather(
         columns[2].astype(np.uint8),
         columns[3].astype(np.float32),
         np.zeros(len(columns[0]), np.float32),
+        np.arange(len(frames), dtype=np.int64),
     )

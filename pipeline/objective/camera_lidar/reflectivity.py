@@ -29,10 +29,11 @@ __all__ = ["marking_gradients", "marking_scores"]
 @numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def marking_scores(
     camera: Float32[np.ndarray, " 18"],
-    contrast: Int8[np.ndarray, "F H W"],
+    contrast: Int8[np.ndarray, "I H W"],
     points: Float32[np.ndarray, "N 3"],
     weight: Float32[np.ndarray, " N"],
     start: Int64[np.ndarray, " G"],
+    image: Int64[np.ndarray, " F"],
     poses: Float32[np.ndarray, "P F 12"],
     focal: Float32[np.ndarray, " P"],
 ) -> Float32[np.ndarray, "P F"]:
@@ -54,8 +55,8 @@ def marking_scores(
                     continue
                 iu, iv = int(u), int(v)
                 a, b = u - f4(iu), v - f4(iv)
-                c00, c01 = f4(contrast[f, iv, iu]), f4(contrast[f, iv, iu + 1])
-                c10, c11 = f4(contrast[f, iv + 1, iu]), f4(contrast[f, iv + 1, iu + 1])
+                c00, c01 = f4(contrast[image[f], iv, iu]), f4(contrast[image[f], iv, iu + 1])
+                c10, c11 = f4(contrast[image[f], iv + 1, iu]), f4(contrast[image[f], iv + 1, iu + 1])
                 upper, lower = c00 + a * (c01 - c00), c10 + a * (c11 - c10)
                 total += weight[i] * (upper + b * (lower - upper))
             out[p, f] = total
@@ -70,6 +71,7 @@ def marking_gradients(
     points: np.ndarray,
     weight: np.ndarray,
     start: np.ndarray,
+    image: np.ndarray,
     poses: np.ndarray,
     focal: float,
     motion: np.ndarray,
@@ -98,8 +100,8 @@ def marking_gradients(
                 continue
             iu, iv = int(u), int(v)
             a, b = u - iu, v - iv
-            c00, c01 = float(contrast[f, iv, iu]), float(contrast[f, iv, iu + 1])
-            c10, c11 = float(contrast[f, iv + 1, iu]), float(contrast[f, iv + 1, iu + 1])
+            c00, c01 = float(contrast[image[f], iv, iu]), float(contrast[image[f], iv, iu + 1])
+            c10, c11 = float(contrast[image[f], iv + 1, iu]), float(contrast[image[f], iv + 1, iu + 1])
             top, bottom, left = c01 - c00, c11 - c10, c10 - c00
             gu = weight[i] * (top + b * (bottom - top))
             gv = weight[i] * (left + a * (bottom - top))

@@ -113,16 +113,9 @@ class Terms:
         return replace(self, edges=edges, markings=markings)
 
     def of_frames(self, frames: np.ndarray) -> Terms:
-        """Some of the frames."""
-        maps = replace(
-            self.maps,
-            offsets=self.maps.offsets[frames],
-            contrast=self.maps.contrast[:, frames],
-            labels=self.maps.labels[frames],
-        )
+        """Some of the frames, which look at the same maps."""
         return replace(
             self,
-            maps=maps,
             edges=self.edges.of_frames(frames),
             markings=self.markings.of_frames(frames),
             classes=self.classes.of_frames(frames),
@@ -190,14 +183,14 @@ class Terms:
         m, contrast = self.markings, self.maps.contrast[settings.contrast_level]
         focal = at.focal.astype(np.float32)
         return marking_scores(
-            self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, self.poses(at), focal
+            self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, m.image, self.poses(at), focal
         )
 
     def class_information(self, at: Alignments) -> Float[np.ndarray, " P"]:
         """Mutual information of lidar class and label, nats per point; for the basin only."""
         c = self.classes
         return class_information(
-            self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, self.poses(at), CLASSES
+            self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, c.image, self.poses(at), CLASSES
         )
 
     def score(self, at: Alignments, settings: KernelSettings) -> Float[np.ndarray, "P F"]:
@@ -234,7 +227,7 @@ class Terms:
         if settings.marking_weight > 0:
             contrast = self.maps.contrast[settings.contrast_level]
             g, H = marking_gradients(
-                self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, poses, focal, motion
+                self.camera, contrast, m.xyz_m, _weights(m, settings), m.start, m.image, poses, focal, motion
             )
             gradient += settings.marking_weight * g
             information += settings.marking_weight * H

@@ -34,6 +34,7 @@ __all__ = [
     "NormalEquations",
     "RegistrationFrames",
     "normal_equations",
+    "registration_cost",
     "registration_frames",
     "updated_sigma",
 ]
@@ -182,9 +183,53 @@ def normal_equations(
         stride: use every n-th detection.
         range_bias_m: measured minus true range (the radar's own offset, and how far it sees into things).
     """
+    about = (frames, T_lidar_radar, dt_s, sigma, bounce_prior, outlier, stride, range_bias_m)
+    H, g, info, stats = _accumulated(*about, with_equations=True)
+    seen = np.maximum(stats[:, 1], 1)
+    total = stats.sum(0)
+    moments = total[4:7] / np.maximum([total[2], total[7], total[2]], 1e-9)
+    return NormalEquations(
+        H,
+        g,
+        info,
+        -stats[:, 0] / seen,
+        stats[:, 2] / seen,
+        float(total[3] / max(total[2], 1e-9)),
+        moments,
+    )
+
+
+def registration_cost(
+    frames: RegistrationFrames,
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    dt_s: float,
+    sigma: Float[np.ndarray, " 3"],
+    outlier: float = 1.0,
+    stride: int = 1,
+    range_bias_m: float = 0.0,
+) -> Float[np.ndarray, " F"]:
+    """The cost of `normal_equations` alone, without ground bounces: half the work, to compare poses and offsets."""
+    about = (frames, T_lidar_radar, dt_s, sigma, 0.0, outlier, stride, range_bias_m)
+    stats = _accumulated(*about, with_equations=False)[-1]
+    return np.asarray(-stats[:, 0] / np.maximum(stats[:, 1], 1))
+
+
+def _accumulated(
+    frames: RegistrationFrames,
+    T_lidar_radar: np.ndarray,
+    dt_s: float,
+    sigma: np.ndarray,
+    bounce_prior: float,
+    outlier: float,
+    stride: int,
+    range_bias_m: float,
+    *,
+    with_equations: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """H (2 F 8 8), g (2 F 8), information (2 F 8 8) and statistics (F STATS) of the compiled loop."""
     F = frames.count
-    H, info = np.zeros((2, F, 8, 8)), np.zeros((2, F, 8, 8))
-    g, stats = np.zeros((2, F, 8)), np.zeros((F, STATS))
+    H, info = np.zeros((F, 2, 8, 8)), np.zeros((F, 2, 8, 8))
+    g, stats = np.zeros((F, 2, 8)), np.zeros((F, STATS))
     accumulate_frames(
         np.ascontiguousarray(T_lidar_radar, np.float64),
         frames.stamp_gap_s + dt_s,
@@ -204,23 +249,13 @@ def normal_equations(
         bounce_prior,
         stride,
         RANGE_M[1] + 5.0,
+        with_equations,
         H,
         g,
         info,
         stats,
     )
-    seen = np.maximum(stats[:, 1], 1)
-    total = stats.sum(0)
-    moments = total[4:7] / np.maximum([total[2], total[7], total[2]], 1e-9)
-    return NormalEquations(
-        H,
-        g,
-        info,
-        -stats[:, 0] / seen,
-        stats[:, 2] / seen,
-        float(total[3] / max(total[2], 1e-9)),
-        moments,
-    )
+    return H.swapaxes(0, 1), g.swapaxes(0, 1), info.swapaxes(0, 1), stats
 
 
 def updated_sigma(

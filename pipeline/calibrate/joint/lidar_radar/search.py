@@ -21,7 +21,7 @@ from pipeline.calibrate.joint.lidar_radar.time_offset import scan_time_offset
 from pipeline.calibrate.numerics.bias_floors import BOX_ELEVATION_GATES_RAD, OUTLIER_DENSITY
 from pipeline.config import SolveConfig
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.objective.radar.registration import BOUNCE_PRIOR, SIGMA_START, normal_equations, updated_sigma
+from pipeline.objective.radar.registration import BOUNCE_PRIOR, SIGMA_START, registration_cost, updated_sigma
 from pipeline.objective.radar.vehicle_boxes import BOX_CLASSES, BoxPairs, box_pairs
 
 __all__ = ["NONE_FIXED", "anneal", "finish", "last_step", "scan"]
@@ -45,8 +45,7 @@ def scan(problem: RadarProblem, config: SolveConfig) -> list[RadarState]:
         from_rotation_translation(exp_so3(np.array([0.0, 0.0, a])) @ T0[:3, :3], T0[:3, 3]) for a in turns
     ]
     cost = [
-        float(normal_equations(part, T, 0.0, sigma, 0.0, OUTLIER_DENSITY, stride=SCHEDULE.stride).cost.mean())
-        for T in poses
+        float(registration_cost(part, T, 0.0, sigma, OUTLIER_DENSITY, SCHEDULE.stride).mean()) for T in poses
     ]
     bias = np.zeros(len(BOX_CLASSES))
     best = int(np.argmin(cost if "static" in problem.terms else np.abs(turns)))

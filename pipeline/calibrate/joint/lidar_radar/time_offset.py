@@ -17,7 +17,7 @@ from scipy.ndimage import median_filter
 from pipeline.calibrate.joint.lidar_radar.normal_equations import RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY, REGISTRATION_COMPARISON_SIGMA
-from pipeline.objective.radar.registration import SIGMA_START, RegistrationFrames, normal_equations
+from pipeline.objective.radar.registration import SIGMA_START, RegistrationFrames, registration_cost
 
 __all__ = ["better_time_offset", "comparison_cost", "dips", "scan_time_offset"]
 
@@ -46,17 +46,9 @@ def scan_time_offset(problem: RadarProblem, state: RadarState, widen: float) -> 
     detections = max(len(part.radar_m) / SCHEDULE.stride / max(part.count, 1), 1.0)
 
     def cost(dt_s: float) -> float:
-        found = normal_equations(
-            part,
-            state.T_lidar_radar,
-            dt_s,
-            widen * SIGMA_START,
-            0.0,
-            OUTLIER_DENSITY,
-            SCHEDULE.stride,
-            state.range_bias_m,
-        )
-        return float(found.cost.sum() * detections)
+        T, sigma = state.T_lidar_radar, widen * SIGMA_START
+        found = registration_cost(part, T, dt_s, sigma, OUTLIER_DENSITY, SCHEDULE.stride, state.range_bias_m)
+        return float(found.sum() * detections)
 
     value = dips(np.array([[cost(float(dt_s))] for dt_s in offsets]))[:, 0]
     value += 0.5 * (offsets / problem.dt_sigma_s) ** 2
@@ -87,24 +79,16 @@ def better_time_offset(problem: RadarProblem, state: RadarState) -> RadarState |
 def _own_cost(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " F"]:
     """Cost of each frame at the radar's own sigmas: of few detections, for it only confirms."""
     sigma = np.maximum(state.sigma, 0.5 * REGISTRATION_COMPARISON_SIGMA)  # dips as wide as steps
-    return normal_equations(
-        problem.frames,
-        state.T_lidar_radar,
-        state.dt_s,
-        sigma,
-        0.0,
-        OUTLIER_DENSITY,
-        _OWN_STRIDE,
-        state.range_bias_m,
-    ).cost
+    T, dt_s = state.T_lidar_radar, state.dt_s
+    return registration_cost(problem.frames, T, dt_s, sigma, OUTLIER_DENSITY, _OWN_STRIDE, state.range_bias_m)
 
 
 def comparison_cost(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " F"]:
     """Cost of each frame, to compare the ends of different starts: the same sigmas for all."""
     T, dt_s = state.T_lidar_radar, state.dt_s
-    return normal_equations(
-        problem.frames, T, dt_s, REGISTRATION_COMPARISON_SIGMA, 0.0, OUTLIER_DENSITY, stride=2
-    ).cost
+    return registration_cost(
+        problem.frames, T, dt_s, REGISTRATION_COMPARISON_SIGMA, OUTLIER_DENSITY, stride=2
+    )
 
 
 def _step_s(frames: RegistrationFrames, step_m: float) -> float:
