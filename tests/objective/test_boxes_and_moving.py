@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from pipeline.geometry.se3 import exp_se3, transform_points
 from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.objective.radar.medians import median_of_rows
 from pipeline.objective.radar.moving_clusters import (
     azimuth_equations_camera,
     azimuth_equations_lidar,
@@ -177,3 +179,11 @@ def test_moving_clusters_give_yaw_against_lidar_and_camera():
         H, g, _ = azimuth_equations_camera(clusters, T, np.radians(3))
         T = exp_se3(np.array([0, -g.sum(0)[1] / H.sum(0)[1, 1], 0, 0, 0, 0])) @ T
     assert abs((T @ np.linalg.inv(T_CAMERA_RADAR))[0, 2]) < np.radians(0.35)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 8])
+def test_medians_of_few_rows_are_those_of_numpy(count):
+    x = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
+    np.testing.assert_array_equal(median_of_rows(x), np.median(x, axis=0))
+    np.testing.assert_array_equal(median_of_rows(x[:, 0]), np.median(x[:, 0]))
+    assert median_of_rows(x).dtype == np.float32

@@ -145,39 +145,99 @@ def _edge_loop(
     base: np.ndarray,
     gain: np.ndarray,
 ) -> np.ndarray:
-    """The sum of log(base + gain sharpness (1 + (r sharpness)^2)^-2) over each frame's points."""
+    """The sum of log(base + gain sharpness (1 + (r sharpness)^2)^-2) over each frame's points.
+
+    Steps of few arrays each, without branches, become vector instructions; whether a point finds a boundary is nothing
+    that a processor could foresee, and was two thirds of the time.
+    """
     count, frames = poses.shape[0], poses.shape[1]
     height, width = offsets.shape[2], offsets.shape[3]
     out = np.zeros((count, frames), np.float32)
-    f4, i4 = np.float32, np.int32
-    half, one = f4(0.5), f4(1.0)
-    u_max, v_max = f4(width - 1), f4(height - 1)
-    us, vs = np.empty(most_points(start), np.float32), np.empty(most_points(start), np.float32)
+    most = most_points(start)
+    us, vs, found = np.empty(most, np.float32), np.empty(most, np.float32), np.empty(most, np.float32)
+    rest, place = np.empty(most, np.float32), np.empty(most, np.int32)
+    floor, row = base[kind], kind.astype(np.int32) * gain.shape[1]
+    gains = gain.reshape(-1)
     for f in range(frames):
+        a, b = start[f], start[f + 1]
+        n = b - a
+        map_ = offsets[image[f]].reshape(-1)
         for p in range(count):
-            project_points(camera, xyz, start[f], start[f + 1], poses[p, f], focal[p], us, vs)
-            total, product, factors = f4(0.0), one, 0
-            for i in range(start[f], start[f + 1]):
-                u, v = us[i - start[f]], vs[i - start[f]]
-                if u < f4(0) or v < f4(0) or u > u_max or v > v_max:
-                    continue
-                c, n = side[i], kind[i]
-                iu, iv = i4(u + half), i4(v + half)
-                k = offsets[image[f], c, iv, iu]
-                ratio = base[n]
-                if k != -128:
-                    r = f4(k) + half + (f4(iu) - u if c < 2 else f4(iv) - v)
-                    x = r * sharpness[i]
-                    q = one + x * x
-                    ratio += gain[n, min(i4(abs(r)), i4(127))] * sharpness[i] / (q * q)
-                # One logarithm for eight factors: each is above 1e-4 and below 1e4.
-                product *= ratio
-                factors += 1
-                if factors == 8:
-                    total += np.log(product)
-                    product, factors = one, 0
-            out[p, f] = total + np.log(product)
+            project_points(camera, xyz, a, b, poses[p, f], focal[p], us, vs)
+            _places(us[:n], vs[:n], side[a:b], width, height, place, rest)
+            for i in range(n):
+                found[i] = map_[place[i]]
+            _ratios(found[:n], rest, sharpness[a:b], floor[a:b], row[a:b], gains, us)
+            out[p, f] = _sum_of_logs(us[:n])
     return out
+
+
+_UNSEEN = np.float32(1e6)  # px: no distance in an image
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+def _places(
+    us: np.ndarray,
+    vs: np.ndarray,
+    side: np.ndarray,
+    width: int,
+    height: int,
+    place: np.ndarray,
+    rest: np.ndarray,
+) -> None:
+    """Where in its frame's flat map each point looks, and from there to the point along its axis [px]."""
+    half, zero = np.float32(0.5), np.float32(0)
+    u_max, v_max = np.float32(width - 1), np.float32(height - 1)
+    across = np.int32(width)
+    down = np.int32(width * height)
+    for i in range(us.shape[0]):
+        u, v = us[i], vs[i]
+        seen = (u >= zero) & (v >= zero) & (u <= u_max) & (v <= v_max)
+        u, v = u if seen else zero, v if seen else zero
+        iu, iv = np.int32(u + half), np.int32(v + half)
+        place[i] = np.int32(side[i]) * down + iv * across + iu
+        along = np.float32(iu) - u if side[i] < 2 else np.float32(iv) - v
+        rest[i] = along if seen else _UNSEEN
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+def _ratios(
+    found: np.ndarray,
+    rest: np.ndarray,
+    sharpness: np.ndarray,
+    floor: np.ndarray,
+    row: np.ndarray,
+    gains: np.ndarray,
+    ratio: np.ndarray,
+) -> None:
+    """Likelihood ratio of each point; 1 outside the image."""
+    one, last = np.float32(1), np.float32(CHANCE_BINS - 1)
+    for i in range(found.shape[0]):
+        r = found[i] + np.float32(0.5) + rest[i]
+        x = r * sharpness[i]
+        q = one + x * x
+        gain = gains[row[i] + np.int32(min(abs(r), last))]
+        gain = gain * sharpness[i] / (q * q)
+        matched = floor[i] + (gain if found[i] > np.float32(-128) else np.float32(0))
+        ratio[i] = matched if rest[i] < _UNSEEN else one
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+def _sum_of_logs(x: np.ndarray) -> float:
+    """One logarithm for eight factors: each is above 1e-4 and below 1e4."""
+    total, eighths = np.float32(0), x.shape[0] // 8
+    for b in range(eighths):
+        i = 8 * b
+        total += np.log(
+            ((x[i] * x[i + 1]) * (x[i + 2] * x[i + 3])) * ((x[i + 4] * x[i + 5]) * (x[i + 6] * x[i + 7]))
+        )
+    product = np.float32(1)
+    for i in range(8 * eighths, x.shape[0]):
+        product *= x[i]
+    return total + np.log(product)
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code

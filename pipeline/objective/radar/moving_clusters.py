@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, wrap_angle
+from pipeline.objective.radar.medians import median_of_rows
 from pipeline.objective.radar.vehicle_boxes import select_frames
 from pipeline.objective.stamp_gaps import radar_gaps_s, scan_to_image_s
 from schemas.observations import Observation
@@ -117,13 +118,13 @@ def moving_clusters(
             member = o.radar_cluster == label
             if member.sum() < least_detections:
                 continue
-            centre = np.median(o.radar_xyz_m[member], axis=0).astype(np.float64)
+            centre = median_of_rows(o.radar_xyz_m[member]).astype(np.float64)
             distance = float(np.linalg.norm(centre))
             if not 3.0 < distance < 60.0:
                 continue
             u = centre / distance
             own = np.zeros(3) if o.radar_velocity_mps is None else o.radar_velocity_mps
-            rate = float(np.median(o.radar_residual_mps[member])) - u @ own
+            rate = float(median_of_rows(o.radar_residual_mps[member])) - u @ own
             points.append(centre)
             speeds.append(rate * u)
             frames.append(index)

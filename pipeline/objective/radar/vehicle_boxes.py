@@ -16,6 +16,7 @@ from jaxtyping import Float, Int64
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import hat, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical, to_spherical
+from pipeline.objective.radar.medians import median_of_rows
 from pipeline.objective.stamp_gaps import scan_to_image_s
 from schemas.observations import Observation
 
@@ -135,7 +136,7 @@ def box_pairs(
         for b in np.flatnonzero(boxes.frame == index):
             chosen = _detections_of(angles, distance, boxes, int(b), elevation_gate_rad)
             if len(chosen) >= least_detections:
-                middle = from_spherical(np.median(to_spherical(radar[chosen]), axis=0))
+                middle = from_spherical(median_of_rows(to_spherical(radar[chosen])))
                 centre = boxes.azimuth_rad[b], boxes.elevation_rad[b]
                 rows.append((middle, *centre, len(chosen), int(boxes.kind[b]), int(index)))
     if not rows:
