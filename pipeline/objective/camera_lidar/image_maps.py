@@ -162,14 +162,45 @@ def contrast_levels(
     inside = is_road[band].astype(np.float32)
     value = contrast[band].astype(np.float32) * inside
     count = np.maximum(_row_sums(inside), 1.0)
+    smooth = np.empty_like(value)
+    sums = np.empty((2, len(value), 1), np.float32)
     for level, blur in enumerate(blurs_px):
-        smooth = inside * _blurred(value, blur) / np.maximum(_blurred(inside, blur), 0.05)
-        mean = _row_sums(smooth) / count
-        variance = _row_sums(smooth * smooth) / count - mean * mean
+        _mean_over_road(inside, _blurred(value, blur), _blurred(inside, blur), smooth, sums)
+        mean, square = (_over_rows(s) / count for s in sums)
         # One grey level of spread: below it a road is plain, and its noise must not be blown up to unit size.
-        standard = inside * (smooth - mean) / (np.sqrt(np.maximum(variance, 0.0)) + 1.0)
-        out[level, band] = np.clip(standard, -2.0, 3.9) / CONTRAST_STEP
+        spread = np.sqrt(np.maximum(square - mean * mean, 0.0)) + 1.0
+        _standardise(inside, smooth, mean, spread, out[level, band])
     return out
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _mean_over_road(
+    inside: np.ndarray, value: np.ndarray, share: np.ndarray, smooth: np.ndarray, sums: np.ndarray
+) -> None:
+    """Blurred contrast as a mean over the road alone, and the sums over each row of it and of its square."""
+    for i in range(inside.shape[0]):
+        total, squares = np.float32(0), np.float32(0)
+        for j in range(inside.shape[1]):
+            x = inside[i, j] * value[i, j] / max(share[i, j], np.float32(0.05))
+            smooth[i, j] = x
+            total += x
+            squares += x * x
+        sums[0, i, 0], sums[1, i, 0] = total, squares
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _standardise(
+    inside: np.ndarray, smooth: np.ndarray, mean: np.ndarray, spread: np.ndarray, out: np.ndarray
+) -> None:
+    """Zero mean and unit spread by row in steps of CONTRAST_STEP, 0 outside the road."""
+    steps, low, high = np.float32(1 / CONTRAST_STEP), np.float32(-2.0), np.float32(3.9)
+    for i in range(inside.shape[0]):
+        middle, per_spread = mean[i, 0], np.float32(1) / spread[i, 0]
+        for j in range(inside.shape[1]):
+            x = inside[i, j] * (smooth[i, j] - middle) * per_spread
+            out[i, j] = np.int8(steps * min(max(x, low), high))
 
 
 def _blurred(x: np.ndarray, sigma_px: float) -> np.ndarray:
@@ -182,7 +213,12 @@ def _blurred(x: np.ndarray, sigma_px: float) -> np.ndarray:
 
 def _row_sums(x: np.ndarray) -> np.ndarray:
     """Sums over each row and, with falling weight, the rows about it, as a column."""
-    return cv2.GaussianBlur(x.sum(1, keepdims=True), (1, 25), 0, sigmaY=4.0)
+    return _over_rows(x.sum(1, keepdims=True))
+
+
+def _over_rows(x: np.ndarray) -> np.ndarray:
+    """Each value of a column and, with falling weight, those about it."""
+    return cv2.GaussianBlur(x, (1, 25), 0, sigmaY=4.0)
 
 
 def prepare_maps(observations: Sequence[Observation], blurs_px: tuple[float, ...]) -> CameraMaps:

@@ -182,28 +182,33 @@ def camera_azimuth_residuals(
     in_camera = transform_points(T_camera_radar, clusters.at_image_time())
     azimuth = camera_direction_angles(in_camera)[:, 0]
     distance = np.linalg.norm(in_camera, axis=1)
-    chosen: list[int] = []
-    residual: list[float] = []
-    for b in np.flatnonzero(in_camera[:, 2] > 1.0):
-        box_azimuth, expected_m = clusters.box_azimuths[clusters.frame[b]]
-        if not len(box_azimuth):
-            continue
-        ratio = distance[b] / expected_m
-        fits = (ratio < _RANGE_FACTOR) & (ratio > 1 / _RANGE_FACTOR)
-        gap = np.where(fits, np.abs(azimuth[b] - box_azimuth), np.inf)
-        n = int(np.argmin(gap))
-        if gap[n] <= gate_rad:
-            chosen.append(int(b))
-            residual.append(azimuth[b] - box_azimuth[n])
+    ahead = np.flatnonzero(in_camera[:, 2] > 1.0)
+    box_azimuth, expected_m = (table[clusters.frame[ahead]] for table in _box_table(clusters))
+    ratio = distance[ahead, None] / expected_m
+    fits = (ratio < _RANGE_FACTOR) & (ratio > 1 / _RANGE_FACTOR)
+    apart = azimuth[ahead, None] - box_azimuth
+    gap = np.where(fits, np.abs(apart), np.inf)
+    nearest = np.arange(len(ahead)), np.argmin(gap, axis=1)
+    found = gap[nearest] <= gate_rad
+    chosen, residual = ahead[found], apart[nearest][found]
     p = in_camera[chosen]
     h2 = p[:, 0] ** 2 + p[:, 2] ** 2
     # azimuth = atan2(-x, z); dp = dphi x p + drho
     gradient = np.stack([-p[:, 2] / h2, np.zeros(len(p)), p[:, 0] / h2], -1)
     return (
-        np.array(residual, np.float64),
+        residual,
         np.concatenate([np.cross(p, gradient), gradient], 1),
         clusters.frame[chosen],
     )
+
+
+def _box_table(clusters: MovingClusters) -> tuple[Float[np.ndarray, "F M"], Float[np.ndarray, "F M"]]:
+    """Azimuth and expected range of each frame's boxes; infinite where a frame has fewer than others."""
+    most = max([len(azimuth) for azimuth, _ in clusters.box_azimuths], default=0)
+    azimuth, expected_m = np.full((2, len(clusters.box_azimuths), max(most, 1)), np.inf)
+    for f, boxes in enumerate(clusters.box_azimuths):
+        azimuth[f, : len(boxes[0])], expected_m[f, : len(boxes[1])] = boxes
+    return azimuth, expected_m
 
 
 def azimuth_equations_lidar(
