@@ -80,7 +80,7 @@ def _seen_by_radar(xyz, R, t, motion, range_bias, inverse_cell, cells, seen, cel
 
     A point behind the radar, or too far away, is in the cell after the last.
     """
-    # A loop each: of a loop that fills many arrays the compiler does not find out that they do not overlap.
+    # A loop each: LLVM checks at run time that arrays do not overlap, and for eight pairs at most.
     n = xyz.shape[0]
     azimuth, distance, ahead, left, up = seen[0, :n], seen[1, :n], seen[2, :n], seen[3, :n], seen[4, :n]
     turn = motion[3]
