@@ -7,11 +7,11 @@ from pathlib import Path
 __all__ = ["ingest"]
 
 
-def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
+def ingest(*logs: str, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     """Synchronise camera, lidar and radar of one vehicle-day and keep the trios.
 
     Args:
-        logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of that day, in any order.
+        logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of that day, in any order; also s3://BUCKET/KEY.
         fleet: fleet.toml.
         lake: folder of the tables.
         vehicle: vehicle id, as in fleet.toml.
@@ -24,6 +24,7 @@ def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     from pipeline.fleet.ledger import record_outcome
     from pipeline.stages import INGEST
     from pipeline.store.partitions import Lake, Partition
+    from pipeline.store.remote_logs import log_at
     from pipeline.work import Task
 
     if not logs:
@@ -32,7 +33,8 @@ def ingest(*logs: Path, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     require_named_files(config)
     tables = Lake.at(lake)
     with progress_reporter(f"ingest {vehicle} {day}") as progress:
-        task = Task(config, tables, Partition(vehicle, day), logs=logs, progress=progress)
+        paths = tuple(log_at(log) for log in logs)
+        task = Task(config, tables, Partition(vehicle, day), logs=paths, progress=progress)
         outcome = INGEST.run(task)
     record_outcome(tables, outcome)
     print_summary("ingest", outcome.status, **outcome.counts())

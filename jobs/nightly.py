@@ -40,6 +40,7 @@ def nightly(
         fleet: fleet.toml.
         lake: folder of the tables; made where it is missing.
         logs: pattern such as "logs/{vehicle}/{day}/*.mcap" or "data/{vehicle}_{day}_*"; quoted.
+            In a bucket: "s3://BUCKET/{vehicle}/{day}/*.mcap".
         from_day: first day, YYYY-MM-DD.
         to_day: last day.
         executor: process (a pool) or inline (one after the other in this process).

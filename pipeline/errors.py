@@ -14,6 +14,7 @@ __all__ = [
     "MissingExtraError",
     "ModelError",
     "SolveError",
+    "StorageError",
 ]
 
 
@@ -94,6 +95,14 @@ class ModelError(BoresightError):
     def __init__(self, manifest: str, problem: str) -> None:
         self.manifest, self.problem = manifest, problem
         super().__init__(f"{manifest}: {problem}")
+
+
+class StorageError(BoresightError):
+    """An object store that does not answer, also after retries: nothing is damaged, and another try may help."""
+
+    def __init__(self, place: str, problem: str) -> None:
+        self.place, self.problem = place, problem
+        super().__init__(f"{place}: {problem}")
 
 
 class SolveError(BoresightError):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
@@ -13,6 +12,7 @@ from pydantic import BaseModel
 from pipeline.config import FleetConfig
 from pipeline.results import Progress, silent
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.remote_logs import LogPath
 from pipeline.store.tables import Manifest
 from schemas.outcomes import OutcomeRow
 
@@ -38,7 +38,7 @@ class Task:
         method: of calibration records; None = the stage's default.
         seed: of everything random; None = `solve.seed`.
         perturb: of calibrate: exact angle [deg] and shift [m] by which the prior is moved on purpose.
-        logs: of ingest: files or ROS 2 bag folders of the day, in any order.
+        logs: of ingest: files, ROS 2 bag folders or objects of a bucket, of the day, in any order.
         given: what one stage alone is given; its function says what.
         progress: told how far it is.
         inputs: manifests of the tables that the stage reads, by name; the runner fills them in.
@@ -53,7 +53,7 @@ class Task:
     method: str | None = None
     seed: int | None = None
     perturb: tuple[float, float] | None = None
-    logs: tuple[Path, ...] = ()
+    logs: tuple[LogPath, ...] = ()
     given: Any = None
     progress: Progress = silent
     inputs: Mapping[str, Manifest] = field(default_factory=dict)

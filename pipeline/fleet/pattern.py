@@ -11,12 +11,13 @@ import glob
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.store.partitions import Partition, is_day
+from pipeline.store.remote_logs import LogPath, find_remote_logs
 
 __all__ = ["VehicleDay", "check_day", "find_vehicle_days"]
 
@@ -33,7 +34,7 @@ class VehicleDay:
     """One unit of work: the logs of a vehicle and a day, in order of path."""
 
     partition: Partition
-    logs: tuple[Path, ...]
+    logs: tuple[LogPath, ...]
 
 
 def find_vehicle_days(
@@ -44,7 +45,8 @@ def find_vehicle_days(
     Args:
         pattern: a path with {vehicle} and {day} (YYYY-MM-DD), each as often as wanted, also inside file
             names; besides *, ?, [abc] and ** as in a shell. A match is an .mcap, .bag or .db3 file, a ROS 2
-            bag folder, or a folder of such logs; other files are passed over. A bag folder is one log where all
+            bag folder, or a folder of such logs; other files are passed over. Of a bucket
+            ("s3://BUCKET/{vehicle}/{day}/*.mcap") each object that matches is a log. A bag folder is one log where all
             of its files match for the same vehicle-day; in a folder that vehicles or days share, each file is.
         from_day: first day wanted, None = from the beginning.
         to_day: last day wanted.
@@ -58,11 +60,24 @@ def find_vehicle_days(
         raise ConfigError("command line", "--from", f"{from_day} is after --to {to_day}")
     days = [
         VehicleDay(Partition(vehicle, day), tuple(sorted(logs)))
-        for (day, vehicle), logs in sorted(_logs_by_owner(_owned(pattern)).items())
+        for (day, vehicle), logs in sorted(_found(pattern).items())
     ]
     if not days:
         raise ConfigError("command line", "--logs", f"no log matches {pattern!r}")
     return [d for d in days if (from_day or "") <= d.partition.day <= (to_day or "9999")]
+
+
+def _found(pattern: str) -> Mapping[_Owner, Iterable[LogPath]]:
+    """Logs of each vehicle-day that matches, in a folder or in a bucket."""
+    if not pattern.startswith("s3://"):
+        return _logs_by_owner(_owned(pattern))
+    matcher, found = _matcher(pattern), defaultdict[_Owner, list[LogPath]](list)
+    # Listed is what lies below the last folder that the pattern names to the letter.
+    for log in find_remote_logs(re.split(r"[{*?\[]", pattern)[0].rpartition("/")[0]):
+        match = matcher.fullmatch(str(log))
+        if match and is_day(match["day"]) and log.name.endswith(_SUFFIXES):
+            found[match["day"], match["vehicle"]].append(log)
+    return found
 
 
 def check_day(name: str, day: str | None) -> None:
@@ -91,9 +106,11 @@ def _matcher(pattern: str) -> re.Pattern[str]:
 
 
 def _shell_token(token: str) -> str:
-    # The shell pattern has chosen the files already; here it only says where the placeholders stand.
     wildcards = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
-    return wildcards.get(token) or ("[^/]" if token[0] == "[" and len(token) > 1 else re.escape(token))
+    if token[0] != "[" or len(token) == 1:
+        return wildcards.get(token) or re.escape(token)
+    negation = "^" if token[1] == "!" else ""
+    return f"[{negation}{re.escape(token[1 + len(negation) : -1]).replace(chr(92) + '-', '-')}]"
 
 
 def _owned(pattern: str) -> dict[str, _Owner]:

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int64
@@ -25,6 +24,7 @@ from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
 from pipeline.rigs import Rig, TopicSemantics
+from pipeline.store.remote_logs import LogPath
 
 __all__ = ["ACCEPTED_TYPES", "NEEDED", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]
 
@@ -133,7 +133,7 @@ def topics_of(rig: Rig) -> dict[str, str]:
 
 
 def index_logs(
-    paths: Sequence[Path], rig: Rig, *, survey: bool = False, budget: int | None = None
+    paths: Sequence[LogPath], rig: Rig, *, survey: bool = False, budget: int | None = None
 ) -> DayIndex:
     """Scan the logs once; of images and clouds only the stamp is read. Unreadable logs become problems.
 
@@ -143,9 +143,19 @@ def index_logs(
         survey: every topic is counted in `surveyed`, for those who ask what a log holds at all.
         budget: sweeps beyond which a day is read in bursts, None = it is read whole.
     """
-    index, topics = DayIndex(), topics_of(rig)
+    index = DayIndex()
     _allow_open_files()
-    _open_logs(index, paths)
+    try:
+        _open_logs(index, paths)
+        _read_day(index, rig, budget, survey=survey)
+    except BaseException:  # a store that does not answer: nobody else would let go of the others
+        index.close()
+        raise
+    return index
+
+
+def _read_day(index: DayIndex, rig: Rig, budget: int | None, *, survey: bool) -> None:
+    topics = topics_of(rig)
     timelines = [None if budget is None else log.timeline() for log in index.logs]
     if budget is not None:
         logs = dict(zip(index.logs, timelines, strict=True))
@@ -164,10 +174,9 @@ def index_logs(
         for other in index.trees:
             tree.fill_from(other)
     index.cameras.sort(key=lambda c: c[1])
-    return index
 
 
-def _open_logs(index: DayIndex, paths: Sequence[Path]) -> None:
+def _open_logs(index: DayIndex, paths: Sequence[LogPath]) -> None:
     cache = ChunkCache()
     for path in paths:
         try:

@@ -80,6 +80,38 @@ class Bucket:
             reader = obstore.open_reader(_store(self.name), str(key), buffer_size=_BUFFER_BYTES)
         yield cast("BinaryIO", io.BufferedReader(_Reader(self, key, reader), _BUFFER_BYTES))
 
+    def read_range(self, key: PurePath, start: int, length: int) -> bytes:
+        """Bytes of an object, by one request for just them.
+
+        Raises:
+            OSError: the store does not answer, or there is no such object.
+        """
+        with self._as_os_errors(key):
+            return bytes(obstore.get_range(_store(self.name), str(key), start=start, length=length))
+
+    def size_and_tag(self, key: PurePath) -> tuple[int, str]:
+        """Bytes of an object, and its entity tag, which another content changes.
+
+        Raises:
+            FileNotFoundError: no such object.
+            OSError: the store does not answer.
+        """
+        with self._as_os_errors(key):
+            about = obstore.head(_store(self.name), str(key))
+            return int(about["size"]), str(about["e_tag"])
+
+    def listed(self, folder: PurePath) -> Iterator[tuple[str, int, str]]:
+        """Key, size and tag of all objects below a folder, in order of key.
+
+        Raises:
+            OSError: the store does not answer.
+        """
+        prefix = "" if str(folder) == "." else f"{folder}/"
+        with self._as_os_errors(folder):
+            for page in obstore.list(_store(self.name), prefix or None, chunk_size=1000):
+                for item in page:
+                    yield str(item["path"]), int(item["size"]), str(item["e_tag"])
+
     @contextmanager
     def replacing(self, key: PurePath) -> Iterator[BinaryIO]:
         """A stream whose content becomes the object when the block ends; on an error the object stays as it was.

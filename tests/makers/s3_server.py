@@ -3,7 +3,8 @@
     python -m tests.makers.s3_server
 
 Prints its port. `POST /faults {"fail": N, "stall": N, "stall_s": S}` makes the next N requests answer 503, the N after
-them wait; `GET /faults` says how many requests came and how many were failed or stalled.
+them wait; `GET /faults` says how many requests came, how many were failed or stalled, and
+how many bytes the answers had.
 """
 
 import json
@@ -26,7 +27,7 @@ class Faults:
     def __init__(self, app):
         self.app, self.lock = app, threading.Lock()
         self.plan = {"fail": 0, "stall": 0, "stall_s": 0.0, "every": 1}
-        self.counts = {"requests": 0, "failed": 0, "stalled": 0}
+        self.counts = {"requests": 0, "failed": 0, "stalled": 0, "bytes_sent": 0}
 
     def __call__(self, environ, start_response):
         if environ["PATH_INFO"] == "/faults":
@@ -47,7 +48,14 @@ class Faults:
             return [b"<Error><Code>SlowDown</Code></Error>"]
         if stall:
             time.sleep(self.plan["stall_s"])
-        return self.app(environ, start_response)
+
+        def counted(status, headers, exc_info=None):
+            with self.lock:
+                is_get = environ["REQUEST_METHOD"] == "GET"
+                self.counts["bytes_sent"] += is_get * int(dict(headers).get("Content-Length", 0))
+            return start_response(status, headers, exc_info)
+
+        return self.app(environ, counted)
 
     def control(self, environ, start_response):
         if environ["REQUEST_METHOD"] == "POST":

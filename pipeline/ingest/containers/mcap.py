@@ -11,7 +11,6 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator
 from io import BytesIO
-from pathlib import Path
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -23,6 +22,7 @@ from pipeline.errors import LogError
 from pipeline.ingest.containers.bounded import unpack_lz4, unpack_zstd
 from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
 from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
+from pipeline.store.remote_logs import LogPath
 
 __all__ = ["McapLog"]
 
@@ -40,7 +40,7 @@ _DAMAGED = (*READ_ERRORS, struct.error, zstandard.ZstdError)
 class McapLog:
     """LogReader of one .mcap file."""
 
-    def __init__(self, path: Path, cache: ChunkCache) -> None:
+    def __init__(self, path: LogPath, cache: ChunkCache) -> None:
         self.path, self.damage = path, Counter[str]()
         self._cache, self._file = cache, path.open("rb")
         self._size = path.stat().st_size
@@ -52,6 +52,7 @@ class McapLog:
         self._messages: dict[int, int] = {}  # of each channel, by the summary's statistics
         self._chunks = self._read_summary()
         self._chunk_starts = [c.position for c in self._chunks]
+        self._lengths = {c.position + _RECORD.size: c.length - _RECORD.size for c in self._chunks}
 
     def timeline(self) -> Timeline | None:
         """See LogReader."""
@@ -120,7 +121,9 @@ class McapLog:
             return memoryview(self._content(start, end - start))
         chunk = self._cache.get((str(self.path), chunk_start))
         if chunk is None:
-            length = _RECORD.unpack(self._content(chunk_start - _RECORD.size, _RECORD.size))[1]
+            length = self._lengths.get(chunk_start)
+            if length is None:
+                length = _RECORD.unpack(self._content(chunk_start - _RECORD.size, _RECORD.size))[1]
             chunk = self._open_chunk(self._content(chunk_start, length), check=False)
             if chunk is None or len(chunk) < end:
                 raise LogError(str(self.path), "changed while it was read")

@@ -17,6 +17,7 @@ from typing import Protocol, runtime_checkable
 
 from pipeline.errors import LogError
 from pipeline.ingest.containers.timeline import Stretches, Timeline
+from pipeline.store.remote_logs import LogPath, RemoteLog
 
 __all__ = [
     "BACKENDS",
@@ -63,7 +64,7 @@ class RawMessage:
 class LogReader(Protocol):
     """What a backend can do. `damage` counts by name what could not be read, complete after a scan."""
 
-    path: Path
+    path: LogPath
     damage: Counter[str]
 
     def timeline(self) -> Timeline | None:
@@ -95,7 +96,9 @@ BACKENDS: dict[str, str] = {
     ".db3": "pipeline.ingest.containers.rosbag2_sqlite:Db3Log",
     ".zstd": "pipeline.ingest.containers.rosbag2_folder:CompressedLog",
     "folder": "pipeline.ingest.containers.rosbag2_folder:FolderLog",
+    "fetched": "pipeline.ingest.containers.rosbag2_folder:FetchedLog",
 }
+_BY_RANGES = (".mcap", ".bag")  # of a bucket's logs, those that are read where they lie
 _MAGIC = {
     b"\x89MCAP": ".mcap",
     b"#ROSBAG": ".bag",
@@ -116,25 +119,31 @@ READ_ERRORS = (
 )
 
 
-def open_log(path: Path, cache: ChunkCache | None = None) -> LogReader:
-    """The reader of a log: an MCAP, .bag or .db3 file, or a ROS 2 bag folder.
+def open_log(path: LogPath, cache: ChunkCache | None = None) -> LogReader:
+    """The reader of a log: an MCAP, .bag or .db3 file, of a folder or a bucket, or a ROS 2 bag folder.
 
     Raises:
         LogError: there is no such file, or it is none of these.
+        StorageError: the bucket's store does not answer.
     """
-    module, name = BACKENDS[_kind(path)].split(":")
+    kind = _kind(path)
+    if isinstance(path, RemoteLog) and kind not in _BY_RANGES:
+        kind = "fetched"
+    module, name = BACKENDS[kind].split(":")
     backend = getattr(importlib.import_module(module), name)
     return backend(path, cache or ChunkCache())
 
 
-def content_identity(path: Path) -> str:
-    """Name, size and a hash of samples of a log, for work keys.
+def content_identity(path: LogPath) -> str:
+    """Name, size and a hash of samples of a log, for work keys; of a bucket's log name, size and entity tag.
 
     Hashed are the first and last MiB of each file and 64 samples of 4 KiB evenly between. A full hash would
     read a fleet's terabytes only to find that nothing is to be done; logs are written once, and what changes
     in them (an appended, recovered, re-indexed or re-recorded log) changes size, head or tail. Modification
     times are left out: copies differ in them.
     """
+    if isinstance(path, RemoteLog):
+        return path.identity
     if path.exists() and not (path.is_dir() or path.is_file()):
         raise LogError(str(path), "is neither a file nor a folder")
     digest = hashlib.sha256(path.name.encode())
@@ -180,11 +189,12 @@ class ChunkCache:
             self._bytes -= len(dropped)
 
 
-def _kind(path: Path) -> str:
-    if path.is_dir():
-        return "folder"
-    if path.exists() and not path.is_file():
-        raise LogError(str(path), "is neither a file nor a folder")  # to open a pipe would wait for ever
+def _kind(path: LogPath) -> str:
+    if isinstance(path, Path):
+        if path.is_dir():
+            return "folder"
+        if path.exists() and not path.is_file():
+            raise LogError(str(path), "is neither a file nor a folder")  # to open a pipe would wait for ever
     try:
         with path.open("rb") as stream:
             head = stream.read(16)

@@ -9,12 +9,12 @@ import struct
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator
-from pathlib import Path
 
 from pipeline.errors import LogError
 from pipeline.ingest.containers.bounded import unpack_bz2, unpack_lz4
 from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
 from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
+from pipeline.store.remote_logs import LogPath
 
 __all__ = ["BagLog"]
 
@@ -31,7 +31,7 @@ _DAMAGED = (*READ_ERRORS, struct.error)
 class BagLog:
     """LogReader of one .bag file."""
 
-    def __init__(self, path: Path, cache: ChunkCache) -> None:
+    def __init__(self, path: LogPath, cache: ChunkCache) -> None:
         self.path, self.damage = path, Counter[str]()
         self._cache, self._file = cache, path.open("rb")
         self._size = path.stat().st_size

@@ -10,14 +10,20 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import zstandard
 
 from pipeline.errors import LogError
 from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
+from pipeline.store.remote_logs import LogPath
 
-__all__ = ["CompressedLog", "FolderLog"]
+__all__ = ["CompressedLog", "FetchedLog", "FolderLog"]
+
+_MOST_FETCHED_BYTES = (
+    16 << 30
+)  # of one object: a worker's scratch is no archive. MCAP and .bag have no limit.
 
 _UNPACKED = "boresight-unpacked-"  # then the process that unpacked it
 _LEFT_BEHIND_S = 86400.0  # longer than any log is open
@@ -71,22 +77,26 @@ class FolderLog:
             log.close()
 
 
-class CompressedLog:
-    """LogReader of a file that rosbag2 compressed as a whole (.zstd); a temporary file holds its content while open."""
+class _CopiedLog:
+    """LogReader of a temporary copy of a log, which is gone when it is closed."""
 
-    def __init__(self, path: Path, cache: ChunkCache) -> None:
+    def __init__(self, path: LogPath, cache: ChunkCache) -> None:
         self.path = path
         _remove_left_behind()
         self._folder = tempfile.TemporaryDirectory(prefix=f"{_UNPACKED}{os.getpid()}-")
         try:
-            plain = Path(self._folder.name) / path.with_suffix("").name
-            with path.open("rb") as source, plain.open("wb") as target:
-                shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(source), target, 1 << 22)
-            self._log = open_log(plain, cache)
+            self._log = open_log(self._copied(Path(self._folder.name)), cache)
         except (zstandard.ZstdError, OSError, LogError) as err:
             self._folder.cleanup()
             raise LogError(str(path), f"cannot be unpacked: {err}") from err
+        except BaseException:
+            self._folder.cleanup()
+            raise
         self.damage = self._log.damage
+
+    def _copied(self, folder: Path) -> Path:
+        """The copy, put into the folder."""
+        raise NotImplementedError
 
     def timeline(self) -> Timeline | None:
         """See LogReader."""
@@ -106,6 +116,33 @@ class CompressedLog:
         """See LogReader."""
         self._log.close()
         self._folder.cleanup()
+
+
+class CompressedLog(_CopiedLog):
+    """A file that rosbag2 compressed as a whole (.zstd)."""
+
+    def _copied(self, folder: Path) -> Path:
+        plain = folder / self.path.name.removesuffix(".zstd")
+        with self.path.open("rb") as source, plain.open("wb") as target:
+            packed = cast("BinaryIO", source)
+            shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed), target, 1 << 22)
+        return plain
+
+
+class FetchedLog(_CopiedLog):
+    """An object of a bucket that cannot be read where it lies: a database, or what is compressed as a whole."""
+
+    def _copied(self, folder: Path) -> Path:
+        size = self.path.stat().st_size
+        if size > _MOST_FETCHED_BYTES:
+            most = _MOST_FETCHED_BYTES >> 30
+            raise LogError(
+                str(self.path), f"has {size >> 30} GiB, and more than {most} are not fetched: use MCAP"
+            )
+        copy = folder / self.path.name
+        with self.path.open("rb") as source, copy.open("wb") as target:
+            shutil.copyfileobj(source, target, 1 << 24)
+        return copy
 
 
 def _remove_left_behind() -> None:

@@ -1,0 +1,163 @@
+"""Logs that lie in a bucket, as the readers know files: what is asked for is fetched, and nothing else."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from pipeline.errors import ConfigError, StorageError
+from pipeline.store.object_store import Bucket
+
+__all__ = ["LogPath", "RangeReader", "RemoteLog", "find_remote_logs", "log_at"]
+
+_AHEAD_BYTES = 1 << 16  # of a small read: record headers and footers come one after another
+
+
+class _About(NamedTuple):
+    st_size: int
+
+
+@dataclass(frozen=True, order=True)
+class RemoteLog:
+    """An object that is a log. It answers as much of what a `Path` does as the readers of logs ask.
+
+    Its methods raise StorageError where the store does not answer: never an OSError, which readers take for damage.
+    """
+
+    bucket: str
+    key: str
+    listed: tuple[int, str] | None = field(
+        default=None, compare=False
+    )  # size and tag, where a listing told them
+
+    def __str__(self) -> str:
+        return f"s3://{self.bucket}/{self.key}"
+
+    @property
+    def name(self) -> str:
+        """Last part of the key."""
+        return PurePosixPath(self.key).name
+
+    @property
+    def identity(self) -> str:
+        """Name, and what the store says of the content: another one has another tag."""
+        size, tag = self._size_and_tag
+        return f"{self.name}:{size}:{tag}"
+
+    def exists(self) -> bool:
+        """Whether there is such an object."""
+        with suppress(FileNotFoundError):
+            return self._size_and_tag[0] >= 0
+        return False
+
+    def stat(self) -> _About:
+        """Its size."""
+        return _About(self._size_and_tag[0])
+
+    def open(self, mode: str) -> RangeReader:
+        """To read at any place."""
+        assert mode == "rb", "logs are read"
+        return RangeReader(self)
+
+    def content(self, start: int, length: int) -> bytes:
+        """Bytes from a place on.
+
+        Raises:
+            StorageError: the store does not answer.
+        """
+        try:
+            return Bucket(self.bucket).read_range(PurePosixPath(self.key), start, length)
+        except OSError as err:
+            raise StorageError(str(self), str(err)) from err
+
+    @cached_property
+    def _size_and_tag(self) -> tuple[int, str]:
+        if self.listed is not None:
+            return self.listed
+        try:
+            return Bucket(self.bucket).size_and_tag(PurePosixPath(self.key))
+        except FileNotFoundError:
+            raise
+        except OSError as err:
+            raise StorageError(str(self), str(err)) from err
+
+
+LogPath = Path | RemoteLog
+
+
+class RangeReader(io.RawIOBase):
+    """A stream whose reads are requests for what they ask for; small ones take some of what follows along."""
+
+    def __init__(self, log: RemoteLog) -> None:
+        super().__init__()
+        self._log, self._size, self._at = log, log.stat().st_size, 0
+        self._start, self._held = 0, b""
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Move; nothing is fetched for it."""
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        """Where the next read begins."""
+        return self._at
+
+    def seekable(self) -> bool:
+        """Yes."""
+        return True
+
+    def readable(self) -> bool:
+        """Yes."""
+        return True
+
+    def read(self, size: int = -1) -> bytes:
+        """So many bytes, fewer at the end.
+
+        Raises:
+            StorageError: the store does not answer.
+        """
+        left = max(self._size - self._at, 0)
+        size = left if size < 0 else min(size, left)
+        begin = self._at - self._start
+        if not 0 <= begin <= begin + size <= len(self._held):
+            held = self._log.content(self._at, min(max(size, _AHEAD_BYTES), left)) if size else b""
+            self._start, self._held, begin = self._at, held, 0
+        got = self._held[begin : begin + size]
+        self._at += len(got)
+        if len(self._held) > _AHEAD_BYTES:
+            self._held = b""
+        return got
+
+
+def log_at(place: str) -> LogPath:
+    """The log at a path or at "s3://BUCKET/KEY".
+
+    Raises:
+        ConfigError: another scheme, or no key.
+    """
+    scheme, separator, rest = place.partition("://")
+    if not separator:
+        return Path(place)
+    bucket, _, key = rest.partition("/")
+    if scheme != "s3" or not bucket or not key:
+        raise ConfigError("command line", "LOG", f"{place!r} is no file and no s3://BUCKET/KEY")
+    return RemoteLog(bucket, key)
+
+
+def find_remote_logs(prefix: str) -> Iterator[RemoteLog]:
+    """All objects whose names begin with "s3://BUCKET/FOLDER/", in order of key.
+
+    Raises:
+        StorageError: the store does not answer.
+    """
+    bucket, _, folder = prefix.removeprefix("s3://").partition("/")
+    try:
+        for key, size, tag in Bucket(bucket).listed(PurePosixPath(folder)):
+            yield RemoteLog(bucket, key, (size, tag))
+    except OSError as err:
+        raise StorageError(prefix, str(err)) from err
