@@ -14,6 +14,7 @@ from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import exp_se3, exp_so3, log_se3, perturb_exactly
 from pipeline.geometry.spherical import from_spherical, to_spherical
+from tests.makers.radar_errors import bounced, elevated
 from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
@@ -187,6 +188,23 @@ def test_a_way_that_contradicts_the_registration_makes_pitch_less_sure_and_says_
     )
     assert contradicting.covariance[1, 1] > 4 * agreeing.covariance[1, 1]
     assert any("witnesses of radar pitch contradict each other" in note for note in contradicting.notes)
+
+
+def test_a_constant_elevation_error_turns_pitch_and_leaves_roll(day):
+    right = solve(day[:20], prior_off_by(1, 0.02), None)
+    high = solve(elevated(day[:20], np.radians(1.0)), prior_off_by(1, 0.02), None)
+    turned = change_between(right.T, high.T)
+    assert 0.8 < np.degrees(turned[1]) < 1.1  # all but the prior's share
+    assert abs(np.degrees(turned[0])) < 0.15
+
+
+def test_detections_by_way_of_the_road_turn_the_radar_by_less_than_its_sigma(day):
+    plane = np.array([0.0, 0.0, 1.0, -GROUND_M])
+    rows = [replace(o, ground_plane=plane) for o in day[:20]]
+    right = solve(rows, prior_off_by(1, 0.02), None)
+    bent = solve(bounced(rows, T_LIDAR_RADAR, 1 / 6, np.random.default_rng(0)), prior_off_by(1, 0.02), None)
+    turned = change_between(right.T, bent.T)
+    assert np.all(np.abs(turned[:2]) < np.sqrt(np.diag(bent.covariance)[:2]))
 
 
 def test_constant_elevation_and_range_errors_are_named_as_assumptions(day):
