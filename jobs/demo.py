@@ -46,7 +46,7 @@ def demo(
         workers: processes at a time; default: one per CPU that this process may use.
         seed: another seed is another fleet.
     """
-    from jobs.nightly import Drawing, close_night, usable_cpus
+    from jobs.nightly import Drawing, close_night
     from jobs.terminal.demo_table import print_comparison, print_methods
     from pipeline.config import load_fleet
     from pipeline.fleet.nightly import Night
@@ -57,13 +57,13 @@ def demo(
     spec, dates = _plan(vehicles, days, frames, seed)
     bump = "; before day 3 someone bumps a radar" if spec.faults else ""
     _say(f"[bold]1/3[/]  vehicles: {vehicles}, days: {days}{bump}")
-    _simulate(spec, out, workers or usable_cpus())
+    _simulate(spec, out, workers)
     night = Night(load_fleet(out / "fleet.toml"), Lake.at(out / "lake"))
     _say("[bold]2/3[/]  the night: ingest, perceive, calibrate every vehicle-day")
-    outcomes = _calibrate(night, out / "logs", dates, workers or usable_cpus())
+    outcomes = _calibrate(night, out / "logs", dates, workers)
     _say("[bold]3/3[/]  the audit: which sensor moved, and since when")
     truth = read_truth(out / "truth")
-    drawing = Drawing(out / "report" / "fleet.html", True, "process", workers or usable_cpus(), truth)
+    drawing = Drawing(out / "report" / "fleet.html", True, "process", workers, truth)
     findings, pages = close_night(night, None, drawing, outcomes)
     errors = print_comparison(night.lake, night.method, truth, dates[-1], findings)
     errors += print_methods(night.lake, (night.method, _NETWORK), truth, dates[-1])[_NETWORK]
@@ -91,7 +91,7 @@ def _plan(vehicles: int, days: int, frames: int, seed: int) -> tuple[FleetSpec, 
     return FleetSpec(**(vars(base) | {"faults": parse_faults(knocks, dates)})), dates
 
 
-def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int) -> list[DayOutcome]:
+def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int | None) -> list[DayOutcome]:
     """Every vehicle-day by the night's method, and the last day by the network too."""
     from jobs.nightly import watch_night
     from pipeline.fleet.pattern import find_vehicle_days
@@ -119,7 +119,7 @@ def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told
     return code
 
 
-def _simulate(spec: FleetSpec, out: Path, workers: int) -> None:
+def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
     """Write the fleet's logs, unless the same fleet lies there already."""
     import shutil
     from contextlib import closing

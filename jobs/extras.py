@@ -12,8 +12,8 @@ __all__ = ["EXTRAS", "needs", "require"]
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Extra -> the module without which its commands cannot start.
-EXTRAS = {"simulate": "embreex", "train": "torch"}
+# Extra -> the module without which its commands, or an option of them, cannot start.
+EXTRAS = {"simulate": "embreex", "train": "torch", "ray": "ray", "ops": "openlineage"}
 
 
 def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pipeline.store.partitions import Lake
     from schemas.drift import DriftFinding
 
-__all__ = ["Drawing", "close_night", "nightly", "tidy", "usable_cpus", "watch_night"]
+__all__ = ["Drawing", "close_night", "nightly", "tidy", "watch_night"]
 
 
 # A command's parameters are its options: more than eight, because each is one that a user sets.
@@ -26,12 +26,14 @@ def nightly(
     logs: str,
     from_day: Annotated[str | None, Parameter(name="--from")] = None,
     to_day: Annotated[str | None, Parameter(name="--to")] = None,
-    executor: Literal["process", "inline"] = "process",
+    executor: Literal["process", "inline", "ray"] = "process",
     workers: int | None = None,
     method: str | None = None,
     seed: int | None = None,
     report: Path | None = None,
     pictures: bool = True,
+    metrics: Path | None = None,
+    lineage: str | None = None,
     dry_run: bool = False,
 ) -> int:
     """Take every vehicle-day of a pattern through all stages; one bad day never stops the fleet.
@@ -43,14 +45,19 @@ def nightly(
             In a bucket: "s3://BUCKET/{vehicle}/{day}/*.mcap".
         from_day: first day, YYYY-MM-DD.
         to_day: last day.
-        executor: process (a pool) or inline (one after the other in this process).
-        workers: processes at a time; default: one per CPU that this process may use.
+        executor: process (a pool), inline (one after the other in this process) or ray (tasks of the cluster that
+            RAY_ADDRESS names, else of this machine; needs the extra [ray]).
+        workers: processes or tasks at a time; default: one per CPU that this process may use, two per CPU of a cluster.
         method: calibration method; default: audit.method, so that calibration and charts agree.
         seed: of everything random; the configuration's where left out.
         report: HTML page of the fleet; default: report/fleet.html inside the lake.
         pictures: --no-pictures draws pages without images of public roads.
+        metrics: Prometheus text file to replace when the night ends; needs the extra [ops].
+        lineage: file or URL that OpenLineage events are sent to; needs the extra [ops].
         dry_run: only say what would run, and why.
     """
+    from jobs.extras import require
+    from jobs.night_sinks import night_sinks
     from jobs.terminal.summary import exit_code, left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from pipeline.calibrate.methods import method_named
@@ -60,6 +67,9 @@ def nightly(
     from pipeline.fleet.pattern import find_vehicle_days
     from pipeline.store.partitions import Lake
 
+    for extra, is_asked in (("ray", executor == "ray"), ("ops", metrics or lineage)):
+        if is_asked:
+            require(extra)
     config = load_fleet(fleet)
     require_named_files(config)
     tables = Lake.at(lake)
@@ -67,11 +77,13 @@ def nightly(
     days = find_vehicle_days(logs, from_day, to_day)
     if dry_run:
         return _print_plan(night, days)
-    outcomes = watch_night(night, days, executor, workers)
-    drawing = Drawing(report, pictures, executor, workers or usable_cpus())
-    findings, pages = close_night(night, to_day, drawing, outcomes) if outcomes else ([], [])
-    tidy(tables)
-    code = exit_code([o.status for o in outcomes])
+    with night_sinks(night, days, metrics, lineage) as sinks:
+        outcomes = watch_night(night, days, executor, workers, sinks.take)
+        drawing = Drawing(report, pictures, executor, workers)
+        findings, pages = close_night(night, to_day, drawing, outcomes) if outcomes else ([], [])
+        tidy(tables)
+        code = exit_code([o.status for o in outcomes])
+        sinks.ended(code, findings)
     print_summary(
         "nightly",
         {0: "done", 1: "failed", 3: "held"}[code],
@@ -121,9 +133,16 @@ def tidy(lake: Lake) -> None:
 
 
 def watch_night(
-    night: Night, days: Sequence[VehicleDay], executor: str, workers: int | None
+    night: Night,
+    days: Sequence[VehicleDay],
+    executor: str,
+    workers: int | None,
+    take: Callable[[DayOutcome], None] = lambda _: None,
 ) -> list[DayOutcome]:
-    """Run the night in view of whoever watches; outcomes in order of their end."""
+    """Run the night in view of whoever watches; outcomes in order of their end, without what the stages answered.
+
+    `take` is told each one whole.
+    """
     from jobs.terminal.night_view import night_view
     from pipeline.errors import ConfigError
     from pipeline.fleet.nightly import run_night
@@ -133,9 +152,12 @@ def watch_night(
     known = [d.partition for d in days if d.partition.vehicle in night.fleet.vehicles]
     outcomes = []
     with night_view([f"{p.vehicle} {p.day}" for p in known], len(days)) as view:
-        for outcome in run_night(night, days, executor, workers or usable_cpus(), view.watch):
+        for outcome in run_night(night, days, executor, workers, view.watch):
             view.finished(outcome)
-            outcomes.append(outcome)
+            take(outcome)
+            outcomes.append(
+                replace(outcome, results=())
+            )  # the records of a whole fleet would fill the memory
     return outcomes
 
 
@@ -147,14 +169,14 @@ class Drawing:
         report: HTML page of the fleet; None = report/fleet.html inside the lake.
         pictures: False = pages without images of public roads.
         executor: where pages of days are drawn.
-        workers: processes at a time.
+        workers: processes or tasks at a time; None = as many as the executor finds CPUs for.
         truth: of a simulated fleet.
     """
 
     report: Path | None = None
     pictures: bool = True
     executor: str = "inline"
-    workers: int = 1
+    workers: int | None = 1
     truth: Any = None
 
 
@@ -194,13 +216,6 @@ def close_night(
         task = Task(night.fleet, night.lake, Window(), night.method, given=pages, progress=progress)
         outputs = REPORT.run(task).outputs
     return findings, [files.uri(PurePath(path)) for path in outputs]
-
-
-def usable_cpus() -> int:
-    """CPUs that this process may use; containers often give fewer than the machine has."""
-    import os
-
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _problem(outcome: DayOutcome) -> dict[str, Any]:

@@ -126,7 +126,6 @@ def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outco
     from contextlib import closing
     from functools import partial
 
-    from jobs.nightly import usable_cpus
     from jobs.terminal.summary import progress_reporter
     from pipeline.errors import ConfigError
     from pipeline.fleet.executor import EXECUTORS
@@ -144,7 +143,7 @@ def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outco
             progress(len(results), len(work), f"{day.vehicle} {day.day}: {what} {done}/{total}")
 
         prepare_day = partial(try_stage, PREPARE)
-        with closing(EXECUTORS[executor](prepare_day, work, workers or usable_cpus(), watch)) as finished:
+        with closing(EXECUTORS[executor](prepare_day, work, workers, watch)) as finished:
             for end in finished:
                 day = end.item.partition
                 lost = Outcome("prepare", day.vehicle, day.day, "failed", "", reason=end.error)

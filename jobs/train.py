@@ -54,7 +54,7 @@ def train(  # options of the command: as many as a user may set
         device: cpu, cuda, or whatever is there.
         compiled: compile the encoders (minutes at first, faster afterwards).
         resident: hold all training data on the device.
-        ray_workers: train on a Ray cluster with so many workers; needs the extra [ray].
+        ray_workers: train on a Ray cluster with so many workers; needs the extra [train-ray].
     """
     from pipeline.learn.train.run import TrainRequest
     from pipeline.learn.train.settings import load_train_config

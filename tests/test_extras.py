@@ -16,7 +16,12 @@ from jobs.cli import COMMANDS
 REPO = Path(__file__).resolve().parent.parent
 PACKAGES = ("jobs", "pipeline", "schemas")
 PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
-DISTRIBUTION_OF = {"cv2": "opencv-python-headless", "ruamel": "ruamel.yaml"}  # where the import name differs
+# Where the import name differs.
+DISTRIBUTION_OF = {
+    "cv2": "opencv-python-headless",
+    "openlineage": "openlineage-python",
+    "ruamel": "ruamel.yaml",
+}
 # Commands beyond the night, and the extra that each needs.
 NEEDS = {
     "demo": "simulate",
@@ -26,6 +31,8 @@ NEEDS = {
     "train-lidar-semantics": "train",
     "export": "train",
 }
+# What only an option of a command imports, and asks for before anything is read: `--executor ray`, `--metrics` ...
+OPTIONAL = {"ray", "openlineage", "prometheus_client"}
 # Each as a person would call it; the folders need not exist, since the extra is asked for first.
 CALLS = {
     "demo": ["demo"],
@@ -98,19 +105,33 @@ def test_the_walk_reaches_every_stage_and_method():
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c not in NEEDS])
 def test_a_plain_install_holds_all_that_a_command_of_the_night_may_import(command):
-    assert reached(command)[1] <= declared()
+    assert reached(command)[1] <= declared() | OPTIONAL
 
 
 @pytest.mark.parametrize("command", NEEDS)
 def test_an_extra_holds_all_else_that_its_commands_may_import(command):
-    # `train --ray-workers` names an extra of its own.
-    assert reached(command)[1] - declared(NEEDS[command]) <= ({"ray"} if "train" in command else set())
+    assert reached(command)[1] - declared(NEEDS[command]) <= OPTIONAL
 
 
 def test_nothing_is_declared_that_nothing_imports():
     imported = set().union(*(reached(command)[1] for command in COMMANDS))
-    declared_for_users = declared("simulate", "train", "ray") - {"boresight"}
+    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops") - {"boresight"}
     assert declared_for_users - imported == {"tensorboard"}  # imported by torch.utils.tensorboard
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "extra"),
+    [("--executor", "ray", "ray"), ("--metrics", "a.prom", "ops"), ("--lineage", "a.json", "ops")],
+)
+def test_an_option_without_its_extra_says_so_before_anything_is_read(option, value, extra):
+    code = (
+        f"import sys; sys.modules |= dict.fromkeys({OPTIONAL}); from jobs.cli import main;"
+        "sys.exit(main(['nightly', '--fleet', 'f.toml', '--lake', 'l', '--logs', '*', *sys.argv[1:]]))"
+    )
+    command = [sys.executable, "-c", code, option, value]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPO)
+    assert done.returncode == 2
+    assert f"pip install 'boresight[{extra}]'" in done.stderr
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,17 @@ fails is told in the outcome, and neither keeps the others waiting. Running the 
 failed or whose inputs changed, because every stage answers "cached" to a work key that it knows.
 """
 
+# ruff: noqa: PTH100 (os.path.abspath leaves links alone and costs a microsecond)
+
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
-from typing import overload
+from functools import partial
+from pathlib import Path
+from typing import Any, overload
 
 from pipeline.config import FleetConfig
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
@@ -54,11 +59,12 @@ class DayOutcome:
     results: tuple[Outcome, ...] = field(default=(), repr=False)  # of the stages, with the records to commit
 
 
-_Job = tuple[Night, VehicleDay, Known]
+# What fleet.toml says of the vehicle, the day with its logs, and what the lake has of it.
+_Job = tuple[dict[str, Any], VehicleDay, Known]
 
 
 def run_night(
-    night: Night, days: Sequence[VehicleDay], executor: str, workers: int, watch: Watch
+    night: Night, days: Sequence[VehicleDay], executor: str, workers: int | None, watch: Watch
 ) -> Iterator[DayOutcome]:
     """Outcome of every vehicle-day as it comes; vehicles that fleet.toml does not know are refused at once.
 
@@ -66,7 +72,7 @@ def run_night(
         night: what the vehicle-days share.
         days: what is to be done.
         executor: a key of EXECUTORS.
-        workers: processes at work at a time.
+        workers: processes or tasks at a time; None = as many as the executor finds CPUs for.
         watch: told what the i-th of the days known to fleet.toml is doing.
     """
     known = [d for d in days if d.partition.vehicle in night.fleet.vehicles]
@@ -74,9 +80,9 @@ def run_night(
         reason = f"{night.fleet.file} has no vehicle {unknown.vehicle!r}"
         yield DayOutcome(unknown.vehicle, unknown.day, "refused", reason)
     ledger = Ledger(night.lake, [d.partition for d in known])
-    jobs = _Jobs(night, known, ledger)
+    jobs, run = _Jobs(night, known, ledger), partial(_run_job, _shared(night))
     try:
-        with closing(EXECUTORS[executor](_run_job, jobs, workers, watch)) as results:
+        with closing(EXECUTORS[executor](run, jobs, workers, watch)) as results:
             for finished in results:
                 outcome = _outcome(finished)
                 for result in outcome.results:
@@ -151,19 +157,23 @@ class _Jobs(Sequence[_Job]):
     def __getitem__(self, index: int | slice) -> _Job | list[_Job]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        day = self._days[index]
-        return _of(self._night, day.partition.vehicle), day, self._ledger.known(day.partition)
+        day, fleet = self._days[index], self._night.fleet
+        vehicle = fleet.vehicles[day.partition.vehicle]
+        own = {"vehicles": {day.partition.vehicle: vehicle}, "rigs": {vehicle.rig: fleet.rigs[vehicle.rig]}}
+        logs = tuple(Path(os.path.abspath(log)) for log in day.logs)  # as in `_shared`
+        return own, replace(day, logs=logs), self._ledger.known(day.partition)
 
 
-def _run_job(job: _Job, progress: Progress) -> DayOutcome:
-    return run_vehicle_day(*job, progress)
+def _shared(night: Night) -> Night:
+    """The night as every worker needs it: no vehicle's own configuration, and no path that depends on where it runs."""
+    fleet = night.fleet.model_copy(update={"vehicles": {}, "rigs": {}})
+    file = Path(os.path.abspath(night.fleet.file))  # a link in the path stays what the user called it
+    return replace(night, fleet=fleet.read_from(file), lake=night.lake.absolute())
 
 
-def _of(night: Night, vehicle: str) -> Night:
-    """The night as one vehicle needs it: a worker is sent no other vehicle's configuration."""
-    known = night.fleet.vehicles[vehicle]
-    own = {"vehicles": {vehicle: known}, "rigs": {known.rig: night.fleet.rigs[known.rig]}}
-    return replace(night, fleet=night.fleet.model_copy(update=own))
+def _run_job(night: Night, job: _Job, progress: Progress) -> DayOutcome:
+    own, day, known = job
+    return run_vehicle_day(replace(night, fleet=night.fleet.model_copy(update=own)), day, known, progress)
 
 
 def _named(stage: Stage, progress: Progress) -> Progress:

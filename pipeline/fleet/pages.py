@@ -20,11 +20,11 @@ class OnWorkers:
 
     Args:
         executor: a key of EXECUTORS.
-        workers: processes at a time.
+        workers: processes or tasks at a time; None = as many as the executor finds CPUs for.
     """
 
     executor: str
-    workers: int
+    workers: int | None
 
     def __call__(
         self, function: Callable[[Any, Progress], Any], items: Sequence[Any], progress: Progress

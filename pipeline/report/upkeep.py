@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any, Protocol, overload, runtime_checkable
 from urllib.parse import quote
 
@@ -184,7 +184,11 @@ class _Jobs(Sequence[DayJob]):
     ) -> None:
         # A worker is sent no vehicle's configuration: a page needs the fleet's name.
         fleet = album.fleet.model_copy(update={"vehicles": {}, "rigs": {}})
-        self._album = Album(album.lake, fleet, album.method, album.page, album.files, album.pictures)
+        page = (
+            album.page.absolute() if isinstance(album.page, Path) else album.page
+        )  # a worker may be elsewhere
+        lake = album.lake.absolute()
+        self._album = Album(lake, fleet, album.method, page, album.files, album.pictures)
         self._days, self._findings = vehicle_days, findings
         self._records = lru_cache(maxsize=2)(self._read)  # workers end a day while others begin the next
 

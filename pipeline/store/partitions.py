@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
 from urllib.parse import quote, unquote
 
@@ -100,6 +100,10 @@ class Lake:
         if not isinstance(self.root, Path):
             raise ConfigError("command line", "lake", f"{self} is no folder, and this command needs one")
         return self.root
+
+    def absolute(self) -> Lake:
+        """The same lake, wherever a process works."""
+        return replace(self, root=self.root.absolute()) if isinstance(self.root, Path) else self
 
     def folder(self, table: str, partition: Partition) -> PurePath:
         """The folder of one partition of one table."""

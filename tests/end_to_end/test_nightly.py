@@ -1,5 +1,6 @@
-"""The installed command on a small simulated fleet: good days, poisoned ones, killed workers, an order to stop."""
+"""The installed command on a small simulated fleet: good days, poisoned ones, what is killed, an order to stop."""
 
+import dataclasses
 import json
 import shutil
 import signal
@@ -17,6 +18,7 @@ from pipeline.store.tables import read_manifest, read_records, read_rows
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
+from tests.makers.ray_clusters import two_nodes
 
 BORESIGHT = f"{sys.prefix}/bin/boresight"
 DAYS = ("2026-03-02", "2026-03-03")
@@ -199,6 +201,46 @@ def test_a_killed_worker_costs_time_and_no_vehicle_day(fleet, tmp_path):
     assert summary["failed"] == 0
     assert summary["vehicle_days"] == 6
     assert good_days(lake) >= WANTED
+
+
+def answers(lake, **of):
+    """What the lake has recorded, but for when."""
+    found = read_records(Lake.at(lake), CALIBRATIONS, CalibrationRecord, **of)
+    rows = [dataclasses.asdict(r) | {"recorded_at": "", "asserted_at": ""} for r in found]
+    return sorted(repr(sorted(row.items())) for row in rows)
+
+
+@pytest.mark.slow
+def test_all_executors_record_the_same_though_a_worker_and_a_node_of_a_cluster_die(
+    fleet, first_night, tmp_path
+):
+    with two_nodes() as (cluster, (node, _)):
+        process = subprocess.Popen(
+            command(fleet, tmp_path / "ray", "--executor", "ray"),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        on_node = psutil.Process(node.all_processes["raylet"][0].process.pid)
+        deadline = time.monotonic() + 120
+        while not (tasks := [c for c in on_node.children() if "ray::_work" in " ".join(c.cmdline())]):
+            assert time.monotonic() < deadline
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.02)
+        tasks[0].kill()
+        while not any(Path(tmp_path / "ray").rglob("observations/*/*/*.parquet")):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        cluster.remove_node(node, allow_graceful=False)
+        out, err = process.communicate(timeout=300)
+    lines = out.splitlines()
+    assert (process.returncode, len(lines)) == (3, 1), err  # Ray has nothing to say on stdout
+    assert json.loads(lines[0])["failed"] == 0
+    assert all(json.loads(line) for line in err.splitlines())
+    assert answers(tmp_path / "ray") == answers(first_night[0])
+    run(*command(fleet, tmp_path / "inline", "--executor", "inline", "--to", DAYS[0]))
+    assert answers(tmp_path / "inline") == answers(first_night[0], day=DAYS[0])
+    assert len(answers(tmp_path / "inline")) == 9
 
 
 @pytest.mark.slow

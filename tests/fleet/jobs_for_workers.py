@@ -17,10 +17,13 @@ def behave(item, progress):
         os.kill(os.getpid(), signal.SIGKILL)
     elif kind.startswith("raise"):
         raise RuntimeError(f"poisoned {kind}")
+    elif kind.startswith("wait"):
+        time.sleep(2)
     elif kind.startswith("sleep"):
         try:
             (log / f"{kind}.tmp").touch()
-            time.sleep(60)
+            for _ in range(600):
+                time.sleep(0.1)  # Ray's order to stop waits for the interpreter's turn
         finally:
             (log / f"{kind}.tmp").unlink()
     return f"{kind} done", os.environ.get("NUMBA_NUM_THREADS")

@@ -1,4 +1,3 @@
-import importlib.util
 import os
 import signal
 import subprocess
@@ -10,19 +9,9 @@ import psutil
 import pytest
 
 from pipeline.fleet.executor import EXECUTORS
+from tests.makers.ray_clusters import ray_or_skip
 
 HERE = Path(__file__).resolve().parent
-
-
-@pytest.fixture
-def behave(monkeypatch):
-    # Spawned workers find the function by its module's name: they take sys.path from this process.
-    monkeypatch.syspath_prepend(str(HERE))
-    spec = importlib.util.spec_from_file_location("jobs_for_workers", HERE / "jobs_for_workers.py")
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "jobs_for_workers", module)
-    spec.loader.exec_module(module)
-    return module.behave
 
 
 def run(name, function, kinds, folder, workers=2, watch=lambda *_: None):
@@ -34,10 +23,22 @@ def tries(folder, kind):
     return len((folder / f"{kind}.tries").read_text().split())
 
 
-@pytest.mark.parametrize("name", EXECUTORS)
-def test_every_item_ends_once_and_an_error_stays_with_its_own_item(name, behave, tmp_path):
+@pytest.fixture
+def installed(request, monkeypatch):
+    """The executor's name; Ray's is a cluster of its own on this machine, gone when the test ends."""
+    if request.param == "ray":
+        monkeypatch.delenv("RAY_ADDRESS", raising=False)
+        ray_or_skip()
+    yield request.param
+    if request.param == "ray":
+        ray_or_skip().shutdown()
+
+
+@pytest.mark.parametrize("installed", EXECUTORS, indirect=True)
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_every_item_ends_once_and_an_error_stays_with_its_own_item(installed, behave, tmp_path):
     seen = []
-    found = run(name, behave, ["a", "raise-1", "b", "c"], tmp_path, watch=lambda *at: seen.append(at))
+    found = run(installed, behave, ["a", "raise-1", "b", "c"], tmp_path, watch=lambda *at: seen.append(at))
     assert {k: f.value[0] for k, f in found.items() if f.value} == {
         "a": "a done",
         "b": "b done",
@@ -46,7 +47,7 @@ def test_every_item_ends_once_and_an_error_stays_with_its_own_item(name, behave,
     assert found["raise-1"].error == "RuntimeError: poisoned raise-1"
     assert "jobs_for_workers" in found["raise-1"].trace
     assert all(tries(tmp_path, kind) == 1 for kind in found)
-    if name == "inline":
+    if installed == "inline":
         assert (0, 1, 2, "a at work") in seen
 
 
@@ -82,20 +83,25 @@ def stop(signum, frame):
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, stop)
     items = [("sleep-1", {log!r}), ("sleep-2", {log!r})]
-    for finished in EXECUTORS["process"](behave, items, 2, lambda *_: None):
+    for finished in EXECUTORS[{name!r}](behave, items, 2, lambda *_: None):
         print(finished)
 """
 
 
-def started(tmp_path):
+def started(name, tmp_path):
+    if name == "ray":
+        ray_or_skip()
     script = tmp_path / "main.py"
-    script.write_text(SCRIPT.format(here=str(HERE), log=str(tmp_path)))
-    process = subprocess.Popen([sys.executable, str(script)])
-    deadline = time.monotonic() + 30
+    script.write_text(SCRIPT.format(here=str(HERE), log=str(tmp_path), name=name))
+    environment = {k: v for k, v in os.environ.items() if k != "RAY_ADDRESS"}
+    process = subprocess.Popen([sys.executable, str(script)], env=environment)
+    deadline = time.monotonic() + 120
     while not all((tmp_path / f"sleep-{i}.tmp").exists() for i in (1, 2)):
         assert time.monotonic() < deadline, "workers never began"
         time.sleep(0.05)
-    return process, psutil.Process(process.pid).children(recursive=True)
+    children = psutil.Process(process.pid).children(recursive=True)
+    # Ray's agents take up to a minute to see that they are alone.
+    return process, [c for c in children if "Agent" not in c.name() + " ".join(c.cmdline())]
 
 
 def gone(processes, seconds):
@@ -103,16 +109,17 @@ def gone(processes, seconds):
     return not alive
 
 
-def test_sigterm_lets_workers_put_their_things_away_and_leaves_none_behind(tmp_path):
-    process, workers = started(tmp_path)
+@pytest.mark.parametrize("name", ["process", "ray"])
+def test_sigterm_lets_workers_put_their_things_away_and_leaves_none_behind(name, tmp_path):
+    process, workers = started(name, tmp_path)
     process.send_signal(signal.SIGTERM)
-    assert process.wait(20) == 143
+    assert process.wait(30) == 143
     assert gone(workers, 5)
     assert not list(tmp_path.glob("*.tmp"))
 
 
 def test_workers_do_not_outlive_a_killed_parent(tmp_path):
-    process, workers = started(tmp_path)
+    process, workers = started("process", tmp_path)
     process.kill()
     process.wait()
     assert gone(workers, 10)

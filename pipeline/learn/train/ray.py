@@ -1,4 +1,4 @@
-"""Training on a Ray cluster: the same function in every worker, as torchrun would start it. Needs the extra [ray]."""
+"""Training on a Ray cluster: the same function in every worker, as by torchrun. Needs the extra [train-ray]."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def train_on_ray(request: TrainRequest, config: TrainConfig, workers: int) -> Tr
 
     Raises:
         ConfigError: `workers` is below 1.
-        MissingExtraError: Ray is not installed.
+        MissingExtraError: Ray's trainer is not installed.
         BoresightError: what `train` raised in a worker.
         ContractError: a worker failed otherwise, or was lost.
     """
@@ -33,7 +33,7 @@ def train_on_ray(request: TrainRequest, config: TrainConfig, workers: int) -> Tr
         from ray.train import RunConfig, ScalingConfig, TrainingFailedError  # noqa: PLC0415 - an extra
         from ray.train.torch import TorchTrainer  # noqa: PLC0415
     except ImportError as err:
-        raise MissingExtraError("ray", "ray") from err
+        raise MissingExtraError("train-ray", "ray.train") from err
     # Workers run elsewhere: what is relative here is another place there.
     request = replace(request, out=request.out.absolute(), data=_absolute(request.data))
     request.out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Training on a Ray cluster of this machine: two workers, and their errors as ours; skipped without the extra [ray]."""
+"""Training on a Ray cluster of this machine: two workers, and their errors as ours. Needs the extra [train-ray]."""
 
 import pickle
 
@@ -19,7 +19,10 @@ CONFIG = TrainConfig(steps=2, batch_size=1, width=4, hidden=8, validation_frames
 @pytest.fixture(scope="module")
 def cluster():
     """A cluster of this machine alone, as small as training needs."""
-    ray = pytest.importorskip("ray", reason="the extra [ray] is not installed: pip install 'boresight[ray]'")
+    missing = "the extra [train-ray] is not installed: pip install 'boresight[train-ray]'"
+    pytest.importorskip("ray.train", reason=missing, exc_type=ImportError)
+    import ray
+
     ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False, configure_logging=False)
     yield
     ray.shutdown()

@@ -1,0 +1,96 @@
+"""Where else a night is told of: metrics and lineage, both optional; one that fails is named and fails nothing."""
+
+from __future__ import annotations
+
+import datetime as dt
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jobs.terminal.logging import logger
+
+if TYPE_CHECKING:
+    from pipeline.fleet.lineage import NightLineage
+    from pipeline.fleet.lineage_sink import LineageSink
+    from pipeline.fleet.nightly import DayOutcome, Night
+    from pipeline.fleet.pattern import VehicleDay
+    from schemas.drift import DriftFinding
+
+__all__ = ["NightSinks", "night_sinks"]
+
+_SENT_WITHIN_S = 30.0  # after the night, for what still waits
+_STOPPED_WITHIN_S = 2.0  # after an order to stop
+
+
+class NightSinks:
+    """Told of each vehicle-day as it ends, and of the night's end.
+
+    Args:
+        night: what its vehicle-days share.
+        metrics: file of Prometheus metrics to replace; None = none.
+        lineage: events and where they go; None = none.
+    """
+
+    def __init__(
+        self, night: Night, metrics: Path | None, lineage: tuple[NightLineage, LineageSink] | None
+    ) -> None:
+        from pipeline.fleet.tally import Tally
+
+        self._night, self._metrics, self._lineage = night, metrics, lineage
+        self._tally, self._began_s = Tally(), time.time()
+        self._state = "ABORT"
+
+    def take(self, outcome: DayOutcome) -> None:
+        """A vehicle-day ended."""
+        self._tally.add(outcome)
+        if self._lineage is not None:
+            lineage, sink = self._lineage
+            for event in lineage.of_day(outcome):
+                sink.emit(event)
+
+    def ended(self, exit_code: int, findings: Sequence[DriftFinding]) -> None:
+        """The night ended with this exit code, and the audit found this."""
+        from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+
+        self._state = "FAIL" if exit_code == 1 else "COMPLETE"
+        if self._metrics is None:
+            return
+        from pipeline.fleet.metrics import NightEnd, write_metrics
+
+        moved = moved_sensors(findings)
+        end = NightEnd(exit_code, self._began_s, time.time(), count_statuses(findings), moved)
+        try:
+            write_metrics(self._metrics, self._night.fleet.fleet.name, self._tally, end)
+        except OSError as err:
+            logger().warning("no metrics", file=str(self._metrics), reason=str(err))
+
+    def close(self) -> None:
+        """Say how the night ended, and wait until that is sent."""
+        if self._lineage is None:
+            return
+        lineage, sink = self._lineage
+        sink.emit(lineage.ended(dt.datetime.now(dt.UTC), self._state))
+        problem = sink.close(_STOPPED_WITHIN_S if self._state == "ABORT" else _SENT_WITHIN_S)
+        if problem:
+            logger().warning("lineage is not whole", reason=problem)
+
+
+@contextmanager
+def night_sinks(
+    night: Night, days: Sequence[VehicleDay], metrics: Path | None, lineage: str | None
+) -> Iterator[NightSinks]:
+    """The sinks of a night: `metrics` is a file, `lineage` a file or a URL."""
+    opened = None
+    if lineage is not None:
+        from pipeline.fleet.lineage import NightLineage
+        from pipeline.fleet.lineage_sink import LineageSink
+
+        opened = NightLineage.of(night, days), LineageSink(lineage)
+        opened[1].emit(opened[0].begun(dt.datetime.now(dt.UTC)))
+    sinks = NightSinks(night, metrics, opened)
+    try:
+        yield sinks
+    finally:
+        sinks.close()

@@ -1,0 +1,129 @@
+"""A night's counts as a Prometheus text file, as node_exporter's textfile collector reads it. Needs the extra [ops]."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.fleet.tally import Tally
+from schemas.versions import CODE_VERSION
+
+if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry
+
+__all__ = ["NightEnd", "write_metrics"]
+
+_SUCCESS = (0, 3)  # what is held or refused is an answer; a night that only has those was a good one
+_LAST_SUCCESS = "boresight_last_success_timestamp_seconds"
+_DAY_STATUSES = ("done", "cached", "held", "refused", "failed")
+
+
+@dataclass(frozen=True)
+class NightEnd:
+    """How a night ended.
+
+    Args:
+        exit_code: of the command.
+        began_s: Unix time.
+        ended_s: Unix time.
+        vehicles: how many of which status (GREEN, YELLOW, RED, UNKNOWN), after the audit.
+        moved: vehicle, sensor and first day ("since") of each sensor that moved.
+    """
+
+    exit_code: int
+    began_s: float
+    ended_s: float
+    vehicles: Mapping[str, int]
+    moved: Sequence[Mapping[str, Any]]
+
+
+def write_metrics(path: Path, fleet: str, tally: Tally, end: NightEnd) -> None:
+    """Replace the file as a whole; when the last good night was is taken over from it, where this one was not good.
+
+    Args:
+        path: what node_exporter looks at, so NAME.prom; its folder must be there.
+        fleet: the fleet's name, label of every metric.
+        tally: what the night counted.
+        end: how it ended.
+
+    Raises:
+        OSError: the file cannot be written; it stays as it was.
+    """
+    from prometheus_client import CollectorRegistry, write_to_textfile  # noqa: PLC0415 - an extra
+
+    registry = CollectorRegistry()
+    last = end.ended_s if end.exit_code in _SUCCESS else _last_success(path, fleet)
+    _about_the_night(registry, fleet, tally, end, last)
+    _about_stages(registry, fleet, tally)
+    write_to_textfile(str(path), registry)
+
+
+def _about_the_night(
+    registry: CollectorRegistry, fleet: str, tally: Tally, end: NightEnd, last_success_s: float | None
+) -> None:
+    add = _Gauges(registry, fleet)
+    add("boresight_info", "Release that ran.", {(CODE_VERSION,): 1}, ("version",))
+    add("boresight_last_run_timestamp_seconds", "When the last night ended.", {(): end.ended_s})
+    if last_success_s is not None:
+        add(_LAST_SUCCESS, "When the last night ended without a failure.", {(): last_success_s})
+    add("boresight_exit_code", "Of the last night: 0, 1 failed, 3 held or refused.", {(): end.exit_code})
+    add("boresight_duration_seconds", "Of the last night.", {(): end.ended_s - end.began_s})
+    days = {(s,): tally.vehicle_days[s] for s in _DAY_STATUSES}
+    add("boresight_vehicle_days", "Vehicle-days of the last night.", days, ("status",))
+    add(
+        "boresight_records",
+        "Current records of the last night's vehicle-days.",
+        tally.records,
+        ("pair", "status"),
+    )
+    vehicles = {(status,): count for status, count in end.vehicles.items()}
+    add("boresight_vehicles", "Vehicles by status of the last audit.", vehicles, ("status",))
+    moved = {(m["vehicle"], m["sensor"], m["since"] or ""): 1 for m in end.moved}
+    add("boresight_sensor_moved", "1 for a sensor that moved.", moved, ("vehicle", "sensor", "since"))
+
+
+def _about_stages(registry: CollectorRegistry, fleet: str, tally: Tally) -> None:
+    add = _Gauges(registry, fleet)
+    add("boresight_stage_ends", "Vehicle-days by how a stage ended.", tally.stages, ("stage", "status"))
+    for name, what, counts in (
+        ("boresight_stage_seconds", "Workers' seconds in a stage.", tally.seconds),
+        ("boresight_stage_read_bytes", "Bytes that workers read in a stage.", tally.bytes_read),
+        ("boresight_stage_written_bytes", "Bytes that workers wrote in a stage.", tally.bytes_written),
+    ):
+        add(name, what, {(stage,): value for stage, value in counts.items()}, ("stage",))
+
+
+class _Gauges:
+    """Adds gauges of one fleet. All are gauges: a night's counts do not add up to the next one's."""
+
+    def __init__(self, registry: CollectorRegistry, fleet: str) -> None:
+        self._registry, self._fleet = registry, fleet
+
+    def __call__(
+        self,
+        name: str,
+        what: str,
+        values: Mapping[Any, int | float],
+        labels: Sequence[str] = (),
+    ) -> None:
+        from prometheus_client import Gauge  # noqa: PLC0415 - an extra
+
+        gauge = Gauge(name, what, ("fleet", *labels), registry=self._registry)
+        for of, value in sorted(values.items()):
+            gauge.labels(self._fleet, *of).set(value)
+
+
+def _last_success(path: Path, fleet: str) -> float | None:
+    """What the file says; None where it is not there or says nothing that can be read."""
+    from prometheus_client.parser import text_string_to_metric_families  # noqa: PLC0415 - an extra
+
+    try:
+        for family in text_string_to_metric_families(path.read_text()):
+            for sample in family.samples:
+                if sample.name == _LAST_SUCCESS and sample.labels.get("fleet") == fleet:
+                    return float(sample.value)
+    except (OSError, ValueError):
+        return None
+    return None

@@ -1,0 +1,144 @@
+"""A pool of spawned processes that survives killed workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from multiprocessing import connection, get_context, parent_process
+from typing import Any, TypeVar
+
+from pipeline.fleet.attempts import ONE_THREAD, Finished, Turns, Watch, attempt, usable_cpus
+from pipeline.fleet.board import Board
+from pipeline.results import Progress
+
+__all__ = ["run_processes"]
+
+Item = TypeVar("Item")
+Outcome = TypeVar("Outcome")
+
+_POLL_S = 0.2
+_GRACE_S = 10.0  # for a worker to leave its `with` blocks; Kubernetes gives the whole pod 30 s
+
+
+def run_processes(
+    function: Callable[[Item, Progress], Outcome], items: Sequence[Item], workers: int | None, watch: Watch
+) -> Generator[Finished[Item, Outcome], None, None]:
+    """A pool of spawned processes (fork would copy the threads that numeric libraries hold).
+
+    Where a worker is killed, the pool is built anew: items that had not begun go on as before, items that
+    were in work are tried again one at a time, and one that kills its worker twice alone ends with an error.
+    """
+    board, turns = Board(len(items)), Turns(len(items))
+    while turns:
+        alone, queue = turns.alone, turns.queue
+        size = 1 if alone else min(workers or usable_cpus(), len(queue))
+        with _pool(size, function, board) as pool:
+            lost = yield from _drain(pool, items, queue, size, board, watch)
+        for index in lost:
+            why = turns.died(index, alone=alone)
+            if why:
+                yield Finished(items[index], error=why)
+
+
+def _drain(
+    pool: ProcessPoolExecutor,
+    items: Sequence[Item],
+    queue: deque[int],
+    workers: int,
+    board: Board,
+    watch: Watch,
+) -> Generator[Finished[Item, Outcome], None, list[int]]:
+    """Run the queue until it is empty or the pool breaks; returns what was in work when it broke."""
+    running: dict[Future[Finished[Item, Outcome]], int] = {}
+    while queue or running:
+        # No more than there are workers, so that what is in work when the pool breaks is known.
+        while queue and len(running) < workers:
+            index = queue.popleft()
+            try:
+                running[pool.submit(_work, items[index], index)] = index
+            except BrokenProcessPool:
+                queue.appendleft(index)
+                return list(running.values())
+        done, _ = wait(running, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+        for index in running.values():
+            watch(index, *board.read(index))
+        broken = [f for f in done if isinstance(f.exception(), BrokenProcessPool)]
+        for future in done.difference(broken):
+            index = running.pop(future)
+            error = future.exception()
+            yield (
+                replace(future.result(), item=items[index])
+                if error is None
+                else Finished(items[index], error=f"{type(error).__name__}: {error}")
+            )
+        if broken:
+            return list(running.values())
+    return []
+
+
+@contextmanager
+def _pool(
+    workers: int, function: Callable[[Any, Progress], Any], board: Board
+) -> Iterator[ProcessPoolExecutor]:
+    """A pool whose processes are gone when the block ends, however it ends."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)  # spawned processes read it while they import
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (function, board))
+    try:
+        yield pool
+        pool.shutdown()
+    finally:
+        processes = list((pool._processes or {}).values())  # noqa: SLF001 - the only way to the workers
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            with suppress(OSError):
+                process.terminate()
+        deadline = time.monotonic() + _GRACE_S
+        for process in processes:
+            process.join(max(0.0, deadline - time.monotonic()))
+            if process.is_alive():
+                process.kill()
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+_OF_THIS_WORKER: list[tuple[Callable[[Any, Progress], Any], Board]] = []
+
+
+def _begin(function: Callable[[Any, Progress], Any], board: Board) -> None:
+    """Prepare a worker: stop when told, leave Ctrl-C to the parent, never outlive it."""
+    _OF_THIS_WORKER[:] = [(function, board)]
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+
+
+def _leave(_signum: int, _frame: Any) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.exit(128 + signal.SIGTERM)
+
+
+def _follow_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _work(item: Any, index: int) -> Finished[Any, Any]:
+    function, board = _OF_THIS_WORKER[0]
+    try:
+        finished = attempt(function, item, lambda done, total, what: board.write(index, done, total, what))
+    except SystemExit as err:
+        # Told to stop, and everything is put away. The pool would send this back as a result and go on.
+        os._exit(int(err.code or 0))
+    return Finished(None, finished.value, finished.error, finished.trace)  # the parent has the item

@@ -1,0 +1,122 @@
+"""The Ray cluster that tasks run on: connecting to it, so that nothing of Ray's shows or stays."""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from pipeline.errors import ConfigError, MissingExtraError
+
+__all__ = ["Cluster", "connected", "sigterm_between_calls"]
+
+# Vehicle-days and their records are kilobytes, a page is a megabyte; left alone, Ray takes 30 % of the memory.
+_STORE_BYTES = 200 << 20
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A connected cluster.
+
+    Args:
+        ray: the module.
+        is_shared: $RAY_ADDRESS names it; else it is this process's own, on this machine.
+    """
+
+    ray: ModuleType
+    is_shared: bool
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What tasks need to import what this process can; on a shared cluster the same must be installed."""
+        return {} if self.is_shared else {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+
+    def beside_the_driver(self, kind: type[Any]) -> Any:
+        """An actor on this very node, where it lives as long as who asks for it."""
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy  # noqa: PLC0415 - an extra
+
+        here = self.ray.get_runtime_context().get_node_id()
+        place = NodeAffinitySchedulingStrategy(here, soft=True)
+        return self.ray.remote(kind).options(num_cpus=0, scheduling_strategy=place).remote()
+
+
+def connected(workers: int) -> Cluster:
+    """The cluster that $RAY_ADDRESS names, else one of this machine with so many workers, until the process ends.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ConfigError: $RAY_ADDRESS cannot be reached, or is that of a Ray client.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing leaves the cluster
+    try:
+        import ray  # noqa: PLC0415 - an extra
+    except ImportError as err:
+        raise MissingExtraError("ray", "ray") from err
+    address = os.environ.get("RAY_ADDRESS", "")
+    if "://" in address:
+        problem = f"{address!r}: the night must run in the cluster (`ray job submit`), not as a client of it"
+        raise ConfigError("environment", "RAY_ADDRESS", problem)
+    if not ray.is_initialized():
+        own = {"num_cpus": workers, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
+        if not address:
+            os.environ.setdefault(
+                "RAY_AUTH_TOKEN", secrets.token_hex()
+            )  # Ray would write one into the home folder
+        quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+        with _signals_stay():
+            try:
+                ray.init(address or "local", **quiet, **({} if address else own))
+            except ConnectionError as err:
+                raise ConfigError("environment", "RAY_ADDRESS", f"no cluster at {address!r}") from err
+        # It would write onto stdout whose worker died; whoever runs the tasks tells that, and stdout is for a summary.
+        ray._private.worker.print_to_stdstream = _say_nothing  # noqa: SLF001 - there is no other way
+    return Cluster(ray, bool(address))
+
+
+@contextmanager
+def _signals_stay() -> Iterator[None]:
+    """Ray takes SIGTERM for itself, and would end the process with another code."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    except SystemExit:  # Ray's answer to SIGTERM
+        sys.exit(128 + signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def sigterm_between_calls() -> Iterator[Callable[[], None]]:
+    """A function to call often: SIGTERM has its effect there. Inside a call of Ray's, any exit code becomes 1."""
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+    noted: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda signum, _frame: noted.append(signum))
+
+    def obey() -> None:
+        if noted:
+            noted.clear()
+            signal.signal(signal.SIGTERM, before)
+            signal.raise_signal(signal.SIGTERM)
+
+    try:
+        yield obey
+        obey()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _say_nothing(*_args: Any, **_kwargs: Any) -> None:
+    """In place of what Ray would print."""

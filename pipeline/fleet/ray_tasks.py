@@ -1,0 +1,221 @@
+"""Items as plain tasks of a Ray cluster: the one that $RAY_ADDRESS names, or a small one on this machine.
+
+Ray gives every task in work a process of its own, so a worker that dies takes nobody with it. A node that is lost is
+nobody's fault: what was in work there is tried again elsewhere. Needs the extra [ray]; see README.md beside this file.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, TypeVar
+
+from pipeline.errors import ConfigError, ContractError
+from pipeline.fleet.attempts import ONE_THREAD, Finished, Turns, Watch, attempt, usable_cpus
+from pipeline.fleet.ray_cluster import Cluster, connected, sigterm_between_calls
+from pipeline.results import Progress
+from schemas.versions import CODE_VERSION
+
+__all__ = ["run_on_ray"]
+
+Item = TypeVar("Item")
+Outcome = TypeVar("Outcome")
+
+# What DESIGN grants a worker, whatever the log's length (tests/benchmarks/results/long_log.json: 455 MB).
+_MEMORY_BYTES = 2 << 30
+# For each CPU two tasks: the second waits for the first, and tells an autoscaler that more nodes have work.
+_TASKS_PER_CPU = 2
+# An item that was in work on so many nodes when they were lost may be why: it goes on alone. Where spot nodes are taken
+# away within a vehicle-day's minute one time in a hundred, that is one item in a million, and costs it time only.
+_NODES_LOST = 3
+_POLL_S = 0.2
+_LOOK_S = 0.5  # between two looks at the board, and what a task says of itself: all of it goes to one process
+_COUNT_S = 5.0  # between two looks at the nodes
+_GRACE_S = 10.0  # for a worker to leave its `with` blocks, as in a pool
+_NO_NODE_S = 600.0  # Kubernetes brings a node within minutes, or never
+
+
+def run_on_ray(
+    function: Callable[[Item, Progress], Outcome], items: Sequence[Item], workers: int | None, watch: Watch
+) -> Generator[Finished[Item, Outcome], None, None]:
+    """Tasks of one CPU and 2 GiB each; `workers` bounds how many are in flight, None = two for each CPU of the cluster.
+
+    An item whose worker is killed is tried again alone, as in a pool of processes.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ConfigError: the cluster cannot be reached, or for ten minutes has no node that such a task fits on.
+    """
+    if not items:
+        return
+    cluster, turns = connected(workers or usable_cpus()), Turns(len(items))
+    with sigterm_between_calls() as obey:
+        crew = _Crew(cluster, function, items, watch)
+        try:
+            while turns:
+                alone = turns.alone
+                suspects = yield from crew.drain(turns.queue, 1 if alone else workers, obey)
+                for index in suspects:
+                    why = turns.died(index, alone=alone)
+                    if why:
+                        yield Finished(items[index], error=why)
+        finally:
+            crew.leave()
+
+
+class _Crew:
+    """Tasks in flight, and what is known of them and of the nodes that they run on.
+
+    Args:
+        cluster: connected.
+        function: what all tasks do; put into the object store once.
+        items: on what; each is put together when its turn comes.
+        watch: told how far each one is.
+    """
+
+    def __init__(
+        self, cluster: Cluster, function: Callable[[Any, Progress], Any], items: Sequence[Any], watch: Watch
+    ) -> None:
+        self._ray, self._items, self._watch = cluster.ray, items, watch
+        self._memory = _MEMORY_BYTES if cluster.is_shared else 0  # alone on a machine, `workers` bounds it
+        self._function = self._ray.put(function)
+        self._board = cluster.beside_the_driver(_Board)
+        self._reading, self._read_at = self._board.read.remote(), time.monotonic()
+        self._task = self._ray.remote(_work).options(
+            num_cpus=1,
+            memory=self._memory or None,
+            max_retries=0,  # Ray would try a poisoned item again beside the others
+            runtime_env={"env_vars": cluster.environment | ONE_THREAD},
+        )
+        self._running: dict[Any, int] = {}
+        self._nodes_lost = Counter[int]()
+        self._cpus, self._counted_at, self._room_at = 1, 0.0, time.monotonic()
+
+    def drain(
+        self, queue: deque[int], most: int | None, obey: Callable[[], None]
+    ) -> Generator[Finished[Any, Any], None, list[int]]:
+        """Run the queue until it is empty; returns the items that shall go on alone."""
+        suspects: list[int] = []
+        while queue or self._running:
+            self._count()
+            while queue and len(self._running) < (most or _TASKS_PER_CPU * self._cpus):
+                index = queue.popleft()
+                task = self._function, self._items[index], index, self._board, CODE_VERSION
+                self._running[self._task.remote(*task)] = index
+            ended = self._ended()
+            obey()
+            self._tell()
+            for ref in ended:
+                index = self._running.pop(ref)
+                end = self._end(ref, index)
+                if end is not None:
+                    yield replace(end, item=self._items[index])
+                elif self._nodes_lost[index] in range(1, _NODES_LOST):
+                    queue.append(index)
+                else:
+                    suspects.append(index)
+        return suspects
+
+    def leave(self) -> None:
+        """Stop what is still in work: it puts its things away first."""
+        waiting = list(self._running)
+        with suppress(Exception):  # whatever is wrong with the cluster, the night ends here
+            for force in (False, True):
+                for ref in waiting:
+                    self._ray.cancel(ref, force=force)
+                if waiting:
+                    _, waiting = self._ray.wait(waiting, num_returns=len(waiting), timeout=_GRACE_S)
+            self._ray.kill(self._board)
+
+    def _ended(self) -> list[Any]:
+        refs = list(self._running)
+        done, _ = self._ray.wait(refs, num_returns=1, timeout=_POLL_S, fetch_local=False)
+        if done:
+            done, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0, fetch_local=False)
+        return list(done)
+
+    def _end(self, ref: Any, index: int) -> Finished[None, Any] | None:
+        """How a task ended; None where it did not, because its worker or its node died."""
+        errors = self._ray.exceptions
+        try:
+            return self._ray.get(ref)
+        except (errors.NodeDiedError, errors.ObjectLostError):
+            self._nodes_lost[index] += 1
+            return None
+        except (errors.WorkerCrashedError, errors.OutOfMemoryError):
+            self._nodes_lost[index] = 0
+            return None
+        except errors.RayError as err:
+            return Finished(None, error=f"{type(err).__name__}: {err}".splitlines()[0], trace=str(err))
+
+    def _tell(self) -> None:
+        """Pass on what the board says."""
+        now = time.monotonic()
+        with suppress(self._ray.exceptions.RayError):  # the board may be lost: it is for the eye only
+            if self._reading is not None and self._ray.wait([self._reading], timeout=0)[0]:
+                reading, self._reading = self._reading, None
+                in_work = set(self._running.values())
+                for index, at in self._ray.get(reading).items():
+                    if index in in_work:
+                        self._watch(index, *at)
+            if self._reading is None and now - self._read_at >= _LOOK_S:
+                self._reading, self._read_at = self._board.read.remote(), now
+
+    def _count(self) -> None:
+        """See how many CPUs there are.
+
+        Raises:
+            ConfigError: no node has had room for a task for long.
+        """
+        now = time.monotonic()
+        if now - self._counted_at < min(_COUNT_S, _NO_NODE_S):
+            return
+        self._counted_at = now
+        rooms = [n["Resources"] for n in self._ray.nodes() if n["Alive"]]
+        self._cpus = max(1, sum(int(room.get("CPU", 0)) for room in rooms))
+        if any(room.get("CPU", 0) >= 1 and room.get("memory", 0) >= self._memory for room in rooms):
+            self._room_at = now
+        elif now - self._room_at > _NO_NODE_S:
+            needed = f"1 CPU and {self._memory >> 30} GiB of memory"
+            raise ConfigError("environment", "RAY_ADDRESS", f"no node of the cluster has {needed} for a task")
+
+
+class _Board:
+    """Where tasks write how far they are; keeps what nobody has read yet."""
+
+    def __init__(self) -> None:
+        self._news: dict[int, tuple[int, int, str]] = {}
+
+    def write(self, index: int, done: int, total: int, what: str) -> None:
+        self._news[index] = (done, total, what)
+
+    def read(self) -> dict[int, tuple[int, int, str]]:
+        news, self._news = self._news, {}
+        return news
+
+
+def _work(
+    function: Callable[[Any, Progress], Any], item: Any, index: int, board: Any, version: str
+) -> Finished[None, Any]:
+    """A task; the driver has the item. Every second it says how far it is, and whenever its stage changes."""
+    if version != CODE_VERSION:
+        problem = f"the night is of version {version}: install the same on every node"
+        raise ContractError(f"boresight {CODE_VERSION}", problem)
+    said_at, said = 0.0, ""
+
+    def progress(done: int, total: int, what: str) -> None:
+        nonlocal said_at, said
+        now, stage = time.monotonic(), what.partition(" ")[0]
+        if stage != said or now - said_at >= _LOOK_S:
+            said_at, said = now, stage
+            with suppress(Exception):  # nobody needs to know
+                board.write.remote(index, done, total, what)
+
+    # Ray's order to stop is an interrupt, which what a shell starts in the background ignores, and its heirs.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    finished = attempt(function, item, progress)
+    return Finished(None, finished.value, finished.error, finished.trace)

@@ -1,0 +1,42 @@
+"""What a night counts: added up as vehicle-days end, so that nobody keeps their records for it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from pipeline.fleet.nightly import DayOutcome
+
+__all__ = ["Tally"]
+
+
+@dataclass
+class Tally:
+    """Counts of a night.
+
+    Args:
+        vehicle_days: by status.
+        records: of calibrations that are current, by pair and status.
+        stages: by stage and how it ended.
+        seconds: of the workers, by stage.
+        bytes_read: by them, from the page cache too, by stage.
+        bytes_written: likewise.
+    """
+
+    vehicle_days: Counter[str] = field(default_factory=Counter)
+    records: Counter[tuple[str, str]] = field(default_factory=Counter)
+    stages: Counter[tuple[str, str]] = field(default_factory=Counter)
+    seconds: Counter[str] = field(default_factory=Counter)
+    bytes_read: Counter[str] = field(default_factory=Counter)
+    bytes_written: Counter[str] = field(default_factory=Counter)
+
+    def add(self, outcome: DayOutcome) -> None:
+        """Count one vehicle-day."""
+        self.vehicle_days[outcome.status] += 1
+        self.records.update(outcome.pairs.items())
+        for result in outcome.results:
+            effort = result.effort
+            self.stages[result.stage, result.status] += 1
+            self.seconds[result.stage] += effort.seconds  # type: ignore[assignment]  # a Counter adds what adds up
+            self.bytes_read[result.stage] += effort.bytes_read or 0
+            self.bytes_written[result.stage] += effort.bytes_written or 0
