@@ -34,6 +34,7 @@ def nightly(
     pictures: bool = True,
     metrics: Path | None = None,
     lineage: str | None = None,
+    held_exit_code: Literal[0, 3] = 3,
     dry_run: bool = False,
 ) -> int:
     """Take every vehicle-day of a pattern through all stages; one bad day never stops the fleet.
@@ -54,6 +55,7 @@ def nightly(
         pictures: --no-pictures draws pages without images of public roads.
         metrics: Prometheus text file to replace when the night ends; needs the extra [ops].
         lineage: file or URL that OpenLineage events are sent to; needs the extra [ops].
+        held_exit_code: where something was held or refused; 0 for schedulers to whom all else is a failure.
         dry_run: only say what would run, and why.
     """
     from jobs.extras import require
@@ -95,7 +97,7 @@ def nightly(
         damaged=left_out(tables),
         report=pages[0] if pages else None,
     )
-    return code
+    return held_exit_code if code == 3 else code
 
 
 def _print_plan(night: Night, days: Sequence[VehicleDay]) -> int:

@@ -1,0 +1,63 @@
+"""`boresight nightly`: metrics, lineage and exit codes of a night without work: one vehicle that nobody knows."""
+
+import json
+
+import pytest
+
+from jobs.cli import main
+from tests.makers.fleet_files import fleet_toml
+
+
+@pytest.fixture
+def night(tmp_path, capfd):
+    log = tmp_path / "logs" / "stranger" / "2026-03-02" / "a.mcap"
+    log.parent.mkdir(parents=True)
+    log.touch()
+    (tmp_path / "fleet.toml").write_text(fleet_toml("car"))
+
+    def run(*options):
+        command = [
+            "nightly",
+            "--fleet",
+            f"{tmp_path}/fleet.toml",
+            "--lake",
+            f"{tmp_path}/lake",
+            "--executor",
+            "inline",
+        ]
+        code = main([*command, "--logs", f"{tmp_path}/logs/{{vehicle}}/{{day}}/*", *options])
+        out, err = capfd.readouterr()
+        return code, json.loads(out.splitlines()[-1]), err
+
+    return run
+
+
+def test_a_refused_day_is_a_success_where_the_scheduler_knows_no_other(night):
+    assert night()[0] == 3
+    code, summary, _ = night("--held-exit-code", "0")
+    assert (code, summary["status"], summary["refused"]) == (0, "held", 1)
+
+
+def test_no_other_exit_code_can_be_asked_for(night):
+    assert night("--held-exit-code", "1")[0] == 2
+
+
+def test_a_night_is_told_to_monitoring_and_lineage(night, tmp_path):
+    pytest.importorskip("openlineage.client", reason="pip install 'boresight[ops]'")
+    options = ("--metrics", f"{tmp_path}/night.prom", "--lineage", f"{tmp_path}/events.json")
+    assert night(*options)[0] == 3
+    metrics = (tmp_path / "night.prom").read_text()
+    assert 'boresight_vehicle_days{fleet="tests",status="refused"} 1.0' in metrics
+    assert "boresight_last_success_timestamp_seconds" in metrics
+    events = [json.loads(line) for line in (tmp_path / "events.json").read_text().splitlines()]
+    assert [e["eventType"] for e in events] == ["START", "COMPLETE"]
+    assert {e["job"]["name"] for e in events} == {"nightly"}
+
+
+def test_sinks_that_fail_are_named_and_fail_nothing(night, tmp_path):
+    pytest.importorskip("openlineage.client", reason="pip install 'boresight[ops]'")
+    options = ("--metrics", f"{tmp_path}/missing/night.prom", "--lineage", f"{tmp_path}/missing/events.json")
+    code, summary, err = night(*options)
+    assert (code, summary["status"]) == (3, "held")
+    assert f"{tmp_path}/missing/night.prom" in err
+    assert "2 events were not sent" in err
