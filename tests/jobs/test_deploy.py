@@ -1,0 +1,355 @@
+"""What `jobs/deploy` offers to schedulers: looked at by what they themselves bring, where that is here.
+
+Airflow and Dagster have pins of their own: $BORESIGHT_AIRFLOW_PYTHON and $BORESIGHT_DAGSTER_PYTHON name interpreters
+that have them.
+"""
+
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import tomllib
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+REPO = Path(__file__).resolve().parents[2]
+DEPLOY = REPO / "jobs" / "deploy"
+SYSTEMD = DEPLOY / "systemd"
+CRONJOB = DEPLOY / "kubernetes" / "cronjob.yaml"
+RAYJOB = DEPLOY / "kubernetes" / "rayjob.yaml"
+RETRIED = {0: False, 1: True, 2: False, 3: False}  # by the night's exit code
+
+
+@pytest.fixture
+def fake_night(tmp_path, monkeypatch):
+    """A command that notes how it is called, tells a summary, and ends with a code that a test chooses."""
+    command = tmp_path / "bin" / "boresight"
+    command.parent.mkdir()
+    command.write_text(
+        '#!/bin/sh\nprintf "%s\\n" "$@" > "$NOTED"\necho \'{"command": "nightly", "status": "done", "held": 4}\'\n'
+        "exit $CODE\n"
+    )
+    command.chmod(command.stat().st_mode | stat.S_IXUSR)
+    settings = {"": command, "_FLEET": "/f/fleet.toml", "_LAKE": "/f/lake", "_LOGS": "/f/{vehicle}/{day}/*"}
+    for name, value in settings.items():
+        monkeypatch.setenv(f"BORESIGHT{name}", str(value))
+    monkeypatch.setenv("NOTED", str(tmp_path / "noted"))
+    return tmp_path / "noted"
+
+
+def options_of(noted):
+    """What the fake night was called with."""
+    command, *rest = noted.read_text().splitlines()
+    assert command == "nightly"
+    return dict(zip(rest[::2], rest[1::2], strict=True))
+
+
+def known(arguments):
+    """Whether `boresight nightly` has all these options, spelled so."""
+    from jobs.nightly import nightly
+
+    names = {"from_day": "from", "to_day": "to"}
+    options = {"--" + names.get(name, name).replace("_", "-") for name in nightly.__kwdefaults__ or {}}
+    options |= {"--fleet", "--lake", "--logs"}
+    return {a.partition("=")[0] for a in arguments if a.startswith("--")} <= options
+
+
+# systemd and cron
+
+
+def lines_of(unit):
+    text = (SYSTEMD / unit).read_text().replace("\\\n", " ")
+    return [
+        line.partition("=")[::2] for line in text.splitlines() if "=" in line and not line.startswith("#")
+    ]
+
+
+def test_systemd_tries_again_what_may_help_and_nothing_else():
+    unit = dict(lines_of("boresight-night.service"))
+    assert (unit["Type"], unit["Restart"]) == ("oneshot", "on-failure")
+    assert (unit["SuccessExitStatus"], unit["RestartPreventExitStatus"]) == ("3", "2")
+
+
+def test_systemd_itself_takes_the_units(tmp_path):
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not on this machine: apt-get install systemd")
+    for unit in ("boresight-night.service", "boresight-night.timer"):
+        shutil.copy(SYSTEMD / unit, tmp_path)
+    service = tmp_path / "boresight-night.service"
+    # Neither the user nor the file of settings is on a machine that only looks at the unit.
+    service.write_text(
+        service.read_text().replace("User=boresight", "").replace("=/etc/boresight/", "=-/etc/boresight/")
+    )
+    verify = ["systemd-analyze", "verify", "--man=no", *sorted(map(str, tmp_path.glob("boresight*")))]
+    done = subprocess.run(verify, capture_output=True, text=True, check=False)
+    ours = [line for line in done.stderr.splitlines() if "boresight" in line]
+    assert (done.returncode, ours) == (0, []), done.stderr
+    [when] = [value for key, value in lines_of("boresight-night.timer") if key == "OnCalendar"]
+    subprocess.run(["systemd-analyze", "calendar", when], capture_output=True, check=True)
+
+
+def shell_line_of_the_service():
+    line = dict(lines_of("boresight-night.service"))["ExecStart"]
+    return re.fullmatch(r"/bin/sh -c '(.*)'", line)[1].replace("%%", "%")
+
+
+@pytest.mark.parametrize("code", RETRIED)
+def test_the_services_command_is_the_nights_and_ends_with_its_code(code, fake_night, monkeypatch):
+    monkeypatch.setenv("CODE", str(code))
+    done = subprocess.run(["/bin/sh", "-c", shell_line_of_the_service()], capture_output=True, check=False)
+    options = options_of(fake_night)
+    assert done.returncode == code
+    assert options["--logs"] == "/f/{vehicle}/{day}/*"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", options["--from"])
+    assert known(options)
+
+
+@pytest.mark.parametrize("code", [0, 1, 2])
+def test_cron_mails_what_is_wrong_and_nothing_else(code, fake_night, monkeypatch, tmp_path):
+    monkeypatch.setenv("CODE", str(code))
+    [line] = [x for x in (SYSTEMD / "crontab").read_text().splitlines() if not x.startswith("#")]
+    *when, user, command = line.split(maxsplit=6)
+    assert (when, user) == (["30", "1", "*", "*", "*"], "boresight")
+    command = (
+        command.replace("\\%", "%")
+        .replace("/tmp/", f"{tmp_path}/")
+        .replace(". /etc/boresight/night.env;", "")
+    )
+    done = subprocess.run(["/bin/sh", "-c", command], capture_output=True, text=True, check=False)
+    assert bool(done.stdout) == (code != 0)
+    assert options_of(fake_night)["--held-exit-code"] == "0"
+    assert known(options_of(fake_night))
+
+
+def test_the_settings_are_all_that_the_commands_ask_for():
+    given = {
+        line.partition("=")[0] for line in (SYSTEMD / "night.env").read_text().splitlines() if "=" in line
+    }
+    files = [*SYSTEMD.glob("*.service"), SYSTEMD / "crontab"]
+    asked = {name for f in files for name in re.findall(r'"\$(BORESIGHT\w*)"', f.read_text())}
+    assert given == asked
+
+
+# Kubernetes
+
+
+def manifest(path):
+    return YAML(typ="safe").load(path.read_text())
+
+
+@pytest.mark.parametrize("path", [CRONJOB], ids=lambda p: p.name)
+def test_kubernetes_own_schema_takes_the_manifest(path):
+    validate = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate").validate
+    validate(manifest(path), validate_latest(), strict=True)
+
+
+def validate_latest():
+    from kubernetes_validate import latest_version
+
+    return latest_version()
+
+
+def test_a_cronjob_tries_again_what_may_help_and_a_held_day_is_no_failed_pod():
+    spec = manifest(CRONJOB)["spec"]
+    job = spec["jobTemplate"]["spec"]
+    pod = job["template"]["spec"]
+    [night] = pod["containers"]
+    rules = {rule["action"]: rule for rule in job["podFailurePolicy"]["rules"]}
+    assert rules["FailJob"]["onExitCodes"] == {
+        "containerName": night["name"],
+        "operator": "In",
+        "values": [2],
+    }
+    assert "DisruptionTarget" in str(rules["Ignore"])
+    assert "--held-exit-code=0" in night["args"]
+    assert "command" not in night  # the image's own: no shell stands between SIGTERM and the night
+    assert (spec["concurrencyPolicy"], pod["restartPolicy"]) == ("Forbid", "Never")
+    assert pod["terminationGracePeriodSeconds"] > 10
+    assert known(night["args"])
+    assert pod["securityContext"]["runAsUser"] == 10001  # as in the Dockerfile
+    assert "--uid 10001" in (DEPLOY / "Dockerfile").read_text()
+
+
+def test_every_volume_is_mounted_and_every_mount_is_a_volume():
+    for pod in pods():
+        volumes = {v["name"] for v in pod["volumes"]}
+        assert {m["name"] for c in pod["containers"] for m in c["volumeMounts"]} == volumes
+
+
+def pods():
+    ray = manifest(RAYJOB)["spec"]["rayClusterSpec"]
+    groups = [ray["headGroupSpec"], *ray["workerGroupSpecs"]]
+    return [
+        manifest(CRONJOB)["spec"]["jobTemplate"]["spec"]["template"]["spec"],
+        *(g["template"]["spec"] for g in groups),
+    ]
+
+
+def test_kubernetes_own_schema_takes_the_pods_of_the_rayjob():
+    validate = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate").validate
+    for pod in pods():
+        told = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "a"}, "spec": pod}
+        validate(told, validate_latest(), strict=True)
+
+
+# KubeRay's CRD is on no package index: these are its field names and types as its API reference (v1) states them.
+RAYJOB_FIELDS = {
+    "entrypoint": str, "submissionMode": str, "backoffLimit": int, "activeDeadlineSeconds": int,
+    "shutdownAfterJobFinishes": bool, "ttlSecondsAfterFinished": int, "rayClusterSpec": dict,
+}  # fmt: skip
+CLUSTER_FIELDS = {
+    "rayVersion": str, "enableInTreeAutoscaling": bool, "autoscalerOptions": dict, "headGroupSpec": dict,
+    "workerGroupSpecs": list,
+}  # fmt: skip
+GROUP_FIELDS = {
+    "groupName": str,
+    "replicas": int,
+    "minReplicas": int,
+    "maxReplicas": int,
+    "rayStartParams": dict,
+    "template": dict,
+}
+
+
+def assert_fields(found, fields):
+    assert found.keys() <= fields.keys()
+    assert all(isinstance(value, fields[name]) for name, value in found.items())
+
+
+def test_a_rayjob_has_the_structure_that_kuberay_asks_for():
+    told = manifest(RAYJOB)
+    assert (told["apiVersion"], told["kind"]) == ("ray.io/v1", "RayJob")
+    cluster = told["spec"]["rayClusterSpec"]
+    assert_fields(told["spec"], RAYJOB_FIELDS)
+    assert_fields(cluster, CLUSTER_FIELDS)
+    for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
+        assert_fields(group, GROUP_FIELDS)
+        assert all(isinstance(v, str) for v in group["rayStartParams"].values())
+    assert told["spec"]["submissionMode"] in {"K8sJobMode", "HTTPMode", "SidecarMode", "InteractiveMode"}
+    assert told["spec"]["ttlSecondsAfterFinished"] == 0 or told["spec"]["shutdownAfterJobFinishes"]
+
+
+def test_a_rayjob_runs_the_night_with_the_ray_that_was_tested():
+    spec = manifest(RAYJOB)["spec"]
+    cluster = spec["rayClusterSpec"]
+    arguments = spec["entrypoint"].split()
+    assert arguments[:4] == ["boresight", "nightly", "--executor", "ray"]
+    assert known(arguments)
+    assert "--held-exit-code 0" in spec["entrypoint"]
+    assert f"ray=={cluster['rayVersion']}\n" in (REPO / "constraints.txt").read_text()
+    assert f"rayproject/ray:{cluster['rayVersion']}-py311" in (DEPLOY / "Dockerfile.ray").read_text()
+    assert cluster["headGroupSpec"]["rayStartParams"]["num-cpus"] == "0"
+    # Where logs, lake and configuration are must be the same for the driver and the workers.
+    mounts = [c["volumeMounts"] for pod in pods()[1:] for c in pod["containers"]]
+    assert all(m == mounts[0] for m in mounts)
+
+
+# Airflow and Dagster
+
+
+def python_with(module):
+    """An interpreter that has the module; the test is left out where none is known."""
+    named = os.environ.get(f"BORESIGHT_{module.upper()}_PYTHON")
+    if named is None and find_spec(module) is None:
+        pytest.skip(
+            f"no {module} here, and $BORESIGHT_{module.upper()}_PYTHON names no interpreter that has it"
+        )
+    return named or sys.executable
+
+
+@pytest.fixture(scope="module")
+def airflow(tmp_path_factory):
+    """Interpreter and environment of an Airflow with an empty database."""
+    python, home = python_with("airflow"), tmp_path_factory.mktemp("airflow")
+    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "AIRFLOW_HOME")}
+    environment |= {
+        "AIRFLOW_HOME": str(home),
+        "AIRFLOW__CORE__LOAD_EXAMPLES": "False",
+        "AIRFLOW__CORE__DAGS_FOLDER": str(DEPLOY / "airflow"),
+    }
+    subprocess.run(
+        [python, "-m", "airflow", "db", "migrate"], env=environment, capture_output=True, check=True
+    )
+    return python, environment
+
+
+RUN_TASK = """
+import sys
+from airflow.dag_processing.dagbag import DagBag
+bag = DagBag(sys.argv[1], include_examples=False)
+assert not bag.import_errors, bag.import_errors
+dag = bag.dags["boresight_night"]
+[task] = dag.tasks
+assert (task.retries, dag.catchup, dag.max_active_runs) == (2, False, 1)
+from airflow.sdk.exceptions import AirflowFailException
+try:
+    print("said", task.python_callable())
+except AirflowFailException as err:
+    print("never again", err)
+except Exception as err:
+    print("again", err)
+"""
+
+
+@pytest.mark.parametrize("code", RETRIED)
+def test_airflow_takes_the_dag_and_tries_again_what_may_help(code, airflow, fake_night):
+    python, environment = airflow
+    ours = {k: v for k, v in os.environ.items() if k.startswith(("BORESIGHT", "NOTED"))}
+    done = subprocess.run(
+        [python, "-c", RUN_TASK, str(DEPLOY / "airflow")],
+        env=environment | ours | {"CODE": str(code)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    last = done.stdout.splitlines()[-1]
+    assert last.split()[0] == {0: "said", 3: "said", 1: "again", 2: "never"}[code]
+    assert '"held": 4' in last
+    assert known(options_of(fake_night))
+
+
+RUN_ASSET = """
+import sys, importlib.util, dagster as dg
+spec = importlib.util.spec_from_file_location("definitions", sys.argv[1])
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+dg.Definitions.validate_loadable(module.definitions)
+result = dg.materialize([module.calibrations], partition_key="2026-03-02", raise_on_error=False)
+events = {e.event_type_value for e in result.all_events}
+print("success" if result.success else "retry" if "STEP_UP_FOR_RETRY" in events else "failure")
+"""
+
+
+@pytest.mark.parametrize("code", [0, 2, 3])
+def test_dagster_makes_the_asset_of_a_day(code, fake_night):
+    done = run_asset(code)
+    assert done == ("failure" if code == 2 else "success")
+    options = options_of(fake_night)
+    assert (options["--from"], options["--to"]) == ("2026-03-02", "2026-03-02")
+    assert known(options)
+
+
+def run_asset(code):
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"CODE": str(code)}
+    command = [python_with("dagster"), "-c", RUN_ASSET, str(DEPLOY / "dagster" / "definitions.py")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout.splitlines()[-1]
+
+
+def test_the_readme_names_every_file():
+    readme = (DEPLOY / "README.md").read_text()
+    files = [p.relative_to(DEPLOY) for p in DEPLOY.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+    assert [str(f) for f in files if f.name not in readme and f.name != "README.md"] == []
+
+
+def test_images_install_what_this_release_is():
+    version = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]["requires-python"]
+    assert version == ">=3.11"
+    assert all("python:3.11-slim" in (DEPLOY / f).read_text() for f in ("Dockerfile", "Dockerfile.ray"))
