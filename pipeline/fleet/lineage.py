@@ -18,6 +18,7 @@ from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import Outcome
 from pipeline.stages import INGEST, STAGES
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.remote_logs import LogPath
 from schemas.columns import TableSchema
 from schemas.versions import CODE_VERSION
 
@@ -47,7 +48,7 @@ class NightLineage:
     """
 
     night: Night
-    logs: Mapping[Partition, tuple[Path, ...]] = field(repr=False)
+    logs: Mapping[Partition, tuple[LogPath, ...]] = field(repr=False)
 
     @classmethod
     def of(cls, night: Night, days: Sequence[VehicleDay]) -> NightLineage:
@@ -158,7 +159,7 @@ class NightLineage:
         partition = Partition(result.vehicle, result.day)
         if result.stage == INGEST.name:
             for log in self.logs.get(partition, ()):
-                yield InputDataset("file", str(log.absolute()))
+                yield InputDataset(*_named(str(log)))
         for schema in _STAGES[result.stage].reads:
             yield InputDataset(*_place(self.night.lake.absolute(), schema, partition))
 
@@ -181,9 +182,13 @@ class NightLineage:
 def _place(lake: Lake, schema: TableSchema, partition: Partition) -> tuple[str, str]:
     """Namespace and name of a dataset, in OpenLineage's way: a day of a heavy table, a record table whole."""
     of_day = lake.files.uri(lake.folder(schema.name, partition))
-    where = lake.table(schema.name) if schema.is_record_table else of_day
+    return _named(lake.table(schema.name) if schema.is_record_table else of_day)
+
+
+def _named(where: str) -> tuple[str, str]:
+    """Namespace and name of a path of this machine, or of an object of a bucket."""
     scheme, separator, rest = where.partition("://")
     if not separator:
-        return "file", where
+        return "file", str(Path(where).absolute())
     bucket, _, name = rest.partition("/")
     return f"{scheme}://{bucket}", name

@@ -160,7 +160,8 @@ class _Jobs(Sequence[_Job]):
         day, fleet = self._days[index], self._night.fleet
         vehicle = fleet.vehicles[day.partition.vehicle]
         own = {"vehicles": {day.partition.vehicle: vehicle}, "rigs": {vehicle.rig: fleet.rigs[vehicle.rig]}}
-        logs = tuple(Path(os.path.abspath(log)) for log in day.logs)  # as in `_shared`
+        # As in `_shared`; what lies in a bucket is there from everywhere.
+        logs = tuple(Path(os.path.abspath(g)) if isinstance(g, Path) else g for g in day.logs)
         return own, replace(day, logs=logs), self._ledger.known(day.partition)
 
 

@@ -4,6 +4,7 @@ import datetime as dt
 import json
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from uuid import UUID
@@ -14,6 +15,7 @@ from pipeline.config import FleetConfig
 from pipeline.fleet.nightly import Night
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.remote_logs import RemoteLog
 from tests.makers.night_outcomes import DAY, day_outcome, stage_outcome
 
 pytest.importorskip("openlineage.client", reason="pip install 'boresight[ops]'")
@@ -153,6 +155,16 @@ def test_the_same_work_is_the_same_run_and_other_work_another(lineage):
     assert all(UUID(i).version == 5 for i in ids[0])
     assert lineage.begun(NOW).run.runId == lineage.ended(NOW, "ABORT").run.runId
     assert run_id_of("ingest", "car", DAY, "a") != run_id_of("ingest", "bus", DAY, "a")
+
+
+def test_what_lies_in_a_bucket_is_named_after_it(lineage):
+    night = replace(lineage.night, lake=Lake.at("s3://fleet/lake"))
+    logs = {Partition("car", DAY): (RemoteLog("logs-of-cars", "car/a.mcap"),)}
+    _, ended = list(NightLineage(night, logs).of_day(good_day()))[:2]
+    assert [(d.namespace, d.name) for d in ended.inputs] == [("s3://logs-of-cars", "car/a.mcap")]
+    assert [(d.namespace, d.name) for d in ended.outputs] == [
+        ("s3://fleet", f"lake/frames/vehicle=car/day={DAY}")
+    ]
 
 
 def test_what_was_up_to_date_is_not_told_again(lineage):
