@@ -10,9 +10,10 @@ from pipeline.errors import ConfigError
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipeline.export.calibration import ExportedCalibration, FrameNames
+    from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
+    from pipeline.export.compare import Side
 
-__all__ = ["mounting", "read_calibration"]
+__all__ = ["mounting", "read_calibration", "read_side"]
 
 
 def read_calibration(
@@ -79,3 +80,63 @@ def mounting(text: str, names: FrameNames) -> np.ndarray:
         problem = f"no chain joins these frames; the file has: {frames or 'none'}"
         raise ConfigError(path, f"{names.base}, {names.lidar}", problem)
     return T
+
+
+def read_side(text: str, location: str | None, vehicle: str | None, method: str, names: FrameNames) -> Side:
+    """What `boresight compare` calls A or B: FORMAT:FILE[,FILE], a prior file, or of the lake [VEHICLE@]DAY[/METHOD].
+
+    METHOD may be "prior": what was known before the day; DAY may be "state": what to load tonight.
+
+    Raises:
+        ConfigError: it is none of these, or there is none.
+    """
+    from pipeline.export.formats import FORMATS
+
+    form, colon, files = text.partition(":")
+    if (colon and form in FORMATS) or text.endswith(".json"):
+        return _side_of_files(text, form if colon and form in FORMATS else "", files, names)
+    return _side_of_lake(text, location, vehicle, method)
+
+
+def _side_of_files(text: str, form: str, files: str, names: FrameNames) -> Side:
+    from pipeline.export.calibration import ExportedPair
+    from pipeline.export.compare import Side, composed
+    from pipeline.export.files import read_files
+    from pipeline.export.formats import format_named
+    from pipeline.extrinsics.prior import read_transforms
+
+    if form:
+        found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names)
+    else:
+        found = read_transforms(Path(text))
+    pairs = {pair: ExportedPair(pair, T, status="given") for pair, T in found.items()}
+    return Side(text, composed(pairs))
+
+
+def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: str) -> Side:
+    from pipeline.export.compare import Side
+    from pipeline.export.lake import choose_pairs, pairs_of_day, pairs_of_state, priors_of_day
+    from pipeline.store.partitions import Lake
+
+    owner, at, rest = text.rpartition("@")
+    owner = owner if at else (vehicle or "")
+    day, _, named = rest.partition("/")
+    if location is None or not owner:
+        problem = f"{text!r} is no FORMAT:FILE and no .json; a day of a lake needs --lake and --vehicle"
+        raise ConfigError("command line", "A, B", problem)
+    lake = Lake.existing(location)
+    if day == "state":
+        found = pairs_of_state(lake, owner, named or method)
+    elif named == "prior":
+        found = priors_of_day(lake, owner, day, method)
+    else:
+        found = pairs_of_day(lake, owner, day, named or method)
+    pairs, missing = choose_pairs(found, force=True)
+    days = frozenset[str]() if named == "prior" else _days(pairs, day)
+    return Side(f"{owner} {rest}", pairs, owner, days, missing)
+
+
+def _days(pairs: dict[str, ExportedPair], day: str) -> frozenset[str]:
+    """Days that the pairs rest on."""
+    listed = {str(d) for pair in pairs.values() for d in _listed(pair.details.get("days"))}
+    return frozenset(listed if day == "state" else {day})

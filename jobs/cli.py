@@ -59,6 +59,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Write a calibration for ROS 2, Autoware, KITTI, ...; the tables' JSON Schema; a network as ONNX.",
     ),
     "import": ("jobs.import_prior:import_prior", "Calibration files of other programs to a prior file."),
+    "compare": ("jobs.compare:compare", "Two calibrations, axis by axis: records, days, methods, files."),
     "migrate": ("jobs.migrate:migrate", "A lake of an older release to the tables of this one."),
     "simulate": ("jobs.simulate:simulate", "Logs of a synthetic fleet, its truth in a file of its own."),
     "evaluate": ("jobs.evaluate:evaluate", "Compare records with a known truth or a reflector recording."),

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.errors import ConfigError, ContractError
 from pipeline.export.calibration import USABLE, ExportedPair
 from pipeline.geometry.cameras import Camera, camera_of
-from pipeline.store.current import current_records, current_states, transform_of
+from pipeline.store.current import current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.tables import iterate_rows, read_manifest
@@ -17,7 +17,7 @@ from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.states import STATES, StateRow
 
-__all__ = ["choose_pairs", "pairs_of_day", "pairs_of_state", "read_camera"]
+__all__ = ["choose_pairs", "pairs_of_day", "pairs_of_state", "priors_of_day", "read_camera"]
 
 # What a record or state says of itself beside its numbers, as far as it has it.
 _DETAILS = (
@@ -32,6 +32,27 @@ def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, E
     Raises:
         ConfigError: there is no record of that vehicle, day and method; it names those that there are.
     """
+    return _pairs(_records(lake, vehicle, day, method))
+
+
+def priors_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:
+    """By pair what was known before the day, as its records say.
+
+    Raises:
+        ConfigError: as `pairs_of_day`.
+    """
+    found: dict[str, ExportedPair | str] = {}
+    for record in _records(lake, vehicle, day, method):
+        T = prior_of(record)
+        found[record.pair] = (
+            "no prior was given"
+            if T is None
+            else ExportedPair(record.pair, T, record.prior_covariance, "prior", certified=())
+        )
+    return found
+
+
+def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[CalibrationRecord]:
     Partition(vehicle, day)  # refuses what is no vehicle or day
     records = current_records(read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day))
     found = [r for r in records if r.method == method]
@@ -41,7 +62,7 @@ def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, E
         raise ConfigError(
             "command line", "day", f"the lake has no record of {vehicle} {day} by {method}{there}"
         )
-    return _pairs(found)
+    return found
 
 
 def pairs_of_state(lake: Lake, vehicle: str, method: str) -> dict[str, ExportedPair | str]:

@@ -1,0 +1,132 @@
+"""Two calibrations, axis by axis: how far apart, and whether their sigmas explain it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.export.calibration import ExportedPair
+from pipeline.export.tree import ESTIMATED_PAIRS
+from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.geometry.target_sigmas import target_sigmas
+from schemas.calibrations import PAIRS
+
+__all__ = ["PairDifference", "Side", "compare", "composed"]
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of the two.
+
+    Args:
+        title: as a person calls it.
+        pairs: by pair, what it says.
+        vehicle: whose it is; empty where a file does not say.
+        days: days that it rests on; empty where a file does not say.
+        missing: by pair, why there is none.
+    """
+
+    title: str
+    pairs: Mapping[str, ExportedPair]
+    vehicle: str = ""
+    days: frozenset[str] = frozenset()
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class PairDifference:
+    """What leads from A's estimate of a pair to B's.
+
+    Args:
+        pair: of sensors.
+        statuses: of A and B.
+        change: rotation vector [rad], shift of the child's origin [m], along the axes of the parent.
+        sigma: of it; None where neither side states any.
+        determined: per DoF, both sides' data did, or are taken as given.
+        targets_rad: how far azimuth and elevation of targets 15 to 40 m away move, root mean square.
+    """
+
+    pair: str
+    statuses: tuple[str, str]
+    change: Float[np.ndarray, " 6"]
+    sigma: Float[np.ndarray, " 6"] | None
+    determined: Bool[np.ndarray, " 6"]
+    targets_rad: Float[np.ndarray, " 2"]
+
+    @property
+    def z(self) -> Float[np.ndarray, " 6"] | None:
+        """The change in its sigmas."""
+        return None if self.sigma is None else self.change / self.sigma
+
+
+def compare(a: Side, b: Side) -> tuple[list[PairDifference], list[str]]:
+    """By pair that both have, the change from A to B, and what to know of the sigmas, a sentence each.
+
+    Different days of one vehicle: what all days err by alike is no part of their difference, and is left out of its
+    sigma where both sides state it. Otherwise the sigmas are those of independent estimates.
+    """
+    apart = bool(a.vehicle) and a.vehicle == b.vehicle and bool(a.days and b.days) and not a.days & b.days
+    found, lacks_common = [], False
+    for pair in (p for p in PAIRS if p in a.pairs and p in b.pairs):
+        one, other = a.pairs[pair], b.pairs[pair]
+        common = apart and one.common is not None and other.common is not None
+        lacks_common |= apart and not common
+        covariances = [_covariance(p, without_common=common) for p in (one, other)]
+        stated = [c for c in covariances if c is not None]
+        xi = log_se3(other.T @ inverse(one.T))
+        found.append(
+            PairDifference(
+                pair,
+                (one.status, other.status),
+                change_between(one.T, other.T),
+                np.sqrt(np.diag(sum(stated, np.zeros((6, 6))))) if stated else None,
+                np.array(one.observable) & np.array(other.observable),
+                target_sigmas(pair, one.T, np.outer(xi, xi)),
+            )
+        )
+    return found, _notes(a, b, apart=apart, lacks_common=lacks_common)
+
+
+def composed(pairs: Mapping[str, ExportedPair]) -> dict[str, ExportedPair]:
+    """With the third pair, of those that a file has; nobody says how sure it is."""
+    found = dict(pairs)
+    if "camera_radar" not in found and all(p in found for p in ESTIMATED_PAIRS):
+        first, second = (found[p] for p in ESTIMATED_PAIRS)
+        found["camera_radar"] = ExportedPair("camera_radar", first.T @ second.T, status=first.status)
+    return found
+
+
+def _covariance(pair: ExportedPair, *, without_common: bool) -> Float[np.ndarray, "6 6"] | None:
+    """Of (rotation vector, origin) of an estimate, as far as it counts for a difference."""
+    if pair.covariance is None:
+        return None
+    full = change_covariance(pair.T, pair.covariance)
+    if not without_common or pair.common is None:
+        return full
+    varying = change_covariance(pair.T, pair.covariance - pair.common)
+    # Sigmas are estimates themselves: as in the state, a day varies by a tenth of its sigma at least.
+    floor = 0.01 * np.diag(full)
+    return varying + np.diag(np.maximum(floor - np.diag(varying), 0.0))
+
+
+def _notes(a: Side, b: Side, *, apart: bool, lacks_common: bool) -> list[str]:
+    notes = [f"{side.title}: no {pair}: {why}" for side in (a, b) for pair, why in side.missing.items()]
+    if a.vehicle and b.vehicle and a.vehicle != b.vehicle:
+        notes.append("Two vehicles: their mountings differ, whatever the sigmas.")
+    elif a.days & b.days:
+        notes.append(
+            "Both rest on the same days: their errors are not independent, and the true sigma may be smaller."
+        )
+    elif apart:
+        words = "Different days of one vehicle: what all days err by alike is left out of the sigmas"
+        notes.append(f"{words}{', where the records state it' if lacks_common else ''}.")
+    if any(p.status == "prior" for side in (a, b) for p in side.pairs.values()):
+        notes.append(
+            "A record leans on its prior: what the day did not determine changes less than the sigmas say."
+        )
+    exact = [s.title for s in (a, b) if s.pairs and all(p.covariance is None for p in s.pairs.values())]
+    return [*notes, *(f"{title} states no sigma and is taken as exact." for title in exact)]

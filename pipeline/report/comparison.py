@@ -1,0 +1,92 @@
+"""The page of `boresight compare`: two calibrations, axis by axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from markupsafe import Markup
+
+from pipeline.report.page import render
+from pipeline.report.words import PAIR_TITLES, dof_title, scaled, unit_of
+from schemas.calibrations import DOF_NAMES
+
+__all__ = ["PairView", "comparison_page"]
+
+_CLEAR_SIGMAS = 3.0
+_REACH = 6.0  # sigmas to either side that a bar has room for
+_WIDTH, _HEIGHT = 240, 18  # px of a bar
+
+
+@dataclass(frozen=True, eq=False)
+class PairView:
+    """A pair: statuses of A and B, the change along the parent's axes [rad, m], its sigma, determined axes, targets."""
+
+    pair: str
+    statuses: tuple[str, str]
+    change: Float[np.ndarray, " 6"]
+    sigma: Float[np.ndarray, " 6"] | None
+    determined: Bool[np.ndarray, " 6"]
+    targets_rad: Float[np.ndarray, " 2"]
+
+
+def comparison_page(first: str, second: str, pairs: Sequence[PairView], notes: Sequence[str]) -> str:
+    """HTML of the change from one calibration to another."""
+    clear = [
+        f"{PAIR_TITLES[p.pair]} {dof_title(p.pair, dof)}"
+        for p in pairs
+        for k, dof in enumerate(DOF_NAMES)
+        if p.sigma is not None and abs(p.change[k]) > _CLEAR_SIGMAS * p.sigma[k]
+    ]
+    known = any(p.sigma is not None for p in pairs)
+    return render(
+        "comparison.html",
+        first=first,
+        second=second,
+        known=known,
+        clear=clear,
+        notes=list(notes),
+        pairs=[_view(p) for p in pairs],
+    )
+
+
+def _view(p: PairView) -> dict[str, object]:
+    azimuth, elevation = np.degrees(p.targets_rad)
+    axes = []
+    for k, dof in enumerate(DOF_NAMES):
+        z = None if p.sigma is None else float(p.change[k] / p.sigma[k])
+        axes.append(
+            {
+                "title": dof_title(p.pair, dof),
+                "change": f"{scaled(p.change[k], dof):+.4f} {unit_of(dof)}",
+                "sigma": "" if p.sigma is None else f"{scaled(p.sigma[k], dof):.4f}",
+                "z": "" if z is None else f"{z:+.1f}",
+                "beyond": z is not None and abs(z) > _CLEAR_SIGMAS,
+                "determined": bool(p.determined[k]),
+                "bar": "" if z is None else _bar(z),
+            }
+        )
+    return {
+        "title": PAIR_TITLES[p.pair],
+        "statuses": p.statuses,
+        "targets": f"{azimuth:.3f} deg in azimuth, {elevation:.3f} deg in elevation",
+        "axes": axes,
+    }
+
+
+def _bar(z: float) -> Markup:
+    """A bar from 0 to z; the band of three sigmas is grey behind it, and what passes six is cut there."""
+    middle, unit = _WIDTH / 2, _WIDTH / 2 / _REACH
+    end = middle + float(np.clip(z, -_REACH, _REACH)) * unit
+    left, width = min(middle, end), max(abs(end - middle), 1.0)
+    colour = "var(--bad)" if abs(z) > _CLEAR_SIGMAS else "var(--good)"
+    band = _CLEAR_SIGMAS * unit
+    return Markup(  # noqa: S704 (numbers of our own)
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" role="img" '
+        f'aria-label="{z:+.1f} sigma">'
+        f'<rect x="{middle - band:.1f}" y="2" width="{2 * band:.1f}" height="{_HEIGHT - 4}" fill="var(--none-bg)"/>'
+        f'<rect x="{left:.1f}" y="5" width="{width:.1f}" height="{_HEIGHT - 10}" fill="{colour}"/>'
+        f'<line x1="{middle}" y1="1" x2="{middle}" y2="{_HEIGHT - 1}" stroke="var(--soft)"/></svg>'
+    )
