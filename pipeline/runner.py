@@ -159,6 +159,7 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
     """Stream the rows into the partition, which appears as a whole or not at all."""
     done = _readable(task, schema)
     if done is not None and done.work_key == run.work_key and not work.again:
+        # A night that was killed told nobody what it had to say of its work: the next one does.
         return replace(_partition_outcome(stage, task, work, "cached", done), inputs=run.inputs)
     refused = _refused_before(stage, task, run)
     if refused is not None:
@@ -170,7 +171,8 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
         ):
             for group in _groups(rows):
                 out.append(group)
-            out.describe(kept={"frames": out.rows, **run.kept}, rejected=dict(run.rejected), **run.extra)
+            counts = {"kept": {"frames": out.rows, **run.kept}, "rejected": dict(run.rejected)}
+            out.describe(**counts, remarks=run.remarks, **run.extra)
     except NothingUsable as refusal:
         counts = {"kept": {"frames": 0, **run.kept}, "rejected": dict(run.rejected)}
         return _outcome(
@@ -178,7 +180,7 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
         )
     written = read_manifest(task.lake, schema, task.partition)
     assert written is not None, "the partition was just written"
-    outcome = _partition_outcome(stage, task, work, "done", written, run.remarks)
+    outcome = _partition_outcome(stage, task, work, "done", written)
     return replace(outcome, inputs=run.inputs)
 
 
@@ -201,10 +203,8 @@ def _readable(task: Task, schema: TableSchema) -> Manifest | None:
         return None
 
 
-def _partition_outcome(
-    stage: Stage, task: Task, work: Work, status: str, manifest: Manifest, remarks: str = ""
-) -> Outcome:
-    reason = remarks
+def _partition_outcome(stage: Stage, task: Task, work: Work, status: str, manifest: Manifest) -> Outcome:
+    reason = manifest.remarks
     if manifest.rows == 0:
         status = "refused"
         counts = ", ".join(f"{n} {why}" for why, n in sorted(manifest.rejected.items()))

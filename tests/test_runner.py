@@ -180,6 +180,8 @@ def test_the_manifest_says_what_was_kept_and_left_out_and_so_does_the_outcome(ta
     assert manifest.extra == {"grid": [1, 2]}
     assert manifest.work_key == outcome.work_key
     assert outcome.reason == "one log ends early"
+    again = stage(rows)[0].run(task)  # a night that was killed may have told nobody
+    assert (again.status, again.reason) == ("cached", "one log ends early")
     assert outcome.outputs == [str(task.lake.folder("observations", DAY))]
 
 

@@ -50,6 +50,7 @@ class Manifest:
     kept: dict[str, int] = field(default_factory=dict)
     rejected: dict[str, int] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)
+    remarks: str = ""  # what the outcome said although the work was done
 
 
 class PartitionWriter:
@@ -66,9 +67,11 @@ class PartitionWriter:
             self._writer.write_table(to_table(rows, self._schema), row_group_size=len(rows))
             self.rows += len(rows)
 
-    def describe(self, *, kept: dict[str, int], rejected: dict[str, int], **extra: Any) -> None:
-        """Counts for the manifest."""
-        self.manifest_fields = {"kept": kept, "rejected": rejected, "extra": extra}
+    def describe(
+        self, *, kept: dict[str, int], rejected: dict[str, int], remarks: str = "", **extra: Any
+    ) -> None:
+        """Counts and words for the manifest."""
+        self.manifest_fields = {"kept": kept, "rejected": rejected, "remarks": remarks, "extra": extra}
 
 
 @contextmanager
