@@ -7,7 +7,7 @@ WORKERS ?= 2
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 help: ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/' | expand -t 16
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/' | expand -t 20
 
 setup: $(STAMP) ## create .venv with the command boresight and all that demo and tests need
 
@@ -46,7 +46,21 @@ bench-accept: setup ## the same, and writes what it measures into the baseline
 licenses: setup ## write jobs/deploy/THIRD_PARTY_LICENSES.md anew
 	$(BIN)/python -m tests.makers.third_party > jobs/deploy/THIRD_PARTY_LICENSES.md
 
-clean: ## remove what the other targets made
-	rm -rf .venv demo .pytest_cache .mypy_cache .ruff_cache
+# Tools that look at the environment from outside, in one of their own: they would be part of what they describe.
+LOOKERS := .venv-audit
+$(LOOKERS)/.ready: Makefile
+	test -x $(LOOKERS)/bin/python || $(PYTHON) -m venv $(LOOKERS)
+	$(LOOKERS)/bin/python -m pip install --quiet cyclonedx-bom==7.5.0 pip-audit==2.10.1
+	@touch $@
 
-.PHONY: help setup demo test browser lint bench bench-accept licenses clean
+sbom: setup $(LOOKERS)/.ready ## write sbom.json: the environment as CycloneDX, checked against its schema
+	$(LOOKERS)/bin/cyclonedx-py environment --pyproject pyproject.toml --mc-type application --output-reproducible \
+		--validate --of JSON -o sbom.json $(BIN)/python
+
+audit-dependencies: $(LOOKERS)/.ready ## known vulnerabilities of what constraints.txt pins (asks pypi.org)
+	$(LOOKERS)/bin/pip-audit --strict --no-deps --disable-pip -r constraints.txt
+
+clean: ## remove what the other targets made
+	rm -rf .venv $(LOOKERS) sbom.json demo .pytest_cache .mypy_cache .ruff_cache
+
+.PHONY: help setup demo test browser lint bench bench-accept licenses sbom audit-dependencies clean
