@@ -61,6 +61,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "import": ("jobs.import_prior:import_prior", "Calibration files of other programs to a prior file."),
     "compare": ("jobs.compare:compare", "Two calibrations, axis by axis: records, days, methods, files."),
     "migrate": ("jobs.migrate:migrate", "A lake of an older release to the tables of this one."),
+    "convert": (
+        "jobs.convert:convert",
+        "Folders of public data sets (nuScenes, View-of-Delft, KITTI) to logs.",
+    ),
     "simulate": ("jobs.simulate:simulate", "Logs of a synthetic fleet, its truth in a file of its own."),
     "evaluate": ("jobs.evaluate:evaluate", "Compare records with a known truth or a reflector recording."),
 }

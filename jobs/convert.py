@@ -1,0 +1,82 @@
+"""`boresight convert`: folders of public data sets to logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from pipeline.convert.recording import Recording
+
+__all__ = ["convert"]
+
+DataSet = Literal["nuscenes", "vod", "kitti"]
+
+
+def convert(
+    data_set: DataSet,
+    folder: Path,
+    /,
+    *,
+    out: Path,
+    vehicle: str | None = None,
+    day: str = "2000-01-01",
+    camera: str = "CAM_FRONT",
+    lidar: str = "LIDAR_TOP",
+    radar: str = "RADAR_FRONT",
+    radar_columns: str = "x,y,z,power,doppler",
+    segmenter: str | None = None,
+    detector: str | None = None,
+) -> int:
+    """Write OUT/logs/VEHICLE/DAY/*.mcap and OUT/fleet.toml from a folder of a data set.
+
+    Args:
+        data_set: nuscenes; vod (View-of-Delft); kitti: image_2, velodyne, calib (with Tr_radar_to_velo) and radar.
+        folder: of the data set.
+        out: folder to write into.
+        vehicle: of vod and kitti; default: the data set's name. nuScenes names its own, and its days.
+        day: of vod and kitti, which have no stamps, YYYY-MM-DD.
+        camera: channel of nuScenes.
+        lidar: channel of nuScenes.
+        radar: channel of nuScenes.
+        radar_columns: of kitti's radar/*.bin (float32); doppler is the range rate, positive = receding.
+        segmenter: manifest of a model for fleet.toml, relative to it; without one, semantics must come from elsewhere.
+        detector: manifest of a model for fleet.toml.
+    """
+    from jobs.terminal.summary import print_summary, progress_reporter
+    from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
+    from pipeline.convert.log_file import fleet_text, write_log
+    from pipeline.convert.nuscenes import Channels, read_nuscenes
+    from pipeline.errors import ConfigError
+    from pipeline.store.partitions import Partition
+
+    if (segmenter is None) != (detector is None):
+        raise ConfigError("command line", "segmenter, detector", "give both or neither")
+    owner = vehicle or str(data_set)
+    Partition(owner, day)  # refuses what is no vehicle or day
+    if data_set == "nuscenes":
+        recordings = read_nuscenes(folder, Channels(camera, lidar, radar))
+    elif data_set == "vod":
+        recordings = read_view_of_delft(folder, owner, day)
+    else:
+        recordings = read_kitti(folder, owner, day, radar_columns.split(","))
+    paths = [_path_of(out, r) for r in recordings]
+    messages = 0
+    with progress_reporter("convert") as progress:
+        for done, (path, recording) in enumerate(zip(paths, recordings, strict=True)):
+            progress(done, len(paths), recording.name)
+            messages += write_log(path, recording)
+    models = None if segmenter is None or detector is None else (segmenter, detector)
+    has_ego = all(any(e.kind == "ego" for e in r.events) for r in recordings)
+    vehicles = sorted({r.vehicle for r in recordings})
+    fleet = out / "fleet.toml"
+    fleet.write_text(fleet_text(data_set, vehicles, models, ego=has_ego))
+    print_summary("convert", "done", fleet=fleet, logs=paths, messages=messages)
+    return 0
+
+
+def _path_of(out: Path, recording: Recording) -> Path:
+    from pipeline.store.partitions import Partition
+
+    Partition(recording.vehicle, recording.day)
+    return out / "logs" / recording.vehicle / recording.day / f"{recording.name}.mcap"

@@ -1,0 +1,1 @@
+"""Folders of public data sets to logs that ingest reads."""

@@ -1,0 +1,222 @@
+"""KITTI-shaped folders with a radar: View-of-Delft's two trees, and one tree with a folder `radar`.
+
+The data sets give no stamps: frames count at 10 Hz from noon of the day that the caller names, and all sensors of a
+frame have the same stamp. Where poses jump farther than a car drives between frames, another drive begins a minute
+later.
+
+Source: View-of-Delft development kit (vod/configuration/file_locations.py, vod/frame/transformations.py: pose, calib;
+radar rows are x, y, z, RCS, v_r, v_r compensated, time); KITTI object development kit.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.convert.files import read_bytes, read_float_rows
+from pipeline.convert.recording import Event, Recording, ego_events
+from pipeline.errors import ConfigError
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import inverse
+
+__all__ = ["Layout", "read_kitti", "read_view_of_delft"]
+
+_PERIOD_NS = 100_000_000
+_PAUSE_NS = 60 * 10**9
+_JUMP_M = 5.0  # 50 m/s at 10 Hz: farther from frame to frame is another drive
+_LIDAR_COLUMNS = ("x", "y", "z", "intensity")
+_VOD_RADAR = ("x", "y", "z", "power", "doppler", "", "")  # the last two are derived or constant
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where things are in the folder.
+
+    Args:
+        images: folder of images, named by frame.
+        lidar: folder of .bin.
+        radar: folder of .bin.
+        calib: folder of .txt.
+        radar_calib: folder of the radar's own, whose Tr_velo_to_cam is the radar's; empty: Tr_radar_to_velo in calib.
+        poses: folder of .json; may be missing.
+        radar_columns: of a row; empty names are left out.
+    """
+
+    images: str
+    lidar: str
+    radar: str
+    calib: str
+    radar_calib: str
+    poses: str
+    radar_columns: tuple[str, ...]
+
+
+def read_view_of_delft(folder: Path, vehicle: str, day: str) -> list[Recording]:
+    """The one recording of a View-of-Delft folder (with `lidar` and `radar` in it).
+
+    Raises:
+        ConfigError: no frame is whole, or a file is not what it should be.
+    """
+    lidar, radar = "lidar/training", "radar/training"
+    layout = Layout(
+        f"{lidar}/image_2",
+        f"{lidar}/velodyne",
+        f"{radar}/velodyne",
+        f"{lidar}/calib",
+        f"{radar}/calib",
+        f"{lidar}/pose",
+        _VOD_RADAR,
+    )
+    return [_read(folder, layout, vehicle, day)]
+
+
+def read_kitti(folder: Path, vehicle: str, day: str, radar_columns: Sequence[str]) -> list[Recording]:
+    """The one recording of a folder with image_2, velodyne, radar and calib (with Tr_radar_to_velo).
+
+    Raises:
+        ConfigError: as `read_view_of_delft`, or the radar's columns lack x, y, z or doppler.
+    """
+    missing = [name for name in ("x", "y", "z", "doppler") if name not in radar_columns]
+    if missing:
+        raise ConfigError("command line", "radar-columns", f"lacks {', '.join(missing)}")
+    layout = Layout("image_2", "velodyne", "radar", "calib", "", "pose", tuple(radar_columns))
+    return [_read(folder, layout, vehicle, day)]
+
+
+def _read(folder: Path, layout: Layout, vehicle: str, day: str) -> Recording:
+    images = {p.stem: p for p in sorted((folder / layout.images).glob("*")) if p.suffix in (".jpg", ".png")}
+    frames = [
+        n for n in images if all((folder / f / f"{n}.bin").is_file() for f in (layout.lidar, layout.radar))
+    ]
+    if not frames:
+        where = f"{layout.images}, {layout.lidar} and {layout.radar}"
+        raise ConfigError(str(folder), "", f"no frame is in all of {where}")
+    camera, T_camera_lidar, T_lidar_radar = _calibration(folder, layout, frames[0], images[frames[0]])
+    # The lidar is the base: nothing says where it sits on the car.
+    T_base = {"camera": inverse(T_camera_lidar), "lidar": np.eye(4), "radar": T_lidar_radar}
+    poses = {n: T for n in frames if (T := _pose(folder / layout.poses / f"{n}.json")) is not None}
+    T_odom_base = {n: T @ T_camera_lidar for n, T in poses.items()}
+    stamps = _stamps(frames, T_odom_base, day)
+    events = []
+    for n, stamp in stamps.items():
+        events += [
+            Event(stamp, "image", partial(read_bytes, images[n])),
+            Event(stamp, "lidar", partial(_points, folder / layout.lidar / f"{n}.bin", _LIDAR_COLUMNS)),
+            Event(stamp, "radar", partial(_points, folder / layout.radar / f"{n}.bin", layout.radar_columns)),
+        ]
+    for drive in _drives(stamps, T_odom_base):
+        events += ego_events([stamps[n] for n in drive], [T_odom_base[n] for n in drive])
+    events.sort(key=lambda event: event.stamp_ns)
+    return Recording(vehicle, day, folder.resolve().name, camera, T_base, events)
+
+
+def _calibration(
+    folder: Path, layout: Layout, frame: str, image: Path
+) -> tuple[Camera, Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]]:
+    path = folder / layout.calib / f"{frame}.txt"
+    lines = _lines(path)
+    data = np.frombuffer(read_bytes(image), np.uint8)
+    pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    if pixels is None:
+        raise ConfigError(str(image), "", "is no readable image")
+    P = _matrix(path, lines, "P2")
+    camera = Camera("plumb_bob", P[:3, :3].copy(), np.zeros(5), pixels.shape[1], pixels.shape[0])
+    T_camera_lidar = _rectified(path, lines, P) @ _matrix(path, lines, "Tr_velo_to_cam")
+    if not layout.radar_calib:
+        return camera, T_camera_lidar, _matrix(path, lines, "Tr_radar_to_velo")
+    path = folder / layout.radar_calib / f"{frame}.txt"
+    own = _lines(path)
+    T_camera_radar = _rectified(path, own, P) @ _matrix(path, own, "Tr_velo_to_cam")
+    return camera, T_camera_lidar, inverse(T_camera_lidar) @ T_camera_radar
+
+
+def _rectified(path: Path, lines: Mapping[str, Sequence[float]], P: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """From the reference camera to the camera of P2: rectified, and shifted by its baseline (K^-1 P's last column)."""
+    T = np.eye(4)
+    T[:3, 3] = np.linalg.solve(P[:3, :3], P[:3, 3])
+    R = np.eye(4)
+    if len(lines.get("R0_rect", ())) == 9:
+        R[:3, :3] = np.reshape(lines["R0_rect"], (3, 3))
+    elif "R0_rect" in lines:
+        raise ConfigError(str(path), "R0_rect", "needs 9 numbers")
+    return T @ R
+
+
+def _lines(path: Path) -> dict[str, list[float]]:
+    found = {}
+    for line in read_bytes(path).decode("ascii", "replace").splitlines():
+        name, colon, numbers = line.partition(":")
+        if colon:
+            try:
+                found[name.strip()] = [float(word) for word in numbers.split()]
+            except ValueError as err:
+                raise ConfigError(str(path), name.strip(), f"holds what is no number: {err}") from err
+    return found
+
+
+def _matrix(path: Path, lines: Mapping[str, Sequence[float]], name: str) -> Float[np.ndarray, "4 4"]:
+    values = lines.get(name, ())
+    if len(values) != 12:
+        raise ConfigError(str(path), name, f"needs 12 numbers and has {len(values)}")
+    return np.vstack([np.reshape(values, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+
+
+def _pose(path: Path) -> Float[np.ndarray, "4 4"] | None:
+    """T_odom_camera of the line that has it; the key reads the other way round, the development kit this way."""
+    if not path.is_file():
+        return None
+    for line in read_bytes(path).decode("utf-8", "replace").splitlines():
+        try:
+            held = json.loads(line)
+        except ValueError as err:
+            raise ConfigError(str(path), "", f"no readable JSON: {err}") from err
+        if "odomToCamera" in held:
+            T = np.array(held["odomToCamera"], np.float64).reshape(-1)
+            if T.size != 16:
+                raise ConfigError(str(path), "odomToCamera", f"needs 16 numbers and has {T.size}")
+            return T.reshape(4, 4)
+    return None
+
+
+def _stamps(frames: Sequence[str], T_odom_base: Mapping[str, np.ndarray], day: str) -> dict[str, int]:
+    """Stamp of each frame: its number, or its place where names are no numbers, at 10 Hz, with a pause at each jump."""
+    noon = dt.datetime.fromisoformat(f"{day}T12:00:00+00:00")
+    start, pauses, found = int(noon.timestamp()) * 10**9, 0, {}
+    numbers = [int(n) if n.isdecimal() else k for k, n in enumerate(frames)]
+    for k, n in enumerate(frames):
+        pauses += k > 0 and _is_jump(T_odom_base, frames[k - 1], n, numbers[k] - numbers[k - 1])
+        found[n] = start + (numbers[k] - numbers[0]) * _PERIOD_NS + pauses * _PAUSE_NS
+    return found
+
+
+def _is_jump(T_odom_base: Mapping[str, np.ndarray], before: str, after: str, frames: int) -> bool:
+    if before not in T_odom_base or after not in T_odom_base:
+        return False
+    way = np.linalg.norm(T_odom_base[after][:3, 3] - T_odom_base[before][:3, 3])
+    return bool(way > _JUMP_M * max(frames, 1))
+
+
+def _drives(stamps: Mapping[str, int], T_odom_base: Mapping[str, np.ndarray]) -> list[list[str]]:
+    """Frames with a pose, split where the clock pauses."""
+    drives: list[list[str]] = []
+    last = -_PAUSE_NS
+    for n, stamp in stamps.items():
+        if n in T_odom_base:
+            if stamp - last >= _PAUSE_NS:
+                drives.append([])
+            drives[-1].append(n)
+            last = stamp
+    return drives
+
+
+def _points(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    rows = read_float_rows(path, len(columns))
+    return {name: rows[:, k] for k, name in enumerate(columns) if name}

@@ -1,0 +1,76 @@
+"""A drive of a data set: intrinsics, where sensors sit on the car, and what each of them saw when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import inverse, log_so3
+
+__all__ = ["EgoMotion", "Event", "Recording", "ego_events", "image_format"]
+
+
+class EgoMotion(NamedTuple):
+    """Pose T_odom_base, forward speed [m/s], yaw rate [rad/s, positive to the left]."""
+
+    T_odom_base: np.ndarray
+    speed_mps: float
+    yaw_rate_radps: float
+
+
+class Event(NamedTuple):
+    """What one sensor saw: `load` gives JPEG or PNG bytes, columns of points by name, or an EgoMotion."""
+
+    stamp_ns: int
+    kind: str  # image, lidar, radar or ego
+    load: Callable[[], Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One drive.
+
+    Args:
+        vehicle: its id.
+        day: YYYY-MM-DD.
+        name: of the log.
+        camera: intrinsics.
+        T_base: T_base_sensor of camera (optical), lidar and radar (both x forward, y left, z up).
+        events: in order of their stamps; radar columns hold x, y, z, doppler (range rate, positive = receding).
+    """
+
+    vehicle: str
+    day: str
+    name: str
+    camera: Camera
+    T_base: Mapping[str, Float[np.ndarray, "4 4"]]
+    events: Sequence[Event]
+
+
+def ego_events(stamps_ns: Sequence[int], T_odom_base: Sequence[Float[np.ndarray, "4 4"]]) -> list[Event]:
+    """Odometry of poses at rising stamps: motion from one neighbour to the other, at the ends to the only one."""
+    events = []
+    for k, (stamp, T) in enumerate(zip(stamps_ns, T_odom_base, strict=True)):
+        before, after = max(k - 1, 0), min(k + 1, len(stamps_ns) - 1)
+        dt_s = (stamps_ns[after] - stamps_ns[before]) / 1e9
+        if dt_s <= 0:
+            continue
+        step = inverse(T_odom_base[before]) @ T_odom_base[after]
+        motion = EgoMotion(T, float(step[0, 3] / dt_s), float(log_so3(step[:3, :3])[2] / dt_s))
+        events.append(Event(stamp, "ego", partial(_same, motion)))
+    return events
+
+
+def _same(motion: EgoMotion) -> EgoMotion:
+    return motion
+
+
+def image_format(data: bytes) -> str:
+    """'jpeg' or 'png', by the first bytes."""
+    return "png" if data.startswith(b"\x89PNG") else "jpeg"

@@ -1,0 +1,167 @@
+"""Folders of the shape of public data sets become logs that `check` and `ingest` read, with the numbers they held."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jobs.cli import main
+from pipeline.geometry.se3 import from_quaternion
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_rows
+from schemas.frames import FRAMES, Frame
+from tests.makers import data_sets
+from tests.makers.data_sets import (
+    SPEED_MPS,
+    T_BASE_CAMERA,
+    T_BASE_LIDAR,
+    T_BASE_RADAR,
+    lidar_points,
+    radar_points,
+)
+
+MAKERS = {"nuscenes": data_sets.nuscenes, "vod": data_sets.view_of_delft, "kitti": data_sets.kitti}
+# Vehicle, day and how many frames there are.
+WHAT = {
+    "nuscenes": ("n008", "2018-08-01", 12),
+    "vod": ("vod", "2021-05-04", 12),
+    "kitti": ("kitti", "2021-05-04", 6),
+}
+
+
+@pytest.fixture(scope="module", params=MAKERS)
+def converted(request, tmp_path_factory):
+    """Name, folder of what convert wrote, and the frames that ingest made of it."""
+    name, folder = request.param, tmp_path_factory.mktemp(request.param)
+    MAKERS[name](folder / "data")
+    call = ["convert", name, str(folder / "data"), "--out", str(folder / "out"), "--day", "2021-05-04"]
+    assert main(call) == 0
+    vehicle, day, _ = WHAT[name]
+    logs = sorted(map(str, (folder / "out" / "logs" / vehicle / day).iterdir()))
+    lake = folder / "lake"
+    about = [
+        "--fleet",
+        str(folder / "out" / "fleet.toml"),
+        "--lake",
+        str(lake),
+        "--vehicle",
+        vehicle,
+        "--day",
+        day,
+    ]
+    assert main(["ingest", *logs, *about]) == 0
+    return name, folder, logs, read_rows(Lake.at(lake), FRAMES, Partition(vehicle, day), Frame)
+
+
+def test_every_frame_of_the_data_set_becomes_a_trio(converted):
+    name, _, _, frames = converted
+    assert len(frames) == WHAT[name][2]
+    first = frames[0]
+    assert (first.image_width_px, first.image_height_px) == (data_sets.WIDTH, data_sets.HEIGHT)
+    np.testing.assert_array_equal(first.camera_K, data_sets.K)
+    assert first.image_format == ("png" if name == "kitti" else "jpeg")
+
+
+def test_sensors_are_where_the_data_set_says(converted):
+    _, _, _, frames = converted
+    wanted = {
+        "camera_lidar": np.linalg.inv(T_BASE_CAMERA) @ T_BASE_LIDAR,
+        "lidar_radar": np.linalg.inv(T_BASE_LIDAR) @ T_BASE_RADAR,
+    }
+    for pair, T in wanted.items():
+        parts = [
+            getattr(frames[0], f"prior_{pair}_{p}") for p in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+        ]
+        found = from_quaternion(np.array(parts[:4]), np.array(parts[4:]))
+        np.testing.assert_allclose(found, T, atol=1e-9, err_msg=pair)
+
+
+def test_points_are_in_front_of_the_car_and_what_stands_still_comes_nearer(converted):
+    name, _, _, frames = converted
+    own = lidar_points(0.0)
+    np.testing.assert_allclose(frames[0].lidar_xyz_m, own[:, :3], atol=1e-5)
+    points = radar_points(0.0)
+    assert len(frames[0].radar_x_m) == len(points)  # nuScenes' ambiguous point is left out
+    np.testing.assert_allclose(frames[0].radar_y_m, points[:, 1], atol=1e-5)
+    if name == "nuscenes":
+        rate = -SPEED_MPS * points[:, 0] / np.hypot(points[:, 0], points[:, 1])
+        np.testing.assert_array_equal(frames[0].lidar_ring, np.arange(len(own)) % 32)
+    else:
+        rate = points[:, 4]
+    np.testing.assert_allclose(frames[0].radar_range_rate_mps, rate, atol=1e-4)
+
+
+def test_the_car_drives_as_its_poses_say(converted):
+    name, _, _, frames = converted
+    speeds = [f.ego_speed_mps for f in frames]
+    if name == "kitti":
+        assert set(speeds) == {None}  # no poses, no odometry, and fleet.toml asks for none
+    else:
+        np.testing.assert_allclose(speeds, SPEED_MPS, atol=1e-3)
+        np.testing.assert_allclose([f.ego_yaw_rate_radps for f in frames], 0, atol=1e-6)
+
+
+def test_check_finds_every_topic_but_semantics_and_has_no_complaint_about_the_radar(converted, capsys):
+    _, folder, logs, _ = converted
+    assert main(["check", str(folder / "out" / "fleet.toml"), *logs, "--json"]) in (1, 2)
+    report = json.loads(capsys.readouterr().out)
+    problems = {t["role"]: t["problem"] for t in report["topics"]}
+    assert {role for role, problem in problems.items() if problem} == {"labels", "detections"}
+    assert not any("oppler" in words or "backwards" in words for words in report["problems"])
+
+
+def test_a_jump_of_the_poses_begins_another_drive(tmp_path):
+    data_sets.view_of_delft(tmp_path / "data", frames=8, jump_at=5)
+    assert main(["convert", "vod", str(tmp_path / "data"), "--out", str(tmp_path)]) == 0
+    about = ["--fleet", str(tmp_path / "fleet.toml"), "--lake", str(tmp_path / "lake"), "--vehicle", "vod"]
+    log = next((tmp_path / "logs").rglob("*.mcap"))
+    assert main(["ingest", str(log), *about, "--day", "2000-01-01"]) == 0
+    frames = read_rows(Lake.at(tmp_path / "lake"), FRAMES, Partition("vod", "2000-01-01"), Frame)
+    assert [f.drive for f in frames] == [0] * 5 + [1] * 3
+    np.testing.assert_allclose([f.ego_speed_mps for f in frames], SPEED_MPS, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "content", "words"),
+    [
+        ("nuscenes", "v1.0-mini/sensor.json", b"[]", "CAM_FRONT: no such channel"),
+        ("nuscenes", "v1.0-mini/sample.json", b"{", "sample.json: no readable JSON"),
+        (
+            "nuscenes",
+            "v1.0-mini/sample_data.json",
+            b'[{"token": "a"}]',
+            "sample_data.json: calibrated_sensor_token",
+        ),
+        ("nuscenes", "samples/LIDAR_TOP/0.pcd.bin", b"123", "0.pcd.bin: 3 bytes are no rows of 5 float32"),
+        ("nuscenes", "samples/RADAR_FRONT/0.pcd", b"FIELDS x\n", "0.pcd: no readable PCD"),
+        ("vod", "lidar/training/calib/00000.txt", b"P2: 1 2\n", "00000.txt: P2: needs 12 numbers and has 2"),
+        ("vod", "lidar/training/pose/00003.json", b'{"odomToCamera": [1]}', "odomToCamera: needs 16 numbers"),
+        ("vod", "lidar/training/image_2/00000.jpg", b"", "00000.jpg: is no readable image"),
+        ("kitti", "calib/000000.txt", b"P2: one\n", "P2: holds what is no number"),
+    ],
+)
+def test_a_broken_file_is_named_and_leaves_no_log(name, file, content, words, tmp_path, capsys):
+    MAKERS[name](tmp_path / "data")
+    (tmp_path / "data" / file).write_bytes(content)
+    assert main(["convert", name, str(tmp_path / "data"), "--out", str(tmp_path / "out")]) == 2
+    assert words in json.loads(capsys.readouterr().out.splitlines()[-1])["reason"]
+    assert list(tmp_path.rglob("*.mcap")) == []
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_an_empty_folder_is_no_data_set(name, tmp_path):
+    assert main(["convert", name, str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+
+
+def test_models_are_named_in_fleet_toml_and_a_radar_without_doppler_is_refused(tmp_path, capsys):
+    data_sets.kitti(tmp_path / "data", frames=1)
+    call = ["convert", "kitti", str(tmp_path / "data"), "--out", str(tmp_path)]
+    assert main([*call, "--radar-columns", "x,y,z,power,speed"]) == 2
+    assert "lacks doppler" in capsys.readouterr().out
+    assert main([*call, "--segmenter", "s.toml"]) == 2
+    assert main([*call, "--segmenter", "s.toml", "--detector", "d.toml", "--vehicle", 'the "red" one']) == 0
+    from pipeline.config import load_fleet
+
+    fleet = load_fleet(tmp_path / "fleet.toml")
+    assert fleet.rigs["default"].camera.semantics.segmenter == "s.toml"
+    assert list(fleet.vehicles) == ['the "red" one']
