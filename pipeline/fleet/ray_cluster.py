@@ -6,6 +6,7 @@ import logging
 import os
 import secrets
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ __all__ = ["Cluster", "connected", "sigterm_between_calls"]
 
 # Vehicle-days and their records are kilobytes, a page is a megabyte; left alone, Ray takes 30 % of the memory.
 _STORE_BYTES = 200 << 20
+_ANSWER_S = 10.0  # a connection takes milliseconds
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ def connected(workers: int) -> Cluster:
         problem = f"{address!r}: the night must run in the cluster (`ray job submit`), not as a client of it"
         raise ConfigError("environment", "RAY_ADDRESS", problem)
     if not ray.is_initialized():
+        _require_answer(address)
         own = {"num_cpus": workers, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
         if not address:
             os.environ.setdefault(
@@ -79,6 +82,17 @@ def connected(workers: int) -> Cluster:
         # It would write onto stdout whose worker died; whoever runs the tasks tells that, and stdout is for a summary.
         ray._private.worker.print_to_stdstream = _say_nothing  # noqa: SLF001 - there is no other way
     return Cluster(ray, bool(address))
+
+
+def _require_answer(address: str) -> None:
+    """Raise ConfigError where HOST:PORT does not answer: Ray itself would ask for a quarter of an hour."""
+    host, separator, port = address.rpartition(":")
+    if not separator:  # none, or "auto"
+        return
+    try:
+        socket.create_connection((host, int(port)), _ANSWER_S).close()
+    except (OSError, ValueError) as err:
+        raise ConfigError("environment", "RAY_ADDRESS", f"no cluster at {address!r}: {err}") from err
 
 
 @contextmanager

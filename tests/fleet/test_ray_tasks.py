@@ -132,6 +132,15 @@ def test_another_version_on_a_node_is_named(behave, tmp_path):
         _work(behave, ("a", str(tmp_path)), 0, None, "0.0.1")
 
 
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere:port"])
+def test_a_cluster_that_does_not_answer_is_named_at_once(address, behave, tmp_path, monkeypatch):
+    ray = pytest.importorskip("ray")
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(ConfigError, match=f"no cluster at '{address}'"):
+        ends_of(behave, ["a"], tmp_path)
+
+
 def test_a_client_of_a_cluster_is_told_to_run_inside(behave, tmp_path, monkeypatch):
     pytest.importorskip("ray")
     monkeypatch.setenv("RAY_ADDRESS", "ray://head:10001")
