@@ -25,6 +25,7 @@ __all__ = [
 
 Positive = Annotated[float, Field(gt=0)]
 Topic = Annotated[str, Field(pattern=r"^/\S+$")]
+TF_STATIC = "/tf_static"
 
 
 class Section(BaseModel):
@@ -132,6 +133,9 @@ class PriorConfig(Section):
     """Where the prior comes from and how far to trust it."""
 
     source: Literal["tf_static", "file"] = "tf_static"
+    # Where static transforms are logged: ROS's name; Foxglove's loggers have no custom. Left out of dumps where it is
+    # that: no reason to ingest a rig's logs again.
+    topic: Topic = Field(default=TF_STATIC, exclude_if=lambda topic: topic == TF_STATIC)
     file: str | None = None  # JSON: {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}, relative to fleet.toml
     rotation_sigma_deg: Positive = 2.0
     translation_sigma_m: Positive = 0.05
@@ -156,6 +160,7 @@ class Rig(Section):
     def _topics_differ(self) -> Rig:
         semantics = self.camera.semantics
         topics = [self.camera.image, self.camera.info, self.lidar.points, self.radar.points]
+        topics.append(self.prior.topic)
         topics += [semantics.labels, semantics.detections] if isinstance(semantics, TopicSemantics) else []
         topics += [] if self.ego is None else [self.ego.odometry]
         twice = sorted({topic for topic in topics if topics.count(topic) > 1})

@@ -19,6 +19,8 @@ PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
 # Where the import name differs.
 DISTRIBUTION_OF = {
     "cv2": "opencv-python-headless",
+    "google": "protobuf",
+    "mcap_protobuf": "mcap-protobuf-support",
     "openlineage": "openlineage-python",
     "ruamel": "ruamel.yaml",
 }

@@ -218,7 +218,7 @@ class FrameBuilder:
         for T, a, b in ((T_camera_lidar, camera, lidar), (T_lidar_radar, lidar, radar)):
             if T is None:
                 names = f"{a or '(no frame id)'} to {b or '(no frame id)'}"
-                self._index.complain(f"/tf_static has no chain from {names}: no prior")
+                self._index.complain(f"{self._rig.prior.topic} has no chain from {names}: no prior")
         return T_camera_lidar, T_lidar_radar
 
 

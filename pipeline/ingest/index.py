@@ -19,7 +19,8 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.transform_tree import TransformTree
 from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
-from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stamp_ns
+from pipeline.ingest.messages.decoding import DECODE_ERRORS, content_without_stamp, decode, header_stamp_ns
+from pipeline.ingest.messages.foxglove import REFUSED, foxglove_types
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
@@ -28,16 +29,25 @@ from pipeline.store.remote_logs import LogPath
 
 __all__ = ["ACCEPTED_TYPES", "NEEDED", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]
 
-_IMAGE_TYPES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+_IMAGE_TYPES = (
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/Image",
+    *foxglove_types("CompressedImage", "RawImage"),
+)
+_CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2", *foxglove_types("PointCloud"))
 ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
     "image": _IMAGE_TYPES,
-    "info": ("sensor_msgs/msg/CameraInfo",),
+    "info": ("sensor_msgs/msg/CameraInfo", *foxglove_types("CameraCalibration")),
     "labels": _IMAGE_TYPES,
     "detections": ("vision_msgs/msg/Detection2DArray",),
-    "lidar": ("sensor_msgs/msg/PointCloud2",),
-    "radar": ("sensor_msgs/msg/PointCloud2", "radar_msgs/msg/RadarScan", "radar_msgs/msg/RadarTracks"),
-    "odometry": ("nav_msgs/msg/Odometry",),
-    "tf_static": ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
+    "lidar": _CLOUD_TYPES,
+    "radar": (*_CLOUD_TYPES, "radar_msgs/msg/RadarScan", "radar_msgs/msg/RadarTracks"),
+    "odometry": ("nav_msgs/msg/Odometry", *foxglove_types("Odometry")),
+    "tf_static": (
+        "tf2_msgs/msg/TFMessage",
+        "tf/msg/tfMessage",
+        *foxglove_types("FrameTransforms", "FrameTransform"),
+    ),
 }
 _MOST_OPEN_FILES = 65536  # as many minutes are 45 days: more than one vehicle-day has
 _MOST_CAMERAS = 1000  # distinct camera_info contents remembered: a bound where a driver writes noise into it
@@ -124,7 +134,7 @@ def topics_of(rig: Rig) -> dict[str, str]:
         rig.lidar.points: "lidar",
         rig.radar.points: "radar",
     }
-    topics["/tf_static"] = "tf_static"
+    topics[rig.prior.topic] = "tf_static"
     if isinstance(rig.camera.semantics, TopicSemantics):
         topics |= {rig.camera.semantics.labels: "labels", rig.camera.semantics.detections: "detections"}
     if rig.ego is not None:
@@ -254,8 +264,9 @@ def _index_log(
         index.topics_seen.add(message.channel.topic)
         if message.channel.msgtype not in ACCEPTED_TYPES[role]:
             index.damage["wrong_type"] += 1
-            found, wanted = message.channel.msgtype or "no type", " or ".join(ACCEPTED_TYPES[role])
-            index.complain(f"{index.log_names[number]}, topic {message.channel.topic}: {found}, not {wanted}")
+            index.complain(
+                f"{index.log_names[number]}, topic {message.channel.topic}: {_refusal(message, role)}"
+            )
             continue
         if role == "tf_static":
             _take_transforms(index, number, message)
@@ -275,6 +286,13 @@ def _index_log(
         index.damage[name] += count
         what = "is cut off" if name == "truncated" else f"{count} {name.replace('_', ' ')}"
         index.complain(f"{log.path.name}: {what}")
+
+
+def _refusal(message: RawMessage, role: str) -> str:
+    """Why a message of this type cannot be what the rig says that its topic is."""
+    found = message.channel.msgtype or "no type"
+    reason = REFUSED.get(found.removeprefix("foxglove.").removeprefix("foxglove_msgs/msg/"))
+    return f"{found}: {reason}" if reason else f"{found}, not {' or '.join(ACCEPTED_TYPES[role])}"
 
 
 def _take_transforms(index: DayIndex, number: int, message: RawMessage) -> None:
@@ -297,7 +315,7 @@ def _take_odometry(index: DayIndex, stamp: int, message: RawMessage) -> None:
 
 def _take_camera(index: DayIndex, number: int, stamp: int, message: RawMessage) -> None:
     index.stream("info").stamps.append(stamp)
-    content = bytes(message.data[12:])  # all but sequence number and stamp: the same for hours
+    content = content_without_stamp(message.channel, message.data)  # the same for hours
     camera = index.camera_of_bytes.get(content)
     if camera is None:
         try:

@@ -20,7 +20,15 @@ from mcap.records import ChunkIndex, Footer, Schema, Statistics
 
 from pipeline.errors import LogError
 from pipeline.ingest.containers.bounded import unpack_lz4, unpack_zstd
-from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
+from pipeline.ingest.containers.reader import (
+    BYTES_AS_TEXT,
+    PROTOBUF,
+    READ_ERRORS,
+    Channel,
+    ChunkCache,
+    Position,
+    RawMessage,
+)
 from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
 from pipeline.store.remote_logs import LogPath
 
@@ -298,6 +306,9 @@ def _channel(record: ChannelRecord, schema: Schema | None) -> Channel:
     if schema is None:
         return Channel(record.topic, "", record.message_encoding)
     definition_format = "idl" if schema.encoding == "ros2idl" else "msg"
+    if schema.encoding == PROTOBUF:
+        definition = schema.data.decode(BYTES_AS_TEXT)
+        return Channel(record.topic, schema.name, record.message_encoding, definition, PROTOBUF)
     name = schema.name if schema.name.count("/") != 1 else schema.name.replace("/", "/msg/")  # ROS 1 spelling
     return Channel(
         record.topic, name, record.message_encoding, schema.data.decode(errors="replace"), definition_format

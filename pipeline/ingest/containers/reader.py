@@ -21,6 +21,8 @@ from pipeline.store.remote_logs import LogPath, RemoteLog
 
 __all__ = [
     "BACKENDS",
+    "BYTES_AS_TEXT",
+    "PROTOBUF",
     "READ_ERRORS",
     "Channel",
     "ChunkCache",
@@ -33,14 +35,16 @@ __all__ = [
 
 # Where a message lies inside its log: opaque to all but the backend that gave it.
 Position = tuple[int, ...]
+PROTOBUF = "protobuf"  # MCAP's name of the encoding, of messages and of schemas
+BYTES_AS_TEXT = "latin-1"  # one character for each byte and back, for definitions that are no text
 
 
 @dataclass(frozen=True)
 class Channel:
     """A stream of messages in a log.
 
-    `encoding` is "cdr" or "ros1" (others cannot be decoded); `definition` is the embedded schema, "" where
-    there is none; `definition_format` is "msg" or "idl".
+    `encoding` is "cdr", "ros1" or "protobuf" (others cannot be decoded); `definition` is the embedded schema, "" where
+    there is none; `definition_format` is "msg", "idl" or "protobuf" (BYTES_AS_TEXT).
     """
 
     topic: str

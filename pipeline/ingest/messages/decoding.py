@@ -11,10 +11,12 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from rosbags.typesys.store import Typestore
 
 from pipeline.errors import LogError
-from pipeline.ingest.containers.reader import READ_ERRORS, Channel
+from pipeline.ingest.containers.reader import PROTOBUF, READ_ERRORS, Channel
+from pipeline.ingest.messages import protobuf
 from pipeline.ingest.messages.definitions import DEFINITIONS
+from pipeline.ingest.messages.foxglove import as_ros
 
-__all__ = ["DECODE_ERRORS", "decode", "header_frame_id", "header_stamp_ns"]
+__all__ = ["DECODE_ERRORS", "content_without_stamp", "decode", "header_frame_id", "header_stamp_ns"]
 
 # What malformed bytes make rosbags and numpy raise.
 DECODE_ERRORS = (*READ_ERRORS, struct.error, SerdeError, TypesysError, TypeError, AttributeError, MemoryError)
@@ -25,7 +27,12 @@ _SEPARATOR = "=" * 80 + "\n"
 
 
 def header_stamp_ns(channel: Channel, data: memoryview) -> int | None:
-    """Stamp of a message that starts with a std_msgs/Header; None where that is cut off, zero or no time."""
+    """Stamp of a message that starts with a std_msgs/Header; None where that is cut off, zero or no time.
+
+    Foxglove's ROS 2 messages start with the same bytes; of a protobuf message it is the `timestamp`.
+    """
+    if channel.encoding == PROTOBUF:
+        return protobuf.stamp_ns_of(channel, data)
     if len(data) < _STAMP_END:
         return None
     seconds, nanoseconds = struct.unpack_from(_order(channel, data) + "iI", data, 4)
@@ -38,6 +45,8 @@ def header_stamp_ns(channel: Channel, data: memoryview) -> int | None:
 
 def header_frame_id(channel: Channel, data: memoryview) -> str:
     """Frame id of such a message, without ROS 1's leading slash; "" where there is none."""
+    if channel.encoding == PROTOBUF:
+        return protobuf.frame_id_of(channel, data)
     if len(data) < _STAMP_END + 4:
         return ""
     length = struct.unpack_from(_order(channel, data) + "I", data, _STAMP_END)[0]
@@ -45,17 +54,29 @@ def header_frame_id(channel: Channel, data: memoryview) -> str:
     return raw.rstrip(b"\0").decode(errors="replace").lstrip("/")
 
 
+def content_without_stamp(channel: Channel, data: memoryview) -> bytes:
+    """Bytes that are the same for messages that differ in nothing but stamp and sequence number."""
+    if channel.encoding == PROTOBUF:
+        return protobuf.content_without_stamp(channel, data)
+    return bytes(data[_STAMP_END:])
+
+
 def decode(channel: Channel, data: memoryview) -> Any:
     """The message by its embedded definition (arrays are views: copy what outlives the bytes).
 
+    Foxglove's messages have the attributes of their ROS twins.
+
     Raises:
-        LogError: no definition, neither CDR nor ROS 1, or bytes that do not fit the definition.
+        LogError: no definition, neither CDR, ROS 1 nor protobuf, or bytes that do not fit the definition.
     """
     try:
-        store = _typestore(channel)
-        if channel.encoding == "ros1":
-            return store.deserialize_ros1(data, channel.msgtype)
-        return store.deserialize_cdr(data, channel.msgtype)
+        if channel.encoding == PROTOBUF:
+            message = protobuf.parse(channel, data)
+        elif channel.encoding == "ros1":
+            message = _typestore(channel).deserialize_ros1(data, channel.msgtype)
+        else:
+            message = _typestore(channel).deserialize_cdr(data, channel.msgtype)
+        return as_ros(channel.msgtype, message)
     except DECODE_ERRORS as err:
         raise LogError(
             "", f"{channel.msgtype} cannot be decoded: {type(err).__name__}: {err}", topic=channel.topic
@@ -69,7 +90,7 @@ def _order(channel: Channel, data: memoryview) -> str:
 @lru_cache(maxsize=64)
 def _typestore(channel: Channel) -> Typestore:
     if channel.encoding not in {"cdr", "ros1"}:
-        raise ValueError(f"encoding {channel.encoding!r} is neither cdr nor ros1")
+        raise ValueError(f"encoding {channel.encoding!r} is neither cdr, ros1 nor protobuf")
     if not channel.definition:
         return _fallback(channel.msgtype)
     store = get_typestore(Stores.EMPTY)
