@@ -28,6 +28,7 @@ def export(
     method: str = "joint",
     force: bool = False,
     mount: str | None = None,
+    update: Path | None = None,
     frames: FrameOptions | None = None,
     run: Path | None = None,
     notes: Path | None = None,
@@ -48,6 +49,8 @@ def export(
         force: write held pairs too, marked as such; the exit code stays 3.
         mount: FORMAT:FILE that says where the lidar sits on the car (frames --base-frame and --lidar-frame), as
             tf-static:log.mcap; default: the lidar is the root of the tree.
+        update: of "autoware": your sensor_kit_calibration.yaml; --out is that file with new numbers for camera and
+            radar, all else as it was.
         frames: names of the frames.
         run: folder of `boresight train`; needed for "onnx".
         notes: JSON object for the card: what was measured, what the data was.
@@ -64,7 +67,7 @@ def export(
         print_summary("export", "done", what=what, outputs=paths, bytes=out.stat().st_size)
         return 0
     calibration = _calibration(lake, vehicle, day, method, force, mount, frames or FrameOptions())
-    return _export_calibration(what, out, calibration)
+    return _export_calibration(what, out, calibration, update)
 
 
 def _calibration(
@@ -86,10 +89,10 @@ def _calibration(
     return read_calibration(lake, vehicle, day, method, force=force, names=names, T_base_lidar=T_base_lidar)
 
 
-def _export_calibration(what: str, out: Path, calibration: ExportedCalibration) -> int:
+def _export_calibration(what: str, out: Path, calibration: ExportedCalibration, update: Path | None) -> int:
     from jobs.terminal.logging import logger
     from jobs.terminal.summary import print_summary
-    from pipeline.export.files import write_files, written_files
+    from pipeline.export.files import updated_file, write_files, written_files
     from pipeline.export.formats import format_named
     from pipeline.export.provenance import not_certified, warnings_of
     from pipeline.export.tree import ESTIMATED_PAIRS
@@ -98,7 +101,12 @@ def _export_calibration(what: str, out: Path, calibration: ExportedCalibration) 
     for words in warnings_of(calibration):
         logger().warning(words, vehicle=calibration.vehicle, source=calibration.source)
     written = [pair for pair in ESTIMATED_PAIRS if pair in calibration.pairs]
-    files = written_files(format_named(what), calibration, out) if written else {}
+    files = {}
+    if written:
+        form = format_named(what)
+        files = (
+            updated_file(form, calibration, update, out) if update else written_files(form, calibration, out)
+        )
     write_files(files)
     status = ("held" if doubts else "done") if written else "refused"
     told = {"vehicle": calibration.vehicle, "source": calibration.source, "pairs": written}

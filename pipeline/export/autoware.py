@@ -18,7 +18,7 @@ from pipeline.export.calibration import ExportedCalibration
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.rotations import T_LINK_OPTICAL, pose_of_rpy, rpy_of
-from pipeline.export.texts import load_yaml, number_of, to_yaml
+from pipeline.export.texts import edit_yaml, field_of, load_yaml, number_of, to_yaml
 from pipeline.export.tree import require_frames
 from pipeline.export.urdf import xml_of
 from pipeline.geometry.se3 import inverse
@@ -40,13 +40,7 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     names, T_base_lidar = calibration.names, calibration.T_base_lidar
     is_kit_known = T_base_lidar is not None and names.base == _KIT
     T_kit_lidar = T_base_lidar if is_kit_known and T_base_lidar is not None else np.eye(4)
-    poses = {names.lidar: T_kit_lidar}
-    pairs = calibration.pairs
-    if "camera_lidar" in pairs:
-        T_lidar_camera = inverse(pairs["camera_lidar"].T)
-        poses[names.camera] = T_kit_lidar @ T_lidar_camera @ inverse(T_LINK_OPTICAL)
-    if "lidar_radar" in pairs:
-        poses[names.radar] = T_kit_lidar @ pairs["lidar_radar"].T
+    poses = {names.lidar: T_kit_lidar} | _links(calibration, T_kit_lidar)
     comments = comment_lines(calibration, "the camera's link, not its optical frame: x forward, y left, z up")
     if not is_kit_known:
         comments.append(f"{_KIT} sits at {names.lidar}")
@@ -58,6 +52,41 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     if T_base_lidar is not None and not is_kit_known:
         files[_CAR_FILE] = to_yaml({names.base: {_KIT: _entry(T_base_lidar)}}, comments)
     return files
+
+
+def _links(calibration: ExportedCalibration, T_kit_lidar: np.ndarray) -> dict[str, np.ndarray]:
+    """Poses of the camera's link and of the radar in the kit, those of them that the calibration has."""
+    names, pairs, poses = calibration.names, calibration.pairs, {}
+    if "camera_lidar" in pairs:
+        poses[names.camera] = T_kit_lidar @ inverse(pairs["camera_lidar"].T) @ inverse(T_LINK_OPTICAL)
+    if "lidar_radar" in pairs:
+        poses[names.radar] = T_kit_lidar @ pairs["lidar_radar"].T
+    return poses
+
+
+def _update(file: str, content: bytes, calibration: ExportedCalibration) -> tuple[bytes, list[str]]:
+    """A kit's own sensor_kit_calibration.yaml with new numbers for camera and radar, and the frames that have them.
+
+    The lidar keeps its place in the kit; entries of other sensors, their order and all comments stay.
+
+    Raises:
+        ConfigError: the file is no kit with that lidar, or has neither the camera nor the radar.
+    """
+    names, changed = calibration.names, list[str]()
+
+    def edit(held: Any) -> None:
+        values = np.array([number_of(file, held, _KIT, names.lidar, name) for name in _FIELDS])
+        for child, T in _links(calibration, pose_of_rpy(values[:3], values[3:])).items():
+            if child in held[_KIT]:
+                field_of(file, held, _KIT, child, "x")
+                held[_KIT][child].update(_entry(T))
+                changed.append(child)
+
+    text = edit_yaml(file, content, edit)
+    if not changed:
+        problem = f"neither is in {_KIT}; name them with --camera-frame, --radar-frame"
+        raise ConfigError(file, f"{names.camera}, {names.radar}", problem)
+    return text, changed
 
 
 def _entry(T: np.ndarray) -> dict[str, float]:
@@ -110,4 +139,4 @@ def _tree(files: Files) -> TransformTree:
     return tree
 
 
-AUTOWARE = Format("autoware", _write, tree=_tree, T_frame_camera=T_LINK_OPTICAL)
+AUTOWARE = Format("autoware", _write, tree=_tree, update=_update, T_frame_camera=T_LINK_OPTICAL)

@@ -15,7 +15,7 @@ from pipeline.export.texts import to_json
 from pipeline.export.tree import ESTIMATED_PAIRS
 from pipeline.store.atomic_write import atomic_write
 
-__all__ = ["SIDE_FILE", "prior_text", "read_files", "write_files", "written_files"]
+__all__ = ["SIDE_FILE", "prior_text", "read_files", "updated_file", "write_files", "written_files"]
 
 SIDE_FILE = ".provenance.json"
 _MOST_BYTES = 1 << 30  # a calibration is kilobytes; a log that is read for /tf_static may be larger
@@ -38,6 +38,22 @@ def written_files(form: Format, calibration: ExportedCalibration, out: Path) -> 
         stem = first.name.partition(".")[0]
         found[first.with_name(stem + SIDE_FILE)] = to_json(provenance_of(calibration) | notes)
     return found
+
+
+def updated_file(
+    form: Format, calibration: ExportedCalibration, template: Path, out: Path
+) -> dict[Path, bytes]:
+    """Content by path: the caller's own file with new numbers, as the file `out`, and the side file.
+
+    Raises:
+        ConfigError: the format's files are not updated in place, or the file is none with these frames.
+    """
+    if form.update is None:
+        raise ConfigError("command line", "update", f"{form.name} has no files that are updated in place")
+    [(name, content)] = read_files([template]).items()
+    text, changed = form.update(name, content, calibration)
+    side = provenance_of(calibration) | {"format": form.name, "updated": changed}
+    return {out: text, out.with_name(out.name.partition(".")[0] + SIDE_FILE): to_json(side)}
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:

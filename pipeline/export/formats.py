@@ -30,6 +30,8 @@ class Format:
         tree: frames that files hold, where the format names frames.
         read: transforms by pair that files hold, where it has names of its own for them. Both raise ConfigError that
             names file and field.
+        update: of a format whose files hold more than a calibration: a file with new numbers in place of the old, and
+            the frames that have them.
         T_frame_camera: of a format whose camera frame is not the optical one: from the optical frame to its own.
         holds_provenance: the files say all that the side file would.
         notes: for the side file, what the format cannot say or takes for granted.
@@ -39,6 +41,7 @@ class Format:
     write: Callable[[ExportedCalibration], dict[str, bytes]] | None = None
     tree: Callable[[Files], TransformTree] | None = None
     read: Callable[[Files, FrameNames], dict[str, np.ndarray]] | None = None
+    update: Callable[[str, bytes, ExportedCalibration], tuple[bytes, list[str]]] | None = None
     T_frame_camera: np.ndarray | None = None
     holds_provenance: bool = False
     notes: tuple[str, ...] = ()

@@ -1,7 +1,8 @@
 """KITTI's calibration of one frame (object benchmark), with the radar's line of V2X-Radar and View-of-Delft's kin.
 
 Row-major numbers after a name: P0 to P3 (3x4), R0_rect (3x3), Tr_velo_to_cam, Tr_imu_to_velo, Tr_radar_to_velo (3x4);
-Tr_a_to_b takes coordinates in a to b, so Tr_velo_to_cam = T_camera_lidar.
+Tr_a_to_b takes coordinates in a to b, so Tr_velo_to_cam = T_camera_lidar where the camera of image_2 is the reference;
+in KITTI's own files it lies beside it, which reading takes into account.
 
 Source: KITTI object development kit, readme and matlab/; V2X-Radar (Tr_radar_to_velo).
 """
@@ -20,7 +21,7 @@ from pipeline.geometry.se3 import inverse
 
 __all__ = ["KITTI", "VOD"]
 
-_CAMERA, _RADAR, _RECTIFIED = "Tr_velo_to_cam", "Tr_radar_to_velo", "R0_rect"
+_CAMERA, _RADAR, _RECTIFIED, _IMAGE = "Tr_velo_to_cam", "Tr_radar_to_velo", "R0_rect", "P2"
 _NOTES = (
     "P0 to P3 are all K [I | 0] of the one camera: undistort its images before they are used with them.",
     "R0_rect is the identity: the camera's optical frame counts as rectified.",
@@ -92,20 +93,28 @@ def _numbers(file: str, name: str, words: Iterable[str]) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as err:
-        if name in (_CAMERA, _RADAR, _RECTIFIED):
+        if name in (_CAMERA, _RADAR, _RECTIFIED, _IMAGE):
             raise ConfigError(file, name, f"holds what is no number: {err}") from err
         return []  # a line of others, as calib_time
 
 
 def _rectified(file: str, lines: dict[str, list[float]]) -> np.ndarray:
-    """What takes the camera's coordinates to the rectified camera's, which the images are of."""
-    values = lines.get(_RECTIFIED)
-    if values is None:
-        return np.eye(4)
-    if len(values) != 9:
-        raise ConfigError(file, _RECTIFIED, f"needs 9 numbers and has {len(values)}")
-    R = np.reshape(values, (3, 3))
-    return matrix_of(file, _RECTIFIED, np.hstack([R, np.zeros((3, 1))]))
+    """What takes the reference camera's coordinates to those of the camera that image_2 is of.
+
+    That is the rectification, and the baseline between the two cameras, which KITTI has in P2's last column.
+    """
+    T = np.eye(4)
+    if (rectification := lines.get(_RECTIFIED)) is not None:
+        if len(rectification) != 9:
+            raise ConfigError(file, _RECTIFIED, f"needs 9 numbers and has {len(rectification)}")
+        R = np.reshape(rectification, (3, 3))
+        T = matrix_of(file, _RECTIFIED, np.hstack([R, np.zeros((3, 1))]))
+    if (projection := lines.get(_IMAGE)) is not None:
+        if len(projection) != 12 or not np.linalg.det(np.reshape(projection, (3, 4))[:, :3]):
+            raise ConfigError(file, _IMAGE, "is no 3x4 projection")
+        P = np.reshape(projection, (3, 4))
+        T[:3, 3] += np.linalg.solve(P[:, :3], P[:, 3])
+    return T
 
 
 KITTI = Format("kitti", _write, read=_read, notes=_NOTES)

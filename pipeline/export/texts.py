@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion
 
 __all__ = [
+    "edit_yaml",
     "field_of",
     "load_json",
     "load_yaml",
@@ -88,6 +89,26 @@ def load_yaml(file: str, content: bytes) -> Any:
         return YAML(typ="safe", pure=True).load(text)
     except (YAMLError, ValueError, RecursionError) as err:
         raise ConfigError(file, "", f"no readable YAML: {' '.join(str(err).split())[:200]}") from err
+
+
+def edit_yaml(file: str, content: bytes, edit: Callable[[Any], None]) -> bytes:
+    """A YAML file with some values changed in place: other values, their order and all comments stay.
+
+    Raises:
+        ConfigError: it is no YAML.
+    """
+    yaml = YAML()
+    yaml.Representer = _Representer
+    yaml.preserve_quotes = True
+    yaml.width = 4096
+    try:
+        held = yaml.load(text_of(file, content))
+    except (YAMLError, ValueError, RecursionError) as err:
+        raise ConfigError(file, "", f"no readable YAML: {' '.join(str(err).split())[:200]}") from err
+    edit(held)
+    stream = io.StringIO()
+    yaml.dump(held, stream)
+    return stream.getvalue().encode()
 
 
 def field_of(file: str, value: Any, *path: str | int) -> Any:

@@ -33,6 +33,7 @@ BAD = [
     ("kitti", {"c.txt": "Tr_velo_to_cam: 2 0 0 0 0 1 0 0 0 0 1 0\n"}, "Tr_velo_to_cam: its 3x3 part is no rotation"),
     ("kitti", {"c.txt": "Tr_velo_to_cam: 1 0 0 0 0 1 0 0 0 0 x 0\n"}, "Tr_velo_to_cam: holds what is no number"),
     ("kitti", {"c.txt": "P2: 1 0 0 0 0 1 0 0 0 0 1 0\n"}, "Tr_velo_to_cam: missing"),
+    ("kitti", {"c.txt": "Tr_velo_to_cam: 1 0 0 0 0 1 0 0 0 0 1 0\nP2: 1 2\n"}, r"c\.txt: P2: is no 3x4"),
     ("vod", {"c.txt": ""}, "give two files"),
     ("nuscenes", {"sensor.json": "[]"}, r"calibrated_sensor\.json: missing"),
     ("nuscenes", {"sensor.json": "[]", "calibrated_sensor.json": '[{"sensor_token": "x"}]'}, r"0\.sensor_token"),

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from jobs.cli import main
+from pipeline.export.calibration import FrameNames
+from pipeline.export.formats import format_named
 from pipeline.extrinsics.prior import read_transforms
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition
@@ -217,3 +219,46 @@ def test_a_prior_takes_from_another_file_what_the_calibration_lacks(tmp_path, ca
     made = read_transforms(tmp_path / "new.json")
     assert made["camera_lidar"][1, 3] == 0.5
     assert made["lidar_radar"][0, 0] == -1
+
+
+KIT = """# kit of the red car
+sensor_kit_base_link:
+  front/camera_link:   # Design Value
+    x: 0.5
+    y: 0.0
+    z: 0.2
+    roll: 0.0
+    pitch: 0.0
+    yaw: 0.0
+  top_base_link: {x: 0.0, y: 0.0, z: 0.1, roll: 0.0, pitch: 0.0, yaw: 1.5}   # measured
+  gnss_link: {x: -0.1, y: 0.0, z: -0.2, roll: 0.0, pitch: 0.0, yaw: 0.0}
+"""
+
+
+def test_autoware_s_own_kit_keeps_its_comments_its_other_sensors_and_its_lidar(lake, tmp_path, capsys):
+    folder, days = lake
+    kit = tmp_path / "sensor_kit_calibration.yaml"
+    kit.write_text(KIT)
+    of_v = ["--lake", folder, "--vehicle", "v", "--day", days[0], "--update", kit, "--out", kit]
+    names = ["--camera-frame", "front/camera_link", "--lidar-frame", "top_base_link"]
+    code, summary, _ = run(capsys, "export", "autoware", *of_v, *names)
+    assert (code, len(summary["outputs"])) == (0, 2)
+    before, after = KIT.splitlines(), kit.read_text().splitlines()
+    changed = [k for k, (a, b) in enumerate(zip(before, after, strict=True)) if a.split() != b.split()]
+    assert set(changed) <= set(range(3, 9))  # the six numbers of the camera
+    side = json.loads((tmp_path / "sensor_kit_calibration.provenance.json").read_text())
+    assert side["updated"] == ["front/camera_link"]
+    found = format_named("autoware").pairs(
+        {"kit": kit.read_bytes()}, FrameNames("front/camera_link", "top_base_link")
+    )
+    records = read_records(Lake.at(folder), CALIBRATIONS, CalibrationRecord, vehicle="v", day=days[0])
+    [wanted] = [transform_of(r) for r in records if r.pair == "camera_lidar"]
+    np.testing.assert_allclose(found["camera_lidar"], wanted, atol=1e-12)
+    for form, bad, words in (
+        ("autoware", [*names[:2], "--lidar-frame", "side"], "sensor_kit_base_link.side: missing"),
+        ("autoware", ["--camera-frame", "c", *names[2:]], "neither is in sensor_kit_base_link"),
+        ("urdf", names, "no files that are updated in place"),
+    ):
+        code, summary, _ = run(capsys, "export", form, *of_v, *bad)
+        assert code == 2
+        assert words in summary["reason"]

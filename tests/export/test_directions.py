@@ -158,6 +158,7 @@ def test_tf_static_says_the_same_to_another_reader_of_ros_2():
 
 
 # The same sensors as other programs would have written them.
+# The camera's quaternion alone would not tell x y z w from w x y z (it is its own negative then): the radar's does.
 FOREIGN = {
     "ros2": {
         "a.launch.yaml": """
@@ -234,9 +235,9 @@ child_frame_id: radar
 "lidar": {"type": "sensor_cs", "parent": "vehicle-iso8855", "children": ["camera", "radar"],
   "pose_wrt_parent": {"quaternion": [0, 0, 0, 1], "translation": [0, 0, 2]}},
 "camera": {"type": "sensor_cs", "parent": "lidar", "children": [],
-  "pose_wrt_parent": {"quaternion": [-0.5, 0.5, -0.5, 0.5], "translation": [1, 0, 0.5]}},
+  "pose_wrt_parent": {"matrix4x4": [0, 0, 1, 1, -1, 0, 0, 0, 0, -1, 0, 0.5, 0, 0, 0, 1]}},
 "radar": {"type": "sensor_cs", "parent": "lidar", "children": [],
-  "pose_wrt_parent": {"matrix4x4": [0, -1, 0, 2, 1, 0, 0, 0.25, 0, 0, 1, -1, 0, 0, 0, 1]}}}}}"""
+  "pose_wrt_parent": {"quaternion": [0, 0, 0.7071067811865476, 0.7071067811865476], "translation": [2, 0.25, -1]}}}}}"""
     },
     "matlab": {
         "a.json": '{"T_camera_lidar": [[0,-1,0,0],[0,0,-1,0.5],[1,0,0,-1],[0,0,0,1]], '
@@ -257,3 +258,14 @@ def test_every_format_stands_in_these_tests():
     assert (
         FOREIGN.keys() | {"t4", "tf-static", "xacro"} == FORMATS.keys()
     )  # these three are read by another's reader
+
+
+def test_kitti_s_images_are_of_a_camera_beside_the_one_that_its_transform_is_to():
+    """P2's last column is -800 * 0.06, so image_2's camera lies 6 cm to the right of the reference."""
+    text = (
+        "P2: 800 0 640 -48 0 800 360 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+        "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0.5 1 0 0 -1\n"
+    )
+    found = format_named("kitti").pairs({"calib.txt": text.encode()}, FrameNames())
+    wanted = T_CAMERA_LIDAR + np.array([[0, 0, 0, -0.06], *[[0] * 4] * 3])
+    np.testing.assert_allclose(found["camera_lidar"], wanted, atol=1e-12)
