@@ -48,10 +48,8 @@ from tests.makers.written_logs import START_NS, Kit
 RESULTS = Path("tests/benchmarks/results/soak.jsonl")
 VEHICLES, DAYS, FRAMES = 3, 3, 5
 DAY_NS = 86_400 * 10**9
-KILLS_A_ROUND = 8
-SECONDS_TO_DRAW = (
-    12.0  # a kill comes within this time of the last one: a night on two busy cores takes about as long
-)
+KILLS_A_ROUND = 20
+SECONDS_TO_DRAW = 6.0  # a kill comes within this time of the last one: half of a night on two busy cores
 
 
 @dataclass
