@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 from pipeline.audit.service import restart_of
 from pipeline.store.current import current_records
@@ -44,6 +44,7 @@ def read_history(
     events: Mapping[str, Sequence[ServiceEvent]],
     enough: tuple[int, int],
     sound: Callable[[CalibrationRecord], bool],
+    asked: Collection[str] = (),
 ) -> list[CalibrationRecord]:
     """Current records of a method that charts need, in order of vehicle and day.
 
@@ -53,23 +54,21 @@ def read_history(
         events: by vehicle; what lies before them is not asked for.
         enough: days that a chart needs at least, and accepted days that a reference takes.
         sound: False for a record that nothing can be made of.
+        asked: vehicles that are wanted though they may not have driven in the window.
     """
     first, last, method = window
     fewest, reference_days = enough
     found = [r for r in _read(lake, first, last, method) if sound(r)]
     driven = Counter(v for v, _ in {(r.vehicle, r.day) for r in found})
-    vehicles = set(driven)
-    sparse = {v for v in vehicles if driven[v] < fewest}
-    earliest = first
+    sparse = {v for v in {*driven, *asked} if driven[v] < fewest}
     for month, end in _months_before(first, _MONTHS_BACK):
         if not sparse:
             break
-        more = [r for r in _read(lake, month, end, method) if r.vehicle in sparse and sound(r)]
+        more = [r for r in _read(lake, month, end, method, sparse) if sound(r)]
         driven.update(v for v, _ in {(r.vehicle, r.day) for r in more})
         found += more
-        earliest = month
         sparse = {v for v in sparse if driven[v] < fewest}
-    found += _references(lake, (earliest, last, method), events, reference_days, sound, found)
+    found += _references(lake, window, events, reference_days, sound, found)
     unique = {(r.vehicle, r.day, r.trio, r.pair): r for r in found}
     return [unique[key] for key in sorted(unique)]
 
@@ -92,7 +91,7 @@ def _references(
     for month, end in _months_until(lake, until):
         if not lacking:
             break
-        for record in _read(lake, month, end, method):
+        for record in _read(lake, month, end, method, {vehicle for vehicle, _ in lacking}):
             key = (record.vehicle, record.pair)
             event = restart.get(key)
             if key not in lacking or (event is not None and record.day <= event.day) or not sound(record):
@@ -104,8 +103,11 @@ def _references(
     return found
 
 
-def _read(lake: Lake, first: str, last: str, method: str) -> list[CalibrationRecord]:
-    rows = read_records(lake, CALIBRATIONS, CalibrationRecord, first=first, last=last, columns=_COLUMNS)
+def _read(
+    lake: Lake, first: str, last: str, method: str, among: Collection[str] | None = None
+) -> list[CalibrationRecord]:
+    window = {"first": first, "last": last}
+    rows = read_records(lake, CALIBRATIONS, CalibrationRecord, **window, columns=_COLUMNS, among=among)
     return [r for r in current_records(rows) if r.method == method]
 
 

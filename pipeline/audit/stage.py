@@ -71,7 +71,7 @@ def work(task: Task) -> Work:
     for event in read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last):
         events.setdefault(event.vehicle, []).append(event)
     enough = (FEWEST_DAYS, fleet.audit.reference_days)
-    records = read_history(task.lake, (first, last, method), events, enough, sound)
+    records = read_history(task.lake, (first, last, method), events, enough, sound, fleet.vehicles)
     vehicles = _by_vehicle(fleet, records, events)
     done = sorted([e.vehicle, e.day, e.sensor, e.kind] for v in vehicles.values() for e in v.events)
     settings = (fleet.audit, {"from": first, "to": last, "method": method, "events": done})

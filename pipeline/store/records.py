@@ -7,7 +7,7 @@ Rows come in through `commit_records`, which knows the same work again and never
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from itertools import groupby
 from operator import itemgetter
@@ -107,6 +107,7 @@ def read_records(
     first: str | None = None,
     last: str | None = None,
     columns: Sequence[str] | None = None,
+    among: Collection[str] | None = None,
 ) -> list[Row]:
     """Records in order of vehicle, day and time of their last assertion; `current_records` keeps the last of a kind.
 
@@ -121,11 +122,14 @@ def read_records(
         first: only from this day on.
         last: only until this day.
         columns: of those with a default in `row_type`, which to read; the others keep their default. None = all.
+        among: only these vehicles'; None = all.
 
     Raises:
         ContractError: the lake is of another release, or lacks a column that has no default.
     """
     found = _sorted_rows(lake, schema, row_type, vehicle, day or first, day or last, columns)
+    if found is not None and among is not None:
+        found = found.filter(pc.is_in(found["vehicle"], pa.array(sorted(among), pa.string())))
     return [] if found is None else from_table(found, schema, row_type)
 
 

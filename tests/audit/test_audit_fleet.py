@@ -262,6 +262,28 @@ def test_a_record_of_a_day_to_come_and_one_of_nonsense_are_named_and_left_out(
     assert sum(a == f.status for a, f in zip(whole, outcome.records, strict=True)) >= 34
 
 
+def test_a_knocked_vehicle_that_stands_still_for_weeks_stays_red(tmp_path: Path, maker: ModuleType) -> None:
+    lake, rng = Lake.at(tmp_path), np.random.default_rng(31)
+    _write(lake, maker.vehicle_records("parked", 20, rng, motion=lambda d: {"radar": KNOCK} if d > 9 else {}))
+    _write(lake, maker.vehicle_records("daily", 80, rng))
+    for last in (30, 47, 79):  # its last day leaves the window on day 47
+        findings = audit_fleet(lake, _fleet("parked", "daily"), None, _day(last))
+        assert _status(findings, "parked") == ("RED", "radar", _day(10)), last
+        assert _status(findings, "daily")[0] == "GREEN"
+
+
+def test_a_vehicle_that_drives_rarely_takes_nobody_s_reference_away(
+    tmp_path: Path, maker: ModuleType
+) -> None:
+    lake, rng = Lake.at(tmp_path), np.random.default_rng(32)
+    _write(lake, maker.vehicle_records("v", 60, rng, motion=lambda d: {"radar": KNOCK} if d > 14 else {}))
+    _write(lake, maker.vehicle_records("rare", 60, rng)[-3:])
+    for last in (17, 32, 45, 59):
+        findings = audit_fleet(lake, _fleet("v", "rare"), None, _day(last))
+        assert _status(findings) == ("RED", "radar", _day(15)), last
+        assert _status(findings, "rare")[0] == "UNKNOWN"
+
+
 def test_a_vehicle_that_drives_weekly_and_one_after_months_have_sensible_statuses(
     tmp_path: Path, maker: ModuleType
 ) -> None:
