@@ -34,7 +34,7 @@ NEEDS = {
     "export": "train",
 }
 # What only an option of a command imports, and asks for before anything is read: `--executor ray`, `--metrics` ...
-OPTIONAL = {"ray", "openlineage", "prometheus_client"}
+OPTIONAL = {"av", "ray", "openlineage", "prometheus_client"}
 # Each as a person would call it; the folders need not exist, since the extra is asked for first.
 CALLS = {
     "demo": ["demo"],
@@ -117,7 +117,7 @@ def test_an_extra_holds_all_else_that_its_commands_may_import(command):
 
 def test_nothing_is_declared_that_nothing_imports():
     imported = set().union(*(reached(command)[1] for command in COMMANDS))
-    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops") - {"boresight"}
+    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops", "video") - {"boresight"}
     assert declared_for_users - imported == {"tensorboard"}  # imported by torch.utils.tensorboard
 
 

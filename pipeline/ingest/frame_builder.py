@@ -17,10 +17,17 @@ from pipeline.ingest.deskew import deskew
 from pipeline.ingest.index import DayIndex, Located
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_frame_id
 from pipeline.ingest.messages.detections import read_detections
-from pipeline.ingest.messages.image import EncodedImage, encode_raw_image, inspect_image, label_image
+from pipeline.ingest.messages.image import (
+    EncodedImage,
+    encode_pixels,
+    encode_raw_image,
+    inspect_image,
+    label_image,
+)
 from pipeline.ingest.messages.odometry import EgoState
 from pipeline.ingest.messages.point_cloud import LidarCloud, read_lidar
 from pipeline.ingest.messages.radar import RadarCloud, read_radar
+from pipeline.ingest.messages.video import VideoPictures, video_codec
 from pipeline.ingest.sync import Rejection
 from pipeline.rigs import Rig, TopicSemantics
 from schemas.frames import Frame
@@ -61,6 +68,7 @@ class FrameBuilder:
         # Where models compute semantics later, frames without logged ones lack nothing.
         self._logged_semantics = int(isinstance(rig.camera.semantics, TopicSemantics))
         self._priors: dict[tuple[int, str, str, str], dict[str, float | None]] = {}
+        self._video = VideoPictures(self._image_packet, index.stream("image").stamps_ns)
         self.counts: Counter[str] = Counter()
         self.frame_ids: dict[str, list[str]] = {}
 
@@ -78,7 +86,7 @@ class FrameBuilder:
         stamp = self._index.stream("lidar").stamps[trio.lidar]
         camera_stamp = self._index.stream("image").stamps[trio.camera]
         camera = self._camera(image_at, camera_stamp)
-        image, camera_frame = self._image(image_at, camera)
+        image, camera_frame = self._image(trio.camera, camera)
         lidar, lidar_frame = self._lidar(lidar_at, stamp)
         radar, radar_frame = self._radar(radar_at)
         ego = self._index.ego.at(stamp)
@@ -123,20 +131,25 @@ class FrameBuilder:
             raise Rejected(Rejection.CAMERA_INFO)
         return camera
 
-    def _image(self, located: Located, camera: Camera) -> tuple[EncodedImage, str]:
+    def _image(self, place: int, camera: Camera) -> tuple[EncodedImage, str]:
         try:
-            message, frame_id = self._message(located)
-            image = (
-                inspect_image(bytes(message.data))
-                if hasattr(message, "format")
-                else encode_raw_image(message)
-            )
+            message, frame_id = self._message(self._located("image", place))
+            if not hasattr(message, "format"):
+                image = encode_raw_image(message)
+            elif video_codec(message.format) is not None:
+                image = encode_pixels(self._video.picture(place))
+            else:
+                image = inspect_image(bytes(message.data))
         except (LogError, *DECODE_ERRORS) as err:
             raise Rejected(Rejection.IMAGE_DAMAGED, str(err)) from err
         if (image.width_px, image.height_px) != (camera.width_px, camera.height_px):
             sizes = f"{image.width_px}x{image.height_px}, camera_info {camera.width_px}x{camera.height_px}"
             raise Rejected(Rejection.IMAGE_SIZE, sizes)
         return image, frame_id
+
+    def _image_packet(self, place: int) -> tuple[str, bytes]:
+        message, _ = self._message(self._located("image", place))
+        return str(message.format), bytes(message.data)
 
     def _lidar(self, located: Located, stamp_ns: int) -> tuple[LidarCloud, str]:
         try:

@@ -34,9 +34,10 @@ _IMAGE_TYPES = (
     "sensor_msgs/msg/Image",
     *foxglove_types("CompressedImage", "RawImage"),
 )
+_VIDEO_TYPES = foxglove_types("CompressedVideo")
 _CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2", *foxglove_types("PointCloud"))
 ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
-    "image": _IMAGE_TYPES,
+    "image": (*_IMAGE_TYPES, *_VIDEO_TYPES),
     "info": ("sensor_msgs/msg/CameraInfo", *foxglove_types("CameraCalibration")),
     "labels": _IMAGE_TYPES,
     "detections": ("vision_msgs/msg/Detection2DArray",),

@@ -1,7 +1,7 @@
 """Foxglove's messages as the ROS messages that say the same, so that one reader serves both.
 
 Of Foxglove's schemas those count that have a twin in ROS; they come as protobuf (`foxglove.PointCloud`) and as ROS 2
-messages (`foxglove_msgs/msg/PointCloud`). CompressedImage needs no translation.
+messages (`foxglove_msgs/msg/PointCloud`). CompressedImage and CompressedVideo need no translation.
 Source: foxglove-sdk, schemas/proto/foxglove; sensor_msgs, geometry_msgs, nav_msgs.
 """
 

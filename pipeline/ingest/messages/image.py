@@ -12,8 +12,16 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.geometry.cameras import Camera
+from pipeline.ingest.messages.other_codecs import decode_other
 
-__all__ = ["EncodedImage", "encode_raw_image", "inspect_image", "label_image", "read_camera_info"]
+__all__ = [
+    "EncodedImage",
+    "encode_pixels",
+    "encode_raw_image",
+    "inspect_image",
+    "label_image",
+    "read_camera_info",
+]
 
 _MODELS = {
     "plumb_bob": "plumb_bob",
@@ -72,15 +80,23 @@ class EncodedImage:
 def inspect_image(data: bytes) -> EncodedImage:
     """Check an encoded image without decoding its pixels: JPEG structure and end marker, PNG checksums.
 
+    WebP, AVIF and JPEG 2000 become the PNG of their pixels.
+
     Raises:
-        ValueError: neither JPEG nor PNG, or cut off, or damaged where the structure shows it.
+        ValueError: none of these, or cut off, or damaged where the structure shows it.
     """
     if data[:3] == b"\xff\xd8\xff":
         return EncodedImage(data, "jpeg", *_possible(*_jpeg_size(data)))
     if data[:8] == _PNG_MAGIC:
         width, height, *_ = _png_header(data)
         return EncodedImage(data, "png", *_possible(width, height))
-    raise ValueError("neither JPEG nor PNG")
+    return encode_pixels(decode_other(data))
+
+
+def encode_pixels(pixels: np.ndarray) -> EncodedImage:
+    """PNG of grey or BGR pixels."""
+    height_px, width_px = pixels.shape[:2]
+    return EncodedImage(_to_png(pixels), "png", *_possible(width_px, height_px))
 
 
 def encode_raw_image(message: Any) -> EncodedImage:

@@ -173,3 +173,15 @@ def test_a_header_that_claims_more_pixels_than_a_camera_has_is_refused_before_th
     for reads in (inspect_image, lambda data: label_image(SimpleNamespace(format="png", data=data))):
         with pytest.raises(ValueError, match="100000 x 100000 pixels"):
             reads(bytes(png))
+
+
+@pytest.mark.parametrize("ending", [".webp", ".avif", ".jp2"])
+def test_other_codecs_become_the_png_of_their_pixels(ending):
+    smooth = cv2.GaussianBlur(RNG.integers(0, 255, (48, 64, 3), np.uint8), (0, 0), 4)
+    data = cv2.imencode(ending, smooth)[1].tobytes()
+    image = inspect_image(data)
+    assert (image.format, image.width_px, image.height_px) == ("png", 64, 48)
+    np.testing.assert_array_equal(decode(image.data), cv2.imdecode(np.frombuffer(data, np.uint8), 1))
+    assert np.abs(decode(image.data).astype(int) - smooth).mean() < 6
+    with pytest.raises(ValueError, match="damaged"):
+        inspect_image(data[: len(data) // 4])
