@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
     from pipeline.export.compare import Side
+    from pipeline.geometry.transform_tree import TransformTree
 
 __all__ = ["mounting", "read_calibration", "read_side"]
 
@@ -59,7 +60,7 @@ def _listed(value: object) -> list[object]:
 
 
 def mounting(text: str, names: FrameNames) -> np.ndarray:
-    """T_base_lidar out of FORMAT:FILE.
+    """T_base_lidar out of log:FILE (its /tf_static) or FORMAT:FILE.
 
     Raises:
         ConfigError: not of that form, or the file does not join the two frames.
@@ -69,17 +70,37 @@ def mounting(text: str, names: FrameNames) -> np.ndarray:
 
     name, colon, path = text.partition(":")
     if not colon:
-        raise ConfigError("command line", "mount", f"{text!r} is not FORMAT:FILE, as tf-static:log.mcap")
-    form = format_named(name)
-    if form.tree is None:
-        raise ConfigError("command line", "mount", f"{name} knows no frames of a car")
-    tree = form.tree(read_files([Path(path)]))
+        raise ConfigError(
+            "command line", "mount", f"{text!r} is not log:FILE or FORMAT:FILE, as urdf:car.urdf"
+        )
+    if name == "log":
+        tree = _logged(Path(path))
+    else:
+        form = format_named(name)
+        if form.tree is None:
+            raise ConfigError("command line", "mount", f"{name} knows no frames of a car")
+        tree = form.tree(read_files([Path(path)]))
     T = tree.lookup(names.base, names.lidar)
     if T is None:
         frames = ", ".join(sorted({*tree.edges, *tree.edges.values()}))
         problem = f"no chain joins these frames; the file has: {frames or 'none'}"
         raise ConfigError(path, f"{names.base}, {names.lidar}", problem)
     return T
+
+
+def _logged(path: Path) -> TransformTree:
+    """What a log of any container says on /tf_static."""
+    from contextlib import closing
+
+    from pipeline.geometry.transform_tree import TransformTree
+    from pipeline.ingest.containers.reader import open_log
+    from pipeline.ingest.messages.decoding import decode
+
+    tree = TransformTree()
+    with closing(open_log(path)) as log:
+        for message in log.scan(["/tf_static"]):
+            tree.add_message(decode(message.channel, message.data))
+    return tree
 
 
 def read_side(text: str, location: str | None, vehicle: str | None, method: str, names: FrameNames) -> Side:

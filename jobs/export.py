@@ -47,8 +47,8 @@ def export(
         day: YYYY-MM-DD: this day's records; default: the vehicle's state.
         method: of the calibration.
         force: write held pairs too, marked as such; the exit code stays 3.
-        mount: FORMAT:FILE that says where the lidar sits on the car (frames --base-frame and --lidar-frame), as
-            tf-static:log.mcap; default: the lidar is the root of the tree.
+        mount: where the lidar sits on the car (frames --base-frame and --lidar-frame): log:FILE, whose /tf_static says
+            it, or FORMAT:FILE, as urdf:car.urdf; default: the lidar is the root of the tree.
         update: of "autoware": your sensor_kit_calibration.yaml; --out is that file with new numbers for camera and
             radar, all else as it was.
         frames: names of the frames.

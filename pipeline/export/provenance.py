@@ -48,7 +48,7 @@ def warnings_of(calibration: ExportedCalibration) -> list[str]:
         if pair.status not in USABLE:
             found.append(f"{pair.pair} is {pair.status.upper()}, do not load it unseen: {pair.reason}")
         elif missing := [d for d in _DIRECTIONS if d not in pair.certified]:
-            found.append(f"{pair.pair}: {' and '.join(missing)} not certified")
+            found.append(f"{pair.pair}: {' and '.join(missing)} not certified; {pair.reason}".rstrip("; "))
         if pair.at_prior:
             found.append(
                 f"{pair.pair}: {', '.join(pair.at_prior)} not determined by the data, kept at the prior"

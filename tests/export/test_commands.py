@@ -18,7 +18,7 @@ from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.observations import OBSERVATIONS
 from schemas.states import STATES, StateRow
 from tests.audit.fleet_records import vehicle_records
-from tests.makers.calibrations import CAMERA
+from tests.makers.calibrations import CAMERA, T_BASE_LIDAR, calibration
 from tests.makers.table_rows import make_row
 
 BOTH = ["azimuth", "elevation"]
@@ -182,6 +182,12 @@ def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(la
     files = sorted((tmp_path / "o").iterdir())
     assert run(capsys, "import", "apollo", *files, *named[:4], "--out", tmp_path / "p.json")[0] == 0
     assert run(capsys, *call, "--lidar-frame", "side", "--mount", f"urdf:{mount}")[0] == 2
+    log = tmp_path / "drive.mcap"
+    log.write_bytes(format_named("tf-static").write(calibration(T_base_lidar=T_BASE_LIDAR))["tf_static.mcap"])
+    call[-1] = tmp_path / "l"
+    assert run(capsys, *call, "--mount", f"log:{log}")[0] == 0
+    assert "z: 2.0" in (tmp_path / "l" / "lidar_extrinsics.yaml").read_text()
+    assert run(capsys, *call, "--base-frame", "map", "--mount", f"log:{log}")[0] == 2
 
 
 @pytest.mark.parametrize(
@@ -193,7 +199,10 @@ def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(la
         (["kitti", "--lake", "{lake}", "--vehicle", "v", "--day", "yesterday"], "is no day"),
         (["urdf", "--lake", "{lake}", "--vehicle", "v", "--lidar-frame", "a b"], "is no frame name"),
         (["urdf", "--lake", "{lake}", "--vehicle", "v", "--lidar-frame", "radar"], "must differ"),
-        (["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "car.urdf"], "is not FORMAT:FILE"),
+        (
+            ["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "car.urdf"],
+            "is not log:FILE or FORMAT:FILE",
+        ),
         (["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "urdf:none.urdf"], "cannot be read"),
         (["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "kitti:none"], "knows no frames of a car"),
         (["stl", "--lake", "{lake}", "--vehicle", "v"], "stl"),

@@ -45,22 +45,20 @@ def test_a_turn_and_a_shift_are_told_apart_whatever_the_lever_arm():
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_the_change_between_days_is_as_large_as_its_sigma_says(shared):
-    """Days of one vehicle, whose errors are in part the same every day: 400 pairs of days, z of unit spread."""
-    rng = np.random.default_rng(11)
+    """Days whose errors are in part the same every day (one vehicle), or not (two): z has unit spread either way."""
+    rng, pairs = np.random.default_rng(11), 150
     T = exp_se3(rng.normal(size=6))
+    varying, common = (rng.normal(size=(pairs, 2, 6)) * np.sqrt(np.diag(C)) for C in (VARYING, COMMON))
     z = []
-    for _ in range(400):
-        same = rng.multivariate_normal(np.zeros(6), COMMON)
-        sides = []
-        for day in ("2026-03-01", "2026-03-02"):
-            own = same if shared else rng.multivariate_normal(np.zeros(6), COMMON)
-            error = rng.multivariate_normal(np.zeros(6), VARYING) + own
-            vehicle = "v" if shared else day
-            sides.append(side(day, exp_se3(error) @ T, VARYING + COMMON, vehicle, (day,), common=COMMON))
+    for own, same in zip(varying, common, strict=True):
+        errors = own + (same[0] if shared else same)
+        sides = [
+            side(day, exp_se3(error) @ T, VARYING + COMMON, "v" if shared else day, (day,), common=COMMON)
+            for day, error in zip(("2026-03-01", "2026-03-02"), errors, strict=True)
+        ]
         [found], _ = compare(*sides)
         z.append(found.z)
-    spread = np.std(z, axis=0)
-    np.testing.assert_allclose(spread, 1, atol=4 / np.sqrt(2 * len(z)))  # four sigmas of a spread of 400
+    np.testing.assert_allclose(np.std(z, axis=0), 1, atol=4 / np.sqrt(2 * pairs))  # four sigmas of a spread
 
 
 def test_days_in_common_are_said_and_nothing_is_taken_out_of_their_sigmas():

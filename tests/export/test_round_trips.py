@@ -128,3 +128,12 @@ def test_a_fisheye_is_written_as_one(D):
 def test_formats_that_need_intrinsics_say_so(name):
     with pytest.raises(ConfigError, match="camera: the format needs intrinsics"):
         format_named(name).write(calibration(camera=None))
+
+
+def test_what_is_not_finite_is_null_in_json():
+    from pipeline.export.texts import to_json
+
+    assert json.loads(to_json({"a": [1.5, float("nan")], "b": {"c": float("inf")}})) == {
+        "a": [1.5, None],
+        "b": {"c": None},
+    }
