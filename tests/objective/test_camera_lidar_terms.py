@@ -216,6 +216,23 @@ def test_score_above_chance_prefers_the_truth_to_poses_that_turn_everything_out_
         assert score(perturb_exactly(T_TRUE, np.radians(degrees), metres, rng)) < truth
 
 
+def test_edges_seen_throughout_are_in_sight_at_every_alignment_and_no_others_are_left_out(terms):
+    turned = AlignmentState(T_TRUE, 0.02).changed(
+        np.outer([-0.4, 0.4], np.eye(8)[1])
+    )  # 0.4 rad to either side
+    one, other = (
+        Alignments(turned.T_camera_lidar[k : k + 1], turned.dt_s[k : k + 1], turned.focal[k : k + 1])
+        for k in (0, 1)
+    )
+    both = terms.seen_throughout(turned)
+    kept = len(both.edges.xyz_m)
+    assert both.edges_in_view(one)[0] == both.edges_in_view(other)[0] == kept
+    assert 0 < kept < min(terms.edges_in_view(one)[0], terms.edges_in_view(other)[0])
+    assert len(terms.seen_throughout(one).edges.xyz_m) == terms.edges_in_view(one)[0]
+    in_turn = terms.seen_throughout(one).seen_throughout(other)
+    np.testing.assert_array_equal(in_turn.edges.xyz_m, both.edges.xyz_m)
+
+
 def test_share_of_matches_is_recovered_and_vanishes_where_there_are_none():
     rng = np.random.default_rng(0)
     chance_px = rng.uniform(-90, 90, 4000)

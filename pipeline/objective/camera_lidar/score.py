@@ -103,6 +103,19 @@ class Terms:
         )
         return replace(self, edges=edges, markings=markings)
 
+    def seen_throughout(self, at: Alignments) -> Terms:
+        """With the edges that each of some alignments puts into the image.
+
+        An edge out of sight scores 0, one in sight more than that on average, matched or not: rails beside the car
+        match wherever on them they are seen. What scores with the edges that come into sight is drawn to where more do.
+        """
+        still = np.zeros((len(self.edges.xyz_m), 2), np.float32)
+        is_seen = np.ones(len(still), bool)
+        for poses, focal in zip(self.poses(at), at.focal.astype(np.float32), strict=True):
+            residual = edge_residuals(self.camera, self.maps.offsets, self.edges, poses, focal, still)
+            is_seen &= ~np.isnan(residual)
+        return replace(self, edges=self.edges.chosen(is_seen))
+
     def at_most(self, points: int, rng: np.random.Generator) -> Terms:
         """With about this many edges, and markings, at most, drawn at random."""
         share = [min(1.0, points / max(len(p.xyz_m), 1)) for p in (self.edges, self.markings)]

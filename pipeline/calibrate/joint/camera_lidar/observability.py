@@ -48,6 +48,7 @@ __all__ = [
     "time_offset_variance",
 ]
 
+_REACH_SIGMAS = 2.0  # of what is expected of the time offset
 IS_TZ, _IS_DT, _IS_FOCAL = (np.arange(8) == k for k in (TZ, DT, FOCAL))
 
 
@@ -158,8 +159,11 @@ def _fix_unobservable(
 def _timed(
     problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, rng: np.random.Generator
 ) -> TimeOffsetProfile:
-    """The time offset's profile, by some of the points."""
-    some = replace(problem.scored(kernel), terms=problem.terms.at_most(SCHEDULE.time_offset_points, rng))
+    """The time offset's profile, by some of the points: edges that are in sight at every offset that may be."""
+    reach_s = _REACH_SIGMAS * problem.config.time_offset_sigma_s
+    ends = replace(state, dt_s=0.0, focal=1.0).changed(np.outer([-reach_s, reach_s], _IS_DT))
+    terms = problem.terms.seen_throughout(ends).at_most(SCHEDULE.time_offset_points, rng)
+    some = replace(problem.scored(kernel), terms=terms)
     return profile_time_offset(some, state, IS_TZ)
 
 

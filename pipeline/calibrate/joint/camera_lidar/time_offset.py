@@ -6,6 +6,10 @@ time offset by 20 to 30 ms. With the focal length at the log's and tz fixed, edg
 milliseconds. So it is stepped both ways through its valley, the pose is solved again at each step, and what focal
 length and tz leave open is carried into its sigma.
 
+The profile is that of edges which are in sight at every offset that may be (`Terms.seen_throughout`). With the others a
+fisheye on a highway was 110 to 160 ms off, at a sigma of 10: pushed ahead by four metres, the rails beside the car came
+into view and matched, as rails do wherever on them one looks.
+
 Sources: profile likelihood: Murphy & van der Vaart 2000; parameters considered, not solved for: Schmidt 1966.
 """
 
