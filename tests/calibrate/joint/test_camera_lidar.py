@@ -110,7 +110,7 @@ def test_the_less_is_known_along_the_axis_the_less_is_known_of_the_time_offset()
     # A car that stands dt later looks as if it stood further on.
     day = traced_day(SPARSE, 6, seed=3)
     begun = align_camera_lidar(day, prior_off_by(1.0, 0.03, 2), SolveConfig(), np.random.default_rng(5))
-    timed = TimeOffsetProfile(begun.state, 1e-6)
+    timed = TimeOffsetProfile(begun.state, 1e-6, 0.0)
     little, much = (
         time_offset_variance(replace(begun.problem, tz_variance=m**2), begun.state, begun.kernel, timed)
         for m in (0.02, 0.1)

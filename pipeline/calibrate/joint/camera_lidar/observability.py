@@ -164,7 +164,12 @@ def _timed(
     ends = replace(state, dt_s=0.0, focal=1.0).changed(np.outer([-reach_s, reach_s], _IS_DT))
     terms = problem.terms.seen_throughout(ends).at_most(SCHEDULE.time_offset_points, rng)
     some = replace(problem.scored(kernel), terms=terms)
-    return profile_time_offset(some, state, IS_TZ)
+    found = profile_time_offset(some, state, IS_TZ)
+    # The alignment saw all edges: where they drew it further than a profile reaches back, it begins anew.
+    if max(abs(state.dt_s), abs(found.state.dt_s)) <= SCHEDULE.time_offset_reach_s:
+        return found
+    anew = profile_time_offset(some, replace(state, dt_s=0.0), IS_TZ)
+    return anew if anew.score > found.score else found
 
 
 def time_offset_variance(

@@ -34,10 +34,11 @@ _DT_AND_FOCAL = np.isin(np.arange(8), (DT, FOCAL))
 
 @dataclass(frozen=True, eq=False)
 class TimeOffsetProfile:
-    """The best state of the profile, and the variance of its time offset over resampled frames."""
+    """The best state of the profile, the variance of its time offset over resampled frames, and its score."""
 
     state: AlignmentState
     variance_s2: float
+    score: float
 
 
 def s_per_metre(terms: Terms, state: AlignmentState) -> float:
@@ -69,7 +70,7 @@ def profile_time_offset(
     )
     spread = float(np.mean((_maximum(drawn @ score) - top) ** 2))
     best = replace(ends[int(steps[k])][0], dt_s=ends[0][0].dt_s + (top + steps[0]) * step_s)
-    return TimeOffsetProfile(best, spread * step_s**2)
+    return TimeOffsetProfile(best, spread * step_s**2, float(score[:, k].sum()))
 
 
 def _ends(
