@@ -1,6 +1,9 @@
 """Folders of the shape of public data sets become logs that `check` and `ingest` read, with the numbers they held."""
 
 import json
+import os
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,10 +72,7 @@ def test_sensors_are_where_the_data_set_says(converted):
         "lidar_radar": np.linalg.inv(T_BASE_LIDAR) @ T_BASE_RADAR,
     }
     for pair, T in wanted.items():
-        parts = [
-            getattr(frames[0], f"prior_{pair}_{p}") for p in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-        ]
-        found = from_quaternion(np.array(parts[:4]), np.array(parts[4:]))
+        found = transform_in(frames[0], f"prior_{pair}")
         np.testing.assert_allclose(found, T, atol=1e-9, err_msg=pair)
 
 
@@ -165,3 +165,42 @@ def test_models_are_named_in_fleet_toml_and_a_radar_without_doppler_is_refused(t
     fleet = load_fleet(tmp_path / "fleet.toml")
     assert fleet.rigs["default"].camera.semantics.segmenter == "s.toml"
     assert list(fleet.vehicles) == ['the "red" one']
+
+
+def transform_in(frame, prefix):
+    parts = [getattr(frame, f"{prefix}_{p}") for p in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")]
+    return from_quaternion(np.array(parts[:4]), np.array(parts[4:]))
+
+
+@pytest.fixture(scope="module")
+def found_by_devkits(tmp_path_factory):
+    python = os.environ.get("BORESIGHT_READERS")
+    if not python:
+        pytest.skip("BORESIGHT_READERS names no Python with the devkits (tests/convert/real_devkits.py)")
+    folder = tmp_path_factory.mktemp("devkits")
+    paths = [str(MAKERS[name](folder / name)) for name in ("nuscenes", "vod")]
+    script = Path(__file__).parent / "real_devkits.py"
+    done = subprocess.run([python, script, *paths], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_the_data_sets_own_devkits_find_the_same_in_these_folders(converted, found_by_devkits):
+    name, _, _, frames = converted
+    if name == "kitti":
+        pytest.skip("KITTI's own kit knows no radar")
+    devkit = {key: np.array(value) for key, value in found_by_devkits[name].items() if key != "devkit"}
+    frame = frames[0 if name == "nuscenes" else 3]
+    np.testing.assert_allclose(frame.radar_xyz_m, devkit["radar"], atol=1e-5)
+    T_lidar_radar = transform_in(frame, "prior_lidar_radar")
+    if name == "nuscenes":
+        np.testing.assert_allclose(frame.lidar_xyz_m + T_BASE_LIDAR[:3, 3], devkit["lidar_base"], atol=1e-5)
+        T_camera_radar = transform_in(frame, "prior_camera_lidar") @ T_lidar_radar
+        np.testing.assert_allclose(T_camera_radar, devkit["camera_radar"], atol=1e-9)
+    else:
+        np.testing.assert_allclose(frame.lidar_xyz_m, devkit["lidar"], atol=1e-5)
+        np.testing.assert_allclose(frame.radar_range_rate_mps, devkit["range_rate"], atol=1e-5)
+        np.testing.assert_allclose(
+            T_lidar_radar, devkit["lidar_radar"], atol=1e-6
+        )  # the devkit counts in float32
+        np.testing.assert_allclose(transform_in(frame, "ego"), devkit["odom_lidar"], atol=1e-5)

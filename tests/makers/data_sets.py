@@ -159,6 +159,11 @@ def nuscenes(folder, frames=12):
                 "filename": str(path.relative_to(folder)), "is_key_frame": n % 4 == 0, "fileformat": "jpg",
                 "width": WIDTH if "CAM" in channel else 0, "height": HEIGHT if "CAM" in channel else 0,
             })  # fmt: skip
+    tables["map"] = [
+        {"token": "map", "log_tokens": ["log"], "category": "semantic_prior", "filename": "maps/m.png"}
+    ]
+    (folder / "maps").mkdir()
+    (folder / "maps" / "m.png").write_bytes(image_bytes(".png"))
     (folder / "v1.0-mini").mkdir()
     for name, rows in tables.items():
         (folder / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows))
@@ -196,4 +201,4 @@ VIEWPOINT 0 0 0 1 0 0 0
 POINTS {len(rows)}
 DATA binary
 """
-    return header.encode() + rows.tobytes()
+    return header.encode() + rows.tobytes() + b"\n"  # the devkit asks for a byte behind the last point
