@@ -26,6 +26,13 @@ __all__ = [
 Positive = Annotated[float, Field(gt=0)]
 Topic = Annotated[str, Field(pattern=r"^/\S+$")]
 TF_STATIC = "/tf_static"
+# What labels can mean (Cityscapes' classes), and which of them are road users.
+StreetClass = Literal[
+    "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation",
+    "terrain", "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle",
+]  # fmt: skip
+RoadUser = Literal["person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"]
+LabelId = Annotated[int, Field(ge=0, le=255)]
 
 
 class Section(BaseModel):
@@ -40,7 +47,19 @@ class TopicSemantics(Section):
     source: Literal["topics"]
     labels: Topic
     detections: Topic
-    label_set: Literal["cityscapes", "ade20k", "coco"] = "cityscapes"
+    # One of these, or a set of one's own: { road = [7, 8], car = [26], ... }; labels that it leaves out mean nothing.
+    label_set: Literal["cityscapes", "ade20k", "coco"] | dict[StreetClass, tuple[LabelId, ...]] = "cityscapes"
+    # Of a detector that logs numbers or names of its own: { "2" = "car", ... }, as logged.
+    classes: dict[str, RoadUser] = Field(default_factory=dict, exclude_if=lambda classes: not classes)
+
+    @model_validator(mode="after")
+    def _a_label_means_one_thing(self) -> TopicSemantics:
+        groups = self.label_set.values() if isinstance(self.label_set, dict) else ()
+        ids = [label for group in groups for label in group]
+        twice = sorted({label for label in ids if ids.count(label) > 1})
+        if twice:
+            raise ValueError(f"label_set gives two meanings to {', '.join(map(str, twice))}")
+        return self
 
 
 class OnnxSemantics(Section):
@@ -118,9 +137,23 @@ class RadarTopics(Section):
     doppler_field: str = "doppler"
     doppler_positive: Literal["approaching", "receding"] = "receding"
     doppler_period_mps: Positive | None = None
+    # ["vx", "vy"] or three: components of the velocity relative to the radar, in its axes, of a cloud without a Doppler
+    # field. Ego-compensated ones (over ground) say nothing of the radar's pose and must not be named here.
+    velocity_fields: tuple[str, str] | tuple[str, str, str] | None = Field(
+        default=None, exclude_if=lambda fields: fields is None
+    )
     azimuth_positive: Literal["left", "right"] = "left"  # RadarScan drivers differ; PointCloud2 has x y z
     # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
     drivable: OnnxDrivable | None = Field(default=None, exclude=True)
+
+    @model_validator(mode="after")
+    def _one_way_to_say_velocity(self) -> RadarTopics:
+        both = {"doppler_field", "doppler_positive"} & self.model_fields_set
+        if self.velocity_fields is not None and both:
+            raise ValueError(
+                f"velocity_fields stands in place of {' and '.join(sorted(both))}: leave one out"
+            )
+        return self
 
 
 class EgoTopics(Section):

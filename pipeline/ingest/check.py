@@ -197,6 +197,8 @@ def _doppler_problem(frames: list[Frame], speeds: Float[np.ndarray, " N"], rig: 
         )
     moving = speeds[np.abs(speeds) > _MOVING_MPS]
     if len(moving) >= 3 and np.mean(moving < 0) > 2 / 3:
+        if rig.radar.velocity_fields is not None:
+            return "the car would drive backwards: velocity_fields must be relative to the radar, x ahead"
         other = "receding" if rig.radar.doppler_positive == "approaching" else "approaching"
         return f'the car would drive backwards: doppler_positive is probably "{other}"'
     return ""

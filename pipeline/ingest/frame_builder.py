@@ -17,6 +17,7 @@ from pipeline.ingest.deskew import deskew
 from pipeline.ingest.index import DayIndex, Located
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_frame_id
 from pipeline.ingest.messages.detections import read_detections
+from pipeline.ingest.messages.detections_3d import DETECTIONS_3D, read_detections_3d
 from pipeline.ingest.messages.image import (
     EncodedImage,
     encode_pixels,
@@ -91,7 +92,7 @@ class FrameBuilder:
         radar, radar_frame = self._radar(radar_at)
         ego = self._index.ego.at(stamp)
         (lidar_x, lidar_y, lidar_z), is_deskewed = self._deskewed(lidar, lidar_frame, lidar_at.log, ego)
-        boxes, classes, scores = self._detections(trio)
+        boxes, classes, scores = self._detections(trio, camera, camera_frame)
         prior = self._prior(lidar_at.log, camera_frame, lidar_frame, radar_frame)
         self.counts.update(lidar.dropped + radar.dropped)
         self.counts["frames_without_prior"] += None in prior.values()
@@ -182,18 +183,22 @@ class FrameBuilder:
             self._index.complain(f"labels: {err}")
             return None
 
-    def _detections(self, trio: Trio) -> tuple[np.ndarray | None, list[str] | None, np.ndarray | None]:
+    def _detections(
+        self, trio: Trio, camera: Camera, camera_frame: str
+    ) -> tuple[np.ndarray | None, list[str] | None, np.ndarray | None]:
         if trio.detections is None:
             self.counts["frames_without_detections"] += self._logged_semantics
             return None, None, None
         try:
-            boxes, classes, scores, dropped = read_detections(
-                self._message(self._located("detections", trio.detections))[0]
-            )
+            located = self._located("detections", trio.detections)
+            message, _ = self._message(located)
+            is_3d = located.channel.msgtype in DETECTIONS_3D
+            found = read_detections_3d(message, camera, camera_frame) if is_3d else read_detections(message)
         except (LogError, *DECODE_ERRORS) as err:
             self.counts["detections_damaged"] += 1
             self._index.complain(f"detections: {err}")
             return None, None, None
+        boxes, classes, scores, dropped = found
         self.counts["detections_without_box_or_class"] += dropped
         return boxes, classes, scores
 

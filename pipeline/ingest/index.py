@@ -20,6 +20,7 @@ from pipeline.geometry.transform_tree import TransformTree
 from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, content_without_stamp, decode, header_stamp_ns
+from pipeline.ingest.messages.detections_3d import DETECTIONS_3D
 from pipeline.ingest.messages.foxglove import REFUSED, foxglove_types
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
@@ -40,7 +41,7 @@ ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
     "image": (*_IMAGE_TYPES, *_VIDEO_TYPES),
     "info": ("sensor_msgs/msg/CameraInfo", *foxglove_types("CameraCalibration")),
     "labels": _IMAGE_TYPES,
-    "detections": ("vision_msgs/msg/Detection2DArray",),
+    "detections": ("vision_msgs/msg/Detection2DArray", *DETECTIONS_3D),
     "lidar": _CLOUD_TYPES,
     "radar": (*_CLOUD_TYPES, "radar_msgs/msg/RadarScan", "radar_msgs/msg/RadarTracks"),
     "odometry": ("nav_msgs/msg/Odometry", *foxglove_types("Odometry")),

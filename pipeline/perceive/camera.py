@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -12,7 +13,7 @@ from jaxtyping import Float32, UInt8
 from pipeline.config import PerceiveConfig
 from pipeline.perceive.labels import ROAD_ID, SKY_ID, road_user_name, to_cityscapes
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
-from pipeline.rigs import TopicSemantics
+from pipeline.rigs import RoadUser, TopicSemantics
 from schemas.frames import Frame
 
 __all__ = [
@@ -74,6 +75,7 @@ class TopicSource:
 
     def __init__(self, topics: TopicSemantics, config: PerceiveConfig) -> None:
         self._table = to_cityscapes(topics.label_set)
+        self._classes = topics.classes
         self._config = config
 
     def read(self, frame: Frame) -> CameraSemantics:
@@ -90,7 +92,7 @@ class TopicSource:
         size = label_size(frame.image_width_px, frame.image_height_px, self._config.label_scale)
         if not _same_aspect(labels.shape, size):
             raise FrameRejectedError(FrameReason.LABELS_SHAPE)
-        detections = _logged_detections(frame).at_least(self._config.detection_min_score)
+        detections = _logged_detections(frame, self._classes).at_least(self._config.detection_min_score)
         return CameraSemantics(resize_labels(self._table[labels], size), detections)
 
 
@@ -173,13 +175,13 @@ def _same_aspect(shape: tuple[int, ...], size: tuple[int, int]) -> bool:
     return abs(scale_rows - scale_columns) <= max(1 / size[0], 1 / size[1]) * max(scale_rows, scale_columns)
 
 
-def _logged_detections(frame: Frame) -> Detections:
+def _logged_detections(frame: Frame, own_classes: Mapping[str, RoadUser]) -> Detections:
     boxes, classes, scores = frame.detection_boxes_px, frame.detection_classes, frame.detection_scores
     if boxes is None or classes is None or scores is None:
         raise FrameRejectedError(FrameReason.NO_DETECTIONS)
     if not len(boxes) == len(classes) == len(scores):
         raise FrameRejectedError(FrameReason.BAD_DETECTIONS)
-    names = [road_user_name(c) for c in classes]
+    names = [own_classes.get(c) or road_user_name(c) for c in classes]
     finite = np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
     whole = finite & (boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])
     keep = [i for i, name in enumerate(names) if name is not None and whole[i]]

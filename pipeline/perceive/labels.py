@@ -6,8 +6,13 @@ COCO-Stuff `labels.md` (182 ids, here from 0, 255 = void); COCO detection's 80 c
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import get_args
+
 import numpy as np
 from jaxtyping import Bool, UInt8
+
+from pipeline.rigs import RoadUser, StreetClass
 
 __all__ = [
     "CITYSCAPES",
@@ -24,11 +29,8 @@ __all__ = [
     "to_cityscapes",
 ]
 
-CITYSCAPES = (
-    "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation",
-    "terrain", "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle",
-)  # fmt: skip
-ROAD_USERS = ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle")
+CITYSCAPES: tuple[str, ...] = get_args(StreetClass)  # the place is the train id
+ROAD_USERS: tuple[str, ...] = get_args(RoadUser)
 ROAD_ID, SKY_ID, VOID_ID = 0, 10, 255
 # Paper, section 4.3: vehicles, pedestrians, signs, poles, buildings, fences and vegetation reflect lidar.
 REFLECTING_IDS = (2, 3, 4, 5, 6, 7, 8, 11, 12, 13, 14, 15, 16, 17, 18)
@@ -67,10 +69,16 @@ _ALIASES = {
 }  # fmt: skip
 
 
-def to_cityscapes(label_set: str) -> UInt8[np.ndarray, " 256"]:
-    """Lookup table from labels of a set to Cityscapes train ids; what has no counterpart becomes VOID_ID."""
+def to_cityscapes(label_set: str | Mapping[StreetClass, tuple[int, ...]]) -> UInt8[np.ndarray, " 256"]:
+    """Lookup table from labels of a set (its name, or what it means) to Cityscapes train ids.
+
+    What has no counterpart becomes VOID_ID.
+    """
     table = np.full(256, VOID_ID, np.uint8)
-    for name, foreign in LABEL_SETS[label_set].items():
+    meaning: Mapping[str, tuple[int, ...]] = (
+        LABEL_SETS[label_set] if isinstance(label_set, str) else {str(k): v for k, v in label_set.items()}
+    )
+    for name, foreign in meaning.items():
         table[list(foreign)] = CITYSCAPES.index(name)
     return table
 

@@ -198,7 +198,8 @@ def _source(
 ) -> tuple[SemanticsSource, dict[str, Any]]:
     """Where semantics come from, and what of it belongs into the work key."""
     if isinstance(wanted, TopicSemantics):
-        return TopicSource(wanted, fleet.perceive), {"source": "topics", "label_set": wanted.label_set}
+        keyed = wanted.model_dump(mode="json", include={"source", "label_set", "classes"})
+        return TopicSource(wanted, fleet.perceive), keyed
     # onnxruntime loads only where it is used.
     from pipeline.perceive.models.source import ModelSource  # noqa: PLC0415
 

@@ -135,3 +135,17 @@ def test_broken_and_foreign_images_are_rejected(made_frame):
         with pytest.raises(FrameRejectedError) as rejection:
             decode_grey(replace(frame, image=image), 0.5)
         assert rejection.value.reason is reason
+
+
+def test_classes_of_a_detectors_own_become_road_users(made_frame):
+    frame = made_frame()
+    boxes = np.array([[1, 1, 20, 20], [30, 5, 60, 40]], np.float32)
+    two = {
+        "detection_boxes_px": boxes,
+        "detection_classes": ["2", "17"],
+        "detection_scores": np.ones(2, np.float32),
+    }
+    frame = replace(frame, **two)
+    assert source().read(frame).detections.classes == []
+    topics = TOPICS.model_copy(update={"classes": {"2": "truck"}})
+    assert TopicSource(topics, PerceiveConfig()).read(frame).detections.classes == ["truck"]

@@ -7,6 +7,7 @@ from pipeline.perceive.labels import (
     CITYSCAPES,
     DETECTOR_SETS,
     LABEL_SETS,
+    ROAD_ID,
     ROAD_USERS,
     SKY_ID,
     VOID_ID,
@@ -14,6 +15,7 @@ from pipeline.perceive.labels import (
     road_user_name,
     to_cityscapes,
 )
+from pipeline.rigs import TopicSemantics
 
 
 def test_cityscapes_labels_stay_as_they_are():
@@ -58,3 +60,29 @@ def test_detectors_know_only_road_users():
 def test_sky_road_and_void_reflect_no_lidar():
     labels = np.array([[0, SKY_ID, VOID_ID, CITYSCAPES.index("car"), CITYSCAPES.index("pole")]], np.uint8)
     assert is_reflecting(labels).tolist() == [[False, False, False, True, True]]
+
+
+def test_labels_of_a_set_of_ones_own_mean_what_it_says_and_the_others_nothing():
+    table = to_cityscapes({"road": (7, 8), "car": (26,)})
+    assert table[[7, 8, 26]].tolist() == [ROAD_ID, ROAD_ID, CITYSCAPES.index("car")]
+    assert set(np.delete(table, [7, 8, 26])) == {VOID_ID}
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        ({"label_set": {"street": [1]}}, "traffic light"),
+        ({"label_set": {"road": [1], "car": [1]}}, "two meanings to 1"),
+        ({"label_set": {"road": [256]}}, "255"),
+        ({"classes": {"1": "cow"}}, "motorcycle"),
+    ],
+)
+def test_a_set_of_ones_own_that_cannot_be_right_is_refused(own, said):
+    with pytest.raises(ValueError, match=said):
+        TopicSemantics(source="topics", labels="/l", detections="/d", **own)
+
+
+def test_the_ids_of_the_named_sets_stay_those_of_cityscapes():
+    assert CITYSCAPES[ROAD_ID] == "road"
+    assert CITYSCAPES[SKY_ID] == "sky"
+    assert [CITYSCAPES[i] for i in range(11, 19)] == list(ROAD_USERS)

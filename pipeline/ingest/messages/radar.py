@@ -37,8 +37,9 @@ def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
     Args:
         message: decoded by the log's own definition.
         msgtype: PointCloud2, RadarScan or RadarTracks decide what is read.
-        config: name and sign of the Doppler field, sign of RadarScan's azimuth. The velocity of a RadarTrack
-            needs no sign: taken relative to the sensor, its part along the line of sight is the range rate.
+        config: name and sign of the Doppler field, sign of RadarScan's azimuth. The velocity of a RadarTrack, and the
+            components that `velocity_fields` names, need no sign: taken relative to the sensor, their part along the
+            line of sight is the range rate.
 
     Raises:
         ValueError: a field is missing (the message names those there are), or the layout is contradictory.
@@ -80,23 +81,25 @@ _Columns = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"], Float[np.nda
 def _cloud(message: Any, config: RadarTopics) -> _Columns:
     points = cloud_columns(message)
     names = points.dtype.names or ()
-    if config.doppler_field not in names:
-        raise ValueError(
-            f"no field {config.doppler_field!r} for the Doppler; there are {', '.join(names) or 'none'}"
-        )
+    moving = (config.doppler_field,) if config.velocity_fields is None else config.velocity_fields
+    unknown = [repr(name) for name in moving if name not in names]
+    if unknown:
+        what = "the Doppler" if config.velocity_fields is None else "the velocity"
+        raise ValueError(f"no field {', '.join(unknown)} for {what}; there are {', '.join(names) or 'none'}")
     missing = [n for n in ("x", "y") if n not in names]
     if missing:
         raise ValueError(f"no field {' and '.join(missing)}; there are {', '.join(names)}")
-    used = ["x", "y", *(["z"] if "z" in names else []), config.doppler_field]
+    used = ["x", "y", *(["z"] if "z" in names else []), *moving]
     if any(points[n].ndim > 1 for n in used):
         raise ValueError(f"a field of {', '.join(used)} holds more than one value a point")
     # A planar radar has no z: 0 and has_elevation = False say so.
     z = points["z"] if "z" in names else 0.0
     xyz = np.empty((len(points), 3))
     xyz[:, 0], xyz[:, 1], xyz[:, 2] = points["x"], points["y"], z
-    doppler = points[config.doppler_field].astype(np.float64)
+    rates = np.stack([points[name].astype(np.float64) for name in moving], axis=1)
+    range_rate = _receding(rates[:, 0], config) if config.velocity_fields is None else _along(xyz, rates)
     power = first_field(points, _POWER)
-    return xyz, _receding(doppler, config), None if power is None else power.astype(np.float64)
+    return xyz, range_rate, None if power is None else power.astype(np.float64)
 
 
 def _scan(message: Any, config: RadarTopics) -> _Columns:
@@ -119,8 +122,12 @@ def _tracks(message: Any, _config: RadarTopics) -> _Columns:
     velocity = np.array(
         [(t.velocity.x, t.velocity.y, t.velocity.z) for t in message.tracks], np.float64
     ).reshape(-1, 3)
-    range_rate = np.einsum("ij,ij->i", xyz, velocity) / np.linalg.norm(xyz, axis=1)
-    return xyz, range_rate, None
+    return xyz, _along(xyz, velocity), None
+
+
+def _along(xyz: Float[np.ndarray, "N 3"], velocity: Float[np.ndarray, "N K"]) -> Float[np.ndarray, " N"]:
+    """Part of velocities relative to the sensor along the line of sight; of two components the third is 0."""
+    return np.einsum("ij,ij->i", xyz[:, : velocity.shape[1]], velocity) / np.linalg.norm(xyz, axis=1)
 
 
 def _receding(doppler: Float[np.ndarray, " N"], config: RadarTopics) -> Float[np.ndarray, " N"]:

@@ -104,3 +104,29 @@ def test_radar_tracks_are_read_by_the_definition_in_the_log_whichever_version_it
     _, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"))
     np.testing.assert_array_equal(frames[2].radar_xyz_m, [[30, 40, 0]])
     np.testing.assert_allclose(frames[2].radar_range_rate_mps, [5.0])  # along the line of sight, moving away
+
+
+def test_velocity_components_give_the_range_rate_that_doppler_gives(kit):
+    columns = kit.radar(0)
+    xyz = np.stack([columns[n] for n in "xyz"], axis=1).astype(float)
+    velocity = np.random.default_rng(1).normal(0, 10, (len(xyz), 3))
+    along = np.sum(xyz * velocity, axis=1) / np.linalg.norm(xyz, axis=1)
+    del columns["doppler"]
+    columns |= {f"v{n}": velocity[:, i].astype(np.float32) for i, n in enumerate("xyz")}
+    found = read_radar(kit.Kit().cloud(0, columns), "PointCloud2", config(velocity_fields=("vx", "vy", "vz")))
+    np.testing.assert_allclose(found.range_rate_mps, along, atol=1e-5)
+    columns["z"][:] = 0  # a planar radar: two components say all
+    found = read_radar(kit.Kit().cloud(0, columns), "PointCloud2", config(velocity_fields=("vx", "vy")))
+    expected = np.sum(xyz[:, :2] * velocity[:, :2], axis=1) / np.hypot(xyz[:, 0], xyz[:, 1])
+    np.testing.assert_allclose(found.range_rate_mps, expected, atol=1e-5)
+
+
+def test_velocity_components_that_are_not_there_are_named(kit):
+    message = kit.Kit().cloud(0, kit.radar(0))
+    with pytest.raises(ValueError, match=r"'vx', 'vy' for the velocity; there are x, y, z, doppler, power"):
+        read_radar(message, "PointCloud2", config(velocity_fields=("vx", "vy")))
+
+
+def test_doppler_and_velocity_components_cannot_both_be_named():
+    with pytest.raises(ValueError, match="velocity_fields stands in place of doppler_field"):
+        config(velocity_fields=("vx", "vy"), doppler_field="v")

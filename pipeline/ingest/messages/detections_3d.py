@@ -1,0 +1,96 @@
+"""Road users logged as boxes in space: what they are in the image, where they are given in the camera's own frame.
+
+In any other frame they would reach the image through the calibration that is looked for, and confirm whatever prior
+they came through: those are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import from_quaternion, transform_points
+
+__all__ = ["DETECTIONS_3D", "read_detections_3d"]
+
+DETECTIONS_3D = (
+    "vision_msgs/msg/Detection3DArray",
+    "autoware_perception_msgs/msg/DetectedObjects",
+    "autoware_auto_perception_msgs/msg/DetectedObjects",
+)
+# autoware_perception_msgs/ObjectClassification; 0 is unknown.
+_AUTOWARE = {1: "car", 2: "truck", 3: "bus", 4: "trailer", 5: "motorcycle", 6: "bicycle", 7: "pedestrian"}
+# Places on a box of side 1: corners, and the middles between them, since a lens bends edges outwards.
+_ON_A_BOX = np.array(list(product((-0.5, 0.0, 0.5), repeat=3)))
+_UNIT_TOLERANCE = 0.01  # a quaternion farther from unit length is damaged
+
+_Thing = tuple[Any, Any, str, float]  # pose, size, class, score
+
+
+def read_detections_3d(
+    message: Any, camera: Camera, camera_frame: str
+) -> tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]:
+    """As `read_detections`: boxes in the image, classes, scores, and how many had no box or class or were not in view.
+
+    Args:
+        message: vision_msgs/Detection3DArray or Autoware's DetectedObjects.
+        camera: of the image.
+        camera_frame: frame id of the image, an optical frame.
+
+    Raises:
+        ValueError: the boxes are given in another frame.
+    """
+    frame = str(message.header.frame_id).lstrip("/")
+    if frame != camera_frame:
+        raise ValueError(
+            f"3D boxes in frame {frame!r} would reach the image through the calibration that is looked for: log them "
+            f"in the camera's frame {camera_frame!r}, or 2D detections of the image"
+        )
+    things = _autoware(message) if hasattr(message, "objects") else _vision(message)
+    boxes, classes, scores, dropped = [], [], [], 0
+    for pose, size, name, score in things:
+        box = _box(pose, size, camera)
+        if box is None or not name:
+            dropped += 1
+            continue
+        boxes.append(box)
+        classes.append(name)
+        scores.append(score if np.isfinite(score) else 0.0)
+    return np.array(boxes, np.float32).reshape(-1, 4), classes, np.array(scores, np.float32), dropped
+
+
+def _vision(message: Any) -> Iterator[_Thing]:
+    for detection in message.detections:
+        hypotheses = [getattr(r, "hypothesis", r) for r in detection.results]
+        named = [(str(h.class_id if hasattr(h, "class_id") else h.id), float(h.score)) for h in hypotheses]
+        name, score = max(named, key=lambda pair: pair[1], default=("", 0.0))
+        yield detection.bbox.center, detection.bbox.size, name, score
+
+
+def _autoware(message: Any) -> Iterator[_Thing]:
+    for thing in message.objects:
+        likely = max(thing.classification, key=lambda c: c.probability, default=None)
+        name = "" if likely is None else _AUTOWARE.get(int(likely.label), "")
+        pose = thing.kinematics.pose_with_covariance.pose
+        yield pose, thing.shape.dimensions, name, float(thing.existence_probability)
+
+
+def _box(pose: Any, size: Any, camera: Camera) -> Float[np.ndarray, " 4"] | None:
+    """The upright box around what is seen, inside the image; None where it is no box or not whole before the camera."""
+    p, q = pose.position, pose.orientation
+    t, q_wxyz = np.array([p.x, p.y, p.z], np.float64), np.array([q.w, q.x, q.y, q.z], np.float64)
+    sides = np.array([size.x, size.y, size.z], np.float64)
+    is_box = bool(np.all(np.isfinite([*t, *q_wxyz, *sides])) and np.all(sides > 0))
+    if not is_box or abs(np.linalg.norm(q_wxyz) - 1) > _UNIT_TOLERANCE:
+        return None
+    uv, is_seen = camera.project(transform_points(from_quaternion(q_wxyz, t), _ON_A_BOX * sides))
+    if not is_seen.all():
+        return None
+    least, most = np.array([-0.5, -0.5]), np.array([camera.width_px, camera.height_px]) - 0.5
+    low, high = np.clip(uv.min(axis=0), least, most), np.clip(uv.max(axis=0), least, most)
+    return np.concatenate([low, high]) if np.all(high > low) else None
