@@ -91,7 +91,7 @@ def why_to_run(stage: Stage, task: Task) -> str:
     Raises:
         ConfigError, ContractError: see `run_stage`.
     """
-    task, _, run = _prepared(stage, task)
+    task, work, run = _prepared(stage, task)
     [schema] = stage.writes
     if _refused_before(stage, task, run) is not None:
         return ""
@@ -100,7 +100,7 @@ def why_to_run(stage: Stage, task: Task) -> str:
     else:
         done = _readable(task, schema)
         made = [(done.work_key, done.code_version, tuple(done.inputs))] if done is not None else []
-    if run.work_key in {key for key, _, _ in made}:
+    if {run.work_key, *_wider_keys(stage, work, run)} & {key for key, _, _ in made}:
         return ""
     if not made:
         return f"no {schema.name} yet"
@@ -133,6 +133,11 @@ def _prepared(stage: Stage, task: Task) -> tuple[Task, Work, Run]:
     return task, work, Run(key, inputs, task.progress)
 
 
+def _wider_keys(stage: Stage, work: Work, run: Run) -> list[str]:
+    """Keys of the same inputs under settings that give all that these do, and more."""
+    return [work_key(stage.name, CODE_VERSION, config_hash(*s), list(run.inputs)) for s in work.wider]
+
+
 def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
     """`run_stage` whose errors are outcomes: one vehicle-day's trouble never stops the others."""
     with measured() as effort:
@@ -158,7 +163,8 @@ def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
 def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: TableSchema) -> Outcome:
     """Stream the rows into the partition, which appears as a whole or not at all."""
     done = _readable(task, schema)
-    if done is not None and done.work_key == run.work_key and not work.again:
+    keys = (run.work_key, *_wider_keys(stage, work, run))
+    if done is not None and done.work_key in keys and not work.again:
         # A night that was killed told nobody what it had to say of its work: the next one does.
         return replace(_partition_outcome(stage, task, work, "cached", done), inputs=run.inputs)
     refused = _refused_before(stage, task, run)

@@ -61,6 +61,13 @@ class IngestConfig(Section):
         """`read_sweeps` as a number, None = no limit."""
         return None if self.read_sweeps == "all" else self.read_sweeps
 
+    @property
+    def wider(self) -> IngestConfig:
+        """The same, with twice the sweeps."""
+        return self.model_copy(
+            update={"read_sweeps": "all" if self.read_sweeps == "all" else 2 * self.read_sweeps}
+        )
+
 
 class PerceiveConfig(Section):
     """Feature extraction."""

@@ -113,6 +113,8 @@ class Work:
         inputs: work keys of what is read; None = those of all tables of `task.inputs`.
         nothing: what the outcome says of a partition without a row, before the counted reasons.
         tell: what the outcome says of record rows.
+        wider: settings under which the partition would hold all of this one and more: where it was made under one of
+            them, nothing is to do.
         again: True where work that is recorded already is recorded once more, so that it becomes current.
     """
 
@@ -121,6 +123,7 @@ class Work:
     inputs: tuple[str, ...] | None = None
     nothing: str = ""
     tell: Callable[[Sequence[Any]], Told] = lambda rows: Told({"rows": len(rows)})
+    wider: tuple[tuple[BaseModel | dict[str, Any], ...], ...] = ()
     again: bool = False
 
 

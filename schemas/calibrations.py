@@ -8,7 +8,16 @@ import numpy as np
 
 from schemas.columns import DEFAULT_TRIO, TableSchema, array, record_columns, scalar, transform_columns
 
-__all__ = ["CALIBRATIONS", "DOF_NAMES", "FRAMES_OF_PAIR", "METHODS", "PAIRS", "STATUSES", "CalibrationRecord"]
+__all__ = [
+    "ASKS_FOR_FRAMES",
+    "CALIBRATIONS",
+    "DOF_NAMES",
+    "FRAMES_OF_PAIR",
+    "METHODS",
+    "PAIRS",
+    "STATUSES",
+    "CalibrationRecord",
+]
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
 FRAMES_OF_PAIR = {
@@ -18,6 +27,8 @@ FRAMES_OF_PAIR = {
 }
 METHODS = ("joint", "tracking", "pairwise-optimisation", "joint-optimisation", "pairwise-ssl", "joint-ssl")
 STATUSES = ("accepted", "held", "refused")
+# What reasons say that more frames may clear: too few to fit or to judge by, or a direction that is not known well.
+ASKS_FOR_FRAMES = ("too few frames", "too few held-out frames", "(1 sigma), not within ")
 # Order of the covariance and of every per-DoF list: left perturbation T <- exp(xi) T, rotation vector then translation,
 # both along the axes of the parent frame.
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")

@@ -20,6 +20,7 @@ from typing import Any, overload
 from pipeline.config import FleetConfig
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
 from pipeline.fleet.ledger import Known, Ledger
+from pipeline.fleet.more_frames import MOST_TIMES_MORE, asks_for_more, spent_before, with_more_sweeps
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import Outcome, Progress, silent
 from pipeline.runner import Stage, try_stage
@@ -107,10 +108,16 @@ def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Prog
     task = task_of(night, work, known, progress)
     outcome = _through_stages(task, progress)
     damaged = next((r.damaged for r in outcome.results if r.damaged), "")
-    if not damaged:
-        return outcome
-    night.lake.set_aside(damaged)  # what it was made of is there: make it anew, once
-    return _through_stages(task, progress)
+    if damaged:
+        night.lake.set_aside(damaged)  # what it was made of is there: make it anew, once
+        outcome = _through_stages(task, progress)
+    for _ in range(MOST_TIMES_MORE):
+        if not asks_for_more(outcome.results):
+            break
+        task, before = with_more_sweeps(task), outcome
+        outcome = _through_stages(task, progress)
+        outcome = replace(outcome, results=spent_before(before.results, outcome.results))
+    return outcome
 
 
 def task_of(night: Night, work: VehicleDay, known: Known, progress: Progress = silent) -> Task:

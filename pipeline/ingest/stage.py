@@ -61,10 +61,13 @@ def work(task: Task) -> Work:
         raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
     file_prior = read_file_prior(rig, task.fleet)
     prior_key = {} if file_prior is None else {"prior": [T.tolist() for T in file_prior]}
+    config = task.fleet.ingest
+    wider = (config.wider, config.wider.wider)  # as a night reads a long day that asked for more
     return Work(
-        (task.fleet.ingest, rig, prior_key),
+        (config, rig, prior_key),
         lambda run: _rows(task, rig, file_prior, run),
         inputs=tuple(sorted(content_identity(p) for p in task.logs)),
+        wider=() if config.read_budget is None else tuple((c, rig, prior_key) for c in wider),
     )
 
 

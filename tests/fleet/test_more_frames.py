@@ -1,0 +1,131 @@
+"""A long day that lacks frames is read wider, and only such a one; what was read wider counts as read."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.numerics.search_range import SearchRange
+from pipeline.calibrate.select.frames import _too_few
+from pipeline.calibrate.verify.held_out_test import HeldOutTest
+from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.calibrate.verify.target_accuracy import Claim
+from pipeline.calibrate.verify.verdict import Evidence, judge
+from pipeline.extrinsics.estimates import PairEstimate, Prior
+from pipeline.fleet.more_frames import MOST_TIMES_MORE, _lacks_frames, asks_for_more, spent_before
+from pipeline.fleet.nightly import Night, run_night
+from pipeline.fleet.pattern import VehicleDay
+from pipeline.results import Effort, Outcome
+from pipeline.runner import Stage, why_to_run
+from pipeline.stages import INGEST
+from pipeline.store.partitions import Lake, Partition
+from pipeline.work import Task
+from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.frames import SWEEPS_LOGGED, SWEEPS_PLANNED
+from tests.fleet.test_nightly import DAY, FLEET
+from tests.makers.written_logs import Kit, fleet_config
+
+PRIOR = Prior(np.eye(4), np.eye(4), 0.035, 0.05)
+ESTIMATE = PairEstimate("lidar_radar", np.eye(4), np.eye(6) * 1e-6, np.full(6, 0.9), np.ones(6, bool), 50)
+VAGUE, SURE = (Claim(sigma, 0.0, 0.0, sigma, 0.003, 0.995) for sigma in (0.01, 1e-4))
+FEW = _too_few("camera_lidar", [1, 2], [["sky"]] * 9)
+
+
+def held_for(claim, frames):
+    """The reason of a verdict on a result that is right but for what is given."""
+    evidence = Evidence(HeldOutTest(1.0, 0.8, 0.02, frames, 10), {"azimuth": claim})
+    found = judge(ESTIMATE, PRIOR, evidence, SearchRange(0.1, 0.3), VerdictLimits())
+    assert found.status == "held"
+    return found.reason
+
+
+UNSURE, FEW_HELD_OUT = held_for(VAGUE, 20), held_for(SURE, 1)
+MOVED = "rz moved 5.0 prior sigmas"
+
+
+@pytest.mark.parametrize("reason", [UNSURE, FEW, FEW_HELD_OUT, f"{FEW_HELD_OUT}; {UNSURE}"])
+def test_reasons_that_more_frames_may_clear_are_known(reason):
+    assert _lacks_frames(reason)
+
+
+@pytest.mark.parametrize("reason", [MOVED, f"{MOVED}; {UNSURE}", "not triggered: the prior stays", ""])
+def test_reasons_that_more_frames_cannot_clear_ask_for_none(reason):
+    assert not _lacks_frames(reason)
+
+
+def record(pair, reason):
+    status = "held" if reason else "accepted"
+    return CalibrationRecord("car", DAY, "joint", pair, *FRAMES_OF_PAIR[pair], status, reason, "key", "0", 0)
+
+
+def results(reason, logged=36000, planned=400, ingest="done"):
+    kept = {SWEEPS_LOGGED: logged, SWEEPS_PLANNED: planned} if logged else {}
+    records = tuple(record(pair, reason if pair == PAIRS[0] else "") for pair in PAIRS)
+    return [
+        Outcome("ingest", "car", DAY, ingest, "i", rows=7, kept=kept),
+        Outcome("calibrate", "car", DAY, "done", "c", records=records),
+    ]
+
+
+def test_more_is_read_where_frames_are_lacking_and_sweeps_lie_unread():
+    assert asks_for_more(results(UNSURE))
+    assert asks_for_more(results("", ingest="refused"))
+    assert not asks_for_more(results(""))
+    assert not asks_for_more(results(MOVED))
+    assert not asks_for_more(results(UNSURE, logged=None))  # read whole
+    assert not asks_for_more(results(UNSURE, logged=400))
+    assert not asks_for_more([*results(UNSURE), Outcome("perceive", "car", DAY, "failed", "")])
+
+
+def night_of(monkeypatch, tmp_path, enough):
+    """A night whose day is accepted once so many sweeps were read; budgets that ingest was asked for."""
+    asked = []
+
+    def run(stage, task):
+        budget = task.fleet.ingest.read_sweeps
+        found = results("" if budget >= enough else UNSURE, planned=budget)
+        if stage is INGEST:
+            asked.append(budget)
+            return found[0]
+        return found[1] if stage.name == "calibrate" else replace(found[0], stage="perceive", kept={})
+
+    monkeypatch.setattr(Stage, "run", run)
+    days = [VehicleDay(Partition("car", DAY), (Path("a.mcap"),))]
+    [outcome] = run_night(Night(FLEET, Lake.at(tmp_path)), days, "inline", 1, lambda *_: None)
+    return outcome, asked
+
+
+@pytest.mark.parametrize(("enough", "asked"), [(400, [400]), (700, [400, 800]), (10**9, [400, 800, 1600])])
+def test_a_night_doubles_what_is_read_until_it_is_enough_and_not_for_ever(
+    enough, asked, monkeypatch, tmp_path
+):
+    outcome, budgets = night_of(monkeypatch, tmp_path, enough)
+    assert budgets == asked
+    assert len(asked) <= 1 + MOST_TIMES_MORE
+    assert outcome.status == ("done" if enough <= 1600 else "held")
+    assert len(outcome.results) == 3  # of the last pass: one record per pair becomes current
+
+
+def test_what_passes_cost_is_counted_together():
+    a = [replace(r, effort=Effort("t0", 2.0, 5, None)) for r in results("")]
+    b = [replace(r, effort=Effort("t1", 3.0, 7, 1)) for r in results("")]
+    assert [r.effort for r in spent_before(a, b)] == [Effort("t0", 5.0, 12, None)] * 2
+
+
+def test_a_day_that_was_read_wider_is_up_to_date_and_one_that_was_read_less_is_not(tmp_path):
+    log = Kit(frames=120).drive().mcap(tmp_path / "a.mcap")
+
+    def task(sweeps):
+        fleet = fleet_config(ingest={"read_sweeps": sweeps}).read_from(tmp_path / "fleet.toml")
+        return Task(fleet, Lake.at(tmp_path / "lake"), Partition("car", "2023-11-14"), logs=(log,))
+
+    made = INGEST.run(task(80))
+    assert (made.status, made.kept[SWEEPS_PLANNED]) == ("done", 80)
+    for sweeps in (80, 40, 20):
+        again = INGEST.run(task(sweeps))
+        assert (again.status, again.work_key, again.rows) == ("cached", made.work_key, made.rows)
+        assert why_to_run(INGEST, task(sweeps)) == ""
+    assert why_to_run(INGEST, task(10)) == "other configuration"
+    assert why_to_run(INGEST, task(160)) == "other configuration"
+    assert INGEST.run(task(100)).status == "done"
