@@ -17,8 +17,10 @@ from pipeline.ingest.containers.timeline import Stretches
 
 __all__ = ["BURST_TRIOS", "BurstMotion", "choose_bursts", "possible_bursts"]
 
-# Tracks of moving clusters are believed from their third scan on, and Doppler wraps are told apart within a few more;
-# 20 scans are 2 s at 10 Hz, shorter than the blocks by which frames that judge are held out (3 s and longer).
+# Tracks of moving clusters count from their second scan on (`calibrate/select/triggers.py`), and Doppler wraps are told
+# apart within a few more; 20 scans are 2 s at 10 Hz, shorter than the blocks by which frames that judge are held out.
+# Bursts of 10 were as good on a simulated day, and worse on the real one, whose sweeps come in clumps: more of them are
+# missed by short stretches of time (50 sweeps of 80 planned, not 75).
 BURST_TRIOS = 20
 _CHOICE = 3  # as many bursts could be read as are, times this: each costs a glance at its odometry
 # Classes: standing, creeping, city, main road, country road, motorway; turning right, bending, straight ...
