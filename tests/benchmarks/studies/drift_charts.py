@@ -32,7 +32,7 @@ from schemas.drift import DriftFinding, VehicleStatus
 from tests.benchmarks.studies.commits import commit_now
 
 RESULTS = Path("tests/benchmarks/results/drift_charts.jsonl")
-NOISES = ("white", "ar .3", "ar .6", "t4", "wrong sigmas", "floors")
+NOISES = ("white", "ar .3", "ar .6", "t4", "wrong sigmas", "floors", "warmth .03", "warmth .06")
 T_CAMERA_LIDAR = from_rotation_translation(
     np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.05, -0.4, -0.6])
 )
@@ -48,6 +48,11 @@ COMMON = {
     "lidar_radar": (0.2, 0.2, 0.01, 0.025, 0.013, 0.02),
 }
 LOG_SD = 0.25  # of what a vehicle's sigmas are wrong by
+YEAR = 365.25
+WEATHER = (
+    0.8,
+    0.5,
+)  # autocorrelation of days' temperatures, and their scatter in amplitudes of the year's swing
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,7 @@ class Case:
         twist: in its own axes [rad, m].
         on: first day with the new pose.
         back: first day on which it is repaired; 0 = never.
+        served: day of a service event: charts begin anew after it, with the sensor where it is; 0 = none.
         held: share of days that are held, refused and disproved (a lost basin), from two days before on.
     """
 
@@ -68,6 +74,7 @@ class Case:
     twist: tuple[float, ...] = (0.0,) * 6
     on: int = 0
     back: int = 0
+    served: int = 0
     lost: float = 0.0
     days: int = 100
 
@@ -87,6 +94,7 @@ CASES = (
     Case("camera knock 1, days lost", "camera", _turn("y", 1.0), on=40, lost=0.3, days=70),
     Case("camera .3 on day 5", "camera", _turn("y", 0.3), on=4, days=80),
     Case("camera .3, back", "camera", _turn("y", 0.3), on=40, back=50, days=70),
+    Case("camera .3, service event", "camera", _turn("y", 0.3), on=40, served=49, days=70),
 )
 
 
@@ -95,6 +103,7 @@ class Vehicle:
     """All days of one vehicle, and the references that froze."""
 
     pairs: Mapping[str, PairDays]
+    served: int = 0
     frozen: dict[str, Reference] = field(default_factory=dict)
 
     def tonight(self, night: int, config: AuditConfig) -> dict[str, PairDays]:
@@ -104,6 +113,9 @@ class Vehicle:
 
     def _charted(self, pair: str, first: int, night: int, config: AuditConfig) -> PairDays:
         days = self.pairs[pair]
+        if self.served and night > self.served and "camera" in pair:
+            since = days.between(self.served + 1, night)
+            return charted(since, first, night, reference_of(since, config.reference_days))
         reference = self.frozen.get(pair)
         if reference is None and first > 0:
             known = days.between(0, night)
@@ -118,7 +130,9 @@ def make_vehicle(noise: str, case: Case, rng: np.random.Generator) -> Vehicle:
     D = case.days
     moved = np.zeros((D, 6))
     moved[case.on : case.back or D] = case.twist
+    warmth = _swing(noise, D, rng)
     M = {s: exp_se3(moved if s == case.sensor else np.zeros((D, 6))) for s in ("camera", "lidar", "radar")}
+    M["camera"] = M["camera"] @ exp_se3(warmth)
     clean = {
         "camera_lidar": inverse(M["camera"]) @ T_CAMERA_LIDAR @ M["lidar"],
         "lidar_radar": inverse(M["lidar"]) @ T_LIDAR_RADAR @ M["radar"],
@@ -151,7 +165,8 @@ def make_vehicle(noise: str, case: Case, rng: np.random.Generator) -> Vehicle:
                 accepted[kept],
             )
             for pair in PAIRS
-        }
+        },
+        case.served,
     )
 
 
@@ -168,6 +183,20 @@ def _errors(noise: str, days: int, rng: np.random.Generator) -> np.ndarray:
     for k in range(1, days):
         e[k] = phi * e[k - 1] + np.sqrt(1 - phi**2) * e[k]
     return e
+
+
+def _swing(noise: str, days: int, rng: np.random.Generator) -> np.ndarray:
+    """The camera's turn in its bracket with the temperature: pitch and yaw, over the year and with the weather."""
+    turn = np.zeros((days, 6))
+    if noise.startswith("warmth"):
+        amplitude, (phi, scatter) = float(np.radians(float(noise.split()[1]))), WEATHER
+        year = np.sin(2 * np.pi * (np.arange(days) / YEAR + rng.uniform()))
+        weather = rng.normal(size=days)
+        for k in range(1, days):
+            weather[k] = phi * weather[k - 1] + np.sqrt(1 - phi**2) * weather[k]
+        direction = rng.uniform(0, 2 * np.pi)
+        turn[:, :2] = amplitude * (year + scatter * weather)[:, None] * [np.cos(direction), np.sin(direction)]
+    return turn
 
 
 def _fates(case: Case, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -240,21 +269,22 @@ def detection(noise: str, case: Case, vehicles: int, seed: int) -> dict[str, Any
     day_right, wrong = np.zeros(vehicles, bool), np.zeros(vehicles, bool)
     green_after = np.full(vehicles, 99)
     red_at_end = np.zeros(vehicles, bool)
-    watched = sorted({*range(case.on, case.on + 12), *range(case.back, case.back + 6), case.days - 1})
+    again = case.back or (case.served + 1 if case.served else 0)  # the first day that is well again
+    watched = sorted({*range(case.on, case.on + 12), *range(again, again + 12), case.days - 1})
     for night, verdicts in nights(fleet, [n for n in watched if n >= case.on], config):
         for v, verdict in enumerate(verdicts):
-            if not any(c.change for c in verdict.charts.values()) and (not case.back or green_after[v] < 99):
+            if not any(c.change for c in verdict.charts.values()) and (not again or green_after[v] < 99):
                 continue
             status = status_of_night(verdict, config)
             after = night - case.on + 1
-            if status.status == "RED" and (not case.back or night < case.back):
+            if status.status == "RED" and (not again or night < again):
                 red[v] = min(red[v], after)
                 wrong[v] |= status.sensor not in (case.sensor, None)
                 if status.sensor == case.sensor and right[v] == 99:
                     right[v], day_right[v] = after, is_right_day(verdict, case.on)
             red_at_end[v] = night == case.days - 1 and status.status == "RED"
-            if case.back and night >= case.back and status.status == "GREEN":
-                green_after[v] = min(green_after[v], night - case.back + 1)
+            if again and night >= again and status.status == "GREEN":
+                green_after[v] = min(green_after[v], night - again + 1)
     out = {
         "vehicles": vehicles,
         "red_within_3": _share(red <= 3),
@@ -266,7 +296,7 @@ def detection(noise: str, case: Case, vehicles: int, seed: int) -> dict[str, Any
         "day_right_within_1": _share(day_right[right < 99]) if (right < 99).any() else None,
         "red_on_the_last_night": _share(red_at_end),
     }
-    return out | ({"green_within_5": _share(green_after <= 5)} if case.back else {})
+    return out | ({f"green_within_{n}": _share(green_after <= n) for n in (5, 8, 12)} if again else {})
 
 
 def is_right_day(verdict: VehicleVerdict, day: int) -> bool:

@@ -1,0 +1,54 @@
+"""A few kills of the soak (`tests/benchmarks/studies/soak.py` has hundreds), and that it sees what it looks for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.store.partitions import Lake
+from pipeline.store.records import commit_records, read_records
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from tests.benchmarks.studies.soak import Soak, contents, differences, make_fleet, soak_round, storage
+from tests.makers.s3_server import BUCKET
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "kills"), [("folder", 3), ("s3", 2)])
+def test_nights_that_are_killed_leave_what_an_undisturbed_one_leaves(kind, kills, tmp_path, monkeypatch):
+    for name in (
+        "AWS_ACCESS_KEY_ID",
+        "AWS_SECRET_ACCESS_KEY",
+        "AWS_REGION",
+        "AWS_ENDPOINT_URL",
+        "AWS_ALLOW_HTTP",
+    ):
+        monkeypatch.setenv(name, "")  # given back after the test
+    soak = Soak(tmp_path)
+    make_fleet(soak.folder)
+    with storage(kind) as s3:
+        lakes = str(tmp_path) if s3 is None else f"s3://{BUCKET}"
+        soak.undisturbed(f"{lakes}/quiet")
+        quiet = Lake.at(f"{lakes}/quiet")
+        wanted = contents(quiet)
+        assert len([key for key in wanted if key.startswith("calibrations")]) == 27
+        assert len([key for key in wanted if key.startswith("page")]) == 1 + 9
+        if s3 is not None:
+            s3.faults(fail=10**6, every=20)
+        told = soak_round(soak, f"{lakes}/disturbed", kills, np.random.default_rng(5), wanted)
+        assert (told.kills, told.differences) == (kills, [])
+        if s3 is not None:
+            assert s3.faults()["failed"] > 10
+        else:
+            planted_differences_are_seen(soak, quiet, wanted)
+
+
+def planted_differences_are_seen(soak, lake, wanted):
+    assert differences(soak, lake, wanted) == []
+    record = read_records(lake, CALIBRATIONS, CalibrationRecord)[0]
+    commit_records(lake, CALIBRATIONS, [replace(record, work_key="other", recorded_at="", asserted_at="")])
+    frames = next(iter(lake.files.find(lake.root / "frames", "*/*/*.parquet")))
+    frames.write_bytes(frames.read_bytes() + b" ")
+    next(iter(lake.files.find(lake.root / "report", "*/*/*.html"))).unlink()
+    (frames.parent / ".writing-host-1-x.tmp").touch()
+    found = differences(soak, lake, wanted)
+    assert sorted(line.split(":")[0] for line in found) == ["differs", "left over", "lost", "too much"]
