@@ -27,6 +27,7 @@ _COLUMNS = (
 )  # fmt: skip
 _MONTHS_BACK = 4  # that a window of few days reaches back
 _YEARS_BACK = 20  # before which no lake began
+_FIRST_DAYS = 14  # of a lake, read before the rest of its first month: a reference takes ten accepted ones
 
 
 def last_audited_day(lake: Lake, tomorrow: str) -> str | None:
@@ -120,7 +121,12 @@ def _months_before(day: str, count: int) -> Iterator[tuple[str, str]]:
 
 
 def _months_until(lake: Lake, day: str) -> Iterator[tuple[str, str]]:
-    """The same, the earliest first, from the lake's first month on."""
+    """The same, the earliest first, from the lake's first days on: in them lie most vehicles' references."""
     months = list(_months_before(day, 12 * _YEARS_BACK))
     begun = first_day(lake, CALIBRATIONS) or day
-    return iter([m for m in reversed(months) if m[1] >= begun])
+    for month, end in reversed([m for m in months if m[1] >= begun]):
+        until = min(end, (dt.date.fromisoformat(begun) + dt.timedelta(days=_FIRST_DAYS - 1)).isoformat())
+        if month <= begun < end and until < end:
+            yield begun, until
+            month = (dt.date.fromisoformat(until) + dt.timedelta(days=1)).isoformat()  # noqa: PLW2901
+        yield month, end

@@ -19,7 +19,7 @@ from pipeline.errors import ConfigError
 from pipeline.results import Progress
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.records import read_records
+from pipeline.store.records import read_latest, read_records
 from pipeline.work import Records, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
@@ -28,6 +28,8 @@ from schemas.versions import CODE_VERSION
 
 __all__ = ["work"]
 
+# What is asked of an earlier audit's rows.
+_OF_BEFORE = ("start_day", "start_day_earliest", "start_day_latest", "kind")
 _NAMED = 5  # records that an outcome names where they were left out; the others it counts
 
 
@@ -103,10 +105,10 @@ def _judged(
         return
     days = [_charted(vehicle, window, fleet.audit) for vehicle in vehicles.values()]
     verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit)
+    before = _found_before(task.lake, method, dict(zip(vehicles, verdicts, strict=True)), first)
     for done, ((name, vehicle), verdict) in enumerate(zip(vehicles.items(), verdicts, strict=True)):
         progress(done, len(vehicles), name)
-        before = _found_before(task.lake, name, method, verdict, first)
-        yield _findings(fleet, name, vehicle, verdict, window, (shifts, before))
+        yield _findings(fleet, name, vehicle, verdict, window, (shifts, before.get(name, {})))
     progress(len(vehicles), len(vehicles), "")
 
 
@@ -172,14 +174,21 @@ def _findings(
 
 
 def _found_before(
-    lake: Lake, vehicle: str, method: str, verdict: VehicleVerdict, first: str
-) -> dict[tuple[str, str], DriftFinding]:
-    """The latest earlier audit's rows, where a change may have begun before the window did."""
+    lake: Lake, method: str, verdicts: Mapping[str, VehicleVerdict], first: str
+) -> dict[str, dict[tuple[str, str], DriftFinding]]:
+    """By vehicle, the latest earlier audit's rows, where a change may have begun before the window did."""
     window = dt.date.fromisoformat(first).toordinal()
-    if not any(c.change is not None and c.change.earliest < window for c in verdict.charts.values()):
-        return {}
-    rows = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle, first=first)
-    return {(f.pair, f.dof): f for f in current_drift([f for f in rows if f.method == method])}
+    asked = {
+        name
+        for name, verdict in verdicts.items()
+        if any(c.change is not None and c.change.earliest < window for c in verdict.charts.values())
+    }
+    before: dict[str, dict[tuple[str, str], DriftFinding]] = {}
+    if asked:
+        rows = read_latest(lake, DRIFT, DriftFinding, first=first, among=asked, columns=_OF_BEFORE)
+        for finding in current_drift([f for f in rows if f.method == method]):
+            before.setdefault(finding.vehicle, {})[finding.pair, finding.dof] = finding
+    return before
 
 
 def _remarks(

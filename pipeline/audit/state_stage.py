@@ -19,7 +19,7 @@ from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.target_sigmas import target_sigmas
 from pipeline.store.current import current_drift, current_records
 from pipeline.store.partitions import Partition, work_key
-from pipeline.store.records import last_day, read_records
+from pipeline.store.records import last_day, read_latest, read_records
 from pipeline.work import Records, Run, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
@@ -66,7 +66,14 @@ def work(task: Task) -> Work:
         if r.method == method and fault_of(r, last) is None
     )
     events = _by_vehicle(read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last or None))
-    found = read_records(task.lake, DRIFT, DriftFinding, first=first, last=last)
+    found = read_latest(
+        task.lake,
+        DRIFT,
+        DriftFinding,
+        first=first,
+        last=last or None,
+        columns=("start_day", "start_day_latest"),
+    )
     changes = _by_vehicle(current_drift([f for f in found if f.method == method]))
 
     def rows(run: Run) -> Generator[Records, None, None]:

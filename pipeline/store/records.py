@@ -208,7 +208,15 @@ def _sorted_rows(
 
 
 def read_latest(
-    lake: Lake, schema: TableSchema, row_type: type[Row], *, first: str, vehicle: str | None = None
+    lake: Lake,
+    schema: TableSchema,
+    row_type: type[Row],
+    *,
+    first: str,
+    last: str | None = None,
+    vehicle: str | None = None,
+    among: Collection[str] | None = None,
+    columns: Sequence[str] | None = None,
 ) -> list[Row]:
     """Records of the last day that each vehicle and method has any of, in order as `read_records` gives them.
 
@@ -219,9 +227,14 @@ def read_latest(
         schema: of the table.
         row_type: its dataclass.
         first: days before this one are not looked at.
+        last: nor are days after this one.
         vehicle: only this vehicle's.
+        among: only these vehicles'; None = all.
+        columns: see `read_records`.
     """
-    keys = _rows_of(lake, schema, ["vehicle", "method", "day"], vehicle, first, None)
+    keys = _rows_of(lake, schema, ["vehicle", "method", "day"], vehicle, first, last)
+    if keys is not None and among is not None:
+        keys = keys.filter(pc.is_in(keys["vehicle"], pa.array(sorted(among), pa.string())))
     if keys is None:
         return []
     latest = keys.group_by(["vehicle", "method"]).aggregate([("day", "max")])
@@ -231,7 +244,9 @@ def read_latest(
     }
     found: list[Any] = []
     for day in sorted(set(day_of.values())):
-        of_day: list[Any] = read_records(lake, schema, row_type, vehicle=vehicle, day=day)
+        of_day: list[Any] = read_records(
+            lake, schema, row_type, vehicle=vehicle, day=day, columns=columns, among=among
+        )
         found += [row for row in of_day if day_of[row.vehicle, row.method] == day]
     return sorted(found, key=lambda row: row.vehicle)
 
