@@ -15,7 +15,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@command -v $(PYTHON) >/dev/null || { echo "Boresight needs $(PYTHON) (set PYTHON=...)"; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip -c constraints.txt
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[simulate,train,ray,ops,video,test,dev]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[simulate,train,ray,ops,video,viz,test,dev]'
 	@touch $(STAMP)
 
 demo: setup ## synthetic fleet to HTML report, in minutes

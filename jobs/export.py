@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from jobs.frame_options import FrameOptions
 
@@ -14,7 +17,7 @@ __all__ = ["export"]
 
 What = Literal[
     "schemas", "onnx", "ros2", "tf-static", "urdf", "xacro", "autoware", "kitti", "nuscenes", "t4", "kalibr", "opencv",
-    "apollo", "openlabel", "matlab",
+    "apollo", "openlabel", "matlab", "foxglove",
 ]  # fmt: skip
 
 
@@ -30,6 +33,7 @@ def export(
     mount: str | None = None,
     update: Path | None = None,
     frames: FrameOptions | None = None,
+    most_frames: Annotated[int, Parameter(validator=Number(gte=1))] = 100,
     run: Path | None = None,
     notes: Path | None = None,
 ) -> int:
@@ -39,8 +43,8 @@ def export(
     Exit code 3 where not all of it is accepted and certified; the file and the summary say what.
 
     Args:
-        what: format of a calibration; or "schemas", one JSON Schema (2020-12) of a row per table; or "onnx", a trained
-            network with its card.
+        what: format of a calibration; or "foxglove", an MCAP of a day's drive with it, for viewers; or "schemas", one
+            JSON Schema (2020-12) of a row per table; or "onnx", a trained network with its card.
         out: folder, made where it is missing; or the file, of a format that is one.
         lake: folder of the tables.
         vehicle: whose calibration.
@@ -52,6 +56,7 @@ def export(
         update: of "autoware": your sensor_kit_calibration.yaml; --out is that file with new numbers for camera and
             radar, all else as it was.
         frames: names of the frames.
+        most_frames: of "foxglove", which shows the drive of --day: so many frames, evenly spread.
         run: folder of `boresight train`; needed for "onnx".
         notes: JSON object for the card: what was measured, what the data was.
     """
@@ -67,6 +72,8 @@ def export(
         print_summary("export", "done", what=what, outputs=paths, bytes=out.stat().st_size)
         return 0
     calibration = _calibration(lake, vehicle, day, method, force, mount, frames or FrameOptions())
+    if what == "foxglove":
+        return _export_drive(out, calibration, lake, day, most_frames)
     return _export_calibration(what, out, calibration, update)
 
 
@@ -90,27 +97,50 @@ def _calibration(
 
 
 def _export_calibration(what: str, out: Path, calibration: ExportedCalibration, update: Path | None) -> int:
-    from jobs.terminal.logging import logger
-    from jobs.terminal.summary import print_summary
     from pipeline.export.files import updated_file, write_files, written_files
     from pipeline.export.formats import format_named
-    from pipeline.export.provenance import not_certified, warnings_of
-    from pipeline.export.tree import ESTIMATED_PAIRS
 
-    doubts = not_certified(calibration)
-    for words in warnings_of(calibration):
-        logger().warning(words, vehicle=calibration.vehicle, source=calibration.source)
-    written = [pair for pair in ESTIMATED_PAIRS if pair in calibration.pairs]
     files = {}
-    if written:
+    if _written(calibration):
         form = format_named(what)
         files = (
             updated_file(form, calibration, update, out) if update else written_files(form, calibration, out)
         )
     write_files(files)
+    return _tell(what, calibration, list(files))
+
+
+def _export_drive(
+    out: Path, calibration: ExportedCalibration, lake: str | None, day: str | None, most_frames: int
+) -> int:
+    from jobs.export_drive import export_foxglove
+    from pipeline.errors import ConfigError
+
+    if lake is None or day is None:
+        raise ConfigError("command line", "day", "foxglove shows a day's drive: give --day")
+    wanted = bool(_written(calibration))
+    outputs = export_foxglove(calibration, lake, day, out, most_frames) if wanted else []
+    return _tell("foxglove", calibration, outputs)
+
+
+def _written(calibration: ExportedCalibration) -> list[str]:
+    from pipeline.export.tree import ESTIMATED_PAIRS
+
+    return [pair for pair in ESTIMATED_PAIRS if pair in calibration.pairs]
+
+
+def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> int:
+    """Warnings, the summary and the exit code: what is not accepted never goes out unsaid."""
+    from jobs.terminal.logging import logger
+    from jobs.terminal.summary import print_summary
+    from pipeline.export.provenance import not_certified, warnings_of
+
+    doubts, written = not_certified(calibration), _written(calibration)
+    for words in warnings_of(calibration):
+        logger().warning(words, vehicle=calibration.vehicle, source=calibration.source)
     status = ("held" if doubts else "done") if written else "refused"
     told = {"vehicle": calibration.vehicle, "source": calibration.source, "pairs": written}
-    print_summary("export", status, what=what, **told, not_certified=doubts, outputs=list(files))
+    print_summary("export", status, what=what, **told, not_certified=doubts, outputs=outputs)
     return 3 if doubts or not written else 0
 
 

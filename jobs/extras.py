@@ -13,7 +13,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 # Extra -> the module without which its commands, or an option of them, cannot start.
-EXTRAS = {"simulate": "embreex", "train": "torch", "ray": "ray", "ops": "openlineage"}
+EXTRAS = {"simulate": "embreex", "train": "torch", "ray": "ray", "ops": "openlineage", "viz": "foxglove"}
 
 
 def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

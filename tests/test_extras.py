@@ -19,6 +19,7 @@ PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
 # Where the import name differs.
 DISTRIBUTION_OF = {
     "cv2": "opencv-python-headless",
+    "foxglove": "foxglove-sdk",
     "google": "protobuf",
     "mcap_protobuf": "mcap-protobuf-support",
     "openlineage": "openlineage-python",
@@ -34,7 +35,7 @@ NEEDS = {
     "export": "train",
 }
 # What only an option of a command imports, and asks for before anything is read: `--executor ray`, `--metrics` ...
-OPTIONAL = {"av", "ray", "openlineage", "prometheus_client"}
+OPTIONAL = {"av", "foxglove", "ray", "openlineage", "prometheus_client"}
 # Each as a person would call it; the folders need not exist, since the extra is asked for first.
 CALLS = {
     "demo": ["demo"],
@@ -117,7 +118,7 @@ def test_an_extra_holds_all_else_that_its_commands_may_import(command):
 
 def test_nothing_is_declared_that_nothing_imports():
     imported = set().union(*(reached(command)[1] for command in COMMANDS))
-    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops", "video") - {"boresight"}
+    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops", "video", "viz") - {"boresight"}
     assert declared_for_users - imported == {"tensorboard"}  # imported by torch.utils.tensorboard
 
 

@@ -1,0 +1,106 @@
+"""What is sure of a calibration as one JSON message, for a viewer's table; and the layout that shows all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from foxglove import layouts
+from jaxtyping import Float
+
+from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, sigmas_of
+from pipeline.export.provenance import warnings_of
+from pipeline.geometry.se3 import inverse, log_so3
+from schemas.calibrations import DOF_NAMES
+
+__all__ = ["TABLE_SCHEMA", "layout_of", "table_of"]
+
+_ROW = {
+    "pair": {"type": "string"},
+    "axis": {"type": "string"},
+    "change": {"type": "number"},
+    "sigma": {"type": "number"},
+    "unit": {"type": "string"},
+    "determined": {"type": "boolean"},
+    "status": {"type": "string"},
+}
+TABLE_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "title": "boresight.Calibration",
+    "properties": {
+        "vehicle": {"type": "string"},
+        "source": {"type": "string"},
+        "method": {"type": "string"},
+        "warnings": {"type": "array", "items": {"type": "string"}},
+        "rows": {"type": "array", "items": {"type": "object", "properties": _ROW}},
+    },
+}
+
+
+def table_of(
+    calibration: ExportedCalibration, priors: Mapping[str, Float[np.ndarray, "4 4"]]
+) -> dict[str, Any]:
+    """A row per pair and axis: turn about and shift along the parent's axes since the prior, with sigma [deg, cm]."""
+    rows = [row for pair in calibration.pairs.values() for row in _rows(pair, priors.get(pair.pair))]
+    told = {"vehicle": calibration.vehicle, "source": calibration.source, "method": calibration.method}
+    return told | {"warnings": warnings_of(calibration), "rows": rows}
+
+
+def _rows(pair: ExportedPair, prior: Float[np.ndarray, "4 4"] | None) -> list[dict[str, Any]]:
+    change: list[float | None] = [None] * 6
+    if prior is not None:
+        turn = np.degrees(log_so3((pair.T @ inverse(prior))[:3, :3]))
+        change = [float(v) for v in (*turn, *(100 * (pair.T[:3, 3] - prior[:3, 3])))]
+    known = sigmas_of(pair.T, pair.covariance)
+    in_units = [np.degrees(1.0)] * 3 + [100.0] * 3
+    sigma: list[float | None] = (
+        [None] * 6 if known is None else [float(s * u) for s, u in zip(known.values(), in_units, strict=True)]
+    )
+    units = ["deg"] * 3 + ["cm"] * 3
+    rows = [
+        {"pair": pair.pair, "axis": axis, "change": c, "sigma": s, "unit": unit, "determined": bool(seen),
+         "status": pair.status}
+        for axis, c, s, unit, seen in zip(DOF_NAMES, change, sigma, units, pair.observable, strict=True)
+    ]  # fmt: skip
+    return [{name: value for name, value in row.items() if value is not None} for row in rows]
+
+
+def layout_of(topics: Mapping[str, str], names: FrameNames) -> bytes:
+    """A layout of Foxglove's for these topics: image with lidar and overlay, scene from the lidar, table of sigmas."""
+
+    def cloud(name: str, field: str, *, visible: bool) -> tuple[str, Any]:
+        settings = layouts.BaseRendererPointCloudTopicSettings(
+            visible=visible, color_mode="colormap", color_field=field, color_map="turbo", point_size=2.0
+        )
+        return topics[name], settings
+
+    shown = ("boxes", "overlay")
+    annotations = {
+        topics[name]: layouts.ImageAnnotationSettings(visible=name in shown)
+        for name in (*shown, "overlay_prior")
+    }
+    image = layouts.ImagePanel(
+        title="Camera: lidar as calibrated (switch topics to see the prior)",
+        config=layouts.ImageConfig(
+            image_mode=layouts.ImageModeConfig(
+                image_topic=topics["image"], calibration_topic=topics["camera"], annotations=annotations
+            ),
+            topics=dict([cloud("lidar", "x", visible=True), cloud("lidar_prior", "x", visible=False)]),
+        ),
+    )
+    clouds = [
+        cloud("lidar", "z", visible=True),
+        cloud("lidar_prior", "z", visible=False),
+        cloud("radar", "range_rate_mps", visible=True),
+        cloud("radar_prior", "range_rate_mps", visible=False),
+    ]
+    scene = layouts.ThreeDeePanel(
+        title="From above", config=layouts.ThreeDeeConfig(follow_tf=names.lidar, topics=dict(clouds))
+    )
+    table = layouts.TablePanel(config=layouts.TableConfig(topic_path=f"{topics['table']}.rows"))
+    right = layouts.SplitContainer(
+        direction="column", items=[layouts.SplitItem(content=scene), layouts.SplitItem(content=table)]
+    )
+    both = [layouts.SplitItem(proportion=3, content=image), layouts.SplitItem(proportion=2, content=right)]
+    return layouts.Layout(content=layouts.SplitContainer(direction="row", items=both)).to_json().encode()

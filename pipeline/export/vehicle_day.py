@@ -1,0 +1,46 @@
+"""Frames of a vehicle-day with what perception found in them, for formats that show a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import iterate_rows, read_manifest
+from schemas.frames import FRAMES, Frame
+from schemas.observations import OBSERVATIONS, Observation
+
+__all__ = ["read_scenes"]
+
+
+def read_scenes(lake: Lake, partition: Partition, most: int) -> Iterator[tuple[Frame, Observation | None]]:
+    """At most so many frames, evenly spread, in order of stamp; None beside those that perception left out.
+
+    Raises:
+        ConfigError: the lake has no frames of that day.
+        DamagedError: a file of the day cannot be read.
+        CollectedError: the day's rows left the lake after their time.
+    """
+    manifest = read_manifest(lake, FRAMES, partition)
+    if manifest is None:
+        problem = f"the lake has no frames of {partition.vehicle} {partition.day}: ingest the day's logs"
+        raise ConfigError("command line", "day", problem)
+    picked = np.unique(np.linspace(0, max(manifest.rows - 1, 0), most).round().astype(int)).tolist()
+    perceived = _perceived(lake, partition)
+    observation = next(perceived, None)
+    for frames in iterate_rows(lake, FRAMES, partition, Frame, rows=picked):
+        for frame in frames:
+            while observation is not None and observation.frame_index < frame.frame_index:
+                observation = next(perceived, None)
+            is_its = observation is not None and observation.frame_index == frame.frame_index
+            yield frame, observation if is_its else None
+
+
+def _perceived(lake: Lake, partition: Partition) -> Iterator[Observation]:
+    """Observations in order of frame; none of a day that was not perceived."""
+    if read_manifest(lake, OBSERVATIONS, partition) is None:
+        return
+    for rows in iterate_rows(lake, OBSERVATIONS, partition, Observation):
+        yield from rows

@@ -1,0 +1,256 @@
+"""A drive as Foxglove MCAP: read by the official schemas and by our own ingest it says what the lake says."""
+
+import json
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from jobs.cli import main
+from pipeline.export.foxglove import TOPICS
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import exp_se3, from_quaternion, inverse, to_quaternion, transform_points
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import commit_records
+from pipeline.store.tables import read_rows, write_partition
+from schemas.calibrations import CALIBRATIONS
+from schemas.frames import FRAMES, Frame
+from schemas.observations import OBSERVATIONS
+from tests.makers.calibrations import SIGMA, T_CAMERA_LIDAR, T_LIDAR_RADAR
+from tests.makers.foxglove_logs import schema
+from tests.makers.stages import ingest_day
+from tests.makers.table_rows import make_row
+from tests.makers.written_logs import fleet_config, jpeg
+
+pytest.importorskip("foxglove")
+DAY, COUNT = Partition("car", "2026-03-02"), 4
+START_NS = 1_772_400_000_000_000_000
+CAMERA = Camera("equidistant", np.array([[40.0, 0, 48], [0, 40, 32], [0, 0, 1]]), np.zeros(0), 96, 64)
+TURN = exp_se3(np.array([0.01, -0.02, 0.03, 0.04, 0.05, -0.06]))  # from the prior to the calibration
+T = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_LIDAR_RADAR}
+# What a viewer needs beside clouds of a size that ingest takes.
+INTRINSICS = {
+    "image_format": "jpeg", "image_width_px": 96, "image_height_px": 64, "camera_model": CAMERA.model,
+    "camera_K": CAMERA.K, "camera_D": CAMERA.D,
+}  # fmt: skip
+
+
+def columns(prefix, transform):
+    if transform is None:
+        return {}
+    numbers = (*to_quaternion(transform), *transform[:3, 3])
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    return {prefix + n: float(v) for n, v in zip(names, numbers, strict=True)}
+
+
+def frame(i):
+    rng = np.random.default_rng(i)
+    stamp = START_NS + i * 100_000_000
+    stamps = {
+        "stamp_ns": stamp,
+        "lidar_stamp_ns": stamp,
+        "camera_stamp_ns": stamp + 10**6,
+        "radar_stamp_ns": stamp - 10**6,
+    }
+    xyz = rng.uniform((3, -9, -2), (40, 9, 3), (600, 3)).astype(np.float32)
+    clouds = {f"lidar_{n}_m": xyz[:, k] for k, n in enumerate("xyz")}
+    clouds |= {"lidar_intensity": xyz[:, 0], "lidar_ring": None, "lidar_time_s": None}
+    return make_row("frames", rng, frame_index=i, drive=0, image=jpeg(i), **stamps, **INTRINSICS, **clouds)
+
+
+def observation(i):
+    rng = np.random.default_rng(50 + i)
+    same = {k: v for k, v in INTRINSICS.items() if k != "image_format"}
+    boxes = {"road_user_boxes_px": np.array([[10, 20, 30, 40]], np.float32), "road_user_classes": ["car"],
+             "road_user_scores": np.ones(1, np.float32)}  # fmt: skip
+    edges = rng.uniform((5, -3, -1), (30, 3, 2), (7, 3)).astype(np.float32)
+    return make_row("observations", rng, frame_index=i, **same, **boxes, lidar_edge_xyz_m=edges)
+
+
+def records():
+    rng, found = np.random.default_rng(0), []
+    for pair, pose in (T | {"camera_radar": T_CAMERA_LIDAR @ T_LIDAR_RADAR}).items():
+        parent, child = pair.split("_")
+        said = {"vehicle": "car", "day": DAY.day, "method": "joint", "pair": pair, "status": "accepted", "reason": "",
+                "parent_frame": parent, "child_frame": child, "determined": ["azimuth", "elevation"],
+                "observable": [True] * 5 + [False], "covariance": np.diag(SIGMA**2), "work_key": pair}  # fmt: skip
+        prior = columns("prior_", inverse(TURN) @ pose)
+        found.append(make_row("calibrations", rng, **said, **columns("", pose), **prior))
+    return found
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A day of four frames, the third of which perception left out, exported."""
+    folder = tmp_path_factory.mktemp("drive")
+    lake = Lake.at(folder / "lake")
+    with write_partition(lake, FRAMES, DAY, "key", "0.7.0") as writer:
+        writer.append([frame(i) for i in range(COUNT)])
+    with write_partition(lake, OBSERVATIONS, DAY, "key", "0.7.0") as writer:
+        writer.append([observation(i) for i in range(COUNT) if i != 2])
+    commit_records(lake, CALIBRATIONS, records())
+    out = folder / "drive.mcap"
+    call = [
+        "export",
+        "foxglove",
+        "--lake",
+        str(folder / "lake"),
+        "--vehicle",
+        "car",
+        "--day",
+        DAY.day,
+        "--out",
+        str(out),
+    ]
+    assert main(call) == 0
+    return lake, out
+
+
+@pytest.fixture(scope="module")
+def messages(exported):
+    """Decoded messages by topic."""
+    found = {}
+    with exported[1].open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
+        for its, channel, message in reader.iter_messages():
+            if its.encoding == "protobuf":
+                whole = schema(
+                    its.name.removeprefix("foxglove.")
+                )  # the official class, not the file's own schema
+                assert its.name == whole.DESCRIPTOR.full_name
+                found.setdefault(channel.topic, []).append(whole.FromString(message.data))
+            else:
+                found.setdefault(channel.topic, []).append(json.loads(message.data))
+    return found
+
+
+def points_of(cloud):
+    assert cloud.point_stride == 4 * len(cloud.fields)
+    return np.frombuffer(cloud.data, "<f4").reshape(-1, len(cloud.fields)), [f.name for f in cloud.fields]
+
+
+def test_every_topic_has_its_messages_and_images_pass_byte_for_byte(messages):
+    without = 1  # the frame that perception left out
+    counts = dict.fromkeys(TOPICS.values(), COUNT)
+    counts |= {TOPICS[n]: COUNT - without for n in ("boxes", "overlay", "overlay_prior", "clusters")}
+    counts[TOPICS["table"]] = 1
+    assert {topic: len(found) for topic, found in messages.items()} == counts
+    assert [m.data for m in messages[TOPICS["image"]]] == [jpeg(i) for i in range(COUNT)]
+    assert {m.frame_id for m in messages[TOPICS["image"]]} == {"camera"}
+
+
+def test_the_camera_is_called_what_foxglove_calls_it(messages):
+    camera = messages[TOPICS["camera"]][0]
+    assert (camera.distortion_model, camera.width, camera.height) == ("kannala_brandt", 96, 64)
+    assert (list(camera.K), list(camera.D)) == (CAMERA.K.reshape(-1).tolist(), [0.0] * 4)
+    assert np.array(camera.P).reshape(3, 4)[:, :3].tolist() == CAMERA.K.tolist()
+
+
+def test_the_tree_takes_points_where_calibration_and_prior_take_them(messages):
+    edges = {}
+    for edge in messages[TOPICS["tf"]][0].transforms:
+        q, t = edge.rotation, edge.translation
+        pose = from_quaternion(np.array([q.w, q.x, q.y, q.z]), np.array([t.x, t.y, t.z]))
+        edges[edge.parent_frame_id, edge.child_frame_id] = pose
+    # Worked out in the head (makers/calibrations): the camera is 1 m ahead of the lidar and 0.5 m above it.
+    np.testing.assert_allclose(edges["lidar", "camera"][:3, 3], [1, 0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(edges["lidar", "radar"], T_LIDAR_RADAR, atol=1e-12)
+    np.testing.assert_allclose(edges["camera", "lidar_prior"], inverse(TURN) @ T_CAMERA_LIDAR, atol=1e-12)
+    np.testing.assert_allclose(edges["lidar", "radar_prior"], inverse(TURN) @ T_LIDAR_RADAR, atol=1e-12)
+
+
+def test_clouds_are_those_of_the_lake_in_a_frame_each(messages):
+    for sensor in ("lidar", "radar"):
+        one, prior = messages[TOPICS[sensor]][1], messages[TOPICS[f"{sensor}_prior"]][1]
+        assert (one.frame_id, prior.frame_id, one.data) == (sensor, f"{sensor}_prior", prior.data)
+    points, names = points_of(messages[TOPICS["radar"]][1])
+    assert names == ["x", "y", "z", "range_rate_mps", "power_db"]
+    np.testing.assert_array_equal(points[:, 3], frame(1).radar_range_rate_mps)
+
+
+def test_overlays_lie_where_the_lidars_edges_are_seen(messages):
+    seen = transform_points(T_CAMERA_LIDAR, observation(0).lidar_edge_xyz_m.astype(float))
+    uv, valid = CAMERA.project(seen)
+    expected = uv[valid & CAMERA.contains(uv)] + 0.5
+    [dots] = messages[TOPICS["overlay"]][0].points
+    np.testing.assert_allclose([(p.x, p.y) for p in dots.points], expected, atol=1e-9)
+    [before] = messages[TOPICS["overlay_prior"]][0].points
+    assert len(expected) > 3
+    assert [(p.x, p.y) for p in before.points] != [(p.x, p.y) for p in dots.points]
+    boxes = messages[TOPICS["boxes"]][0]
+    assert [(p.x, p.y) for p in boxes.points[0].points] == [
+        (10.5, 20.5),
+        (30.5, 20.5),
+        (30.5, 40.5),
+        (10.5, 40.5),
+    ]
+    assert boxes.texts[0].text == "car"
+
+
+def test_the_table_says_change_and_sigma_of_each_axis(messages):
+    [table] = messages[TOPICS["table"]]
+    rows = {(r["pair"], r["axis"]): r for r in table["rows"]}
+    assert len(rows) == 18
+    row = rows["camera_lidar", "rz"]
+    assert (row["change"], row["unit"]) == (pytest.approx(np.degrees(0.03), abs=1e-9), "deg")
+    assert row["sigma"] == pytest.approx(np.degrees(SIGMA[2]))
+    assert [rows["camera_lidar", axis]["determined"] for axis in ("ty", "tz")] == [True, False]
+    assert any("tz not determined" in words for words in table["warnings"])
+
+
+def test_our_own_ingest_reads_the_drive_back(exported, tmp_path):
+    lake, out = exported
+    topics = {"camera": {"image": TOPICS["image"], "info": TOPICS["camera"],
+                         "semantics": {"source": "onnx", "segmenter": "s.toml", "detector": "d.toml"}},
+              "lidar": {"points": TOPICS["lidar"]}, "prior": {"topic": TOPICS["tf"]},
+              "radar": {"points": TOPICS["radar"], "doppler_field": "range_rate_mps"}}  # fmt: skip
+    plain = fleet_config().model_dump(mode="json", exclude_none=True)
+    fleet = (
+        type(fleet_config())
+        .model_validate(plain | {"rigs": {"default": topics}})
+        .read_from(tmp_path / "fleet.toml")
+    )
+    again = Lake.at(tmp_path / "lake")
+    assert ingest_day([out], DAY, fleet, again).status == "done"
+    before, after = (read_rows(its, FRAMES, DAY, Frame) for its in (lake, again))
+    for a, b in zip(before, after, strict=True):
+        assert (a.image, a.camera_stamp_ns, a.radar_stamp_ns) == (
+            b.image,
+            b.camera_stamp_ns,
+            b.radar_stamp_ns,
+        )
+        np.testing.assert_array_equal(a.lidar_xyz_m, b.lidar_xyz_m)
+        np.testing.assert_array_equal(a.radar_range_rate_mps, b.radar_range_rate_mps)
+        np.testing.assert_allclose(b.prior_camera_lidar_tx_m, T_CAMERA_LIDAR[0, 3], atol=1e-12)
+
+
+def test_a_layout_lies_beside_it_that_names_topics_of_the_file(exported):
+    layout = json.loads(exported[1].with_suffix(".layout.json").read_text())
+    told = json.dumps(layout)
+    assert layout["content"]["type"] == "split"
+    assert all(topic in told for name, topic in TOPICS.items() if name not in {"tf", "clusters"})
+
+
+def test_what_cannot_be_shown_is_said(exported, tmp_path, capsys):
+    lake = str(exported[1].parent / "lake")
+    call = ["export", "foxglove", "--lake", lake, "--vehicle", "car", "--out", str(tmp_path / "a.mcap")]
+    assert main([*call, "--day", "2026-03-09"]) == 2
+    assert (
+        main(
+            [
+                "export",
+                "foxglove",
+                "--lake",
+                lake,
+                "--vehicle",
+                "car",
+                "--day",
+                DAY.day,
+                "--out",
+                str(tmp_path),
+            ]
+        )
+        == 2
+    )
+    assert "must end in .mcap" in capsys.readouterr().err
