@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pipeline.fleet.lineage_sink import LineageSink
     from pipeline.fleet.nightly import DayOutcome, Night
     from pipeline.fleet.pattern import VehicleDay
+    from pipeline.results import Outcome
     from schemas.drift import DriftFinding
 
 __all__ = ["NightSinks", "night_sinks"]
@@ -49,6 +50,10 @@ class NightSinks:
             lineage, sink = self._lineage
             for event in lineage.of_day(outcome):
                 sink.emit(event)
+
+    def take_stage(self, outcome: Outcome) -> None:
+        """A stage of the whole fleet ended."""
+        self._tally.add_stage(outcome)
 
     def ended(self, exit_code: int, findings: Sequence[DriftFinding]) -> None:
         """The night ended with this exit code, and the audit found this."""

@@ -12,6 +12,7 @@ from cyclopts import Parameter
 if TYPE_CHECKING:
     from pipeline.fleet.nightly import DayOutcome, Night
     from pipeline.fleet.pattern import VehicleDay
+    from pipeline.results import Outcome
     from pipeline.store.partitions import Lake
     from schemas.drift import DriftFinding
 
@@ -82,7 +83,9 @@ def nightly(
     with night_sinks(night, days, metrics, lineage) as sinks:
         outcomes = watch_night(night, days, executor, workers, sinks.take)
         drawing = Drawing(report, pictures, executor, workers)
-        findings, pages = close_night(night, to_day, drawing, outcomes) if outcomes else ([], [])
+        findings, pages = (
+            close_night(night, to_day, drawing, outcomes, sinks.take_stage) if outcomes else ([], [])
+        )
         tidy(tables)
         code = exit_code([o.status for o in outcomes])
         sinks.ended(code, findings)
@@ -183,12 +186,16 @@ class Drawing:
 
 
 def close_night(
-    night: Night, to_day: str | None, drawing: Drawing, outcomes: Sequence[DayOutcome] = ()
+    night: Night,
+    to_day: str | None,
+    drawing: Drawing,
+    outcomes: Sequence[DayOutcome] = (),
+    told: Callable[[Outcome], None] = lambda _: None,
 ) -> tuple[list[DriftFinding], list[str]]:
     """Audit the fleet, say what vehicles should load, and write the pages; returns the findings and the pages.
 
     However few days the night was about, the charts look back over `audit.window_days`; its own days get a page
-    however long ago they were.
+    however long ago they were. `told` is told how each of these stages ended.
     """
     from jobs.terminal.summary import progress_reporter
     from pipeline.fleet.pages import OnWorkers
@@ -200,8 +207,10 @@ def close_night(
 
     with progress_reporter("audit") as progress:
         task = Task(night.fleet, night.lake, Window(None, to_day), night.method, progress=progress)
-        findings = list(AUDIT.run(task).records)
-        STATE.run(task)
+        audit = AUDIT.run(task)
+        told(audit)
+        told(STATE.run(task))
+    findings = list(audit.records)
     if not findings:
         return [], []
     files = night.lake.files if drawing.report is None else LocalFiles()
@@ -216,8 +225,9 @@ def close_night(
             OnWorkers(drawing.executor, drawing.workers),
         )
         task = Task(night.fleet, night.lake, Window(), night.method, given=pages, progress=progress)
-        outputs = REPORT.run(task).outputs
-    return findings, [files.uri(PurePath(path)) for path in outputs]
+        report = REPORT.run(task)
+        told(report)
+    return findings, [files.uri(PurePath(path)) for path in report.outputs]
 
 
 def _problem(outcome: DayOutcome) -> dict[str, Any]:

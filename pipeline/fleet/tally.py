@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from pipeline.fleet.nightly import DayOutcome
+from pipeline.results import Outcome
 
 __all__ = ["Tally"]
 
@@ -18,7 +19,7 @@ class Tally:
         vehicle_days: by status.
         records: of calibrations that are current, by pair and status.
         stages: by stage and how it ended.
-        seconds: of the workers, by stage.
+        seconds: by stage, of the workers; of audit, state and report, of the driver.
         bytes_read: by them, from the page cache too, by stage.
         bytes_written: likewise.
     """
@@ -35,8 +36,12 @@ class Tally:
         self.vehicle_days[outcome.status] += 1
         self.records.update(outcome.pairs.items())
         for result in outcome.results:
-            effort = result.effort
-            self.stages[result.stage, result.status] += 1
-            self.seconds[result.stage] += effort.seconds  # type: ignore[assignment]  # a Counter adds what adds up
-            self.bytes_read[result.stage] += effort.bytes_read or 0
-            self.bytes_written[result.stage] += effort.bytes_written or 0
+            self.add_stage(result)
+
+    def add_stage(self, result: Outcome) -> None:
+        """Count one stage, of a vehicle-day or of the fleet."""
+        effort = result.effort
+        self.stages[result.stage, result.status] += 1
+        self.seconds[result.stage] += effort.seconds  # type: ignore[assignment]  # a Counter adds what adds up
+        self.bytes_read[result.stage] += effort.bytes_read or 0
+        self.bytes_written[result.stage] += effort.bytes_written or 0

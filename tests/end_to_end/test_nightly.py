@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import psutil
@@ -214,9 +215,10 @@ def answers(lake, **of):
 def test_all_executors_record_the_same_though_a_worker_and_a_node_of_a_cluster_die(
     fleet, first_night, tmp_path
 ):
+    told = ("--metrics", f"{tmp_path}/night.prom", "--lineage", f"{tmp_path}/events.json")
     with two_nodes() as (cluster, (node, _)):
         process = subprocess.Popen(
-            command(fleet, tmp_path / "ray", "--executor", "ray"),
+            command(fleet, tmp_path / "ray", "--executor", "ray", *told),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -241,6 +243,13 @@ def test_all_executors_record_the_same_though_a_worker_and_a_node_of_a_cluster_d
     run(*command(fleet, tmp_path / "inline", "--executor", "inline", "--to", DAYS[0]))
     assert answers(tmp_path / "inline") == answers(first_night[0], day=DAYS[0])
     assert len(answers(tmp_path / "inline")) == 9
+    metrics = (tmp_path / "night.prom").read_text()
+    for stage in ("ingest", "perceive", "calibrate", "audit", "state", "report"):
+        assert f'boresight_stage_seconds{{fleet="synthetic",stage="{stage}"}}' in metrics
+    events = [json.loads(line) for line in (tmp_path / "events.json").read_text().splitlines()]
+    runs = Counter(e["run"]["runId"] for e in events)
+    assert set(runs.values()) == {2}  # each begun and ended once, what was tried twice too
+    assert {e["job"]["name"] for e in events} == {"nightly", "ingest", "perceive", "calibrate"}
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ how many bytes the answers had.
 
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -16,6 +17,7 @@ import time
 import urllib.request
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import urlencode
 
 REPO = Path(__file__).resolve().parents[2]
 BUCKET = "fleet"
@@ -27,13 +29,16 @@ class Faults:
     def __init__(self, app):
         self.app, self.lock = app, threading.Lock()
         self.plan = {"fail": 0, "stall": 0, "stall_s": 0.0, "every": 1}
-        self.counts = {"requests": 0, "failed": 0, "stalled": 0, "bytes_sent": 0}
+        self.counts = {"requests": 0, "failed": 0, "stalled": 0, "bytes_sent": 0, "puts": 0, "gets": 0}
 
     def __call__(self, environ, start_response):
         if environ["PATH_INFO"] == "/faults":
             return self.control(environ, start_response)
         with self.lock:
             self.counts["requests"] += 1
+            # As object stores bill: what writes or lists, and what reads.
+            lists = environ["REQUEST_METHOD"] == "GET" and "list-type" in environ["QUERY_STRING"]
+            self.counts["puts" if lists or environ["REQUEST_METHOD"] in ("PUT", "POST") else "gets"] += 1
             hit = self.counts["requests"] % self.plan["every"] == 0
             fail = hit and self.plan["fail"] > 0
             stall = hit and not fail and self.plan["stall"] > 0
@@ -97,6 +102,18 @@ class S3:
         body = json.dumps(plan).encode() if plan else None
         with urllib.request.urlopen(urllib.request.Request(f"{self.url}/faults", body)) as answer:
             return json.load(answer)
+
+    def stored(self, prefix=""):
+        """Bytes of the bucket's objects, or of those whose names begin so."""
+        sizes, token = [], ""
+        while token is not None:
+            asked = {"list-type": 2, "prefix": prefix} | ({"continuation-token": token} if token else {})
+            with urllib.request.urlopen(f"{self.url}/{BUCKET}?{urlencode(asked)}") as answer:
+                listing = answer.read().decode()
+            sizes += map(int, re.findall(r"<Size>(\d+)</Size>", listing))
+            more = re.search(r"<NextContinuationToken>(.*?)</NextContinuationToken>", listing)
+            token = more[1] if more else None
+        return sum(sizes)
 
 
 @contextmanager
