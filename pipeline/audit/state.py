@@ -61,7 +61,7 @@ def fuse(days: Sequence[DayEstimate], *, scale: float = 1.0, autocorrelation: fl
         return None
     origin = days[0].T
     changes = log_se3(np.stack([d.T for d in days]) @ inverse(origin))
-    spread = np.stack([_varying(d) for d in days])
+    spread = _varying(days)
     kept = _belonging(changes, spread, np.stack([d.observable for d in days]))
     own, x = [days[i] for i in kept], changes[kept]
     varying = spread[kept] * scale**2
@@ -103,12 +103,15 @@ def _belonging(
     return kept or list(range(len(x)))
 
 
-def _varying(day: DayEstimate) -> Float[np.ndarray, "6 6"]:
-    """What varies; what the day did not determine has all of its variance, so that it does not weigh."""
-    varying = day.covariance if day.common is None else day.covariance - day.common
-    floor = 0.01 * np.diag(day.covariance)  # sigmas are estimates themselves
-    missing = np.where(day.observable, np.maximum(floor - np.diag(varying), 0.0), np.diag(day.covariance))
-    return varying + np.diag(missing)
+def _varying(days: Sequence[DayEstimate]) -> Float[np.ndarray, "N 6 6"]:
+    """What varies; what a day did not determine has all of its variance, so that it does not weigh."""
+    covariance = np.stack([d.covariance for d in days])
+    varying = covariance - np.stack([np.zeros((6, 6)) if d.common is None else d.common for d in days])
+    own, left = (np.einsum("nii->ni", matrices) for matrices in (covariance, varying))
+    floor = 0.01 * own  # sigmas are estimates themselves
+    seen = np.stack([d.observable for d in days])
+    missing = np.where(seen, np.maximum(floor - left, 0.0), own)
+    return varying + missing[:, :, None] * np.eye(6)
 
 
 def _positive(matrix: np.ndarray) -> np.ndarray:

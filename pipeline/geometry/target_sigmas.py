@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from jaxtyping import Float
 
@@ -21,10 +23,16 @@ def target_jacobian(
     angles = to_spherical if pair == "lidar_radar" else camera_direction_angles
     points = transform_points(T, targets)
     columns = []
-    for axis in np.eye(6):
-        ahead, behind = (angles(transform_points(exp_se3(sign * _STEP * axis), points)) for sign in (1, -1))
+    for steps in _nudges():
+        ahead, behind = (angles(transform_points(step, points)) for step in steps)
         columns.append(wrap_angle(ahead[:, :2] - behind[:, :2]) / (2 * _STEP))
     return np.stack(columns, -1).transpose(1, 0, 2)
+
+
+@cache
+def _nudges() -> tuple[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]], ...]:
+    """Small twists ahead and back along each axis: making them was most of a Jacobian."""
+    return tuple((exp_se3(_STEP * axis), exp_se3(-_STEP * axis)) for axis in np.eye(6))
 
 
 def target_sigmas(

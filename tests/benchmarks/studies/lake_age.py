@@ -17,6 +17,7 @@ import argparse
 import datetime as dt
 import json
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -77,10 +78,13 @@ def main() -> None:
             if not fill(lake, given.vehicles, days, until):
                 sys.stdout.write(f"{lake} is filled until {last_day(lake, STATES)}: run it again\n")
                 return
-            command = [sys.executable, "-m", "tests.benchmarks.studies.lake_age", "--measure", str(lake)]
+            copy = Path(folder) / "measured"  # which adds nights
+            shutil.copytree(lake.local_root, copy)
+            command = [sys.executable, "-m", "tests.benchmarks.studies.lake_age", "--measure", str(copy)]
             told = subprocess.run(
                 [*command, "--vehicles", str(given.vehicles)], check=True, capture_output=True, text=True
             )
+            shutil.rmtree(copy)
             line = {"vehicles": given.vehicles, "days": days, "commit": commit_now()}
             line |= json.loads(told.stdout.splitlines()[-1])
             sys.stdout.write(json.dumps(line) + "\n")
