@@ -118,7 +118,9 @@ def test_an_extra_holds_all_else_that_its_commands_may_import(command):
 
 def test_nothing_is_declared_that_nothing_imports():
     imported = set().union(*(reached(command)[1] for command in COMMANDS))
-    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops", "video", "viz") - {"boresight"}
+    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops", "video", "viz") - {
+        "boresight"
+    }
     assert declared_for_users - imported == {"tensorboard"}  # imported by torch.utils.tensorboard
 
 
