@@ -11,11 +11,12 @@ from jaxtyping import Float
 
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, sigmas_of
 from pipeline.export.provenance import warnings_of
-from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.geometry.changes import change_between
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["TABLE_SCHEMA", "layout_of", "table_of"]
 
+_IN_UNITS = np.array([np.degrees(1.0)] * 3 + [100.0] * 3)  # rad to deg, m to cm
 _ROW = {
     "pair": {"type": "string"},
     "axis": {"type": "string"},
@@ -50,12 +51,12 @@ def table_of(
 def _rows(pair: ExportedPair, prior: Float[np.ndarray, "4 4"] | None) -> list[dict[str, Any]]:
     change: list[float | None] = [None] * 6
     if prior is not None:
-        turn = np.degrees(log_so3((pair.T @ inverse(prior))[:3, :3]))
-        change = [float(v) for v in (*turn, *(100 * (pair.T[:3, 3] - prior[:3, 3])))]
+        change = (change_between(prior, pair.T) * _IN_UNITS).tolist()
     known = sigmas_of(pair.T, pair.covariance)
-    in_units = [np.degrees(1.0)] * 3 + [100.0] * 3
     sigma: list[float | None] = (
-        [None] * 6 if known is None else [float(s * u) for s, u in zip(known.values(), in_units, strict=True)]
+        [None] * 6
+        if known is None
+        else [float(s * u) for s, u in zip(known.values(), _IN_UNITS, strict=True)]
     )
     units = ["deg"] * 3 + ["cm"] * 3
     rows = [

@@ -1,0 +1,1 @@
+"""Examples to read and to change: cells for a notebook, scripts too."""
