@@ -24,7 +24,8 @@ from pathlib import Path
 from pipeline.config import load_fleet
 from pipeline.store.partitions import Lake, Partition
 stage, folder, lake = sys.argv[1], Path(sys.argv[2]), Lake.at(sys.argv[3])
-fleet, day = load_fleet(folder / "fleet.toml"), Partition("vehicle-1", "2026-03-02")
+fleet = load_fleet(folder / "fleet.toml").changed(ingest={"read_sweeps": "all"})  # the most that a worker may be asked
+day = Partition("vehicle-1", "2026-03-02")
 if stage == "ingest":
     from tests.makers.stages import ingest_day
     result = ingest_day(sorted((folder / "logs").rglob("*.mcap")), day, fleet, lake)
