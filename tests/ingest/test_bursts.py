@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.ingest.bursts import BURST_TRIOS, BurstMotion, choose_bursts, possible_bursts
-from pipeline.ingest.containers.timeline import Stretches
+from pipeline.ingest.containers.timeline import Chunk, Stretches, timeline_of_chunks
 
 S = 10**9
 gaps = st.lists(st.tuples(st.integers(1, 4000), st.integers(3, 4000)), min_size=1, max_size=12)
@@ -94,3 +94,16 @@ def test_what_comes_once_a_day_is_read(kind):
         "place": 5e3,
     }[kind]
     assert 47 in choose_bursts(motion(speed, yaw_rate, position), 20)
+
+
+def test_a_pause_within_a_chunk_is_no_recorded_time():
+    # Ten drives of 40 s, a minute apart; chunks hold 6 s of data, whatever pause comes while they are filled.
+    driven = np.concatenate([100 * drive + np.arange(400) / 10 for drive in range(10)])
+    times = ((1_700_000_000 + driven) * S).astype(np.int64)
+    chunks = [Chunk(i, 1, int(t[0]), int(t[-1]), None) for i, t in enumerate(np.array_split(times, 67))]
+    timeline = timeline_of_chunks(chunks, {1: "/lidar"}, {1: len(times)})
+    assert timeline.messages == {"/lidar": 4000}
+    assert timeline.recorded.length_ns / S == pytest.approx(400, rel=0.1)
+    found = possible_bursts(timeline.recorded, 4000, 400, is_motion_known=False)
+    read = sum(int(((times >= start) & (times <= end)).sum()) for start, end in found)
+    assert read == pytest.approx(400, rel=0.1)

@@ -115,12 +115,24 @@ def timeline_of_chunks(
         if channel in topics:
             counts[topics[channel]] = counts.get(topics[channel], 0) + count
     first: dict[str, tuple[int, int]] = {}
+    # Without those that have no message, or whose index is damaged.
+    filled = sorted((c for c in chunks if 0 < c.end_ns >= c.start_ns), key=lambda c: c.start_ns)
+    typical_ns = int(np.median([c.end_ns - c.start_ns for c in filled])) if filled else 0
     spans = []
-    for chunk in sorted(chunks, key=lambda c: c.start_ns):
-        if not 0 < chunk.end_ns >= chunk.start_ns:  # one without a message, or a damaged index
-            continue
-        spans.append((chunk.start_ns, chunk.end_ns))
+    for chunk in filled:
+        spans += _without_pause(chunk, typical_ns)
         for channel in topics if chunk.channels is None else chunk.channels:
             if channel in topics:
                 first.setdefault(topics[channel], (chunk.start_ns, chunk.end_ns))
     return Timeline(Stretches.merged(spans, _PAUSE_NS), counts, first)
+
+
+def _without_pause(chunk: Chunk, typical_ns: int) -> list[tuple[int, int]]:
+    """When a chunk's messages were logged, as far as its span tells: chunks hold equal amounts of data.
+
+    One that took much longer than others to fill was begun before a pause and ended after it.
+    """
+    if chunk.end_ns - chunk.start_ns <= 3 * typical_ns + _PAUSE_NS:
+        return [(chunk.start_ns, chunk.end_ns)]
+    half = typical_ns // 2
+    return [(chunk.start_ns, chunk.start_ns + half), (chunk.end_ns - half, chunk.end_ns)]
