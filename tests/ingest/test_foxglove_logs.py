@@ -7,6 +7,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from pipeline.errors import LogError
+from pipeline.ingest.check import check_logs
 from pipeline.ingest.containers.reader import BYTES_AS_TEXT, PROTOBUF, Channel
 from pipeline.ingest.messages.decoding import decode, header_stamp_ns
 from tests.makers import foxglove_logs
@@ -165,3 +166,22 @@ def test_damaged_protobuf_bytes_are_an_error_that_names_the_topic_and_never_anot
 def test_a_protobuf_channel_without_a_schema_is_refused_in_words(kit):
     with pytest.raises(LogError, match="schema"):
         decode(Channel(kit.LIDAR, "foxglove.PointCloud", PROTOBUF, "", PROTOBUF), memoryview(b""))
+
+
+def test_a_long_foxglove_day_is_read_in_the_same_bursts(kit, tmp_path, run_ingest):
+    made = kit.Kit(frames=150).drive()
+    fleet = kit.fleet(ingest={"read_sweeps": 20})
+    result, ros = run_ingest(made.mcap(tmp_path / "ros.mcap"), fleet=fleet, name="a")
+    _, protobuf = run_ingest(foxglove_logs.write(made, tmp_path / "foxglove.mcap"), fleet=fleet, name="b")
+    assert result.kept["sweeps_in_logs"] == 150
+    assert len(ros) < 60
+    assert_same_rows(ros, protobuf)
+
+
+def test_check_says_of_a_foxglove_log_what_it_says_of_the_ros_log(kit, tmp_path):
+    made, fleet = drive(kit), kit.fleet()
+    logs = made.mcap(tmp_path / "ros.mcap"), foxglove_logs.write(made, tmp_path / "foxglove.mcap")
+    ros, protobuf = (check_logs([log], fleet.rig_of("car"), fleet) for log in logs)
+    assert {t.problem for t in protobuf.topics} == {""}
+    assert "foxglove.PointCloud" in {kind for t in protobuf.topics for kind in t.types}
+    assert replace(protobuf, topics=[]) == replace(ros, topics=[])
