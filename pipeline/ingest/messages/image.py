@@ -49,6 +49,7 @@ _CONVERSIONS = {
     "uyvy": cv2.COLOR_YUV2BGR_UYVY,
     "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUYV,
     "yuyv": cv2.COLOR_YUV2BGR_YUYV,
+    "nv12": cv2.COLOR_YUV2BGR_NV12,
 }
 _CHANNELS = {
     "rgb8": 3,
@@ -225,6 +226,10 @@ def _raw_pixels(message: Any, encoding: str) -> np.ndarray:
         raise ValueError(f"image encoding {message.encoding!r} is not supported")
     channels, size = _CHANNELS.get(encoding, 1), _BYTES.get(encoding, 1)
     height, width, row = int(message.height), int(message.width), int(message.width) * channels * size
+    if encoding == "nv12":  # below the brightness, half as many rows hold the colours of 2x2 pixels each
+        if height % 2 or width % 2:
+            raise ValueError(f"nv12 needs even sides, not {width}x{height}")
+        height += height // 2
     step = int(message.step) or row
     data = np.asarray(message.data, np.uint8)
     if min(height, width) < 1 or step < row or len(data) < step * (height - 1) + row:

@@ -185,3 +185,21 @@ def test_other_codecs_become_the_png_of_their_pixels(ending):
     assert np.abs(decode(image.data).astype(int) - smooth).mean() < 6
     with pytest.raises(ValueError, match="damaged"):
         inspect_image(data[: len(data) // 4])
+
+
+def test_nv12_images_have_their_brightness_and_colours_where_they_belong(kit):
+    smooth = cv2.GaussianBlur(RNG.integers(0, 255, (48, 64, 3), np.uint8), (0, 0), 6)
+    planes = cv2.cvtColor(smooth, cv2.COLOR_BGR2YUV_I420)
+    u, v = planes[48:60].reshape(-1), planes[60:].reshape(-1)
+    colours = np.stack([u, v], axis=1).reshape(24, 64)  # NV12: both in turn
+    message = kit.Kit().image(0, np.vstack([planes[:48], colours]), "nv12", step=70)
+    message.height = 48
+    image = encode_raw_image(message)
+    assert (image.width_px, image.height_px) == (64, 48)
+    assert np.abs(decode(image.data).astype(int) - smooth).mean() < 3
+    message.data = message.data[: 70 * 50]
+    with pytest.raises(ValueError, match="too few"):
+        encode_raw_image(message)
+    message.height = 47
+    with pytest.raises(ValueError, match="even sides"):
+        encode_raw_image(message)
