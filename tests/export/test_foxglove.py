@@ -1,6 +1,7 @@
 """A drive as Foxglove MCAP: read by the official schemas and by our own ingest it says what the lake says."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -254,3 +255,12 @@ def test_what_cannot_be_shown_is_said(exported, tmp_path, capsys):
         == 2
     )
     assert "must end in .mcap" in capsys.readouterr().err
+
+
+def test_without_the_extra_it_says_what_to_install(exported, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    lake = str(exported[1].parent / "lake")
+    call = ["export", "foxglove", "--lake", lake, "--vehicle", "car", "--day", DAY.day]
+    assert main([*call, "--out", str(tmp_path / "a.mcap")]) == 2
+    assert "pip install 'boresight[viz]'" in capsys.readouterr().err
+    assert not (tmp_path / "a.mcap").exists()

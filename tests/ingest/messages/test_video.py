@@ -81,28 +81,34 @@ def test_a_damaged_packet_costs_its_pictures_up_to_the_next_key_frame(streams):
     assert torn.picture(10).shape == (64, 96, 3)
 
 
-@pytest.mark.parametrize("name", ["h264", "h265"])
-def test_a_log_of_video_gives_frames_from_its_first_key_frame_on(kit, tmp_path, run_ingest, streams, name):
-    made = kit.Kit(frames=COUNT - 2).drive()
-    place = iter(range(2, COUNT))  # the log begins between key frames
+def video_log(kit, data, name, path):
+    """A log with the data of a video, one picture a message, in place of its pictures."""
+    made, place = kit.Kit(frames=len(data)).drive(), iter(data)
 
     def as_video(message):
         said = foxglove_logs.foxglove(message)
-        if message.__msgtype__.endswith("CompressedImage") and message.format == "jpeg":
-            data = streams[name][next(place)]
-            return foxglove_logs.schema("CompressedVideo")(
-                timestamp=said.timestamp, frame_id=said.frame_id, data=data, format=name
-            )
-        return said
+        if not (message.__msgtype__.endswith("CompressedImage") and message.format == "jpeg"):
+            return said
+        same = {"timestamp": said.timestamp, "frame_id": said.frame_id}
+        return foxglove_logs.schema("CompressedVideo")(**same, data=next(place), format=name)
 
-    result, frames = run_ingest(foxglove_logs.write(made, tmp_path / "video.mcap", as_video))
+    return foxglove_logs.write(made, path, as_video)
+
+
+@pytest.mark.parametrize("name", ["h264", "h265"])
+def test_a_log_of_video_gives_frames_from_its_first_key_frame_on(kit, tmp_path, run_ingest, streams, name):
+    log = video_log(kit, streams[name][2:], name, tmp_path / "video.mcap")  # it begins between key frames
+    result, frames = run_ingest(log)
     assert result.rejected["image_damaged"] == KEY_EVERY - 2
     assert len(frames) == COUNT - KEY_EVERY
     seen = video(streams[name], name).picture(KEY_EVERY)
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(frames[0].image, np.uint8), 1), seen)
 
 
-def test_video_without_the_extra_says_what_to_install(streams, monkeypatch):
+def test_a_day_of_video_without_the_extra_fails_with_what_to_install(
+    kit, tmp_path, run_ingest, streams, monkeypatch
+):
+    log = video_log(kit, streams["h264"], "h264", tmp_path / "video.mcap")
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingExtraError, match=r"boresight\[video\]"):
-        video(streams["h264"], "h264").picture(0)
+        run_ingest(log)
