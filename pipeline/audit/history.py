@@ -10,6 +10,7 @@ from __future__ import annotations
 import datetime as dt
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 
 from pipeline.audit.service import restart_of
 from pipeline.store.current import current_records
@@ -105,10 +106,10 @@ def _references(
 
 
 def _read(
-    lake: Lake, first: str, last: str, method: str, among: Collection[str] | None = None
+    lake: Lake, first: str, last: str, method: str, among: AbstractSet[str] | None = None
 ) -> list[CalibrationRecord]:
     window = {"first": first, "last": last}
-    rows = read_records(lake, CALIBRATIONS, CalibrationRecord, **window, columns=_COLUMNS, among=among)
+    rows = read_records(lake, CALIBRATIONS, CalibrationRecord, **window, columns=_COLUMNS, vehicle=among)
     return [r for r in current_records(rows) if r.method == method]
 
 

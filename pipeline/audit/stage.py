@@ -185,7 +185,7 @@ def _found_before(
     }
     before: dict[str, dict[tuple[str, str], DriftFinding]] = {}
     if asked:
-        rows = read_latest(lake, DRIFT, DriftFinding, first=first, among=asked, columns=_OF_BEFORE)
+        rows = read_latest(lake, DRIFT, DriftFinding, first=first, vehicle=asked, columns=_OF_BEFORE)
         for finding in current_drift([f for f in rows if f.method == method]):
             before.setdefault(finding.vehicle, {})[finding.pair, finding.dof] = finding
     return before

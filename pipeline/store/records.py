@@ -7,7 +7,8 @@ Rows come in through `commit_records`, which knows the same work again and never
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import MISSING, fields, replace
 from itertools import groupby
 from operator import itemgetter
@@ -102,12 +103,11 @@ def read_records(
     schema: TableSchema,
     row_type: type[Row],
     *,
-    vehicle: str | None = None,
+    vehicle: str | AbstractSet[str] | None = None,
     day: str | None = None,
     first: str | None = None,
     last: str | None = None,
     columns: Sequence[str] | None = None,
-    among: Collection[str] | None = None,
 ) -> list[Row]:
     """Records in order of vehicle, day and time of their last assertion; `current_records` keeps the last of a kind.
 
@@ -117,19 +117,19 @@ def read_records(
         lake: where the table is.
         schema: of the table.
         row_type: its dataclass.
-        vehicle: only this vehicle's.
+        vehicle: only this vehicle's, or only these'.
         day: only of this day.
         first: only from this day on.
         last: only until this day.
         columns: of those with a default in `row_type`, which to read; the others keep their default. None = all.
-        among: only these vehicles'; None = all.
 
     Raises:
         ContractError: the lake is of another release, or lacks a column that has no default.
     """
-    found = _sorted_rows(lake, schema, row_type, vehicle, day or first, day or last, columns)
-    if found is not None and among is not None:
-        found = found.filter(pc.is_in(found["vehicle"], pa.array(sorted(among), pa.string())))
+    one = vehicle if isinstance(vehicle, str) else None
+    found = _sorted_rows(lake, schema, row_type, one, day or first, day or last, columns)
+    if found is not None and isinstance(vehicle, AbstractSet):
+        found = found.filter(pc.is_in(found["vehicle"], pa.array(sorted(vehicle), pa.string())))
     return [] if found is None else from_table(found, schema, row_type)
 
 
@@ -214,8 +214,7 @@ def read_latest(
     *,
     first: str,
     last: str | None = None,
-    vehicle: str | None = None,
-    among: Collection[str] | None = None,
+    vehicle: str | AbstractSet[str] | None = None,
     columns: Sequence[str] | None = None,
 ) -> list[Row]:
     """Records of the last day that each vehicle and method has any of, in order as `read_records` gives them.
@@ -228,13 +227,13 @@ def read_latest(
         row_type: its dataclass.
         first: days before this one are not looked at.
         last: nor are days after this one.
-        vehicle: only this vehicle's.
-        among: only these vehicles'; None = all.
+        vehicle: only this vehicle's, or only these'.
         columns: see `read_records`.
     """
-    keys = _rows_of(lake, schema, ["vehicle", "method", "day"], vehicle, first, last)
-    if keys is not None and among is not None:
-        keys = keys.filter(pc.is_in(keys["vehicle"], pa.array(sorted(among), pa.string())))
+    one = vehicle if isinstance(vehicle, str) else None
+    keys = _rows_of(lake, schema, ["vehicle", "method", "day"], one, first, last)
+    if keys is not None and isinstance(vehicle, AbstractSet):
+        keys = keys.filter(pc.is_in(keys["vehicle"], pa.array(sorted(vehicle), pa.string())))
     if keys is None:
         return []
     latest = keys.group_by(["vehicle", "method"]).aggregate([("day", "max")])
@@ -244,9 +243,7 @@ def read_latest(
     }
     found: list[Any] = []
     for day in sorted(set(day_of.values())):
-        of_day: list[Any] = read_records(
-            lake, schema, row_type, vehicle=vehicle, day=day, columns=columns, among=among
-        )
+        of_day: list[Any] = read_records(lake, schema, row_type, vehicle=vehicle, day=day, columns=columns)
         found += [row for row in of_day if day_of[row.vehicle, row.method] == day]
     return sorted(found, key=lambda row: row.vehicle)
 
