@@ -13,7 +13,7 @@ from tests.makers.s3_server import BUCKET
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "kills"), [("folder", 3), ("s3", 2)])
+@pytest.mark.parametrize(("kind", "kills"), [("folder", 2), ("s3", 1)])
 def test_nights_that_are_killed_leave_what_an_undisturbed_one_leaves(kind, kills, tmp_path, monkeypatch):
     for name in (
         "AWS_ACCESS_KEY_ID",
