@@ -1,9 +1,10 @@
 """Study: does `boresight verify` let a wrong calibration pass, or fail a right one?
 
-    python tests/benchmarks/studies/days.py generate --root DAYS --sets coverage
+    python tests/benchmarks/studies/days.py generate --root DAYS --sets coverage basin
     python tests/benchmarks/studies/in_use.py --root DAYS --workers 2
 
-Every day of the coverage study (40 frames, the paper's sensors, urban and highway in turn) with the true calibration in
+Every day of the studies `sigma_coverage` (40 frames, the paper's sensors, urban and highway in turn) and `basin` (eight
+rigs, every fifth day at dusk) with the true calibration in
 use, and with one that is wrong: camera-lidar by 0.5 deg across the camera's axis in a drawn direction, lidar-radar by
 1 deg of yaw. A pair fails where one of its axes does, passes where all that it is good for pass or warn, and is
 inconclusive otherwise.
@@ -25,7 +26,7 @@ _ANSWERS = ("pass", "fail", "inconclusive")
 def main() -> None:
     """Run what is missing, then print the table."""
     args = study_arguments(__doc__ or "", "in_use").parse_args()
-    days = SETS["dev" if args.tuning else "coverage"]
+    days = SETS["dev"] if args.tuning else SETS["coverage"] + SETS["basin"]
     wrong_deg = IN_USE_ASKED_DEG[0]
     runs = [Run(day, seed=day.seed, prior=("in use", deg, 0.0)) for day in days for deg in (0.0, wrong_deg)]
     run_study(runs, args, summary)
