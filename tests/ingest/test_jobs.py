@@ -25,10 +25,11 @@ def test_ingest_exits_0_when_done_or_cached_and_3_when_refused(kit, tmp_path, fl
     log = kit.Kit().drive().mcap(tmp_path / "a.mcap")
     common = {"fleet": fleet, "lake": str(tmp_path / "lake"), "vehicle": "car", "day": "2023-11-14"}
     for status in ("done", "cached"):
-        assert ingest(log, **common) == 0
+        assert ingest(str(log), **common) == 0
         summary = last_line(capsys)
         assert (summary["command"], summary["status"], summary["rows"]) == ("ingest", status, 4)
-    assert ingest(kit.Kit().drive().without(kit.LIDAR).mcap(tmp_path / "b.mcap"), **common) == 3
+    without_lidar = kit.Kit().drive().without(kit.LIDAR).mcap(tmp_path / "b.mcap")
+    assert ingest(str(without_lidar), **common) == 3
     assert kit.LIDAR in last_line(capsys)["reason"]
     with pytest.raises(ConfigError, match="at least one log"):
         ingest(**common)
