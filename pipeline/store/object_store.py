@@ -186,8 +186,13 @@ class _Reader(io.RawIOBase):
         return len(got)
 
 
-@cache
 def _store(bucket: str) -> S3Store:
+    """The client of a bucket, another one where the environment names another store or other credentials."""
+    return _client(bucket, tuple(sorted(item for item in os.environ.items() if item[0].startswith("AWS_"))))
+
+
+@cache
+def _client(bucket: str, environment: tuple[tuple[str, str], ...]) -> S3Store:  # noqa: ARG001 - tells clients apart
     return S3Store(
         bucket,
         client_options={

@@ -28,11 +28,11 @@ def s3(server, monkeypatch):
         monkeypatch.setenv(name, value)
     for name, value in {"REQUEST_S": 5.0, "RETRIES": 2, "RETRY_S": 2.0}.items():
         monkeypatch.setattr(pipeline.store.object_store, name, value)
-    pipeline.store.object_store._store.cache_clear()
+    pipeline.store.object_store._client.cache_clear()
     server.faults(fail=0, stall=0)
     yield server
     server.faults(fail=0, stall=0)
-    pipeline.store.object_store._store.cache_clear()
+    pipeline.store.object_store._client.cache_clear()
 
 
 @pytest.fixture

@@ -39,10 +39,10 @@ def s3(server, monkeypatch):
     for name, value in server.environment.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(pipeline.store.object_store, "REQUEST_S", 2.0)
-    pipeline.store.object_store._store.cache_clear()
+    pipeline.store.object_store._client.cache_clear()
     server.faults(fail=0, stall=0)
     yield server
-    pipeline.store.object_store._store.cache_clear()
+    pipeline.store.object_store._client.cache_clear()
 
 
 @pytest.fixture
@@ -180,7 +180,7 @@ def test_a_store_that_is_down_is_an_error_and_never_damage(lake, rng, s3, monkey
     write(lake, [make_row("frames", rng)])
     commit_records(lake, CALIBRATIONS, [record(rng, "k")])
     monkeypatch.setattr(pipeline.store.object_store, "RETRIES", 1)
-    pipeline.store.object_store._store.cache_clear()
+    pipeline.store.object_store._client.cache_clear()
     s3.faults(fail=10_000)
     for call in (
         lambda: read_manifest(lake, FRAMES, DAY),
@@ -195,6 +195,13 @@ def test_a_store_that_is_down_is_an_error_and_never_damage(lake, rng, s3, monkey
     assert lake.damage == []
     assert [r.work_key for r in read(lake)] == ["k"]
     assert read_manifest(lake, FRAMES, DAY).work_key == "k1"
+
+
+def test_a_bucket_of_the_same_name_in_another_store_is_another_one(lake, rng, monkeypatch):
+    write(lake, [make_row("frames", rng)])
+    with running() as other:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", other.environment["AWS_ENDPOINT_URL"])
+        assert read_manifest(lake, FRAMES, DAY) is None
 
 
 _COMMITS = """

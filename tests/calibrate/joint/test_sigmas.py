@@ -3,7 +3,7 @@
 The statistic is the root mean square of error over sigma, over the degrees of freedom that a day determines (and the
 radar's time offset). It would be 1 where sigmas held noise only. Theirs also hold bias floors, for what real drives
 have and these scenes have not, so it is smaller here; the bounds are a third either way of what other seeds showed
-(100 to 107 for the radar, 100 to 104 for the camera).
+(100 to 107 for the radar; 100 to 109 for the camera, measured with 0.7.0: 0.23 and 0.33 by fives).
 """
 
 import numpy as np
@@ -51,7 +51,7 @@ def normalised(estimate, T_true):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("of_day", "usual"),
-    [(radar_normalised, 0.47), (camera_normalised, 0.34)],
+    [(radar_normalised, 0.47), (camera_normalised, 0.28)],
     ids=["lidar-radar", "camera-lidar"],
 )
 def test_errors_are_as_large_as_their_sigmas_say_neither_larger_nor_smaller(of_day, usual):
