@@ -12,12 +12,12 @@ inconclusive otherwise.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from pipeline.in_use.axes import NEEDED_AXES
 from tests.benchmarks.studies.days import SETS
 from tests.benchmarks.studies.engine import IN_USE_ASKED_DEG, Run, run_study, study_arguments
-from tests.benchmarks.studies.metrics import share
 
 _PAIRS = ("camera_lidar", "lidar_radar")
 _ANSWERS = ("pass", "fail", "inconclusive")
@@ -33,24 +33,16 @@ def main() -> None:
 
 
 def summary(results: list[dict[str, Any]]) -> str:
-    """Answers per pair, for right and wrong calibrations, and why the inconclusive ones are."""
-    lines = ["| pair | calibration in use | logs | pass | fail | inconclusive |", "|---|---|---|---|---|---|"]
-    for pair in _PAIRS:
+    """Answers per pair and of the whole log, for right and wrong calibrations."""
+    lines = ["| of | calibration in use | logs | pass | fail | inconclusive |", "|---|---|---|---|---|---|"]
+    kinds = {pair: partial(answer_of_pair, pair=pair) for pair in _PAIRS} | {"the log": answer_of_log}
+    for name, answer_of in kinds.items():
         for is_wrong in (False, True):
-            answers = [answer_of_pair(r, pair) for r in results if (r["prior"][1] > 0) == is_wrong]
-            counts = [f"{answers.count(a)} ({share(answers.count(a), len(answers))})" for a in _ANSWERS]
+            answers = [answer_of(r) for r in results if (r["prior"][1] > 0) == is_wrong]
+            counts = [f"{answers.count(a)} ({answers.count(a) / max(len(answers), 1):.1%})" for a in _ANSWERS]
             lines.append(
-                f"| {pair} | {'wrong' if is_wrong else 'right'} | {len(answers)} | {' | '.join(counts)} |"
+                f"| {name} | {'wrong' if is_wrong else 'right'} | {len(answers)} | {' | '.join(counts)} |"
             )
-    whole = {
-        is_wrong: [answer_of_log(r) for r in results if (r["prior"][1] > 0) == is_wrong]
-        for is_wrong in (False, True)
-    }
-    for is_wrong, answers in whole.items():
-        counts = [f"{answers.count(a)} ({share(answers.count(a), len(answers))})" for a in _ANSWERS]
-        lines.append(
-            f"| the log | {'wrong' if is_wrong else 'right'} | {len(answers)} | {' | '.join(counts)} |"
-        )
     return "\n".join(lines)
 
 
