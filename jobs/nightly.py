@@ -61,8 +61,7 @@ def nightly(
     """
     from jobs.extras import require
     from jobs.night_sinks import night_sinks
-    from jobs.terminal.summary import exit_code, left_out, print_summary
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+    from jobs.terminal.summary import exit_code
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.extrinsics.prior import require_named_files
@@ -89,6 +88,21 @@ def nightly(
         tidy(tables)
         code = exit_code([o.status for o in outcomes])
         sinks.ended(code, findings)
+    _print_end(tables, code, outcomes, findings, pages)
+    return held_exit_code if code == 3 else code
+
+
+def _print_end(
+    tables: Lake,
+    code: int,
+    outcomes: Sequence[DayOutcome],
+    findings: Sequence[DriftFinding],
+    pages: Sequence[str],
+) -> None:
+    """The night's summary: what became of the vehicle-days and of the vehicles, and where to read about it."""
+    from jobs.terminal.summary import left_out, print_summary
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+
     print_summary(
         "nightly",
         {0: "done", 1: "failed", 3: "held"}[code],
@@ -100,7 +114,6 @@ def nightly(
         damaged=left_out(tables),
         report=pages[0] if pages else None,
     )
-    return held_exit_code if code == 3 else code
 
 
 def _print_plan(night: Night, days: Sequence[VehicleDay]) -> int:

@@ -144,21 +144,18 @@ class PrepareConfig(Section):
     cluster_points: Annotated[int, Field(ge=64)] = 1024
     edge_points: Annotated[int, Field(ge=64)] = 768
     max_frames: Annotated[int, Field(gt=0)] | None = None  # per vehicle-day, evenly spread; None = all
-    min_step_m: Annotated[float, Field(ge=0)] = (
-        0.5  # a frame that the vehicle hardly moved for says nothing new
-    )
+    # A frame that the vehicle hardly moved for says nothing new.
+    min_step_m: Annotated[float, Field(ge=0)] = 0.5
     split_by: tuple[Literal["vehicle", "day", "place"], ...] = ("vehicle", "day", "place")
     val_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     test_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     positions: Literal["local", "map"] = "local"  # map: odometry of all logs is in one frame (GNSS, a map)
     place_m: Positive = 100.0  # side of a place's cell
     place_s: Positive = 20.0  # stretch of a drive that counts as a place where the log has no positions
-    guard_s: Annotated[float, Field(ge=0)] = (
-        3.0  # frames of one drive this near to another split are left out
-    )
-    duplicate_bits: Annotated[int, Field(ge=0, le=128)] = (
-        16  # of 256 fingerprint bits: fewer differ = same view
-    )
+    # Frames of one drive this near to another split are left out.
+    guard_s: Annotated[float, Field(ge=0)] = 3.0
+    # Of 256 fingerprint bits: fewer differ = same view.
+    duplicate_bits: Annotated[int, Field(ge=0, le=128)] = 16
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
@@ -235,15 +232,12 @@ class AuditConfig(Section):
     method: MethodName = "joint"
     false_alarms_per_1000_vehicle_days: Positive = 1.0
     baseline_days: Annotated[int, Field(gt=0)] = 2  # a chart says nothing until it has one day more than this
-    held_sigma_factor: Annotated[float, Field(ge=1)] = (
-        2.0  # held days weigh less: held-out frames did not confirm them
-    )
-    reference_days: Annotated[int, Field(gt=1)] = (
-        10  # first accepted days that tonight is held against, for good
-    )
-    window_days: Annotated[int, Field(gt=2, le=3660)] = (
-        28  # audited days where the command names no first day
-    )
+    # Held days weigh less: held-out frames did not confirm them.
+    held_sigma_factor: Annotated[float, Field(ge=1)] = 2.0
+    # First accepted days that tonight is held against, for good.
+    reference_days: Annotated[int, Field(gt=1)] = 10
+    # Audited days where the command names no first day.
+    window_days: Annotated[int, Field(gt=2, le=3660)] = 28
     camera_lidar_limit_deg: Positive = 0.1
     radar_limit_deg: Positive = 0.25
     translation_limit_m: Positive = 0.05

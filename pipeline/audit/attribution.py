@@ -27,9 +27,8 @@ __all__ = ["SENSORS", "Attribution", "PairShift", "attribute", "pair_shift"]
 
 SENSORS = ("camera", "lidar", "radar")
 _CLEAR_PROBABILITY = 0.95
-_MISFIT_PROBABILITY = (
-    1e-3  # a best motion that explains the shifts worse than this is not the whole story ...
-)
+# A best motion that explains the shifts worse than this is not the whole story ...
+_MISFIT_PROBABILITY = 1e-3
 _WHOLE_STORY = 0.99  # ... unless it explains this share of them (of chi-squared): sigmas are estimates
 
 

@@ -32,9 +32,8 @@ class Change:
     kind: str  # 'step' or 'slow drift'
     size: float
     size_sigma: float
-    settled: int = (
-        0  # first day of the level that it has tonight; between `day` and it lie others that are off too
-    )
+    # First day of the level that it has tonight; between `day` and it lie others that are off too.
+    settled: int = 0
 
 
 @dataclass(frozen=True, eq=False)

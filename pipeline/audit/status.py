@@ -10,9 +10,8 @@ __all__ = ["decide_status"]
 
 # Turns that every night determines on a car with one camera, lidar and radar; a turn of any of the three sensors
 # shows in one of these groups. A group is watched where all charts of one of its alternatives are GREEN.
-_CAMERA_AGAINST_LIDAR = (
-    (("camera_lidar", "rx"), ("camera_lidar", "ry")),
-)  # pitch and yaw: the image's two axes
+# Pitch and yaw: the image's two axes.
+_CAMERA_AGAINST_LIDAR = ((("camera_lidar", "rx"), ("camera_lidar", "ry")),)
 # Yaw alone: radars measure azimuth ten times better than elevation, and many measure no elevation at all.
 _RADAR_AGAINST_THE_OTHERS = ((("lidar_radar", "rz"),), (("camera_radar", "ry"),))
 _WATCHED = {"camera or lidar": _CAMERA_AGAINST_LIDAR, "radar": _RADAR_AGAINST_THE_OTHERS}

@@ -23,9 +23,8 @@ __all__ = ["VehicleVerdict", "independent_pairs", "judge_fleet", "limit_of"]
 # (Student's t with 4 degrees of freedom, AR(1) 0.6, wrong sigmas; 20,700 nights each, seed 101 of study drift_charts).
 # So they are set for this many times the budget, and the study proves it on other seeds.
 _BOUND_IS_LOOSE = 15.0
-_COMPOSED_WITHIN = (
-    1e-6  # camera_radar is composed of the other two where it is nearer to them than this [rad, m]
-)
+# Camera_radar is composed of the other two where it is nearer to them than this [rad, m].
+_COMPOSED_WITHIN = 1e-6
 
 
 @dataclass(frozen=True, eq=False)

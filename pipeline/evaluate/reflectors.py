@@ -25,9 +25,8 @@ Echoes = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]  # points [m],
 _CLIP_SIGMAS: Final = 3.5
 _FEWEST_FRAMES: Final = 8  # fewer give no standard error worth its name
 _BRIGHT: Final = 0.5  # of the brightest echo near the guess
-_OVER_MEDIAN: Final = (
-    4.0  # bare metal against the median echo of a lot, asphalt; a tripod reaches half of that
-)
+# Bare metal against the median echo of a lot, asphalt; a tripod reaches half of that.
+_OVER_MEDIAN: Final = 4.0
 _CELL_RAD: Final = np.radians(0.1)  # returns of one beam of a standing sensor fall into one cell
 _RANGE_SIGMA_M: Final = 0.02  # of a beam's mean range on a plate: mixed returns, steps of the range counter
 _FACING_SIGMA_RAD: Final = np.radians(

@@ -79,9 +79,8 @@ class TableRow:
     values: tuple[float, ...]  # COLUMNS, NaN where there is none
     accepted_pairs: int | None = None
     pairs: int | None = None
-    independent_loop_deg: float | None = (
-        None  # of pairs estimated apart: a check, where a method closes the loop itself
-    )
+    # Of pairs estimated apart: a check, where a method closes the loop itself.
+    independent_loop_deg: float | None = None
     independent_loop_m: float | None = None
 
 

@@ -68,9 +68,8 @@ class PairEstimate:
     time_offset_sigma_s: float | None = None
     diagnostics: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    common_covariance: np.ndarray | None = (
-        None  # 6 6, what all days of a vehicle err by alike; part of covariance
-    )
+    # 6 6, what all days of a vehicle err by alike; part of covariance.
+    common_covariance: np.ndarray | None = None
     disproved: str = ""  # why it cannot be right, where a check of the solver's shows that
 
 

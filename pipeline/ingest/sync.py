@@ -24,9 +24,8 @@ __all__ = [
 
 _DRIVE_GAP_NS = 10 * 10**9
 _HALF_A_PERIOD = 0.55  # and a tenth for jitter
-_TRIGGERED = (
-    0.8  # length of the gaps' mean on the circle of a period: they scatter by a tenth of it, one sigma
-)
+# Length of the gaps' mean on the circle of a period: they scatter by a tenth of it, one sigma.
+_TRIGGERED = 0.8
 # What is taken for a car that nobody measured, and for others that drive past one that stands.
 _UNKNOWN_MPS, _UNKNOWN_RADPS, _OTHERS_MPS = 40.0, float(np.radians(30.0)), 10.0
 

@@ -19,9 +19,8 @@ from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 __all__ = ["Jumps", "jumps_between_neighbours"]
 
 _NEIGHBOURS: Final = 16  # of a random pattern these reach about 2.3 mean spacings far
-_REACH_STEPS: Final = (
-    4.0  # median distances to the nearest point; beyond, something did not return in between
-)
+# Median distances to the nearest point; beyond, something did not return in between.
+_REACH_STEPS: Final = 4.0
 _ASIDE: Final = 0.5  # a neighbour to one side lies at most this much of its distance to another
 # Axis of (azimuth, elevation) and sign towards the background: azimuth grows to the left, and a foreground that ends
 # at its left lies right of its silhouette.

@@ -78,16 +78,7 @@ def write_day_page(
     method = method or fleet.audit.method
     if read is None:
         read = DayRead(day_records(lake, partition, method), drift_of(lake, method, partition.vehicle))
-    records, findings = read.records, read.findings
-    views = [pair_view(records[p]) for p in PAIRS if p in records]
-    before, after = states_of(records) or (None, None)
-    labels = ("prior", _after_label(views))
-    offsets = time_offsets_of(records)
-    drawn, residual_svg, no_pictures = (
-        _pictures(lake, partition, before, after, labels, offsets)
-        if pictures
-        else ([], "", "this page was asked for without pictures")
-    )
+    shown = _content(lake, partition, read, pictures)
     html = render(
         "day.html" if in_use is None else "in_use.html",
         in_use=in_use,
@@ -96,17 +87,7 @@ def write_day_page(
         fleet=fleet.fleet.name,
         fleet_link=fleet_link,
         method=method,
-        environment=next(iter(records.values())).environment,
-        answer=answer_for(views, partition.day, findings),
-        drift=_as_of(findings),
-        pairs=views,
-        labels=labels,
-        scenes=drawn,
-        no_pictures=no_pictures,
-        offsets=offsets.in_words(),
-        sigma_svg=_sigma_svg(records),
-        residual_svg=residual_svg,
-        provenance=_provenance(list(records.values())),
+        **shown,
     )
     return write_page(out, html, files or LocalFiles())
 
@@ -137,6 +118,33 @@ def write_day_picture(
     stamped = as_stamped(after, scene.observation, time_offsets_of(records))
     labels = ("prior", _after_label([pair_view(r) for r in records.values()]))
     return write_picture(out, scene, before, stamped, labels)
+
+
+def _content(lake: Lake, partition: Partition, read: DayRead, pictures: bool) -> dict[str, Any]:
+    """What the records, the findings and the frames of a day tell, by the names that the template uses."""
+    records, findings = read.records, read.findings
+    views = [pair_view(records[p]) for p in PAIRS if p in records]
+    before, after = states_of(records) or (None, None)
+    labels = ("prior", _after_label(views))
+    offsets = time_offsets_of(records)
+    drawn, residual_svg, no_pictures = (
+        _pictures(lake, partition, before, after, labels, offsets)
+        if pictures
+        else ([], "", "this page was asked for without pictures")
+    )
+    return {
+        "environment": next(iter(records.values())).environment,
+        "answer": answer_for(views, partition.day, findings),
+        "drift": _as_of(findings),
+        "pairs": views,
+        "labels": labels,
+        "scenes": drawn,
+        "no_pictures": no_pictures,
+        "offsets": offsets.in_words(),
+        "sigma_svg": _sigma_svg(records),
+        "residual_svg": residual_svg,
+        "provenance": _provenance(list(records.values())),
+    }
 
 
 def _as_of(findings: Sequence[DriftFinding]) -> tuple[str, str]:

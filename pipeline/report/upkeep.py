@@ -184,9 +184,8 @@ class _Jobs(Sequence[DayJob]):
     ) -> None:
         # A worker is sent no vehicle's configuration: a page needs the fleet's name.
         fleet = album.fleet.model_copy(update={"vehicles": {}, "rigs": {}})
-        page = (
-            album.page.absolute() if isinstance(album.page, Path) else album.page
-        )  # a worker may be elsewhere
+        # A worker may be elsewhere.
+        page = album.page.absolute() if isinstance(album.page, Path) else album.page
         lake = album.lake.absolute()
         self._album = Album(lake, fleet, album.method, page, album.files, album.pictures)
         self._days, self._findings = vehicle_days, findings

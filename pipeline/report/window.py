@@ -24,9 +24,8 @@ from schemas.calibrations import CALIBRATIONS, PAIRS, STATUSES
 
 __all__ = ["FEWEST_DAYS", "FleetWindow", "read_window"]
 
-FEWEST_DAYS = (
-    14  # of a vehicle, however far back they lie: as many as its charts reach back to (audit/days.py)
-)
+# Of a vehicle, however far back they lie: as many as its charts reach back to (audit/days.py).
+FEWEST_DAYS = 14
 _MONTHS_BACK = 4  # and no further, as charts do (audit/history.py)
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _COLUMNS = ("status", *_POSE, "covariance", "observable", "code_version")

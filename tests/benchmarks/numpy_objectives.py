@@ -12,7 +12,7 @@ from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP, NO_BOUNDAR
 from pipeline.objective.paper import camera_lidar, camera_radar, lidar_radar
 from pipeline.objective.paper.classes import SKY, camera_at_label_size, labels_of
 from pipeline.objective.radar.registration import RANGE_M, VIEW_MARGIN_RAD
-from pipeline.objective.radar.registration_loops import CUT
+from pipeline.objective.radar.registration_neighbours import CUT
 
 
 def score(terms, at, settings):

@@ -194,9 +194,8 @@ def test_on_the_grid_a_turn_of_the_camera_is_a_shift():
     grid = GridProjection(-0.8, -0.4, np.radians(0.4))
     points = torch.tensor(cloud(3)[:, [0, 1, 2]][None])
     points = points[:, points[0, :, 2] > 0.5]
-    turned = (
-        points @ torch.tensor(se3.exp_so3(np.array([0, 0.05, 0]))).T
-    )  # about the downward axis: to the right
+    # About the downward axis: to the right.
+    turned = points @ torch.tensor(se3.exp_so3(np.array([0, 0.05, 0]))).T
     shift = grid.project(turned)[0] - grid.project(points)[0]
     np.testing.assert_allclose(shift[..., 0], 0.05 / np.radians(0.4), atol=1e-9)
     np.testing.assert_allclose(shift[..., 1], 0, atol=1e-9)

@@ -73,9 +73,8 @@ class _Check:
     margin: float
     reason: str
     disproves: bool = False  # where it fails, the pose is wrong, not only unproved
-    of_sigma: bool = (
-        False  # where it fails, the pose may be as good as its sigma says; that is not good enough
-    )
+    # Where it fails, the pose may be as good as its sigma says; that is not good enough.
+    of_sigma: bool = False
 
 
 def judge(

@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import suppress
@@ -21,9 +22,8 @@ from pipeline.store.remote_logs import LogPath
 
 __all__ = ["CompressedLog", "FetchedLog", "FolderLog"]
 
-_MOST_FETCHED_BYTES = (
-    16 << 30
-)  # of one object: a worker's scratch is no archive. MCAP and .bag have no limit.
+# Of one object: a worker's scratch is no archive. MCAP and .bag have no limit.
+_MOST_FETCHED_BYTES = 16 << 30
 
 _UNPACKED = "boresight-unpacked-"  # then the process that unpacked it
 _LEFT_BEHIND_S = 86400.0  # longer than any log is open
@@ -77,7 +77,7 @@ class FolderLog:
             log.close()
 
 
-class _CopiedLog:
+class _CopiedLog(ABC):
     """LogReader of a temporary copy of a log, which is gone when it is closed."""
 
     def __init__(self, path: LogPath, cache: ChunkCache) -> None:
@@ -94,9 +94,9 @@ class _CopiedLog:
             raise
         self.damage = self._log.damage
 
+    @abstractmethod
     def _copied(self, folder: Path) -> Path:
         """The copy, put into the folder."""
-        raise NotImplementedError
 
     def timeline(self) -> Timeline | None:
         """See LogReader."""

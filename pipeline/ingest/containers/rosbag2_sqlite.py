@@ -65,9 +65,8 @@ class Db3Log:
         """See LogReader."""
         self.damage.clear()
         if Path(f"{self.path}-wal").exists() and Path(f"{self.path}-wal").stat().st_size:
-            self.damage["write_ahead_log_not_merged"] += (
-                1  # the recorder died: open the bag once with sqlite3 to merge
-            )
+            # The recorder died: open the bag once with sqlite3 to merge.
+            self.damage["write_ahead_log_not_merged"] += 1
         wanted = [i for i, c in self._channels.items() if topics is None or c.topic in topics]
         indexed = within is not None and self._has_time_index()
         found = self._rows_in(wanted, within) if within is not None and indexed else self._rows(wanted)

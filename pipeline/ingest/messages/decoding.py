@@ -20,9 +20,8 @@ __all__ = ["DECODE_ERRORS", "content_without_stamp", "decode", "header_frame_id"
 
 # What malformed bytes make rosbags and numpy raise.
 DECODE_ERRORS = (*READ_ERRORS, struct.error, SerdeError, TypesysError, TypeError, AttributeError, MemoryError)
-_STAMP_END = (
-    12  # CDR: 4 bytes of encapsulation, seconds, nanoseconds; ROS 1: sequence number, seconds, nanoseconds
-)
+# CDR: 4 bytes of encapsulation, seconds, nanoseconds; ROS 1: sequence number, seconds, nanoseconds.
+_STAMP_END = 12
 _SEPARATOR = "=" * 80 + "\n"
 
 

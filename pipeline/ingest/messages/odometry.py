@@ -12,9 +12,8 @@ from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_transl
 
 __all__ = ["EgoState", "EgoTrack"]
 
-_LONGEST_GAP_S = (
-    0.5  # odometry comes at 10 Hz or more; across a longer gap a car's yaw rate is anyone's guess
-)
+# Odometry comes at 10 Hz or more; across a longer gap a car's yaw rate is anyone's guess.
+_LONGEST_GAP_S = 0.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,9 +24,8 @@ _H264_IDR = 5
 _H265_IRAP = range(16, 22)
 # Longest run back to a key frame: ten seconds at 30 Hz, what encoders choose at most unless told otherwise.
 _MOST_PACKETS = 300
-_LOST_PERIODS = (
-    1.7  # between stamps: nearer to two periods than to one, so a picture is missing that others refer to
-)
+# Between stamps: nearer to two periods than to one, so a picture is missing that others refer to.
+_LOST_PERIODS = 1.7
 
 
 def video_codec(format_: str) -> str | None:

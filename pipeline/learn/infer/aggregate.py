@@ -69,9 +69,8 @@ class Answers:
     variance: Float[np.ndarray, "N 6"]  # as the network predicts it
     block: Int[np.ndarray, " N"]  # frames of one block see the same things
     frames: int  # different ones among the N
-    bias_sigma: Float[np.ndarray, " 6"] | None = (
-        None  # (bearing rotation, translation); None: BIAS_SIGMA of the pair
-    )
+    # (bearing rotation, translation); None: BIAS_SIGMA of the pair.
+    bias_sigma: Float[np.ndarray, " 6"] | None = None
 
 
 def twists_about(

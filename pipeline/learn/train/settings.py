@@ -62,9 +62,8 @@ class AugmentConfig(_Section):
 
     rotation_deg: NotNegative = 3.0  # per axis, even
     translation_m: NotNegative = 0.1  # per axis, even
-    small_share: Annotated[float, Field(ge=0, le=1)] = (
-        0.5  # of the frames, moved by u^2 of that with u even in 0..1
-    )
+    # Of the frames, moved by u^2 of that with u even in 0..1.
+    small_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     view_deg: NotNegative = 4.0  # per axis, even; the stored grid must be wider than the network's by as much
 
 
@@ -73,9 +72,8 @@ class TrainConfig(_Section):
 
     architecture: Literal["matching", "concat"] = "matching"
     pairs: Literal["joint", "camera_lidar", "camera_radar", "lidar_radar"] = "joint"
-    cell_deg: Annotated[float, Field(ge=0.1, le=0.5)] = (
-        0.4  # of the network's grid; the data's must be the same
-    )
+    # Of the network's grid; the data's must be the same.
+    cell_deg: Annotated[float, Field(ge=0.1, le=0.5)] = 0.4
     width: Count = 16  # channels of the encoders' first stage
     hidden: Count = 192
     iterations: Annotated[int, Field(ge=1, le=5)] = 1  # passes per frame; losses of all passes are averaged
@@ -89,9 +87,8 @@ class TrainConfig(_Section):
     final_learning_rate: Positive = 3e-7
     adam_betas: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]] = (0.9, 0.999)
     gradient_norm: Positive = 10.0  # longer gradients are cut: single frames can be wild
-    budget_minutes: Positive | None = (
-        None  # in place of epochs: the run ends, and the cosine, after so much time
-    )
+    # In place of epochs: the run ends, and the cosine, after so much time.
+    budget_minutes: Positive | None = None
     # Of the likelihood of each frame's scatter about its day's mean, which teaches the log variances.
     uncertainty_weight: NotNegative = 0.01
     validate_every: Count = 500  # steps

@@ -23,7 +23,7 @@ from pipeline.objective.radar.registration import (
     STRAY,
     VIEW_MARGIN_RAD,
 )
-from pipeline.objective.radar.registration_loops import CUT
+from pipeline.objective.radar.registration_neighbours import CUT
 
 __all__ = ["StaticFrames", "elevation_limits", "static_cost", "tells_elevation"]
 

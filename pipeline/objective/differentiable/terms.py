@@ -32,9 +32,8 @@ __all__ = [
 ]
 
 DEG = 180.0 / torch.pi
-CLASS_CLAMP_DEG = (
-    2 * CLASS_SCALE_RAD * DEG
-)  # the paper loss's robust scale: there its cost is four fifths of all
+# The paper loss's robust scale: there its cost is four fifths of all.
+CLASS_CLAMP_DEG = 2 * CLASS_SCALE_RAD * DEG
 _CLASS_TAU_DEG = 0.1  # of the soft choice of a cluster's class
 EDGE_CLAMP_DEG = 4.0  # evidence: convex to +-4 deg
 # Most jumps match no boundary. What they add to a wide cost biases it (roll by 0.3, yaw by 0.15 deg on a simulated

@@ -81,9 +81,8 @@ def test_distances_and_boundaries_are_angles_from_the_centre_of_the_cell(step_de
     aside = (azimuth > 8) & (elevation > 2.5) & (elevation < 6)
     assert np.abs(found.sky_depth / 10.0 - (elevation - 2.5))[aside].max() < 0.11
     assert (found.sky_depth[elevation < 2.4] == 0).all()
-    upright = (
-        level & (np.abs(azimuth - 5.03) > 0.3) & (np.abs(azimuth + 3.17) > 0.3)
-    )  # pixels make stairs of a side
+    # Pixels make stairs of a side.
+    upright = level & (np.abs(azimuth - 5.03) > 0.3) & (np.abs(azimuth + 3.17) > 0.3)
     assert (found.edge_offset[EDGE_ABOVE][upright] == NO_EDGE).all()
 
 

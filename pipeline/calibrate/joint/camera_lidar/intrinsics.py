@@ -70,9 +70,8 @@ class DayIntrinsics:
     centre_px: Float[np.ndarray, " 2"]
     centre_sigma_px: Float[np.ndarray, " 2"]
     focal_px: tuple[float, float]
-    halves: tuple[
-        DayIntrinsics, ...
-    ] = ()  # of the frames by themselves, where the whole contradicts CameraInfo
+    # Of either half of the frames by itself, where the whole contradicts CameraInfo.
+    halves: tuple[DayIntrinsics, ...] = ()
 
     def diagnostics(self, known: CameraPrior) -> dict[str, float]:
         """Numbers of the record; `mounting_*` is what the principal point leaves open in the camera's turn."""

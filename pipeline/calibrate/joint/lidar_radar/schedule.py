@@ -36,9 +36,8 @@ class Schedule:
     dt_scans: Mapping[int, float] = field(default_factory=lambda: MappingProxyType({4: 1.5, 8: 0.8, 11: 0.5}))
     dt_scan_step_m: float = 0.25  # of way driven ...
     dt_compare_step_m: float = 0.2  # ... and when solutions are compared at other time offsets
-    dt_dip_steps: int = (
-        6  # to each side, whose median a dip is measured against: 1.5 m of way, sharp sigmas reach 0.5
-    )
+    # To each side, whose median a dip is measured against: 1.5 m of way, sharp sigmas reach 0.5.
+    dt_dip_steps: int = 6
     least_scan_speed_mps: float = 8.0  # slower cars need no finer steps of time
 
     # Last steps, with all detections.
