@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jobs.frame_options import FrameOptions
+
 if TYPE_CHECKING:
     from pipeline.config import FleetConfig
     from pipeline.in_use.axes import AxisCheck
@@ -24,13 +26,15 @@ _FRAMES = 60
 def verify(
     *logs: Path,
     fleet: Path,
-    calibration: Path | None = None,
+    calibration: str | None = None,
+    lake: str | None = None,
     vehicle: str | None = None,
     camera_lidar_deg: float = 0.5,
     radar_deg: float = 1.0,
     frames: int = _FRAMES,
     page: Path | None = None,
     json: bool = False,
+    named: FrameOptions | None = None,
 ) -> int:
     """Check the calibration in use against one log: per pair and axis pass, warn, fail or inconclusive.
 
@@ -39,29 +43,42 @@ def verify(
     Args:
         logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of one drive.
         fleet: fleet.toml: topics, and from where on an error matters ([verify]).
-        calibration: what the car uses, as JSON {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}; default: the prior that
-            fleet.toml names (tf_static of the log, or its file).
+        calibration: what the car uses: JSON {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}, FORMAT:FILE[,FILE] of
+            `boresight export`, or of a lake [VEHICLE@]DAY or state; default: the prior that fleet.toml names
+            (tf_static of the log, or its file).
+        lake: folder of the tables, where the calibration is one of its days or a state.
         vehicle: whose rig the log is of; default: the only one of fleet.toml.
         camera_lidar_deg: an error of this size must not go unseen: a pass says that it would have failed.
         radar_deg: the same for pairs with the radar.
         frames: how many of the log to look at.
         page: HTML page with pictures of both calibrations.
         json: print every axis as one JSON object on stdout, and nothing else.
+        named: what the frames are called in the calibration's files.
     """
+    from tempfile import TemporaryDirectory
+
     from jobs.terminal.summary import print_json, print_summary, progress_reporter
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.extrinsics.prior import require_named_files
     from pipeline.in_use.axes import answer_of
+    from pipeline.store.partitions import Lake
 
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the car")
     config = load_fleet(fleet)
     name = _vehicle(config, vehicle)
-    config = _for_one_look(config, name, calibration, frames)
-    require_named_files(config)
-    with progress_reporter(f"verify {name}") as progress:
-        checks, reason = _checked(config, name, logs, (camera_lidar_deg, radar_deg), page, progress)
+    with TemporaryDirectory(prefix="boresight-verify-") as folder:
+        config = _for_one_look(config, frames)
+        if calibration is not None:
+            in_use = _as_prior(Path(folder), calibration, lake, name, named or FrameOptions())
+            config = config.with_prior_file(name, in_use)
+        require_named_files(config)
+        tables = Lake.at(Path(folder) / "lake")
+        with progress_reporter(f"verify {name}") as progress:
+            checks, reason = _checked(
+                config, tables, name, logs, (camera_lidar_deg, radar_deg), page, progress
+            )
     answer = answer_of(checks)
     told = [_told(c) for c in checks]
     if json:
@@ -83,21 +100,30 @@ def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
     return next(iter(config.vehicles))
 
 
-def _for_one_look(config: FleetConfig, vehicle: str, calibration: Path | None, frames: int) -> FleetConfig:
-    """Few frames, spread over the log; every pair is estimated; the calibration in use is the prior."""
-    from pipeline.extrinsics.prior import read_transforms
-
-    changed = config.changed(
+def _for_one_look(config: FleetConfig, frames: int) -> FleetConfig:
+    """Few frames, spread over the log; every pair is estimated."""
+    return config.changed(
         ingest={"max_frames": frames}, select={"frames": frames}, trigger={"when": "always"}
     )
-    if calibration is None:
-        return changed
-    read_transforms(calibration)  # raises before the first log is opened
-    return changed.with_prior_file(vehicle, calibration)
+
+
+def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, named: FrameOptions) -> Path:
+    """What `--calibration` names, as a prior file; raises before the first log is opened."""
+    from jobs.calibration_sources import read_side
+    from pipeline.errors import ConfigError
+    from pipeline.export.files import prior_text
+
+    side = read_side(calibration, lake, vehicle, "joint", named.names())
+    for pair, why in side.missing.items():
+        raise ConfigError(side.title, pair, f"no transform to verify: {why}")
+    file = folder / "in_use.json"
+    file.write_bytes(prior_text({pair: p.T for pair, p in side.pairs.items()}, side.title, [calibration]))
+    return file
 
 
 def _checked(
     config: FleetConfig,
+    lake: Lake,
     vehicle: str,
     logs: tuple[Path, ...],
     asked_deg: tuple[float, float],
@@ -105,17 +131,14 @@ def _checked(
     progress: Progress,
 ) -> tuple[list[AxisCheck], str]:
     """Every axis of every pair, and why there is none where the log could not be used at all."""
-    from tempfile import TemporaryDirectory
-
     from pipeline.in_use.axes import check_axes, limits_of
-    from pipeline.store.partitions import Lake, Partition
+    from pipeline.store.partitions import Partition
 
-    with TemporaryDirectory(prefix="boresight-verify-") as folder:
-        lake, partition = Lake.at(folder), Partition(vehicle, _DAY)
-        records = _records(config, lake, partition, logs, progress)
-        checks = [c for r in records for c in check_axes(r, limits_of(r.pair, config.verify, asked_deg))]
-        if page is not None:
-            _write_page(config, lake, partition, checks, page)
+    partition = Partition(vehicle, _DAY)
+    records = _records(config, lake, partition, logs, progress)
+    checks = [c for r in records for c in check_axes(r, limits_of(r.pair, config.verify, asked_deg))]
+    if page is not None:
+        _write_page(config, lake, partition, checks, page)
     reasons = {r.reason for r in records if r.status == "refused"}
     return checks, "; ".join(sorted(reasons))
 

@@ -2,10 +2,14 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
 from jobs.cli import main
+from jobs.frame_options import FrameOptions
+from jobs.verify import _as_prior
+from pipeline.extrinsics.prior import read_transforms
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from tests.makers.simulated_days import simulated_day
 
@@ -65,11 +69,25 @@ def test_a_log_with_a_few_frames_is_inconclusive_with_the_reason(car, tmp_path, 
     assert "frames" in answer["reason"]
 
 
+def test_a_calibration_in_the_format_of_another_program_becomes_the_prior(tmp_path):
+    T = {"camera_lidar": np.eye(4), "lidar_radar": np.eye(4)}
+    T["camera_lidar"][:3] = from_rotation_translation(exp_so3(np.array([0.1, -0.2, 0.3])), np.arange(3.0))[:3]
+    file = tmp_path / "in_use.yaml"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for pair, matrix in T.items():
+        storage.write(f"T_{pair}", matrix)
+    storage.release()
+    prior = read_transforms(_as_prior(tmp_path, f"opencv:{file}", None, "car", FrameOptions()))
+    for pair, matrix in T.items():
+        np.testing.assert_allclose(prior[pair], matrix, atol=1e-12)
+
+
 def test_nonsense_is_refused_before_a_log_is_opened(car, tmp_path, capsys):
     fleet = car[0]
     (tmp_path / "empty.json").write_text("{}")
     calls = {
         "T_camera_lidar": ["no.mcap", "--calibration", str(tmp_path / "empty.json")],
+        "needs --lake": ["no.mcap", "--calibration", "2026-03-02"],
         "unknown vehicle": ["no.mcap", "--vehicle", "nobody"],
         "name at least one log": [],
     }
