@@ -98,9 +98,11 @@ def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
     partition = task.partition
     if page is not None:
         from pipeline.report.frame import write_frame_page
+        from pipeline.report.reading import scene_of
 
         title = f"{partition.vehicle}, {partition.day}, frame {found.frame.frame_index}"
-        write_frame_page(page, found.frame, found.observation, found.prior, found.solution, title)
+        scene = scene_of(found.frame, found.observation, task.fleet.report)
+        write_frame_page(page, scene, found.prior, found.solution, title)
     estimates = {
         pair: {
             "T": estimate.T,

@@ -28,6 +28,7 @@ from pipeline.sections import (
     LearnConfig,
     PerceiveConfig,
     PrepareConfig,
+    ReportConfig,
     SelectConfig,
     SolveConfig,
     TriggerConfig,
@@ -42,6 +43,7 @@ __all__ = [
     "LearnConfig",
     "PerceiveConfig",
     "PrepareConfig",
+    "ReportConfig",
     "SelectConfig",
     "SolveConfig",
     "TriggerConfig",
@@ -80,6 +82,7 @@ class FleetConfig(Section):
     prepare: PrepareConfig = PrepareConfig()
     learn: LearnConfig = LearnConfig()
     audit: AuditConfig = AuditConfig()
+    report: ReportConfig = ReportConfig()
     _file: Path = PrivateAttr(default=Path("fleet.toml"))  # no value of the file: never dumped, never hashed
 
     @model_validator(mode="after")

@@ -16,6 +16,7 @@ __all__ = [
     "LearnConfig",
     "PerceiveConfig",
     "PrepareConfig",
+    "ReportConfig",
     "SelectConfig",
     "SolveConfig",
     "TriggerConfig",
@@ -224,6 +225,13 @@ class LearnConfig(Section):
     )
     iterations: Annotated[int, Field(ge=1, le=5)] = 3  # passes per frame, each rendered at the one before
     threads: Annotated[int, Field(ge=1)] = 1
+
+
+class ReportConfig(Section):
+    """What pages show."""
+
+    # "hidden": people and vehicles in mosaic, as far as perception found them, faces and number plates with them.
+    road_users: Literal["shown", "hidden"] = "shown"
 
 
 class AuditConfig(Section):

@@ -26,6 +26,7 @@ from pipeline.report.reading import (
 )
 from pipeline.report.residuals import frame_residuals
 from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
+from pipeline.sections import ReportConfig
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import PAIRS, CalibrationRecord
@@ -78,7 +79,7 @@ def write_day_page(
     method = method or fleet.audit.method
     if read is None:
         read = DayRead(day_records(lake, partition, method), drift_of(lake, method, partition.vehicle))
-    shown = _content(lake, partition, read, pictures)
+    shown = _content(lake, partition, read, fleet.report if pictures else None)
     html = render(
         "day.html" if in_use is None else "in_use.html",
         in_use=in_use,
@@ -114,13 +115,15 @@ def write_day_picture(
         problem = f"{partition.vehicle} has no frame with a prior on {partition.day}"
         raise ConfigError("command line", "picture", problem)
     before, after = states
-    scene = scenes_among(lake, partition, spread, after.T_camera_lidar, 1)[0]
+    scene = scenes_among(lake, partition, spread, after.T_camera_lidar, 1, fleet.report)[0]
     stamped = as_stamped(after, scene.observation, time_offsets_of(records))
     labels = ("prior", _after_label([pair_view(r) for r in records.values()]))
     return write_picture(out, scene, before, stamped, labels)
 
 
-def _content(lake: Lake, partition: Partition, read: DayRead, pictures: bool) -> dict[str, Any]:
+def _content(
+    lake: Lake, partition: Partition, read: DayRead, pictures: ReportConfig | None
+) -> dict[str, Any]:
     """What the records, the findings and the frames of a day tell, by the names that the template uses."""
     records, findings = read.records, read.findings
     views = [pair_view(records[p]) for p in PAIRS if p in records]
@@ -128,8 +131,8 @@ def _content(lake: Lake, partition: Partition, read: DayRead, pictures: bool) ->
     labels = ("prior", _after_label(views))
     offsets = time_offsets_of(records)
     drawn, residual_svg, no_pictures = (
-        _pictures(lake, partition, before, after, labels, offsets)
-        if pictures
+        _pictures(lake, partition, before, after, labels, offsets, pictures)
+        if pictures is not None
         else ([], "", "this page was asked for without pictures")
     )
     return {
@@ -167,12 +170,13 @@ def _pictures(
     after: Extrinsics | None,
     labels: tuple[str, str],
     offsets: TimeOffsets,
+    config: ReportConfig,
 ) -> tuple[list[Any], Any, str]:
     """Pictures, residuals, and why there are none; `after` is drawn with the day's time offsets, `before` had none."""
     if before is None or after is None:
         return [], "", "the records carry no prior"
     try:
-        return _drawn(lake, partition, before, after, labels, offsets)
+        return _drawn(lake, partition, before, after, labels, offsets, config)
     except DamagedError as err:
         lake.damage.append(str(err))
         return [], "", "the day's frames or observations cannot be read"
@@ -185,6 +189,7 @@ def _drawn(
     after: Extrinsics,
     labels: tuple[str, str],
     offsets: TimeOffsets,
+    config: ReportConfig,
 ) -> tuple[list[Any], Any, str]:
     """Pictures, residuals, and why there are none.
 
@@ -197,7 +202,7 @@ def _drawn(
     if not spread:
         return [], "", "no frame of the day could be used"
     residuals = residual_figure(*frame_residuals(spread, (before, after), (TimeOffsets(), offsets)))
-    scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, _SCENES)
+    scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, _SCENES, config)
     pictures = [
         scene_pictures([s], before, as_stamped(after, s.observation, offsets), labels)[0] for s in scenes
     ]

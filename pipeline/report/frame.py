@@ -13,30 +13,24 @@ from pipeline.report.overlays import Extrinsics, Scene, whole_view
 from pipeline.report.page import render, write_page
 from pipeline.report.pictures import close_ups_of
 from schemas.calibrations import DOF_NAMES, PAIRS
-from schemas.frames import Frame
-from schemas.observations import Observation
 
 __all__ = ["write_frame_page"]
 
 _LABELS = ("before", "from this frame")
 
 
-def write_frame_page(
-    path: Path, frame: Frame, observation: Observation, prior: Prior, solution: Solution, title: str
-) -> Path:
+def write_frame_page(path: Path, scene: Scene, prior: Prior, solution: Solution, title: str) -> Path:
     """Write pictures at the prior and at the solution, and how sure one frame is of each pair.
 
     Args:
         path: the HTML file.
-        frame: what was calibrated from.
-        observation: what perception found in it; only drawn.
+        scene: what was calibrated from, and what perception found in it.
         prior: start.
         solution: result.
         title: vehicle, day and frame.
     """
     before = Extrinsics(*(prior.of(pair) for pair in PAIRS))
     after = Extrinsics(*(solution.pairs[pair].T for pair in PAIRS))
-    scene = Scene(frame, observation)
     views = [
         {
             "label": label,

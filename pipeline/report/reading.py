@@ -9,7 +9,9 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.report.overlays import Extrinsics, Scene
+from pipeline.report.privacy import without_road_users
 from pipeline.report.scenes import choose_frames
+from pipeline.sections import ReportConfig
 from pipeline.store.current import current_drift, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import last_day, read_latest, read_records
@@ -25,6 +27,7 @@ __all__ = [
     "fleet_records",
     "has_frames",
     "records_of_day",
+    "scene_of",
     "scenes_among",
     "spread_observations",
     "states_of",
@@ -121,18 +124,26 @@ def spread_observations(lake: Lake, partition: Partition) -> list[Observation]:
     return [found[i] for i in some]
 
 
+def scene_of(frame: Frame, observation: Observation, config: ReportConfig) -> Scene:
+    """A frame to be drawn, its road users hidden where the fleet wants that."""
+    is_hidden = config.road_users == "hidden"
+    return Scene(without_road_users(frame, observation) if is_hidden else frame, observation)
+
+
 def scenes_among(
     lake: Lake,
     partition: Partition,
     observations: Sequence[Observation],
     T_camera_lidar: np.ndarray,
     count: int,
+    config: ReportConfig,
 ) -> list[Scene]:
     """Frames with much to see, spread over the given observations, read from the lake."""
     chosen = [observations[i] for i in choose_frames(observations, T_camera_lidar, count)]
     rows = [o.frame_index for o in chosen]
     frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
-    return [Scene(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
+    there = [(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
+    return [scene_of(f, o, config) for f, o in there]
 
 
 def _extrinsics(pairs: Mapping[str, np.ndarray]) -> Extrinsics:

@@ -141,7 +141,8 @@ def stamp_of(album: Album, work_keys: Iterable[str], findings: Sequence[DriftFin
     """
     stored = status_of(findings)
     moved = [stored.sensor, stored.since] if stored.status == "RED" else None
-    settings = {"pictures": album.pictures, "link": album.page.name, "code": CODE_VERSION}
+    shown = album.fleet.report.model_dump() if album.pictures else None
+    settings = {"pictures": shown, "link": album.page.name, "code": CODE_VERSION}
     return config_hash({"keys": sorted(work_keys), "moved": moved, **settings})
 
 

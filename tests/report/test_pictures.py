@@ -1,6 +1,6 @@
 """The pictures: what is drawn where, on a made scene with one pole."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import cv2
@@ -19,8 +19,10 @@ from pipeline.report.overlays import (
     front_view,
     whole_view,
 )
+from pipeline.report.reading import scene_of
 from pipeline.report.residuals import MEASURES, boundary_distance_px, frame_residuals
 from pipeline.report.scenes import choose_frames, choose_windows
+from pipeline.sections import ReportConfig
 from schemas.frames import Frame
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
@@ -179,3 +181,29 @@ def test_the_pole_is_chosen_as_a_window_and_empty_frames_as_none(scene: Scene) -
 
 def test_the_camera_of_a_row_is_the_rows(scene: Scene) -> None:
     assert camera_of(scene.frame).focal_px == (FOCAL, FOCAL)
+
+
+def test_road_users_are_hidden_and_nothing_else():
+    scene, rng = _scene(), np.random.default_rng(5)
+    image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    labels = np.full((HEIGHT, WIDTH), 2, np.uint8)
+    labels[100:160, 50:80] = 11  # a person
+    box = np.array([[200.0, 120.0, 260.0, 160.0]], np.float32)  # a car that only the detector saw
+    frame = replace(scene.frame, image=cv2.imencode(".png", image)[1].tobytes())
+    observation = replace(
+        scene.observation, labels_png=cv2.imencode(".png", labels)[1].tobytes(), road_user_boxes_px=box
+    )
+    shown = decode_image(scene_of(frame, observation, ReportConfig()).frame)
+    hidden = decode_image(scene_of(frame, observation, ReportConfig(road_users="hidden")).frame)
+    np.testing.assert_array_equal(shown, image)
+    for rows, columns in ((slice(100, 160), slice(50, 80)), (slice(120, 160), slice(200, 260))):
+        assert len(np.unique(hidden[rows, columns].reshape(-1, 3), axis=0)) < 0.02 * image[rows, columns].size
+    far = np.ones((HEIGHT, WIDTH), bool)
+    far[90:170, 40:90] = far[110:170, 190:270] = False
+    np.testing.assert_array_equal(hidden[far], image[far])
+
+
+def test_what_is_no_picture_is_not_shown_where_road_users_are_hidden():
+    scene = _scene()
+    broken = replace(scene.frame, image=b"no picture")
+    assert scene_of(broken, scene.observation, ReportConfig(road_users="hidden")).frame.image == b""
