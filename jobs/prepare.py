@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from pipeline.config import FleetConfig
     from pipeline.learn.prepare.inventory import Inventory
+    from pipeline.learn.prepare.sides import Choice
     from pipeline.results import Outcome
     from pipeline.store.partitions import Lake, Partition
     from pipeline.work import Task
@@ -31,6 +32,8 @@ def prepare(
 ) -> int:
     """Make table training: what a network learns from, split so that no vehicle, day or place is on two sides.
 
+    Prints what the split costs, and what splitting by less would cost ([prepare] split_by).
+
     Args:
         fleet: fleet.toml; its section prepare says how finely and how the frames are split.
         lake: folder of the tables, with frames and observations.
@@ -40,6 +43,9 @@ def prepare(
         executor: process (a pool) or inline (one after the other in this process).
         workers: processes at a time; default: one per CPU that this process may use.
     """
+    from dataclasses import asdict
+
+    from jobs.terminal.split_table import print_choices
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
     from pipeline.config import load_fleet
     from pipeline.learn.prepare.inventory import take_inventory, write_inventory
@@ -47,11 +53,13 @@ def prepare(
 
     config, tables = load_fleet(fleet), Lake.existing(lake)
     days = _days(config, tables, from_day, to_day, vehicles)
-    results = _run(_plan(config, tables, days), executor, workers)
+    planned, choices = _plan(config, tables, days)
+    results = _run(planned, executor, workers)
     with progress_reporter("inventory") as progress:
         progress(0, 0, "compare views")
         inventory = take_inventory(tables, config.prepare.duplicate_bits)
-    path = write_inventory(tables, inventory, _about(config))
+    path = write_inventory(tables, inventory, _about(config) | {"choices": [asdict(c) for c in choices]})
+    print_choices(choices)
     statuses = [r.status for r in results] + (["held"] if _empty_sides(config, inventory) else [])
     code = exit_code(statuses)
     print_summary(
@@ -62,6 +70,7 @@ def prepare(
         frames=inventory.frames,
         environments=inventory.environments,
         rejected=inventory.rejected,
+        choices=[asdict(c) for c in choices],
         leaks=len(inventory.leaks),
         problems=_problems(config, results, inventory),
         manifest=path,
@@ -98,9 +107,10 @@ def _days(
     return days
 
 
-def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> list[Task]:
-    """Look over all days and divide them; each worker gets the keys of its own day."""
+def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> tuple[list[Task], list[Choice]]:
+    """Look over all days and divide them; each worker gets the keys of its own day. And what each choice costs."""
     from jobs.terminal.summary import progress_reporter
+    from pipeline.learn.prepare.sides import price_choices
     from pipeline.learn.prepare.split import SplitPlan, Unit
     from pipeline.learn.prepare.stage import decided_sides
     from pipeline.learn.prepare.survey import plan_days, survey_day
@@ -118,7 +128,7 @@ def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> list[Ta
         keys = {k for place in set(survey.place) for k in Unit(day.vehicle, day.day, place).keys(plan.by)}
         own = SplitPlan(plan.by, {k: plan.sides[k] for k in keys & plan.sides.keys()})
         work.append(Task(config, lake, day, given=own))
-    return work
+    return work, price_choices(surveys, plan, config.prepare)
 
 
 def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outcome]:

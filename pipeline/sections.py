@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, get_args
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from pipeline.rigs import Positive, Section
 from schemas.calibrations import METHODS
@@ -147,6 +147,7 @@ class PrepareConfig(Section):
     max_frames: Annotated[int, Field(gt=0)] | None = None  # per vehicle-day, evenly spread; None = all
     # A frame that the vehicle hardly moved for says nothing new.
     min_step_m: Annotated[float, Field(ge=0)] = 0.5
+    # What no two sides share; in fleet.toml also one word: "vehicle", "day", "place" or "all".
     split_by: tuple[Literal["vehicle", "day", "place"], ...] = ("vehicle", "day", "place")
     val_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     test_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
@@ -158,6 +159,13 @@ class PrepareConfig(Section):
     # Of 256 fingerprint bits: fewer differ = same view.
     duplicate_bits: Annotated[int, Field(ge=0, le=128)] = 16
     seed: Annotated[int, Field(ge=0)] = 0
+
+    @field_validator("split_by", mode="before")
+    @classmethod
+    def _one_word_will_do(cls, value: object) -> object:
+        if value == "all":
+            return ("vehicle", "day", "place")
+        return (value,) if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _splits_make_sense(self) -> PrepareConfig:

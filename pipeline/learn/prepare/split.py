@@ -1,8 +1,8 @@
 """Which frames train, validate and test a network: no vehicle, day or place on two sides.
 
 Frames are linked by what they share. Where the links leave separate groups, whole groups are dealt out and no frame is
-lost. Where everything hangs together (every vehicle drives every day), vehicles and days are divided each for itself,
-every place goes to the side that has most of it, and a frame counts only where all of its keys agree.
+lost. Where everything hangs together (every vehicle drives every day), vehicles, days and places are divided so that
+the sides that come out are worth most (`search`), and a frame counts only where all of its keys agree.
 
 What an earlier run decided stays decided: a lake grows, and a frame that tested one network must not train the next.
 """
@@ -14,6 +14,10 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+from jaxtyping import Bool, Int
+
+from pipeline.learn.prepare.search import Cut, search_sides
 from schemas.training import SPLITS
 
 __all__ = ["SplitPlan", "Unit", "environment_of_speeds", "plan_split"]
@@ -70,11 +74,10 @@ def plan_split(
     """
     shares = {TRAIN: 1 - val_fraction - test_fraction, VAL: val_fraction, TEST: test_fraction}
     shares = {side: share for side, share in shares.items() if share > 0}
-    known = {key: side for key, side in (decided or {}).items() if key[0] in by}
-    groups = _linked(units, by)
-    if len(groups) >= len(shares) and all(len(_decided(g, by, known)) <= 1 for g in groups):
-        return SplitPlan(tuple(by), known | _deal_groups(groups, by, shares, seed, known))
-    return SplitPlan(tuple(by), known | _divide_keys(units, by, shares, seed, known))
+    units = sorted(units, key=lambda u: (u.vehicle, u.day, u.place))
+    known = {key: side for key, side in (decided or {}).items() if key[0] in by and side in shares}
+    dealt = _deal_groups(_linked(units, by), by, shares, seed, known)
+    return SplitPlan(tuple(by), known | _searched(units, by, shares, seed, known, dealt))
 
 
 def environment_of_speeds(speeds_mps: Sequence[float | None]) -> str:
@@ -121,9 +124,9 @@ def _deal_groups(
     sides: dict[tuple[str, str], str] = {}
     free = []
     for group in groups:
-        earlier = _decided(group, by, known)
+        earlier = Counter(known[key] for unit in group for key in unit.keys(by) if key in known)
         if earlier:
-            _assign(group, by, earlier.pop(), sides, have)
+            _assign(group, by, max(SPLITS, key=lambda side: earlier[side]), sides, have)
         else:
             free.append(group)
     free.sort(key=lambda g: (-sum(u.frames for u in g), _rank(min(u.keys(by)[0] for u in g), seed)))
@@ -133,10 +136,6 @@ def _deal_groups(
         lacks = {side: shares[side] * total - have[side] for side in open_to}
         _assign(group, by, max(open_to, key=lambda s: lacks[s]), sides, have)
     return sides
-
-
-def _decided(group: Sequence[Unit], by: Sequence[str], known: Mapping[tuple[str, str], str]) -> set[str]:
-    return {known[key] for unit in group for key in unit.keys(by) if key in known}
 
 
 def _assign(
@@ -152,70 +151,39 @@ def _assign(
             sides[key] = side
 
 
-def _divide_keys(
+def _searched(
     units: Sequence[Unit],
     by: Sequence[str],
     shares: Mapping[str, float],
     seed: int,
     known: Mapping[tuple[str, str], str],
+    dealt: Mapping[tuple[str, str], str],
 ) -> dict[tuple[str, str], str]:
-    """Vehicles and days each for itself, then places by majority; places by quota where they stand alone."""
-    drawn = [kind for kind in by if kind != "place"] or ["place"]
-    values = {kind: sorted({getattr(u, kind) for u in units}) for kind in drawn}
-    divisible = [kind for kind in drawn if len(values[kind]) > 1]
-    sides: dict[tuple[str, str], str] = {}
-    for kind in drawn:
-        quota = _share_per_kind(shares, max(1, len(divisible)))
-        sides |= _draw(kind, values[kind], quota if kind in divisible else {TRAIN: 1.0}, seed, known)
-    if "place" in by and "place" not in drawn:
-        sides |= _majorities(units, drawn, sides | dict(known), known)
-    return sides
+    """Sides of all keys by search from two starts: whole groups dealt out, and everything on the first side."""
+    if not units:
+        return {}
+    names = list(shares)
+    number = {key: i for i, key in enumerate(dealt)}
+    keys = np.array([[number[key] for key in unit.keys(by)] for unit in units])
+    fixed = np.array([key in known for key in number])
+    own = _without_riders(keys, fixed)
+    merged, of_unit = np.unique(own, axis=0, return_inverse=True)
+    frames = np.bincount(of_unit.reshape(-1), [u.frames for u in units]).astype(np.int64)
+    groups = np.array([names.index(known.get(key, side)) for key, side in dealt.items()])
+    cut = Cut(merged, frames, np.array([shares[name] for name in names]), fixed)
+    sides = search_sides(cut, [groups, np.where(fixed, groups, 0)], seed)
+    for unit, kept in zip(keys, own, strict=True):  # riders go where the rest of their unit goes
+        sides[unit[kept < 0]] = sides[unit[kept >= 0][0]]
+    return {key: names[sides[i]] for key, i in number.items()}
 
 
-def _share_per_kind(shares: Mapping[str, float], kinds: int) -> dict[str, float]:
-    """Shares of each of several independent draws, so that what all of them agree on has the wanted shares."""
-    roots = {side: share ** (1 / kinds) for side, share in shares.items()}
-    return {side: r / sum(roots.values()) for side, r in roots.items()}
-
-
-def _draw(
-    kind: str,
-    values: Sequence[str],
-    shares: Mapping[str, float],
-    seed: int,
-    known: Mapping[tuple[str, str], str],
-) -> dict[tuple[str, str], str]:
-    """Deal values in an order that only their names and the seed decide."""
-    have = Counter(known[kind, v] for v in values if (kind, v) in known)
-    free = sorted((v for v in values if (kind, v) not in known), key=lambda v: _rank((kind, v), seed))
-    sides = {}
-    for position, value in enumerate(free):
-        empty = [side for side in shares if not have[side]]
-        open_to = empty if len(empty) >= len(free) - position else list(shares)
-        side = max(open_to, key=lambda s: shares[s] * len(values) - have[s])
-        sides[kind, value] = side
-        have[side] += 1
-    return sides
-
-
-def _majorities(
-    units: Sequence[Unit],
-    by: Sequence[str],
-    sides: Mapping[tuple[str, str], str],
-    known: Mapping[tuple[str, str], str],
-) -> dict[tuple[str, str], str]:
-    """Each place to the side that would lose most without it, as a share of what that side has."""
-    frames: dict[str, Counter[str]] = defaultdict(Counter)
-    for unit in units:
-        side = SplitPlan(tuple(by), sides).side_of(unit.vehicle, unit.day, unit.place)
-        if side is not None:
-            frames[unit.place][side] += unit.frames
-    total: Counter[str] = sum(frames.values(), Counter())
-    return {
-        ("place", place): max(SPLITS, key=lambda s: count[s] / total[s] if total[s] else 0.0)
-        for place, count in frames.items()
-        if ("place", place) not in known
-    }
+def _without_riders(keys: Int[np.ndarray, "N K"], known: Bool[np.ndarray, " M"]) -> Int[np.ndarray, "N K"]:
+    """Keys of each unit, -1 for those that no other unit has and nobody decided: they follow; one key stays."""
+    alone = (np.bincount(keys.ravel(), minlength=len(known)) == 1) & ~known
+    out = np.where(alone[keys], -1, keys)
+    nothing = (out < 0).all(axis=1)
+    out[nothing, 0] = keys[nothing, 0]
+    return out
 
 
 def _rank(key: tuple[str, str], seed: int) -> str:

@@ -16,6 +16,7 @@ from pipeline.config import PrepareConfig, config_hash
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import prior_key, read_prior
+from pipeline.learn.prepare.sides import frame_sides
 from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import Survey, survey_day
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
@@ -54,7 +55,7 @@ def work(task: Task) -> Work:
     config, plan, vehicle = task.fleet.prepare, task.given, task.partition.vehicle
     prior = task.fleet.rig_of(vehicle).prior
     survey = survey_day(task.partition, task.lake, config)
-    sides, rejected = _sides(survey, plan, config)
+    sides, rejected = frame_sides(survey, plan, config)
     settings = {"prior_file": prior_key(task.fleet, vehicle), "sides": [s or "" for s in sides]}
     about = _about(survey, task.fleet.vehicles[vehicle].rig, sides)
     extra = {
@@ -128,36 +129,6 @@ def _logged_prior(observation: Observation) -> np.ndarray:
     names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     pairs = ("camera_lidar", "lidar_radar")
     return np.array([getattr(observation, f"prior_{p}_{n}") for p in pairs for n in names], np.float64)
-
-
-def _sides(survey: Survey, plan: SplitPlan, config: PrepareConfig) -> tuple[list[str | None], Counter[str]]:
-    """Side of each frame, None where it is left out, and how many are left out by reason."""
-    vehicle, day = survey.partition.vehicle, survey.partition.day
-    sides = np.array([plan.side_of(vehicle, day, place) or "" for place in survey.place])
-    reasons = np.full(len(sides), "", object)
-    reasons[sides == ""] = SampleReason.SPLIT_CONFLICT.value
-    reasons[(reasons == "") & _near_other_side(survey, sides, config.guard_s)] = (
-        SampleReason.NEXT_TO_OTHER_SPLIT.value
-    )
-    reasons[~survey.moved] = SampleReason.HARDLY_MOVED.value
-    reasons[~survey.perceived] = SampleReason.NOT_PERCEIVED.value
-    kept = np.flatnonzero(reasons == "")
-    if config.max_frames is not None and len(kept) > config.max_frames:
-        spread = np.linspace(0, len(kept) - 1, config.max_frames).astype(int)
-        reasons[np.setdiff1d(kept, kept[spread])] = SampleReason.NOT_NEEDED.value
-    counts: Counter[str] = Counter(str(r) for r in reasons if r)
-    return [str(s) if not r else None for s, r in zip(sides, reasons, strict=True)], counts
-
-
-def _near_other_side(survey: Survey, sides: np.ndarray, guard_s: float) -> np.ndarray:
-    """True where a frame of the same day on another side is nearer in time than the guard."""
-    near = np.zeros(len(sides), bool)
-    for i, j in itertools.pairwise(range(len(sides))):
-        if sides[i] == sides[j]:
-            continue
-        border = (survey.stamp_s[i] + survey.stamp_s[j]) / 2
-        near |= np.abs(survey.stamp_s - border) < guard_s / 2
-    return near
 
 
 def _sides_given(survey: Survey, plan: SplitPlan) -> list[list[str]]:

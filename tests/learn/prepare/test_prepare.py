@@ -222,7 +222,13 @@ def test_the_job_tells_counts_and_exit_codes(tmp_path, capsys):
     assert (code, told["status"], told["done"], told["cached"]) == (0, "done", 1, 2)
     assert told["frames"] == {"train": 2, "val": 2, "test": 2}
     assert sum(told["environments"]["train"].values()) == 2
+    assert [c["split_by"] for c in told["choices"] if c["chosen"]] == [["vehicle"]]
+    costs = {" ".join(c["split_by"]): c for c in told["choices"]}
+    assert costs["vehicle"]["frames"] == told["frames"]
+    strict = costs["vehicle day place"]  # one day, so all frames on one side
+    assert (strict["frames"], strict["lost"]) == ({"train": 6, "val": 0, "test": 0}, {})
     manifest = json.loads((lake.root / "training" / "manifest.json").read_text())
+    assert manifest["choices"] == told["choices"]
     assert manifest["frames"] == told["frames"]
     assert manifest["settings"]["lidar_points"] == 512 == load_fleet(fleet).prepare.lidar_points
     first = lake.partitions(TRAINING.name)[0]

@@ -1,8 +1,11 @@
 """No vehicle, day or place on two sides, whatever the fleet looks like; and what was decided stays."""
 
+import itertools
+
 import numpy as np
 import pytest
 
+from pipeline.learn.prepare.search import worth
 from pipeline.learn.prepare.split import Unit, environment_of_speeds, plan_split
 from schemas.training import SPLITS
 
@@ -63,6 +66,53 @@ def test_a_fleet_that_hangs_together_is_cut_with_all_sides_alive():
     assert min(counts.values()) > 0
     assert counts["train"] > 2 * max(counts["val"], counts["test"])
     assert sum(counts.values()) < len(units)  # frames between the sides are lost: that is the price
+
+
+def kept(units, assignments):
+    """Frames that each side keeps (n 3) under assignments (n keys) of sides to the units' keys in order."""
+    keys = sorted({key for unit in units for key in unit.keys(ALL)})
+    frames = np.zeros((len(assignments), 3))
+    for unit in units:
+        own = assignments[:, [keys.index(key) for key in unit.keys(ALL)]]
+        for side in range(3):
+            frames[:, side] += unit.frames * (own == side).all(axis=1)
+    return frames
+
+
+def kept_by(plan, units):
+    """The same of one plan (3)."""
+    keys = sorted({key for unit in units for key in unit.keys(ALL)})
+    return kept(units, np.array([[SPLITS.index(plan.sides[key]) for key in keys]]))[0]
+
+
+def test_no_assignment_of_a_small_fleet_is_worth_more_than_the_one_found():
+    rng = np.random.default_rng(3)
+    shares = np.array([0.8, 0.1, 0.1])
+    lossy = 0
+    for _ in range(25):
+        places = rng.integers(0, 3, size=9)
+        met = [(v, d) for v in range(3) for d in range(3) if rng.random() < 0.7] or [(0, 0)]
+        units = [Unit(f"v{v}", f"d{d}", f"p{places[3 * v + d]}", int(rng.integers(1, 9))) for v, d in met]
+        keys = {key for unit in units for key in unit.keys(ALL)}
+        total = sum(u.frames for u in units)
+        every = np.array(list(itertools.product(range(3), repeat=len(keys))))
+        best = max(worth(frames, shares, total) for frames in np.unique(kept(units, every), axis=0))
+        found = kept_by(plan_split(units, ALL, 0.1, 0.1), units)
+        assert worth(found, shares, total) == pytest.approx(best, abs=1e-9)
+        lossy += found.sum() < total
+    assert lossy > 10  # else nothing had to be cut, and dealing out groups would do
+
+
+def test_three_vehicles_on_the_same_two_days_keep_half_of_their_frames_and_all_by_vehicle():
+    units = [
+        Unit(f"v{v}", f"d{d}", f"v{v}/d{d}: {p}", 10) for v in range(3) for d in range(2) for p in range(10)
+    ]
+    strict = kept_by(plan_split(units, ALL, 0.1, 0.1), units)
+    # Two days fill two sides at most; two vehicles on one day and one on the other is the best that there is.
+    assert sorted(strict) == [0, 100, 200]
+    by_vehicle = sides(plan_split(units, ("vehicle",), 0.1, 0.1), units)
+    assert None not in by_vehicle.values()
+    assert set(by_vehicle.values()) == set(SPLITS)
 
 
 def test_one_vehicle_and_day_can_still_be_split_by_place():
