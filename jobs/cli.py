@@ -47,6 +47,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "jobs.train_lidar_semantics:train_lidar_semantics",
         "A small range-image network for lidar points, taught by the camera.",
     ),
+    "models": (
+        "jobs.models:models",
+        "The networks that ship: purpose, licence, size, sha256, command, card.",
+    ),
     "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
     "service": ("jobs.service:service", "Note a repair, a re-mount or a release: charts begin anew."),
     "state": ("jobs.state:state", "What each vehicle should load tonight, with its sigma."),

@@ -26,6 +26,7 @@ FOUNDATIONS = {
     "objective",
     "extrinsics",
     "rigs",
+    "shipped_models",
     "work",
 }
 # Folders of commands.

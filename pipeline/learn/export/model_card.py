@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,10 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
 
 
 def write_card(model: Path, card: dict[str, Any]) -> None:
-    """Write the card beside the model's file, as .json for programs and .md for people."""
+    """Write the card beside the model's file, as .json for programs and .md for people; it tells size and sha256."""
+    content = model.read_bytes()
+    told = {"file": model.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    card = told | {key: value for key, value in card.items() if key not in told}
     model.with_suffix(".json").write_text(json.dumps(card, indent=2, default=str) + "\n")
     model.with_suffix(".md").write_text(_markdown(card))
 

@@ -79,7 +79,7 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
     onnx.checker.check_model(model)
     onnx.save(model, str(unfinished))
     unfinished.replace(out)
-    write_card(out, _card_of(out, network, metadata, card or {}))
+    write_card(out, _card_of(network, metadata, card or {}))
     return out
 
 
@@ -141,12 +141,10 @@ def _metadata(config: NetworkConfig, card: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def _card_of(
-    out: Path, network: CalibrationNetwork, metadata: dict[str, str], card: dict[str, Any]
-) -> dict[str, Any]:
+def _card_of(network: CalibrationNetwork, metadata: dict[str, str], card: dict[str, Any]) -> dict[str, Any]:
     return {
-        "file": out.name,
-        "bytes": out.stat().st_size,
+        "purpose": f"calibration from single frames ({network.config.pairs}): methods joint-ssl and pairwise-ssl",
+        "command": "boresight train, boresight export onnx",
         "parameters": sum(p.numel() for p in network.parameters()),
         "architecture": network.config.architecture,
         "network": json.loads(metadata["network"]),

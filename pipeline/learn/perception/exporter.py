@@ -58,7 +58,7 @@ def export_model(
     )
     onnx.checker.check_model(traced)
     unfinished.replace(model)
-    plain = {"file": model.name, "bytes": model.stat().st_size, "code_version": CODE_VERSION, **card}
+    plain = {"code_version": CODE_VERSION, **card}
     plain["parameters"] = sum(p.numel() for p in graph.module.parameters())
     plain["limits"] = list(limits)
     write_card(model, plain)

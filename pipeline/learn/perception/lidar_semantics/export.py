@@ -16,6 +16,7 @@ from pipeline.learn.perception.lidar_semantics.training import Normal
 __all__ = ["LIMITS", "NAME", "export_sweeps"]
 
 NAME = "lidar_semantics"
+PURPOSE = "classes of lidar points (paper, section 4.2): lidar.semantics of a rig"
 LIMITS = (
     "Learned from the camera's classes through a calibration: it is wrong where either is.",
     "Thin things are taught by their middles only; what the camera never saw, by nothing.",
@@ -32,7 +33,8 @@ def export_sweeps(
         The manifest.
     """
     graph = ExportedGraph(network.eval(), torch.zeros(1, 5, *layout.size), "points", "logits")
-    return export_model(graph, folder, NAME, _manifest(layout, normal), card, LIMITS)
+    told = {"purpose": PURPOSE, "command": "boresight train-lidar-semantics", **card}
+    return export_model(graph, folder, NAME, _manifest(layout, normal), told, LIMITS)
 
 
 def _manifest(layout: SweepLayout, normal: Normal) -> str:

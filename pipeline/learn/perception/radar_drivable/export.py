@@ -16,6 +16,7 @@ from pipeline.learn.perception.radar_drivable.network import DrivableNetwork
 __all__ = ["LIMITS", "NAME", "export_drivable"]
 
 NAME = "radar_drivable"
+PURPOSE = "drivable area of a radar's scan (paper, section 4.2): radar.drivable of a rig"
 LIMITS = (
     "Learned from the lidar's drivable ground through each day's prior: it is wrong where lidar and prior are.",
     "Knows no more radars, roads and weathers than its samples show.",
@@ -43,4 +44,5 @@ def export_drivable(network: DrivableNetwork, folder: Path, card: dict[str, Any]
     network.eval()
     graph = ExportedGraph(_Graph(network), torch.zeros(1, len(CHANNELS), *SHAPE), "features", "drivable")
     layout = "".join(f"{key} = {json.dumps(value)}\n" for key, value in grid_layout().items())
-    return export_model(graph, folder, NAME, f'task = "{NAME}"\n\n[grid]\n{layout}', card, LIMITS)
+    told = {"purpose": PURPOSE, "command": "boresight train-radar-drivable", **card}
+    return export_model(graph, folder, NAME, f'task = "{NAME}"\n\n[grid]\n{layout}', told, LIMITS)
