@@ -15,6 +15,7 @@ from pipeline.learn.network.outputs import Predictions
 from pipeline.learn.sample.layout import PAIRS
 from pipeline.learn.train.augment import Guess, random_guess, turned_view
 from pipeline.learn.train.frame_objective import frame_objective, weighted
+from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.running_mean import DayMeans, uncertainty_loss
 from pipeline.learn.train.semantics_loss import semantics_loss
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
@@ -56,6 +57,7 @@ def batch_loss(
     network: CalibrationNetwork,
     *,
     matched: bool = True,
+    paper: PaperFrames | None = None,
 ) -> StepLoss:
     """The loss of one batch from random guesses.
 
@@ -67,6 +69,7 @@ def batch_loss(
         generator: of everything random here.
         network: of the passes, for its grid.
         matched: whether poses are estimated and judged, or encoders learn classes only.
+        paper: where `loss.definition` is "paper": what its losses are computed from.
     """
     grid = network.config.grid
     guess = random_guess(batch, config.augment, generator)
@@ -79,17 +82,8 @@ def batch_loss(
         semantics = _semantics(answers, view, guess, batch, day_means, network)
         loss = config.loss.semantics * semantics
         return StepLoss(loss, {"loss": loss.detach(), "semantics": semantics.detach()})
-    objective, pairs = frame_objective(batch), PAIRS_OF[config.pairs]
-    total = torch.zeros((), device=batch.T_camera_lidar.device)
-    terms: dict[str, Tensor] = {}
-    for answer in answers:
-        terms = objective.terms(
-            guess.unturned(answer.T_camera_lidar),
-            guess.unturned(answer.T_camera_radar),
-            answer.T_lidar_radar,
-            pairs,
-        )
-        total = total + weighted(terms, config.loss, pairs).mean() / len(answers)
+    pairs = PAIRS_OF[config.pairs]
+    total, terms = _alignment(answers, guess, batch, config, paper)
     semantics = _semantics(answers, view, guess, batch, day_means, network)
     uncertainty, scatter = _uncertainty(answers[-1], guess, batch, day_means)
     loss = total + config.loss.semantics * semantics + config.uncertainty_weight * uncertainty
@@ -98,6 +92,31 @@ def batch_loss(
     report |= {"uncertainty": uncertainty.detach()}
     report |= {f"scatter_deg/{pair}": scatter[i] * _DEG for i, pair in enumerate(PAIRS) if pair in pairs}
     return StepLoss(loss, report)
+
+
+def _alignment(
+    answers: list[Predictions],
+    guess: Guess,
+    batch: TrainingBatch,
+    config: TrainConfig,
+    paper: PaperFrames | None,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """What the answers are worth, mean over frames and passes, and the terms of the last pass."""
+    objective, pairs = None if paper else frame_objective(batch), PAIRS_OF[config.pairs]
+    total = torch.zeros((), device=batch.T_camera_lidar.device)
+    terms: dict[str, Tensor] = {}
+    for answer in answers:
+        T_camera_lidar, T_camera_radar = map(guess.unturned, (answer.T_camera_lidar, answer.T_camera_radar))
+        poses = (T_camera_lidar, T_camera_radar, answer.T_lidar_radar)
+        if objective is not None:
+            terms = objective.terms(*poses, pairs)
+            value = weighted(terms, config.loss, pairs)
+        else:
+            assert paper is not None
+            terms = paper.terms(batch, *poses, pairs)
+            value = torch.stack(list(terms.values())).sum(0)
+        total = total + value.mean() / len(answers)
+    return total, terms
 
 
 def _semantics(

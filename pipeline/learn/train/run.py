@@ -162,6 +162,7 @@ def _step(run: RunState, processes: Processes) -> dict[str, torch.Tensor]:
         _generator(config.seed, run.step, processes.rank),
         run.network,
         matched=matched,
+        paper=run.paper,
     )
     run.optimiser.zero_grad(set_to_none=True)
     found.loss.backward()  # type: ignore[no-untyped-call]
@@ -185,7 +186,7 @@ def _validate(run: RunState, frames: TrainingBatch, folder: Path, log: MetricsLo
     with torch.no_grad():
         for first in range(0, len(frames), 16):
             part = frames_at(frames, torch.arange(first, min(first + 16, len(frames)))).to(device)
-            found = batch_loss(passes, part, run.config, day_means, generator, run.network)
+            found = batch_loss(passes, part, run.config, day_means, generator, run.network, paper=run.paper)
             for name, value in found.report.items():
                 sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
     run.network.train()

@@ -19,10 +19,12 @@ from pipeline.learn.train.acceleration import accelerate
 from pipeline.learn.train.batch_loss import Passes
 from pipeline.learn.train.batch_stream import BatchStream, batch_stream
 from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
+from pipeline.learn.train.paper_objective import PaperFrames, with_paper_inputs
 from pipeline.learn.train.processes import Processes
 from pipeline.learn.train.running_mean import DayMeans
 from pipeline.learn.train.schedule import DivergenceGuard
 from pipeline.learn.train.settings import RENAMED, TrainConfig
+from pipeline.store.partitions import Lake
 
 __all__ = ["RunState", "begin_run", "network_of_run"]
 
@@ -45,6 +47,7 @@ class RunState:
     step: int = 0
     trained_s: float = 0.0
     best: float = math.inf
+    paper: PaperFrames | None = None
 
     @property
     def progress(self) -> float:
@@ -133,6 +136,9 @@ def begin_run(
     try:
         grid = Grid(config.cell_deg)
         network = build_network(_network_config(config, grid), config.seed).to(processes.device)
+        by_paper = config.loss.definition == "paper"
+        if by_paper:
+            with_paper_inputs(network)
         accelerate(network, half=processes.device.type == "cuda", compiled=compiled)
         passes: nn.Module = Passes(network, config.iterations)
         if processes.count > 1:
@@ -148,6 +154,7 @@ def begin_run(
             DayMeans(),
             DivergenceGuard(config.diverged_factor),
             _steps(config, stream.frames, processes.count),
+            paper=PaperFrames(Lake.at(data)) if by_paper else None,
         )
         if (folder / LAST).exists():
             state = load_checkpoint(folder / LAST, processes.device)

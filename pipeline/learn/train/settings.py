@@ -40,6 +40,9 @@ class _Section(BaseModel):
 class LossConfig(_Section):
     """Weights of the terms; angles count in degrees. 0 leaves a term out."""
 
+    # "grid": this project's terms on the grid, weighted as below. "paper": the objective of `joint-optimisation`, L_P +
+    # L_G, all weights one (those below count for nothing), from observations; and the paper's inputs, no more.
+    definition: Literal["grid", "paper"] = "grid"
     classes: NotNegative = 1.0
     edges: NotNegative = 1.0
     sky: NotNegative = 1.0
@@ -119,6 +122,14 @@ class TrainConfig(_Section):
     def _encoders_exist(self) -> TrainConfig:
         if self.matched_every > 1 and (self.architecture == "concat" or self.pairs == "lidar_radar"):
             raise ValueError("matched_every must be 1 where no classes are learned: concat, lidar_radar")
+        return self
+
+    @model_validator(mode="after")
+    def _paper_is_whole(self) -> TrainConfig:
+        if self.loss.definition == "paper" and (self.architecture, self.augment.view_deg) != ("concat", 0.0):
+            raise ValueError(
+                'loss.definition = "paper" needs architecture = "concat" and augment.view_deg = 0'
+            )
         return self
 
     @model_validator(mode="after")

@@ -1,0 +1,109 @@
+"""Training on the paper's loss: the numbers of `joint-optimisation` on the same frames, and the paper's inputs."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.calibrate.paper.joint_optimisation import joint_costs
+from pipeline.calibrate.paper.minimise import poses_about
+from pipeline.calibrate.paper.pairwise import pair_problem
+from pipeline.errors import ConfigError
+from pipeline.extrinsics.prior import read_prior
+from pipeline.learn.batches.collate import collate
+from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.train.metrics import read_metrics
+from pipeline.learn.train.paper_objective import PaperFrames
+from pipeline.learn.train.run import TrainRequest, train
+from pipeline.learn.train.run_state import network_of_run
+from pipeline.learn.train.settings import PAIRS_OF, load_train_config
+from pipeline.objective.paper.loop import loop_loss, loop_transform
+from pipeline.store.partitions import Partition
+from pipeline.store.tables import read_rows, write_partition
+from schemas.calibrations import PAIRS
+from schemas.frames import FRAMES, Frame
+from schemas.training import TRAINING
+from tests.makers.simulated_days import simulated_day
+
+PAPER = """
+architecture = "concat"
+width = 4
+hidden = 16
+batch_size = 2
+steps = 2
+log_every = 1
+uncertainty_weight = 0.0
+[loss]
+definition = "paper"
+[augment]
+view_deg = 0.0
+"""
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory):
+    """Three frames with their rows of table training, all of side train."""
+    day = simulated_day(tmp_path_factory.mktemp("day"), frames=3)
+    frames = {f.frame_index: f for f in read_rows(day.lake, FRAMES, day.partition, Frame)}
+    prior = read_prior(day.observations, day.fleet, "vehicle-1")
+    about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
+    rows = [make_row(frames[o.frame_index], o, prior, about, day.fleet.prepare) for o in day.observations]
+    with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key", "0") as writer:
+        writer.append(rows)
+        writer.describe(kept={}, rejected={})
+    return day, prior, rows
+
+
+def test_the_loss_that_trains_is_the_objective_of_joint_optimisation_on_the_same_frames(day):
+    made, prior, rows = day
+    batch, rng = collate(rows), np.random.default_rng(0)
+    x = rng.uniform(-1, 1, (3, 18)) * np.tile([0.05, 0.05, 0.05, 0.2, 0.2, 0.2], 3)
+    frames = PaperFrames(made.lake)
+    problems = {pair: pair_problem(pair, made.observations, prior, made.fleet.solve) for pair in PAIRS}
+    letter = joint_costs(problems, prior, dict.fromkeys(PAIRS, 1.0), x)
+    for k, moves in enumerate(x):
+        T = {
+            pair: poses_about(prior.of(pair), moves[None, 6 * i : 6 * i + 6]) for i, pair in enumerate(PAIRS)
+        }
+        given = [torch.tensor(np.repeat(T[pair], len(rows), 0), dtype=torch.float32) for pair in PAIRS]
+        terms = frames.terms(batch, *given, PAIRS_OF["joint"])
+        mean = {}
+        for pair in PAIRS:
+            expected = problems[pair].frame_losses(T[pair])[0]
+            assert np.allclose(terms[pair].numpy(), expected, atol=2e-4)
+            assert np.ptp(expected) > 1e-3  # else frames could be mixed up unseen
+            mean[pair] = terms[pair].numpy()[problems[pair].informative].mean()
+        loop = loop_loss(loop_transform(T["camera_lidar"], T["lidar_radar"], T["camera_radar"]))[0]
+        assert terms["loop"].numpy() == pytest.approx(loop, abs=1e-4)
+        equation_2 = (1 + sum(mean.values())) * (1 + terms["loop"].numpy()[0])
+        assert equation_2 == pytest.approx(letter[k], rel=1e-3)
+
+
+def test_a_run_on_the_papers_loss_descends_its_terms_and_learns_nothing_of_derived_channels(day, tmp_path):
+    made, _, _ = day
+    recipe = tmp_path / "train.toml"
+    recipe.write_text(PAPER)
+    config = load_train_config(recipe, {})
+    out = tmp_path / "run"
+    assert train(TrainRequest(str(made.lake.root), out, "cpu"), config).status == "done"
+    reports = [r for r in read_metrics(out) if "term/loop" in r]
+    total = sum(reports[-1][f"term/{name}"] for name in (*PAIRS, "loop"))
+    assert reports[-1]["alignment"] == pytest.approx(total, rel=1e-4)
+    network = network_of_run(out, best=False)
+    lidar = network.core.encoders["lidar"][0].weight.abs().amax(dim=(0, 2, 3))
+    assert (lidar > 0).tolist() == [True, True, True, False, False, False]  # occupied, nearness, intensity
+    radar = network.core.encoders["radar"][0].weight.abs().amax(dim=(0, 2, 3))
+    assert (radar > 0).tolist() == [
+        True,
+        True,
+        True,
+        True,
+        False,
+    ]  # ..., Doppler, power; not whether it moves
+
+
+def test_the_papers_loss_is_refused_with_what_is_not_the_papers(tmp_path):
+    recipe = tmp_path / "train.toml"
+    for wrong in (PAPER.replace("concat", "matching"), PAPER.replace("view_deg = 0.0", "view_deg = 4.0")):
+        recipe.write_text(wrong)
+        with pytest.raises(ConfigError, match="definition"):
+            load_train_config(recipe, {})
