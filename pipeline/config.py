@@ -34,6 +34,7 @@ from pipeline.sections import (
     TriggerConfig,
     VerifyConfig,
 )
+from pipeline.shipped_models import PREFIX, shipped_manifest
 
 __all__ = [
     "TERMS",
@@ -130,8 +131,8 @@ class FleetConfig(Section):
             yield f"learn.pairwise_models.{pair}", model
 
     def path_of(self, name: str) -> Path:
-        """A path that the file names: relative to the file's folder unless absolute."""
-        return self._file.parent / name
+        """A path that the file names: relative to the file's folder unless absolute, or a network that ships."""
+        return shipped_manifest(name) if name.startswith(PREFIX) else self._file.parent / name
 
     def read_from(self, file: Path) -> FleetConfig:
         """The same configuration as if it had been read from another file."""

@@ -8,7 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-__all__ = ["REQUIRED", "ShippedModel", "shipped_models"]
+__all__ = ["PREFIX", "REQUIRED", "SHIPPED", "ShippedModel", "shipped_manifest", "shipped_models"]
+
+SHIPPED = Path(__file__).parent / "learn" / "models"
+PREFIX = "shipped:"  # in fleet.toml: `model = "shipped:radar_drivable"`
 
 # What a card must say before its model ships.
 REQUIRED = ("purpose", "license", "bytes", "sha256", "command", "data", "limits")
@@ -32,6 +35,11 @@ class ShippedModel:
     def name(self) -> str:
         """What the model is called: its file without suffix."""
         return self.file.stem
+
+
+def shipped_manifest(name: str) -> Path:
+    """The manifest that fleet.toml names by `shipped:NAME`."""
+    return SHIPPED / f"{name.removeprefix(PREFIX)}.toml"
 
 
 def shipped_models(folder: Path | None = None) -> list[ShippedModel]:

@@ -6,8 +6,8 @@ import shutil
 import pytest
 
 from jobs.cli import main
-from pipeline.learn.infer.onnx_networks import SHIPPED
-from pipeline.shipped_models import REQUIRED, shipped_models
+from pipeline.shipped_models import REQUIRED, SHIPPED, shipped_models
+from tests.makers.training_lakes import fleet_of
 
 
 def test_every_shipped_model_is_the_file_that_its_card_speaks_of(capsys):
@@ -38,3 +38,9 @@ def test_another_file_or_a_card_that_lacks_something_is_told(spoil, tmp_path, ca
     monkeypatch.setattr("pipeline.shipped_models.Path", lambda _: tmp_path / "models.py")
     assert main(["models"]) == 1
     assert "joint" in capsys.readouterr().err
+
+
+def test_fleet_toml_names_what_ships_by_a_word_and_files_of_its_own_by_their_path(tmp_path):
+    fleet = fleet_of(["a"]).read_from(tmp_path / "fleet.toml")
+    assert fleet.path_of("shipped:radar_drivable") == SHIPPED / "radar_drivable.toml"
+    assert fleet.path_of("radar_drivable.toml") == tmp_path / "radar_drivable.toml"
