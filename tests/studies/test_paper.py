@@ -1,0 +1,60 @@
+"""The paper's tables and figures beside ours: what is printed is what was measured, and the page opens by itself."""
+
+import json
+import re
+from types import SimpleNamespace
+
+import numpy as np
+
+from pipeline.geometry.se3 import exp_se3
+from pipeline.report.overlays import Extrinsics, Scene
+from tests.benchmarks.studies import paper_figures, paper_table
+from tests.benchmarks.studies.engine import RESULTS
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.makers.training_lakes import frame_of
+
+
+def test_the_papers_columns_are_means_of_the_lines_measured_and_its_rows_stand_below_ours():
+    results = [
+        json.loads(line) for name in paper_table.FILES for line in (RESULTS / name).read_text().splitlines()
+    ]
+    name = "pairwise-optimisation, learned drivable areas"
+    lines = paper_table.paper_table(results, "Table 1", "").splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith(f"| {name} |"))
+    mine = [r for r in results if r.get("row") == name]
+    told = [float(v) for v in lines[at].strip("| ").split(" | ")[1:]]
+    assert told[0] == len(mine) == 10
+    assert abs(told[5] - np.mean([r["pairs"]["lidar_radar"]["az_deg"] for r in mine])) < 6e-4
+    assert np.allclose(told[8:], np.mean([r["loop"] for r in mine], axis=0), atol=6e-4)
+    assert "paper: pairwise optimization" in lines[at + 1]
+    assert "*1.43* | *0.83* | *0.01*" in lines[at + 1]  # the loop that the paper prints
+    joint = next(line for line in lines if line.startswith("| joint |"))
+    assert joint.endswith("closed | closed | closed |")  # not an accuracy of zero
+    urban, highway = (paper_table.values_of(results, name, e) for e in ("urban", "highway"))
+    assert len(urban) == len(highway) == 5
+    committed = (RESULTS / "table1_paper.md").read_text()
+    assert "\n".join(lines) in committed
+
+
+def test_the_page_of_figures_needs_nothing_from_outside_and_tells_errors_against_the_truth():
+    observations = make_day(3, seed=1)
+    scenes = [Scene(frame_of(o, np.random.default_rng(i)), o) for i, o in enumerate(observations)]
+    truth = {
+        "camera_lidar": T_CAMERA_LIDAR,
+        "camera_radar": T_CAMERA_LIDAR @ T_LIDAR_RADAR,
+        "lidar_radar": T_LIDAR_RADAR,
+    }
+    right = Extrinsics(truth["camera_lidar"], truth["camera_radar"], truth["lidar_radar"])
+    turned = exp_se3(np.array([0.0, np.radians(1.5), 0.0, 0.0, 0.0, 0.0])) @ T_CAMERA_LIDAR
+    wrong = Extrinsics(turned, turned @ T_LIDAR_RADAR, T_LIDAR_RADAR)
+    states = dict.fromkeys(paper_figures.METHODS, right)
+    day = SimpleNamespace(true_of=truth.__getitem__)
+    page = paper_figures.figures_page("a day", scenes, wrong, states, [(wrong, right)] * 3, day)
+    assert [f"Figure {n}" in page for n in (1, 3, 4)] == [True] * 3
+    assert "prior: camera-lidar 1.50 / 0.0" in page  # 1.5 deg to a side
+    assert "joint: camera-lidar 0.00 / 0.00, camera-radar 0.00 / 0.00" in page
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
+    assert len(re.findall(r"<figure>", page)) == 2 + 8 + 12
+    empty = paper_figures.without_lidar(scenes[0])
+    assert len(empty.frame.lidar_xyz_m) == 0
+    assert len(empty.observation.radar_track_xyz_m) == len(scenes[0].observation.radar_track_xyz_m)
