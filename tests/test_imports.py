@@ -26,6 +26,7 @@ FOUNDATIONS = {
     "objective",
     "extrinsics",
     "rigs",
+    "ros_messages",
     "shipped_models",
     "work",
 }

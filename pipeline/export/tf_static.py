@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import json
 import struct
-from typing import Any
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
@@ -16,11 +15,11 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import Edge, ExportedCalibration, edges_of
+from pipeline.export.calibration import ExportedCalibration, edges_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import provenance_of
-from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.transform_tree import TransformTree
+from pipeline.ros_messages import RosMessages
 
 __all__ = ["TF_STATIC"]
 
@@ -37,12 +36,13 @@ _MOST_BYTES = 1 << 30  # /tf_static comes first in a log; of a larger one, give 
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    message = store.types[_TYPE](transforms=[_stamped(store, edge) for edge in edges_of(calibration)])
+    ros = RosMessages(get_typestore(Stores.ROS2_HUMBLE), 2)
+    edges = edges_of(calibration)
+    message = ros.transforms((ros.header(0, edge.parent), edge.child, edge.T) for edge in edges)
     stream = io.BytesIO()
     writer = Writer(stream, compression=CompressionType.NONE)
     writer.start(profile="ros2", library=f"boresight {calibration.code_version}")
-    text = store.generate_msgdef(_TYPE, ros_version=2)[0]
+    text = ros.typestore.generate_msgdef(_TYPE, ros_version=2)[0]
     schema = writer.register_schema(name=_TYPE, encoding="ros2msg", data=text.encode())
     channel = writer.register_channel(
         topic=_TOPIC,
@@ -50,29 +50,10 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
         schema_id=schema,
         metadata={"offered_qos_profiles": _QOS},
     )
-    data = bytes(store.serialize_cdr(message, _TYPE))
-    writer.add_message(channel, log_time=0, publish_time=0, data=data)
+    writer.add_message(channel, log_time=0, publish_time=0, data=ros.serialised(message))
     writer.add_metadata("boresight", {"provenance": json.dumps(provenance_of(calibration))})
     writer.finish()
     return {"tf_static.mcap": stream.getvalue()}
-
-
-def _stamped(store: Any, edge: Edge) -> Any:
-    def new(kind: str, **fields: Any) -> Any:
-        return store.types[kind](**fields)
-
-    q, t = to_quaternion(edge.T), edge.T[:3, 3]
-    header = new(
-        "std_msgs/msg/Header",
-        stamp=new("builtin_interfaces/msg/Time", sec=0, nanosec=0),
-        frame_id=edge.parent,
-    )
-    rotation = new("geometry_msgs/msg/Quaternion", x=float(q[1]), y=float(q[2]), z=float(q[3]), w=float(q[0]))
-    translation = new("geometry_msgs/msg/Vector3", x=float(t[0]), y=float(t[1]), z=float(t[2]))
-    transform = new("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
-    return new(
-        "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=edge.child, transform=transform
-    )
 
 
 def _tree(files: Files) -> TransformTree:
