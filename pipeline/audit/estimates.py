@@ -1,109 +1,216 @@
-"""Records of a vehicle to day estimates: what each day may say, as far as its checks allow."""
+"""Records of a fleet as columns, and what each day of them may say, as far as its checks allow."""
 
 from __future__ import annotations
 
 import datetime as dt
+from bisect import bisect_left
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.days import PairDays, pair_days
 from pipeline.geometry.se3 import from_quaternion
-from schemas.calibrations import PAIRS, CalibrationRecord
+from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
+from pipeline.store.current import current_rows
+from schemas.calibrations import CALIBRATIONS, PAIRS, STATUSES
 
-__all__ = ["days_of", "fault_of", "transforms_of"]
+__all__ = ["COLUMNS", "Estimates", "day_name", "days_of", "estimates_of", "faults_of", "joined"]
 
 _ROUNDING = 1e-3  # of what should be 1
+_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_SHIFTS = tuple(f"diagnostics.holdout_{n}_shift_rad" for n in ("azimuth", "elevation"))
+_DISPROVED = "diagnostics.disproved"
+# What is asked of a record besides what identifies it.
+COLUMNS = ("status", *_POSE, "covariance", "common_covariance", "observable", _DISPROVED, *_SHIFTS)
+_ACCEPTED, _HELD, _REFUSED = (STATUSES.index(name) for name in ("accepted", "held", "refused"))
 
 
-def days_of(records: Sequence[CalibrationRecord], held_sigma_factor: float) -> dict[str, PairDays]:
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Current records of one method in order of vehicle, day and pair; what a record lacks is not finite.
+
+    A year of a fleet as rows would be gigabytes; a record is 700 bytes here.
+
+    Args:
+        vehicles: names, in order.
+        owner: which of them a record is of.
+        day: ordinals of the calendar.
+        pair: places in PAIRS.
+        status: places in STATUSES.
+        pose: of T_parent_child: quaternion (scalar first), translation [m].
+        has_estimate: neither pose nor covariance is null.
+        covariance: of left perturbations.
+        common: the part of it that all days err by alike.
+        has_common: a record of an older release does not say.
+        observable: what the day determined; all of it where a record does not say.
+        disproved: a check shows that the pose is wrong.
+        shown_wrong_rad: the angle that the checks of a held record found it off by.
+        work_key: of each record.
+    """
+
+    vehicles: list[str]
+    owner: Int[np.ndarray, " N"]
+    day: Int[np.ndarray, " N"]
+    pair: Int[np.ndarray, " N"]
+    status: Int[np.ndarray, " N"]
+    pose: Float[np.ndarray, "N 7"]
+    has_estimate: Bool[np.ndarray, " N"]
+    covariance: Float[np.ndarray, "N 6 6"]
+    common: Float[np.ndarray, "N 6 6"]
+    has_common: Bool[np.ndarray, " N"]
+    observable: Bool[np.ndarray, "N 6"]
+    disproved: Bool[np.ndarray, " N"]
+    shown_wrong_rad: Float[np.ndarray, " N"]
+    work_key: pa.Array
+
+    def at(self, rows: slice | np.ndarray) -> Estimates:
+        """Some of the records, in their order."""
+        keys = self.work_key[rows] if isinstance(rows, slice) else self.work_key.take(pa.array(rows))
+        return Estimates(
+            self.vehicles, self.owner[rows], self.day[rows], self.pair[rows], self.status[rows], self.pose[rows],
+            self.has_estimate[rows], self.covariance[rows], self.common[rows], self.has_common[rows],
+            self.observable[rows], self.disproved[rows], self.shown_wrong_rad[rows], keys,
+        )  # fmt: skip
+
+    def of(self, vehicle: str) -> Estimates:
+        """One vehicle's records."""
+        begin = bisect_left(self.vehicles, vehicle)
+        if begin == len(self.vehicles) or self.vehicles[begin] != vehicle:
+            return self.at(slice(0, 0))
+        return self.at(slice(*np.searchsorted(self.owner, [begin, begin + 1])))
+
+    @property
+    def accepted(self) -> Bool[np.ndarray, " N"]:
+        """Records to use."""
+        return self.status == _ACCEPTED
+
+    @property
+    def refused(self) -> Bool[np.ndarray, " N"]:
+        """Days that could not say anything."""
+        return self.status == _REFUSED
+
+    def transforms(self) -> Float[np.ndarray, "N 4 4"]:
+        """T_parent_child; not finite where a record has none."""
+        return from_quaternion(self.pose[:, :4], self.pose[:, 4:])
+
+    def keys(self) -> list[str]:
+        """Work keys, each once, in order."""
+        return sorted(set(self.work_key.to_pylist()))
+
+
+def estimates_of(table: pa.Table | None) -> Estimates:
+    """The current ones of the records in a table that has COLUMNS and what tells which are current.
+
+    Args:
+        table: records of one method, in any order; None = none.
+    """
+    if table is None:
+        table = CALIBRATIONS.arrow_schema().empty_table()
+        for name in (_DISPROVED, *_SHIFTS):
+            table = table.append_column(name, pa.array([], pa.float64()))
+    found = current_rows(table, CALIBRATIONS)
+    names = found["vehicle"].combine_chunks().dictionary_encode()
+    owner, day = np.asarray(names.indices).astype(np.int64), ordinals(found["day"])
+    pair = places(found["pair"], PAIRS)
+    order = np.lexsort((pair, day, owner))  # trios of a day side by side
+    found = found.take(pa.array(order))
+    pose = np.stack([found[name].to_numpy() for name in _POSE], axis=1)
+    is_there = np.all([there(found[name]) for name in (*_POSE, "covariance")], axis=0)
+    shifts = np.abs(np.stack([pc.fill_null(found[name], 0.0).to_numpy() for name in _SHIFTS], axis=1))
+    worst = shifts.max(axis=1, initial=0.0)
+    return Estimates(
+        names.dictionary.to_pylist(),  # rows are in order of vehicle, and so is what they are first met in
+        owner[order], day[order], pair[order], places(found["status"], STATUSES), pose,
+        is_there, matrices(found["covariance"]), matrices(found["common_covariance"]),
+        there(found["common_covariance"]), observable_dofs(found["observable"]),
+        pc.fill_null(found[_DISPROVED], 0.0).to_numpy() != 0.0, np.where(np.isfinite(worst), worst, 0.0),
+        found["work_key"].combine_chunks(),
+    )  # fmt: skip
+
+
+def joined(parts: Sequence[Estimates]) -> Estimates:
+    """Records of several parts, none of which is in two of them, as one; vehicles without any are left out.
+
+    Args:
+        parts: one at least.
+    """
+    vehicles = sorted({part.vehicles[v] for part in parts for v in np.unique(part.owner)})
+    place = {vehicle: v for v, vehicle in enumerate(vehicles)}
+    owner = np.concatenate(
+        [np.array([place.get(v, -1) for v in part.vehicles], np.int64)[part.owner] for part in parts]
+    )
+    whole = {
+        f.name: np.concatenate([getattr(part, f.name) for part in parts])
+        for f in fields(Estimates)
+        if f.name not in ("vehicles", "owner", "work_key")
+    }
+    keys = pa.concat_arrays([part.work_key for part in parts])
+    found = Estimates(vehicles, owner, work_key=keys, **whole)
+    return found.at(np.lexsort((found.pair, found.day, owner)))
+
+
+def days_of(records: Estimates, held_sigma_factor: float) -> dict[str, PairDays]:
     """Estimates by pair; refused and disproved days are gaps, held ones are less sure.
 
     Args:
-        records: current ones of one vehicle and method, in order of day, none with a fault.
+        records: of one vehicle, none with a fault.
         held_sigma_factor: by which a held day is less sure at least.
     """
     pairs = {}
-    for pair in PAIRS:
-        rows = [r for r in records if r.pair == pair and _may_be_right(r)]
-        if not rows:
+    usable = ~records.refused & records.has_estimate & ~records.disproved
+    for place, pair in enumerate(PAIRS):
+        rows = np.flatnonzero(usable & (records.pair == place))
+        if not len(rows):
             continue
-        covariance = np.stack([np.asarray(r.covariance, float) for r in rows])
-        common = np.stack([_common(r) for r in rows])
-        held = np.array([r.status != "accepted" for r in rows])
+        own = records.at(rows)
+        # Where an older release did not say what is common, all of it counts as varying.
+        common = np.where(own.has_common[:, None, None], own.common, 0.0)
+        covariance, held = own.covariance.copy(), ~own.accepted
         covariance[held] = common[held] + (covariance - common)[held] * held_sigma_factor**2
-        for k in np.flatnonzero(held):
-            covariance[k, :3, :3] += np.eye(3) * _shown_wrong_rad(rows[k]) ** 2
-        pairs[pair] = pair_days(
-            np.array([dt.date.fromisoformat(r.day).toordinal() for r in rows]),
-            transforms_of(rows),
-            covariance,
-            common,
-            np.array([r.observable or [True] * 6 for r in rows], dtype=bool),
-            ~held,
-        )
+        covariance[held, :3, :3] += np.eye(3) * own.shown_wrong_rad[held, None, None] ** 2
+        pairs[pair] = pair_days(own.day, own.transforms(), covariance, common, own.observable, own.accepted)
     return pairs
 
 
-def fault_of(record: CalibrationRecord, latest_day: str) -> str | None:  # noqa: PLR0911 - a fault each
-    """Why a record cannot be used, in words; None where it can. A refused day is no fault.
+def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:
+    """Why records cannot be used, in words, by row. A refused day is no fault.
 
     Args:
-        record: any.
+        records: any.
         latest_day: the last day that a drive can be of.
     """
-    if record.day > latest_day:
-        return "is of a day that has not come yet"
-    if record.status == "refused":
-        return None
-    pose, C = _pose(record), record.covariance
-    if None in pose or C is None:
-        return None if record.status == "held" else "has no pose"
-    norm = sum(float(v or 0) ** 2 for v in pose)
-    if not np.isfinite(norm) or abs(sum(float(v or 0) ** 2 for v in pose[:4]) - 1) > _ROUNDING:
-        return "holds no rigid transform"
-    if np.shape(C) != (6, 6) or not np.isfinite(C).all() or np.diag(C).min() <= 0 or not _is_positive(C):
-        return "holds no covariance"
-    common = record.common_covariance
-    if common is not None and not (np.shape(common) == (6, 6) and np.isfinite(common).all()):
-        return "holds no covariance of what all days err by alike"
-    return None
+    future = records.day > dt.date.fromisoformat(latest_day).toordinal()
+    looked_at = ~future & ~records.refused
+    estimated, C = looked_at & records.has_estimate, records.covariance
+    pose = np.where(np.isfinite(records.pose), records.pose, np.inf)
+    rigid = np.isfinite(pose).all(axis=1) & (np.abs((pose[:, :4] ** 2).sum(axis=1) - 1) <= _ROUNDING)
+    said = np.isfinite(C).all(axis=(1, 2))
+    diagonal = np.einsum("nii->ni", C)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        said &= (diagonal > 0).all(axis=1)
+        # No correlation is beyond 1: what a damaged covariance fails, at a fraction of what eigenvalues cost.
+        scale = 1 / np.sqrt(diagonal)
+        said &= (np.abs(C * scale[:, :, None] * scale[:, None, :]) < 1 + _ROUNDING).all(axis=(1, 2))
+    common = ~records.has_common | np.isfinite(records.common).all(axis=(1, 2))
+    faults: dict[int, str] = {}
+    for wrong, why in (
+        (future, "is of a day that has not come yet"),
+        (looked_at & ~records.has_estimate & (records.status != _HELD), "has no pose"),
+        (estimated & ~rigid, "holds no rigid transform"),
+        (estimated & ~said, "holds no covariance"),
+        (estimated & ~common, "holds no covariance of what all days err by alike"),
+    ):
+        for row in np.flatnonzero(wrong).tolist():
+            faults.setdefault(row, why)
+    return dict(sorted(faults.items()))
 
 
-def transforms_of(records: Sequence[CalibrationRecord]) -> Float[np.ndarray, "N 4 4"]:
-    """T_parent_child of records that have one, all at once."""
-    poses = np.array([_pose(r) for r in records], float)
-    return from_quaternion(poses[:, :4], poses[:, 4:])
-
-
-def _pose(record: CalibrationRecord) -> tuple[float | None, ...]:
-    return record.qw, record.qx, record.qy, record.qz, record.tx_m, record.ty_m, record.tz_m
-
-
-def _is_positive(C: np.ndarray) -> bool:
-    """Whether no correlation is beyond 1: what a damaged covariance fails, at a fraction of what eigenvalues cost."""
-    scale = 1 / np.sqrt(np.diag(C))
-    return bool(np.abs(C * np.outer(scale, scale)).max() < 1 + _ROUNDING)
-
-
-def _may_be_right(record: CalibrationRecord) -> bool:
-    """Whether a record has a pose that no check disproved: a lost basin is 0.7 m off at a sigma of millimetres."""
-    return (
-        record.status != "refused"
-        and record.covariance is not None
-        and record.qw is not None
-        and not record.diagnostics.get("disproved", 0.0)
-    )
-
-
-def _common(record: CalibrationRecord) -> Float[np.ndarray, "6 6"]:
-    """What all days err by alike; nothing where an older release did not say: then all of it counts as varying."""
-    return np.zeros((6, 6)) if record.common_covariance is None else record.common_covariance
-
-
-def _shown_wrong_rad(record: CalibrationRecord) -> float:
-    """The angle that the checks of a held record found it off by: held-out frames would turn it by so much."""
-    shifts = [abs(record.diagnostics.get(f"holdout_{n}_shift_rad", 0.0)) for n in ("azimuth", "elevation")]
-    worst = max(shifts)
-    return worst if np.isfinite(worst) else 0.0
+@lru_cache(maxsize=4096)
+def day_name(ordinal: int) -> str:
+    """YYYY-MM-DD of an ordinal of the calendar."""
+    return dt.date.fromordinal(ordinal).isoformat()

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pipeline.audit.attribution import Attribution
+from pipeline.audit.estimates import Estimates, day_name
 from pipeline.audit.status import decide_status
 from pipeline.audit.vehicle import VehicleVerdict, limit_of
 from pipeline.audit.verdicts import ChartVerdict
 from pipeline.config import AuditConfig
-from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.calibrations import DOF_NAMES, PAIRS, STATUSES
 from schemas.drift import DriftFinding
 
 __all__ = ["VehicleAudit", "vehicle_findings"]
@@ -33,7 +34,7 @@ class VehicleAudit:
 
 def vehicle_findings(
     audit: VehicleAudit,
-    records: Sequence[CalibrationRecord],
+    records: Estimates,
     verdict: VehicleVerdict,
     config: AuditConfig,
     remarks: Mapping[tuple[str, str], str],
@@ -51,9 +52,11 @@ def vehicle_findings(
     """
     findings = []
     for pair in PAIRS:
+        without_data, last_estimate = _without_data(records, pair), _last_estimate(records, pair)
         for dof in DOF_NAMES:
-            chart = verdict.charts.get((pair, dof)) or _without_data(records, pair)
-            chart = _with_last_day(chart, records, pair)
+            chart = verdict.charts.get((pair, dof)) or without_data
+            if last_estimate:
+                chart = replace(chart, reason=f"{chart.reason}; no estimate after {last_estimate}")
             if (pair, dof) in remarks:
                 chart = replace(chart, reason=f"{chart.reason}; {remarks[pair, dof]}")
             if before is not None:
@@ -82,9 +85,9 @@ def _change_columns(chart: ChartVerdict, moved: Attribution | None) -> dict[str,
     if change is None:
         return {}
     columns: dict[str, Any] = {
-        "start_day": _iso(change.day),
-        "start_day_earliest": _iso(change.earliest),
-        "start_day_latest": _iso(change.latest),
+        "start_day": day_name(change.day),
+        "start_day_earliest": day_name(change.earliest),
+        "start_day_latest": day_name(change.latest),
         "kind": change.kind,
         "magnitude": change.size,
         "magnitude_sigma": change.size_sigma,
@@ -115,21 +118,15 @@ def _begun_before(chart: ChartVerdict, before: DriftFinding | None) -> ChartVerd
     return replace(chart, change=replace(change, day=day, earliest=earliest, latest=latest))
 
 
-def _with_last_day(chart: ChartVerdict, records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:
-    """Say so where the vehicle drove on after the last estimate of a pair."""
-    days = [r.day for r in records if r.pair == pair and r.status != "refused"]
-    last = max((r.day for r in records), default="")
-    if not days or max(days) == last:
-        return chart
-    return replace(chart, reason=f"{chart.reason}; no estimate after {max(days)}")
+def _last_estimate(records: Estimates, pair: str) -> str:
+    """The day of a pair's last estimate, where the vehicle drove on after it; else empty."""
+    days = records.day[(records.pair == PAIRS.index(pair)) & ~records.refused]
+    return day_name(int(days.max())) if len(days) and days.max() < records.day.max() else ""
 
 
-def _without_data(records: Sequence[CalibrationRecord], pair: str) -> ChartVerdict:
-    found = [r.status for r in records if r.pair == pair]
-    counts = ", ".join(f"{found.count(s)} {s}" for s in ("held", "refused") if s in found)
+def _without_data(records: Estimates, pair: str) -> ChartVerdict:
+    found = records.status[records.pair == PAIRS.index(pair)].tolist()
+    kinds = [(name, found.count(STATUSES.index(name))) for name in ("held", "refused")]
+    counts = ", ".join(f"{count} {name}" for name, count in kinds if count)
     reason = f"no estimate in the window ({counts})" if counts else "no record in the window"
     return ChartVerdict("UNKNOWN", reason, 0, None, None, None, None)
-
-
-def _iso(ordinal: int) -> str:
-    return dt.date.fromordinal(ordinal).isoformat()

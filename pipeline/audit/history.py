@@ -1,31 +1,30 @@
 """What an audit reads of a lake: the window, and of each vehicle the first accepted days, month by month and no more.
 
-A month is held at a time, and reading ends as soon as no vehicle lacks days: in a lake whose vehicles began together
-that is its first month, however old it is. A vehicle that has not had enough accepted days yet costs a look at all
-months.
+A month is held at a time, as columns, and reading ends as soon as no vehicle lacks days: in a lake whose vehicles
+began together that is its first month, however old it is. A vehicle that has not had enough accepted days yet costs a
+look at all months.
 """
 
 from __future__ import annotations
 
 import datetime as dt
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field
 
+import numpy as np
+import pyarrow.compute as pc
+
+from pipeline.audit.estimates import COLUMNS, Estimates, day_name, estimates_of, faults_of, joined
 from pipeline.audit.service import restart_of
-from pipeline.store.current import current_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import first_day, last_day, read_records
-from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from pipeline.store.records import first_day, last_day, read_columns
+from schemas.calibrations import CALIBRATIONS, PAIRS
 from schemas.service_events import ServiceEvent
 
-__all__ = ["last_audited_day", "read_history"]
+__all__ = ["History", "last_audited_day"]
 
-# What charts need of a record besides what identifies it.
-_COLUMNS = (
-    *("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"),
-    "covariance", "common_covariance", "observable", "diagnostics",
-)  # fmt: skip
 _MONTHS_BACK = 4  # that a window of few days reaches back
 _YEARS_BACK = 20  # before which no lake began
 _FIRST_DAYS = 14  # of a lake, read before the rest of its first month: a reference takes ten accepted ones
@@ -36,81 +35,118 @@ def last_audited_day(lake: Lake, tomorrow: str) -> str | None:
     last = last_day(lake, CALIBRATIONS)
     if last is None or last <= tomorrow:
         return last
-    days = [r.day for r in read_records(lake, CALIBRATIONS, CalibrationRecord, last=tomorrow, columns=())]
-    return max(days, default=None)
+    found = read_columns(lake, CALIBRATIONS, (), first=None, last=tomorrow)
+    return None if found is None else str(pc.max(found["day"]).as_py())
 
 
-def read_history(
-    lake: Lake,
-    window: tuple[str, str, str],
-    events: Mapping[str, Sequence[ServiceEvent]],
-    enough: tuple[int, int],
-    sound: Callable[[CalibrationRecord], bool],
-    asked: Collection[str] = (),
-) -> list[CalibrationRecord]:
-    """Current records of a method that charts need, in order of vehicle and day.
+@dataclass
+class History:
+    """Reads the current records of a method, and names those that nothing can be made of.
 
     Args:
         lake: where they are.
-        window: first and last day, and the method.
-        events: by vehicle; what lies before them is not asked for.
-        enough: days that a chart needs at least, and accepted days that a reference takes.
-        sound: False for a record that nothing can be made of.
-        asked: vehicles that are wanted though they may not have driven in the window.
+        method: of them.
+        latest: the last day that a drive can be of.
+        left_out: what was not usable, in words, each once.
     """
-    first, last, method = window
-    fewest, reference_days = enough
-    found = [r for r in _read(lake, first, last, method) if sound(r)]
-    driven = Counter(v for v, _ in {(r.vehicle, r.day) for r in found})
-    sparse = {v for v in {*driven, *asked} if driven[v] < fewest}
-    for month, end in _months_before(first, _MONTHS_BACK):
-        if not sparse:
-            break
-        more = [r for r in _read(lake, month, end, method, sparse) if sound(r)]
-        driven.update(v for v, _ in {(r.vehicle, r.day) for r in more})
-        found += more
-        sparse = {v for v in sparse if driven[v] < fewest}
-    found += _references(lake, window, events, reference_days, sound, found)
-    unique = {(r.vehicle, r.day, r.trio, r.pair): r for r in found}
-    return [unique[key] for key in sorted(unique)]
+
+    lake: Lake
+    method: str
+    latest: str
+    left_out: dict[str, None] = field(default_factory=dict)
+
+    def window(
+        self,
+        window: tuple[str, str],
+        events: Mapping[str, Sequence[ServiceEvent]],
+        enough: tuple[int, int],
+        asked: Collection[str] = (),
+    ) -> Estimates:
+        """The records that charts need.
+
+        Args:
+            window: first and last day.
+            events: by vehicle; what lies before them is not asked for.
+            enough: days that a chart needs at least, and accepted days that a reference takes.
+            asked: vehicles that are wanted though they may not have driven in the window.
+        """
+        (first, last), (fewest, reference_days) = window, enough
+        parts = [self.read(first, last)]
+        driven = Counter(dict.fromkeys(asked, 0)) + _days_driven(parts[0])
+        begin = dict.fromkeys({*asked, *parts[0].vehicles}, first)
+        for month, end in _months_before(first, _MONTHS_BACK):
+            sparse = {v for v in begin if driven[v] < fewest}
+            if not sparse:
+                break
+            parts.append(self.read(month, end, sparse))
+            driven += _days_driven(parts[-1])
+            begin |= dict.fromkeys(sparse, month)
+        return joined([*parts, *self._references(begin, window, events, reference_days, parts)])
+
+    def _references(
+        self,
+        begin: Mapping[str, str],
+        window: tuple[str, str],
+        events: Mapping[str, Sequence[ServiceEvent]],
+        count: int,
+        known: Sequence[Estimates],
+    ) -> Iterator[Estimates]:
+        """Records of the first accepted days of each pair since it was last serviced.
+
+        Args:
+            begin: day from which each vehicle's records are known already.
+            window: see `window`.
+            events: likewise.
+            count: accepted days.
+            known: what was read already.
+        """
+        until, last = window
+        pairs = {key for part in known for key in _pairs(part)}
+        restart = {key: restart_of(events.get(key[0], ()), PAIRS[key[1]], last) for key in pairs}
+        lacking = {key for key in pairs if (event := restart[key]) is None or event.day < until}
+        accepted: Counter[tuple[str, int]] = Counter()
+        for month, end in _months_until(self.lake, until):
+            if not lacking:
+                break
+            part = self.read(month, end, {vehicle for vehicle, _ in lacking})
+            rows = []
+            of_row = zip(_pairs(part), part.day.tolist(), part.accepted.tolist(), strict=True)
+            for row, (key, ordinal, is_accepted) in enumerate(of_row):
+                event, day = restart.get(key), day_name(ordinal)
+                if key not in lacking or (event is not None and day <= event.day):
+                    continue
+                if accepted[key] < count and day < begin[key[0]]:
+                    rows.append(row)
+                accepted[key] += is_accepted
+            yield part.at(np.array(rows, np.int64))
+            lacking = {key for key in lacking if accepted[key] < count}
+
+    def read(self, first: str | None, last: str | None, among: AbstractSet[str] | None = None) -> Estimates:
+        """Sound records of a span of days, of all vehicles or of some."""
+        found = read_columns(self.lake, CALIBRATIONS, COLUMNS, first=first, last=last, vehicle=among)
+        if found is not None:
+            found = found.filter(pc.equal(found["method"], self.method))
+        records = estimates_of(found)
+        faults = faults_of(records, self.latest)
+        for row, why in faults.items():
+            owner, day = records.vehicles[records.owner[row]], day_name(int(records.day[row]))
+            self.left_out[f"{owner} {day} {PAIRS[records.pair[row]]} {why}"] = None
+        kept = np.delete(np.arange(len(records.day)), list(faults))
+        return joined([records.at(kept)]) if faults else records
 
 
-def _references(
-    lake: Lake,
-    window: tuple[str, str, str],
-    events: Mapping[str, Sequence[ServiceEvent]],
-    count: int,
-    sound: Callable[[CalibrationRecord], bool],
-    known: Sequence[CalibrationRecord],
-) -> list[CalibrationRecord]:
-    """Records of the first accepted days of each pair since it was last serviced, as far as the window lacks them."""
-    until, last, method = window
-    accepted: Counter[tuple[str, str]] = Counter()
-    pairs = {(r.vehicle, r.pair) for r in known}
-    restart = {key: restart_of(events.get(key[0], ()), key[1], last) for key in pairs}
-    lacking = {key for key in pairs if (event := restart[key]) is None or event.day < until}
-    found = []
-    for month, end in _months_until(lake, until):
-        if not lacking:
-            break
-        for record in _read(lake, month, end, method, {vehicle for vehicle, _ in lacking}):
-            key = (record.vehicle, record.pair)
-            event = restart.get(key)
-            if key not in lacking or (event is not None and record.day <= event.day) or not sound(record):
-                continue
-            if accepted[key] < count:
-                found.append(record)
-            accepted[key] += record.status == "accepted"
-        lacking = {key for key in lacking if accepted[key] < count}
-    return found
+def _pairs(records: Estimates) -> list[tuple[str, int]]:
+    """Vehicle and pair of each record."""
+    names = records.vehicles
+    return [(names[v], p) for v, p in zip(records.owner.tolist(), records.pair.tolist(), strict=True)]
 
 
-def _read(
-    lake: Lake, first: str, last: str, method: str, among: AbstractSet[str] | None = None
-) -> list[CalibrationRecord]:
-    window = {"first": first, "last": last}
-    rows = read_records(lake, CALIBRATIONS, CalibrationRecord, **window, columns=_COLUMNS, vehicle=among)
-    return [r for r in current_records(rows) if r.method == method]
+def _days_driven(records: Estimates) -> Counter[str]:
+    """How many days each vehicle has a record of."""
+    owner = np.unique(np.stack([records.owner, records.day]), axis=1)[0]
+    return Counter(
+        {records.vehicles[v]: int(n) for v, n in zip(*np.unique(owner, return_counts=True), strict=True)}
+    )
 
 
 def _months_before(day: str, count: int) -> Iterator[tuple[str, str]]:

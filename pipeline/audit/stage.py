@@ -7,11 +7,13 @@ from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from pipeline.audit.days import FEWEST_DAYS, PairDays, charted, reference_of
-from pipeline.audit.estimates import days_of, fault_of
+from pipeline.audit.estimates import Estimates, days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
-from pipeline.audit.history import last_audited_day, read_history
+from pipeline.audit.history import History, last_audited_day
 from pipeline.audit.service import restart_of, what_was_done
 from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.config import AuditConfig, FleetConfig, config_hash
@@ -21,7 +23,7 @@ from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.records import read_latest, read_records
 from pipeline.work import Records, Task, Told, Window, Work
-from schemas.calibrations import CALIBRATIONS, DOF_NAMES, CalibrationRecord
+from schemas.calibrations import DOF_NAMES, PAIRS
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.versions import CODE_VERSION
@@ -37,7 +39,7 @@ _NAMED = 5  # records that an outcome names where they were left out; the others
 class _Vehicle:
     """What the audit looks at: sound records until the window's end, and what was done to the vehicle."""
 
-    records: Sequence[CalibrationRecord]
+    records: Estimates
     events: Sequence[ServiceEvent]
 
 
@@ -59,41 +61,24 @@ def work(task: Task) -> Work:
     tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
     latest = max(tomorrow, task.of.last or "")
     first, last = _window(task, last_audited_day(task.lake, latest))
-    left_out: list[str] = []
-
-    def sound(record: CalibrationRecord) -> bool:
-        why = fault_of(record, latest)
-        if why is not None:
-            left_out.append(f"{record.vehicle} {record.day} {record.pair} {why}")
-        return why is None
-
-    for record in read_records(task.lake, CALIBRATIONS, CalibrationRecord, first=_after(latest), columns=()):
-        sound(record)
+    history = History(task.lake, method, latest)
+    history.read(_after(latest), None)  # days to come are named
     events: dict[str, list[ServiceEvent]] = {}
     for event in read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last):
         events.setdefault(event.vehicle, []).append(event)
     enough = (FEWEST_DAYS, fleet.audit.reference_days)
-    records = read_history(task.lake, (first, last, method), events, enough, sound, fleet.vehicles)
-    vehicles = _by_vehicle(fleet, records, events)
+    records = history.window((first, last), events, enough, fleet.vehicles)
+    names = sorted({*records.vehicles, *fleet.vehicles})
+    vehicles = {v: _Vehicle(records.of(v), events.get(v, ())) for v in names}
     done = sorted([e.vehicle, e.day, e.sensor, e.kind] for v in vehicles.values() for e in v.events)
     settings = (fleet.audit, {"from": first, "to": last, "method": method, "events": done})
     return Work(
         settings,
         lambda run: _judged(task, vehicles, (first, last, method), run.progress),
-        inputs=tuple(sorted({r.work_key for v in vehicles.values() for r in v.records})),
-        tell=lambda rows: _told(rows, left_out),
+        inputs=tuple(records.keys()),
+        tell=lambda rows: _told(rows, list(history.left_out)),
         again=True,
     )
-
-
-def _by_vehicle(
-    fleet: FleetConfig, records: Sequence[CalibrationRecord], events: Mapping[str, Sequence[ServiceEvent]]
-) -> dict[str, _Vehicle]:
-    """In order of name: the configuration's vehicles, and others that have records."""
-    rows: dict[str, list[CalibrationRecord]] = {v: [] for v in fleet.vehicles}
-    for record in records:
-        rows.setdefault(record.vehicle, []).append(record)
-    return {vehicle: _Vehicle(rows[vehicle], events.get(vehicle, ())) for vehicle in sorted(rows)}
 
 
 def _judged(
@@ -101,7 +86,8 @@ def _judged(
 ) -> Generator[Records, None, None]:
     """The findings of one vehicle after the other; all of them are judged side by side."""
     fleet, (first, _, method) = task.fleet, window
-    if not any(r.day >= first for v in vehicles.values() for r in v.records):
+    begin = dt.date.fromisoformat(first).toordinal()
+    if not any((v.records.day >= begin).any() for v in vehicles.values()):
         return
     days = [_charted(vehicle, window, fleet.audit) for vehicle in vehicles.values()]
     verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit)
@@ -164,11 +150,13 @@ def _findings(
     known: tuple[Mapping[tuple[str, str], FleetShift], Mapping[tuple[str, str], DriftFinding]],
 ) -> Records:
     (first, last, method), (shifts, before) = window, known
-    inputs = sorted({r.work_key for r in vehicle.records if r.day >= first})
+    records = vehicle.records.at(
+        np.flatnonzero(vehicle.records.day >= dt.date.fromisoformat(first).toordinal())
+    )
+    inputs = records.keys()
     config = config_hash(fleet.audit, {"from": first, "to": last, "method": method})
     key = work_key("audit", CODE_VERSION, config, inputs)
     audit = VehicleAudit(name, last, method, key, inputs)
-    records = [r for r in vehicle.records if r.day >= first]
     rows = vehicle_findings(audit, records, verdict, fleet.audit, _remarks(vehicle, last, shifts), before)
     return Records(rows, Partition(name, last), key, inputs)
 
@@ -196,7 +184,7 @@ def _remarks(
 ) -> dict[tuple[str, str], str]:
     """What a reader of a chart should know besides: where it begins, and what was taken out of it."""
     remarks: dict[tuple[str, str], str] = {}
-    for pair in {r.pair for r in vehicle.records}:
+    for pair in (PAIRS[p] for p in np.unique(vehicle.records.pair)):
         restart = restart_of(vehicle.events, pair, last)
         if restart is not None:
             remarks |= {(pair, dof): f"since the {what_was_done(restart)}" for dof in DOF_NAMES}

@@ -8,20 +8,20 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float
 from scipy.special import ndtri
 
-from pipeline.audit.estimates import fault_of, transforms_of
+from pipeline.audit.estimates import Estimates, day_name, estimates_of
+from pipeline.audit.history import History
 from pipeline.audit.service import restart_of, what_was_done
 from pipeline.audit.state import DayEstimate, State, fuse
 from pipeline.config import FleetConfig, VerifyConfig, config_hash
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.target_sigmas import target_sigmas
-from pipeline.store.current import current_drift, current_records
+from pipeline.store.current import current_drift
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.records import last_day, read_latest, read_records
 from pipeline.work import Records, Run, Task, Told, Window, Work
-from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import StateRow
@@ -31,17 +31,12 @@ __all__ = ["work"]
 
 # Days that a state looks back: beyond, its common part is nearly all of it, and seasons and tyres are others.
 _DAYS_BACK = 60
-# What `work` reads of a record besides what identifies it.
-_COLUMNS = (
-    *("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"),
-    "covariance", "common_covariance", "observable", "diagnostics",
-)  # fmt: skip
 # Of successive accepted days: the most that the charts' budget is proved for. A state promises no more than such days
 # can give.
 _AUTOCORRELATION = 0.6
 
 
-_Row = TypeVar("_Row", CalibrationRecord, ServiceEvent, DriftFinding)
+_Row = TypeVar("_Row", ServiceEvent, DriftFinding)
 
 
 def work(task: Task) -> Work:
@@ -58,13 +53,7 @@ def work(task: Task) -> Work:
     tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
     last = task.of.last or min(last_day(task.lake, CALIBRATIONS) or "", tomorrow)
     first = (dt.date.fromisoformat(last) - dt.timedelta(days=_DAYS_BACK - 1)).isoformat() if last else ""
-    records = _by_vehicle(
-        r
-        for r in current_records(
-            read_records(task.lake, CALIBRATIONS, CalibrationRecord, first=first, last=last, columns=_COLUMNS)
-        )
-        if r.method == method and fault_of(r, last) is None
-    )
+    records = History(task.lake, method, last).read(first, last) if last else estimates_of(None)
     events = _by_vehicle(read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last or None))
     found = read_latest(
         task.lake,
@@ -77,14 +66,13 @@ def work(task: Task) -> Work:
     changes = _by_vehicle(current_drift([f for f in found if f.method == method]))
 
     def rows(run: Run) -> Generator[Records, None, None]:
-        for done, (vehicle, own) in enumerate(sorted(records.items())):
-            run.progress(done, len(records), vehicle)
+        for done, vehicle in enumerate(records.vehicles):
+            run.progress(done, len(records.vehicles), vehicle)
             since = {p: _since(p, events.get(vehicle, ()), changes.get(vehicle, ()), last) for p in PAIRS}
-            yield _states(fleet, (vehicle, last, method), own, since)
+            yield _states(fleet, (vehicle, last, method), records.of(vehicle), since)
 
     settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
-    keys = {r.work_key for own in records.values() for r in own}
-    return Work(settings, rows, inputs=tuple(sorted(keys)), tell=_told, again=True)
+    return Work(settings, rows, inputs=tuple(records.keys()), tell=_told, again=True)
 
 
 def _by_vehicle(rows: Iterable[_Row]) -> dict[str, list[_Row]]:
@@ -114,19 +102,20 @@ def _since(
 def _states(
     fleet: FleetConfig,
     about: tuple[str, str, str],
-    records: Sequence[CalibrationRecord],
+    records: Estimates,
     since: Mapping[str, tuple[str, str]],
 ) -> Records:
     vehicle, last, method = about
-    inputs = sorted({r.work_key for r in records})
+    inputs = records.keys()
     config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method, "since": since})
     key = work_key("state", CODE_VERSION, config, inputs)
     rows = []
     for pair in PAIRS:
         first, why = since[pair]
-        own = [r for r in records if r.pair == pair and r.status == "accepted" and r.day >= first]
-        days = [_estimate(r, T) for r, T in zip(own, transforms_of(own), strict=True)] if own else []
-        found = fuse(days, autocorrelation=_AUTOCORRELATION)
+        begin = dt.date.fromisoformat(first).toordinal() if first else 0
+        usable = records.accepted & records.has_estimate & (records.day >= begin)
+        own = records.at(np.flatnonzero(usable & (records.pair == PAIRS.index(pair))))
+        found = fuse(_days(own), autocorrelation=_AUTOCORRELATION)
         parent, child = FRAMES_OF_PAIR[pair]
         words = _words(why, found)
         base = StateRow(vehicle, last, method, pair, parent, child, "none", words, key, since=first or None)
@@ -142,16 +131,18 @@ def _words(why: str, found: State | None) -> str:
     return "; ".join(text for text in (why, left) if text)
 
 
-def _estimate(record: CalibrationRecord, T: Float[np.ndarray, "4 4"]) -> DayEstimate:
-    """An accepted record as a day to fuse."""
-    assert record.covariance is not None, "records without one were left out"
-    observable = np.array(record.observable or [True] * 6, bool)
-    return DayEstimate(record.day, T, record.covariance, record.common_covariance, observable)
+def _days(records: Estimates) -> list[DayEstimate]:
+    """Accepted records of a pair as days to fuse."""
+    return [
+        DayEstimate(day_name(day), T, covariance, common if has_common else None, observable)
+        for day, T, covariance, common, has_common, observable in zip(
+            records.day.tolist(), records.transforms(), records.covariance, records.common,
+            records.has_common.tolist(), records.observable, strict=True,
+        )
+    ]  # fmt: skip
 
 
-def _with_state(
-    base: StateRow, found: State, records: Sequence[CalibrationRecord], verify: VerifyConfig
-) -> StateRow:
+def _with_state(base: StateRow, found: State, records: Estimates, verify: VerifyConfig) -> StateRow:
     sigma = target_sigmas(base.pair, found.T, found.covariance)
     azimuth, elevation = (
         (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
@@ -173,7 +164,9 @@ def _with_state(
         azimuth_sigma_rad=float(sigma[0]),
         elevation_sigma_rad=float(sigma[1]),
         days=list(found.days),
-        inputs=sorted({r.work_key for r in records if r.day in found.days}),
+        inputs=records.at(
+            np.flatnonzero([day_name(day) in found.days for day in records.day.tolist()])
+        ).keys(),
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
+from pipeline.store.columns import ordinals, places
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import last_day, read_columns
@@ -115,24 +116,12 @@ def _findings(found: pa.Table, owner: Int[np.ndarray, " N"]) -> dict[str, list[D
 
 def _charts(found: pa.Table, owner: Int[np.ndarray, " N"]) -> ChartVerdicts:
     names = ("start_day", "start_day_earliest", "start_day_latest")
-    starts = np.stack([_ordinals(found[name]) for name in names], axis=1)
+    starts = np.stack([ordinals(found[name]) for name in names], axis=1)
     return ChartVerdicts(
         owner,
-        _places(found["pair"], PAIRS),
-        _places(found["dof"], DOF_NAMES),
-        _places(found["status"], DRIFT_STATUSES),
+        places(found["pair"], PAIRS),
+        places(found["dof"], DOF_NAMES),
+        places(found["status"], DRIFT_STATUSES),
         found["limit"].to_numpy(),
         np.where((starts > 0).all(axis=1, keepdims=True), starts, 0),
     )
-
-
-def _ordinals(days: pa.ChunkedArray) -> Int[np.ndarray, " N"]:
-    coded = pc.fill_null(days, "").combine_chunks().dictionary_encode()
-    known = [dt.date.fromisoformat(day).toordinal() if day else 0 for day in coded.dictionary.to_pylist()]
-    return np.array(known, np.int64)[np.asarray(coded.indices)]
-
-
-def _places(column: pa.ChunkedArray, names: tuple[str, ...]) -> Int[np.ndarray, " N"]:
-    coded = column.combine_chunks().dictionary_encode()
-    place = np.array([names.index(name) for name in coded.dictionary.to_pylist()], np.int64)
-    return place[np.asarray(coded.indices)]

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import from_quaternion
+from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import first_day, last_day, read_columns
@@ -126,18 +127,16 @@ def _window_of(table: pa.Table | None) -> FleetWindow:
         return FleetWindow([], none, none, none, none, T, sigma, np.zeros((0, 6), bool), [], [])
     found = current_rows(table, CALIBRATIONS)
     names = found["vehicle"].combine_chunks().dictionary_encode()
-    days = found["day"].combine_chunks().dictionary_encode()
-    ordinals = np.array([dt.date.fromisoformat(day).toordinal() for day in days.dictionary.to_pylist()])
     T, sigma = _estimates(found)
     return FleetWindow(
         names.dictionary.to_pylist(),  # rows are in order of vehicle, and so is what they are first met in
         np.asarray(names.indices).astype(np.int64),
-        ordinals[np.asarray(days.indices)],
-        _places(found["pair"], PAIRS),
-        _places(found["status"], STATUSES),
+        ordinals(found["day"]),
+        places(found["pair"], PAIRS),
+        places(found["status"], STATUSES),
         T,
         sigma,
-        _observable(found["observable"]),
+        observable_dofs(found["observable"]),
         found["work_key"].to_pylist(),
         sorted(set(found["code_version"].unique().to_pylist())),
     )
@@ -146,32 +145,14 @@ def _window_of(table: pa.Table | None) -> FleetWindow:
 def _estimates(found: pa.Table) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "N 6"]]:
     """Poses and the sigmas of what a mechanic can measure; not finite where a record has none."""
     pose = np.stack([found[name].to_numpy() for name in _POSE], axis=1)
-    covariance = found["covariance"].combine_chunks()
-    there = np.isfinite(pose).all(axis=1) & np.asarray(covariance.is_valid())
+    covariance = matrices(found["covariance"])
+    is_there = np.isfinite(pose).all(axis=1) & there(found["covariance"])
     T, sigma = np.full((len(pose), 4, 4), np.nan), np.full((len(pose), 6), np.nan)
-    if there.any():
-        T[there] = from_quaternion(pose[there, :4], pose[there, 4:])
-        blobs = covariance.filter(pa.array(there)).to_pylist()
-        of_change = change_covariance(T[there], np.frombuffer(b"".join(blobs), "<f8").reshape(-1, 6, 6))
-        sigma[there] = np.sqrt(np.maximum(np.diagonal(of_change, axis1=1, axis2=2), 0.0))
+    if is_there.any():
+        T[is_there] = from_quaternion(pose[is_there, :4], pose[is_there, 4:])
+        of_change = change_covariance(T[is_there], covariance[is_there])
+        sigma[is_there] = np.sqrt(np.maximum(np.diagonal(of_change, axis1=1, axis2=2), 0.0))
     return T, sigma
-
-
-def _observable(column: pa.ChunkedArray) -> Bool[np.ndarray, "N 6"]:
-    """Per DoF; a record that does not say has determined them all."""
-    values = column.combine_chunks()
-    seen = np.ones((len(values), 6), bool)
-    said = np.asarray(values.is_valid()) & (pc.list_value_length(values).fill_null(0).to_numpy() == 6)
-    if said.any():
-        flat = values.filter(pa.array(said)).flatten()
-        seen[said] = np.asarray(flat.to_numpy(zero_copy_only=False)).astype(bool).reshape(-1, 6)
-    return seen
-
-
-def _places(column: pa.ChunkedArray, names: tuple[str, ...]) -> Int[np.ndarray, " N"]:
-    coded = column.combine_chunks().dictionary_encode()
-    place = np.array([names.index(name) for name in coded.dictionary.to_pylist()], np.int64)
-    return place[np.asarray(coded.indices)]
 
 
 def _months_before(day: str) -> Iterator[tuple[str, str]]:

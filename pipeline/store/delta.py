@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from deltalake import DeltaTable, Schema, WriterProperties
@@ -25,6 +26,7 @@ from schemas.columns import TableSchema
 
 __all__ = [
     "LiveFile",
+    "Wanted",
     "live_files",
     "merge_rows",
     "open_table",
@@ -38,6 +40,10 @@ _MONTH = "month"
 _VERSION = "boresight.version"
 # A reader of one vehicle's day reads whole files: 32 MB are some thousand vehicle-days, read in a tenth of a second.
 _FILE_BYTES = 32 << 20
+# Rows of a row group: a day of a thousand vehicles is one or a few, and a reader of one day reads no more of a month's
+# file. A group costs 20 kB of footer, a hundredth of what it holds.
+_GROUP_ROWS = 4096
+_WRITER = WriterProperties(compression="ZSTD", max_row_group_size=_GROUP_ROWS)
 _FILES_A_MONTH = 8  # more small files than this are put together after the night
 # Old generations stay for readers that began before the compaction: the week that Delta's own tools keep.
 _KEEP_HOURS = 7 * 24
@@ -48,18 +54,29 @@ _DAMAGED = "_damaged"  # a name with an underscore: Delta's own tools leave it a
 
 
 @dataclass(frozen=True)
+class Wanted:
+    """Which rows a reader asks for: of these vehicles (None = all), from day `first` to day `last` (None = open)."""
+
+    vehicles: frozenset[str] | None = None
+    first: str | None = None
+    last: str | None = None
+
+    def may_be_within(self, days: tuple[str, str] | None, vehicles: tuple[str, str] | None) -> bool:
+        """False where no such row can be among rows between these days and vehicles (None: not known)."""
+        if days is not None and ((self.first or "") > days[1] or (self.last or "9999") < days[0]):
+            return False
+        if self.vehicles is None or vehicles is None:
+            return True
+        return any(vehicles[0] <= vehicle <= vehicles[1] for vehicle in self.vehicles)
+
+
+@dataclass(frozen=True)
 class LiveFile:
     """A data file of a table's newest version; its rows lie between these days and vehicles (None: not known)."""
 
     name: str
     days: tuple[str, str] | None = None
     vehicles: tuple[str, str] | None = None
-
-    def may_hold(self, vehicle: str | None, first: str | None, last: str | None) -> bool:
-        """False where no row of the vehicle (None = any) from day `first` to day `last` can be in it."""
-        if self.days is not None and ((first or "") > self.days[1] or (last or "9999") < self.days[0]):
-            return False
-        return vehicle is None or self.vehicles is None or self.vehicles[0] <= vehicle <= self.vehicles[1]
 
 
 def stored_schema(schema: TableSchema) -> pa.Schema:
@@ -113,14 +130,26 @@ def live_files(table: DeltaTable) -> list[LiveFile]:
     return [LiveFile(name, span("day", i), span("vehicle", i)) for i, name in enumerate(columns["path"])]
 
 
-def read_file(lake: Lake, schema: TableSchema, name: str, columns: Sequence[str]) -> pa.Table | None:
-    """Columns of one data file, those that it has; None where it is damaged or gone, which `lake.damage` then names."""
-    path = lake.record_file(schema.name, name)
-    wanted = schema.arrow_schema()
+def read_file(
+    lake: Lake, schema: TableSchema, name: str, columns: Sequence[str], wanted: Wanted | None = None
+) -> pa.Table | None:
+    """Columns of one data file, those that it has; None where it is damaged or gone, which `lake.damage` then names.
+
+    Args:
+        lake: where the table is.
+        schema: of the table.
+        name: of the file.
+        columns: names; "MAP.KEY" is one value of a column of maps, as float64, null where a row has none.
+        wanted: row groups without such rows are left out; rows beside them in the others are not.
+    """
+    path, mapped = lake.record_file(schema.name, name), _mapped(columns)
+    whole = [c for c in columns if "." not in c]
+    # Keys of maps are the same in every row: as places in a dictionary they are a fifth of the memory and time.
+    coded = [f"{c}.key_value.key" for c in mapped if c not in whole]
     try:
-        with lake.files.opened(path) as stream, pq.ParquetFile(stream) as file:
-            there = [c for c in columns if c in file.schema_arrow.names]
-            table = file.read(columns=there)
+        with lake.files.opened(path) as stream, pq.ParquetFile(stream, read_dictionary=coded) as file:
+            there = [c for c in dict.fromkeys([*whole, *mapped]) if c in file.schema_arrow.names]
+            table = file.read_row_groups(_groups(file.metadata, wanted or Wanted()), columns=there)
     except PermissionError:
         raise
     except (pa.ArrowException, OSError, EOFError) as err:
@@ -129,7 +158,52 @@ def read_file(lake: Lake, schema: TableSchema, name: str, columns: Sequence[str]
         lake.damage.append(f"{path}: {str(err).splitlines()[0]}")
         return None
     # The writer may have chosen string views for strings.
-    return table.cast(pa.schema([wanted.field(n).with_nullable(True) for n in there]))
+    there = [c for c in there if c in whole]
+    arrow = schema.arrow_schema()
+    found = table.select(there).cast(pa.schema([arrow.field(c).with_nullable(True) for c in there]))
+    for column, keys in mapped.items():
+        for key in keys:
+            maps = table[column] if column in table.column_names else None
+            found = found.append_column(f"{column}.{key}", _values_of(maps, key, table.num_rows))
+    return found
+
+
+def _mapped(columns: Sequence[str]) -> dict[str, list[str]]:
+    """Keys that are asked for of columns of maps."""
+    found: dict[str, list[str]] = {}
+    for column, _, key in (c.partition(".") for c in columns if "." in c):
+        found.setdefault(column, []).append(key)
+    return found
+
+
+def _groups(metadata: pq.FileMetaData, wanted: Wanted) -> list[int]:
+    """Row groups in which rows that are asked for may be."""
+    place = {metadata.schema.column(i).path: i for i in range(metadata.num_columns)}
+    return [
+        g
+        for g in range(metadata.num_row_groups)
+        if wanted.may_be_within(*(_span(metadata.row_group(g), place.get(c)) for c in ("day", "vehicle")))
+    ]
+
+
+def _span(group: pq.RowGroupMetaData, column: int | None) -> tuple[str, str] | None:
+    statistics = group.column(column).statistics if column is not None else None
+    return (statistics.min, statistics.max) if statistics is not None and statistics.has_min_max else None
+
+
+def _values_of(maps: pa.ChunkedArray | None, key: str, rows: int) -> pa.Array:
+    """The values of one key of a column of maps."""
+    values, begin = np.full(rows, np.nan), 0
+    there = np.zeros(rows, bool)
+    for chunk in maps.chunks if maps is not None else []:
+        keys = chunk.keys if pa.types.is_dictionary(chunk.keys.type) else chunk.keys.dictionary_encode()
+        known = keys.dictionary.to_pylist()
+        if key in known:
+            at = np.flatnonzero(np.asarray(keys.indices) == known.index(key))
+            row = begin + np.searchsorted(np.asarray(chunk.offsets), at, side="right") - 1
+            values[row], there[row] = np.asarray(chunk.items)[at], True
+        begin += len(chunk)
+    return pa.array(values, pa.float64(), mask=~there)
 
 
 def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool = True) -> None:
@@ -174,7 +248,7 @@ def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bo
         source_alias="s",
         target_alias="t",
         merge_schema=not known >= set(rows.column_names),
-        writer_properties=WriterProperties(compression="ZSTD"),
+        writer_properties=_WRITER,
     ).when_matched_update({"asserted_at": "s.asserted_at"}, predicate="s.asserted_at > t.asserted_at")
     (merging.when_not_matched_insert_all() if insert else merging).execute()
 
@@ -246,6 +320,8 @@ def tidy_table(lake: Lake, schema: TableSchema) -> Iterator[str]:
 
 
 def _compacted(table: DeltaTable, month: str) -> Iterator[str]:
-    done: dict[str, Any] = table.optimize.compact([(_MONTH, "=", month)], target_size=_FILE_BYTES)
+    done: dict[str, Any] = table.optimize.compact(
+        [(_MONTH, "=", month)], target_size=_FILE_BYTES, writer_properties=_WRITER
+    )
     if done["numFilesRemoved"]:
         yield f"{month}: {done['numFilesRemoved']} files are {done['numFilesAdded']} now"

@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.store.delta import live_files, merge_rows, open_table, read_file, stored_schema
+from pipeline.store.delta import Wanted, live_files, merge_rows, open_table, read_file, stored_schema
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
@@ -126,25 +126,37 @@ def read_records(
     Raises:
         ContractError: the lake is of another release, or lacks a column that has no default.
     """
-    one = vehicle if isinstance(vehicle, str) else None
-    found = _sorted_rows(lake, schema, row_type, one, day or first, day or last, columns)
-    if found is not None and isinstance(vehicle, AbstractSet):
-        found = found.filter(pc.is_in(found["vehicle"], pa.array(sorted(vehicle), pa.string())))
+    wanted = _wanted(vehicle, day or first, day or last)
+    found = _sorted_rows(lake, schema, row_type, wanted, columns)
     return [] if found is None else from_table(found, schema, row_type)
 
 
 def read_columns(
-    lake: Lake, schema: TableSchema, columns: Sequence[str], *, first: str | None, last: str | None
+    lake: Lake,
+    schema: TableSchema,
+    columns: Sequence[str],
+    *,
+    first: str | None,
+    last: str | None,
+    vehicle: str | AbstractSet[str] | None = None,
 ) -> pa.Table | None:
     """Columns of the records of a window of days, in no order, with what tells which of them are current.
 
     For thousands of vehicles, of which rows would be gigabytes (`current_rows` keeps the current ones).
 
+    Args:
+        lake: where the table is.
+        schema: of the table.
+        columns: names; "diagnostics.disproved" is one value of a column of maps, null where a record has none.
+        first: only from this day on.
+        last: only until this day.
+        vehicle: only this vehicle's, or only these'.
+
     Returns:
         None where there is no record.
     """
-    wanted = dict.fromkeys([*schema.about, "asserted_at", "work_key", *columns])
-    return _rows_of(lake, schema, list(wanted), None, first, last)
+    asked = dict.fromkeys([*schema.about, "asserted_at", "work_key", *columns])
+    return _rows_of(lake, schema, list(asked), _wanted(vehicle, first, last))
 
 
 class RecordIndex(Generic[Row]):
@@ -171,7 +183,7 @@ class RecordIndex(Generic[Row]):
         columns: Sequence[str] | None = None,
     ) -> None:
         self._schema, self._row_type = schema, row_type
-        self._rows = _sorted_rows(lake, schema, row_type, None, first, last, columns)
+        self._rows = _sorted_rows(lake, schema, row_type, Wanted(None, first, last), columns)
         self._spans: dict[tuple[str, str], tuple[int, int]] = {}
         if self._rows is not None:
             owners = zip(*(self._rows[name].to_pylist() for name in ("vehicle", "day")), strict=True)
@@ -190,17 +202,15 @@ def _sorted_rows(
     lake: Lake,
     schema: TableSchema,
     row_type: type[Any],
-    vehicle: str | None,
-    first: str | None,
-    last: str | None,
+    wanted: Wanted,
     columns: Sequence[str] | None,
 ) -> pa.Table | None:
     """Columns as `read_records` promises them, in its order; None where there is no row."""
     known = {f.name: f for f in fields(row_type)}
     required = {n for n, f in known.items() if (f.default, f.default_factory) == (MISSING, MISSING)}
     always = required | {*schema.about, "work_key", "recorded_at", "asserted_at"}
-    wanted = [c.name for c in schema.columns if columns is None or c.name in always or c.name in columns]
-    found = _rows_of(lake, schema, wanted, vehicle, first, last)
+    asked = [c.name for c in schema.columns if columns is None or c.name in always or c.name in columns]
+    found = _rows_of(lake, schema, asked, wanted)
     if found is None:
         return None
     order = [(name, "ascending") for name in ("vehicle", "day", "asserted_at", *schema.about[2:], "work_key")]
@@ -230,10 +240,7 @@ def read_latest(
         vehicle: only this vehicle's, or only these'.
         columns: see `read_records`.
     """
-    one = vehicle if isinstance(vehicle, str) else None
-    keys = _rows_of(lake, schema, ["vehicle", "method", "day"], one, first, last)
-    if keys is not None and isinstance(vehicle, AbstractSet):
-        keys = keys.filter(pc.is_in(keys["vehicle"], pa.array(sorted(vehicle), pa.string())))
+    keys = _rows_of(lake, schema, ["vehicle", "method", "day"], _wanted(vehicle, first, last))
     if keys is None:
         return []
     latest = keys.group_by(["vehicle", "method"]).aggregate([("day", "max")])
@@ -262,30 +269,32 @@ def last_day(lake: Lake, schema: TableSchema) -> str | None:
     return max((days[1] for days in spans if days is not None), default=None)
 
 
-def _rows_of(
-    lake: Lake,
-    schema: TableSchema,
-    columns: Sequence[str],
-    vehicle: str | None,
-    first: str | None,
-    last: str | None,
-) -> pa.Table | None:
+def _wanted(vehicle: str | AbstractSet[str] | None, first: str | None, last: str | None) -> Wanted:
+    own = (
+        frozenset([vehicle]) if isinstance(vehicle, str) else None if vehicle is None else frozenset(vehicle)
+    )
+    return Wanted(own, first, last)
+
+
+def _rows_of(lake: Lake, schema: TableSchema, columns: Sequence[str], wanted: Wanted) -> pa.Table | None:
     table = open_table(lake, schema)
-    files = [f for f in live_files(table) if f.may_hold(vehicle, first, last)] if table is not None else []
-    read = (read_file(lake, schema, file.name, columns) for file in files)
-    parts = [_chosen(part, vehicle, first, last) for part in read if part is not None]
+    files = live_files(table) if table is not None else []
+    files = [f for f in files if wanted.may_be_within(f.days, f.vehicles)]
+    read = (read_file(lake, schema, file.name, columns, wanted) for file in files)
+    parts = [_chosen(part, wanted) for part in read if part is not None]
     parts = [p for p in parts if p.num_rows]
     return pa.concat_tables(parts, promote_options="default").combine_chunks() if parts else None
 
 
-def _chosen(rows: pa.Table, vehicle: str | None, first: str | None, last: str | None) -> pa.Table:
+def _chosen(rows: pa.Table, wanted: Wanted) -> pa.Table:
     conditions = []
-    if vehicle is not None:
-        conditions.append(pc.equal(rows["vehicle"], vehicle))
-    if first is not None:
-        conditions.append(pc.greater_equal(rows["day"], first))
-    if last is not None:
-        conditions.append(pc.less_equal(rows["day"], last))
+    if wanted.vehicles is not None:
+        among = pa.array(sorted(wanted.vehicles), pa.string())
+        conditions.append(pc.is_in(rows["vehicle"], among))
+    if wanted.first is not None:
+        conditions.append(pc.greater_equal(rows["day"], wanted.first))
+    if wanted.last is not None:
+        conditions.append(pc.less_equal(rows["day"], wanted.last))
     for condition in conditions[1:]:
         conditions[0] = pc.and_(conditions[0], condition)
     return rows.filter(conditions[0]) if conditions else rows
@@ -300,9 +309,9 @@ def _known(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> Mapping[tupl
     rows = list(rows)
     days = sorted({row.day for row in rows})
     vehicles = {row.vehicle for row in rows}
-    one = next(iter(vehicles)) if len(vehicles) == 1 else None
+    one = vehicles if len(vehicles) == 1 else None
     columns = [*schema.about, "work_key", "asserted_at"]
-    found = _rows_of(lake, schema, columns, one, days[0], days[-1]) if rows else None
+    found = _rows_of(lake, schema, columns, _wanted(one, days[0], days[-1])) if rows else None
     known: dict[tuple[str, ...], dict[str, str]] = {}
     if found is not None:
         values = [found.column(name).to_pylist() for name in columns]

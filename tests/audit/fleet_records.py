@@ -6,9 +6,14 @@ import datetime as dt
 from collections.abc import Callable
 
 import numpy as np
+import pyarrow as pa
 
+from pipeline.audit import estimates
+from pipeline.audit.days import PairDays
+from pipeline.audit.estimates import COLUMNS, estimates_of
 from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse, to_quaternion
-from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from pipeline.store.rows import to_table
+from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 
 FIRST_DAY = dt.date(2026, 3, 1)
 # Lidar axes (x forward, y left, z up) seen in the optical frame, sensors where a car has them.
@@ -62,6 +67,16 @@ def vehicle_records(
             _record(vehicle, day, pair, T[pair], cov[pair], status(day), unobservable) for pair in PAIRS
         ]
     return records
+
+
+def days_of(records: list[CalibrationRecord], held_sigma_factor: float) -> dict[str, PairDays]:
+    """Records of one vehicle as the audit charts them."""
+    table = to_table(records, CALIBRATIONS)
+    for name in COLUMNS:
+        if "." in name:
+            known = [r.diagnostics.get(name.partition(".")[2]) for r in records]
+            table = table.append_column(name, pa.array(known, pa.float64()))
+    return estimates.days_of(estimates_of(table), held_sigma_factor)
 
 
 def _record(

@@ -8,7 +8,6 @@ import pytest
 
 from pipeline.audit.attribution import PairShift, attribute, pair_shift
 from pipeline.audit.days import PairDays
-from pipeline.audit.estimates import days_of
 from pipeline.audit.vehicle import independent_pairs
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse, log_se3
 
@@ -17,7 +16,7 @@ KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])  # a turned bracke
 
 def _days(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[str, PairDays]:
     rng = np.random.default_rng(seed)
-    return days_of(maker.vehicle_records("v", 4, rng, motion=lambda day: moved if day > 1 else {}), 2.0)
+    return maker.days_of(maker.vehicle_records("v", 4, rng, motion=lambda day: moved if day > 1 else {}), 2.0)
 
 
 def _shifts(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[str, PairShift]:

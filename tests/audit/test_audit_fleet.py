@@ -8,7 +8,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from pipeline.audit.estimates import days_of
 from pipeline.audit.vehicle import judge_fleet
 from pipeline.config import AuditConfig, FleetConfig
 from pipeline.errors import ConfigError
@@ -69,7 +68,9 @@ def test_a_vehicle_raises_no_more_false_alarms_than_its_budget(maker: ModuleType
     rng = np.random.default_rng(2)
     config = AuditConfig(false_alarms_per_1000_vehicle_days=200.0)  # 0.2 per audit: 120 audits can tell
     trials = 120
-    fleet = [days_of(maker.vehicle_records("v", 8, rng), config.held_sigma_factor) for _ in range(trials)]
+    fleet = [
+        maker.days_of(maker.vehicle_records("v", 8, rng), config.held_sigma_factor) for _ in range(trials)
+    ]
     alarms = sum(any(v.change for v in verdict.charts.values()) for verdict in judge_fleet(fleet, config))
     assert 0 < alarms <= trials * 0.2 + 3 * np.sqrt(trials * 0.2 * 0.8)
 

@@ -13,18 +13,20 @@ import duckdb
 import numpy as np
 import polars as pl
 import pytest
-from deltalake import DeltaTable
+from deltalake import DeltaTable, WriterProperties
 
 import pipeline.store.delta
 from pipeline.errors import ContractError
+from pipeline.store import delta
 from pipeline.store.current import current_records
-from pipeline.store.delta import tidy_table
+from pipeline.store.delta import Wanted, live_files, open_table, read_file, tidy_table
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import (
     RecordIndex,
     assert_records,
     commit_records,
     last_day,
+    read_columns,
     read_latest,
     read_records,
     write_records,
@@ -141,7 +143,9 @@ def test_a_reader_gets_the_window_the_vehicle_and_the_columns_that_it_asks_for(l
         commit_records(lake, CALIBRATIONS, [row])
     opened = []
     real = pipeline.store.delta.pq.ParquetFile
-    monkeypatch.setattr(pipeline.store.delta.pq, "ParquetFile", lambda f: (opened.append(f), real(f))[1])
+    monkeypatch.setattr(
+        pipeline.store.delta.pq, "ParquetFile", lambda f, **k: (opened.append(f), real(f, **k))[1]
+    )
     got = read(lake, vehicle="a", first="2026-02-01", columns=("qw",))
     assert [(r.vehicle, r.day) for r in got] == [("a", "2026-02-01"), ("a", "2026-02-03")]
     assert len(opened) == 2  # files of other days and vehicles are not opened
@@ -152,6 +156,40 @@ def test_a_reader_gets_the_window_the_vehicle_and_the_columns_that_it_asks_for(l
     assert len(read(lake, last="2026-01-31")) == 2
     assert read(lake, vehicle="c") == []
     assert last_day(lake, CALIBRATIONS) == "2026-02-03"
+
+
+def test_of_a_month_in_one_file_only_the_row_groups_of_the_days_asked_for_are_read(lake, rng, monkeypatch):
+    monkeypatch.setattr(delta, "_WRITER", WriterProperties(max_row_group_size=2))
+    days = [f"2026-01-{d:02d}" for d in range(1, 11)]
+    for day in days:
+        commit_records(lake, CALIBRATIONS, [record(rng, v + day, v, day) for v in ("a", "b")])
+    assert any("are 1 now" in told for told in tidy_table(lake, CALIBRATIONS))
+    [file] = live_files(open_table(lake, CALIBRATIONS))
+    columns = ["vehicle", "day"]
+    assert read_file(lake, CALIBRATIONS, file.name, columns).num_rows == 20
+    for wanted, expected in ((Wanted(None, days[3], days[4]), days[3:5]), (Wanted(None, days[9]), days[9:])):
+        found = read_file(lake, CALIBRATIONS, file.name, columns, wanted)
+        assert set(found["day"].to_pylist()) == set(expected)
+    assert read_file(lake, CALIBRATIONS, file.name, columns, Wanted(frozenset({"c"}))).num_rows == 0
+    assert [r.day for r in read(lake, vehicle={"a", "c"}, last=days[1])] == days[:2]
+
+
+def test_one_value_of_a_column_of_maps_is_read_as_a_column(lake, rng):
+    told = [{}, {"x": 1.5, "y": 2.0}, {"y": 3.0}, {}, {"x": 4.0}]
+    rows = [
+        replace(record(rng, str(k), "a", f"2026-01-{k + 1:02d}"), diagnostics=d) for k, d in enumerate(told)
+    ]
+    commit_records(lake, CALIBRATIONS, rows[:2])
+    commit_records(lake, CALIBRATIONS, rows[2:])
+    asked = ["diagnostics.x", "diagnostics.none", "status"]
+    found = read_columns(lake, CALIBRATIONS, asked, first=None, last=None).sort_by("day")
+    assert found["diagnostics.x"].to_pylist() == [d.get("x") for d in told]
+    assert found["diagnostics.none"].to_pylist() == [None] * 5
+    both = read_columns(lake, CALIBRATIONS, ["diagnostics", "diagnostics.y"], first=None, last=None).sort_by(
+        "day"
+    )
+    assert both["diagnostics.y"].to_pylist() == [d.get("y") for d in told]
+    assert [dict(m) for m in both["diagnostics"].to_pylist()] == told
 
 
 def test_an_index_gives_each_vehicle_day_what_reading_it_gives(lake, rng):

@@ -1,0 +1,60 @@
+"""Columns of record tables as NumPy arrays: what thousands of vehicles' records are worked on as."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Bool, Float, Int
+
+__all__ = ["matrices", "observable_dofs", "ordinals", "places", "there"]
+
+_DOFS = 6
+_MATRIX_BYTES = 8 * _DOFS**2
+
+
+def there(column: pa.ChunkedArray) -> Bool[np.ndarray, " N"]:
+    """Where a column is not null."""
+    return np.asarray(column.is_valid().combine_chunks()).astype(bool)
+
+
+def matrices(column: pa.ChunkedArray) -> Float[np.ndarray, "N 6 6"]:
+    """Covariances of a column; not finite where it has none, or a blob of another size."""
+    whole = there(column) & (pc.binary_length(column).fill_null(0).to_numpy() == _MATRIX_BYTES)
+    found = np.full((len(whole), _DOFS, _DOFS), np.nan)
+    if whole.any():
+        blobs = b"".join(column.filter(pa.array(whole)).to_pylist())
+        found[whole] = np.frombuffer(blobs, "<f8").reshape(-1, _DOFS, _DOFS)
+    return found
+
+
+def observable_dofs(column: pa.ChunkedArray) -> Bool[np.ndarray, "N 6"]:
+    """Per DoF; a record that does not say has determined them all."""
+    values = column.combine_chunks()
+    seen = np.ones((len(values), _DOFS), bool)
+    said = there(column) & (pc.list_value_length(values).fill_null(0).to_numpy() == _DOFS)
+    if said.any():
+        flat = values.filter(pa.array(said)).flatten()
+        seen[said] = np.asarray(flat.to_numpy(zero_copy_only=False)).astype(bool).reshape(-1, _DOFS)
+    return seen
+
+
+def ordinals(days: pa.ChunkedArray) -> Int[np.ndarray, " N"]:
+    """Days of the calendar, YYYY-MM-DD, as ordinals; 0 where a column has none."""
+    coded = pc.fill_null(days, "").combine_chunks().dictionary_encode()
+    known = [dt.date.fromisoformat(day).toordinal() if day else 0 for day in coded.dictionary.to_pylist()]
+    return np.array(known, np.int64)[np.asarray(coded.indices)]
+
+
+def places(column: pa.ChunkedArray, names: Sequence[str]) -> Int[np.ndarray, " N"]:
+    """Where each value of a column stands among names.
+
+    Raises:
+        ValueError: a value is none of them.
+    """
+    coded = column.combine_chunks().dictionary_encode()
+    place = np.array([names.index(name) for name in coded.dictionary.to_pylist()], np.int64)
+    return place[np.asarray(coded.indices)]
