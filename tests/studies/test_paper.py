@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.geometry.se3 import exp_se3
 from pipeline.report.overlays import Extrinsics, Scene
-from tests.benchmarks.studies import paper_figures, paper_table
+from tests.benchmarks.studies import paper_figures, paper_ssl, paper_table
 from tests.benchmarks.studies.engine import RESULTS
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 from tests.makers.training_lakes import frame_of
@@ -58,3 +58,17 @@ def test_the_page_of_figures_needs_nothing_from_outside_and_tells_errors_against
     empty = paper_figures.without_lidar(scenes[0])
     assert len(empty.frame.lidar_xyz_m) == 0
     assert len(empty.observation.radar_track_xyz_m) == len(scenes[0].observation.radar_track_xyz_m)
+
+
+def test_a_learning_curve_is_continued_by_its_power_law_and_not_where_it_does_not_fall(tmp_path):
+    samples = np.array([1e3, 2e3, 4e3, 6e3, 8e3])
+    law = 0.7 + 3.0 * samples**-0.25
+    found = paper_ssl.extrapolated(samples, law, 0.7)
+    assert abs(found["slope"] + 0.25) < 1e-3
+    assert abs(found["at_paper"] - (0.7 + 3.0 * paper_ssl.PAPER_SAMPLES**-0.25)) < 1e-3
+    assert abs(found["halved_at"] / (8e3 * 16) - 1) < 0.01
+    assert paper_ssl.extrapolated(samples, law[::-1], 0.7) is None
+    assert paper_ssl.extrapolated(samples[:2], law[:2], 0.7) is None
+    lines = [{"step": 500, "validation/alignment": 1.25}, {"step": 510, "loss": 1.0}]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert paper_ssl.curve_of(tmp_path, 4) == {"samples": [2000], "loss": [1.25]}
