@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
 __all__ = ["models"]
 
+_WIDTH = 120  # columns, also where nobody watches: a sha256 and a path fit
+
 
 def models(*, json: bool = False) -> int:
     """List every model that ships with the package, and compare each file with the sha256 of its card.
@@ -44,7 +46,7 @@ def _print_table(found: Sequence[ShippedModel]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console = Console(stderr=True, width=_WIDTH, highlight=False)
     for model in found:
         card = model.card
         table = Table(box=None, show_header=False, title=model.name, title_justify="left", title_style="bold")

@@ -10,6 +10,8 @@ if TYPE_CHECKING:
 
 __all__ = ["print_choices"]
 
+_WIDTH = 120  # columns, also where nobody watches: a line per choice
+
 _WORDS = {
     "split_conflict": "between the sides",
     "next_to_other_split": "too near in time to another side",
@@ -25,7 +27,7 @@ def print_choices(choices: Sequence[Choice]) -> None:
     from rich.table import Table
 
     table = Table(box=None, title="what a split costs, in frames", title_justify="left")
-    for name in ("split_by", "train", "val", "test", "lost", "of them", "vehicle-days without a frame"):
+    for name in ("split_by", "train", "val", "test", "lost", "of them", "days without"):
         table.add_column(name, justify="left" if name in ("split_by", "of them") else "right")
     for choice in choices:
         table.add_row(
@@ -35,4 +37,4 @@ def print_choices(choices: Sequence[Choice]) -> None:
             ", ".join(f"{count} {_WORDS.get(reason, reason)}" for reason, count in choice.lost.items()),
             str(choice.empty_vehicle_days),
         )
-    Console(stderr=True, soft_wrap=True).print(table)
+    Console(stderr=True, width=_WIDTH).print(table)

@@ -120,3 +120,13 @@ def test_a_manifest_that_does_not_fit_is_told_by_its_key(before, after, told, tm
 def test_no_manifest_is_a_plain_error(tmp_path, lake):
     with pytest.raises(ModelError, match="no such manifest"):
         perceive_day(DAY, fleet(tmp_path / "fleet.toml", **MODEL), lake)
+
+
+def test_the_network_that_ships_is_named_by_a_word_and_tells_free_ranges(lake):
+    shipped = {"drivable": {"source": "onnx", "model": "shipped:radar_drivable"}}
+    perceive_day(DAY, fleet(), lake)
+    before = [r.radar_drivable_range_m for r in rows(lake)]
+    assert perceive_day(DAY, fleet(**shipped), lake).status == "done"
+    after = [r.radar_drivable_range_m for r in rows(lake)]
+    assert all(len(r) and np.isfinite(r).all() and (r >= 0).all() and (r <= 80).all() for r in after)
+    assert any(len(a) != len(b) or not np.allclose(a, b) for a, b in zip(after, before, strict=True))
