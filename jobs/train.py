@@ -49,7 +49,7 @@ def train(  # options of the command: as many as a user may set
         batch_size: frames per process and step.
         budget: time of the whole run, as in 25m; the learning rate falls over it.
         seed: of everything random.
-        start_from: folder of a finished run whose best weights a new run begins with, to fine-tune them on other data.
+        start_from: finished run, or exported model.onnx, whose weights a new run begins with, to fine-tune them.
         time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
         device: cpu, cuda, or whatever is there.
         compiled: compile the encoders (minutes at first, faster afterwards).

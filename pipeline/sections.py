@@ -233,6 +233,8 @@ class LearnConfig(Section):
     )
     iterations: Annotated[int, Field(ge=1, le=5)] = 3  # passes per frame, each rendered at the one before
     threads: Annotated[int, Field(ge=1)] = 1
+    # What a network that takes classes is shown of a frame with labels: both, its image alone, or its classes alone.
+    camera: Literal["both", "image", "classes"] = "both"
 
 
 class ReportConfig(Section):

@@ -10,7 +10,7 @@ from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import inverse
 from pipeline.simulate.fleet import FleetSpec, drive_of, simulate_vehicle_day
-from pipeline.simulate.logs.fleet_toml import fleet_toml
+from pipeline.simulate.logs.fleet_toml import fleet_toml, mixed_fleet_toml
 from pipeline.simulate.logs.writers import TOPICS
 from pipeline.simulate.sensors.beams import beams_of
 from pipeline.simulate.sensors.camera import render, view_of
@@ -20,7 +20,7 @@ from pipeline.simulate.sensors.rolling_shutter import RollingShutter
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
-every_rig = pytest.mark.parametrize("name", RIGS)
+every_rig = pytest.mark.parametrize("name", [*RIGS, "random-7003", "random-7004"])
 
 
 @every_rig
@@ -51,8 +51,34 @@ def test_pixels_of_a_rig_s_camera_are_where_its_rays_come_from(name):
 
 
 def test_an_unknown_rig_is_refused_with_those_that_exist():
-    with pytest.raises(ConfigError, match="corner-left"):
-        rig_named("corner-middle")
+    for unknown in ("corner-middle", "random-", "random-x"):
+        with pytest.raises(ConfigError, match="corner-left"):
+            rig_named(unknown)
+
+
+def test_random_rigs_are_of_all_kinds_and_a_seed_s_own():
+    rigs = [rig_named(f"random-{seed}") for seed in range(40)]
+    assert rigs[7] == rig_named("random-7")
+    assert not rig_named("random-7-flat").radar.has_elevation
+    rows = [rig.lidar.rows for rig in rigs]
+    assert min(rows) == 16
+    assert max(rows) >= 96
+    assert {rig.camera.model for rig in rigs} == {"equidistant", "plumb_bob"}
+    assert len({rig.camera.width_px for rig in rigs}) > 10
+    assert all(280_000 < rig.camera.width_px * rig.camera.height_px < 540_000 for rig in rigs)
+    assert all(40 < rig.camera.horizontal_deg <= 150 for rig in rigs)
+    assert all(
+        rig.lidar.rows * rig.lidar.columns < 80_000 for rig in rigs
+    )  # no frame costs much more than another
+
+
+def test_every_vehicle_of_a_mixed_fleet_has_its_own_rig(tmp_path):
+    rigs = {f"v{seed}": rig_named(f"random-{seed}") for seed in range(3)}
+    (tmp_path / "fleet.toml").write_text(mixed_fleet_toml("f", rigs))
+    fleet = load_fleet(tmp_path / "fleet.toml")
+    for vehicle, rig in rigs.items():
+        assert fleet.rig_of(vehicle).radar.doppler_period_mps == rig.radar.doppler_period_mps
+        assert fleet.vehicles[vehicle].rig == rig.name
 
 
 @pytest.mark.parametrize(("name", "yaw_deg"), [("corner-left", 45), ("corner-right", -45)])

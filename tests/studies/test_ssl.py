@@ -93,7 +93,17 @@ def test_seeds_of_networks_days_are_nobody_elses(tmp_path):
     assert len(cross) == 6
     assert not others & cross
     assert ssl_fleet.FLEET.seed not in others | cross
+    rigs = {ssl_fleet.spec_of("rigs", n).seed for n in range(ssl_fleet.RIGS.vehicles)}
+    assert len(rigs) == ssl_fleet.RIGS.vehicles
+    assert not rigs & (others | cross)
     assert [w.seed for w in table1_days(tmp_path)][:2] == [SETS["table1"][0].seed, SETS["table1"][5].seed]
+
+
+def test_a_third_of_the_fleet_of_rigs_drives_at_dusk():
+    specs = [ssl_fleet.spec_of("rigs", n) for n in range(30)]
+    assert sum(bool(spec.faults) for spec in specs) == 10
+    assert {spec.environments for spec in specs} == {"urban", "highway", "mixed"}
+    assert len({spec.rig for spec in specs}) == len({spec.semantics for spec in specs}) == 30
 
 
 class Halving:

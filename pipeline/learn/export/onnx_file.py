@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from pipeline.learn.export.model_card import write_card
 from pipeline.learn.export.tracing import trace_to_onnx
 from pipeline.learn.network.calibration_network import CalibrationNetwork
+from pipeline.learn.network.exported_weights import WEIGHTS, weight_places
 from pipeline.learn.network.views import RenderedView
-from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import (
     GRAPH_INPUTS,
     LIDAR_CHANNELS,
@@ -61,7 +61,7 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
         card: what is known of data, seeds, time, results and limits; goes into the file's metadata too.
     """
     network.eval()
-    examples = _examples(network.config.grid)
+    examples = _examples(network.config)
     graph = _Graph(network)
     with torch.no_grad():
         outputs = graph(*examples)
@@ -73,6 +73,7 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
     model = trace_to_onnx(graph, examples, unfinished, GRAPH_INPUTS, names)
     _shorten_names(model, {*GRAPH_INPUTS, *names})
     metadata = _metadata(network.config, card or {})
+    metadata[WEIGHTS] = json.dumps(weight_places(network.state_dict(), model))
     for key, value in metadata.items():
         entry = model.metadata_props.add()
         entry.key, entry.value = key, value
@@ -83,8 +84,9 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
     return out
 
 
-def _examples(grid: Grid) -> tuple[Tensor, ...]:
+def _examples(config: NetworkConfig) -> tuple[Tensor, ...]:
     """Inputs of the right shapes with something ahead of the car."""
+    grid = config.grid
     generator = torch.Generator().manual_seed(0)
 
     def random(*shape: int) -> Tensor:
@@ -96,7 +98,7 @@ def _examples(grid: Grid) -> tuple[Tensor, ...]:
     points = ahead + spread * (random(1, MATCHED_POINTS, 3) - 0.5)
     radar = ahead + spread * (random(1, RADAR_POINTS, 3) - 0.5)
     return (
-        random(1, 4, grid.height, grid.width),
+        random(1, config.camera_channels, grid.height, grid.width),
         random(1, LIDAR_CHANNELS, grid.height, grid.width),
         random(1, RADAR_CHANNELS, grid.height, grid.width),
         points @ to_camera.T,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import no_type_check
 
@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float, Float32, Int32
 from pipeline.geometry.se3 import transform_points
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import (
+    CAMERA_CHANNELS,
+    CLASS_CHANNELS,
     EDGE_BONUS,
     FEATURE_UNITS,
     GROUND_WEIGHT,
@@ -44,10 +46,33 @@ class FrameSensors:
     radar_xyz_m: Float32[np.ndarray, "M 3"]
     radar_features: Float32[np.ndarray, "M 3"]
     radar_has_elevation: bool
+    classes: Float32[np.ndarray, "C H W"] | None = None  # None: nobody says
+
+    def camera_channels(self, count: int) -> Float32[np.ndarray, "1 C H W"]:
+        """The graph's input `camera` of so many channels: the image alone, or the image and its classes."""
+        if count == CAMERA_CHANNELS:
+            return self.camera[None]
+        classes = self.classes
+        if classes is None:
+            classes = np.zeros((CLASS_CHANNELS, *self.camera.shape[1:]), np.float32)
+        return np.concatenate([self.camera, classes])[None]
+
+    def without_image(self) -> FrameSensors:
+        """The same with a grey image: what is seen is known, and nothing of its colours."""
+        camera = self.camera.copy()
+        camera[:-1] = 0
+        return replace(self, camera=camera)
 
 
-def frame_sensors(row: TrainingRow, grid: Grid) -> FrameSensors:
+def frame_sensors(
+    row: TrainingRow, grid: Grid, classes: Float32[np.ndarray, "C H W"] | None = None
+) -> FrameSensors:
     """Inputs from a row of table `training` (see `frame_sample.make_row`), whose grid contains the network's.
+
+    Args:
+        row: one frame.
+        grid: the network's.
+        classes: what a segmenter says of the grid (`camera_maps.class_likelihood`); None where there is none.
 
     Raises:
         ValueError: cells of another size, or a grid that does not contain the network's.
@@ -77,6 +102,7 @@ def frame_sensors(row: TrainingRow, grid: Grid) -> FrameSensors:
         row.radar_xyz_m[:count].astype(np.float32),
         np.stack(radar_features, -1).astype(np.float32),
         bool(row.radar_has_elevation),
+        classes,
     )
 
 
@@ -86,6 +112,7 @@ def render_frame(
     T_camera_radar: Float[np.ndarray, "4 4"],
     T_lidar_radar: Float[np.ndarray, "4 4"],
     grid: Grid,
+    camera_channels: int = CAMERA_CHANNELS,
 ) -> dict[str, np.ndarray]:
     """Inputs of the exported graph by name, batch 1."""
     lidar_camera = transform_points(T_camera_lidar, sensors.lidar_xyz_m).astype(np.float32)
@@ -99,7 +126,7 @@ def render_frame(
     weight = np.where(ground > 0.5, np.float32(GROUND_WEIGHT), np.float32(1))
     count = min(len(radar_camera), RADAR_POINTS)
     return {
-        "camera": sensors.camera[None],
+        "camera": sensors.camera_channels(camera_channels),
         "lidar_grid": _painted(lidar_camera, sensors.lidar_features, grid)[None],
         "radar_grid": _painted(radar_camera, sensors.radar_features, grid)[None],
         "points_camera": _padded(lidar_camera[matched], MATCHED_POINTS),

@@ -15,12 +15,15 @@ from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 from pipeline.config import FleetConfig, LearnConfig, PrepareConfig
 from pipeline.errors import ConfigError, ModelError
 from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.cameras import camera_of
 from pipeline.learn.infer.compiled_rendering import FrameSensors, frame_sensors
 from pipeline.learn.infer.frame_network import FrameAnswer
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.sample.camera_maps import class_likelihood
 from pipeline.learn.sample.frame_sample import About, sensor_row
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS as ROWS
+from pipeline.objective.paper.classes import labels_of
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation
@@ -82,7 +85,7 @@ class OnnxNetwork:
 
     def __init__(self, path: Path, config: LearnConfig, prepare: PrepareConfig, rows: _LastRow) -> None:
         self._path, self._calibrator = path, SingleFrameCalibrator(path, config.threads)
-        self._iterations, self._rows = config.iterations, rows
+        self._iterations, self._camera, self._rows = config.iterations, config.camera, rows
         self._prepare = _prepare_for(self._calibrator.grid, prepare)
         self._bias_sigma = _bias_of_card(path, self._calibrator.metadata.get("card", "{}"))
 
@@ -102,13 +105,18 @@ class OnnxNetwork:
         return self._calibrator.config.composed
 
     def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> FrameSensors:
-        """The frame as the network takes it; semantics are not used.
+        """The frame as the network takes it, with the classes of its labels where it takes some and there are any.
 
         Raises:
             SampleRejectedError: the frame shows too little.
         """
         row = self._rows.of(frame, observation, prior, self._prepare)
-        return frame_sensors(row, self._calibrator.grid)
+        classes, sees = None, self._camera != "classes"
+        if self._calibrator.config.takes_classes and self._camera != "image" and observation.labels_png:
+            grid = self._calibrator.grid
+            classes = class_likelihood(labels_of(observation), camera_of(observation), grid)
+        sensors = frame_sensors(row, self._calibrator.grid, classes)
+        return sensors if sees or classes is None else sensors.without_image()
 
     def answer(self, sensors: FrameSensors, guess: Mapping[str, np.ndarray]) -> FrameAnswer:
         """The last pass's transforms.

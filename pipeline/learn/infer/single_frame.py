@@ -1,6 +1,7 @@
 """Single-frame inference with onnxruntime: render at the guess, compute, correct, up to three times. No torch.
 
-No semantics are needed either: what the encoders know is in the file. The graph is cut behind the camera's encoder,
+No semantics are needed either: what the encoders know is in the file; those that take classes use them where there are
+some. The graph is cut behind the camera's encoder,
 whose answer does not depend on the guess.
 """
 
@@ -77,6 +78,7 @@ class SingleFrameCalibrator:
             self._network = _session(cut.extract_model([LIKELIHOOD, *others], _ANSWERS), threads)
         else:
             self._network = _session(model, threads)
+        self._channels = self.config.camera_channels
         self._inputs = {i.name for i in self._network.get_inputs()}
 
     @property
@@ -105,10 +107,10 @@ class SingleFrameCalibrator:
         guess = (T_camera_lidar, camera_radar, T_lidar_radar)
         likelihood = None
         if self._encoder is not None:
-            likelihood = self._encoder.run(None, {"camera": sensors.camera[None]})[0]
+            likelihood = self._encoder.run(None, {"camera": sensors.camera_channels(self._channels)})[0]
         found: list[FrameEstimate] = []
         for _ in range(iterations):
-            view = render_frame(sensors, *guess, self.grid)
+            view = render_frame(sensors, *guess, self.grid, self._channels)
             if likelihood is not None:
                 view[LIKELIHOOD] = likelihood
             feed = {name: view[name] for name in self._inputs}

@@ -16,7 +16,7 @@ from pipeline.learn.network.concat_network import ConcatCore
 from pipeline.learn.network.inputs import NetworkInputs
 from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.outputs import CoreOutputs, Predictions
-from pipeline.learn.network.views import render
+from pipeline.learn.network.views import RenderedView, render
 from pipeline.learn.sample.layout import NetworkConfig
 
 __all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "refine", "turns_only"]
@@ -30,19 +30,21 @@ class CalibrationNetwork(nn.Module):
         self.config = config
         self.core: MatchingCore | ConcatCore
         if config.architecture == "matching":
-            self.core = MatchingCore(config.grid, config.estimated, config.width, config.hidden)
+            self.core = MatchingCore(
+                config.grid, config.estimated, config.width, config.hidden, config.camera_channels
+            )
         else:
             self.core = ConcatCore(config.grid, config.estimated, config.width, config.hidden)
 
     def forward(self, inputs: NetworkInputs) -> Predictions:
         """One pass."""
-        view, index = render(inputs, self.config.grid)
+        view, index = self._render(inputs)
         return self._predictions(inputs, self.core(view), index)
 
     def encode(self, inputs: NetworkInputs) -> Predictions:
         """Class logits alone, at the guess: what teaches the encoders of `matching`."""
         assert isinstance(self.core, MatchingCore)
-        view, index = render(inputs, self.config.grid)
+        view, index = self._render(inputs)
         return self._predictions(inputs, self.core.encode(view), index)
 
     def refine(self, inputs: NetworkInputs, iterations: int) -> list[Predictions]:
@@ -55,7 +57,7 @@ class CalibrationNetwork(nn.Module):
         likelihood: Tensor | None = None
         logits: Tensor | None = None
         for _ in range(iterations):
-            view, index = render(inputs, self.config.grid)
+            view, index = self._render(inputs)
             if isinstance(self.core, MatchingCore) and found:
                 outputs = self.core.match(view, likelihood, logits)
             else:
@@ -71,6 +73,9 @@ class CalibrationNetwork(nn.Module):
                 T_lidar_radar=guess.T_lidar_radar,
             )
         return found
+
+    def _render(self, inputs: NetworkInputs) -> tuple[RenderedView, Int64[Tensor, "B HW"]]:
+        return render(inputs, self.config.grid, classes=self.config.takes_classes)
 
     def _predictions(
         self, inputs: NetworkInputs, outputs: CoreOutputs, index: Int64[Tensor, "B HW"]

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import FEATURE_UNITS
-from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND
+from pipeline.learn.sample.layout import CLASS_CONFIDENCE, FEATURE_UNITS
+from schemas.training import GRID_CLASSES, POINT_IS_EDGE, POINT_IS_GROUND, UNKNOWN_CLASS
 
-__all__ = ["NetworkInputs", "SensorInputs", "crop", "sensor_inputs"]
+__all__ = ["NetworkInputs", "SensorInputs", "crop", "given_classes", "sensor_inputs"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,10 +23,12 @@ class SensorInputs:
 
     `camera` is red, green, blue (0..1) and 1 where the image shows the whole cell. Features are those named in
     LIDAR_FEATURES and RADAR_FEATURES, of the order of one on any rig: ranks, heights over the ground in units of
-    3 m, Doppler residuals in units of 5 m/s, power over the scan's median in units of 20 dB.
+    3 m, Doppler residuals in units of 5 m/s, power over the scan's median in units of 20 dB. `classes` is what a
+    segmenter makes of the image: the likelihood of each of GRID_CLASSES and 1 where it is known, all 0 elsewhere.
     """
 
     camera: Float[Tensor, "B 4 H W"]
+    classes: Float[Tensor, "B C H W"]
     lidar_xyz_m: Float[Tensor, "B N 3"]
     lidar_features: Float[Tensor, "B N 4"]
     lidar_valid: Bool[Tensor, "B N"]
@@ -65,6 +67,7 @@ def sensor_inputs(batch: TrainingBatch, grid: Grid) -> SensorInputs:
     )
     return SensorInputs(
         crop(camera, batch.grid_step_deg, grid) / 255.0,
+        given_classes(crop(batch.grid_class, batch.grid_step_deg, grid)),
         batch.lidar_xyz_m.float(),
         lidar_features.float(),
         batch.lidar_valid,
@@ -73,6 +76,15 @@ def sensor_inputs(batch: TrainingBatch, grid: Grid) -> SensorInputs:
         batch.radar_valid,
         batch.radar_has_elevation,
     )
+
+
+def given_classes(grid_class: UInt8[Tensor, "B H W"]) -> Float[Tensor, "B C H W"]:
+    """`SensorInputs.classes` of stored classes, one per cell (inference has shares: `sample.camera_maps`)."""
+    count = len(GRID_CLASSES)
+    known = (grid_class != UNKNOWN_CLASS)[:, None].float()
+    hot = torch.stack([(grid_class == k).float() for k in range(count)], 1)
+    likelihood = CLASS_CONFIDENCE * hot + (1 - CLASS_CONFIDENCE) / count
+    return torch.cat([likelihood * known, known], 1)
 
 
 def radar_features(

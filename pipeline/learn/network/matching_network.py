@@ -14,12 +14,15 @@ from pipeline.learn.network.outputs import CoreOutputs, Heads, pose_of_twist
 from pipeline.learn.network.rendering import grid_cells, sphere
 from pipeline.learn.network.views import RenderedView
 from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import LIDAR_CHANNELS, PAIRS, RADAR_FEATURES
+from pipeline.learn.sample.layout import CAMERA_CHANNELS, LIDAR_CHANNELS, PAIRS, RADAR_FEATURES
 from schemas.training import GRID_CLASSES
 
-__all__ = ["MatchingCore"]
+__all__ = ["MatchingCore", "continued_beyond"]
 
 _CLASSES = len(GRID_CLASSES)
+# Of a point that the guess puts outside the image, against one inside: with true classes on 32 frames of a real car,
+# started 2 deg off, 0.11 / 0.15 deg were left at 0.2, and 0.18 / 0.17 deg at 1.
+_UNSEEN_WORTH = 0.2
 _RESIDUAL_STD = 1e-3  # of the heads' weights: an untrained network answers as its matchers
 # The camera's x, y, z look along the lidar's y, z, x; signs do not matter to variances.
 _AXES_CAMERA_OF_LIDAR = (1, 2, 0)
@@ -28,11 +31,13 @@ _AXES_CAMERA_OF_LIDAR = (1, 2, 0)
 class MatchingCore(nn.Module):
     """What is computed from one rendered view; `pairs` says which of the three matchers exist."""
 
-    def __init__(self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int) -> None:
+    def __init__(
+        self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int, channels: int = CAMERA_CHANNELS
+    ) -> None:
         super().__init__()
         self.grid, self.pairs = grid, pairs
         uses_camera = pairs != ("lidar_radar",)
-        self.camera_encoder = CameraEncoder(_CLASSES, width) if uses_camera else None
+        self.camera_encoder = CameraEncoder(_CLASSES, width, channels) if uses_camera else None
         sizes = []
         if "camera_lidar" in pairs:
             self.lidar_encoder = LidarEncoder(LIDAR_CHANNELS, _CLASSES, width)
@@ -68,17 +73,23 @@ class MatchingCore(nn.Module):
         return CoreOutputs(identity, log_variance, None, camera, lidar, radar)
 
     def camera_log_likelihood(
-        self, camera: Float[Tensor, "B 4 H W"], logits: Float[Tensor, "B K H W"]
-    ) -> Float[Tensor, "B K H W"]:
-        """Log-probability of classes, the same for all of them where the camera sees nothing."""
+        self, camera: Float[Tensor, "B C H W"], logits: Float[Tensor, "B K H W"]
+    ) -> Float[Tensor, "B L H W"]:
+        """Log-probability of classes, and behind them 1 where the camera sees the cell.
+
+        Beyond the image's border goes on what is seen at it. Were all classes alike there, points would gain by
+        leaving what is classified well: a narrow image would push a sweep out of itself.
+        """
         log_probability = torch.log_softmax(logits.detach(), 1).clamp(min=FLOOR)
-        seen = camera[:, 3:]
-        return log_probability * seen + NEUTRAL * (1 - seen)
+        seen = camera[:, CAMERA_CHANNELS - 1 : CAMERA_CHANNELS]
+        blind = 1 - seen.amax((2, 3), keepdim=True)
+        continued = continued_beyond(log_probability, seen) * (1 - blind) + NEUTRAL * blind
+        return torch.cat([continued, seen], 1)
 
     def match(
         self,
         view: RenderedView,
-        likelihood: Float[Tensor, "B K H W"] | None,
+        likelihood: Float[Tensor, "B L H W"] | None,
         camera_logits: Float[Tensor, "B K H W"] | None = None,
     ) -> CoreOutputs:
         """The part that depends on the guess: matchers, residuals, log variances."""
@@ -89,7 +100,8 @@ class MatchingCore(nn.Module):
             assert likelihood is not None
             lidar_logits = self.encode_lidar(view.lidar_grid)
             probability = torch.softmax(self._at_points(lidar_logits.detach(), view.points_camera), -1)
-            found = self.lidar_matcher(likelihood, view.points_camera, probability, view.point_weight)
+            weight = view.point_weight * self._worth(likelihood, view.points_camera)
+            found = self.lidar_matcher(likelihood[:, :-1], view.points_camera, probability, weight)
             bases["camera_lidar"] = found
             features.append(_features(found.surfaces.flatten(1), found))
         if "lidar_radar" in self.pairs:
@@ -104,8 +116,8 @@ class MatchingCore(nn.Module):
             distance = view.radar_camera.norm(dim=-1)
             radar_logits = self.radar_encoder(view.radar_features, distance)
             probability = torch.softmax(radar_logits.detach(), -1)
-            weight = view.radar_valid.to(probability.dtype)
-            found = self.radar_class_matcher(likelihood, view.radar_camera, probability, weight)
+            weight = view.radar_valid.to(probability.dtype) * self._worth(likelihood, view.radar_camera)
+            found = self.radar_class_matcher(likelihood[:, :-1], view.radar_camera, probability, weight)
             bases["camera_radar"] = found
             features.append(_features(found.surfaces.flatten(1), found))
         fused = self.fusion(torch.cat([s(f) for s, f in zip(self.summaries, features, strict=True)], -1))
@@ -123,6 +135,13 @@ class MatchingCore(nn.Module):
         mirrored = (torch.arange(len(rendered), device=rendered.device) % 2 == 1)[:, None, None, None]
         logits = self.lidar_encoder(torch.where(mirrored, rendered.flip(-1), rendered))
         return torch.where(mirrored, logits.flip(-1), logits)
+
+    def _worth(self, likelihood: Tensor, points_camera: Tensor) -> Tensor:
+        """B N: what a point counts by where the guess puts it, fixed before it moves: no move can raise it."""
+        row, column = grid_cells(sphere(points_camera), self.grid)
+        inside = (row >= 0) & (column >= 0) & (row < self.grid.height) & (column < self.grid.width)
+        seen = self._at_points(likelihood[:, -1:], points_camera)[..., 0] * inside.to(likelihood.dtype)
+        return _UNSEEN_WORTH + (1 - _UNSEEN_WORTH) * seen
 
     def _at_points(self, maps: Tensor, points_camera: Tensor) -> Tensor:
         """B N K: values of the cells that points fall into."""
@@ -151,6 +170,28 @@ class MatchingCore(nn.Module):
             corrections.append(residual @ base)
             log_variance.append(torch.log(variances[pair]) + log_factor)
         return torch.stack(corrections, 1), torch.stack(log_variance, 1)
+
+
+def continued_beyond(
+    maps: Float[Tensor, "B K H W"], seen: Float[Tensor, "B 1 H W"]
+) -> Float[Tensor, "B K H W"]:
+    """The maps with the nearest seen cell's values where nothing is seen: up and down first, then to the sides.
+
+    Images are convex on the grid or nearly so: between two seen cells of a column all are seen.
+    """
+    height, width = maps.shape[2:]
+    rows = torch.arange(height, device=maps.device)[None, :, None]
+    columns = torch.arange(width, device=maps.device)[None]
+    beyond = torch.where(seen[:, 0] > 0.5, 0.0, float(height + width))
+    first = (beyond + rows).amin(1).long().clamp(max=height - 1)
+    last = (rows - beyond).amax(1).long().clamp(min=0)
+    row = torch.minimum(torch.maximum(rows, first[:, None]), last[:, None])
+    maps = maps.gather(2, row[:, None].expand(-1, maps.shape[1], -1, -1))
+    empty = beyond.amin(1)
+    left = (empty + columns).amin(1, keepdim=True).long().clamp(max=width - 1)
+    right = (columns - empty).amax(1, keepdim=True).long().clamp(min=0)
+    column = torch.minimum(torch.maximum(columns, left), right)
+    return maps.gather(3, column[:, None, None].expand(-1, maps.shape[1], height, -1))
 
 
 def _summary(inputs: int, hidden: int) -> nn.Sequential:

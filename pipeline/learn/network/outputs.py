@@ -24,7 +24,9 @@ class CoreOutputs:
 
     corrections: Float[Tensor, "B 3 4 4"]
     log_variance: Float[Tensor, "B 3 6"]
-    camera_log_likelihood: Float[Tensor, "B K H W"] | None = None
+    camera_log_likelihood: Float[Tensor, "B L H W"] | None = (
+        None  # of K classes, and whether the cell is seen
+    )
     camera_logits: Float[Tensor, "B K H W"] | None = None
     lidar_logits: Float[Tensor, "B K H W"] | None = None
     radar_logits: Float[Tensor, "B M K"] | None = None

@@ -35,7 +35,7 @@ _EDGE, _GROUND = LIDAR_FEATURES.index("edge"), LIDAR_FEATURES.index("ground")
 class RenderedView:
     """One frame of each sensor through one guess, B frames; fields are inputs of the exported graph."""
 
-    camera: Float[Tensor, "B 4 H W"]
+    camera: Float[Tensor, "B C H W"]  # `NetworkConfig.camera_channels`
     lidar_grid: Float[Tensor, "B 6 H W"]
     radar_grid: Float[Tensor, "B 5 H W"]
     points_camera: Float[Tensor, "B N 3"]  # lidar points to be matched, optical frame [m]
@@ -49,8 +49,13 @@ class RenderedView:
     radar_has_elevation: Bool[Tensor, " B"]
 
 
-def render(inputs: NetworkInputs, grid: Grid) -> tuple[RenderedView, Int64[Tensor, "B HW"]]:
-    """The view through the inputs' guess, and which lidar point each cell shows (-1 = none)."""
+def render(
+    inputs: NetworkInputs, grid: Grid, *, classes: bool = False
+) -> tuple[RenderedView, Int64[Tensor, "B HW"]]:
+    """The view through the inputs' guess, and which lidar point each cell shows (-1 = none).
+
+    With `classes` the camera is its image and the classes that a segmenter gave.
+    """
     sensors = inputs.sensors
     lidar_camera = transform_points(inputs.T_camera_lidar, sensors.lidar_xyz_m)
     radar_camera = transform_points(inputs.T_camera_radar, sensors.radar_xyz_m)
@@ -63,7 +68,7 @@ def render(inputs: NetworkInputs, grid: Grid) -> tuple[RenderedView, Int64[Tenso
     solid = _best(rank.expand_as(ground), in_view & (ground < 0.5), OBJECT_POINTS)
     weight = torch.where(ground > 0.5, GROUND_WEIGHT, 1.0) * in_view
     view = RenderedView(
-        sensors.camera,
+        torch.cat([sensors.camera, sensors.classes], 1) if classes else sensors.camera,
         paint(index, _channels(lidar_camera, sensors.lidar_features), grid),
         paint(radar_index, _channels(radar_camera, sensors.radar_features), grid),
         _pick(lidar_camera, matched),

@@ -14,14 +14,15 @@ from typing import no_type_check
 import cv2
 import numba
 import numpy as np
-from jaxtyping import Bool, Int8, Int32, UInt8
+from jaxtyping import Bool, Float32, Int8, Int32, UInt8
 
 from pipeline.geometry.cameras import Camera
 from pipeline.learn.sample.grid import Grid, grid_rays
+from pipeline.learn.sample.layout import CLASS_CONFIDENCE
 from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY, boundary_offsets
 from schemas.training import CLASS_OF_LABEL, DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, UNKNOWN_CLASS
 
-__all__ = ["FINE_DEG", "CameraFeatures", "camera_features", "stored_grid"]
+__all__ = ["FINE_DEG", "CameraFeatures", "camera_features", "class_likelihood", "stored_grid"]
 
 FINE_DEG = 0.1  # one step of the stored distances
 _VOID_LABEL = 255
@@ -57,6 +58,30 @@ def camera_features(labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid
         _edge_offsets(fine.labels, per_cell),
         _sky_depth(classes, fine.seen, per_cell),
     )
+
+
+def class_likelihood(
+    labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid
+) -> Float32[np.ndarray, "C H W"]:
+    """What a network that takes classes is given of a label image: see `likelihood_of_shares`.
+
+    A cell that a boundary crosses has shares of both classes; `camera` belongs to the full image.
+    """
+    fine = _sample_finely(labels, camera, grid)
+    per_cell = round(grid.cell_deg / FINE_DEG)
+    classes = CLASS_OF_LABEL[fine.labels]
+    cells = (grid.height, per_cell, grid.width, per_cell)
+    share = [(classes == k).reshape(cells).mean(axis=(1, 3)) for k in range(len(GRID_CLASSES))]
+    return likelihood_of_shares(np.stack(share).astype(np.float32))
+
+
+def likelihood_of_shares(share: Float32[np.ndarray, "K H W"]) -> Float32[np.ndarray, "C H W"]:
+    """Likelihood of each class, and behind them 1 where at least half of the cell has one; 0 where not."""
+    total = share.sum(axis=0)
+    known = (total >= 0.5).astype(np.float32)
+    doubt = np.float32((1 - CLASS_CONFIDENCE) / len(share))
+    likelihood = np.float32(CLASS_CONFIDENCE) * share / np.maximum(total, np.float32(0.5)) + doubt
+    return np.concatenate([likelihood * known, known[None]]).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)

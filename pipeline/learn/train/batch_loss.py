@@ -19,6 +19,7 @@ from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.running_mean import DayMeans, uncertainty_loss
 from pipeline.learn.train.semantics_loss import semantics_loss
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
+from pipeline.learn.train.strangeness import made_strange
 from pipeline.objective.differentiable.poses import pose, transform_points
 
 __all__ = ["Passes", "StepLoss", "batch_loss"]
@@ -74,9 +75,8 @@ def batch_loss(
     grid = network.config.grid
     guess = random_guess(batch, config.augment, generator)
     view = turned_view(batch, guess.R_turned_camera) if config.augment.view_deg > 0 else batch
-    inputs = NetworkInputs(
-        sensor_inputs(view, grid), guess.T_camera_lidar, guess.T_camera_radar, guess.T_lidar_radar
-    )
+    sensors = made_strange(sensor_inputs(view, grid), config.strange, generator)
+    inputs = NetworkInputs(sensors, guess.T_camera_lidar, guess.T_camera_radar, guess.T_lidar_radar)
     answers: list[Predictions] = passes(inputs, matched=matched)
     if not matched:
         semantics = _semantics(answers, view, guess, batch, day_means, network)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from pipeline.errors import ConfigError, ContractError
 from pipeline.learn.network.calibration_network import CalibrationNetwork, build_network
+from pipeline.learn.network.exported_weights import network_of_file
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.acceleration import accelerate
@@ -126,7 +127,7 @@ def begin_run(
         processes: this process among those that train together.
         compiled: see `TrainRequest`.
         resident: see `TrainRequest`.
-        start: run whose weights a fresh run begins with; a run that goes on has its own.
+        start: run or exported file whose weights a fresh run begins with; a run that goes on has its own.
 
     Raises:
         ConfigError: the folder's run has another configuration; `start` has another kind of network.
@@ -185,15 +186,29 @@ def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
 
 
 def _take_weights(network: CalibrationNetwork, start: Path) -> None:
-    trained = network_of_run(start)
-    if trained.config != network.config:
+    trained = network_of_file(start) if start.suffix == ".onnx" else network_of_run(start)
+    if replace(trained.config, takes_classes=network.config.takes_classes) != network.config:
         problem = f"{start} has a network of another kind, {trained.config}, not {network.config}"
         raise ConfigError("train", "start-from", problem)
-    network.load_state_dict(trained.state_dict())
+    network.load_state_dict(_widened(trained.state_dict(), network.state_dict()))
+
+
+def _widened(trained: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The weights with zeros for channels that the network they come from has not: it answers as before."""
+    found = {}
+    for name, value in fresh.items():
+        weight = trained.get(name, value)
+        if weight.shape != value.shape:
+            weight = torch.zeros_like(value)
+            weight[:, : trained[name].shape[1]] = trained[name]
+        found[name] = weight
+    return found
 
 
 def _network_config(config: TrainConfig, grid: Grid) -> NetworkConfig:
-    return NetworkConfig(config.architecture, config.pairs, grid, config.width, config.hidden)
+    return NetworkConfig(
+        config.architecture, config.pairs, grid, config.width, config.hidden, config.takes_classes
+    )
 
 
 def _steps(config: TrainConfig, frames: int, processes: int) -> int:

@@ -15,7 +15,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pipeline.errors import ConfigError
 from pipeline.learn.sample.grid import Grid
 
-__all__ = ["PAIRS_OF", "RENAMED", "AugmentConfig", "LossConfig", "TrainConfig", "load_train_config"]
+__all__ = [
+    "PAIRS_OF",
+    "RENAMED",
+    "AugmentConfig",
+    "LossConfig",
+    "StrangeConfig",
+    "TrainConfig",
+    "load_train_config",
+]
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -70,6 +78,28 @@ class AugmentConfig(_Section):
     view_deg: NotNegative = 4.0  # per axis, even; the stored grid must be wider than the network's by as much
 
 
+class StrangeConfig(_Section):
+    """How strange what is shown is made in training, so that nothing of one renderer, segmenter or lidar is learned.
+
+    Nothing of it touches what the losses compare. All off: a fleet's own logs look as they will look tomorrow.
+    """
+
+    image: NotNegative = (
+        0.0  # light, colour, texture, blur and noise; at 1 a road may be reddish or half in shadow
+    )
+    classes: NotNegative = (
+        0.0  # errors of the given classes, beyond those that the labels have; 1 = a weak segmenter
+    )
+    no_classes: Annotated[float, Field(ge=0, le=1)] = 1 / 3  # of the frames: the image alone
+    no_image: Annotated[float, Field(ge=0, le=1)] = 0.0  # of the frames with classes: the classes alone
+    lidar: NotNegative = (
+        0.0  # echoes, heights, missing points; at 1 about what lidars of two makers differ by
+    )
+    fewer_rows: Annotated[float, Field(ge=0, le=1)] = (
+        0.0  # of the frames: rows of the sweep 1 to 2.2 deg apart
+    )
+
+
 class TrainConfig(_Section):
     """The whole of train.toml."""
 
@@ -79,6 +109,9 @@ class TrainConfig(_Section):
     cell_deg: Annotated[float, Field(ge=0.1, le=0.5)] = 0.4
     width: Count = 16  # channels of the encoders' first stage
     hidden: Count = 192
+    takes_classes: bool = (
+        False  # besides its image the camera shows what a segmenter makes of it, where there is one
+    )
     iterations: Annotated[int, Field(ge=1, le=5)] = 1  # passes per frame; losses of all passes are averaged
     # Encoders learn from classes alone, at every step; matchers have few weights and cost half of a step: they join at
     # every n-th.
@@ -102,6 +135,7 @@ class TrainConfig(_Section):
     seed: int = 0
     loss: LossConfig = LossConfig()
     augment: AugmentConfig = AugmentConfig()
+    strange: StrangeConfig = StrangeConfig()
 
     @model_validator(mode="before")
     @classmethod
@@ -120,6 +154,8 @@ class TrainConfig(_Section):
 
     @model_validator(mode="after")
     def _encoders_exist(self) -> TrainConfig:
+        if self.takes_classes and (self.architecture == "concat" or self.pairs == "lidar_radar"):
+            raise ValueError("takes_classes must be false where no classes are matched: concat, lidar_radar")
         if self.matched_every > 1 and (self.architecture == "concat" or self.pairs == "lidar_radar"):
             raise ValueError("matched_every must be 1 where no classes are learned: concat, lidar_radar")
         return self

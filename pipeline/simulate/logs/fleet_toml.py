@@ -2,19 +2,36 @@
 
 from __future__ import annotations
 
-from pipeline.simulate.logs.writers import TOPICS
-from pipeline.simulate.sensors.rigs import RigSpec
+from collections.abc import Mapping
 
-__all__ = ["fleet_toml"]
+from pipeline.simulate.logs.writers import TOPICS
+from pipeline.simulate.sensors.rig_spec import RigSpec
+
+__all__ = ["fleet_toml", "mixed_fleet_toml"]
 
 
 def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> str:
     """Text of fleet.toml; the prior's sigmas are those of a mounting against CAD for a pair of sensors."""
+    return _text(fleet, {rig_name: rig}, dict.fromkeys(vehicles, rig_name))
+
+
+def mixed_fleet_toml(fleet: str, rigs: Mapping[str, RigSpec]) -> str:
+    """Text of the fleet.toml of vehicles of which each has a rig of its own, by vehicle."""
+    return _text(fleet, {r.name: r for r in rigs.values()}, {v: r.name for v, r in rigs.items()})
+
+
+def _text(fleet: str, rigs: Mapping[str, RigSpec], vehicles: Mapping[str, str]) -> str:
+    lines = ["[fleet]", f'name = "{fleet}"', ""]
+    for name, rig in rigs.items():
+        lines += [*_sections(name, rig), ""]
+    for vehicle, rig_name in vehicles.items():
+        lines += [f'[vehicles."{vehicle}"]', f'rig = "{rig_name}"', ""]
+    return "\n".join(lines[:-1]) + "\n"
+
+
+def _sections(rig_name: str, rig: RigSpec) -> list[str]:
     period = rig.radar.doppler_period_mps
-    lines = [
-        "[fleet]",
-        f'name = "{fleet}"',
-        "",
+    return [
         f"[rigs.{rig_name}.camera]",
         f'image = "{TOPICS["image"]}"',
         f'info = "{TOPICS["info"]}"',
@@ -41,6 +58,3 @@ def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> 
         "rotation_sigma_deg = 1.2",
         "translation_sigma_m = 0.03",
     ]
-    for vehicle in vehicles:
-        lines += ["", f'[vehicles."{vehicle}"]', f'rig = "{rig_name}"']
-    return "\n".join(lines) + "\n"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -12,39 +12,15 @@ from pipeline.errors import ConfigError
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
+from pipeline.simulate.sensors.random_rigs import random_rig
+from pipeline.simulate.sensors.rig_spec import RigSpec
 
 __all__ = ["RIGS", "Mounting", "RigSpec", "mounting_of", "rig_named"]
 
 # Optical axes (x right, y down, z forward) in a frame with x forward, y left, z up.
 _R_BODY_OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 SENSORS: Final = ("camera", "lidar", "radar")
-
-
-@dataclass(frozen=True)
-class RigSpec:
-    """Sensors, nominal poses in the vehicle frame (rear axle, on the ground), and clocks."""
-
-    name: str
-    camera: CameraSpec = field(default_factory=CameraSpec)
-    lidar: LidarSpec = field(default_factory=LidarSpec)
-    radar: RadarSpec = field(default_factory=RadarSpec)
-    camera_xyz_m: tuple[float, float, float] = (1.62, 0.02, 1.62)
-    lidar_xyz_m: tuple[float, float, float] = (1.50, 0.00, 1.80)
-    radar_xyz_m: tuple[float, float, float] = (1.66, -0.22, 1.58)
-    # Turned about the vehicle's axes: roll first, then pitch (positive = nose down), then yaw (to the left).
-    camera_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    lidar_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    radar_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    camera_delay_s: float = 0.012  # stamp of an event on the camera less its stamp on the lidar
-    radar_delay_s: float = -0.018
-    delay_sd_s: float = 0.004  # sd per vehicle of both delays
-    sync_jitter_s: float = 0.0012
-    # Rates [Hz] of camera, lidar and radar that run freely; None = the lidar triggers both.
-    free_hz: tuple[float, float, float] | None = None
-    prior_rotation_deg: float = 1.2  # sd per vehicle and sensor of the mounting against CAD, angle
-    prior_translation_m: float = 0.02  # sd per axis
-    remount_rotation_deg: float = 0.02  # sd per day and axis
-    remount_translation_m: float = 0.002
+RANDOM: Final = "random-"  # begins the names of rigs that a seed draws
 
 
 # Half the pixels of the paper's camera, and a lidar and a radar to match: as good for most purposes, and much faster.
@@ -117,16 +93,17 @@ RIGS: Final = {rig.name: rig for rig in _ALL}
 
 
 def rig_named(name: str) -> RigSpec:
-    """One of RIGS; `-flat` behind the name takes the radar's elevation away.
+    """One of RIGS, or `random-SEED`; `-flat` behind the name takes the radar's elevation away.
 
     Raises:
         ConfigError: no such rig.
     """
-    base = RIGS.get(name.removesuffix("-flat"))
+    plain = name.removesuffix("-flat")
+    seed = plain.removeprefix(RANDOM)
+    base = random_rig(int(seed)) if plain != seed and seed.isdecimal() else RIGS.get(plain)
     if base is None:
-        raise ConfigError(
-            "simulate", "rig", f"{name!r} is not one of {', '.join(RIGS)}, each with or without -flat"
-        )
+        known = f"{', '.join(RIGS)}, {RANDOM}SEED, each with or without -flat"
+        raise ConfigError("simulate", "rig", f"{name!r} is not one of {known}")
     return (
         replace(base, name=name, radar=replace(base.radar, has_elevation=False))
         if name.endswith("-flat")

@@ -18,7 +18,8 @@ from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.compiled_rendering import frame_sensors, render_frame
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.network.calibration_network import build_network
-from pipeline.learn.network.inputs import NetworkInputs, sensor_inputs
+from pipeline.learn.network.exported_weights import network_of_file, weight_places
+from pipeline.learn.network.inputs import NetworkInputs, crop, given_classes, sensor_inputs
 from pipeline.learn.network.views import render
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.sample.grid import Grid
@@ -29,7 +30,7 @@ from tests.makers import solve_scenes, training_lakes
 
 GRID = Grid(0.4, 25.6, 12.8, -12.8)
 CARD = {"data": "two frames", "seeds": [0], "results": {"azimuth_deg": 0.1}}
-KINDS = ["matching-joint", "matching-camera_radar", "concat-joint"]
+KINDS = ["matching-joint", "matching-camera_radar", "concat-joint", "classes-joint"]
 
 
 @lru_cache
@@ -40,6 +41,11 @@ def row():
     about = About("v", "2026-01-01", "default", "train", "p", "urban")
     config = training_lakes.fleet_of(["v"], lidar_points=4096).prepare
     return make_row(training_lakes.frame_of(observation, rng), observation, prior, about, config)
+
+
+def classes():
+    """What a segmenter gives, one class a cell as table training holds it."""
+    return given_classes(crop(collate([row()]).grid_class, 0.4, GRID))[0].numpy()
 
 
 def guess():
@@ -60,7 +66,10 @@ def inputs():
 def exported(request, tmp_path_factory):
     """A network with weights as large as trained ones, and its file."""
     architecture, pairs = request.param.split("-")
-    network = build_network(NetworkConfig(architecture, pairs, GRID, width=8, hidden=32))
+    takes_classes = architecture == "classes"
+    architecture = "matching" if takes_classes else architecture
+    config = NetworkConfig(architecture, pairs, GRID, width=8, hidden=32, takes_classes=takes_classes)
+    network = build_network(config)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for layer in network.core.heads.layers.values():
@@ -72,7 +81,7 @@ def exported(request, tmp_path_factory):
 def test_the_file_computes_what_the_network_computes(exported):
     network, path = exported
     calibrator = SingleFrameCalibrator(path)
-    sensors = frame_sensors(row(), GRID)
+    sensors = frame_sensors(row(), GRID, classes())
     T_camera_lidar, T_lidar_radar, _ = guess()
     ours = calibrator.estimate(sensors, T_camera_lidar, T_lidar_radar, iterations=1)[0]
     with torch.no_grad():
@@ -91,7 +100,9 @@ def test_the_file_computes_what_the_network_computes(exported):
 def test_three_passes_agree_too(exported):
     network, path = exported
     T_camera_lidar, T_lidar_radar, _ = guess()
-    ours = SingleFrameCalibrator(path).estimate(frame_sensors(row(), GRID), T_camera_lidar, T_lidar_radar)
+    ours = SingleFrameCalibrator(path).estimate(
+        frame_sensors(row(), GRID, classes()), T_camera_lidar, T_lidar_radar
+    )
     with torch.no_grad():
         theirs = network.refine(inputs(), 3)
     assert len(ours) == 3
@@ -100,6 +111,19 @@ def test_three_passes_agree_too(exported):
         assert ours[-1].of(pair) == pytest.approx(getattr(theirs[-1], f"T_{pair}")[0].numpy(), abs=2e-4)
         R = ours[-1].of(pair)[:3, :3]
         assert pytest.approx(np.eye(3), abs=1e-12) == R @ R.T
+
+
+def test_a_file_that_takes_classes_answers_without_them_and_otherwise(exported):
+    network, path = exported
+    sensors, (T_camera_lidar, T_lidar_radar, _) = frame_sensors(row(), GRID, classes()), guess()
+    asked = [sensors, frame_sensors(row(), GRID), sensors.without_image()]
+    answers = [
+        SingleFrameCalibrator(path).estimate(s, T_camera_lidar, T_lidar_radar)[-1].T_camera_radar
+        for s in asked
+    ]
+    differs = not np.allclose(answers[0], answers[1], atol=1e-6)
+    assert differs == network.config.takes_classes
+    assert np.isfinite(answers).all()
 
 
 def test_the_file_is_a_checked_graph_of_a_recent_opset_and_carries_its_card(exported):
@@ -117,6 +141,21 @@ def test_the_file_is_a_checked_graph_of_a_recent_opset_and_carries_its_card(expo
     assert card["results"] == CARD["results"]
     assert card["bytes"] == path.stat().st_size
     assert "azimuth_deg: 0.1" in path.with_suffix(".md").read_text()
+
+
+def test_a_network_can_be_trained_on_from_its_file(exported):
+    network, path = exported
+    again = network_of_file(path)
+    assert again.config == network.config
+    for name, value in network.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value), name
+    assert len(json.dumps(weight_places(network.state_dict(), onnx.load(path)))) < 16_000
+
+
+def test_a_file_that_does_not_say_where_its_weights_lie_is_refused(tmp_path):
+    onnx.save(onnx.helper.make_model(onnx.helper.make_graph([], "empty", [], [])), tmp_path / "old.onnx")
+    with pytest.raises(ModelError, match="weights"):
+        network_of_file(tmp_path / "old.onnx")
 
 
 def test_inference_sees_what_training_saw():

@@ -15,6 +15,7 @@ from pipeline.learn.network.least_squares import (
     small_rotation_vector,
     spherical_jacobian,
 )
+from pipeline.learn.network.matching_network import MatchingCore, continued_beyond
 from pipeline.learn.network.occupancy_matcher import OccupancyMatcher
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
@@ -106,6 +107,38 @@ def test_parallax_tells_a_sideways_shift_from_a_turn():
     T[0, 3] = 0.25
     _, shift, _ = matched(T, passes=4, grid_matcher=matcher)
     assert abs(shift[0]) < 0.12
+
+
+def test_a_narrow_image_does_not_push_points_out_of_itself():
+    # Twice the points that it sees lie beside it: were all classes alike there, the sweep would gain by leaving.
+    likelihood, points, classes = observed()
+    seen = torch.zeros(1, 1, GRID.height, GRID.width)
+    seen[..., 20:50, 60:140] = 1
+    doubtful = torch.log(torch.exp(likelihood) * 0.5 + 0.05)
+    core, view = (
+        MatchingCore(GRID, ("camera_lidar",), 8, 32),
+        torch.cat([torch.zeros(1, 3, *seen.shape[2:]), seen], 1),
+    )
+    turned = points @ torch.tensor(exp_so3(np.radians([1.5, -2.0, 0.5])), dtype=torch.float32).T
+    with torch.no_grad():
+        known = core.camera_log_likelihood(view, doubtful)
+        R = np.eye(3)
+        for _ in range(3):
+            moved = turned @ torch.tensor(R.T, dtype=torch.float32)
+            found = core.lidar_matcher(known[:, :-1], moved, classes, core._worth(known, moved))
+            R = pose_of_twist(found.twist)[0, :3, :3].numpy() @ R
+    left = np.degrees(np.arccos((np.trace(R @ exp_so3(np.radians([1.5, -2.0, 0.5]))) - 1) / 2))
+    assert left < 0.5
+
+
+def test_beyond_the_image_goes_on_what_is_seen_at_its_border():
+    seen = torch.zeros(1, 1, 16, 32)
+    seen[..., 4:10, 8:20] = 1
+    maps = torch.arange(16.0 * 32).reshape(1, 1, 16, 32)
+    filled = continued_beyond(maps, seen)[0, 0]
+    rows = torch.arange(16).clamp(4, 9)[:, None]
+    columns = torch.arange(32).clamp(8, 19)[None]
+    assert torch.equal(filled, (rows * 32 + columns).float())
 
 
 def test_blind_cameras_move_nothing_and_leave_the_prior_s_variance():

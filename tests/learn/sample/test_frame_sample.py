@@ -11,7 +11,7 @@ from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import transform_points
 from pipeline.geometry.spherical import camera_direction_angles
-from pipeline.learn.sample.camera_maps import camera_features, stored_grid
+from pipeline.learn.sample.camera_maps import camera_features, class_likelihood, stored_grid
 from pipeline.learn.sample.clouds import range_edges
 from pipeline.learn.sample.frame_sample import (
     About,
@@ -43,6 +43,22 @@ def angles(grid):
 def pixel_angles():
     v, u = np.mgrid[0 : FTHETA.height_px, 0 : FTHETA.width_px].astype(float)
     return np.moveaxis(np.degrees(camera_direction_angles(FTHETA.unproject(np.stack([u, v], -1)))), -1, 0)
+
+
+def test_cells_that_a_boundary_crosses_have_shares_of_both_classes():
+    grid = stored_grid((64, 96), 0.4)
+    labels = labels_by_angle(lambda a, _: np.where(a > 0.3, CAR, ROAD))
+    labels[: labels.shape[0] // 3] = 255
+    found = class_likelihood(labels, FTHETA, grid)
+    likelihood, known = found[:-1], found[-1]
+    vehicle, road = (likelihood[GRID_CLASSES.index(name), 40] for name in ("vehicle", "road"))
+    assert vehicle[:47] == pytest.approx(0.91, abs=1e-5)
+    assert road[48:] == pytest.approx(0.91, abs=1e-5)
+    # The cell from 0.4 to 0 deg: a quarter of it lies to the left of 0.3 deg.
+    assert vehicle[47] == pytest.approx(0.9 * 0.25 + 0.01, abs=0.05)
+    assert likelihood.sum(axis=0)[known > 0] == pytest.approx(1.0, abs=1e-5)
+    assert known[0].max() == 0
+    assert likelihood[:, 0].max() == 0
 
 
 def labels_by_angle(paint):

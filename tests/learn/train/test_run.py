@@ -297,3 +297,9 @@ def test_a_run_may_start_from_anothers_weights_and_then_goes_on_with_its_own(dat
         train(TrainRequest(data, tmp_path / "x", "cpu", start=tmp_path / "gone"), still)
     with pytest.raises(ConfigError, match="another kind"):
         train(TrainRequest(data, tmp_path / "y", "cpu", start=tmp_path / "old"), config(steps=1, width=8))
+    # What the old network never saw counts nothing at first.
+    wider = still.model_copy(update={"takes_classes": True})
+    train(TrainRequest(data, tmp_path / "z", "cpu", start=tmp_path / "old"), wider)
+    first = network_of_run(tmp_path / "z", best=False).core.camera_encoder.down[0][0].weight
+    assert torch.allclose(first[:, :4], old.core.camera_encoder.down[0][0].weight, atol=1e-7)
+    assert first[:, 4:].abs().max() < 1e-7

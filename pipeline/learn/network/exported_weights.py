@@ -1,0 +1,81 @@
+"""The weights of an exported file, to train on from: of the network that is shipped there is nothing else.
+
+A graph holds weights under numbers, turned or folded into others. The file's metadata says where each lies; the few
+small ones that are folded stand there themselves.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from onnx import numpy_helper
+from torch import Tensor
+
+from pipeline.errors import ModelError
+from pipeline.learn.network.calibration_network import CalibrationNetwork
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import NetworkConfig
+
+__all__ = ["WEIGHTS", "network_of_file", "weight_places"]
+
+WEIGHTS = "weights"  # key of the metadata
+Place = Mapping[str, Any]
+
+
+def weight_places(state: Mapping[str, Tensor], model: onnx.ModelProto) -> dict[str, Place]:
+    """Where each weight lies in the graph: an initializer's name, and whether it is turned; or its values."""
+    lying: dict[bytes, Place] = {}
+    for initializer in model.graph.initializer:
+        values = numpy_helper.to_array(initializer)
+        if values.ndim == 2:
+            lying[_digest(values.T)] = {"name": initializer.name, "turned": True}
+        lying[_digest(values)] = {"name": initializer.name, "turned": False}
+    found: dict[str, Place] = {}
+    for name, weight in state.items():
+        values = weight.detach().cpu().numpy()
+        found[name] = lying.get(_digest(values)) or {"values": values.ravel().tolist()}
+    return found
+
+
+def network_of_file(path: Path) -> CalibrationNetwork:
+    """The network of a file of `boresight export onnx`, on the CPU.
+
+    Raises:
+        ModelError: the file does not say where its weights lie, as none did before 0.8.0.
+    """
+    try:
+        model = onnx.load(str(path))
+        metadata = {entry.key: entry.value for entry in model.metadata_props}
+        places: dict[str, Place] = json.loads(metadata[WEIGHTS])
+        values = json.loads(metadata["network"])
+        config = NetworkConfig(**(values | {"grid": Grid(**values["grid"])}))
+    except Exception as err:  # protobuf has its own exceptions, different by version
+        raise ModelError(
+            str(path), "does not say where its weights lie: nothing can be trained on from it"
+        ) from err
+    held = {i.name: numpy_helper.to_array(i) for i in model.graph.initializer}
+    network = CalibrationNetwork(config)
+    network.load_state_dict(
+        {name: _weight(places[name], held, value.shape) for name, value in network.state_dict().items()}
+    )
+    return network.eval()
+
+
+def _weight(place: Place, held: Mapping[str, np.ndarray], shape: torch.Size) -> Tensor:
+    if "values" in place:
+        values = np.array(place["values"], np.float32)
+    else:
+        values = held[place["name"]]
+        values = values.T if place["turned"] else values
+    return torch.tensor(values.reshape(tuple(shape)))
+
+
+def _digest(values: np.ndarray) -> bytes:
+    """Shapes differ by axes of length one only, so numbers in order tell weights apart."""
+    return np.ascontiguousarray(values, np.float32).tobytes()

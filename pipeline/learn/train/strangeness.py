@@ -1,0 +1,184 @@
+"""Sensors made strange, so that a network learns what holds on every car: shapes and classes, not one renderer's look.
+
+Source: Tobin et al. 2017 (domain randomisation). What is drawn is the same on every device: numbers come from a
+generator of the CPU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
+
+from pipeline.learn.network.inputs import SensorInputs
+from pipeline.learn.sample.layout import CAMERA_CHANNELS, FEATURE_UNITS, LIDAR_FEATURES
+from pipeline.learn.train.settings import StrangeConfig
+
+__all__ = ["made_strange", "strange_classes", "strange_image", "strange_lidar"]
+
+_DEG = 180.0 / torch.pi
+_INTENSITY, _HEIGHT, _GROUND = (LIDAR_FEATURES.index(name) for name in ("intensity", "height", "ground"))
+_FEWEST_POINTS = 300  # a sweep is not thinned below what makes a sample
+# At strength 1; chosen by looking at a hundred frames, not by results.
+_GAMMA, _MIX, _TINT, _TEXTURE, _LIGHT, _NOISE = 0.8, 0.25, 0.15, 0.12, 0.5, 0.08
+_SHIFTED_CELLS, _GROWN, _CONFUSED, _DOUBT = 0.8, 0.6, 0.15, 0.3
+_HOLE = 2.0  # sigmas
+# On a real car a third of the road's points were not flagged as ground, where simulated sweeps flag all but 1 %, leaves
+# echoed half as strongly as simulated ones, and the road's heights scattered by 6 cm.
+_SILENT, _LIFTED_M, _TILTED_RAD = 0.45, 0.06, 0.005
+
+
+def made_strange(sensors: SensorInputs, config: StrangeConfig, generator: torch.Generator) -> SensorInputs:
+    """The sensors with everything that the configuration asks for."""
+    camera, classes = sensors.camera, sensors.classes
+    true = classes
+    if config.classes > 0:
+        classes = strange_classes(classes, config.classes, generator)
+    if config.image > 0:
+        camera = strange_image(camera, true, config.image, generator)
+    without = _chosen(len(camera), config.no_classes, generator, camera.device)
+    classes = classes * (~without)[:, None, None, None]
+    blank = _chosen(len(camera), config.no_image, generator, camera.device) & ~without
+    colours = camera[:, : CAMERA_CHANNELS - 1] * (~blank)[:, None, None, None]
+    camera = torch.cat([colours, camera[:, CAMERA_CHANNELS - 1 :]], 1)
+    sensors = replace(sensors, camera=camera, classes=classes)
+    if config.lidar > 0 or config.fewer_rows > 0:
+        sensors = strange_lidar(sensors, config, generator)
+    return sensors
+
+
+def strange_image(
+    camera: Float[Tensor, "B 4 H W"],
+    classes: Float[Tensor, "B C H W"],
+    strength: float,
+    generator: torch.Generator,
+) -> Float[Tensor, "B 4 H W"]:
+    """Another light, other colours (of each class for itself), other surfaces, another lens and sensor."""
+    count, _, height, width = camera.shape
+    draw = _Draw(generator, camera.device)
+    colours, seen = camera[:, :3], camera[:, 3:]
+    size = strength * draw.even(count, 1, 1, 1)
+    mix = torch.eye(3, device=camera.device) + _MIX * size[..., 0] * draw.normal(count, 3, 3)
+    colours = torch.einsum("bij,bjhw->bihw", mix, colours)
+    tint = _TINT * size[..., 0] * draw.normal(count, 3, classes.shape[1] - 1)
+    colours = colours + torch.einsum("bck,bkhw->bchw", tint, classes[:, :-1])
+    for cells in (3, 8, 24):
+        grain = _TEXTURE * size * draw.even(count, 1, 1, 1)
+        colours = colours + grain * draw.field(count, 1, height, width, cells)
+    light = torch.exp(_LIGHT * size * draw.field(count, 1, height, width, 40))
+    colours = (colours * light).clamp(1e-3, 1.0)
+    colours = colours ** torch.exp(_GAMMA * size * (2 * draw.even(count, 1, 1, 1) - 1))
+    blurred = F.avg_pool2d(F.pad(colours, (1, 1, 1, 1), mode="replicate"), 3, 1)
+    # Negative shares sharpen, as cameras do.
+    share = strength * (1.5 * draw.even(count, 1, 1, 1) - 0.5)
+    colours = colours + share.clamp(-0.5, 1.0) * (blurred - colours)
+    colours = colours + _NOISE * size * draw.even(count, 1, 1, 1) * draw.normal(count, 3, height, width)
+    return torch.cat([colours.clamp(0.0, 1.0) * seen, seen], 1)
+
+
+def strange_classes(
+    classes: Float[Tensor, "B C H W"], strength: float, generator: torch.Generator
+) -> Float[Tensor, "B C H W"]:
+    """Another segmenter's: outlines wander, things swell, patches are confused or missing, it is more or less sure."""
+    count, channels, height, width = classes.shape
+    draw = _Draw(generator, classes.device)
+    # A quarter of the frames keeps the labels' own errors only.
+    size = strength * draw.even(count, 1, 1, 1) * (draw.even(count, 1, 1, 1) > 0.25)
+    moved = _displaced(classes, size * _SHIFTED_CELLS * draw.field(count, 2, height, width, 6))
+    grown = F.max_pool2d(moved[:, :-1], 3, 1, 1)
+    things = (draw.even(count, channels - 1, 1, 1) < 0.3).float()  # some classes swell, others not
+    likelihood = moved[:, :-1] + size * _GROWN * things * (grown - moved[:, :-1])
+    likelihood = likelihood / likelihood.sum(1, keepdim=True).clamp(min=1e-3)
+    confused = (
+        draw.field(count, 1, height, width, 16) > _normal_quantile(_CONFUSED) / size.clamp(min=0.01).sqrt()
+    )
+    other = torch.stack([draw.permutation(channels - 1) for _ in range(count)])
+    taken = likelihood.gather(1, other[..., None, None].expand_as(likelihood))
+    likelihood = torch.where(confused, taken, likelihood)
+    doubt = size * _DOUBT * draw.even(count, 1, 1, 1)
+    likelihood = likelihood * (1 - doubt) + doubt / (channels - 1)
+    hole = draw.field(count, 1, height, width, 24) > _HOLE / size.clamp(min=0.05)
+    known = moved[:, -1:].round() * (~hole)
+    return torch.cat([likelihood * known, known], 1)
+
+
+def strange_lidar(sensors: SensorInputs, config: StrangeConfig, generator: torch.Generator) -> SensorInputs:
+    """Another lidar: echoes on another scale, a ground a little off and flagged in part, points missing, rows apart."""
+    count, points = sensors.lidar_valid.shape
+    draw, strength = _Draw(generator, sensors.lidar_xyz_m.device), config.lidar
+    features = sensors.lidar_features.clone()
+    echo = features[..., _INTENSITY] ** torch.exp(strength * (2 * draw.even(count, 1) - 1))
+    echo = echo + 0.1 * strength * draw.even(count, 1) * draw.normal(count, points)
+    silent = draw.even(count, 1) < _SILENT * strength
+    features[..., _INTENSITY] = torch.where(silent, torch.full_like(echo, 0.5), echo.clamp(0, 1))
+    ahead = sensors.lidar_xyz_m[..., 0]
+    lifted = _LIFTED_M * draw.normal(count, 1) + _TILTED_RAD * draw.normal(count, 1) * ahead
+    lifted = lifted + 0.03 * draw.normal(count, points)
+    features[..., _HEIGHT] = features[..., _HEIGHT] + strength * lifted / FEATURE_UNITS["height"]
+    # Two frames of five keep the flags of the ground, one has none.
+    flagged = (draw.even(count, points) > strength * (2.2 * draw.even(count, 1) - 0.8)).float()
+    features[..., _GROUND] = features[..., _GROUND] * flagged
+    kept = draw.even(count, points) > 0.4 * strength * draw.even(count, 1)
+    thin = _chosen(count, config.fewer_rows, generator, kept.device)[:, None]
+    kept = kept & (~thin | _on_far_rows(sensors.lidar_xyz_m, draw))
+    valid = sensors.lidar_valid & kept
+    enough = (valid.sum(1) >= _FEWEST_POINTS)[:, None]
+    return replace(
+        sensors, lidar_features=features, lidar_valid=torch.where(enough, valid, sensors.lidar_valid)
+    )
+
+
+def _on_far_rows(xyz_m: Float[Tensor, "B N 3"], draw: _Draw) -> Bool[Tensor, "B N"]:
+    """Points on some of the rows: 0.3 deg thick, 1 to 2.2 deg apart, in the lidar's own elevation."""
+    elevation = torch.atan2(xyz_m[..., 2], xyz_m[..., :2].norm(dim=-1)) * _DEG
+    apart = 1.0 + 1.2 * draw.even(len(xyz_m), 1)
+    phase = elevation / apart + draw.even(len(xyz_m), 1)
+    return (phase - phase.round()).abs() * apart < 0.15
+
+
+def _displaced(maps: Tensor, cells: Tensor) -> Tensor:
+    """The maps looked up some cells away (columns, rows)."""
+    count, _, height, width = maps.shape
+    row, column = torch.meshgrid(
+        torch.linspace(-1, 1, height, device=maps.device),
+        torch.linspace(-1, 1, width, device=maps.device),
+        indexing="ij",
+    )
+    at = torch.stack([column, row], -1).expand(count, height, width, 2)
+    step = maps.new_tensor([2 / (width - 1), 2 / (height - 1)])
+    at = at + cells.permute(0, 2, 3, 1) * step
+    return F.grid_sample(maps, at, mode="bilinear", padding_mode="border", align_corners=True)
+
+
+def _chosen(count: int, share: float, generator: torch.Generator, device: torch.device) -> Bool[Tensor, " B"]:
+    return (torch.rand(count, generator=generator) < share).to(device)
+
+
+def _normal_quantile(share: float) -> float:
+    """What a standard normal variable exceeds in this share of cases."""
+    return float(torch.special.ndtri(torch.tensor(1 - share)))
+
+
+class _Draw:
+    """Random numbers of the CPU's generator on any device."""
+
+    def __init__(self, generator: torch.Generator, device: torch.device) -> None:
+        self._generator, self._device = generator, device
+
+    def even(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self._generator).to(self._device)
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self._generator).to(self._device)
+
+    def permutation(self, count: int) -> Tensor:
+        return torch.randperm(count, generator=self._generator).to(self._device)
+
+    def field(self, count: int, channels: int, height: int, width: int, cells: int) -> Tensor:
+        """Smooth fields of about unit variance whose features are some cells wide."""
+        small = self.normal(count, channels, height // cells + 3, width // cells + 3)
+        wide = F.interpolate(small, scale_factor=float(cells), mode="bicubic", align_corners=False)
+        return wide[..., cells : cells + height, cells : cells + width] * 1.35
