@@ -90,7 +90,7 @@ def test_only_vehicles_that_taught_nobody_tune_anything(tmp_path):
 def test_seeds_of_networks_days_are_nobody_elses(tmp_path):
     others = {d.seed for days in SETS.values() for d in days}
     cross = {d.seed for d in ssl_cross_rig.DAYS}
-    assert len(cross) == 6
+    assert len(cross) == 8
     assert not others & cross
     assert ssl_fleet.FLEET.seed not in others | cross
     rigs = {ssl_fleet.spec_of("rigs", n).seed for n in range(ssl_fleet.RIGS.vehicles)}

@@ -36,6 +36,7 @@ class SensorInputs:
     radar_features: Float[Tensor, "B M 3"]
     radar_valid: Bool[Tensor, "B M"]
     radar_has_elevation: Bool[Tensor, " B"]
+    nearness: Float[Tensor, " B"]  # 1; in training a factor of the rendered nearness
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SensorInputs:
         """Apply a function to every tensor (to a device, a slice of the frames)."""
@@ -75,6 +76,7 @@ def sensor_inputs(batch: TrainingBatch, grid: Grid) -> SensorInputs:
         radar_features(batch.radar_residual_mps, batch.radar_power_db, batch.radar_motion == 1),
         batch.radar_valid,
         batch.radar_has_elevation,
+        torch.ones(len(batch), device=batch.image.device),
     )
 
 

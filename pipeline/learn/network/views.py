@@ -69,7 +69,7 @@ def render(
     weight = torch.where(ground > 0.5, GROUND_WEIGHT, 1.0) * in_view
     view = RenderedView(
         torch.cat([sensors.camera, sensors.classes], 1) if classes else sensors.camera,
-        paint(index, _channels(lidar_camera, sensors.lidar_features), grid),
+        paint(index, _channels(lidar_camera, sensors.lidar_features, sensors.nearness[:, None, None]), grid),
         paint(radar_index, _channels(radar_camera, sensors.radar_features), grid),
         _pick(lidar_camera, matched),
         weight.gather(1, matched),
@@ -90,9 +90,9 @@ def _importance(count: int, device: torch.device | str = "cpu") -> Float[Tensor,
     return ((number * 2654435761) % 65536).float() / 65536  # Knuth's multiplicative hash
 
 
-def _channels(points_camera: Tensor, features: Tensor) -> Tensor:
+def _channels(points_camera: Tensor, features: Tensor, factor: Tensor | float = 1.0) -> Tensor:
     distance = points_camera.norm(dim=-1, keepdim=True).clamp(min=NEAR_M)
-    nearness = (NEARNESS_M / distance).clamp(max=2.0)
+    nearness = (factor * NEARNESS_M / distance).clamp(max=2.0)
     return torch.cat([torch.ones_like(distance), nearness, features], -1)
 
 

@@ -30,7 +30,16 @@ def sensors() -> SensorInputs:
     valid = torch.ones(FRAMES, xyz.shape[1], dtype=torch.bool)
     camera = torch.cat([0.3 + 0.4 * torch.rand(FRAMES, 3, 32, 64), torch.ones(FRAMES, 1, 32, 64)], 1) * seen
     return SensorInputs(
-        camera, given_classes(kind), xyz, features, valid, radar, radar, valid[:, :5], valid[:, 0]
+        camera,
+        given_classes(kind),
+        xyz,
+        features,
+        valid,
+        radar,
+        radar,
+        valid[:, :5],
+        valid[:, 0],
+        torch.ones(FRAMES),
     )
 
 
