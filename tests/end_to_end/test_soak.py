@@ -9,6 +9,7 @@ from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records, read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.benchmarks.studies.soak import Soak, contents, differences, make_fleet, soak_round, storage
+from tests.benchmarks.studies.victims import CROWDS
 from tests.makers.s3_server import BUCKET
 
 
@@ -23,21 +24,19 @@ def test_nights_that_are_killed_leave_what_an_undisturbed_one_leaves(kind, kills
         "AWS_ALLOW_HTTP",
     ):
         monkeypatch.setenv(name, "")  # given back after the test
-    soak = Soak(tmp_path)
-    make_fleet(soak.folder)
-    with storage(kind) as s3:
+    make_fleet(tmp_path)
+    with storage(kind) as s3, CROWDS["process"](tmp_path / "tmp") as crowd:
+        soak = Soak(tmp_path, crowd)
         lakes = str(tmp_path) if s3 is None else f"s3://{BUCKET}"
         soak.undisturbed(f"{lakes}/quiet")
         quiet = Lake.at(f"{lakes}/quiet")
         wanted = contents(quiet)
         assert len([key for key in wanted if key.startswith("calibrations")]) == 27
         assert len([key for key in wanted if key.startswith("page")]) == 1 + 9
-        if s3 is not None:
-            s3.faults(fail=10**6, every=20)
-        told = soak_round(soak, f"{lakes}/disturbed", kills, np.random.default_rng(5), wanted)
+        told = soak_round(soak, f"{lakes}/disturbed", kills, np.random.default_rng(5), wanted, s3)
         assert (told.kills, told.differences) == (kills, [])
         if s3 is not None:
-            assert s3.faults()["failed"] > 10
+            assert min(told.requests[fault] for fault in ("failed", "slowed", "lost")) > 1
         else:
             planted_differences_are_seen(soak, quiet, wanted)
 

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-__all__ = ["MISSING", "lasting", "ray_or_skip", "two_nodes"]
+__all__ = ["MISSING", "another_node", "lasting", "ray_or_skip", "two_nodes"]
 
 MISSING = "the extra [ray] is not installed: pip install 'boresight[ray]'"
 # Ray itself leaves files and sockets to the garbage collector.
@@ -21,6 +21,11 @@ _NODE = {"object_store_memory": 80 << 20, "include_dashboard": False}  # Ray's l
 def ray_or_skip():
     """The module; the test is left out where it is not installed."""
     return pytest.importorskip("ray", reason=MISSING)
+
+
+def another_node(cluster):
+    """A node of one CPU that joins the cluster."""
+    return cluster.add_node(num_cpus=1, **_NODE)
 
 
 @contextmanager
@@ -42,7 +47,7 @@ def two_nodes(*importable):
     os.environ.update(ours)
     cluster = Cluster(initialize_head=True, head_node_args=_NODE | {"num_cpus": 0})
     try:
-        nodes = [cluster.add_node(num_cpus=1, **_NODE) for _ in range(2)]
+        nodes = [another_node(cluster) for _ in range(2)]
         os.environ["RAY_ADDRESS"] = cluster.address
         yield cluster, nodes
     finally:

@@ -3,13 +3,20 @@
     python -m tests.makers.s3_server
 
 Prints its port. `POST /faults {"fail": N, "stall": N, "stall_s": S}` makes the next N requests answer 503, the N after
-them wait; `GET /faults` says how many requests came, how many were failed or stalled, and
-how many bytes the answers had.
+them wait; `{"mix": [FAULT, ...], "every": N}` gives every N-th request the next of these faults, round and round:
+
+    503, 500    an answer of that number, nothing done
+    slow        done after `slow_s`
+    stall       done after `stall_s`: where a client waits less, it may have asked again by then
+    lost        done, and the connection closed without an answer
+
+`GET /faults` says how many requests came, how many of each fault there were, and how many bytes the answers had.
 """
 
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 import threading
@@ -21,6 +28,8 @@ from urllib.parse import urlencode
 
 REPO = Path(__file__).resolve().parents[2]
 BUCKET = "fleet"
+ERRORS = {"503": ("503 Slow Down", "SlowDown"), "500": ("500 Internal Server Error", "InternalError")}
+COUNTED = {"503": "failed", "500": "failed", "slow": "slowed", "stall": "stalled", "lost": "lost"}
 
 
 class Faults:
@@ -28,8 +37,9 @@ class Faults:
 
     def __init__(self, app):
         self.app, self.lock = app, threading.Lock()
-        self.plan = {"fail": 0, "stall": 0, "stall_s": 0.0, "every": 1}
-        self.counts = {"requests": 0, "failed": 0, "stalled": 0, "bytes_sent": 0, "puts": 0, "gets": 0}
+        self.plan = {"fail": 0, "stall": 0, "stall_s": 0.0, "slow_s": 0.0, "every": 1, "mix": []}
+        self.counts = {"requests": 0, "failed": 0, "stalled": 0, "slowed": 0, "lost": 0}
+        self.counts |= {"bytes_sent": 0, "puts": 0, "gets": 0}
 
     def __call__(self, environ, start_response):
         if environ["PATH_INFO"] == "/faults":
@@ -39,20 +49,15 @@ class Faults:
             # As object stores bill: what writes or lists, and what reads.
             lists = environ["REQUEST_METHOD"] == "GET" and "list-type" in environ["QUERY_STRING"]
             self.counts["puts" if lists or environ["REQUEST_METHOD"] in ("PUT", "POST") else "gets"] += 1
-            hit = self.counts["requests"] % self.plan["every"] == 0
-            fail = hit and self.plan["fail"] > 0
-            stall = hit and not fail and self.plan["stall"] > 0
-            self.plan["fail"] -= fail
-            self.plan["stall"] -= stall
-            self.counts["failed"] += fail
-            self.counts["stalled"] += stall
-        if fail:
+            fault = self.fault()
+        if fault in ERRORS:
             # The body must be read, or the connection ends before the client has sent it.
             environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
-            start_response("503 Slow Down", [("Content-Type", "application/xml")])
-            return [b"<Error><Code>SlowDown</Code></Error>"]
-        if stall:
-            time.sleep(self.plan["stall_s"])
+            status, code = ERRORS[fault]
+            start_response(status, [("Content-Type", "application/xml")])
+            return [f"<Error><Code>{code}</Code></Error>".encode()]
+        if fault in ("slow", "stall"):
+            time.sleep(self.plan[f"{fault}_s"])
 
         def counted(status, headers, exc_info=None):
             with self.lock:
@@ -60,12 +65,31 @@ class Faults:
                 self.counts["bytes_sent"] += is_get * int(dict(headers).get("Content-Length", 0))
             return start_response(status, headers, exc_info)
 
-        return self.app(environ, counted)
+        answer = self.app(environ, counted)
+        if fault == "lost":
+            environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
+        return answer
+
+    def fault(self):
+        """What becomes of this request, None where nothing does."""
+        plan, counts = self.plan, self.counts
+        if counts["requests"] % plan["every"]:
+            return None
+        fault = None
+        if plan["mix"]:
+            fault = plan["mix"][counts["requests"] // plan["every"] % len(plan["mix"])]
+        for kind, named in (("fail", "503"), ("stall", "stall")):
+            if fault is None and plan[kind] > 0:
+                plan[kind] -= 1
+                fault = named
+        if fault is not None:
+            counts[COUNTED[fault]] += 1
+        return fault
 
     def control(self, environ, start_response):
         if environ["REQUEST_METHOD"] == "POST":
             asked = json.loads(environ["wsgi.input"].read(int(environ["CONTENT_LENGTH"])))
-            self.plan |= {"every": 1} | asked
+            self.plan |= {"every": 1, "mix": []} | asked
         start_response("200 OK", [("Content-Type", "application/json")])
         return [json.dumps(self.counts).encode()]
 

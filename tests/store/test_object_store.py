@@ -163,8 +163,11 @@ def test_other_engines_read_the_bucket_by_the_documented_lines(lake, rng):
     assert pl.scan_delta(where).select("vehicle").collect()["vehicle"].to_list() == ["car"]
 
 
-@pytest.mark.parametrize("fault", [{"fail": 6}, {"stall": 2, "stall_s": 3.0}, {"fail": 40, "every": 3}])
-def test_answers_of_503_and_late_ones_are_asked_for_again(fault, lake, rng, s3):
+@pytest.mark.parametrize(
+    "fault",
+    [{"fail": 6}, {"stall": 2, "stall_s": 3.0}, {"fail": 40, "every": 3}, {"mix": ["500", "lost"], "every": 4}],
+)
+def test_answers_of_5xx_late_ones_and_lost_ones_are_asked_for_again(fault, lake, rng, s3):
     rows = [make_row("frames", rng, frame_index=i) for i in range(3)]
     before = s3.faults(**fault)
     write(lake, rows)
@@ -172,7 +175,7 @@ def test_answers_of_503_and_late_ones_are_asked_for_again(fault, lake, rng, s3):
     assert len(read_rows(lake, FRAMES, DAY, Frame)) == 3
     assert len(read(lake)) == 3
     after = s3.faults(fail=0, stall=0)
-    assert after["failed"] + after["stalled"] > before["failed"] + before["stalled"]
+    assert sum(after[kind] - before[kind] for kind in ("failed", "stalled", "lost")) > 1
     assert lake.damage == []
 
 

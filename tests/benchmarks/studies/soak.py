@@ -2,15 +2,18 @@
 
 Small whole nights (the installed command, logs to pages) over a fleet of tiny logs. In each round a fresh lake is
 worked on by nights that are disturbed: a random worker is killed, or the night itself, or the night with all of its
-processes, at random moments; SIGKILL each time. Then one night is left alone, and its lake is held against one that was
-never disturbed: the same frames and observations byte for byte, the same records and nothing twice, the same findings,
-states and pages, and no temporary file. With `--storage s3` the lake is in a bucket whose server answers 503 to every
-twentieth request meanwhile.
+processes, or (on Ray) a node with all that runs on it, which another one follows, at random moments; SIGKILL each time.
+Then one night is left alone, and its lake is held against one that was never disturbed: the same frames and
+observations byte for byte, the same records and nothing twice, the same findings, states and pages, and no temporary
+file. With `--storage s3` the lake is in a bucket, whose server meanwhile gives every twentieth request a fault: an
+answer of 503 or 500, a late one, one later than the client waits, none at all though the request was carried out.
 
     python -m tests.benchmarks.studies.soak [--kills 200] [--seconds 220] [--executor process] [--storage folder]
 
-A line per round is added to results/soak.jsonl until the executor and storage have that many kills there; a run that
-`--seconds` ended goes on where it was. Any difference ends the run with exit code 1 and is in the round's line.
+`--executor ray` is a cluster of two nodes that outlives the nights, as `RAY_ADDRESS` names one; `ray-own` is what a
+night without it starts for itself. A line per round is added to results/soak.jsonl until the executor and storage have
+that many kills there; a run that `--seconds` ended goes on where it was. Any difference ends the run with exit code 1
+and is in the round's line.
 """
 
 from __future__ import annotations
@@ -19,13 +22,12 @@ import argparse
 import hashlib
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -41,6 +43,7 @@ from schemas.drift import DRIFT, DriftFinding
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.states import STATES, StateRow
 from tests.benchmarks.studies.commits import commit_now
+from tests.benchmarks.studies.victims import CROWDS, Crowd
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.s3_server import BUCKET, S3, running
 from tests.makers.written_logs import START_NS, Kit
@@ -48,8 +51,11 @@ from tests.makers.written_logs import START_NS, Kit
 RESULTS = Path("tests/benchmarks/results/soak.jsonl")
 VEHICLES, DAYS, FRAMES = 3, 3, 5
 DAY_NS = 86_400 * 10**9
-KILLS_A_ROUND = 20
-SECONDS_TO_DRAW = 6.0  # a kill comes within this time of the last one: half of a night on two busy cores
+KILLS_A_ROUND = 10
+# A kill comes within this time of the last one: half of a night and more, on two busy cores.
+SECONDS_TO_DRAW = {"process": 6.0, "ray": 9.0, "ray-own": 9.0}
+# Every twentieth request; once in 820 one that takes longer than a client waits (`REQUEST_S` of `pipeline/store`).
+FAULTS = {"mix": ["503", "500", "slow", "lost"] * 10 + ["stall"], "every": 20, "slow_s": 1.5, "stall_s": 32.0}
 
 
 @dataclass
@@ -59,22 +65,23 @@ class Round:
     worker_kills: int = 0
     night_kills: int = 0
     group_kills: int = 0
+    node_kills: int = 0
     nights: int = 0
-    requests_failed: int = 0
+    requests: dict[str, int] = field(default_factory=dict)
     differences: list[str] = field(default_factory=list)
 
     @property
     def kills(self) -> int:
-        return self.worker_kills + self.night_kills + self.group_kills
+        return self.worker_kills + self.night_kills + self.group_kills + self.node_kills
 
 
 @dataclass(frozen=True)
 class Soak:
-    """Where it happens: the fleet's logs, its temporary files, and the executor that nights use."""
+    """Where it happens: the fleet's logs, its temporary files, and the processes that nights consist of."""
 
     folder: Path
-    executor: str = "process"
-    environment: dict[str, str] = field(default_factory=dict)
+    crowd: Crowd
+    seconds: float = SECONDS_TO_DRAW["process"]
 
     @property
     def scratch(self) -> Path:
@@ -85,12 +92,12 @@ class Soak:
         """A night over all logs."""
         logs = f"{self.folder}/logs/{{vehicle}}/{{day}}/*"
         night = ["nightly", "--fleet", f"{self.folder}/fleet.toml", "--lake", lake, "--logs", logs]
-        return [f"{sys.prefix}/bin/boresight", *night, "--executor", self.executor, "--workers", "2"]
+        return [f"{sys.prefix}/bin/boresight", *night, "--executor", self.crowd.executor, "--workers", "2"]
 
     def started(self, lake: str) -> subprocess.Popen[str]:
         """A night in a process group of its own."""
         self.scratch.mkdir(exist_ok=True)
-        environment = os.environ | {"TMPDIR": str(self.scratch)} | self.environment
+        environment = os.environ | {"TMPDIR": str(self.scratch)}
         return subprocess.Popen(
             self.command(lake), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment,
             start_new_session=True,
@@ -125,20 +132,23 @@ def disturbed(soak: Soak, lake: str, kills: int, rng: np.random.Generator) -> Ro
         process = soak.started(lake)
         told.nights += 1
         try:
-            _disturb(process, told, kills, rng)
+            _disturb(soak, process, told, kills, rng)
         finally:
-            _end(process)
+            soak.crowd.wait_until_gone(process)
     return told
 
 
-def _disturb(process: subprocess.Popen[str], told: Round, kills: int, rng: np.random.Generator) -> None:
+def _disturb(
+    soak: Soak, process: subprocess.Popen[str], told: Round, kills: int, rng: np.random.Generator
+) -> None:
     """Kill until the night is gone, by itself or not."""
+    crowd = soak.crowd
     while told.kills < kills:
         try:
-            process.communicate(timeout=float(rng.uniform(0.0, SECONDS_TO_DRAW)))
+            process.communicate(timeout=float(rng.uniform(0.0, soak.seconds)))
         except subprocess.TimeoutExpired:
-            workers = _workers(process)
-            choice = rng.integers(4)
+            workers = crowd.workers(process.pid)
+            choice = rng.integers(4 if crowd.kill_node is None else 5)
             if choice < 2 and workers:
                 with suppress(psutil.NoSuchProcess):
                     workers[rng.integers(len(workers))].kill()
@@ -148,39 +158,14 @@ def _disturb(process: subprocess.Popen[str], told: Round, kills: int, rng: np.ra
                 told.night_kills += 1
                 return
             elif choice == 3:
-                os.killpg(process.pid, signal.SIGKILL)
+                crowd.kill_all(process)
                 told.group_kills += 1
                 return
+            elif choice == 4 and crowd.kill_node is not None:
+                crowd.kill_node(int(rng.integers(2)))
+                told.node_kills += 1
         else:
             return
-
-
-def _workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    with suppress(psutil.NoSuchProcess):
-        children = psutil.Process(process.pid).children(recursive=True)
-        return [c for c in children if "spawn_main" in " ".join(_command(c))]
-    return []
-
-
-def _command(process: psutil.Process) -> Sequence[str]:
-    with suppress(psutil.Error):
-        return process.cmdline()
-    return []
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    """Wait until no process of a killed night is left: its workers notice by themselves that it is gone."""
-    if process.poll() is None:
-        process.kill()
-    process.communicate()
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline:
-        try:
-            os.killpg(process.pid, 0)
-        except ProcessLookupError:
-            return
-        time.sleep(0.05)
-    raise RuntimeError("workers of a killed night are still there after 30 s")
 
 
 def contents(lake: Lake) -> dict[str, Any]:
@@ -227,10 +212,16 @@ def differences(soak: Soak, lake: Lake, wanted: dict[str, Any]) -> list[str]:
     return told
 
 
-def soak_round(soak: Soak, lake: str, kills: int, rng: np.random.Generator, wanted: dict[str, Any]) -> Round:
-    """Disturb a lake, let one night finish it, and compare."""
+def soak_round(
+    soak: Soak, lake: str, kills: int, rng: np.random.Generator, wanted: dict[str, Any], s3: S3 | None = None
+) -> Round:
+    """Disturb a lake, let one night finish it, and compare; its bucket is at fault until then."""
+    before = {} if s3 is None else s3.faults(**FAULTS)
     told = disturbed(soak, lake, kills, rng)
     summary = soak.undisturbed(lake)
+    if s3 is not None:
+        after = s3.faults(mix=[])
+        told.requests = {k: after[k] - before[k] for k in ("requests", "failed", "slowed", "stalled", "lost")}
     told.differences = differences(soak, Lake.at(lake), wanted)
     if summary["failed"]:
         told.differences.append(f"failed in a night that was left alone: {summary['problems']}")
@@ -253,14 +244,17 @@ def main() -> int:
     )
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=float("inf"))
-    parser.add_argument("--executor", default="process", help="as of boresight nightly")
+    parser.add_argument("--executor", choices=CROWDS, default="process")
     parser.add_argument("--storage", choices=("folder", "s3"), default="folder")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     until, code = time.monotonic() + given.seconds, 0
     how = {"executor": given.executor, "storage": given.storage, "seed": given.seed}
-    with tempfile.TemporaryDirectory() as name, storage(given.storage) as s3:
-        soak = Soak(Path(name), given.executor)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        s3 = stack.enter_context(storage(given.storage))
+        crowd = stack.enter_context(CROWDS[given.executor](folder / "tmp"))
+        soak = Soak(folder, crowd, SECONDS_TO_DRAW[given.executor])
         make_fleet(soak.folder)
         lakes = str(soak.folder) if s3 is None else f"s3://{BUCKET}"
         soak.undisturbed(f"{lakes}/quiet")
@@ -270,12 +264,8 @@ def main() -> int:
             if sum(line["kills"] for line in before) >= given.kills:
                 break
             rng = np.random.default_rng([given.seed, len(before)])
-            if s3 is not None:
-                s3.faults(fail=10**6, every=20)
-            told = soak_round(soak, f"{lakes}/lake-{len(before)}", KILLS_A_ROUND, rng, wanted)
-            if s3 is not None:
-                told.requests_failed = s3.faults()["failed"]
-                s3.faults(fail=0)
+            lake = f"{lakes}/lake-{len(before)}"
+            told = soak_round(soak, lake, KILLS_A_ROUND, rng, wanted, s3)
             line = {"commit": commit_now(), **how, "round": len(before), "kills": told.kills, **vars(told)}
             sys.stdout.write(json.dumps(line) + "\n")
             with RESULTS.open("a") as file:
