@@ -1,9 +1,9 @@
 """Which parts of a long day are read: bursts of consecutive trios, spread over time, speed, turn and place.
 
-A calibration takes some hundred frames, and the ones that come next in a drive show much the same. So the recorded time
-is cut into equal parts; in the middle of each lies a burst that could be read, and of these those are read that show
-most: a set is worth the sum over time, speed, turn and place of log(1 + bursts) in each class of it, and the burst
-that adds most comes next (submodular, as the choice of frames in `calibrate/select/coverage.py`).
+A calibration takes some hundred frames, and the ones that come next in a drive show much the same. So the day is cut
+into parts of equally many sweeps; in the middle of each lies a burst that could be read, and of these those are read
+that show most: a set is worth the sum over time, speed, turn and place of log(1 + bursts) in each class of it, and the
+burst that adds most comes next (submodular, as the choice of frames in `calibrate/select/coverage.py`).
 """
 
 from __future__ import annotations
@@ -13,14 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.ingest.containers.timeline import Stretches
+from pipeline.ingest.containers.timeline import PAUSE_NS
 
-__all__ = ["BURST_TRIOS", "BurstMotion", "choose_bursts", "possible_bursts"]
+__all__ = ["BURST_TRIOS", "BurstMotion", "PossibleBursts", "choose_bursts", "possible_bursts"]
 
 # Tracks of moving clusters count from their second scan on (`calibrate/select/triggers.py`), and Doppler wraps are told
 # apart within a few more; 20 scans are 2 s at 10 Hz, shorter than the blocks by which frames that judge are held out.
-# Bursts of 10 were as good on a simulated day, and worse on the real one, whose sweeps come in clumps: more of them are
-# missed by short stretches of time (50 sweeps of 80 planned, not 75).
+# Bursts of 10 were as good on a simulated day.
 BURST_TRIOS = 20
 _CHOICE = 3  # as many bursts could be read as are, times this: each costs a glance at its odometry
 # Classes: standing, creeping, city, main road, country road, motorway; turning right, bending, straight ...
@@ -28,6 +27,19 @@ _SPEEDS_MPS = np.array([1.0, 5.0, 10.0, 16.0, 25.0])
 _YAW_RATES_RADPS = np.radians([-8.0, -2.0, 2.0, 8.0])
 _TIE = 1e-3  # less than any difference in what bursts add
 _PLACE_M = 200.0  # side of a place's cell: what a lidar sees in it is the same scene
+
+
+@dataclass(frozen=True, eq=False)
+class PossibleBursts:
+    """Bursts that could be read, in order of time.
+
+    Args:
+        spans_ns: first and last moment of each.
+        middle_ns: its middle sweep, with the sweeps before and after that one.
+    """
+
+    spans_ns: Int64[np.ndarray, "M 2"]
+    middle_ns: Int64[np.ndarray, "M 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,28 +57,37 @@ class BurstMotion:
 
 
 def possible_bursts(
-    recorded: Stretches, sweeps: int, budget: int, *, is_motion_known: bool
-) -> Int64[np.ndarray, "M 2"]:
-    """First and last moment of each burst that could be read, in order of time.
+    sweeps_ns: Int64[np.ndarray, " N"], budget: int, *, is_motion_known: bool
+) -> PossibleBursts:
+    """The bursts that could be read, in order of time: of as many sweeps, wherever these lie.
+
+    Within a stretch without pause, where one is long enough; where sweeps come in clumps, a burst is several of them.
 
     Args:
-        recorded: log time in which sweeps were recorded.
-        sweeps: number of them.
+        sweeps_ns: when each was logged, as far as the index tells; in order.
         budget: sweeps that shall be read.
         is_motion_known: False where nothing tells one burst from another: no more are asked for than are read.
     """
-    spans = np.array(recorded.spans_ns, np.int64).reshape(-1, 2)
-    before = np.concatenate([[0], np.cumsum(spans[:, 1] - spans[:, 0])])
-    burst_ns = before[-1] * BURST_TRIOS / max(sweeps, 1)
+    sweeps = len(sweeps_ns)
+    length = min(BURST_TRIOS, sweeps)
     wanted = -(-budget // BURST_TRIOS) * (_CHOICE if is_motion_known else 1)
-    count = max(1, min(wanted, int(before[-1] // max(burst_ns, 1))))
-    middle = (np.arange(count) + 0.5) * before[-1] / count
-    i = np.clip(np.searchsorted(before, middle, "right") - 1, 0, len(spans) - 1)
-    start = spans[i, 0] + middle - before[i] - burst_ns / 2
+    count = max(1, min(wanted, sweeps // length))
+    middle = ((np.arange(count) + 0.5) * sweeps / count).astype(np.int64)
     # A burst that would reach beyond its stretch is moved into it.
-    start = np.maximum(np.minimum(start, spans[i, 1] - burst_ns), spans[i, 0])
-    end = np.minimum(start + burst_ns, spans[i, 1])
-    return np.stack([start, end], axis=1).astype(np.int64)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(sweeps_ns) > PAUSE_NS) + 1, [sweeps]])
+    stretch = np.searchsorted(edges, middle, "right") - 1
+    begin, end = edges[stretch], edges[stretch + 1]
+    is_long = end - begin >= length
+    first = np.clip(
+        middle - length // 2, np.where(is_long, begin, 0), np.where(is_long, end, sweeps) - length
+    )
+    last = first + length - 1
+    # Half-way to the sweeps beside it: the index knows only about when a sweep was logged.
+    half = np.minimum(np.diff(sweeps_ns, prepend=sweeps_ns[0], append=sweeps_ns[-1]), PAUSE_NS) // 2
+    around = sweeps_ns[np.clip(middle[:, None] + [-1, 0, 1], 0, sweeps - 1)]
+    return PossibleBursts(
+        np.stack([sweeps_ns[first] - half[first], sweeps_ns[last] + half[last + 1]], axis=1), around
+    )
 
 
 def choose_bursts(motion: BurstMotion, count: int) -> list[int]:

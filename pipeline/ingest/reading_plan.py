@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.errors import LogError
-from pipeline.ingest.bursts import BURST_TRIOS, BurstMotion, choose_bursts, possible_bursts
+from pipeline.ingest.bursts import BURST_TRIOS, BurstMotion, PossibleBursts, choose_bursts, possible_bursts
 from pipeline.ingest.containers.reader import LogReader, RawMessage
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.ingest.doppler_speed import doppler_speed
@@ -82,14 +82,15 @@ def plan_reading(
     indexed = {log: t for log, t in logs.items() if t is not None}
     timeline = Timeline.joined(t for t in indexed.values() if t.messages.get(lidar))
     sweeps = timeline.messages.get(lidar, 0)
-    if sweeps <= budget or 2 * len(indexed) < len(logs) or not timeline.recorded.length_ns:
+    counted = timeline.counted.get(lidar)
+    if counted is None or sweeps <= budget or 2 * len(indexed) < len(logs) or not timeline.recorded.length_ns:
         return None
     day = _Day(tuple(indexed), rig, roles)
     by = next((r for r in ("odometry", "radar") if any(_holds(t, r, roles) for t in indexed.values())), "")
-    possible = possible_bursts(timeline.recorded, sweeps, budget, is_motion_known=bool(by))
-    motion = _motion_at(day, possible.mean(axis=1).astype(np.int64), by)
+    possible = possible_bursts(counted.times_ns(), budget, is_motion_known=bool(by))
+    motion = _motion_at(day, possible.middle_ns, by)
     needed = {r for r in ("image", "lidar", "radar") if any(_holds(t, r, roles) for t in indexed.values())}
-    margin_ns = _margin_ns(day, possible.mean(axis=1).astype(np.int64), needed)
+    margin_ns = _margin_ns(day, possible.middle_ns, needed)
     if margin_ns is None:
         return None
     return _reading(possible, motion, sweeps, budget, margin_ns)
@@ -107,10 +108,8 @@ def plan_sweeps(
         budget: sweeps that shall be taken.
     """
     order = np.argsort(logged_ns, kind="stable")
-    recorded = Stretches.of_times(logged_ns[order])
-    possible = possible_bursts(recorded, len(order), budget, is_motion_known=len(ego) > 0)
-    middle = np.searchsorted(logged_ns[order], possible.mean(axis=1))
-    stamps = stamps_ns[order][np.minimum(middle, len(order) - 1)]
+    possible = possible_bursts(logged_ns[order], budget, is_motion_known=len(ego) > 0)
+    stamps = stamps_ns[order][np.searchsorted(logged_ns[order], possible.middle_ns[:, 1])]
     return _reading(possible, _ego_motion(ego, stamps), len(order), budget, 0)
 
 
@@ -125,10 +124,10 @@ def rare_topics(timeline: Timeline, roles: Mapping[str, str]) -> tuple[dict[str,
 
 
 def _reading(
-    possible: Int64[np.ndarray, "M 2"], motion: BurstMotion, sweeps: int, budget: int, margin_ns: int
+    possible: PossibleBursts, motion: BurstMotion, sweeps: int, budget: int, margin_ns: int
 ) -> Reading:
     chosen = choose_bursts(motion, -(-budget // BURST_TRIOS))
-    bursts = Stretches.merged((int(start), int(end)) for start, end in possible[chosen])
+    bursts = Stretches.merged((int(start), int(end)) for start, end in possible.spans_ns[chosen])
     return Reading(bursts, bursts.widened(margin_ns), sweeps, min(sweeps, BURST_TRIOS * len(chosen)))
 
 
@@ -136,13 +135,13 @@ def _holds(timeline: Timeline, role: str, roles: Mapping[str, str]) -> bool:
     return any(timeline.messages.get(topic) for topic, its in roles.items() if its == role)
 
 
-def _motion_at(day: _Day, times_ns: Int64[np.ndarray, " M"], by: str) -> BurstMotion:
-    """Motion of the car at these moments of log time, by odometry or by a radar scan's Doppler."""
-    motion = BurstMotion.unknown(len(times_ns))
+def _motion_at(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], by: str) -> BurstMotion:
+    """Motion of the car at these sweeps, by odometry or by a radar scan's Doppler."""
+    motion = BurstMotion.unknown(len(middle_ns))
     if not by:
         return motion
-    edges = (times_ns[1:] + times_ns[:-1]) // 2
-    for _, message in day.messages({by}, _glances(times_ns, _GLANCE_NS)):
+    edges = _between(middle_ns)
+    for _, message in day.messages({by}, _glances(middle_ns, _GLANCE_NS)):
         i = int(np.searchsorted(edges, message.log_time_ns))
         if not np.isnan(motion.speed_mps[i]):
             continue
@@ -185,13 +184,13 @@ def _ego_motion(ego: EgoTrack, stamps_ns: Int64[np.ndarray, " M"]) -> BurstMotio
     return motion
 
 
-def _margin_ns(day: _Day, times_ns: Int64[np.ndarray, " M"], needed: set[str]) -> int | None:
+def _margin_ns(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], needed: set[str]) -> int | None:
     """By how much longer than a burst the stretch must be that is read for it.
 
     None where that is too much, or where of the needed roles one is never logged when the lidar is.
     """
-    glances = times_ns[np.unique(np.linspace(0, len(times_ns) - 1, _LATENCY_GLANCES).round().astype(int))]
-    edges = (glances[1:] + glances[:-1]) // 2
+    glances = middle_ns[np.unique(np.linspace(0, len(middle_ns) - 1, _LATENCY_GLANCES).round().astype(int))]
+    edges = _between(glances)
     late: dict[tuple[int, str], list[int]] = {}
     measured = set(day.roles.values()) - {"tf_static", "info"}
     for role, message in day.messages(measured, _glances(glances, _MARGIN_NS)):
@@ -210,5 +209,15 @@ def _margin_ns(day: _Day, times_ns: Int64[np.ndarray, " M"], needed: set[str]) -
     return margin_ns if needed <= seen and margin_ns <= _MOST_MARGIN_NS else None
 
 
-def _glances(times_ns: Int64[np.ndarray, " M"], half_ns: int) -> Stretches:
-    return Stretches.merged((int(t) - half_ns, int(t) + half_ns) for t in times_ns)
+def _between(middle_ns: Int64[np.ndarray, "M 3"]) -> Int64[np.ndarray, " M-1"]:
+    """Moments that part one middle sweep from the next."""
+    return (middle_ns[1:, 1] + middle_ns[:-1, 1]) // 2
+
+
+def _glances(middle_ns: Int64[np.ndarray, "M 3"], half_ns: int) -> Stretches:
+    """About each middle sweep, to the sweeps beside it: where these are far, it may lie anywhere between."""
+    begin = np.minimum(middle_ns[:, 0], middle_ns[:, 1] - half_ns)
+    end = np.maximum(middle_ns[:, 2], middle_ns[:, 1] + half_ns)
+    far = _MOST_MARGIN_NS
+    begin, end = np.maximum(begin, middle_ns[:, 1] - far), np.minimum(end, middle_ns[:, 1] + far)
+    return Stretches.merged(zip(begin.tolist(), end.tolist(), strict=True))

@@ -6,34 +6,47 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.ingest.bursts import BURST_TRIOS, BurstMotion, choose_bursts, possible_bursts
-from pipeline.ingest.containers.timeline import Chunk, Stretches, timeline_of_chunks
+from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
 
 S = 10**9
 gaps = st.lists(st.tuples(st.integers(1, 4000), st.integers(3, 4000)), min_size=1, max_size=12)
 
 
-def recorded(lengths_and_gaps_s):
-    spans, at = [], 1_700_000_000
+def logged(lengths_and_gaps_s, rate_hz=10):
+    """Sweeps of drives, each so long and followed by such a pause, at 10 Hz."""
+    at, times = 1_700_000_000 * S, []
     for length, gap in lengths_and_gaps_s:
-        spans.append((at * S, (at + length) * S))
-        at += length + gap
-    return Stretches.merged(spans)
+        times.append(at + np.arange(length * rate_hz) * (S // rate_hz))
+        at += (length + gap) * S
+    return np.concatenate(times)
 
 
 @given(gaps, st.integers(1, 2000), st.booleans())
-def test_possible_bursts_lie_within_what_was_recorded_and_are_of_one_length(parts, budget, known):
-    day = recorded(parts)
-    sweeps = max(BURST_TRIOS, 10 * day.length_ns // S)
-    found = possible_bursts(day, sweeps, budget, is_motion_known=known)
-    burst_ns = day.length_ns * BURST_TRIOS / sweeps
-    for start, end in found:
-        inside = [(a, b) for a, b in day.spans_ns if a <= start and end <= b]
-        assert inside
-        assert end - start <= burst_ns + 1
-        # Shorter only where the stretch itself is.
-        assert end - start >= min(burst_ns, inside[0][1] - inside[0][0]) - 1
-    assert np.all(np.diff(found[:, 0]) >= 0)
-    assert len(found) <= -(-budget // BURST_TRIOS) * (3 if known else 1)
+def test_possible_bursts_hold_equally_many_sweeps_without_a_pause_where_that_can_be(parts, budget, known):
+    times = logged(parts)
+    found = possible_bursts(times, budget, is_motion_known=known)
+    length = min(BURST_TRIOS, len(times))
+    drives = np.cumsum(np.diff(times, prepend=times[0]) > 2 * S)
+    for (start, end), (before, middle, after) in zip(found.spans_ns, found.middle_ns, strict=True):
+        inside = (times >= start) & (times <= end)
+        assert inside.sum() == length
+        assert before <= middle <= after
+        its_drive = drives[np.searchsorted(times, middle)]
+        if (drives == its_drive).sum() >= length:
+            assert set(drives[inside]) == {its_drive}
+    assert np.all(np.diff(found.spans_ns[:, 0]) >= 0)
+    assert len(found.spans_ns) <= -(-budget // BURST_TRIOS) * (3 if known else 1)
+
+
+def test_sweeps_in_clumps_are_read_as_many_at_a_time_as_those_that_come_evenly():
+    # Clumps of 1 to 12 sweeps, seconds to a minute apart: 400 sweeps in which no stretch is as long as a burst.
+    rng = np.random.default_rng(1)
+    sizes = rng.integers(1, 13, 80)
+    starts = np.cumsum(rng.uniform(3, 60, 80) + sizes / 10)
+    times = np.concatenate([start + np.arange(n) / 10 for start, n in zip(starts, sizes, strict=True)])
+    times = (times * S).astype(np.int64)
+    found = possible_bursts(times, 80, is_motion_known=False).spans_ns
+    assert [int(((times >= a) & (times <= b)).sum()) for a, b in found] == [BURST_TRIOS] * 4
 
 
 @given(st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100)), max_size=20), st.integers(-5, 110))
@@ -104,6 +117,22 @@ def test_a_pause_within_a_chunk_is_no_recorded_time():
     timeline = timeline_of_chunks(chunks, {1: "/lidar"}, {1: len(times)})
     assert timeline.messages == {"/lidar": 4000}
     assert timeline.recorded.length_ns / S == pytest.approx(400, rel=0.1)
-    found = possible_bursts(timeline.recorded, 4000, 400, is_motion_known=False)
+    found = possible_bursts(timeline.counted["/lidar"].times_ns(), 400, is_motion_known=False).spans_ns
     read = sum(int(((times >= start) & (times <= end)).sum()) for start, end in found)
     assert read == pytest.approx(400, rel=0.1)
+
+
+def test_an_index_that_counts_messages_says_when_each_was_logged_to_within_its_chunk():
+    # Clumps: one chunk has twelve sweeps within a second, the next one within ten.
+    rng = np.random.default_rng(2)
+    starts = np.cumsum(rng.uniform(3, 30, 50)) + 1_700_000_000
+    sizes = rng.integers(1, 13, 50)
+    chunks = [
+        Chunk(i, 1, int(at * S), int((at + 1) * S), frozenset({1, 2}), {1: int(n), 2: 7})
+        for i, (at, n) in enumerate(zip(starts, sizes, strict=True))
+    ]
+    timeline = timeline_of_chunks(chunks, {1: "/lidar", 2: "/odometry"}, {1: int(sizes.sum()), 2: 350})
+    times = timeline.counted["/lidar"].times_ns()
+    assert [sum(c.start_ns <= t <= c.end_ns for t in times) for c in chunks] == sizes.tolist()
+    both = Timeline.joined([timeline, timeline]).counted["/lidar"].times_ns()
+    np.testing.assert_allclose(both[::2], times, atol=S)

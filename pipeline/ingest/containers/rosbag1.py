@@ -181,7 +181,7 @@ class BagLog:
         except _DAMAGED:
             return Chunk(position, 0, 0, 0, None)
         self._messages.update(messages)
-        return Chunk(position, 0, start, end, frozenset(messages))
+        return Chunk(position, 0, start, end, frozenset(messages), messages)
 
     def _learn(self, header: dict[str, bytes], data: bytes) -> None:
         fields = _fields(data)

@@ -19,7 +19,7 @@ import zstandard
 from pipeline.errors import LogError
 from pipeline.ingest.containers.bounded import unpack_zstd
 from pipeline.ingest.containers.reader import Channel, ChunkCache, Position, RawMessage
-from pipeline.ingest.containers.timeline import Stretches, Timeline
+from pipeline.ingest.containers.timeline import Counted, Stretches, Timeline
 
 __all__ = ["Db3Log"]
 
@@ -57,7 +57,12 @@ class Db3Log:
         seen = [(self._channels[i].topic, n, t) for i, n, t in numbers if i in self._channels]
         share = len(times) / max(sum(n for _, n, _ in seen), 1)
         messages = {topic: round(n * share) for topic, n, _ in seen}
-        return Timeline(Stretches.of_times(times), messages, {topic: (t, t) for topic, _, t in seen})
+        counted = {
+            topic: Counted(times, times, np.broadcast_to(count / max(len(times), 1), len(times)))
+            for topic, count in messages.items()
+        }
+        first = {topic: (t, t) for topic, _, t in seen}
+        return Timeline(Stretches.of_times(times), messages, first, counted)
 
     def scan(
         self, topics: Collection[str] | None = None, within: Stretches | None = None

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float, Int64
 
-__all__ = ["Chunk", "Stretches", "Timeline", "timeline_of_chunks"]
+__all__ = ["PAUSE_NS", "Chunk", "Counted", "Stretches", "Timeline", "timeline_of_chunks"]
 
 # Messages of a driving car come every tenth of a second: where none came for so long, nothing was recorded.
-_PAUSE_NS = 2 * 10**9
+PAUSE_NS = 2 * 10**9
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Stretches:
         """Of messages by their times, in order: those that no pause parts lie in one stretch."""
         if not len(times_ns):
             return cls(())
-        ends = np.flatnonzero(np.diff(times_ns) > _PAUSE_NS)
+        ends = np.flatnonzero(np.diff(times_ns) > PAUSE_NS)
         starts = times_ns[np.concatenate([[0], ends + 1])]
         return cls(tuple(zip(starts.tolist(), [*times_ns[ends].tolist(), int(times_ns[-1])], strict=True)))
 
@@ -63,13 +64,44 @@ class Stretches:
         return sum(end - start for start, end in self.spans_ns)
 
 
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """How many messages an index counts from when to when; a fraction where it only knows that there are some."""
+
+    start_ns: Int64[np.ndarray, " K"]
+    end_ns: Int64[np.ndarray, " K"]
+    messages: Float[np.ndarray, " K"]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Counted]) -> Counted:
+        """Of several logs as one."""
+        columns = zip(*((p.start_ns, p.end_ns, p.messages) for p in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
+
+    def times_ns(self) -> Int64[np.ndarray, " N"]:
+        """When each message was logged, in order: right to within the span that counts it, evenly spread there."""
+        order = np.argsort(self.start_ns, kind="stable")
+        messages = self.messages[order]
+        after = np.cumsum(messages)
+        if not len(after):
+            return np.zeros(0, np.int64)
+        origin = int(self.start_ns[order[0]])  # of a day, so that a double holds nanoseconds
+        spans = np.stack([self.start_ns[order], self.end_ns[order]], axis=1) - origin
+        counts = np.stack([after - messages, after], axis=1)
+        number = np.arange(round(float(after[-1]))) + 0.5
+        return np.sort(
+            np.interp(number, counts.ravel(), spans.ravel().astype(float)).astype(np.int64) + origin
+        )
+
+
 @dataclass(frozen=True)
 class Timeline:
-    """When a log was recorded, how many messages a topic has, and between when its first one was logged."""
+    """When a log was recorded, how many messages a topic has and where, and between when its first one was logged."""
 
     recorded: Stretches
     messages: Mapping[str, int]
     first: Mapping[str, tuple[int, int]]
+    counted: Mapping[str, Counted] = field(default_factory=dict)
 
     @classmethod
     def joined(cls, parts: Iterable[Timeline]) -> Timeline:
@@ -77,20 +109,24 @@ class Timeline:
         spans: list[tuple[int, int]] = []
         messages: dict[str, int] = {}
         first: dict[str, tuple[int, int]] = {}
+        counted: dict[str, list[Counted]] = {}
         for part in parts:
             spans += part.recorded.spans_ns
+            for topic, its in part.counted.items():
+                counted.setdefault(topic, []).append(its)
             for topic, count in part.messages.items():
                 messages[topic] = messages.get(topic, 0) + count
             for topic, span in part.first.items():
                 first[topic] = min(span, first.get(topic, span))
-        return cls(Stretches.merged(spans, _PAUSE_NS), messages, first)
+        together = {topic: Counted.joined(of_topic) for topic, of_topic in counted.items()}
+        return cls(Stretches.merged(spans, PAUSE_NS), messages, first, together)
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
     """A chunk as an index knows it: where it lies, between when its messages were logged, of which channels.
 
-    `channels` is None where the index does not say.
+    `channels` is None where the index does not say; `messages` of each channel, where it counts them.
     """
 
     position: int
@@ -98,6 +134,7 @@ class Chunk:
     start_ns: int
     end_ns: int
     channels: frozenset[int] | None
+    messages: Mapping[int, int] = field(default_factory=dict)
 
 
 def timeline_of_chunks(
@@ -118,13 +155,36 @@ def timeline_of_chunks(
     # Without those that have no message, or whose index is damaged.
     filled = sorted((c for c in chunks if 0 < c.end_ns >= c.start_ns), key=lambda c: c.start_ns)
     typical_ns = int(np.median([c.end_ns - c.start_ns for c in filled])) if filled else 0
-    spans = []
+    spans, holders = [], Counter[int]()
     for chunk in filled:
+        channels = topics.keys() if chunk.channels is None else chunk.channels & topics.keys()
         spans += _without_pause(chunk, typical_ns)
-        for channel in topics if chunk.channels is None else chunk.channels:
-            if channel in topics:
-                first.setdefault(topics[channel], (chunk.start_ns, chunk.end_ns))
-    return Timeline(Stretches.merged(spans, _PAUSE_NS), counts, first)
+        holders.update(channels)
+        for channel in channels:
+            first.setdefault(topics[channel], (chunk.start_ns, chunk.end_ns))
+    typical = {channel: messages.get(channel, 0) / count for channel, count in holders.items()}
+    counted = _counted(filled, topics, typical, typical_ns)
+    return Timeline(Stretches.merged(spans, PAUSE_NS), counts, first, counted)
+
+
+def _counted(
+    chunks: Sequence[Chunk], topics: Mapping[int, str], typical: Mapping[int, float], typical_ns: int
+) -> dict[str, Counted]:
+    """Messages of each topic by chunk: its own count, else what a chunk with such messages has in the mean."""
+    found: dict[str, list[tuple[int, int, float]]] = {}
+    for chunk in chunks:
+        spans = _without_pause(chunk, typical_ns)
+        for channel in typical if chunk.channels is None else chunk.channels & typical.keys():
+            count = chunk.messages.get(channel, typical[channel]) / len(spans)
+            found.setdefault(topics[channel], []).extend((*span, count) for span in spans)
+    return {
+        topic: Counted(
+            np.array([s for s, _, _ in parts], np.int64),
+            np.array([e for _, e, _ in parts], np.int64),
+            np.array([n for _, _, n in parts], np.float64),
+        )
+        for topic, parts in found.items()
+    }
 
 
 def _without_pause(chunk: Chunk, typical_ns: int) -> list[tuple[int, int]]:
@@ -132,7 +192,7 @@ def _without_pause(chunk: Chunk, typical_ns: int) -> list[tuple[int, int]]:
 
     One that took much longer than others to fill was begun before a pause and ended after it.
     """
-    if chunk.end_ns - chunk.start_ns <= 3 * typical_ns + _PAUSE_NS:
+    if chunk.end_ns - chunk.start_ns <= 3 * typical_ns + PAUSE_NS:
         return [(chunk.start_ns, chunk.end_ns)]
     half = typical_ns // 2
     return [(chunk.start_ns, chunk.start_ns + half), (chunk.end_ns - half, chunk.end_ns)]
