@@ -53,7 +53,7 @@ VEHICLES, DAYS, FRAMES = 3, 3, 5
 DAY_NS = 86_400 * 10**9
 KILLS_A_ROUND = 10
 # A kill comes within this time of the last one: half of a night and more, on two busy cores.
-SECONDS_TO_DRAW = {"process": 6.0, "ray": 15.0, "ray-own": 15.0}
+SECONDS_TO_DRAW = {"process": 6.0, "ray": 10.0, "ray-own": 10.0}
 # Every twentieth request; once in 820 one that takes longer than a client waits (`REQUEST_S` of `pipeline/store`).
 FAULTS = {"mix": ["503", "500", "slow", "lost"] * 10 + ["stall"], "every": 20, "slow_s": 1.5, "stall_s": 32.0}
 

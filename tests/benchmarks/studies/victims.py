@@ -18,7 +18,8 @@ from tests.makers.ray_clusters import another_node, two_nodes
 __all__ = ["CROWDS", "Crowd"]
 
 _GONE_S = 30.0  # a worker sees within seconds that its night is gone
-_TASK = "ray::_work"  # what Ray calls a worker that has a task of `pipeline/fleet/ray_tasks.py`
+# What Ray calls a worker that has a task of `pipeline/fleet/ray_tasks.py`; and one that has none, or begins with it.
+_TASK, _IDLE = "ray::_work", "ray::IDLE"
 
 
 @dataclass(frozen=True)
@@ -27,12 +28,14 @@ class Crowd:
 
     Args:
         executor: as of `boresight nightly`.
-        workers: of a night, by its process id.
+        workers: that can be killed, by the night's process id.
+        at_work: those of them that work for the night.
         kill_node: end a machine with all that runs on it and bring another; None where there are no machines.
     """
 
     executor: str
     workers: Callable[[int], list[psutil.Process]]
+    at_work: Callable[[int], list[psutil.Process]]
     kill_node: Callable[[int], None] | None = None
 
     def kill_all(self, night: subprocess.Popen[str]) -> None:
@@ -49,7 +52,7 @@ class Crowd:
             night.kill()
         night.communicate()
         deadline = time.monotonic() + _GONE_S
-        while self.workers(night.pid):
+        while self.at_work(night.pid):
             if time.monotonic() > deadline:
                 raise RuntimeError(f"workers of a killed night are still there after {_GONE_S:g} s")
             time.sleep(0.05)
@@ -58,13 +61,15 @@ class Crowd:
 @contextmanager
 def _pool(_folder: Path) -> Iterator[Crowd]:
     """Spawned processes, in the night's own session."""
-    yield Crowd("process", lambda night: _of_session(night, "spawn_main"))
+    yield Crowd("process", *[lambda night: _of_session(night, "spawn_main")] * 2)
 
 
 @contextmanager
 def _own_cluster(_folder: Path) -> Iterator[Crowd]:
     """Ray as a night starts it for itself. Its agents are not at work: they try to tell a dead cluster of its end."""
-    yield Crowd("ray", lambda night: _of_session(night, _TASK))
+    yield Crowd(
+        "ray", lambda night: _of_session(night, _TASK, _IDLE), lambda night: _of_session(night, _TASK)
+    )
 
 
 @contextmanager
@@ -80,7 +85,7 @@ def _shared_cluster(folder: Path) -> Iterator[Crowd]:
             cluster.remove_node(nodes.pop(which % len(nodes)), allow_graceful=False)
             nodes.append(another_node(cluster))
 
-        yield Crowd("ray", lambda _night: _ray_tasks(), kill_node)
+        yield Crowd("ray", lambda _: _of_this(_TASK, _IDLE), lambda _: _of_this(_TASK), kill_node)
 
 
 # Ways to run nights, by what a result's line calls them.
@@ -98,19 +103,24 @@ def _environment(**changes: str) -> Iterator[None]:
             os.environ.pop(name, None) if value is None else os.environ.update({name: value})
 
 
-def _ray_tasks() -> list[psutil.Process]:
-    """Tasks at work on nodes that this process began."""
-    return [p for p in psutil.Process().children(recursive=True) if _TASK in " ".join(_command(p))]
+def _of_this(*what: str) -> list[psutil.Process]:
+    """Processes below this one whose command names what they do."""
+    return [p for p in psutil.Process().children(recursive=True) if _does(p, what)]
 
 
-def _of_session(night: int, what: str) -> list[psutil.Process]:
+def _of_session(night: int, *what: str) -> list[psutil.Process]:
     """Processes of a night's session whose command names what they do."""
     found = []
     for process in psutil.process_iter():
         with suppress(psutil.Error, ProcessLookupError):
-            if os.getsid(process.pid) == night and what in " ".join(_command(process)):
+            if os.getsid(process.pid) == night and _does(process, what):
                 found.append(process)
     return found
+
+
+def _does(process: psutil.Process, what: Sequence[str]) -> bool:
+    command = " ".join(_command(process))
+    return any(name in command for name in what)
 
 
 def _command(process: psutil.Process) -> Sequence[str]:
