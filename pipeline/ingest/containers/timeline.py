@@ -73,10 +73,39 @@ class Counted:
     messages: Float[np.ndarray, " K"]
 
     @classmethod
+    def of(cls, parts: Iterable[tuple[int, int, float]]) -> Counted:
+        """From when, to when, how many."""
+        start, end, messages = zip(*parts, strict=True)
+        return cls(np.array(start, np.int64), np.array(end, np.int64), np.array(messages, np.float64))
+
+    @classmethod
     def joined(cls, parts: Sequence[Counted]) -> Counted:
         """Of several logs as one."""
         columns = zip(*((p.start_ns, p.end_ns, p.messages) for p in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
+
+    def evened(self, recorded: Stretches) -> Counted:
+        """With one span for each stretch through which messages came steadily, as far as these counts tell.
+
+        Where a chunk ends is an accident of its size: what came steadily is known better by the whole stretch.
+        """
+        begins, kept = (
+            np.array([start for start, _ in recorded.spans_ns], np.int64),
+            list[tuple[int, int, float]](),
+        )
+        stretch = np.searchsorted(begins, self.start_ns, "right")
+        order = np.lexsort((self.end_ns, stretch))
+        for part in np.split(order, np.flatnonzero(np.diff(stretch[order])) + 1):
+            start, end = int(self.start_ns[part].min()), int(self.end_ns[part].max())
+            total, after = float(self.messages[part].sum()), np.cumsum(self.messages[part])
+            steady = total * (self.end_ns[part] - start) / max(end - start, 1)
+            # Two chunks may overlap, and the last message of one be counted by the next.
+            if np.abs(after - steady).max() <= self.messages[part].max() + 1:
+                kept.append((start, end, total))
+            else:
+                columns = (self.start_ns[part], self.end_ns[part], self.messages[part])
+                kept += zip(*(column.tolist() for column in columns), strict=True)
+        return Counted.of(kept)
 
     def times_ns(self) -> Int64[np.ndarray, " N"]:
         """When each message was logged, in order: right to within the span that counts it, evenly spread there."""
@@ -155,36 +184,36 @@ def timeline_of_chunks(
     # Without those that have no message, or whose index is damaged.
     filled = sorted((c for c in chunks if 0 < c.end_ns >= c.start_ns), key=lambda c: c.start_ns)
     typical_ns = int(np.median([c.end_ns - c.start_ns for c in filled])) if filled else 0
-    spans, holders = [], Counter[int]()
+    spans = []
     for chunk in filled:
-        channels = topics.keys() if chunk.channels is None else chunk.channels & topics.keys()
         spans += _without_pause(chunk, typical_ns)
-        holders.update(channels)
-        for channel in channels:
+        for channel in _channels(chunk, topics):
             first.setdefault(topics[channel], (chunk.start_ns, chunk.end_ns))
-    typical = {channel: messages.get(channel, 0) / count for channel, count in holders.items()}
-    counted = _counted(filled, topics, typical, typical_ns)
-    return Timeline(Stretches.merged(spans, PAUSE_NS), counts, first, counted)
+    recorded = Stretches.merged(spans, PAUSE_NS)
+    counted = _counted(filled, topics, messages, typical_ns)
+    evened = {topic: its.evened(recorded) for topic, its in counted.items()}
+    return Timeline(recorded, counts, first, evened)
 
 
 def _counted(
-    chunks: Sequence[Chunk], topics: Mapping[int, str], typical: Mapping[int, float], typical_ns: int
+    chunks: Sequence[Chunk], topics: Mapping[int, str], messages: Mapping[int, int], typical_ns: int
 ) -> dict[str, Counted]:
-    """Messages of each topic by chunk: its own count, else what a chunk with such messages has in the mean."""
+    """Messages of each topic by chunk: those that the index counts there, else by its share of the chunks' bytes."""
+    bytes_of = Counter[int]()
+    for chunk in chunks:
+        bytes_of.update(dict.fromkeys(_channels(chunk, topics), max(chunk.length, 1)))
     found: dict[str, list[tuple[int, int, float]]] = {}
     for chunk in chunks:
         spans = _without_pause(chunk, typical_ns)
-        for channel in typical if chunk.channels is None else chunk.channels & typical.keys():
-            count = chunk.messages.get(channel, typical[channel]) / len(spans)
+        for channel in _channels(chunk, topics):
+            share = messages.get(channel, 0) * max(chunk.length, 1) / bytes_of[channel]
+            count = chunk.messages.get(channel, share) / len(spans)
             found.setdefault(topics[channel], []).extend((*span, count) for span in spans)
-    return {
-        topic: Counted(
-            np.array([s for s, _, _ in parts], np.int64),
-            np.array([e for _, e, _ in parts], np.int64),
-            np.array([n for _, _, n in parts], np.float64),
-        )
-        for topic, parts in found.items()
-    }
+    return {topic: Counted.of(parts) for topic, parts in found.items()}
+
+
+def _channels(chunk: Chunk, topics: Mapping[int, str]) -> Iterable[int]:
+    return topics.keys() if chunk.channels is None else chunk.channels & topics.keys()
 
 
 def _without_pause(chunk: Chunk, typical_ns: int) -> list[tuple[int, int]]:
