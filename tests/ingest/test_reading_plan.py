@@ -155,3 +155,20 @@ def test_a_day_split_into_files_has_bursts_of_many_and_transforms_of_the_first(k
     assert len({f.log for f in frames}) >= 3
     assert all(f.prior_camera_lidar_qw is not None for f in frames)
     assert result.kept["sweeps_in_logs"] == 150
+
+
+@pytest.mark.parametrize("container", ["mcap", "bag", "folder"])
+def test_of_sweeps_in_clumps_as_many_are_read_as_planned(kit, tmp_path, run_ingest, container):
+    # Runs of 3 to 9 trios, 4 to 40 s apart: no stretch without pause is as long as a burst.
+    made, at = kit.Kit(ros=1 if container == "bag" else 2), kit.START_NS
+    rng = np.random.default_rng(3)
+    for _ in range(30):
+        made.frames = int(rng.integers(3, 10))
+        made.drive(at)
+        at += made.frames * kit.PERIOD_NS + int(rng.uniform(4, 40) * 1e9)
+    log = getattr(made, container)(tmp_path / f"clumps{'.' * (container != 'folder')}{container}")
+    result, frames = run_ingest(log, fleet=kit.fleet(ingest={"read_sweeps": 80}))
+    assert (result.reason, result.rejected) == ("", {})
+    assert result.kept["sweeps_planned"] == 80
+    assert abs(len(frames) - 80) <= 4
+    assert len({f.drive for f in frames}) > 8
