@@ -8,7 +8,7 @@ import pytest
 from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records, read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from tests.benchmarks.studies.soak import Soak, contents, differences, make_fleet, soak_round, storage
+from tests.benchmarks.studies.soak import FAULTS, Soak, contents, differences, make_fleet, soak_round, storage
 from tests.benchmarks.studies.victims import CROWDS
 from tests.makers.s3_server import BUCKET
 
@@ -26,7 +26,7 @@ def test_nights_that_are_killed_leave_what_an_undisturbed_one_leaves(kind, kills
         monkeypatch.setenv(name, "")  # given back after the test
     make_fleet(tmp_path)
     with storage(kind) as s3, CROWDS["process"](tmp_path / "tmp") as crowd:
-        soak = Soak(tmp_path, crowd)
+        soak = Soak(tmp_path, crowd, faults=FAULTS | {"mix": ["503", "500", "slow", "lost"], "slow_s": 0.3})
         lakes = str(tmp_path) if s3 is None else f"s3://{BUCKET}"
         soak.undisturbed(f"{lakes}/quiet")
         quiet = Lake.at(f"{lakes}/quiet")

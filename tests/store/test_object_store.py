@@ -165,7 +165,12 @@ def test_other_engines_read_the_bucket_by_the_documented_lines(lake, rng):
 
 @pytest.mark.parametrize(
     "fault",
-    [{"fail": 6}, {"stall": 2, "stall_s": 3.0}, {"fail": 40, "every": 3}, {"mix": ["500", "lost"], "every": 4}],
+    [
+        {"fail": 6},
+        {"stall": 2, "stall_s": 3.0},
+        {"fail": 40, "every": 3},
+        {"mix": ["500", "lost"], "every": 4},
+    ],
 )
 def test_answers_of_5xx_late_ones_and_lost_ones_are_asked_for_again(fault, lake, rng, s3):
     rows = [make_row("frames", rng, frame_index=i) for i in range(3)]

@@ -82,6 +82,7 @@ class Soak:
     folder: Path
     crowd: Crowd
     seconds: float = SECONDS_TO_DRAW["process"]
+    faults: dict[str, Any] = field(default_factory=lambda: FAULTS)
 
     @property
     def scratch(self) -> Path:
@@ -216,7 +217,7 @@ def soak_round(
     soak: Soak, lake: str, kills: int, rng: np.random.Generator, wanted: dict[str, Any], s3: S3 | None = None
 ) -> Round:
     """Disturb a lake, let one night finish it, and compare; its bucket is at fault until then."""
-    before = {} if s3 is None else s3.faults(**FAULTS)
+    before = {} if s3 is None else s3.faults(**soak.faults)
     told = disturbed(soak, lake, kills, rng)
     summary = soak.undisturbed(lake)
     if s3 is not None:
