@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from pipeline.config import load_fleet
 from pipeline.geometry.se3 import exp_se3
 from pipeline.report.overlays import Extrinsics, Scene
-from tests.benchmarks.studies import paper_figures, paper_ssl, paper_table
+from tests.benchmarks.studies import paper_figures, paper_ssl, paper_table, reflector_table
 from tests.benchmarks.studies.engine import RESULTS
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 from tests.makers.training_lakes import frame_of
@@ -72,3 +73,10 @@ def test_a_learning_curve_is_continued_by_its_power_law_and_not_where_it_does_no
     lines = [{"step": 500, "validation/alignment": 1.25}, {"step": 510, "loss": 1.0}]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert paper_ssl.curve_of(tmp_path, 4) == {"samples": [2000], "loss": [1.25]}
+
+
+def test_reflectors_are_recorded_and_every_method_has_run_before_they_are_evaluated(tmp_path):
+    names = [name for name, _ in reflector_table.steps_of(tmp_path, 2)]
+    own = ["drives", "stands", "ingest", "standing", "perceive", *reflector_table.METHODS]
+    assert names == [f"vehicle-{n} {what}" for n in (1, 2) for what in own]
+    assert load_fleet(tmp_path / "fleet.toml").rig_of("vehicle-2") is not None

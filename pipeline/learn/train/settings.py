@@ -162,10 +162,10 @@ class TrainConfig(_Section):
 
     @model_validator(mode="after")
     def _paper_is_whole(self) -> TrainConfig:
-        if self.loss.definition == "paper" and (self.architecture, self.augment.view_deg) != ("concat", 0.0):
-            raise ValueError(
-                'loss.definition = "paper" needs architecture = "concat" and augment.view_deg = 0'
-            )
+        own = (self.architecture, self.augment.view_deg, self.takes_classes, self.strange)
+        if self.loss.definition == "paper" and own != ("concat", 0.0, False, StrangeConfig()):
+            problem = 'architecture = "concat", augment.view_deg = 0, and neither takes_classes nor [strange]'
+            raise ValueError(f'loss.definition = "paper" needs {problem}')
         return self
 
     @model_validator(mode="after")
