@@ -34,6 +34,9 @@ from schemas.frames import FRAMES, Frame
 from tests.benchmarks.studies.days import DATE, VEHICLE
 from tests.benchmarks.studies.ssl_days import SslDay, Where, open_day
 
+# Pictures one below the other, each an image or SVG with its caption.
+Cell = list[tuple[Any, str]]
+
 __all__ = ["errors_line", "figures_page", "without_lidar"]
 
 PRIOR, KNOCKS_DEG, KNOCK_M = (2.0, 0.2), (2.0, 5.0, 10.0), 0.05
@@ -54,8 +57,8 @@ _PAPER = {
 _STYLE = """body{font:15px/1.45 system-ui,sans-serif;margin:24px auto;max-width:1500px;color:#1c1c1c;padding:0 16px}
 h2{margin-top:38px}
 .pair{display:grid;grid-template-columns:290px 1fr;gap:26px;border-top:1px solid #ccc;padding-top:12px}
-.paper{color:#555;font-size:14px}.ours{display:grid;grid-template-columns:repeat(auto-fit,minmax(330px,1fr));gap:12px}
-.ours figure{margin:0}.ours img,.ours svg{width:100%;height:auto}figcaption{font-size:13px;color:#333}"""
+.paper{color:#555;font-size:14px}.ours{display:grid;gap:12px;align-items:start}
+.ours figure{margin:0 0 8px}.ours img,.ours svg{width:100%;height:auto}figcaption{font-size:13px;color:#333}"""
 
 
 def main() -> None:
@@ -95,28 +98,32 @@ def figures_page(
     """
     ssl, best = states["joint-ssl"], states["joint-optimisation"]
     halves = ("joint-ssl", "joint-optimisation")
-    one = [
-        (front_view(scenes[1], before, states["joint"], ("prior", "joint")), _said("prior", before, day)),
-        (top_view(scenes[1], before, states["joint"], ("prior", "joint")), _said("joint", states["joint"], day)),
-    ]  # fmt: skip
-    three: list[tuple[Any, str]] = []
+    split = (scenes[1], before, states["joint"], ("prior", "joint"))
+    one: list[Cell] = [
+        [(front_view(*split), _said("prior", before, day))],
+        [(top_view(*split), _said("joint", states["joint"], day))],
+    ]
+    three: list[Cell] = []
     for scene in scenes[:2]:
         radar = without_lidar(scene)
         three += [
-            (front_view(scene, ssl, best, halves), "camera-lidar"),
-            (top_view(scene, ssl, best, halves), "lidar-radar"),
-            (whole_view(radar, ssl, halves[0]), f"camera-radar; {_said(halves[0], ssl, day)}"),
-            (whole_view(radar, best, halves[1]), f"camera-radar; {_said(halves[1], best, day)}"),
+            [(front_view(scene, ssl, best, halves), "camera-lidar")],
+            [(top_view(scene, ssl, best, halves), "lidar-radar")],
+            [
+                (whole_view(radar, ssl, halves[0]), f"camera-radar; {_said(halves[0], ssl, day)}"),
+                (whole_view(radar, best, halves[1]), f"camera-radar; {_said(halves[1], best, day)}"),
+            ],
         ]
-    four: list[tuple[Any, str]] = []
+    four: list[Cell] = []
     for scene, deg, (start, end) in zip(scenes, KNOCKS_DEG, knocked, strict=True):
         labels = (f"knocked by {deg:g} deg", "from this frame")
         for label, state in zip(labels, (start, end), strict=True):
             four += [
-                (whole_view(scene, state, label), _said(label, state, day)),
-                (top_view(scene, state, state, (label, label)), label),
+                [(whole_view(scene, state, label), _said(label, state, day))],
+                [(top_view(scene, state, state, (label, label)), label)],
             ]
-    parts = [_figure(number, shown) for number, shown in (("1", one), ("3", three), ("4", four))]
+    figures = (("1", one, "5fr 3fr"), ("3", three, "3fr 2fr 2fr"), ("4", four, "5fr 3fr"))
+    parts = [_figure(*figure) for figure in figures]
     title = "Figures 1, 3 and 4 of the paper beside ours"
     intro = (
         f"Ours: simulated day {name} (paper's sensors), prior {PRIOR[0]:g} deg / {PRIOR[1]:g} m off, frames at a "
@@ -152,17 +159,19 @@ def _said(label: str, state: Extrinsics, day: SslDay) -> str:
     return f"{label}: {errors_line(errors)}"
 
 
-def _figure(number: str, shown: Sequence[tuple[Any, str]]) -> str:
-    cells = []
-    for picture, caption in shown:
-        drawn = (
-            f'<img src="{jpeg_uri(picture, _WIDE_PX)}" alt="{html.escape(caption)}">'
-            if isinstance(picture, np.ndarray)
-            else str(picture)
-        )
-        cells.append(f"<figure>{drawn}<figcaption>{html.escape(caption)}</figcaption></figure>")
+def _figure(number: str, cells: Sequence[Cell], columns: str) -> str:
+    """One figure: the paper's in words, ours in columns as the paper's are."""
+    drawn = "".join(f"<div>{''.join(_pictured(*picture) for picture in cell)}</div>" for cell in cells)
     paper = f'<div class="paper"><b>In the paper.</b> {html.escape(_PAPER[number])}</div>'
-    return f'<h2>Figure {number}</h2><div class="pair">{paper}<div class="ours">{"".join(cells)}</div></div>'
+    ours = f'<div class="ours" style="grid-template-columns:{columns}">{drawn}</div>'
+    return f'<h2>Figure {number}</h2><div class="pair">{paper}{ours}</div>'
+
+
+def _pictured(picture: Any, caption: str) -> str:
+    drawn = str(picture)
+    if isinstance(picture, np.ndarray):
+        drawn = f'<img src="{jpeg_uri(picture, _WIDE_PX)}" alt="{html.escape(caption)}">'
+    return f"<figure>{drawn}<figcaption>{html.escape(caption)}</figcaption></figure>"
 
 
 def _scene(day: SslDay, row: int) -> Scene:
