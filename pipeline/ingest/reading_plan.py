@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.errors import LogError
-from pipeline.ingest.bursts import BURST_TRIOS, BurstMotion, PossibleBursts, choose_bursts, possible_bursts
+from pipeline.ingest.bursts import BurstMotion, PossibleBursts, choose_bursts, possible_bursts
 from pipeline.ingest.containers.reader import LogReader, RawMessage
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.ingest.doppler_speed import doppler_speed
@@ -126,9 +126,9 @@ def rare_topics(timeline: Timeline, roles: Mapping[str, str]) -> tuple[dict[str,
 def _reading(
     possible: PossibleBursts, motion: BurstMotion, sweeps: int, budget: int, margin_ns: int
 ) -> Reading:
-    chosen = choose_bursts(motion, -(-budget // BURST_TRIOS))
+    chosen = choose_bursts(motion, -(-budget // possible.sweeps))
     bursts = Stretches.merged((int(start), int(end)) for start, end in possible.spans_ns[chosen])
-    return Reading(bursts, bursts.widened(margin_ns), sweeps, min(sweeps, BURST_TRIOS * len(chosen)))
+    return Reading(bursts, bursts.widened(margin_ns), sweeps, min(sweeps, possible.sweeps * len(chosen)))
 
 
 def _holds(timeline: Timeline, role: str, roles: Mapping[str, str]) -> bool:

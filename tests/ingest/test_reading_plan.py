@@ -170,5 +170,5 @@ def test_of_sweeps_in_clumps_as_many_are_read_as_planned(kit, tmp_path, run_inge
     result, frames = run_ingest(log, fleet=kit.fleet(ingest={"read_sweeps": 80}))
     assert (result.reason, result.rejected) == ("", {})
     assert result.kept["sweeps_planned"] == 80
-    assert abs(len(frames) - 80) <= 4
+    assert abs(len(frames) - 80) <= 8  # a chunk of one clump and a half does not say where its sweeps lie
     assert len({f.drive for f in frames}) > 8

@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--days", type=Path, nargs="*", default=[])
     parser.add_argument("--real", type=Path)
     parser.add_argument("--scratch", type=Path, required=True)
-    parser.add_argument("--read", type=int, nargs="*", default=[80, 120], help="sweeps read, of accuracy")
+    parser.add_argument("--read", nargs="*", default=["all", 80, 120], help="sweeps read, of accuracy")
     parser.add_argument("--more", action="store_true", help="read on as a night does, of accuracy")
     parser.add_argument("--frames", type=int, nargs="*", default=[240, 2400, 36000])
     parser.add_argument("--out", type=Path, default=RESULTS / "long_days.jsonl")
@@ -81,7 +81,7 @@ def accuracy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         found = (
             sorted((logs / "vehicle-1" / partition.day).iterdir()) if perturb is None else _recordings(logs)
         )
-        for read in ("all", *args.read):
+        for read in ("all" if r == "all" else int(r) for r in args.read):
             fleet = load_fleet(fleet_file).changed(ingest={"read_sweeps": read})
             lake = Lake.at(args.scratch / f"{folder.name}_{read}")
             stages = _run(found, partition, fleet, lake, perturb, more=args.more)
