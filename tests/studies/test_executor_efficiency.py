@@ -1,17 +1,48 @@
-"""The study of executors: what other processes take of the machine does not count against a night."""
+"""The study of executors: what a night waits for the machine's other work does not count against it."""
 
-from tests.benchmarks.studies.executor_efficiency import table
+import os
+import subprocess
+import sys
+
+from tests.benchmarks.studies.executor_efficiency import _spent_s, table
 
 
-def night(executor, wall_s, own_cpu_s, others_cpu_s=0.0):
-    left_s = 2 * wall_s - others_cpu_s
-    return {"executor": executor, "own_cpu_s": own_cpu_s, "left_s": left_s}
+def night(executor, alone_s):
+    return {"executor": executor, "alone_s": alone_s}
 
 
-def test_a_pool_that_uses_all_that_is_left_to_it_is_efficient_beside_others():
-    lines = [night("inline", 100, 90), night("process", 50, 95), night("ray", 60, 100)]
-    busy = [night("inline", 130, 90, 120), night("process", 80, 95, 60), night("ray", 90, 100, 60)]
-    quiet = (
-        "process: efficiency 0.90 (1 nights)\nray: efficiency 0.75 (1 nights)\nray against process: 0.83\n"
+def test_efficiency_is_of_the_least_seconds_that_a_night_would_take_alone():
+    lines = [
+        night("inline", 100),
+        night("inline", 90),
+        night("process", 50),
+        night("ray", 60),
+        night("ray", 55),
+    ]
+    assert table(lines) == (
+        "efficiency of two workers: process 0.90, ray 0.82\n"
+        "ray against process: 0.91\nnights: 2 inline, 1 process, 2 ray\n"
     )
-    assert table(lines) == table(busy) == quiet
+    assert table(lines[:3]) == ""
+
+
+def test_what_a_process_computes_and_what_it_waits_for_a_cpu_are_told_apart():
+    burn = "import os, time; os.sched_setaffinity(0, {%d})\nwhile time.process_time() < 0.3: pass\nprint(1); input()"
+    cpu = min(os.sched_getaffinity(0))
+    burning = [
+        subprocess.Popen(
+            [sys.executable, "-c", burn % cpu],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        for _ in range(2)
+    ]
+    for process in burning:
+        process.stdout.readline()
+    spent = [_spent_s(process.pid)[process.pid] for process in burning]
+    for process in burning:
+        process.communicate(b"\n")
+    assert all(0.25 < computed < 1.0 for computed, _ in spent)
+    # Both on one CPU: together they waited about as long as one of them computed.
+    assert sum(waited for _, waited in spent) > 0.15

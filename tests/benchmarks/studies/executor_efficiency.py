@@ -7,9 +7,10 @@ Whole nights (the installed command, logs to pages) on fresh lakes: inline, in a
 of this machine with two workers, one after the other, round by round. A line per night is added to
 results/executor_efficiency.jsonl; the last lines printed are the table.
 
-The machine need not be quiet: a line has what other processes took meanwhile (from /proc/stat, less what the night's
-own processes took), and a night is measured by the CPU seconds that were left to it: CPUs times wall clock less what
-others took. Efficiency is what the inline night computed, over what was left to a night with two workers.
+The machine need not be quiet: the kernel counts how long a process was ready to run and had no CPU
+(/proc/PID/schedstat), and what a night's workers so waited in the mean is taken off its wall clock. What remains is
+computing and waiting for files, for other workers and for the driver: the seconds that the night takes alone on as many
+CPUs as it has workers. Efficiency is those of the inline night, over twice those of a night with two workers.
 """
 
 from __future__ import annotations
@@ -43,9 +44,10 @@ def main() -> None:
     parser.add_argument("--fleet", required=True)
     parser.add_argument("--logs", required=True)
     parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--executors", nargs="*", choices=dict(WAYS), default=list(dict(WAYS)))
     args = parser.parse_args()
     for _ in range(args.rounds):
-        for executor, workers in WAYS:
+        for executor, workers in [way for way in WAYS if way[0] in args.executors]:
             line = {"commit": commit_now(), "date": time.strftime("%Y-%m-%d"), "executor": executor}
             line |= {"workers": workers} | night(args.fleet, args.logs, executor, workers)
             sys.stdout.write(json.dumps(line) + "\n")
@@ -55,62 +57,59 @@ def main() -> None:
 
 
 def night(fleet: str, logs: str, executor: str, workers: int) -> dict[str, Any]:
-    """One night on a fresh lake: seconds by the clock, of its own processes and of others'."""
+    """One night on a fresh lake: seconds by the clock, of its processes, and those that its workers had no CPU."""
     with tempfile.TemporaryDirectory() as lake:
         command = [f"{sys.prefix}/bin/boresight", "nightly", "--fleet", fleet, "--lake", lake, "--logs", logs]
         command += ["--executor", executor, "--workers", str(workers)]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         environment.pop("RAY_ADDRESS", None)
-        began, busy = time.perf_counter(), _busy_s()
+        began = time.perf_counter()
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment,
             start_new_session=True,
         )  # fmt: skip
-        taken: dict[int, float] = {}
+        spent: dict[int, tuple[float, float]] = {}
         while process.poll() is None:
-            taken |= _taken_s(process.pid)
+            spent |= _spent_s(process.pid)
             time.sleep(_LOOK_S)
-        wall_s, busy = time.perf_counter() - began, _busy_s() - busy
+        wall_s = time.perf_counter() - began
         out, _ = process.communicate()
     told = json.loads(out.splitlines()[-1])
     assert told["failed"] == 0, told
-    own_s = sum(taken.values())
-    cpus = len(os.sched_getaffinity(0))
+    waited_s = statistics.mean(waited for _, waited in sorted(spent.values())[-workers:])
     return {
         "vehicle_days": told["vehicle_days"],
-        "cpus": cpus,
         "wall_s": round(wall_s, 1),
-        "own_cpu_s": round(own_s, 1),
-        "others_cpu_s": round(max(busy - own_s, 0.0), 1),
-        "left_s": round(cpus * wall_s - max(busy - own_s, 0.0), 1),
+        "cpu_s": round(sum(cpu for cpu, _ in spent.values()), 1),
+        "waited_s": round(waited_s, 1),
+        "alone_s": round(wall_s - waited_s, 1),
     }
 
 
 def table(lines: list[dict[str, Any]]) -> str:
-    """Medians over the rounds."""
-    of = {way: [line for line in lines if line["executor"] == way] for way, _ in WAYS}
-    work_s = statistics.median(line["own_cpu_s"] for line in of["inline"])
-    left_s = {way: statistics.median(line["left_s"] for line in of[way]) for way in ("process", "ray")}
-    rows = [
-        f"{way}: efficiency {work_s / left:.2f} ({len(of[way])} nights)\n" for way, left in left_s.items()
-    ]
-    return "".join(rows) + f"ray against process: {left_s['process'] / left_s['ray']:.2f}\n"
+    """Of the least seconds of each executor's nights."""
+    alone_s: dict[str, list[float]] = {}
+    for line in lines:
+        alone_s.setdefault(line["executor"], []).append(line["alone_s"])
+    if alone_s.keys() < dict(WAYS).keys():
+        return ""
+    one, pool, ray = (min(alone_s[way]) for way, _ in WAYS)
+    nights = ", ".join(f"{len(of)} {way}" for way, of in alone_s.items())
+    return (
+        f"efficiency of two workers: process {one / 2 / pool:.2f}, ray {one / 2 / ray:.2f}\n"
+        f"ray against process: {pool / ray:.2f}\nnights: {nights}\n"
+    )
 
 
-def _taken_s(session: int) -> dict[int, float]:
-    """CPU seconds of each process of a session so far."""
+def _spent_s(session: int) -> dict[int, tuple[float, float]]:
+    """Of each process of a session so far: CPU seconds, and those that its first thread was ready and had no CPU."""
     found = {}
     for process in psutil.process_iter():
-        with suppress(psutil.Error, ProcessLookupError):
+        with suppress(psutil.Error, OSError):
             if os.getsid(process.pid) == session:
-                found[process.pid] = sum(process.cpu_times()[:2])
+                waited_ns = int(Path(f"/proc/{process.pid}/schedstat").read_text().split()[1])
+                found[process.pid] = sum(process.cpu_times()[:2]), waited_ns / 1e9
     return found
-
-
-def _busy_s() -> float:
-    """CPU seconds that all processes of the machine have taken."""
-    times = psutil.cpu_times()
-    return float(times.user + times.nice + times.system + times.irq + times.softirq)
 
 
 if __name__ == "__main__":
