@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import adjoint
@@ -29,6 +29,7 @@ SENSORS = ("camera", "lidar", "radar")
 _CLEAR_PROBABILITY = 0.95
 # A best motion that explains the shifts worse than this is not the whole story ...
 _MISFIT_PROBABILITY = 1e-3
+_KNOWN = 1e9  # degrees of freedom: as good as infinitely many, for which SciPy's F has no value
 _WHOLE_STORY = 0.99  # ... unless it explains this share of them (of chi-squared): sigmas are estimates
 
 
@@ -89,11 +90,12 @@ def _less_sure(days: int, autocorrelation: float) -> float:
     return float(1 + 2 * np.sum((1 - lag / days) * autocorrelation**lag))
 
 
-def attribute(shifts: Mapping[str, PairShift]) -> Attribution:
+def attribute(shifts: Mapping[str, PairShift], known_by: float = np.inf) -> Attribution:
     """Decide between the three sensors.
 
     Args:
         shifts: by pair, of pairs whose errors are their own; at least two, else nothing can be told apart.
+        known_by: degrees of freedom that the scale of the covariances is known to; inf = it is known.
     """
     pairs = tuple(shifts)
     if len(pairs) < 2:
@@ -111,7 +113,11 @@ def attribute(shifts: Mapping[str, PairShift]) -> Attribution:
     if probability[best] < _CLEAR_PROBABILITY:
         rivals = [s for s in SENSORS if probability[s] > 1 - _CLEAR_PROBABILITY]
         return Attribution(None, f"cannot tell {' from '.join(rivals)}", probability, motion, covariance)
-    if chi2.sf(cost[best], freedom) < _MISFIT_PROBABILITY and cost[best] > (1 - _WHOLE_STORY) * total:
+    # What is left, over a scale that the vehicle's own few days told: F, not chi-squared (Hotelling 1931).
+    if (
+        f_distribution.sf(cost[best] / freedom, freedom, min(known_by, _KNOWN)) < _MISFIT_PROBABILITY
+        and cost[best] > (1 - _WHOLE_STORY) * total
+    ):
         text = f"no single sensor explains it ({best} comes nearest): several moved, or sigmas are too small"
         return Attribution(None, text, probability, motion, covariance)
     return Attribution(best, f"the {best} moved", probability, motion, covariance)

@@ -163,7 +163,9 @@ def _attribute(
     is_after = days >= change.day
     if not is_after.any() or is_after.all():
         return Attribution(None, "the pairs have no common days before and after", {}, np.zeros(6), np.eye(6))
-    return attribute(_shifts(pairs, noise, days, is_after))
+    freedom = noise.freedom.reshape(len(PAIRS), DOFS)
+    known_by = min(float(freedom[PAIRS.index(pair)].min()) for pair in pairs)
+    return attribute(_shifts(pairs, noise, days, is_after), known_by)
 
 
 def _strongest(verdicts: Sequence[ChartVerdict]) -> Change:

@@ -57,6 +57,21 @@ def test_two_sensors_that_moved_apart_are_not_blamed_on_one(maker: ModuleType) -
     assert "no single sensor" in found.explanation
 
 
+def test_a_scale_that_few_days_told_does_not_hide_who_moved(maker: ModuleType) -> None:
+    """Scales drawn as sure as ten degrees of freedom tell them: the misfit's own level holds, two movers still show."""
+    rng, named, by_known_scale = np.random.default_rng(7), 0, 0
+    for seed in range(200):
+        shifts = _shifts(maker, {"radar": KNOCK}, seed)
+        told = rng.chisquare(10) / 10
+        shifts = {p: replace(s, covariance=s.covariance * told) for p, s in shifts.items()}
+        named += attribute(shifts, 10.0).sensor == "radar"
+        by_known_scale += attribute(shifts).sensor == "radar"
+    assert by_known_scale < named
+    assert named >= 197
+    both = {"camera": np.array([0, 0.02, 0, 0, 0, 0]), "radar": np.array([0, 0, -0.03, 0, 0.1, 0])}
+    assert attribute(_shifts(maker, both, 0), 10.0).sensor is None
+
+
 def test_one_pair_alone_cannot_tell(maker: ModuleType) -> None:
     shifts = _shifts(maker, {"radar": KNOCK}, 0)
     assert attribute({"lidar_radar": shifts["lidar_radar"]}).sensor is None
