@@ -13,7 +13,14 @@ from pipeline.config import load_fleet
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from pipeline.learn.infer.aggregate import BIAS_SIGMA
 from schemas.calibrations import PAIRS
-from tests.benchmarks.studies import ssl_ablation, ssl_cross_rig, ssl_fleet, ssl_measures, ssl_table1
+from tests.benchmarks.studies import (
+    ssl_ablation,
+    ssl_cross_rig,
+    ssl_fleet,
+    ssl_measures,
+    ssl_photographs,
+    ssl_table1,
+)
 from tests.benchmarks.studies.days import SETS
 from tests.benchmarks.studies.ssl_days import ModelSet, SslDay, Where, fleet_days, table1_days
 from tests.benchmarks.studies.ssl_pages import fleet_file_with
@@ -249,3 +256,17 @@ def test_rows_of_networks_stand_below_those_of_the_other_methods():
     lines = [line.split("|")[1].strip() for line in text.splitlines() if "| camera_lidar | 1 |" in line]
     assert lines == ["(prior)", "joint", "joint-ssl (matching)"] * 2  # all days and urban ones; no highway
     assert Namespace(**mine).part == "days"
+
+
+def test_photographs_are_told_by_what_the_network_is_shown_and_by_log():
+    def record(az, status):
+        return {"az_deg": az, "el_deg": 0.2, "range_m": 0.05, "status": status}
+
+    days = [dict.fromkeys(PAIRS, record(0.1, "accepted")), dict.fromkeys(PAIRS, record(0.3, "held"))]
+    frames = {"log 03": {key: {"mean": [1.0, 0.5, 0.1], "median": [0.4, 0.3, 0.1]} for key in PAIRS}}
+    told = ssl_photographs.summary(
+        {"new, both": {"days": days, "frames": frames}, "new, image": {"days": days}}
+    )
+    assert told.count("| new, both | 2 | 0.20 / 0.20 / 0.05 |") == 1
+    assert told.count("| 3 of 6 |") == 2
+    assert "| new, both | log 03 | 0.40 / 0.30 (1.00 / 0.50) |" in told

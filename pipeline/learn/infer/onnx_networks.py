@@ -38,6 +38,8 @@ _NOBODY = About("", "", "", "", "", "")
 def model_files(method: str, fleet: FleetConfig) -> dict[str, Path]:
     """Files of a method's networks by what they estimate: those of fleet.toml, else those that are shipped.
 
+    Of shipped networks the one that takes classes comes first, but for fleets that want images alone.
+
     Raises:
         ConfigError: a file is missing; the message says which key names another.
     """
@@ -50,11 +52,16 @@ def model_files(method: str, fleet: FleetConfig) -> dict[str, Path]:
         keys = {pair: f"learn.pairwise_models.{pair}" for pair in PAIRS}
     files = {}
     for name, given in named.items():
-        files[name] = SHIPPED / f"{name}.onnx" if given is None else fleet.path_of(given)
+        files[name] = _shipped(name, config) if given is None else fleet.path_of(given)
         if not files[name].is_file():
             said = f"{files[name]} does not exist" if given else "no such network is shipped"
             raise ConfigError(str(fleet.file), keys[name], f"{said}; train one with `boresight train`")
     return files
+
+
+def _shipped(name: str, config: LearnConfig) -> Path:
+    with_classes = SHIPPED / f"{name}_classes.onnx"
+    return with_classes if config.camera != "image" and with_classes.is_file() else SHIPPED / f"{name}.onnx"
 
 
 def models_key(files: Mapping[str, Path]) -> str:

@@ -14,15 +14,23 @@ from pipeline.learn.network.outputs import CoreOutputs, Heads, pose_of_twist
 from pipeline.learn.network.rendering import grid_cells, sphere
 from pipeline.learn.network.views import RenderedView
 from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import CAMERA_CHANNELS, LIDAR_CHANNELS, PAIRS, RADAR_FEATURES
+from pipeline.learn.sample.layout import (
+    CAMERA_CHANNELS,
+    LIDAR_CHANNELS,
+    LIDAR_FEATURES,
+    PAIRS,
+    RADAR_FEATURES,
+)
 from schemas.training import GRID_CLASSES
 
-__all__ = ["MatchingCore", "continued_beyond"]
+__all__ = ["MatchingCore", "continued_beyond", "log_boundaries"]
 
 _CLASSES = len(GRID_CLASSES)
 # Of a point that the guess puts outside the image, against one inside: with true classes on 32 frames of a real car,
 # started 2 deg off, 0.11 / 0.15 deg were left at 0.2, and 0.18 / 0.17 deg at 1.
 _UNSEEN_WORTH = 0.2
+_NO_BOUNDARY = 0.1  # likelihood of an edge where the image has no boundary: branches, kerbs, what labels miss
+_EDGE = 2 + LIDAR_FEATURES.index("edge")  # channel of the rendered sweep
 _RESIDUAL_STD = 1e-3  # of the heads' weights: an untrained network answers as its matchers
 # The camera's x, y, z look along the lidar's y, z, x; signs do not matter to variances.
 _AXES_CAMERA_OF_LIDAR = (1, 2, 0)
@@ -42,6 +50,8 @@ class MatchingCore(nn.Module):
         if "camera_lidar" in pairs:
             self.lidar_encoder = LidarEncoder(LIDAR_CHANNELS, _CLASSES, width)
             self.lidar_matcher = ClassMatcher(grid)
+            # exp: what an edge of the sweep on a boundary is worth, against a point of one class.
+            self.log_edge_worth = nn.Parameter(torch.zeros(())) if channels > CAMERA_CHANNELS else None
             sizes.append(self.lidar_matcher.surface_size + 12)
         if "lidar_radar" in pairs:
             self.radar_matcher = OccupancyMatcher(len(RADAR_FEATURES))
@@ -101,7 +111,9 @@ class MatchingCore(nn.Module):
             lidar_logits = self.encode_lidar(view.lidar_grid)
             probability = torch.softmax(self._at_points(lidar_logits.detach(), view.points_camera), -1)
             weight = view.point_weight * self._worth(likelihood, view.points_camera)
-            found = self.lidar_matcher(likelihood[:, :-1], view.points_camera, probability, weight)
+            edge = self._at_points(view.lidar_grid[:, _EDGE : _EDGE + 1], view.points_camera)
+            maps, probability = self._with_edges(likelihood[:, :-1], probability, edge)
+            found = self.lidar_matcher(maps, view.points_camera, probability, weight)
             bases["camera_lidar"] = found
             features.append(_features(found.surfaces.flatten(1), found))
         if "lidar_radar" in self.pairs:
@@ -135,6 +147,13 @@ class MatchingCore(nn.Module):
         mirrored = (torch.arange(len(rendered), device=rendered.device) % 2 == 1)[:, None, None, None]
         logits = self.lidar_encoder(torch.where(mirrored, rendered.flip(-1), rendered))
         return torch.where(mirrored, logits.flip(-1), logits)
+
+    def _with_edges(self, maps: Tensor, probability: Tensor, edge: Tensor) -> tuple[Tensor, Tensor]:
+        """Boundaries as one more class, that of the sweep's edges: they hold whatever the points are taken for."""
+        if self.log_edge_worth is None:
+            return maps, probability
+        worth = torch.exp(self.log_edge_worth) * edge
+        return torch.cat([maps, log_boundaries(maps)], 1), torch.cat([probability, worth], -1)
 
     def _worth(self, likelihood: Tensor, points_camera: Tensor) -> Tensor:
         """B N: what a point counts by where the guess puts it, fixed before it moves: no move can raise it."""
@@ -192,6 +211,13 @@ def continued_beyond(
     right = (columns - empty).amax(1, keepdim=True).long().clamp(min=0)
     column = torch.minimum(torch.maximum(columns, left), right)
     return maps.gather(3, column[:, None, None].expand(-1, maps.shape[1], height, -1))
+
+
+def log_boundaries(maps: Float[Tensor, "B K H W"]) -> Float[Tensor, "B 1 H W"]:
+    """Logarithm of how much the classes change along the row: rows of a sweep jump where objects end to the side."""
+    beside = F.pad(torch.exp(maps), (1, 1, 0, 0), mode="replicate")
+    change = 0.5 * (beside[..., 2:] - beside[..., :-2]).abs().sum(1, keepdim=True)
+    return torch.log(_NO_BOUNDARY + (1 - _NO_BOUNDARY) * change.clamp(max=1.0))
 
 
 def _summary(inputs: int, hidden: int) -> nn.Sequential:

@@ -58,8 +58,9 @@ def main() -> None:
     )
     parser.add_argument("--root", type=Path, required=True, help="folder of ssl_fleet.py: fleet")
     parser.add_argument("--models", type=ModelSet.parse, required=True, metavar="NAME=FILE[,..]")
+    parser.add_argument("--days", type=int, default=None, help="at most so many vehicle-days")
     args = parser.parse_args()
-    found = [biases(args.models, open_day(where)) for where in fleet_days(args.root)]
+    found = [biases(args.models, open_day(where)) for where in fleet_days(args.root)[: args.days]]
     for pair in PAIRS:
         print(pair, *("[" + " ".join(f"{v:+.3f}" for v in day[pair]) + "]" for day in found), sep="\n  ")
     rms = {pair: np.sqrt(np.mean([day[pair] ** 2 for day in found], axis=0)) for pair in PAIRS}

@@ -111,6 +111,7 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", type=ModelSet.parse, required=True, metavar="NAME=FILE")
     parser.add_argument("--modes", nargs="+", choices=_MODES, default=list(_MODES))
     parser.add_argument("--parts", nargs="+", choices=["days", "frames"], default=["days", "frames"])
+    parser.add_argument("--logs", nargs="+", help="only these; for networks that the others taught")
     parser.add_argument("--draws", type=int, default=4)
     parser.add_argument("--frames", type=int, default=24, help="single frames of each log")
     parser.add_argument("--out", type=Path, default=Path("tests/benchmarks/results/ssl_photographs.json"))
@@ -120,14 +121,15 @@ def main() -> None:
         for mode in args.modes:
             day = real_day(args.real)
             day = replace(day, fleet=day.fleet.changed(learn={"camera": mode}))
+            logs = {log: part for log, part in by_log(day).items() if not args.logs or log in args.logs}
+            seen = {o.frame_index for part in logs.values() for o in part.rows}
+            day = replace(day, rows=[o for o in day.rows if o.frame_index in seen])
             told = results.setdefault(f"{models.name}, {mode}", {"network": models.key})
             told |= {"commit": commit_now(), "date": time.strftime("%Y-%m-%d")}
             if "days" in args.parts and not told.get("days"):
                 told["days"] = days_told(models, day, args.draws)
             if "frames" in args.parts and not told.get("frames"):
-                told["frames"] = {
-                    log: frames_told(models, part, args.frames) for log, part in by_log(day).items()
-                }
+                told["frames"] = {log: frames_told(models, part, args.frames) for log, part in logs.items()}
             args.out.write_text(json.dumps(results, indent=1) + "\n")
             print(summary(results), flush=True)
     args.out.with_suffix(".md").write_text(summary(results) + "\n")

@@ -19,6 +19,7 @@ from pipeline.learn.network.matching_network import MatchingCore, continued_beyo
 from pipeline.learn.network.occupancy_matcher import OccupancyMatcher
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
+from pipeline.learn.sample.layout import CAMERA_CHANNELS, CLASS_CHANNELS
 
 GRID = Grid()
 
@@ -129,6 +130,29 @@ def test_a_narrow_image_does_not_push_points_out_of_itself():
             R = pose_of_twist(found.twist)[0, :3, :3].numpy() @ R
     left = np.degrees(np.arccos((np.trace(R @ exp_so3(np.radians([1.5, -2.0, 0.5]))) - 1) / 2))
     assert left < 0.5
+
+
+def test_edges_find_the_boundaries_of_what_nobody_knows_the_class_of():
+    borders_deg = np.array([-27.0, -16.0, -7.0, 3.0, 14.0, 22.0])
+    azimuth = np.degrees(GRID.azimuth_rad())
+    kind = torch.tensor(np.searchsorted(borders_deg, azimuth) % 10)
+    maps = torch.log(torch.nn.functional.one_hot(kind, 10).float() * 0.9 + 0.01)
+    maps = maps.T[None, :, None].expand(1, 10, GRID.height, GRID.width)
+    rng = np.random.default_rng(0)
+    a, e = np.radians(rng.choice(borders_deg + 0.0, 400)), np.radians(rng.uniform(-12, 8, 400))
+    rays = np.stack([-np.cos(e) * np.sin(a), -np.sin(e), np.cos(e) * np.cos(a)], -1)
+    turn = exp_so3(np.radians([0.0, 2.5, 0.0]))
+    points = torch.tensor(20 * rays @ turn.T, dtype=torch.float32)[None]
+    core = MatchingCore(GRID, ("camera_lidar",), 8, 32, CAMERA_CHANNELS + CLASS_CHANNELS)
+    nothing = torch.zeros(1, 400, 10)
+    left = {}
+    for edges in (0.0, 1.0):
+        with torch.no_grad():
+            table, classes = core._with_edges(maps, nothing, torch.full((1, 400, 1), edges))
+            found = core.lidar_matcher(table, points, classes, torch.ones(1, 400))
+        left[edges] = 2.5 + np.degrees(float(found.twist[0, 1]))  # upright boundaries tell azimuth alone
+    assert left[0.0] > 1.0
+    assert abs(left[1.0]) < 0.2
 
 
 def test_beyond_the_image_goes_on_what_is_seen_at_its_border():
