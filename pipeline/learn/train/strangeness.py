@@ -28,8 +28,8 @@ _SHIFTED_CELLS, _GROWN, _CONFUSED, _DOUBT = 0.8, 0.6, 0.15, 0.3
 _HOLE = 2.0  # sigmas
 # On a real car a third of the road's points were not flagged as ground, where simulated sweeps flag all but 1 %, leaves
 # echoed half as strongly as simulated ones, and the road's heights scattered by 6 cm.
-_SILENT, _LIFTED_M, _TILTED_RAD = 0.45, 0.06, 0.005
-_NEARER = 0.8  # trees 15 m away were taken for lorries, as simulated trees stand 28 m away
+_SILENT, _LIFTED_M, _TILTED_RAD = 0.6, 0.06, 0.005
+_NEARER = 1.0  # trees 15 m away were taken for lorries, as simulated trees stand 28 m away
 
 
 def made_strange(sensors: SensorInputs, config: StrangeConfig, generator: torch.Generator) -> SensorInputs:
@@ -127,8 +127,8 @@ def strange_lidar(sensors: SensorInputs, config: StrangeConfig, generator: torch
     kept = kept & (~thin | _on_far_rows(sensors.lidar_xyz_m, draw))
     valid = sensors.lidar_valid & kept
     enough = (valid.sum(1) >= _FEWEST_POINTS)[:, None]
-    # What stands near the road is not the same everywhere: half of the frames look nearer or farther than they are.
-    factor = torch.exp(strength * _NEARER * (2 * draw.even(count) - 1) * (draw.even(count) < 0.5))
+    # What stands near the road is not the same everywhere: frames look nearer or farther than they are.
+    factor = torch.exp(strength * _NEARER * (2 * draw.even(count) - 1))
     return replace(
         sensors,
         lidar_features=features,
