@@ -79,4 +79,7 @@ def test_reflectors_are_recorded_and_every_method_has_run_before_they_are_evalua
     names = [name for name, _ in reflector_table.steps_of(tmp_path, 2)]
     own = ["drives", "stands", "ingest", "standing", "perceive", *reflector_table.METHODS]
     assert names == [f"vehicle-{n} {what}" for n in (1, 2) for what in own]
-    assert load_fleet(tmp_path / "fleet.toml").rig_of("vehicle-2") is not None
+    fleet = load_fleet(tmp_path / "fleet.toml")
+    assert fleet.rig_of("vehicle-2").radar.drivable.model == "shipped:radar_drivable"
+    assert fleet.solve.paper_loss_scale == "none"  # the paper's row to the letter
+    fleet.require_files()
