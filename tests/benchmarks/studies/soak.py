@@ -51,7 +51,7 @@ from tests.makers.written_logs import START_NS, Kit
 RESULTS = Path("tests/benchmarks/results/soak.jsonl")
 VEHICLES, DAYS, FRAMES = 3, 3, 5
 DAY_NS = 86_400 * 10**9
-KILLS_A_ROUND = 10
+KILLS_A_ROUND = 20
 # A kill comes within this time of the last one: half of a night and more, on two busy cores.
 SECONDS_TO_DRAW = {"process": 6.0, "ray": 10.0, "ray-own": 10.0}
 # Every twentieth request; once in 820 one that takes longer than a client waits (`REQUEST_S` of `pipeline/store`).
@@ -83,6 +83,7 @@ class Soak:
     crowd: Crowd
     seconds: float = SECONDS_TO_DRAW["process"]
     faults: dict[str, Any] = field(default_factory=lambda: FAULTS)
+    until: float = float("inf")  # of the monotonic clock: a round that lasts longer is ended with fewer kills
 
     @property
     def scratch(self) -> Path:
@@ -129,7 +130,7 @@ def make_fleet(folder: Path) -> None:
 def disturbed(soak: Soak, lake: str, kills: int, rng: np.random.Generator) -> Round:
     """Nights on one lake, killed until there were so many kills; the last one that is killed leaves all as it is."""
     told = Round()
-    while told.kills < kills:
+    while told.kills < kills and time.monotonic() < soak.until:
         process = soak.started(lake)
         told.nights += 1
         try:
@@ -144,7 +145,7 @@ def _disturb(
 ) -> None:
     """Kill until the night is gone, by itself or not."""
     crowd = soak.crowd
-    while told.kills < kills:
+    while told.kills < kills and time.monotonic() < soak.until:
         try:
             process.communicate(timeout=float(rng.uniform(0.0, soak.seconds)))
         except subprocess.TimeoutExpired:
@@ -255,7 +256,7 @@ def main() -> int:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         s3 = stack.enter_context(storage(given.storage))
         crowd = stack.enter_context(CROWDS[given.executor](folder / "tmp"))
-        soak = Soak(folder, crowd, SECONDS_TO_DRAW[given.executor])
+        soak = Soak(folder, crowd, SECONDS_TO_DRAW[given.executor], until=until)
         make_fleet(soak.folder)
         lakes = str(soak.folder) if s3 is None else f"s3://{BUCKET}"
         soak.undisturbed(f"{lakes}/quiet")
