@@ -6,17 +6,19 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from ruamel.yaml import YAML
 
 from schemas.versions import CODE_VERSION
-from tests.makers.third_party import HEADING, licences
+from tests.makers.third_party import heading, installed, licences, user_extras
 
 REPO = Path(__file__).resolve().parent.parent
 # Permissive licences, and weak copyleft that asks nothing of who only installs an unchanged library (LGPL, MPL).
 # Strong copyleft (GPL, AGPL) is not here: who passes Boresight on together with it would owe its source likewise.
 COMPATIBLE = re.compile(
     r"0BSD|Apache.*|(\d-Clause )?BSD.*|BSL-1\.0|CC0-1\.0|ISC.*|L?MIT.*|MIT-CMU|PSF.*|Python Software Foundation.*"
-    r"|Zlib|LGPL.*|MPL.*|any-OSI|\(?Apache.*"
+    r"|Zlib|LGPL.*|(MPL|Mozilla Public License).*|any-OSI|\(?Apache.*"
 )  # apsw states any-OSI: whichever approved licence its user likes
 
 
@@ -42,9 +44,17 @@ def test_the_list_of_licences_keeps_others_out(licence):
 
 def test_the_list_of_licences_is_that_of_this_environment(rows):
     listed = (REPO / "jobs" / "deploy" / "THIRD_PARTY_LICENSES.md").read_text()
-    assert listed.startswith(HEADING)
+    assert listed.startswith(heading())
     table = {tuple(c.strip() for c in line.split("|")[1:4:2]) for line in listed.splitlines() if "|" in line}
     assert {(r["Name"], " ".join(r["License"].split())) for r in rows} <= table
+
+
+def test_the_list_covers_every_extra_that_a_user_can_install(rows):
+    extras = user_extras()[1]
+    assert set(extras) >= {"simulate", "train", "ops", "ray", "viz", "video"}
+    names = {canonicalize_name(row["Name"]) for row in rows}
+    asked = {canonicalize_name(Requirement(line).name) for own in extras.values() for line in own}
+    assert asked - {"boresight"} <= names == installed()
 
 
 def test_the_licence_is_whole_and_named_in_the_metadata():

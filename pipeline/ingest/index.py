@@ -22,6 +22,7 @@ from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, content_without_stamp, decode, header_stamp_ns
 from pipeline.ingest.messages.detections_3d import DETECTIONS_3D
 from pipeline.ingest.messages.foxglove import REFUSED, foxglove_types
+from pipeline.ingest.messages.generation import encoding_fault
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
@@ -93,6 +94,7 @@ class DayIndex:
     topics_seen: set[str] = field(default_factory=set)
     surveyed: Counter[tuple[str, str]] = field(default_factory=Counter)  # (topic, type) -> messages
     problems: list[str] = field(default_factory=list)
+    encodings_right: set[tuple[int, str]] = field(default_factory=set)  # log and topic
     damage: Counter[str] = field(default_factory=Counter)
     camera_of_bytes: dict[bytes, Camera | str] = field(default_factory=dict)
     reading: Reading | None = None  # None: all of the day is read
@@ -118,7 +120,8 @@ class DayIndex:
         return min(own, key=lambda c: abs(c[1] - stamp_ns))[2] if own else None
 
     def complain(self, problem: str) -> None:
-        """Remember a problem once."""
+        """Remember a problem once, as text: what broken bytes left in it is shown as question marks."""
+        problem = "".join(c if c.isprintable() else "?" for c in problem.replace("\n", " "))
         if problem not in self.problems:
             self.problems.append(problem)
 
@@ -272,22 +275,47 @@ def _index_log(
             continue
         if role == "tf_static":
             _take_transforms(index, number, message)
-            continue
-        stamp = header_stamp_ns(message.channel, message.data)
-        if stamp is None:
-            index.damage[f"{role}_without_stamp"] += 1
-        elif role == "info":
-            _take_camera(index, number, stamp, message)
-        elif role == "odometry":
-            _take_odometry(index, stamp, message)
+        elif _is_of_another_encoding(index, number, message):
+            index.damage["wrong_encoding"] += 1
         else:
-            index.stream(role).stamps.append(stamp)
-            where = Located(number, message.channel, message.position, message.log_time_ns)
-            index.stream(role).located.append(where)
+            _take(index, number, message, role)
     for name, count in log.damage.items():
         index.damage[name] += count
         what = "is cut off" if name == "truncated" else f"{count} {name.replace('_', ' ')}"
         index.complain(f"{log.path.name}: {what}")
+
+
+def _take(index: DayIndex, number: int, message: RawMessage, role: str) -> None:
+    """A message that begins with a header."""
+    stamp = header_stamp_ns(message.channel, message.data)
+    if stamp is None:
+        index.damage[f"{role}_without_stamp"] += 1
+    elif role == "info":
+        _take_camera(index, number, stamp, message)
+    elif role == "odometry":
+        _take_odometry(index, stamp, message)
+    else:
+        index.stream(role).stamps.append(stamp)
+        where = Located(number, message.channel, message.position, message.log_time_ns)
+        index.stream(role).located.append(where)
+
+
+def _is_of_another_encoding(index: DayIndex, number: int, message: RawMessage) -> bool:
+    """Whether a message's bytes are not what its log says, which is named; not asked once one of its topic was right.
+
+    One that is not says nothing of the next: a flipped bit must not cost a topic.
+    """
+    of = (number, message.channel.topic)
+    if of in index.encodings_right:
+        return False
+    fault = encoding_fault(message.channel, message.data)
+    if fault:
+        index.complain(
+            f"{index.log_names[number]}, topic {message.channel.topic}: {message.channel.msgtype} {fault}"
+        )
+    else:
+        index.encodings_right.add(of)
+    return bool(fault)
 
 
 def _refusal(message: RawMessage, role: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -72,9 +72,12 @@ def fleet_records(lake: Lake, method: str, window_days: int) -> list[Calibration
     return current_records([r for r in records if r.day >= first])
 
 
-def records_of_day(lake: Lake, method: str, day: str) -> dict[str, dict[str, CalibrationRecord]]:
-    """Current records of a day, whole, by vehicle and pair."""
-    found = [r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, day=day) if r.method == method]
+def records_of_day(
+    lake: Lake, method: str, day: str, among: Collection[str]
+) -> dict[str, dict[str, CalibrationRecord]]:
+    """Current records of some vehicles on a day, whole, by vehicle and pair."""
+    rows = read_records(lake, CALIBRATIONS, CalibrationRecord, day=day, vehicle=set(among))
+    found = [r for r in rows if r.method == method]
     records: dict[str, dict[str, CalibrationRecord]] = {}
     for record in current_records(found):
         records.setdefault(record.vehicle, {})[record.pair] = record

@@ -105,7 +105,7 @@ def _keys_of(album: Album, days: Iterable[Partition]) -> dict[tuple[str, str], l
         by_day.setdefault(partition.day, []).append(partition.vehicle)
     keys = {}
     for day, vehicles in sorted(by_day.items()):
-        records = records_of_day(album.lake, album.method, day)
-        for vehicle in sorted(set(vehicles) & set(records)):
+        records = records_of_day(album.lake, album.method, day, vehicles)
+        for vehicle in sorted(records):
             keys[vehicle, day] = [record.work_key for record in records[vehicle].values()]
     return keys

@@ -193,7 +193,8 @@ class _Jobs(Sequence[DayJob]):
         self._records = lru_cache(maxsize=2)(self._read)  # workers end a day while others begin the next
 
     def _read(self, day: str) -> dict[str, dict[str, CalibrationRecord]]:
-        return records_of_day(self._album.lake, self._album.method, day)
+        among = {vehicle for vehicle, of in self._days if of == day}
+        return records_of_day(self._album.lake, self._album.method, day, among)
 
     def __len__(self) -> int:
         return len(self._days)

@@ -1,4 +1,4 @@
-"""Every distribution that `pip install 'boresight[simulate,train]'` brings, with its licence (by pip-licenses).
+"""Every distribution that Boresight with all extras of a user brings, with its licence (by pip-licenses).
 
 python -m tests.makers.third_party    prints jobs/deploy/THIRD_PARTY_LICENSES.md (`make licenses`)
 """
@@ -16,25 +16,33 @@ from packaging.utils import canonicalize_name
 HEADING = """\
 # Licences of what Boresight installs
 
-What `pip install 'boresight[simulate,train]'` brings beside Boresight itself, with the licence that each distribution
-states. Nothing of it is shipped with Boresight. Written by `make licenses`; `tests/test_licenses.py` compares it with
-the licences that go together with Apache-2.0. On Linux PyPI's torch may bring NVIDIA's own libraries as well, under
-NVIDIA's licence; a CPU build of torch does not. opencv's wheel holds FFmpeg's libraries (LGPL-2.1), unchanged and
-loaded at run time.
+What Boresight with every extra that a user can ask for (EXTRAS) brings beside Boresight itself, with the
+licence that each distribution states. Nothing of it is shipped with Boresight. Written by `make licenses`;
+`tests/test_licenses.py` compares it with the licences that go together with Apache-2.0. On Linux PyPI's torch may
+bring NVIDIA's own libraries as well, under NVIDIA's licence; a CPU build of torch does not. opencv's wheel holds
+FFmpeg's libraries (LGPL-2.1), unchanged and loaded at run time. PyAV (`[video]`) states its own licence; its wheel
+holds FFmpeg with x264 and x265, which are under the GPL: who passes that wheel on owes what the GPL asks. Written in
+the environment of `make setup`, which leaves out `[train-ray]`: `ray[train]` brings pandas and tensorboardX besides.
 
 """
 # Who states the whole text in place of a name: words of it, and the name.
 TEXTS = {"embreex": ("Redistributions in binary form must reproduce", "BSD-2-Clause")}
+OF_DEVELOPERS = ("test", "dev")
 OF_A_GPU = ("nvidia-", "cuda-")  # libraries of torch's CUDA build, absent from the CPU build
 
 
-def installed(extras=("simulate", "train")):
-    """Names of all distributions that the extras need, directly and through others."""
+def user_extras():
+    """Extras that users install, and what each asks for; those of who works on Boresight are left out."""
     project = tomllib.loads((Path(__file__).parent.parent.parent / "pyproject.toml").read_text())["project"]
-    lines = [
-        *project["dependencies"],
-        *(line for e in extras for line in project["optional-dependencies"][e]),
-    ]
+    return project["dependencies"], {
+        e: lines for e, lines in project["optional-dependencies"].items() if e not in OF_DEVELOPERS
+    }
+
+
+def installed():
+    """Names of all distributions that Boresight and its extras need, directly and through others."""
+    dependencies, extras = user_extras()
+    lines = [*dependencies, *(line for own in extras.values() for line in own)]
     found, waiting = set(), [(Requirement(line), "") for line in lines]
     while waiting:
         need, extra = waiting.pop()
@@ -48,7 +56,7 @@ def installed(extras=("simulate", "train")):
         if (name, frozenset(need.extras)) not in found:
             found.add((name, frozenset(need.extras)))
             waiting += [(n, e) for n in needed for e in ("", *need.extras)]
-    return {name for name, _ in found}
+    return {name for name, _ in found} - {"boresight"}  # which [train-ray] names
 
 
 def licences():
@@ -71,12 +79,17 @@ def licences():
     return sorted(rows, key=lambda row: row["Name"].lower())
 
 
+def heading():
+    """HEADING with the names of the extras."""
+    return HEADING.replace("EXTRAS", ", ".join(f"`[{e}]`" for e in user_extras()[1]))
+
+
 def table(rows):
     lines = ["| distribution | version | licence |", "|---|---|---|"]
     lines += [
         f"| {r['Name']} | {r['Version'].split('+')[0]} | {' '.join(r['License'].split())} |" for r in rows
     ]
-    return HEADING + "\n".join(lines) + "\n"
+    return heading() + "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -188,7 +188,9 @@ class BagLog:
         try:
             if fields is None or len(header["conn"]) != 4:
                 raise ValueError("connection")
-            package, name = fields["type"].decode().split("/")
+            package, *_, name = fields["type"].decode().split("/")  # some converters leave ROS 2's `/msg/` in
+            if not package or package == name:
+                raise ValueError("type")
             channel = Channel(
                 header["topic"].decode(),
                 f"{package}/msg/{name}",
