@@ -12,7 +12,7 @@ __all__ = ["STATES", "StateRow"]
 
 STATES = TableSchema(
     "states",
-    1,
+    2,
     (
         scalar("vehicle", "string", "vehicle id"),
         scalar("day", "string", "last day of the audited window, YYYY-MM-DD"),
@@ -49,10 +49,40 @@ STATES = TableSchema(
         scalar("since", "string", "first day that may count; null where all may", nullable=True),
         scalar("days", "list<string>", "days that it rests on"),
         scalar("inputs", "list<string>", "work keys of their records"),
+        scalar(
+            "reference_days",
+            "list<string>",
+            "the first accepted days since reference_since, audit.reference_days at most: what the charts' fixed "
+            "reference is made of; null in rows of version 1",
+            nullable=True,
+        ),
+        scalar(
+            "reference_since", "string", "day of the service event before them; null = none", nullable=True
+        ),
+        scalar(
+            "reference_count", "int64", "audit.reference_days; with fewer days the reference is not made yet"
+        ),
+        scalar(
+            "reference_used", "int64", "how many of them it rests on: those before the first step among them"
+        ),
+        *transform_columns(
+            "reference_", "their mean pose T_parent_child; null until it is made", nullable=True
+        ),
+        array(
+            "reference_covariance",
+            "<f8",
+            (6, 6),
+            "of that mean, of (rotation vector, shift of the child's origin) [rad, m], were its days independent",
+            nullable=True,
+        ),
+        scalar(
+            "reference_observable", "list<bool>", "per DoF: at least one of them determined it", nullable=True
+        ),
         *record_columns(),
     ),
     "boresight state prints the latest rows.",
     made_by="state",
+    reads_versions=(1,),
     about=("vehicle", "day", "trio", "method", "pair"),
 )
 
@@ -86,6 +116,19 @@ class StateRow:
     since: str | None = None
     days: list[str] = field(default_factory=list)
     inputs: list[str] = field(default_factory=list)
+    reference_days: list[str] | None = None
+    reference_since: str | None = None
+    reference_count: int = 0
+    reference_used: int = 0
+    reference_qw: float | None = None
+    reference_qx: float | None = None
+    reference_qy: float | None = None
+    reference_qz: float | None = None
+    reference_tx_m: float | None = None
+    reference_ty_m: float | None = None
+    reference_tz_m: float | None = None
+    reference_covariance: np.ndarray | None = None
+    reference_observable: list[bool] | None = None
     trio: str = DEFAULT_TRIO
     recorded_at: str = ""  # written when the row is
     asserted_at: str = ""

@@ -204,16 +204,17 @@ def charted(days: PairDays, first: int, last: int, reference: Reference | None) 
 
 
 def with_reference(days: PairDays, reference: Reference) -> PairDays:
-    """The days with the reference as their first, in place of the days that it rests on."""
+    """The days with the reference as their first, in place of the days that it rests on; changes count from it."""
     own = days.at(~np.isin(days.day, reference.days))
+    T = np.concatenate([reference.T[None], own.T])
     return PairDays(
         np.concatenate([[reference.days[-1]], own.day]),
-        np.concatenate([reference.T[None], own.T]),
-        np.concatenate([_changes(own.origin, reference.T[None]), own.change]),
+        T,
+        _changes(reference.T, T),
         np.concatenate([reference.spread[None], own.spread]),
         np.concatenate([reference.observable[None], own.observable]),
         np.concatenate([[True], own.accepted]),
-        own.origin,
+        reference.T,
         reference_days=len(reference.days),
     )
 

@@ -1,8 +1,7 @@
-"""What an audit reads of a lake: the window, and of each vehicle the first accepted days, month by month and no more.
+"""What an audit reads of a lake: the window, and the first accepted days of vehicles whose reference is not kept yet.
 
-A month is held at a time, as columns, and reading ends as soon as no vehicle lacks days: in a lake whose vehicles
-began together that is its first month, however old it is. A vehicle that has not had enough accepted days yet costs a
-look at all months.
+A month is held at a time, as columns, and reading ends as soon as no vehicle lacks days. References that are made
+stand in table states, and so does the first accepted day of those that are not: a night reads no more of the past.
 """
 
 from __future__ import annotations
@@ -16,7 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pyarrow.compute as pc
 
+from pipeline.audit.days import Reference
 from pipeline.audit.estimates import COLUMNS, Estimates, day_name, estimates_of, faults_of, joined
+from pipeline.audit.references import first_accepted, read_kept
 from pipeline.audit.service import restart_of
 from pipeline.store.partitions import Lake
 from pipeline.store.records import first_day, last_day, read_columns
@@ -61,8 +62,8 @@ class History:
         events: Mapping[str, Sequence[ServiceEvent]],
         enough: tuple[int, int],
         asked: Collection[str] = (),
-    ) -> Estimates:
-        """The records that charts need.
+    ) -> tuple[Estimates, dict[tuple[str, int], Reference]]:
+        """The records that charts need, and the references that need none: by vehicle and place in PAIRS.
 
         Args:
             window: first and last day.
@@ -70,7 +71,7 @@ class History:
             enough: days that a chart needs at least, and accepted days that a reference takes.
             asked: vehicles that are wanted though they may not have driven in the window.
         """
-        (first, last), (fewest, reference_days) = window, enough
+        (first, last), (fewest, count) = window, enough
         parts = [self.read(first, last)]
         driven = Counter(dict.fromkeys(asked, 0)) + _days_driven(parts[0])
         begin = dict.fromkeys({*asked, *parts[0].vehicles}, first)
@@ -81,41 +82,57 @@ class History:
             parts.append(self.read(month, end, sparse))
             driven += _days_driven(parts[-1])
             begin |= dict.fromkeys(sparse, month)
-        return joined([*parts, *self._references(begin, window, events, reference_days, parts)])
+        kept = read_kept(self.lake, self.method, window, events, count)
+        known = joined(parts)
+        usable = known.at(np.flatnonzero(known.usable))
+        # A chart of few days shows the reference's own days among them.
+        often = {key for key, days in Counter(_pairs(usable)).items() if days > fewest}
+        made = {
+            key: kept[key].reference
+            for key in often & kept.keys()
+            if (own := kept[key].reference) is not None and day_name(own.days[-1]) < begin[key[0]]
+        }
+        lacking = {key: first_accepted(kept.get(key)) for key in set(_pairs(known)) - made.keys()}
+        found = joined([known, *self.references(begin, window, events, count, lacking)])
+        return found, {key: own for key, own in made.items() if own is not None}
 
-    def _references(
+    def references(
         self,
         begin: Mapping[str, str],
         window: tuple[str, str],
         events: Mapping[str, Sequence[ServiceEvent]],
         count: int,
-        known: Sequence[Estimates],
+        asked: Mapping[tuple[str, int], str | None],
     ) -> Iterator[Estimates]:
-        """Records of the first accepted days of each pair since it was last serviced.
+        """Records of the first accepted days of pairs since they were last serviced.
 
         Args:
             begin: day from which each vehicle's records are known already.
             window: see `window`.
             events: likewise.
             count: accepted days.
-            known: what was read already.
+            asked: pairs that are asked for, with the day before which none was accepted; None = there is none yet.
         """
         until, last = window
-        pairs = {key for part in known for key in _pairs(part)}
-        restart = {key: restart_of(events.get(key[0], ()), PAIRS[key[1]], last) for key in pairs}
-        lacking = {key for key in pairs if (event := restart[key]) is None or event.day < until}
+        restart = {key: restart_of(events.get(key[0], ()), PAIRS[key[1]], last) for key in asked}
+        since = {
+            key: max(start, "" if (event := restart[key]) is None else _day_after(event.day))
+            for key, start in asked.items()
+            if start is not None
+        }
+        lacking = {key for key, start in since.items() if start < until}
         accepted: Counter[tuple[str, int]] = Counter()
         for month, end in _months_until(self.lake, until):
-            if not lacking:
-                break
-            part = self.read(month, end, {vehicle for vehicle, _ in lacking})
+            vehicles = {key[0] for key in lacking if since[key] <= end}
+            if not vehicles:
+                continue
+            part = self.read(month, end, vehicles)
             rows = []
             of_row = zip(_pairs(part), part.day.tolist(), part.accepted.tolist(), strict=True)
             for row, (key, ordinal, is_accepted) in enumerate(of_row):
-                event, day = restart.get(key), day_name(ordinal)
-                if key not in lacking or (event is not None and day <= event.day):
+                if key not in lacking or day_name(ordinal) < since[key]:
                     continue
-                if accepted[key] < count and day < begin[key[0]]:
+                if accepted[key] < count and day_name(ordinal) < begin[key[0]]:
                     rows.append(row)
                 accepted[key] += is_accepted
             yield part.at(np.array(rows, np.int64))
@@ -123,6 +140,12 @@ class History:
 
     def read(self, first: str | None, last: str | None, among: AbstractSet[str] | None = None) -> Estimates:
         """Sound records of a span of days, of all vehicles or of some."""
+        if among is not None:  # few, who may have driven on few of its days: which, is told by a few columns
+            known = read_columns(self.lake, CALIBRATIONS, (), first=first, last=last, vehicle=among)
+            if known is None:
+                return estimates_of(None)
+            days = pc.min_max(known["day"]).as_py()
+            first, last = days["min"], days["max"]
         found = read_columns(self.lake, CALIBRATIONS, COLUMNS, first=first, last=last, vehicle=among)
         if found is not None:
             found = found.filter(pc.equal(found["method"], self.method))
@@ -133,6 +156,10 @@ class History:
             self.left_out[f"{owner} {day} {PAIRS[records.pair[row]]} {why}"] = None
         kept = np.delete(np.arange(len(records.day)), list(faults))
         return joined([records.at(kept)]) if faults else records
+
+
+def _day_after(day: str) -> str:
+    return (dt.date.fromisoformat(day) + dt.timedelta(days=1)).isoformat()
 
 
 def _pairs(records: Estimates) -> list[tuple[str, int]]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.audit.days import FEWEST_DAYS, PairDays, charted, reference_of
+from pipeline.audit.days import FEWEST_DAYS, PairDays, Reference, charted, reference_of
 from pipeline.audit.estimates import Estimates, days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
@@ -41,6 +41,9 @@ class _Vehicle:
 
     records: Estimates
     events: Sequence[ServiceEvent]
+    references: Mapping[
+        str, Reference
+    ]  # by pair, that an earlier night made of records that are not among these
 
 
 def work(task: Task) -> Work:
@@ -67,9 +70,12 @@ def work(task: Task) -> Work:
     for event in read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last):
         events.setdefault(event.vehicle, []).append(event)
     enough = (FEWEST_DAYS, fleet.audit.reference_days)
-    records = history.window((first, last), events, enough, fleet.vehicles)
+    records, references = history.window((first, last), events, enough, fleet.vehicles)
     names = sorted({*records.vehicles, *fleet.vehicles})
-    vehicles = {v: _Vehicle(records.of(v), events.get(v, ())) for v in names}
+    made: dict[str, dict[str, Reference]] = {}
+    for (name, pair), reference in references.items():
+        made.setdefault(name, {})[PAIRS[pair]] = reference
+    vehicles = {v: _Vehicle(records.of(v), events.get(v, ()), made.get(v, {})) for v in names}
     done = sorted([e.vehicle, e.day, e.sensor, e.kind] for v in vehicles.values() for e in v.events)
     settings = (fleet.audit, {"from": first, "to": last, "method": method, "events": done})
     return Work(
@@ -106,7 +112,8 @@ def _charted(vehicle: _Vehicle, window: tuple[str, str, str], config: AuditConfi
         restart = restart_of(vehicle.events, pair, window[1])
         since = 0 if restart is None else dt.date.fromisoformat(restart.day).toordinal() + 1
         own = days.between(since, last)
-        charts[pair] = charted(own, first, last, reference_of(own, config.reference_days))
+        reference = vehicle.references.get(pair) or reference_of(own, config.reference_days)
+        charts[pair] = charted(own, first, last, reference)
     return charts
 
 

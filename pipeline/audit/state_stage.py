@@ -10,11 +10,12 @@ from typing import TypeVar
 import numpy as np
 from scipy.special import ndtri
 
-from pipeline.audit.estimates import Estimates, day_name, estimates_of
+from pipeline.audit.estimates import Estimates, day_name, days_of, estimates_of, joined
 from pipeline.audit.history import History
+from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
 from pipeline.audit.service import restart_of, what_was_done
 from pipeline.audit.state import DayEstimate, State, fuse
-from pipeline.config import FleetConfig, VerifyConfig, config_hash
+from pipeline.config import AuditConfig, FleetConfig, VerifyConfig, config_hash
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.target_sigmas import target_sigmas
 from pipeline.store.current import current_drift
@@ -34,6 +35,7 @@ _DAYS_BACK = 60
 # Of successive accepted days: the most that the charts' budget is proved for. A state promises no more than such days
 # can give.
 _AUTOCORRELATION = 0.6
+_END = dt.date.max.toordinal()
 
 
 _Row = TypeVar("_Row", ServiceEvent, DriftFinding)
@@ -53,7 +55,8 @@ def work(task: Task) -> Work:
     tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
     last = task.of.last or min(last_day(task.lake, CALIBRATIONS) or "", tomorrow)
     first = (dt.date.fromisoformat(last) - dt.timedelta(days=_DAYS_BACK - 1)).isoformat() if last else ""
-    records = History(task.lake, method, last).read(first, last) if last else estimates_of(None)
+    history = History(task.lake, method, last)
+    records = history.read(first, last) if last else estimates_of(None)
     events = _by_vehicle(read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last or None))
     found = read_latest(
         task.lake,
@@ -65,14 +68,49 @@ def work(task: Task) -> Work:
     )
     changes = _by_vehicle(current_drift([f for f in found if f.method == method]))
 
+    references = _references(history, records, (first, last), events, fleet.audit) if last else {}
+
     def rows(run: Run) -> Generator[Records, None, None]:
         for done, vehicle in enumerate(records.vehicles):
             run.progress(done, len(records.vehicles), vehicle)
             since = {p: _since(p, events.get(vehicle, ()), changes.get(vehicle, ()), last) for p in PAIRS}
-            yield _states(fleet, (vehicle, last, method), records.of(vehicle), since)
+            own = _states(fleet, (vehicle, last, method), records.of(vehicle), since)
+            kept = [references[vehicle, PAIRS.index(row.pair)] for row in own.rows]
+            count = fleet.audit.reference_days
+            yield replace(
+                own, rows=[replace(r, **kept_columns(k, count)) for r, k in zip(own.rows, kept, strict=True)]
+            )
 
     settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
     return Work(settings, rows, inputs=tuple(records.keys()), tell=_told, again=True)
+
+
+def _references(
+    history: History,
+    records: Estimates,
+    window: tuple[str, str],
+    events: Mapping[str, Sequence[ServiceEvent]],
+    config: AuditConfig,
+) -> dict[tuple[str, int], Kept]:
+    """The fixed reference of every vehicle and pair, as far as there is one: kept, or made of its first days."""
+    first, last = window
+    count = config.reference_days
+    kept = read_kept(history.lake, history.method, window, events, count)
+    found = {key: own for key, own in kept.items() if own.reference is not None}
+    asked = {(v, p) for v in records.vehicles for p in range(len(PAIRS))} - found.keys()
+    begin = dict.fromkeys(records.vehicles, first)
+    lacking = {key: first_accepted(kept.get(key)) for key in asked}
+    known = joined([records, *history.references(begin, window, events, count, lacking)])
+    for vehicle in sorted({v for v, _ in asked}):
+        days = days_of(known.of(vehicle), config.held_sigma_factor)
+        for place, pair in enumerate(PAIRS):
+            if (vehicle, place) in asked:
+                event = restart_of(events.get(vehicle, ()), pair, last)
+                since = "" if event is None else event.day
+                begun = dt.date.fromisoformat(since).toordinal() + 1 if since else 0
+                own = days[pair].between(begun, _END) if pair in days else None
+                found[vehicle, place] = kept_of(own, since, count)
+    return found
 
 
 def _by_vehicle(rows: Iterable[_Row]) -> dict[str, list[_Row]]:

@@ -55,14 +55,22 @@ _DAMAGED = "_damaged"  # a name with an underscore: Delta's own tools leave it a
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which rows a reader asks for: of these vehicles (None = all), from day `first` to day `last` (None = open)."""
+    """Which rows a reader asks for (None = all): of these vehicles, from day `first` to day `last`, asserted after."""
 
     vehicles: frozenset[str] | None = None
     first: str | None = None
     last: str | None = None
+    asserted_after: str | None = None
 
-    def may_be_within(self, days: tuple[str, str] | None, vehicles: tuple[str, str] | None) -> bool:
-        """False where no such row can be among rows between these days and vehicles (None: not known)."""
+    def may_be_within(
+        self,
+        days: tuple[str, str] | None,
+        vehicles: tuple[str, str] | None,
+        asserted: tuple[str, str] | None = None,
+    ) -> bool:
+        """False where no such row can be among rows between these (None: not known)."""
+        if asserted is not None and asserted[1] <= (self.asserted_after or ""):
+            return False
         if days is not None and ((self.first or "") > days[1] or (self.last or "9999") < days[0]):
             return False
         if self.vehicles is None or vehicles is None:
@@ -182,7 +190,9 @@ def _groups(metadata: pq.FileMetaData, wanted: Wanted) -> list[int]:
     return [
         g
         for g in range(metadata.num_row_groups)
-        if wanted.may_be_within(*(_span(metadata.row_group(g), place.get(c)) for c in ("day", "vehicle")))
+        if wanted.may_be_within(
+            *(_span(metadata.row_group(g), place.get(c)) for c in ("day", "vehicle", "asserted_at"))
+        )
     ]
 
 

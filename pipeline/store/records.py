@@ -139,6 +139,7 @@ def read_columns(
     first: str | None,
     last: str | None,
     vehicle: str | AbstractSet[str] | None = None,
+    asserted_after: str | None = None,
 ) -> pa.Table | None:
     """Columns of the records of a window of days, in no order, with what tells which of them are current.
 
@@ -151,12 +152,14 @@ def read_columns(
         first: only from this day on.
         last: only until this day.
         vehicle: only this vehicle's, or only these'.
+        asserted_after: only what became current after this moment.
 
     Returns:
         None where there is no record.
     """
     asked = dict.fromkeys([*schema.about, "asserted_at", "work_key", *columns])
-    return _rows_of(lake, schema, list(asked), _wanted(vehicle, first, last))
+    wanted = replace(_wanted(vehicle, first, last), asserted_after=asserted_after)
+    return _rows_of(lake, schema, list(asked), wanted)
 
 
 class RecordIndex(Generic[Row]):
@@ -295,6 +298,8 @@ def _chosen(rows: pa.Table, wanted: Wanted) -> pa.Table:
         conditions.append(pc.greater_equal(rows["day"], wanted.first))
     if wanted.last is not None:
         conditions.append(pc.less_equal(rows["day"], wanted.last))
+    if wanted.asserted_after is not None:
+        conditions.append(pc.greater(rows["asserted_at"], wanted.asserted_after))
     for condition in conditions[1:]:
         conditions[0] = pc.and_(conditions[0], condition)
     return rows.filter(conditions[0]) if conditions else rows

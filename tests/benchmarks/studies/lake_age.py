@@ -76,6 +76,7 @@ def main() -> None:
                 return
             copy = Path(folder) / "measured"  # which adds nights
             shutil.copytree(lake.local_root, copy)
+            STATE.run(Task(one_rig_fleet(), Lake.at(copy), Window()))  # the night before kept references
             line = {"vehicles": given.vehicles, "days": days, "commit": commit_now()}
             line |= measured_apart(copy, given.vehicles, days)
             shutil.rmtree(copy)

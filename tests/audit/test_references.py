@@ -1,0 +1,120 @@
+"""Fixed references that states keep: the same findings, without reading a vehicle's first days again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.audit import history
+from pipeline.audit.estimates import day_name
+from pipeline.audit.references import read_kept
+from pipeline.stages import AUDIT, STATE
+from pipeline.store.partitions import Lake
+from pipeline.store.records import commit_records, read_records
+from pipeline.work import Task, Window
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.service_events import ServiceEvent
+from schemas.states import STATES, StateRow
+from tests.audit.test_audit_fleet import KNOCK, _day, _fleet
+
+DAYS = 60
+LAST = DAYS - 1
+
+
+def night_of(day):
+    return f"{day}T23:00:00.000000Z"
+
+
+@pytest.fixture
+def bare(tmp_path, maker):
+    """A knocked vehicle, a good one that was held at times, and one that joined a week ago; two months."""
+    rng = np.random.default_rng(41)
+    rows = maker.vehicle_records("a", DAYS, rng, status=lambda d: "held" if d % 7 == 3 else "accepted")
+    rows += maker.vehicle_records("b", DAYS, rng, motion=lambda d: {"radar": KNOCK} if d > 50 else {})
+    rows += [r for r in maker.vehicle_records("c", DAYS, rng) if r.day >= _day(54)]
+    lake = Lake.at(tmp_path / "bare")
+    commit_records(lake, CALIBRATIONS, [replace(r, recorded_at=night_of(r.day)) for r in rows])
+    return lake
+
+
+@pytest.fixture
+def lake(tmp_path, bare):
+    """The same, with the states of the night before."""
+    STATE.run(Task(_fleet(), bare, Window(None, _day(LAST - 1))))
+    lake, stamp = Lake.at(tmp_path / "kept"), night_of(_day(LAST - 1))
+    rows = read_records(bare, CALIBRATIONS, CalibrationRecord)
+    commit_records(lake, CALIBRATIONS, [replace(r, asserted_at="") for r in rows])
+    states = read_records(bare, STATES, StateRow)
+    commit_records(lake, STATES, [replace(s, recorded_at=stamp, asserted_at=stamp) for s in states])
+    return lake
+
+
+def audited(lake):
+    return AUDIT.run(Task(_fleet(), lake, Window())).records
+
+
+def kept(lake, events=(), count=10):
+    return read_kept(lake, "joint", (_day(LAST - 27), _day(LAST)), {"a": events}, count)
+
+
+def test_a_night_reads_its_window_alone_and_finds_what_it_would_find_from_the_first_days(
+    lake, bare, tmp_path, monkeypatch
+):
+    expected, spans, real = audited(without_states(bare, tmp_path)), [], history.read_columns
+
+    def spy(*arguments, first, last, **more):
+        spans.append((first, last, more.get("vehicle")))
+        return real(*arguments, first=first, last=last, **more)
+
+    monkeypatch.setattr(history, "read_columns", spy)
+    told = audited(lake)
+    whole = {(first, last) for first, last, vehicle in spans if vehicle is None and last is not None}
+    assert whole == {(_day(LAST - 27), _day(LAST))}
+    assert {v for _, _, vehicle in spans for v in vehicle or ()} <= {"c"}  # which drove on few days
+    assert {f.vehicle for f in told if f.status == "RED"} == {"b"}
+    for a, b in zip(expected, told, strict=True):
+        assert (a.vehicle, a.pair, a.dof, a.status, a.reason) == (
+            b.vehicle,
+            b.pair,
+            b.dof,
+            b.status,
+            b.reason,
+        )
+        assert (a.start_day, a.days_used) == (b.start_day, b.days_used)
+        assert b.statistic == (None if a.statistic is None else pytest.approx(a.statistic, rel=1e-6))
+
+
+def without_states(bare, tmp_path):
+    lake = Lake.at(tmp_path / "without")
+    commit_records(lake, CALIBRATIONS, read_records(bare, CALIBRATIONS, CalibrationRecord))
+    return lake
+
+
+def test_states_keep_the_first_accepted_days_and_from_the_tenth_on_what_they_make(lake):
+    found = kept(lake)
+    assert set(found) == {(v, p) for v in "abc" for p in range(len(PAIRS))}
+    a, c = found["a", 0], found["c", 0]
+    assert a.days == tuple(_day(d) for d in range(12) if d % 7 != 3)
+    assert [day_name(d) for d in a.reference.days] == list(a.days)
+    assert (c.days, c.reference) == (tuple(_day(d) for d in range(54, LAST)), None)
+
+
+def test_what_is_kept_no_longer_counts_after_a_service_event_another_setting_or_another_record(lake):
+    assert kept(lake, count=9) == {}
+    event = ServiceEvent("a", _day(20), "radar", "re-mount")
+    assert {p for v, p in kept(lake, [event]) if v == "a"} == {0}  # camera_lidar has nothing to do with it
+    old = next(r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="a", day=_day(2)))
+    commit_records(lake, CALIBRATIONS, [replace(old, work_key="again", recorded_at="", asserted_at="")])
+    assert {v for v, _ in kept(lake)} == {"b", "c"}
+
+
+def test_the_states_of_every_night_keep_the_same_reference(lake):
+    before = kept(lake)
+    STATE.run(Task(_fleet(), lake, Window()))
+    after = read_kept(lake, "joint", (_day(LAST - 27), _day(LAST)), {}, 10)
+    for key, own in before.items():
+        assert after[key].days[: len(own.days)] == own.days
+        if own.reference is not None:
+            np.testing.assert_array_equal(after[key].reference.spread, own.reference.spread)
+            np.testing.assert_allclose(after[key].reference.T, own.reference.T, atol=1e-15)
+    assert len(after["c", 0].days) == len(before["c", 0].days) + 1
