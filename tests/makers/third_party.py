@@ -39,10 +39,10 @@ def user_extras():
     }
 
 
-def installed():
-    """Names of all distributions that Boresight and its extras need, directly and through others."""
-    dependencies, extras = user_extras()
-    lines = [*dependencies, *(line for own in extras.values() for line in own)]
+def installed(extras=None):
+    """Names of all distributions that Boresight and extras (None = all) need, directly and through others."""
+    dependencies, known = user_extras()
+    lines = [*dependencies, *(line for e in (known if extras is None else extras) for line in known[e])]
     found, waiting = set(), [(Requirement(line), "") for line in lines]
     while waiting:
         need, extra = waiting.pop()

@@ -1,4 +1,4 @@
-from tests.benchmarks.environment_sizes import measure_environment
+from tests.benchmarks.environment_sizes import measure_environment, measure_installed_night
 
 
 def test_what_lies_in_an_environment_is_counted_once_by_package_and_compiled_python_not_at_all(tmp_path):
@@ -18,3 +18,10 @@ def test_what_lies_in_an_environment_is_counted_once_by_package_and_compiled_pyt
         "files": 3,
         "largest_megabytes": {"a": 3.0, "b.py": 0.5},
     }
+
+
+def test_what_the_night_needs_of_this_environment_is_its_dependencies_and_no_extra():
+    found = measure_installed_night()
+    assert {"pyarrow", "deltalake", "scipy"} <= set(found["largest_megabytes"])
+    assert not {"torch", "ray", "av"} & set(found["largest_megabytes"])
+    assert 500 < found["megabytes"] < 1500
