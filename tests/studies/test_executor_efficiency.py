@@ -7,11 +7,11 @@ import sys
 from tests.benchmarks.studies.executor_efficiency import _spent_s, table
 
 
-def night(executor, alone_s):
-    return {"executor": executor, "alone_s": alone_s}
+def night(executor, alone_s, vehicle_days=4):
+    return {"executor": executor, "alone_s": alone_s, "vehicle_days": vehicle_days}
 
 
-def test_efficiency_is_of_the_least_seconds_that_a_night_would_take_alone():
+def test_efficiency_is_of_the_least_seconds_that_a_night_of_so_many_days_would_take_alone():
     lines = [
         night("inline", 100),
         night("inline", 90),
@@ -19,11 +19,11 @@ def test_efficiency_is_of_the_least_seconds_that_a_night_would_take_alone():
         night("ray", 60),
         night("ray", 55),
     ]
-    assert table(lines) == (
-        "efficiency of two workers: process 0.90, ray 0.82\n"
-        "ray against process: 0.91\nnights: 2 inline, 1 process, 2 ray\n"
+    assert table([*lines, night("process", 99, 8)]) == (
+        "4 vehicle-days: inline 90.0 s (2 nights), process 50.0 s (1 nights), ray 55.0 s (2 nights), "
+        "efficiency of process 0.90, efficiency of ray 0.82, ray against process 0.91\n"
+        "8 vehicle-days: process 99.0 s (1 nights)\n"
     )
-    assert table(lines[:3]) == ""
 
 
 def test_what_a_process_computes_and_what_it_waits_for_a_cpu_are_told_apart():

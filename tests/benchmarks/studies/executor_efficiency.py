@@ -87,18 +87,22 @@ def night(fleet: str, logs: str, executor: str, workers: int) -> dict[str, Any]:
 
 
 def table(lines: list[dict[str, Any]]) -> str:
-    """Of the least seconds of each executor's nights."""
-    alone_s: dict[str, list[float]] = {}
+    """Of the least seconds of each executor's nights, by how many vehicle-days these had."""
+    nights: dict[int, dict[str, list[float]]] = {}
     for line in lines:
-        alone_s.setdefault(line["executor"], []).append(line["alone_s"])
-    if alone_s.keys() < dict(WAYS).keys():
-        return ""
-    one, pool, ray = (min(alone_s[way]) for way, _ in WAYS)
-    nights = ", ".join(f"{len(of)} {way}" for way, of in alone_s.items())
-    return (
-        f"efficiency of two workers: process {one / 2 / pool:.2f}, ray {one / 2 / ray:.2f}\n"
-        f"ray against process: {pool / ray:.2f}\nnights: {nights}\n"
-    )
+        nights.setdefault(line["vehicle_days"], {}).setdefault(line["executor"], []).append(line["alone_s"])
+    return "".join(f"{days} vehicle-days: {_row(of)}\n" for days, of in sorted(nights.items()))
+
+
+def _row(alone_s: dict[str, list[float]]) -> str:
+    best = {way: min(alone_s[way]) for way, _ in WAYS if way in alone_s}
+    told = [f"{way} {seconds:.1f} s ({len(alone_s[way])} nights)" for way, seconds in best.items()]
+    pooled = [way for way, workers in WAYS if workers == 2 and way in best]
+    if "inline" in best:
+        told += [f"efficiency of {way} {best['inline'] / 2 / best[way]:.2f}" for way in pooled]
+    if len(pooled) == 2:
+        told.append(f"ray against process {best['process'] / best['ray']:.2f}")
+    return ", ".join(told)
 
 
 def _spent_s(session: int) -> dict[int, tuple[float, float]]:
