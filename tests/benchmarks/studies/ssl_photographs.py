@@ -59,7 +59,7 @@ def by_log(day: SslDay) -> dict[str, SslDay]:
 def days_told(models: ModelSet, day: SslDay, draws: int) -> list[dict[str, Any]]:
     """The product's records of the day, a draw of the start each."""
     found = [measure_day(models, replace(day, where=replace(day.where, seed=k))) for k in range(draws)]
-    keep = ("az_deg", "el_deg", "range_m", "prior_az_deg", "prior_el_deg", "status")
+    keep = ("az_deg", "el_deg", "range_m", "prior_az_deg", "prior_el_deg", "status", "reason")
     return [{p: {k: told.get(k) for k in keep} for p, told in one["pairs"].items()} for one in found]
 
 
