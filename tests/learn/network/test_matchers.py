@@ -15,11 +15,12 @@ from pipeline.learn.network.least_squares import (
     small_rotation_vector,
     spherical_jacobian,
 )
-from pipeline.learn.network.matching_network import MatchingCore, continued_beyond
+from pipeline.learn.network.matching_network import MatchingCore, confusions_of, continued_beyond
 from pipeline.learn.network.occupancy_matcher import OccupancyMatcher
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
 from pipeline.learn.sample.layout import CAMERA_CHANNELS, CLASS_CHANNELS
+from schemas.training import GRID_CLASSES
 
 GRID = Grid()
 
@@ -153,6 +154,18 @@ def test_edges_find_the_boundaries_of_what_nobody_knows_the_class_of():
         left[edges] = 2.5 + np.degrees(float(found.twist[0, 1]))  # upright boundaries tell azimuth alone
     assert left[0.0] > 1.0
     assert abs(left[1.0]) < 0.2
+
+
+def test_classes_are_confused_with_their_like_and_never_with_the_sky():
+    found = confusions_of(0.6, 0.3)
+    assert torch.allclose(found.sum(1), torch.ones(10))
+    name = GRID_CLASSES.index
+    assert found[name("sky"), name("sky")] == 1
+    assert found[name("road"), name("verge")] == pytest.approx(0.3)
+    building = found[name("building")]
+    assert building[name("building")] > building[name("vegetation")] > building[name("vehicle")] > 0
+    assert building[name("road")] == 0
+    assert torch.equal(confusions_of(0.0, 0.0), torch.eye(10))
 
 
 def test_beyond_the_image_goes_on_what_is_seen_at_its_border():
