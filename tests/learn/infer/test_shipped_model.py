@@ -13,7 +13,8 @@ from pipeline.work import Task
 from schemas.calibrations import PAIRS
 from tests.makers.simulated_days import simulated_day
 
-MODEL = SHIPPED / "joint.onnx"
+MODEL, WITH_CLASSES = SHIPPED / "joint.onnx", SHIPPED / "joint_classes.onnx"
+both = pytest.mark.parametrize("model", [MODEL, WITH_CLASSES], ids=lambda path: path.stem)
 
 
 @pytest.fixture(scope="module")
@@ -21,31 +22,43 @@ def day(tmp_path_factory):
     return simulated_day(tmp_path_factory.mktemp("day"), frames=6, rig="demo", seed=77)
 
 
-def test_it_is_small_and_onnxruntime_opens_it():
-    assert MODEL.stat().st_size <= 2_500_000
-    [network] = open_networks({"joint": MODEL}, LearnConfig(), PrepareConfig())
+@both
+def test_it_is_small_and_onnxruntime_opens_it(model):
+    assert model.stat().st_size <= 2_500_000
+    [network] = open_networks({"joint": model}, LearnConfig(), PrepareConfig())
     assert network.pairs == PAIRS
 
 
-def test_its_card_says_what_it_comes_from_and_what_it_cannot_do():
-    card = json.loads(MODEL.with_suffix(".json").read_text())
-    assert card["bytes"] == MODEL.stat().st_size
+@both
+def test_its_card_says_what_it_comes_from_and_what_it_cannot_do(model):
+    card = json.loads(model.with_suffix(".json").read_text())
+    assert card["bytes"] == model.stat().st_size
     for heading in ("data", "seeds", "time", "results", "limits"):
         assert card[heading], heading
-        assert f"## {heading}" in MODEL.with_suffix(".md").read_text()
+        assert f"## {heading}" in model.with_suffix(".md").read_text()
     assert "simulated" in json.dumps(card["data"])
     assert any("translations" in limit for limit in card["limits"])
 
 
-def test_a_fleet_that_names_no_network_gets_it(day):
-    assert model_files("joint-ssl", day.fleet) == {"joint": MODEL}
+def test_a_fleet_that_names_no_network_gets_the_one_that_fits_what_it_is_shown(day):
+    assert model_files("joint-ssl", day.fleet) == {"joint": WITH_CLASSES}
+    assert model_files("joint-ssl", day.fleet.changed(learn={"camera": "classes"})) == {"joint": WITH_CLASSES}
+    assert model_files("joint-ssl", day.fleet.changed(learn={"camera": "image"})) == {"joint": MODEL}
 
 
-def test_one_frame_puts_sensors_right_that_were_knocked_by_five_degrees(day):
-    """Median over frames, of a rig with half the lidar rows that it learned from."""
+@pytest.mark.parametrize("camera", ["both", "image"])
+def test_one_frame_puts_sensors_right_that_were_knocked_by_five_degrees(day, camera):
+    """Median over frames, of a rig that neither network learned from."""
     before, after = [], []
     for o in day.observations:
-        task = Task(day.fleet, day.lake, day.partition, "joint-ssl", o.frame_index, (5.0, 0.05))
+        task = Task(
+            day.fleet.changed(learn={"camera": camera}),
+            day.lake,
+            day.partition,
+            "joint-ssl",
+            o.frame_index,
+            (5.0, 0.05),
+        )
         found = calibrate_frame(task, o.frame_index)
         before.append([off(day, pair, found.prior.of(pair)) for pair in PAIRS])
         after.append([off(day, pair, found.solution.pairs[pair].T) for pair in PAIRS])
