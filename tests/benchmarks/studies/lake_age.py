@@ -6,9 +6,11 @@ with the upkeep that follows a night (`tests/makers/fleet_lakes.py`). Nothing of
 vehicle-days have no pictures.
 
     python -m tests.benchmarks.studies.lake_age [--vehicles 1000] [--days 30 365] [--lakes FOLDER] [--seconds 200]
+        [--undrawn]
 
 A line per lake is added to results/lake_age.jsonl; each lake is measured in a process of its own, and memory is that
-of all its processes together. With `--lakes` they stay, and a run that `--seconds` ended goes on where it was.
+of all its processes together. With `--lakes` they stay, and a run that `--seconds` ended goes on where it was; with
+`--undrawn` pages of vehicle-days are left out.
 """
 
 from __future__ import annotations
@@ -61,10 +63,11 @@ def main() -> None:
     parser.add_argument("--days", type=int, nargs="+", default=[30, 365])
     parser.add_argument("--lakes", type=Path)
     parser.add_argument("--seconds", type=float, default=float("inf"))
+    parser.add_argument("--undrawn", action="store_true")
     parser.add_argument("--measure", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.measure is not None:
-        told = measure(Lake.at(given.measure), FleetHistory(given.vehicles, given.days[0]))
+        told = measure(Lake.at(given.measure), FleetHistory(given.vehicles, given.days[0]), given.undrawn)
         sys.stdout.write(json.dumps(told) + "\n")
         return
     until = time.monotonic() + given.seconds
@@ -78,17 +81,17 @@ def main() -> None:
             shutil.copytree(lake.local_root, copy)
             STATE.run(Task(one_rig_fleet(), Lake.at(copy), Window()))  # the night before kept references
             line = {"vehicles": given.vehicles, "days": days, "commit": commit_now()}
-            line |= measured_apart(copy, given.vehicles, days)
+            line |= measured_apart(copy, given.vehicles, days, given.undrawn)
             shutil.rmtree(copy)
             sys.stdout.write(json.dumps(line) + "\n")
             with RESULTS.open("a") as file:
                 file.write(json.dumps(line) + "\n")
 
 
-def measured_apart(copy: Path, vehicles: int, days: int) -> dict[str, Any]:
+def measured_apart(copy: Path, vehicles: int, days: int, undrawn: bool) -> dict[str, Any]:
     """What a process of its own measures."""
     command = [sys.executable, "-m", "tests.benchmarks.studies.lake_age", "--measure", str(copy)]
-    command += ["--vehicles", str(vehicles), "--days", str(days)]
+    command += ["--vehicles", str(vehicles), "--days", str(days), *(["--undrawn"] if undrawn else [])]
     told = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     found: dict[str, Any] = json.loads(told.stdout.splitlines()[-1])
     return found
@@ -105,7 +108,7 @@ def fill(lake: Lake, history: FleetHistory, until: float) -> bool:
     return True
 
 
-def measure(lake: Lake, history: FleetHistory) -> dict[str, Any]:
+def measure(lake: Lake, history: FleetHistory, undrawn: bool = False) -> dict[str, Any]:
     """Seconds of everything that a night does beside its vehicle-days, and the memory that it took."""
     last = last_day(lake, CALIBRATIONS)
     assert last == history.day_name(history.days - 1), "the lake was just filled"
@@ -139,7 +142,7 @@ def measure(lake: Lake, history: FleetHistory) -> dict[str, Any]:
             findings = AUDIT.run(task).records
         with timed("states"):
             STATE.run(task)
-        drawing = Drawing()
+        drawing = Drawing(0 if undrawn else WORKERS)
         with timed("pages_but_drawing_days"):
             written = write_fleet_report(lake, fleet, replace(pages, fan_out=drawing))
     seconds["pages_but_drawing_days"] -= drawing.driver_s
@@ -166,8 +169,9 @@ def measure(lake: Lake, history: FleetHistory) -> dict[str, Any]:
 
 @dataclass
 class Drawing:
-    """Draws pages of vehicle-days by the night's workers, and says what that took."""
+    """Draws pages of vehicle-days by so many workers (0: leaves them out), and says what that took."""
 
+    workers: int
     pages: int = 0
     wall_s: float = 0.0
     driver_s: float = 0.0
@@ -175,7 +179,8 @@ class Drawing:
     def __call__(self, function: Any, jobs: Any, progress: Any) -> Iterator[tuple[Any, Any, str]]:
         """See `pipeline.report.upkeep.FanOut`."""
         began, at = time.process_time(), time.perf_counter()
-        for end in OnWorkers("process", WORKERS)(function, jobs, progress):
+        fan_out = OnWorkers("process", self.workers) if self.workers else touching
+        for end in fan_out(function, jobs, progress):
             assert not end[2], end[2]
             self.pages += 1
             yield end
