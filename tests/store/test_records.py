@@ -170,6 +170,8 @@ def test_of_a_month_in_one_file_only_the_row_groups_of_the_days_asked_for_are_re
     for wanted, expected in ((Wanted(None, days[3], days[4]), days[3:5]), (Wanted(None, days[9]), days[9:])):
         found = read_file(lake, CALIBRATIONS, file.name, columns, wanted)
         assert set(found["day"].to_pylist()) == set(expected)
+    mapped = read_file(lake, CALIBRATIONS, file.name, ["day", "diagnostics.x"])
+    assert (mapped.num_rows, lake.damage) == (20, [])
     assert read_file(lake, CALIBRATIONS, file.name, columns, Wanted(frozenset({"c"}))).num_rows == 0
     assert [r.day for r in read(lake, vehicle={"a", "c"}, last=days[1])] == days[:2]
 
