@@ -11,6 +11,7 @@ from pipeline.config import FleetConfig, config_hash, load_fleet
 from pipeline.errors import ConfigError, ModelError
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
+from pipeline.shipped_models import shipped_manifest
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows, write_partition
 from schemas.frames import FRAMES
@@ -254,3 +255,23 @@ def test_a_day_whose_model_is_missing_or_wrong_names_the_manifest(tmp_path, lake
     manifest(tmp_path, {ROAD: (NONE, NONE, 0.0)}, classes=12)
     with pytest.raises(ModelError, match=r"seg\.toml.*logits must be"):
         perceived(fleet(tmp_path, MODEL), lake)
+
+
+def test_the_network_that_ships_tells_a_road_from_the_walls_beside_it():
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(-60, 60, 0.4)), np.radians(np.arange(-18, 6, 0.75)))
+    rays = np.stack(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], -1
+    ).reshape(-1, 3)
+    with np.errstate(divide="ignore"):
+        to_ground = np.where(rays[:, 2] < 0, -1.8 / rays[:, 2], np.inf)
+        to_wall = np.where(rays[:, 1] != 0, 9.0 / np.abs(rays[:, 1]), np.inf)
+    distance = np.minimum(to_ground, to_wall)
+    seen = distance < 60
+    xyz = (rays * distance[:, None])[seen].astype(np.float32)
+    is_wall = (to_wall < to_ground)[seen]
+    segmenter = RangeImageSegmenter(shipped_manifest("shipped:lidar_semantics"))
+    is_ground = np.isin(
+        segmenter.kinds(xyz, np.full(len(xyz), 0.3, np.float32)), (PointKind.ROAD, PointKind.FLAT)
+    )
+    assert is_ground[~is_wall].mean() > 0.8
+    assert is_ground[is_wall & (xyz[:, 2] > -0.8)].mean() < 0.2
