@@ -161,8 +161,8 @@ def read_file(
             groups = _groups(file.metadata, wanted or Wanted())
             parts = [file.read_row_group(g, columns=there) for g in groups]
             table = pa.concat_tables(parts) if parts else file.read_row_groups([], columns=there)
-    except PermissionError:
-        raise
+    except (PermissionError, pa.ArrowNotImplementedError):
+        raise  # what we may not or cannot read is not damaged: left out, its records would be lost to every audit
     except (pa.ArrowException, OSError, EOFError) as err:
         if not isinstance(lake.root, Path) and getattr(err, "errno", None) == errno.EIO:
             raise  # the store does not answer: that says nothing of the file
