@@ -18,8 +18,8 @@ __all__ = ["verify"]
 
 _COLOUR = {"pass": "green", "warn": "yellow", "fail": "red", "inconclusive": "dim"}
 _DAY = "2000-01-01"  # of the one vehicle-day of a lake that nobody keeps
-# Enough for camera-lidar to be known to 0.05 deg on simulated days, few enough for a minute on two cores.
-_FRAMES = 60
+# As many as a calibration selects (`select.frames`). On the one real drive tried, 60 left the radar undecided.
+_FRAMES = 100
 
 
 # A command's parameters are its options: more than eight, because each is one that a user sets.
