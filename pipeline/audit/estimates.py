@@ -40,8 +40,8 @@ class Estimates:
         vehicles: names, in order.
         owner: which of them a record is of.
         day: ordinals of the calendar.
-        pair: places in PAIRS.
-        status: places in STATUSES.
+        pair: places in PAIRS; -1: none of them.
+        status: places in STATUSES; -1: none of them.
         pose: of T_parent_child: quaternion (scalar first), translation [m].
         has_estimate: neither pose nor covariance is null.
         covariance: of left perturbations.
@@ -189,7 +189,8 @@ def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:
         latest_day: the last day that a drive can be of.
     """
     future = records.day > dt.date.fromisoformat(latest_day).toordinal()
-    looked_at = ~future & ~records.refused
+    unknown = (records.pair < 0) | (records.status < 0)
+    looked_at = ~future & ~unknown & ~records.refused
     estimated, C = looked_at & records.has_estimate, records.covariance
     pose = np.where(np.isfinite(records.pose), records.pose, np.inf)
     rigid = np.isfinite(pose).all(axis=1) & (np.abs((pose[:, :4] ** 2).sum(axis=1) - 1) <= _ROUNDING)
@@ -204,6 +205,7 @@ def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:
     faults: dict[int, str] = {}
     for wrong, why in (
         (future, "is of a day that has not come yet"),
+        (unknown, "is of a pair or has a status that this release does not know"),
         (looked_at & ~records.has_estimate & (records.status != _HELD), "has no pose"),
         (estimated & ~rigid, "holds no rigid transform"),
         (estimated & ~said, "holds no covariance"),

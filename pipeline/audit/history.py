@@ -153,7 +153,8 @@ class History:
         faults = faults_of(records, self.latest)
         for row, why in faults.items():
             owner, day = records.vehicles[records.owner[row]], day_name(int(records.day[row]))
-            self.left_out[f"{owner} {day} {PAIRS[records.pair[row]]} {why}"] = None
+            pair = int(records.pair[row])
+            self.left_out[f"{owner} {day} {PAIRS[pair] if pair >= 0 else 'record'} {why}"] = None
         kept = np.delete(np.arange(len(records.day)), list(faults))
         return joined([records.at(kept)]) if faults else records
 

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
-from pipeline.store.columns import ordinals, places
+from pipeline.store.columns import known_rows, ordinals, places
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import last_day, read_columns
@@ -86,7 +86,9 @@ def read_verdicts(lake: Lake, method: str, latest: str) -> FleetVerdicts:
         none = np.zeros(0, np.int64)
         empty = ChartVerdicts(none, none, none, none, np.zeros(0), np.zeros((0, 3), np.int64))
         return FleetVerdicts([], {}, empty)
-    found = current_rows(found, DRIFT)
+    found = known_rows(
+        current_rows(found, DRIFT), {"pair": PAIRS, "dof": DOF_NAMES, "status": DRIFT_STATUSES}
+    )
     names = found["vehicle"].combine_chunks().dictionary_encode()
     vehicles, owner = names.dictionary.to_pylist(), np.asarray(names.indices).astype(np.int64)
     return FleetVerdicts(

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import from_quaternion
-from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
+from pipeline.store.columns import known_rows, matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import first_day, last_day, read_columns
@@ -126,6 +126,8 @@ def _window_of(table: pa.Table | None) -> FleetWindow:
         T, sigma = np.zeros((0, 4, 4)), np.zeros((0, 6))
         return FleetWindow([], none, none, none, none, T, sigma, np.zeros((0, 6), bool), [], [])
     found = current_rows(table, CALIBRATIONS)
+    # What no release writes is not drawn; the audit names such records.
+    found = known_rows(found, {"pair": PAIRS, "status": STATUSES})
     names = found["vehicle"].combine_chunks().dictionary_encode()
     T, sigma = _estimates(found)
     return FleetWindow(

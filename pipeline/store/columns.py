@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
-__all__ = ["matrices", "observable_dofs", "ordinals", "places", "there"]
+__all__ = ["known_rows", "matrices", "observable_dofs", "ordinals", "places", "there"]
 
 _DOFS = 6
 _MATRIX_BYTES = 8 * _DOFS**2
+
+
+def known_rows(table: pa.Table, names: Mapping[str, Sequence[str]]) -> pa.Table:
+    """Rows whose columns hold nothing but names that are known, by column."""
+    for column, known in names.items():
+        table = table.filter(pc.is_in(table[column], pa.array(known)))
+    return table
 
 
 def there(column: pa.ChunkedArray) -> Bool[np.ndarray, " N"]:
@@ -50,11 +57,8 @@ def ordinals(days: pa.ChunkedArray) -> Int[np.ndarray, " N"]:
 
 
 def places(column: pa.ChunkedArray, names: Sequence[str]) -> Int[np.ndarray, " N"]:
-    """Where each value of a column stands among names.
-
-    Raises:
-        ValueError: a value is none of them.
-    """
-    coded = column.combine_chunks().dictionary_encode()
-    place = np.array([names.index(name) for name in coded.dictionary.to_pylist()], np.int64)
+    """Where each value of a column stands among names; -1 where it is none of them."""
+    coded = pc.fill_null(column, "").combine_chunks().dictionary_encode()
+    known = {name: place for place, name in enumerate(names)}
+    place = np.array([known.get(name, -1) for name in coded.dictionary.to_pylist()], np.int64)
     return place[np.asarray(coded.indices)]

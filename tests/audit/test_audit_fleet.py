@@ -255,10 +255,12 @@ def test_a_record_of_a_day_to_come_and_one_of_nonsense_are_named_and_left_out(
     whole = [f.status for f in audit_fleet(lake, _fleet("v", "w"))]
     wrong = np.full((6, 6), np.nan)
     spoiled = [replace(records[0], day="2099-01-01", work_key="k1"), replace(records[6], covariance=wrong)]
+    spoiled.append(replace(records[3], status="odd"))
     _write(lake, spoiled, suffix="-again")
     outcome = AUDIT.run(Task(_fleet("v", "w"), lake, Window()))
     assert "v 2099-01-01 camera_lidar is of a day that has not come yet" in outcome.reason
     assert f"v {records[6].day} camera_lidar holds no covariance" in outcome.reason
+    assert f"v {records[3].day} {records[3].pair} is of a pair or has a status" in outcome.reason
     assert {f.day for f in outcome.records} == {_day(7)}
     assert sum(a == f.status for a, f in zip(whole, outcome.records, strict=True)) >= 34
 
