@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import exp_se3
 from pipeline.report.overlays import Extrinsics, Scene
+from schemas.calibrations import PAIRS
 from tests.benchmarks.studies import paper_figures, paper_ssl, paper_table, reflector_table
 from tests.benchmarks.studies.engine import RESULTS
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
@@ -73,6 +74,27 @@ def test_a_learning_curve_is_continued_by_its_power_law_and_not_where_it_does_no
     lines = [{"step": 500, "validation/alignment": 1.25}, {"step": 510, "loss": 1.0}]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert paper_ssl.curve_of(tmp_path, 4) == {"samples": [2000], "loss": [1.25]}
+
+
+def test_runs_of_one_pair_and_of_all_stand_in_one_table_and_one_picture():
+    errors = {"guess": [1.5, 1.5, 0.05], "answer": [1.2, 0.9, 0.09]}
+    loss = {"guess": 2.0, "answer": 1.5, "truth": 1.0}
+    run = {"samples": 40_000, "minutes": 12.0, "loss": loss, "extrapolated": None}
+    run["curve"] = {"samples": [2000, 40_000], "loss": [1.75, 1.25]}
+    told = {
+        "joint": run | {"errors": dict.fromkeys(PAIRS, errors)},
+        "pairwise lidar-radar": run | {"errors": {"lidar_radar": errors}},
+    }
+    lines = paper_ssl.table({"commit": "c", "date": "d", "frames": 2}, told).splitlines()
+    joint, alone = (line.split(" | ") for line in lines if "40,000" in line)
+    assert joint[1:3] == alone[1:3] == ["40,000 (1.00%)", "12.0 (20)"]  # a hundredth in 12 minutes
+    assert joint[3] == "1.50 / 1.50 -> 1.20 / 0.90"
+    assert not alone[3].strip()
+    assert not alone[4].strip()
+    assert alone[5].startswith("1.50 / 1.50 / 0.050 -> 1.20 / 0.90 / 0.090")
+    left = paper_ssl.left_of(told["joint"])
+    assert left == {"samples": [0, 2000, 40_000], "left": [100.0, 75.0, 25.0]}
+    assert paper_ssl.drawn(dict.fromkeys(told, left)).count(">pairwise lidar-radar<") == 1
 
 
 def test_reflectors_are_recorded_and_every_method_has_run_before_they_are_evaluated(tmp_path):
