@@ -184,6 +184,7 @@ REAL = DaySpec(0, "real", 0, "real")
 # show draws new ones.
 SETS: dict[str, list[DaySpec]] = {
     "dev": _both(110, 16),
+    "dev-drivable": _both(140, 8),
     "dev-bad": [
         DaySpec(130, "urban", fault="camera:labels:1"),
         DaySpec(131, "highway", fault="camera:labels:1"),
