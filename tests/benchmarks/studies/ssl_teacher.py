@@ -1,14 +1,15 @@
 """Study: a segmenter that sees photographs, as the eye of a fleet without logged labels, as teacher, and as encoder.
 
-    python -m tests.benchmarks.studies.ssl_teacher --logged REAL --teacher TEACHER --segmenter segmenter.toml \
+    python -m tests.benchmarks.studies.ssl_teacher --logged REAL --teacher TEACHER... --segmenter segmenter.toml \
         --encoders shipped=joint_classes.onnx taught=TUNED.onnx --judge LOG
 
-REAL and TEACHER are folders with fleet.toml and lake of the same real vehicle-day, perceived by its logged labels and
-by the segmenter (`semantics = { source = "onnx", ... }`). Told are how far the two labellings agree, and what encoders
-of images alone make of the frames of one log: shares of the grid's cells with the logged class, and how often ground
-and what stands on it, as the lidar tells them by geometry, fall on cells of such classes at the logged calibration. The
-lidar owes nothing to the segmenter, which made the logged labels too. `probe` is a linear classifier on features inside
-the segmenter, fitted to logged classes on the other logs: what an encoder begins with that is pretrained.
+REAL and TEACHER are folders with fleet.toml and lake of the same real vehicle-day, perceived by its logged labels, and
+by the segmenter (`semantics = { source = "onnx", ... }`), log by log where that suits. Told are how far the two
+labellings agree, and what encoders of images alone make of the frames of one log: shares of the grid's cells with the
+logged class, and how often ground and what stands on it, as the lidar tells them by geometry, fall on cells of such
+classes at the logged calibration. The lidar owes nothing to the segmenter, which made the logged labels too. `probe` is
+a linear classifier on features inside the segmenter, fitted to logged classes on the other logs: what an encoder begins
+with that is pretrained.
 """
 
 from __future__ import annotations
@@ -217,13 +218,13 @@ def summary(told: dict[str, Any]) -> str:
 def main() -> None:
     """Measure, write, print."""
     args = _arguments()
-    logged, teacher = real_day(args.logged), real_day(args.teacher)
+    logged, teachers = real_day(args.logged), [real_day(folder) for folder in args.teacher]
     grid = SingleFrameCalibrator(args.encoders[0].files[0]).grid
-    given = {o.frame_index: o for o in logged.rows}
-    both = [(o, given[o.frame_index]) for o in teacher.rows if o.frame_index in given]
+    given = {o.camera_stamp_ns: o for o in logged.rows}
+    both = [(o, given[o.camera_stamp_ns]) for day in teachers for o in day.rows if o.camera_stamp_ns in given]
     pixels = ((_pixels(a, b), CLASS_OF_LABEL[labels_of(b)]) for a, b in both)
     cells = {o.frame_index: cells_of(o, grid) for o in logged.rows}
-    taught = {o.frame_index: cells_of(o, grid) for o, _ in both}
+    taught = {o.frame_index: cells_of(by, grid) for by, o in both}
     agreed = {"pixels": agreement(pixels), "cells": agreement((taught[k], cells[k]) for k in taught)}
     # The judge's frames, and all others, which the probe learns from.
     judge = by_log(logged)[args.judge].rows
@@ -263,7 +264,7 @@ def _arguments() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--logged", type=Path, required=True)
-    parser.add_argument("--teacher", type=Path, required=True)
+    parser.add_argument("--teacher", type=Path, nargs="+", required=True)
     parser.add_argument("--segmenter", type=Path, required=True, help="its manifest")
     parser.add_argument("--encoders", nargs="+", type=ModelSet.parse, required=True, metavar="NAME=FILE")
     parser.add_argument("--judge", required=True, help="the log that nobody learned from")
