@@ -117,7 +117,9 @@ class SolveConfig(Section):
     paper_loss_scale: Literal["pairwise_minimum", "none"] = "pairwise_minimum"
     bootstrap_blocks: Annotated[int, Field(gt=1)] = 24
     time_offset_sigma_s: Positive = 0.05
-    terms: tuple[Term, ...] = TERMS  # of method joint; leave some out to see what they are worth
+    terms: tuple[Term, ...] = (
+        TERMS  # of method joint (`doppler`: of networks too); leave some out to see what they are worth
+    )
     polish: bool = False  # of the SSL methods: let method joint finish from the network's answer
     seed: Annotated[int, Field(ge=0)] = 0
 

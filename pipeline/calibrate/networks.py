@@ -16,6 +16,7 @@ from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
+from pipeline.learn.infer.way import informed_by_way
 from pipeline.results import Progress
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns
@@ -77,6 +78,8 @@ def ssl_solver(method: str, task: Task) -> Solver:
             triggered=triggered,
             progress=progress,
         )
+        if "doppler" in config.terms:
+            solution = informed_by_way(solution, observations["lidar_radar"], prior)
         if not config.polish:
             return solution
         return _polished(solution, observations, prior, config, seed, triggered, progress)

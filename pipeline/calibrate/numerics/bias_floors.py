@@ -26,7 +26,6 @@ __all__ = [
     "DAY_CENTRE_SIGMAS",
     "DAY_FOCAL_FLOOR",
     "DAY_FOCAL_SIGMAS",
-    "DOPPLER_PITCH_FLOOR_RAD",
     "FOCAL_SIGMA",
     "HEADING_SIGMA_RAD",
     "HELD_OUT_BIAS",
@@ -102,10 +101,6 @@ OUTLIER_DENSITY = 0.2
 # Sigmas of azimuth [rad], elevation [rad] and range [m] at which poses are compared: wide in elevation, which is not
 # what decides.
 REGISTRATION_COMPARISON_SIGMA = np.array([np.radians(0.5), np.radians(6.0), 0.2])
-# Pitch by the car's way, Doppler against road: errors on 12 simulated days of seeds 140 to 153 (40 frames, 96 and 16
-# rows) were 0.11 deg RMS where the frames' scatter gave 0.08; on a real day three sizes of the window for the lidar's
-# elevations moved it by 0.2 deg RMS.
-DOPPLER_PITCH_FLOOR_RAD = np.radians(0.15)
 # Roll by vehicle boxes: which detections of a box are taken moved it by 0.5 deg on real logs.
 BOX_ROLL_FLOOR_LIDAR_RAD = np.radians(1.0)
 

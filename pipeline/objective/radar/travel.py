@@ -33,8 +33,18 @@ from pipeline.objective.radar.registration import RANGE_M, SIDE_RAD
 from pipeline.objective.radar.vehicle_boxes import select_frames
 from schemas.observations import Observation
 
-__all__ = ["TravelDirections", "pitch_equations", "pitch_residuals", "travel_directions"]
+__all__ = [
+    "DOPPLER_PITCH_FLOOR_RAD",
+    "TravelDirections",
+    "pitch_equations",
+    "pitch_residuals",
+    "travel_directions",
+]
 
+# Pitch by the car's way, Doppler against road: errors on 12 simulated days of seeds 140 to 153 (40 frames, 96 and 16
+# rows) were 0.11 deg RMS where the frames' scatter gave 0.08; on a real day three sizes of the window for the lidar's
+# elevations moved it by 0.2 deg RMS.
+DOPPLER_PITCH_FLOOR_RAD = np.radians(0.15)
 _LEAST_SPEED_MPS = 5.0  # slower, a vertical error of 0.05 m/s is half a degree
 _LEAST_DETECTIONS = 30
 _SINGULAR = 1e-9

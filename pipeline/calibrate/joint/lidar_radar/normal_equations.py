@@ -24,7 +24,6 @@ from pipeline.calibrate.joint.lidar_radar.tilt_floors import along_radar, floor_
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_opinion
 from pipeline.calibrate.numerics.bias_floors import (
     BOX_ROLL_FLOOR_LIDAR_RAD,
-    DOPPLER_PITCH_FLOOR_RAD,
     OUTLIER_DENSITY,
     PRIOR_CONTRADICTION_SIGMAS,
     RANGE_BIAS_SIGMA_M,
@@ -35,7 +34,7 @@ from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
 from pipeline.objective.radar.moving_clusters import MovingClusters, azimuth_equations_lidar
 from pipeline.objective.radar.registration import NormalEquations, RegistrationFrames, normal_equations
-from pipeline.objective.radar.travel import TravelDirections, pitch_equations
+from pipeline.objective.radar.travel import DOPPLER_PITCH_FLOOR_RAD, TravelDirections, pitch_equations
 from pipeline.objective.radar.vehicle_boxes import (
     BIAS_SIGMA_RAD,
     BOX_CLASSES,

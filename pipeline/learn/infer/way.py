@@ -1,0 +1,179 @@
+"""The car's way as a second witness of the radar's pitch: networks match detections, which may point wrong.
+
+A network finds the radar's elevation by where detections lie among the lidar's objects. With a radar whose elevations
+are noisier than scenes are tall that is off by a degree and more, alike in every frame, and no averaging shows it. The
+velocity by Doppler and the road (`pipeline.objective.radar.travel`) need no match. So a day's answer is updated by the
+way's, by information. Where the two are farther apart than their sigmas allow, the network gives way: its part of the
+pitch is weighed as Cauchy's distribution has it, the way's is not. That asymmetry is deliberate. The way's sigma comes
+from this day's own frames, the network's bias from vehicles that it was judged on before.
+
+Only the radar's turn about one axis is updated, its position stays; all else is considered (Schmidt 1966).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.extrinsics.common_share import common_part
+from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
+from pipeline.geometry.se3 import exp_so3, inverse, log_se3
+from pipeline.learn.infer.aggregate import OBSERVABLE
+from pipeline.objective.radar.travel import (
+    DOPPLER_PITCH_FLOOR_RAD,
+    pitch_equations,
+    pitch_residuals,
+    travel_directions,
+)
+from schemas.observations import Observation
+
+__all__ = ["WayTurn", "informed_by_way", "updated_by_way", "way_turn"]
+
+_STEPS = 12  # of the robust mean; it gains a digit in two
+_ROUNDS = 30  # of re-weighting the network
+_CAUCHY = 2.0  # sigmas, as for the way's own frames
+_CONTRADICTION_SIGMAS = 2.0  # as between the witnesses of method `joint`
+_LEAST_SHARE = 0.7  # of a degree of freedom's axis in the turn, for the way to have determined it
+
+
+@dataclass(frozen=True, eq=False)
+class WayTurn:
+    """Which turn about an axis of the parent's frame the way asks for; about other axes it says nothing."""
+
+    axis: Float[np.ndarray, " 3"]  # unit vector
+    turn_rad: float  # from the pose that was asked about
+    variance: float  # of this day's frames, without the floor
+    floor: float  # variance of what all days err by alike
+    frames: int
+
+    @property
+    def sigma_rad(self) -> float:
+        """Of the turn, all included."""
+        return float(np.sqrt(self.variance + self.floor))
+
+
+def informed_by_way(solution: Solution, observations: Sequence[Observation], prior: Prior) -> Solution:
+    """The solution with what the car's way says of the radar's pitch, in the pairs that have frames.
+
+    Args:
+        solution: by networks; camera_radar is told by way of its camera_lidar.
+        observations: the frames that it rests on, or others of the day.
+        prior: what the shares of observability refer to.
+    """
+    lidar_radar, camera_lidar = solution.pairs["lidar_radar"], solution.pairs["camera_lidar"]
+    way = way_turn(observations, lidar_radar.T)
+    if way is None:
+        return solution
+    through = {
+        "lidar_radar": way,
+        "camera_radar": _seen_by_camera(way, camera_lidar, lidar_radar.T, solution.pairs["camera_radar"].T),
+    }
+    pairs = {
+        pair: updated_by_way(estimate, through[pair], prior.covariance(pair))
+        if pair in through and estimate.frames_used
+        else estimate
+        for pair, estimate in solution.pairs.items()
+    }
+    return replace(solution, pairs=pairs)
+
+
+def way_turn(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]) -> WayTurn | None:
+    """What a day's way says of a pose; None where too few frames show it.
+
+    The variance is that of the robust mean, no less than what differences between drives give.
+    """
+    travel = travel_directions(observations, T_lidar_radar, 0.0)
+    _, J = pitch_residuals(travel, T_lidar_radar)
+    mean = np.append(J[:, :2].mean(axis=0), 0.0) if len(J) else np.zeros(3)
+    if not mean.any():
+        return None
+    # A turn about this axis, the left one of a car that drives ahead, lowers the velocity.
+    axis = -mean / np.linalg.norm(mean)
+    turn_rad = 0.0
+    for _ in range(_STEPS):
+        H, g, scatter_rad = pitch_equations(
+            travel, _turned(T_lidar_radar, axis * turn_rad), len(observations)
+        )
+        if not np.isfinite(scatter_rad):
+            return None
+        information, gradient = axis[:2] @ H.sum(0) @ axis[:2], g @ axis[:2]
+        turn_rad -= float(gradient.sum() / information)
+    blocks = np.unique([o.drive for o in observations], return_inverse=True)[1].ravel()
+    between = float(np.square(np.bincount(blocks, gradient)).sum()) / information**2
+    return WayTurn(axis, turn_rad, max(1 / information, between), DOPPLER_PITCH_FLOOR_RAD**2, travel.count)
+
+
+def updated_by_way(
+    estimate: PairEstimate, way: WayTurn, prior_covariance: Float[np.ndarray, "6 6"]
+) -> PairEstimate:
+    """The estimate turned towards the way about its axis and the child's origin, with covariance and what it shares."""
+    row = np.append(way.axis, np.zeros(3))
+    direction = np.append(way.axis, np.cross(estimate.T[:3, 3], way.axis))
+    own, measured = float(row @ estimate.covariance @ row), way.variance + way.floor
+    doubt = _doubt(way.turn_rad, own, measured)
+    gain = (own + doubt) / (own + doubt + measured)
+    step, keep = gain * direction, np.eye(6) - gain * np.outer(direction, row)
+
+    def updated(covariance: np.ndarray, noise: float) -> np.ndarray:
+        wide = covariance + doubt * np.outer(direction, direction)
+        return np.asarray(keep @ wide @ keep.T + noise * np.outer(step, step))
+
+    covariance = updated(estimate.covariance, measured)
+    common = estimate.common_covariance
+    observability = np.clip(1 - np.diag(covariance) / np.diag(prior_covariance), 0.0, 1.0)
+    told = np.append(np.abs(way.axis) > _LEAST_SHARE, np.zeros(3, bool)) & (observability >= OBSERVABLE)
+    apart = way.turn_rad / np.sqrt(own + measured)
+    notes = [_sentence(way, apart)] if abs(apart) > _CONTRADICTION_SIGMAS else []
+    return replace(
+        estimate,
+        T=_turned(estimate.T, gain * way.turn_rad * way.axis),
+        covariance=covariance,
+        common_covariance=None if common is None else common_part(updated(common, way.floor), covariance),
+        observability=observability,
+        observable=estimate.observable | told,
+        diagnostics=estimate.diagnostics
+        | {
+            "doppler_pitch_offset_rad": way.turn_rad,
+            "doppler_pitch_sigma_rad": way.sigma_rad,
+            "doppler_frames": float(way.frames),
+        },
+        notes=[*estimate.notes, *notes],
+    )
+
+
+def _doubt(turn_rad: float, own: float, measured: float) -> float:
+    """Variance that is added to the network's, so that it counts as Cauchy's distribution lets it."""
+    doubt = (turn_rad / _CAUCHY) ** 2
+    for _ in range(_ROUNDS):
+        moved = turn_rad * (own + doubt) / (own + doubt + measured)
+        doubt = (moved / _CAUCHY) ** 2
+    return doubt
+
+
+def _seen_by_camera(
+    way: WayTurn, camera_lidar: PairEstimate, T_lidar_radar: np.ndarray, T_camera_radar: np.ndarray
+) -> WayTurn:
+    """The same way, asked about camera_radar: camera_lidar's own error about the axis is added."""
+    axis = camera_lidar.T[:3, :3] @ way.axis
+    wanted = camera_lidar.T @ _turned(T_lidar_radar, way.turn_rad * way.axis)
+    turn_rad = float(axis @ log_se3(wanted @ inverse(T_camera_radar))[:3])
+    own = float(axis @ camera_lidar.covariance[:3, :3] @ axis)
+    return replace(way, axis=axis, turn_rad=turn_rad, variance=way.variance + own)
+
+
+def _turned(T: Float[np.ndarray, "4 4"], omega: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
+    """T turned about the child's own origin, by a rotation vector in parent axes."""
+    out = T.copy()
+    out[:3, :3] = exp_so3(omega) @ T[:3, :3]
+    return out
+
+
+def _sentence(way: WayTurn, sigmas: float) -> str:
+    return (
+        f"the car's way (Doppler against the road, {way.frames} frames) lies {np.degrees(way.turn_rad):+.2f} +- "
+        f"{np.degrees(way.sigma_rad):.2f} deg of pitch from what the network matches, {abs(sigmas):.1f} sigmas: "
+        "the way counts, and the network as far as it does not contradict it"
+    )

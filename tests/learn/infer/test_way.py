@@ -1,0 +1,138 @@
+"""The car's way beside networks: it tells a radar's pitch by itself, and outweighs a network that contradicts it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_se3
+from pipeline.learn.infer.way import WayTurn, informed_by_way, updated_by_way, way_turn
+from schemas.calibrations import PAIRS
+from tests.makers.doppler_streets import T_LIDAR_RADAR, day_of, scene, turned
+from tests.makers.solve_scenes import T_CAMERA_LIDAR
+
+SIGMA = np.array([*np.radians([0.5, 0.3, 0.1]), 0.02, 0.02, 0.1])
+PRIOR_COVARIANCE = np.diag([np.radians(2.0) ** 2] * 3 + [0.2**2] * 3)
+
+
+def estimate_of(pair, T, sigma=SIGMA):
+    covariance = np.diag(sigma**2)
+    return PairEstimate(
+        pair, T, covariance, np.full(6, 0.9), np.ones(6, bool), 12, common_covariance=0.25 * covariance
+    )
+
+
+def solution_at(T_lidar_radar, T_camera_radar, camera_lidar_sigma_deg=0.05):
+    sure = np.array([*np.radians([camera_lidar_sigma_deg] * 3), 0.02, 0.02, 0.02])
+    at = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_lidar_radar, "camera_radar": T_camera_radar}
+    sigmas = {"camera_lidar": sure, "lidar_radar": SIGMA, "camera_radar": SIGMA[[1, 2, 0, 3, 4, 5]]}
+    return Solution("joint-ssl", {p: estimate_of(p, at[p], sigmas[p]) for p in PAIRS})
+
+
+def prior():
+    return Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.2)
+
+
+def numbers(way, turn_deg, sigma_deg=0.2):
+    return replace(way, turn_rad=np.radians(turn_deg), variance=np.radians(sigma_deg) ** 2, floor=0.0)
+
+
+WAY = WayTurn(np.array([0.0, 1.0, 0.0]), 0.0, 1e-5, 1e-6, 40)
+
+
+@pytest.fixture(scope="module")
+def street():
+    return day_of(3, 16, noise_deg=2.0)
+
+
+@pytest.mark.parametrize("pitch_deg", [-2.0, 1.0, 2.5])
+def test_the_way_alone_finds_by_how_much_a_radar_is_pitched(street, pitch_deg):
+    way = way_turn(street, turned(T_LIDAR_RADAR, np.radians(pitch_deg)))
+    assert abs(way.turn_rad + np.radians(pitch_deg)) < 3 * way.sigma_rad
+    assert np.degrees(way.sigma_rad) < 0.4
+    assert way.axis @ [0, 1, 0] > 0.99
+
+
+def test_standing_cars_flat_radars_and_few_frames_change_nothing(street):
+    rng = np.random.default_rng(1)
+    solution = solution_at(T_LIDAR_RADAR, T_CAMERA_LIDAR @ T_LIDAR_RADAR)
+    standing = [scene(rng, speed=1.0) for _ in range(8)]
+    flat = [replace(o, radar_has_elevation=False) for o in street]
+    for day in (standing, flat, street[:4], []):
+        assert informed_by_way(solution, day, prior()) is solution
+
+
+def test_a_network_whose_detections_point_wrong_gives_way_in_both_radar_pairs(street):
+    wrong = turned(T_LIDAR_RADAR, np.radians(2.0))
+    solution = solution_at(wrong, T_CAMERA_LIDAR @ wrong)
+    told = informed_by_way(solution, street, prior()).pairs
+    truth = {"lidar_radar": T_LIDAR_RADAR, "camera_radar": T_CAMERA_LIDAR @ T_LIDAR_RADAR}
+    for pair, T in truth.items():
+        error = log_se3(told[pair].T @ inverse(T))[:3]
+        sigma = np.sqrt(np.diag(told[pair].covariance)[:3])
+        assert np.degrees(np.abs(error)).max() < 0.4
+        assert np.all(np.abs(error) < 3 * sigma)
+        assert "the way counts" in told[pair].notes[0]
+        np.testing.assert_allclose(told[pair].T[:3, 3], solution.pairs[pair].T[:3, 3], atol=1e-12)
+    assert told["camera_lidar"] is solution.pairs["camera_lidar"]
+
+
+def test_pairs_that_were_not_asked_for_keep_their_prior(street):
+    solution = solution_at(turned(T_LIDAR_RADAR, 0.03), T_CAMERA_LIDAR @ T_LIDAR_RADAR)
+    kept = replace(solution.pairs["lidar_radar"], frames_used=0)
+    told = informed_by_way(
+        replace(solution, pairs=solution.pairs | {"lidar_radar": kept}), street, prior()
+    ).pairs
+    assert told["lidar_radar"] is kept
+    assert told["camera_radar"] is not solution.pairs["camera_radar"]
+
+
+def test_what_agrees_is_averaged_by_information_and_gets_surer():
+    before = estimate_of("lidar_radar", T_LIDAR_RADAR)
+    after = updated_by_way(before, numbers(WAY, 0.1), PRIOR_COVARIANCE)
+    moved_deg = np.degrees(log_se3(after.T @ inverse(before.T))[1])
+    assert moved_deg == pytest.approx(0.1 * 0.3**2 / (0.3**2 + 0.2**2), rel=0.05)
+    sigma_deg = np.degrees(np.sqrt(after.covariance[1, 1]))
+    assert sigma_deg == pytest.approx((0.3**-2 + 0.2**-2) ** -0.5, rel=0.05)
+    assert after.notes == []
+    assert np.array_equal(np.delete(np.diag(after.covariance)[:3], 1), np.delete(SIGMA[:3] ** 2, 1))
+
+
+def test_a_way_that_is_unsure_leaves_the_network_where_it_was():
+    before = estimate_of("lidar_radar", T_LIDAR_RADAR)
+    after = updated_by_way(before, numbers(WAY, 1.0, sigma_deg=60.0), PRIOR_COVARIANCE)
+    np.testing.assert_allclose(after.T, before.T, atol=1e-5)
+    np.testing.assert_allclose(after.covariance, before.covariance, atol=1e-5 * SIGMA.max())
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 0.5, 3.0])
+def test_covariances_stay_covariances_and_the_common_part_stays_inside(turn_deg):
+    after = updated_by_way(
+        estimate_of("lidar_radar", T_LIDAR_RADAR), numbers(WAY, turn_deg), PRIOR_COVARIANCE
+    )
+    scale = 1 / np.sqrt(np.diag(after.covariance))
+    for part in (after.covariance, after.common_covariance, after.covariance - after.common_covariance):
+        assert np.linalg.eigvalsh(part * np.outer(scale, scale)).min() > -1e-9
+
+
+def test_pitch_that_the_network_did_not_know_is_determined_by_the_way_and_nothing_else_is():
+    blind = SIGMA.copy()
+    blind[1] = np.radians(2.0)
+    before = replace(
+        estimate_of("lidar_radar", T_LIDAR_RADAR, blind), observable=np.array([0, 0, 1, 1, 1, 0], bool)
+    )
+    after = updated_by_way(before, numbers(WAY, 1.5), PRIOR_COVARIANCE)
+    assert after.observable.tolist() == [False, True, True, True, True, False]
+    assert after.observability[1] > 0.9
+
+
+def test_the_turn_of_a_tilted_parent_is_about_the_same_line():
+    """Asked about camera_radar the way says the same as about lidar_radar where camera_lidar is exact."""
+    street = day_of(5, 12, noise_deg=0.5)
+    wrong = turned(T_LIDAR_RADAR, np.radians(1.0))
+    told = informed_by_way(solution_at(wrong, T_CAMERA_LIDAR @ wrong, 1e-6), street, prior()).pairs
+    offsets = [told[p].diagnostics["doppler_pitch_offset_rad"] for p in ("lidar_radar", "camera_radar")]
+    assert offsets[0] == pytest.approx(offsets[1], abs=1e-9)
+    rotated = from_rotation_translation(exp_so3(np.array([0.0, 0.0, 0.4])) @ wrong[:3, :3], wrong[:3, 3])
+    assert way_turn(street, rotated).axis @ [0, 1, 0] < 0.95
