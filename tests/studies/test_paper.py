@@ -38,6 +38,23 @@ def test_the_papers_columns_are_means_of_the_lines_measured_and_its_rows_stand_b
     assert "\n".join(lines) in committed
 
 
+def test_the_papers_own_training_is_told_by_single_passes_and_days_with_its_share_of_samples():
+    line = {"method": "pairwise-ssl", "day": {"environment": "urban"}}
+    passes = {p: {"prior": [[1.0, 2.0, 0.1]], "errors": [[[0.5, 0.6, 0.2], [9.0] * 3]]} for p in PAIRS}
+    day = {p: {"az_deg": 3.0, "el_deg": 4.0, "range_m": 0.3} for p in PAIRS}
+    results = [
+        line | {"part": "frames", "starts": {"prior": passes}},
+        line | {"part": "days", "pairs": day, "loop": [5.0, 6.0, 0.4]},
+    ]
+    lines = paper_table.own_table(results, {"joint": {"samples": 40_000}}).splitlines()
+    assert lines[1] == "joint 1.00%"
+    start, frame, whole, printed = lines[5:]
+    assert start.endswith("| 1 | 1.000 | 2.000 | 1.000 | 2.000 | 1.000 | 2.000 | 0.100 | - | - | - |")
+    assert frame.endswith("| 1 | 0.500 | 0.600 | 0.500 | 0.600 | 0.500 | 0.600 | 0.200 | - | - | - |")
+    assert whole.endswith("| 3.000 | 4.000 | 0.300 | 5.000 | 6.000 | 0.400 |")
+    assert printed.startswith("| *paper: pairwise SSL")
+
+
 def test_the_page_of_figures_needs_nothing_from_outside_and_tells_errors_against_the_truth():
     observations = make_day(3, seed=1)
     scenes = [Scene(frame_of(o, np.random.default_rng(i)), o) for i, o in enumerate(observations)]
@@ -77,7 +94,7 @@ def test_a_learning_curve_is_continued_by_its_power_law_and_not_where_it_does_no
 
 
 def test_runs_of_one_pair_and_of_all_stand_in_one_table_and_one_picture():
-    errors = {"guess": [1.5, 1.5, 0.05], "answer": [1.2, 0.9, 0.09]}
+    errors = {"guess": [1.5, 1.5, 0.05], "answer": [1.2, 0.9, 0.09], "shift_m": [0.1, 0.0, -0.8]}
     loss = {"guess": 2.0, "answer": 1.5, "truth": 1.0}
     run = {"samples": 40_000, "minutes": 12.0, "loss": loss, "extrapolated": None}
     run["curve"] = {"samples": [2000, 40_000], "loss": [1.75, 1.25]}
@@ -92,6 +109,7 @@ def test_runs_of_one_pair_and_of_all_stand_in_one_table_and_one_picture():
     assert not alone[3].strip()
     assert not alone[4].strip()
     assert alone[5].startswith("1.50 / 1.50 / 0.050 -> 1.20 / 0.90 / 0.090")
+    assert "pairwise lidar-radar: lidar_radar [0.1, 0.0, -0.8]" in "\n".join(lines)
     left = paper_ssl.left_of(told["joint"])
     assert left == {"samples": [0, 2000, 40_000], "left": [100.0, 75.0, 25.0]}
     assert paper_ssl.drawn(dict.fromkeys(told, left)).count(">pairwise lidar-radar<") == 1

@@ -98,7 +98,12 @@ def measure(run: Path, batch: TrainingBatch, true: TrainingBatch, frames: PaperF
         }
     known = [pair for pair in PAIRS if pair in pairs]
     errors = {
-        pair: {"guess": _errors(pair, start, truth), "answer": _errors(pair, found, truth)} for pair in known
+        pair: {
+            "guess": _errors(pair, start, truth),
+            "answer": _errors(pair, found, truth),
+            "shift_m": _shift(pair, found, truth),
+        }
+        for pair in known
     }
     curve = curve_of(run, config.batch_size)
     seen, fallen = (np.array(curve[name], float) for name in ("samples", "loss"))
@@ -188,6 +193,8 @@ def table(about: dict[str, Any], told: dict[str, Any]) -> str:
         share = f"{run['samples']:,} ({run['samples'] / PAPER_SAMPLES:.2%})"
         minutes = f"{run['minutes']} ({hours_for_the_paper(run):.0f})"
         lines.append(f"| {name} | {share} | {minutes} | {' | '.join(cells)} |")
+    shifts = [f"{n}: {p} {e['shift_m']}" for n, r in told.items() for p, e in r["errors"].items()]
+    lines += ["", f"Mean shift of the answers, parent axes [m]: {'; '.join(shifts)}"]
     lines += ["", "Loss L_P + L_G on those frames:", ""]
     lines += [
         "| run | at the guess | answered | at the truth | of the way | extrapolated |",
@@ -215,6 +222,12 @@ def _errors(pair: str, T: tuple[torch.Tensor, ...], truth: tuple[torch.Tensor, .
     errors = np.array([errors_at_targets(pair, a, b) for a, b in both])
     mean = np.nanmean(np.abs(errors), axis=0)
     return [round(float(v), 4) for v in (np.degrees(mean[0]), np.degrees(mean[1]), mean[2])]
+
+
+def _shift(pair: str, T: tuple[torch.Tensor, ...], truth: tuple[torch.Tensor, ...]) -> list[float]:
+    """Mean over frames of how far the answer puts the second sensor from where it is [m], parent axes."""
+    k = PAIRS.index(pair)
+    return [round(float(v), 3) for v in (T[k] - truth[k])[:, :3, 3].mean(0)]
 
 
 def _cell(pair: str, errors: list[float]) -> str:
