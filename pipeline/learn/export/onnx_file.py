@@ -25,6 +25,7 @@ from pipeline.learn.sample.layout import (
     GRAPH_INPUTS,
     LIDAR_CHANNELS,
     LIKELIHOOD,
+    MARKED_POINTS,
     MATCHED_POINTS,
     OBJECT_POINTS,
     PAIRS,
@@ -110,6 +111,8 @@ def _examples(config: NetworkConfig) -> tuple[Tensor, ...]:
         random(1, RADAR_POINTS, 3),
         torch.ones(1, RADAR_POINTS, dtype=torch.bool),
         torch.ones(1, dtype=torch.bool),
+        points[:, :MARKED_POINTS] @ to_camera.T,
+        torch.ones(1, MARKED_POINTS),
     )
 
 

@@ -21,6 +21,9 @@ from pipeline.learn.sample.layout import (
     INDEX_BITS,
     LIDAR_FEATURES,
     MARGIN_DEG,
+    MARK_SIGMAS,
+    MARK_WINDOW,
+    MARKED_POINTS,
     MATCHED_POINTS,
     MILLIMETRES,
     NEAR_M,
@@ -33,6 +36,7 @@ from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
 
 __all__ = ["FrameSensors", "compiled_nearest_points", "frame_sensors", "render_frame"]
 
+_INTENSITY = LIDAR_FEATURES.index("intensity")
 _EDGE, _GROUND = LIDAR_FEATURES.index("edge"), LIDAR_FEATURES.index("ground")
 
 
@@ -125,10 +129,12 @@ def render_frame(
     solid = _best(rank, in_view & (ground < 0.5), OBJECT_POINTS)
     weight = np.where(ground > 0.5, np.float32(GROUND_WEIGHT), np.float32(1))
     count = min(len(radar_camera), RADAR_POINTS)
+    painted, index = _painted(lidar_camera, sensors.lidar_features, grid)
+    strength, marks = _marks(painted, index)
     return {
         "camera": sensors.camera_channels(camera_channels),
-        "lidar_grid": _painted(lidar_camera, sensors.lidar_features, grid)[None],
-        "radar_grid": _painted(radar_camera, sensors.radar_features, grid)[None],
+        "lidar_grid": painted[None],
+        "radar_grid": _painted(radar_camera, sensors.radar_features, grid)[0][None],
         "points_camera": _padded(lidar_camera[matched], MATCHED_POINTS),
         "point_weight": _padded(weight[matched], MATCHED_POINTS),
         "objects": _padded(sensors.lidar_xyz_m[solid], OBJECT_POINTS),
@@ -138,6 +144,8 @@ def render_frame(
         "radar_features": _padded(sensors.radar_features[:count], RADAR_POINTS),
         "radar_valid": _padded(np.ones(count, bool), RADAR_POINTS),
         "radar_has_elevation": np.array([sensors.radar_has_elevation]),
+        "marks_camera": _padded(lidar_camera[marks], MARKED_POINTS),
+        "mark_weight": _padded(strength, MARKED_POINTS),
     }
 
 
@@ -173,8 +181,8 @@ def _nearest(points, valid, limits, height, width, out):  # noqa: ANN001, ANN202
             out[cell] = n
 
 
-def _painted(points_camera: np.ndarray, features: np.ndarray, grid: Grid) -> np.ndarray:
-    """C H W: occupied, nearness and features of the points that won their cells."""
+def _painted(points_camera: np.ndarray, features: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """C H W: occupied, nearness and features of the points that won their cells; and which points these are."""
     index = compiled_nearest_points(points_camera, np.ones(len(points_camera), bool), grid)
     out = np.zeros((2 + features.shape[1], len(index)), np.float32)
     full = np.flatnonzero(index >= 0)
@@ -183,7 +191,29 @@ def _painted(points_camera: np.ndarray, features: np.ndarray, grid: Grid) -> np.
     out[0, full] = 1
     out[1, full] = np.minimum(np.float32(NEARNESS_M) / distance, 2)
     out[2:, full] = features[winners].T
-    return out.reshape(-1, grid.height, grid.width)
+    return out.reshape(-1, grid.height, grid.width), index
+
+
+def _marks(painted: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Strength and points of the brightest ground, brightest first (`network.markings.mark_strength`)."""
+    ground = painted[0] * painted[2 + _GROUND]
+    values = painted[2 + _INTENSITY] * ground
+    share = _row_sums(ground)
+    above = (painted[2 + _INTENSITY] - _row_sums(values) / np.maximum(share, 1e-4 * MARK_WINDOW)) * ground
+    spread = np.sqrt((above * above).sum() / max(ground.sum(), 1.0)) + 1e-3
+    strength = np.clip((above / spread - 1) / (MARK_SIGMAS - 1), 0, 1).astype(np.float32).ravel()
+    cells = np.flatnonzero(strength)
+    cells = cells[np.argsort(-strength[cells], kind="stable")][:MARKED_POINTS]
+    return strength[cells], index[cells]
+
+
+def _row_sums(values: np.ndarray) -> np.ndarray:
+    """Sums over MARK_WINDOW columns about each, as if beyond the grid there were zeros."""
+    half, width = MARK_WINDOW // 2, values.shape[1]
+    total = np.zeros((len(values), width + 1))
+    np.cumsum(values, axis=1, out=total[:, 1:])
+    column = np.arange(width)
+    return total[:, np.minimum(column + half + 1, width)] - total[:, np.maximum(column - half, 0)]
 
 
 def _heights(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:

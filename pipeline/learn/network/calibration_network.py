@@ -31,7 +31,12 @@ class CalibrationNetwork(nn.Module):
         self.core: MatchingCore | ConcatCore
         if config.architecture == "matching":
             self.core = MatchingCore(
-                config.grid, config.estimated, config.width, config.hidden, config.camera_channels
+                config.grid,
+                config.estimated,
+                config.width,
+                config.hidden,
+                config.camera_channels,
+                config.marks,
             )
         else:
             self.core = ConcatCore(config.grid, config.estimated, config.width, config.hidden)

@@ -9,6 +9,7 @@ from torch.nn import functional as F  # noqa: N812 - the name that everybody use
 
 from pipeline.learn.network.class_matcher import FLOOR, NEUTRAL, ClassMatcher, Match
 from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder, PointEncoder
+from pipeline.learn.network.markings import log_markings
 from pipeline.learn.network.occupancy_matcher import OccupancyMatch, OccupancyMatcher
 from pipeline.learn.network.outputs import CoreOutputs, Heads, pose_of_twist
 from pipeline.learn.network.rendering import grid_cells, sphere
@@ -51,8 +52,9 @@ class MatchingCore(nn.Module):
     confusions: Tensor | None
 
     def __init__(
-        self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int, channels: int = CAMERA_CHANNELS
-    ) -> None:
+        self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int, channels: int = CAMERA_CHANNELS,
+        marks: bool = False,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.grid, self.pairs = grid, pairs
         confusions = confusions_of(_CONFUSED_ALIKE, _CONFUSED_SOLID) if channels > CAMERA_CHANNELS else None
@@ -65,6 +67,8 @@ class MatchingCore(nn.Module):
             self.lidar_matcher = ClassMatcher(grid)
             # exp: what an edge of the sweep on a boundary is worth, against a point of one class.
             self.log_edge_worth = nn.Parameter(torch.zeros(())) if channels > CAMERA_CHANNELS else None
+            # exp: what bright ground on paint is worth, against a point of one class.
+            self.log_mark_worth = nn.Parameter(torch.zeros(())) if marks else None
             sizes.append(self.lidar_matcher.surface_size + 12)
         if "lidar_radar" in pairs:
             self.radar_matcher = OccupancyMatcher(len(RADAR_FEATURES))
@@ -129,7 +133,14 @@ class MatchingCore(nn.Module):
             weight = view.point_weight * self._worth(likelihood, view.points_camera)
             edge = self._at_points(view.lidar_grid[:, _EDGE : _EDGE + 1], view.points_camera)
             maps, probability = self._with_edges(likelihood[:, :-1], probability, edge)
-            found = self.lidar_matcher(maps, view.points_camera, probability, weight)
+            points = view.points_camera
+            if self.log_mark_worth is not None:
+                marked = view.mark_weight * self._worth(likelihood, view.marks_camera)
+                maps, probability = self._with_marks(
+                    view.camera, maps, probability, view.marks_camera.shape[1]
+                )
+                points, weight = torch.cat([points, view.marks_camera], 1), torch.cat([weight, marked], 1)
+            found = self.lidar_matcher(maps, points, probability, weight)
             bases["camera_lidar"] = found
             features.append(_features(found.surfaces.flatten(1), found))
         if "lidar_radar" in self.pairs:
@@ -170,6 +181,18 @@ class MatchingCore(nn.Module):
             return maps, probability
         worth = torch.exp(self.log_edge_worth) * edge
         return torch.cat([maps, log_boundaries(maps)], 1), torch.cat([probability, worth], -1)
+
+    def _with_marks(
+        self, camera: Tensor, maps: Tensor, probability: Tensor, count: int
+    ) -> tuple[Tensor, Tensor]:
+        """Paint as the last class, and behind the points as many that have no other."""
+        assert self.log_mark_worth is not None
+        paint, enough = log_markings(camera, maps[:, :_CLASSES])
+        frames, points, classes = probability.shape
+        worth = (torch.exp(self.log_mark_worth) * enough)[:, None, None].expand(frames, count, 1)
+        of_marks = torch.cat([probability.new_zeros(frames, count, classes), worth], -1)
+        of_points = torch.cat([probability, probability.new_zeros(frames, points, 1)], -1)
+        return torch.cat([maps, paint], 1), torch.cat([of_points, of_marks], 1)
 
     def _worth(self, likelihood: Tensor, points_camera: Tensor) -> Tensor:
         """B N: what a point counts by where the guess puts it, fixed before it moves: no move can raise it."""

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from pipeline.learn.network.inputs import NetworkInputs
+from pipeline.learn.network.markings import mark_strength
 from pipeline.learn.network.rendering import nearest_points, paint
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import (
@@ -17,6 +18,7 @@ from pipeline.learn.sample.layout import (
     GROUND_WEIGHT,
     LIDAR_FEATURES,
     MARGIN_DEG,
+    MARKED_POINTS,
     MATCHED_POINTS,
     NEAR_M,
     NEARNESS_M,
@@ -47,6 +49,8 @@ class RenderedView:
     radar_features: Float[Tensor, "B M 3"]
     radar_valid: Bool[Tensor, "B M"]
     radar_has_elevation: Bool[Tensor, " B"]
+    marks_camera: Float[Tensor, "B P 3"]  # lidar points on bright ground, optical frame [m]
+    mark_weight: Float[Tensor, "B P"]  # 0 = absent
 
 
 def render(
@@ -67,9 +71,13 @@ def render(
     matched = _best(rank + EDGE_BONUS * edge + OBJECT_BONUS * (1 - ground), in_view, MATCHED_POINTS)
     solid = _best(rank.expand_as(ground), in_view & (ground < 0.5), OBJECT_POINTS)
     weight = torch.where(ground > 0.5, GROUND_WEIGHT, 1.0) * in_view
+    painted = paint(
+        index, _channels(lidar_camera, sensors.lidar_features, sensors.nearness[:, None, None]), grid
+    )
+    strength, cell = torch.topk(mark_strength(painted).flatten(1), MARKED_POINTS, dim=1)
     view = RenderedView(
         torch.cat([sensors.camera, sensors.classes], 1) if classes else sensors.camera,
-        paint(index, _channels(lidar_camera, sensors.lidar_features, sensors.nearness[:, None, None]), grid),
+        painted,
         paint(radar_index, _channels(radar_camera, sensors.radar_features), grid),
         _pick(lidar_camera, matched),
         weight.gather(1, matched),
@@ -80,6 +88,8 @@ def render(
         sensors.radar_features,
         sensors.radar_valid,
         sensors.radar_has_elevation,
+        _pick(lidar_camera, index.gather(1, cell).clamp(min=0)) * (strength > 0)[..., None],
+        strength,
     )
     return view, index
 

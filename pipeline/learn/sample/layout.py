@@ -21,6 +21,9 @@ __all__ = [
     "LIDAR_FEATURES",
     "LIKELIHOOD",
     "MARGIN_DEG",
+    "MARKED_POINTS",
+    "MARK_SIGMAS",
+    "MARK_WINDOW",
     "MATCHED_POINTS",
     "MILLIMETRES",
     "NEARNESS_M",
@@ -52,6 +55,9 @@ NEAR_M = 0.5  # nothing outside the car is nearer
 MILLIMETRES = 1000.0  # ranges are compared in millimetres
 INDEX_BITS = 20  # up to a million points share a key with their range
 MATCHED_POINTS = 1536  # lidar points whose classes are matched with the camera's
+MARKED_POINTS = 192  # points of bright ground that are matched with the image's paint
+# Ground of that many sigmas above what lies beside it is paint, within 10 deg to each side of the cell.
+MARK_SIGMAS, MARK_WINDOW = 3.0, 51
 OBJECT_POINTS = 512  # lidar points off the ground that radar detections are matched with
 RADAR_POINTS = 384  # as table training holds them
 # Added to a rank in 0..1 to choose points: edges first, then objects. Unequal fractions of a rank's step, so that no
@@ -63,7 +69,8 @@ MARGIN_DEG = 8.0  # beyond the grid's border: for guesses that are wrong
 # Inputs of the exported graph in order: the fields of `network.views.RenderedView`.
 GRAPH_INPUTS = (
     "camera", "lidar_grid", "radar_grid", "points_camera", "point_weight", "objects", "object_weight",
-    "radar_lidar", "radar_camera", "radar_features", "radar_valid", "radar_has_elevation",
+    "radar_lidar", "radar_camera", "radar_features", "radar_valid", "radar_has_elevation", "marks_camera",
+    "mark_weight",
 )  # fmt: skip
 LIKELIHOOD = "camera_log_likelihood"  # an output, where a graph can be cut to encode the camera once
 
@@ -79,6 +86,7 @@ class NetworkConfig:
         width: channels of the encoders' first stage.
         hidden: features per pair before fusion (matching), fused features (concat).
         takes_classes: the camera is its image and what a segmenter makes of it, where there is one (matching).
+        marks: bright ground of the sweep is matched with the image's (matching); files before 0.9.0 do not.
     """
 
     architecture: Literal["matching", "concat"] = "matching"
@@ -87,6 +95,7 @@ class NetworkConfig:
     width: int = 16
     hidden: int = 192
     takes_classes: bool = False
+    marks: bool = False
 
     @property
     def camera_channels(self) -> int:

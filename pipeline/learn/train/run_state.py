@@ -187,7 +187,9 @@ def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
 
 def _take_weights(network: CalibrationNetwork, start: Path) -> None:
     trained = network_of_file(start) if start.suffix == ".onnx" else network_of_run(start)
-    if replace(trained.config, takes_classes=network.config.takes_classes) != network.config:
+    # What the camera is shown, and whether paint is matched, may change between stages.
+    shown = replace(trained.config, takes_classes=network.config.takes_classes, marks=network.config.marks)
+    if shown != network.config:
         problem = f"{start} has a network of another kind, {trained.config}, not {network.config}"
         raise ConfigError("train", "start-from", problem)
     network.load_state_dict(_widened(trained.state_dict(), network.state_dict()))
@@ -207,7 +209,13 @@ def _widened(trained: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, 
 
 def _network_config(config: TrainConfig, grid: Grid) -> NetworkConfig:
     return NetworkConfig(
-        config.architecture, config.pairs, grid, config.width, config.hidden, config.takes_classes
+        config.architecture,
+        config.pairs,
+        grid,
+        config.width,
+        config.hidden,
+        config.takes_classes,
+        config.marks,
     )
 
 

@@ -112,6 +112,7 @@ class TrainConfig(_Section):
     takes_classes: bool = (
         False  # besides its image the camera shows what a segmenter makes of it, where there is one
     )
+    marks: bool = False  # bright ground of the sweep is matched with paint in the image
     iterations: Annotated[int, Field(ge=1, le=5)] = 1  # passes per frame; losses of all passes are averaged
     # Encoders learn from classes alone, at every step; matchers have few weights and cost half of a step: they join at
     # every n-th.

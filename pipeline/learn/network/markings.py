@@ -1,0 +1,65 @@
+"""Lane paint and other bright ground: reflectivity of the sweep against brightness of the image.
+
+Ground is most of what both sensors see, and its classes say least. Paint returns more light than the asphalt beside
+it, to a lidar and to a camera: lines that hold pitch, roll and yaw where a sweep has few rows. Both sides are high-pass
+filters along the row, in units of their own spread, so gains, exposures and scales of reflectivity do not matter.
+
+Source: nighttime lane registration is old; that it is what decides on real sweeps of 16 rings was measured for the
+optimiser (`pipeline/objective/camera_lidar`), whose term this is on the network's grid.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
+
+from pipeline.learn.sample.layout import LIDAR_FEATURES, MARK_SIGMAS, MARK_WINDOW
+
+__all__ = ["log_markings", "mark_strength"]
+
+_OCCUPIED, _INTENSITY, _GROUND = 0, 2 + LIDAR_FEATURES.index("intensity"), 2 + LIDAR_FEATURES.index("ground")
+# Of the image: narrower than the sweep's, for it is dense, and three rows high.
+_WIDE, _HIGH = 25, 3
+_FULL_SIGMAS = 2.0  # contrast that counts as paint for certain
+_NO_MARKING = 0.1  # likelihood of bright ground where the image has no paint: wet patches, kerbs, snow
+_LEAST_ROAD = 50.0  # cells; fewer show no line
+_ROAD, _VERGE = 0, 1  # of GRID_CLASSES
+_FLAT = 1e-3  # a spread below this is rounding
+
+
+def mark_strength(lidar_grid: Float[Tensor, "B C H W"]) -> Float[Tensor, "B H W"]:
+    """How far each cell's ground stands out of the row beside it: 0 up to one sigma, 1 at MARK_SIGMAS and beyond.
+
+    Zero everywhere where no reflectivity is logged.
+    """
+    ground = lidar_grid[:, _OCCUPIED : _OCCUPIED + 1] * lidar_grid[:, _GROUND : _GROUND + 1]
+    above = _above_beside(lidar_grid[:, _INTENSITY : _INTENSITY + 1], ground, (1, MARK_WINDOW))
+    return ((above - 1.0) / (MARK_SIGMAS - 1.0)).clamp(0.0, 1.0)[:, 0]
+
+
+def log_markings(
+    camera: Float[Tensor, "B C H W"], likelihood: Float[Tensor, "B K H W"]
+) -> tuple[Float[Tensor, "B 1 H W"], Float[Tensor, " B"]]:
+    """Log-likelihood of bright ground in the image's cells, and 1 where there is road enough to look for it.
+
+    Args:
+        camera: red, green, blue, and where the image shows the cell.
+        likelihood: logarithms, of GRID_CLASSES.
+    """
+    road = torch.exp(likelihood[:, _ROAD : _VERGE + 1]).sum(1, keepdim=True).clamp(max=1.0) * camera[:, 3:4]
+    above = _above_beside(camera[:, :3].mean(1, keepdim=True), road, (_HIGH, _WIDE))
+    contrast = (above / _FULL_SIGMAS).clamp(0.0, 1.0)
+    enough = ((road > 0.5).to(road.dtype).sum((1, 2, 3)) > _LEAST_ROAD).to(contrast.dtype)
+    return torch.log(_NO_MARKING + (1 - _NO_MARKING) * contrast), enough
+
+
+def _above_beside(values: Tensor, mask: Tensor, window: tuple[int, int]) -> Tensor:
+    """Values less their mean over the masked cells of a window about them, over the spread of that; 0 off the mask."""
+    pad = (window[0] // 2, window[1] // 2)
+    share = F.avg_pool2d(mask, window, 1, pad)
+    beside = F.avg_pool2d(values * mask, window, 1, pad) / share.clamp(min=1e-4)
+    above = (values - beside) * mask
+    spread = (above * above).sum((2, 3), keepdim=True) / mask.sum((2, 3), keepdim=True).clamp(min=1.0)
+    return above / (torch.sqrt(spread) + _FLAT)
