@@ -1,8 +1,7 @@
 """Single-frame inference with onnxruntime: render at the guess, compute, correct, up to three times. No torch.
 
 No semantics are needed either: what the encoders know is in the file; those that take classes use them where there are
-some. The graph is cut behind the camera's encoder,
-whose answer does not depend on the guess.
+some. What the camera alone decides is computed once (`split_graph`).
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnx.utils
 import onnxruntime
 from jaxtyping import Float
 
 from pipeline.errors import ModelError
 from pipeline.learn.infer.compiled_rendering import FrameSensors, render_frame
+from pipeline.learn.infer.split_graph import split_graph
 from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import LIKELIHOOD, PAIRS, NetworkConfig
+from pipeline.learn.sample.layout import PAIRS, NetworkConfig
 
 __all__ = ["FrameEstimate", "SingleFrameCalibrator", "config_from_metadata"]
 
@@ -69,15 +68,9 @@ class SingleFrameCalibrator:
             raise ModelError(str(path), f"is no readable ONNX file: {err}") from err
         self.metadata = {entry.key: entry.value for entry in model.metadata_props}
         self.config = config_from_metadata(path, self.metadata)
-        outputs = {o.name for o in model.graph.output}
-        self._encoder = None
-        if LIKELIHOOD in outputs:
-            cut = onnx.utils.Extractor(model)
-            others = [i.name for i in model.graph.input if i.name != "camera"]
-            self._encoder = _session(cut.extract_model(["camera"], [LIKELIHOOD]), threads)
-            self._network = _session(cut.extract_model([LIKELIHOOD, *others], _ANSWERS), threads)
-        else:
-            self._network = _session(model, threads)
+        once, by_pass = split_graph(model, "camera", _ANSWERS)
+        self._once = None if once is None else _session(once, threads)
+        self._network = _session(by_pass, threads)
         self._channels = self.config.camera_channels
         self._inputs = {i.name for i in self._network.get_inputs()}
 
@@ -105,14 +98,10 @@ class SingleFrameCalibrator:
         """
         camera_radar = T_camera_lidar @ T_lidar_radar if T_camera_radar is None else T_camera_radar
         guess = (T_camera_lidar, camera_radar, T_lidar_radar)
-        likelihood = None
-        if self._encoder is not None:
-            likelihood = self._encoder.run(None, {"camera": sensors.camera_channels(self._channels)})[0]
+        known = self._of_camera(sensors)
         found: list[FrameEstimate] = []
         for _ in range(iterations):
-            view = render_frame(sensors, *guess, self.grid, self._channels)
-            if likelihood is not None:
-                view[LIKELIHOOD] = likelihood
+            view = render_frame(sensors, *guess, self.grid, self._channels) | known
             feed = {name: view[name] for name in self._inputs}
             corrections, log_variance = self._network.run(_ANSWERS, feed)
             step = corrections[0].astype(np.float64)
@@ -121,6 +110,13 @@ class SingleFrameCalibrator:
             step[:, :3, 3] = 0.0
             guess = self._corrected(step, guess)
         return found
+
+    def _of_camera(self, sensors: FrameSensors) -> dict[str, np.ndarray]:
+        """What the camera alone decides, by name."""
+        if self._once is None:
+            return {}
+        values = self._once.run(None, {"camera": sensors.camera_channels(self._channels)})
+        return dict(zip((o.name for o in self._once.get_outputs()), values, strict=True))
 
     def _corrected(
         self, corrections: Float[np.ndarray, "3 4 4"], guess: tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -95,18 +95,17 @@ class ClassMatcher(nn.Module):
             # Large cells need no dense points: every other one, as they come in an even irregular order.
             stride = 1 if level is self.levels[-1] else 2
             turned = points_camera[:, ::stride] @ R.transpose(1, 2)
-            groups = self._groups(turned, weight[:, ::stride])
-            scores = self._scores(table, level, turned, probability[:, ::stride])
-            by_group = torch.einsum("bgn,bnij->bgij", groups, scores)
-            weights = groups.sum(-1)
-            sharpness = torch.exp(log_sharpness) / weights.sum(-1).clamp(min=1e-3)
-            strips = groups[:, :_STRIPS] + groups[:, _STRIPS:]
-            directions, _ = self._centres(strips, turned)
+            angles = sphere(turned)
+            cells = grid_cells(angles, self.grid)
+            groups = self._groups(angles, cells, weight[:, ::stride])
+            by_group = self._scores(table, level, cells, probability[:, ::stride], groups)
+            sums = _sums(groups, turned)
+            sharpness = torch.exp(log_sharpness) / sums[..., -1].sum(-1).clamp(min=1e-3)
+            directions, _ = _centres(sums[:, :_STRIPS] + sums[:, _STRIPS:])
             strip_scores = by_group[:, :_STRIPS] + by_group[:, _STRIPS:]
             omega = self._turn(level, strip_scores, directions, sharpness)
             R = exp_so3(omega) @ R
-        centre = self._centres(groups, turned)
-        return self._finish(self.levels[-1], by_group, centre, sharpness, omega, R)
+        return self._finish(self.levels[-1], by_group, _centres(sums), sharpness, omega, R)
 
     def _pyramid(self, log_likelihood: Tensor) -> list[Tensor]:
         """Maps per level, padded by what a point at the border can reach, with channels last."""
@@ -121,49 +120,52 @@ class ClassMatcher(nn.Module):
             )
         return maps
 
-    def _groups(self, points: Tensor, weight: Tensor) -> Tensor:
+    def _groups(self, angles: Tensor, cells: tuple[Tensor, Tensor], weight: Tensor) -> Tensor:
         """B 12 N: weights of points by strip of azimuth, near ones first."""
-        angles = sphere(points)
-        row, column = grid_cells(angles, self.grid)
-        strip = column / (self.grid.width / _STRIPS)
-        inside = (row >= 0) & (row <= self.grid.height)
-        near = (angles[..., 2] < _NEAR_FAR_M).to(weight.dtype)
-        member = torch.stack(
-            [((strip >= s) & (strip < s + 1) & inside).to(weight.dtype) for s in range(_STRIPS)], 1
-        )
-        return torch.cat([member * (weight * near)[:, None], member * (weight * (1 - near))[:, None]], 1)
+        row, column = cells
+        strip = torch.floor(column / (self.grid.width / _STRIPS))
+        strips = torch.arange(_STRIPS, device=strip.device, dtype=strip.dtype)[:, None]
+        member = (strip[:, None] == strips).to(weight.dtype)
+        inside = ((row >= 0) & (row <= self.grid.height)).to(weight.dtype) * weight
+        near = (angles[..., 2] < _NEAR_FAR_M).to(weight.dtype) * inside
+        return torch.cat([member * near[:, None], member * (inside - near)[:, None]], 1)
 
-    def _scores(self, table: Tensor, level: Level, points: Tensor, probability: Tensor) -> Tensor:
-        """B N S S: each point's expected log-likelihood at shifts of whole cells (rows down, columns right)."""
-        frames, rows, columns, classes = table.shape
-        pad = level.reach + 1
-        row, column = grid_cells(sphere(points), self.grid)
+    def _scores(
+        self,
+        table: Tensor,
+        level: Level,
+        places: tuple[Tensor, Tensor],
+        probability: Tensor,
+        groups: Tensor,
+    ) -> Tensor:
+        """B 12 S S: expected log-likelihood of each group at shifts of whole cells (rows down, columns right)."""
+        # Lengths as plain numbers, not read off tensors: an exporter that traces would compute those in the graph.
+        frames, pad = len(table), level.reach + 1
+        rows, columns = (cells // level.factor + 2 * pad for cells in (self.grid.height, self.grid.width))
         # Minus one half: values stand at the centres of cells.
-        row = (row / level.factor - 0.5).clamp(-1.0, rows - 2.0 * pad)
-        column = (column / level.factor - 0.5).clamp(-1.0, columns - 2.0 * pad)
+        row = (places[0] / level.factor - 0.5).clamp(-1.0, rows - 2.0 * pad)
+        column = (places[1] / level.factor - 0.5).clamp(-1.0, columns - 2.0 * pad)
         first_row, first_column = torch.floor(row), torch.floor(column)
-        offsets = torch.arange(-level.reach, level.reach + 2, device=table.device)
-        at_row = (first_row.long()[..., None] + offsets + pad).clamp(0, rows - 1)
-        at_column = (first_column.long()[..., None] + offsets + pad).clamp(0, columns - 1)
-        index = at_row[..., :, None] * columns + at_column[..., None, :]
-        side = len(offsets)
-        frame = torch.arange(frames, device=table.device)[:, None, None, None] * (rows * columns)
+        offsets = torch.arange(-level.reach, level.reach + 2, device=table.device) + pad
+        at_row = (first_row.long()[..., None] + offsets).clamp(0, rows - 1) * columns
+        at_column = (first_column.long()[..., None] + offsets).clamp(0, columns - 1)
+        frame = torch.arange(frames, device=table.device)[:, None, None] * (rows * columns)
+        index = (at_row + frame)[..., :, None] + at_column[..., None, :]
         # One row of classes per lookup: contiguous, where an elementwise gather would be ten times slower.
-        picked = F.embedding((index + frame).flatten(1), table.reshape(-1, classes))
-        picked = picked.reshape(frames, points.shape[1], side * side, classes)
-        value = (picked @ probability[..., None]).reshape(frames, points.shape[1], side, side)
-        a, b = (row - first_row)[..., None, None], (column - first_column)[..., None, None]
-        value = value[:, :, :-1] * (1 - a) + value[:, :, 1:] * a
-        return value[..., :-1] * (1 - b) + value[..., 1:] * b
-
-    def _centres(self, groups: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean direction and mean inverse range of each group; empty groups look ahead."""
-        total = groups.sum(-1, keepdim=True)
-        distance = points.norm(dim=-1, keepdim=True).clamp(min=0.5)
-        ahead = torch.tensor([0.0, 0.0, 1.0], device=points.device)
-        mean = (groups @ (points / distance) + 1e-3 * ahead) / (total + 1e-3)
-        inverse_range = (groups @ (1 / distance) + 1e-3 * 0.05) / (total + 1e-3)
-        return mean / mean.norm(dim=-1, keepdim=True), inverse_range[..., 0]
+        picked = F.embedding(index.flatten(2), table.flatten(0, 2))
+        value = (picked @ probability[..., None]).squeeze(-1)
+        # Groups are summed at the four corners, and shifted onto each other then: points outnumber groups.
+        a, b = (row - first_row)[:, None], (column - first_column)[:, None]
+        above, below = groups * (1 - a), groups * a
+        corners = torch.cat([above * (1 - b), above * b, below * (1 - b), below * b], 1) @ value
+        side = 2 * pad
+        corner = corners.reshape(frames, 4, -1, side, side)
+        return (
+            corner[:, 0, :, :-1, :-1]
+            + corner[:, 1, :, :-1, 1:]
+            + corner[:, 2, :, 1:, :-1]
+            + corner[:, 3, :, 1:, 1:]
+        )
 
     def _turn(self, level: Level, strips: Tensor, directions: Tensor, sharpness: Tensor) -> Tensor:
         """Rotation vector by soft-argmax over roll, elevation and azimuth shifts; all strips vote together."""
@@ -176,9 +178,11 @@ class ClassMatcher(nn.Module):
         lifted = roll[None, :, None] * -directions[:, None, :, 0] / cell
         at = (place - lifted[..., None]).clamp(0, size - 1)
         blend = (1 - (at[..., None] - place).abs()).clamp(min=0)  # B R G S S: hat functions
-        volume = torch.einsum("brgpq,bgqy->brpy", blend, strips)
-        posterior = torch.softmax((volume * sharpness[:, None, None, None]).flatten(1), -1)
-        posterior = posterior.reshape(volume.shape)
+        frames, rolls = len(blend), len(steps)
+        # brgpq, bgqy -> brpy, as one product of matrices.
+        blend = blend.permute(0, 1, 3, 2, 4).reshape(frames, rolls * size, -1)
+        volume = (blend @ strips.reshape(frames, -1, size)).reshape(frames, rolls * size * size)
+        posterior = torch.softmax(volume * sharpness[:, None], -1).reshape(frames, rolls, size, size)
         shift = (place - level.reach) * cell
         up = -(posterior.sum((1, 3)) * shift).sum(-1)
         left = -(posterior.sum((1, 2)) * shift).sum(-1)
@@ -194,7 +198,8 @@ class ClassMatcher(nn.Module):
         cell = float(np.radians(self.grid.cell_deg * level.factor))
         size = 2 * level.reach + 1
         log_posterior = torch.log_softmax((by_group * sharpness[:, None, None, None]).flatten(2), -1)
-        posterior = torch.exp(log_posterior).reshape(by_group.shape)
+        log_posterior = log_posterior.reshape(by_group.shape)
+        posterior = torch.exp(log_posterior)
         shift = (torch.arange(size, device=R.device, dtype=R.dtype) - level.reach) * cell
         marginals = torch.stack(
             [posterior.sum(2), posterior.sum(3)], 2
@@ -207,11 +212,26 @@ class ClassMatcher(nn.Module):
         J = angular_jacobian(*centre)
         turned = (J[..., :3] @ omega[:, None, :, None])[..., 0]
         residual = -mean / spread - information * turned
-        H = torch.einsum("bgij,bgi,bgik->bjk", J, information, J)
+        rows = J.flatten(1, 2).transpose(1, 2)
+        H = (rows * information.flatten(1)[:, None]) @ J.flatten(1, 2)
         H = H + torch.eye(6, device=R.device) * torch.exp(-2 * self.log_prior_sigma)
         covariance = inverse_spd(H)
-        step = (covariance @ torch.einsum("bgij,bgi->bj", J, residual)[..., None])[..., 0]
+        step = (covariance @ (rows @ residual.flatten(1)[..., None]))[..., 0]
         total = exp_so3(step[:, :3]) @ R
         twist = torch.cat([small_rotation_vector(total), step[:, 3:]], -1)
         variance = (covariance * torch.eye(6, device=covariance.device)).sum(-1)
-        return Match(twist, variance, log_posterior.reshape(by_group.shape))
+        return Match(twist, variance, log_posterior)
+
+
+def _sums(groups: Tensor, points: Tensor) -> Tensor:
+    """B G 5: of directions, inverse ranges and weights over each group."""
+    inverse = 1 / points.norm(dim=-1, keepdim=True).clamp(min=0.5)
+    return groups @ torch.cat([points * inverse, inverse, torch.ones_like(inverse)], -1)
+
+
+def _centres(sums: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean direction and mean inverse range of each group; empty groups look ahead."""
+    nobody = torch.tensor([0.0, 0.0, 1.0, 0.05], device=sums.device)
+    mean = (sums[..., :4] + 1e-3 * nobody) / (sums[..., 4:] + 1e-3)
+    direction = mean[..., :3]
+    return direction / direction.norm(dim=-1, keepdim=True), mean[..., 3]

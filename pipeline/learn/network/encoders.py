@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
 from pipeline.learn.sample.layout import CAMERA_CHANNELS
 
-__all__ = ["CameraEncoder", "LidarEncoder", "PointEncoder"]
+__all__ = ["CameraEncoder", "LidarEncoder", "PointEncoder", "cell_values"]
 
 _LEAST_LIKELIHOOD = 0.005  # a segmenter that is surer than one mistake in 200 cells is not believed
 
@@ -71,13 +71,46 @@ class LidarEncoder(nn.Module):
 
     def forward(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B K H W"]:
         """Logits per cell; meaningful where a point was rendered."""
+        return self.logits_of(self.features(rendered), rendered)
+
+    def logits_of(self, features: Tensor, rendered: Tensor) -> Float[Tensor, "B K H W"]:
+        """The same from the sweep's features."""
+        return F.pixel_shuffle(self.logits(features), 2) + self.own(rendered)
+
+    def features(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B F h w"]:
+        """What the convolutions make of the sweep, by squares of four cells."""
         x, skips = rendered, []
         for block in self.down:
             x = block(x)
             skips.append(x)
         for block, skip in zip(self.up, reversed(skips[:-1]), strict=True):
             x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
-        return F.pixel_shuffle(self.logits(x), 2) + self.own(rendered)
+        return x
+
+    def logits_at(
+        self, features: Tensor, rendered: Tensor, row: Int64[Tensor, "B N"], column: Int64[Tensor, "B N"]
+    ) -> Float[Tensor, "B N K"]:
+        """The same as `forward` at single cells, which are far fewer.
+
+        Args:
+            features: B F H/2 W/2, of the sweep.
+            rendered: B C H W, the sweep.
+            row: of each cell.
+            column: of each cell.
+        """
+        width = rendered.shape[-1]
+        square = cell_values(features, row // 2 * (width // 2) + column // 2)
+        four = F.linear(square, self.logits.weight[:, :, 0, 0], self.logits.bias)
+        place = (row % 2) * 2 + column % 2
+        mine = (place[..., None] == torch.arange(4, device=place.device)).to(four.dtype)
+        x = cell_values(rendered, row * width + column)
+        for layer in self.own:
+            x = (
+                F.linear(x, layer.weight[:, :, 0, 0], layer.bias)
+                if isinstance(layer, nn.Conv2d)
+                else layer(x)
+            )
+        return (four.reshape(*x.shape, 4) * mine[..., None, :]).sum(-1) + x
 
 
 class PointEncoder(nn.Module):
@@ -92,6 +125,14 @@ class PointEncoder(nn.Module):
     ) -> Float[Tensor, "B N K"]:
         """Logits of each point."""
         return self.layers(torch.cat([features, range_m[..., None] / 40.0], -1))
+
+
+def cell_values(maps: Float[Tensor, "B K H W"], cell: Int64[Tensor, "B N"]) -> Float[Tensor, "B N K"]:
+    """Values of single cells, counted row by row."""
+    # Channels go last first: one contiguous row per lookup.
+    table = maps.flatten(2).transpose(1, 2)
+    frame = torch.arange(len(maps), device=maps.device)[:, None] * table.shape[1]
+    return F.embedding(cell + frame, table.flatten(0, 1))
 
 
 def standardised(camera: Float[Tensor, "B 4 H W"]) -> Float[Tensor, "B 4 H W"]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
 from pipeline.learn.network.class_matcher import FLOOR, NEUTRAL, ClassMatcher, Match
-from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder, PointEncoder
+from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder, PointEncoder, cell_values
 from pipeline.learn.network.markings import log_markings
 from pipeline.learn.network.occupancy_matcher import OccupancyMatch, OccupancyMatcher
 from pipeline.learn.network.outputs import CoreOutputs, Heads, pose_of_twist
@@ -107,10 +108,11 @@ class MatchingCore(nn.Module):
         Beyond the image's border goes on what is seen at it. Were all classes alike there, points would gain by
         leaving what is classified well: a narrow image would push a sweep out of itself.
         """
-        log_probability = torch.log_softmax(logits.detach(), 1).clamp(min=FLOOR)
+        # Classes last: runtimes are five times slower along another axis.
+        probability = torch.softmax(logits.detach().permute(0, 2, 3, 1), -1).clamp(min=float(np.exp(FLOOR)))
         if self.confusions is not None:
-            probability = torch.einsum("bkhw,kj->bjhw", torch.exp(log_probability), self.confusions)
-            log_probability = torch.log(probability).clamp(min=FLOOR)
+            probability = probability @ self.confusions
+        log_probability = torch.log(probability).clamp(min=FLOOR).permute(0, 3, 1, 2)
         seen = camera[:, CAMERA_CHANNELS - 1 : CAMERA_CHANNELS]
         blind = 1 - seen.amax((2, 3), keepdim=True)
         continued = continued_beyond(log_probability, seen) * (1 - blind) + NEUTRAL * blind
@@ -128,10 +130,11 @@ class MatchingCore(nn.Module):
         features = []
         if "camera_lidar" in self.pairs:
             assert likelihood is not None
-            lidar_logits = self.encode_lidar(view.lidar_grid)
-            probability = torch.softmax(self._at_points(lidar_logits.detach(), view.points_camera), -1)
+            row, column, _ = self._cells(view.points_camera)
+            lidar_logits, logits = self._lidar_logits(view.lidar_grid, row, column)
+            probability = torch.softmax(logits.detach(), -1)
             weight = view.point_weight * self._worth(likelihood, view.points_camera)
-            edge = self._at_points(view.lidar_grid[:, _EDGE : _EDGE + 1], view.points_camera)
+            edge = cell_values(view.lidar_grid[:, _EDGE : _EDGE + 1], row * self.grid.width + column)
             maps, probability = self._with_edges(likelihood[:, :-1], probability, edge)
             points = view.points_camera
             if self.log_mark_worth is not None:
@@ -194,20 +197,27 @@ class MatchingCore(nn.Module):
         of_points = torch.cat([probability, probability.new_zeros(frames, points, 1)], -1)
         return torch.cat([maps, paint], 1), torch.cat([of_points, of_marks], 1)
 
+    def _lidar_logits(self, rendered: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
+        """Class logits of all cells, and of the points' cells, which are all that a graph without training needs."""
+        if self.training:
+            logits = self.encode_lidar(rendered)
+            return logits, cell_values(logits, row * self.grid.width + column)
+        features = self.lidar_encoder.features(rendered)
+        at_points = self.lidar_encoder.logits_at(features, rendered, row, column)
+        return self.lidar_encoder.logits_of(features, rendered), at_points
+
     def _worth(self, likelihood: Tensor, points_camera: Tensor) -> Tensor:
         """B N: what a point counts by where the guess puts it, fixed before it moves: no move can raise it."""
-        row, column = grid_cells(sphere(points_camera), self.grid)
-        inside = (row >= 0) & (column >= 0) & (row < self.grid.height) & (column < self.grid.width)
-        seen = self._at_points(likelihood[:, -1:], points_camera)[..., 0] * inside.to(likelihood.dtype)
-        return _UNSEEN_WORTH + (1 - _UNSEEN_WORTH) * seen
+        row, column, inside = self._cells(points_camera)
+        seen = cell_values(likelihood[:, -1:], row * self.grid.width + column)[..., 0]
+        return _UNSEEN_WORTH + (1 - _UNSEEN_WORTH) * seen * inside.to(likelihood.dtype)
 
-    def _at_points(self, maps: Tensor, points_camera: Tensor) -> Tensor:
-        """B N K: values of the cells that points fall into."""
+    def _cells(self, points_camera: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """B N each: row and column of the cell that a point falls into (or next to), and whether it falls into it."""
         row, column = grid_cells(sphere(points_camera), self.grid)
         height, width = self.grid.height, self.grid.width
-        index = row.long().clamp(0, height - 1) * width + column.long().clamp(0, width - 1)
-        frame = torch.arange(len(maps), device=maps.device)[:, None] * (height * width)
-        return F.embedding(index + frame, maps.permute(0, 2, 3, 1).reshape(-1, maps.shape[1]))
+        inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
+        return row.long().clamp(0, height - 1), column.long().clamp(0, width - 1), inside
 
     def _combine(self, bases: dict[str, Match | OccupancyMatch], fused: Tensor) -> tuple[Tensor, Tensor]:
         residuals = self.heads(fused)
@@ -260,13 +270,13 @@ def continued_beyond(
     beyond = torch.where(seen[:, 0] > 0.5, 0.0, float(height + width))
     first = (beyond + rows).amin(1).long().clamp(max=height - 1)
     last = (rows - beyond).amax(1).long().clamp(min=0)
-    row = torch.minimum(torch.maximum(rows, first[:, None]), last[:, None])
-    maps = maps.gather(2, row[:, None].expand(-1, maps.shape[1], -1, -1))
     empty = beyond.amin(1)
     left = (empty + columns).amin(1, keepdim=True).long().clamp(max=width - 1)
     right = (columns - empty).amax(1, keepdim=True).long().clamp(min=0)
     column = torch.minimum(torch.maximum(columns, left), right)
-    return maps.gather(3, column[:, None, None].expand(-1, maps.shape[1], height, -1))
+    first, last = (edge.gather(1, column)[:, None] for edge in (first, last))
+    cell = torch.minimum(torch.maximum(rows, first), last) * width + column[:, None]
+    return cell_values(maps, cell.flatten(1)).transpose(1, 2).reshape(maps.shape)
 
 
 def log_boundaries(maps: Float[Tensor, "B K H W"]) -> Float[Tensor, "B 1 H W"]:

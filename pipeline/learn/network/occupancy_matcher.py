@@ -24,6 +24,10 @@ _REACH_DEG, _YAW_STEP_DEG, _PITCH_STEP_DEG = 8.0, 0.4, 0.5
 _FIELD_DEG = (48.0, 28.0)  # azimuth and elevation to each side: what lidar and radar share ahead
 _SECTORS = 3
 _ROLLS_DEG = 1.5 * np.arange(-4, 5)
+_HALF = float(np.sqrt(0.5))
+# Kernels end at exp(-37) = 1e-16, which adds nothing to the floor: products of two of them with a density stay normal
+# numbers. With subnormal ones a matrix product takes ten times as long.
+_FARTHEST = 37.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,21 +97,19 @@ class OccupancyMatcher(nn.Module):
         width = torch.exp(self.log_width)
         lidar, radar = _spherical(objects), _spherical(radar_lidar)
         density = object_weight * lidar[..., 2] ** 2 / 400.0  # beams thin out with the square of the range
-        kernel_range = _kernel(lidar[:, None, :, 2] - radar[:, :, None, 2], width[2]) * density[:, None]
+        away_range = _away(lidar[..., 2], radar[..., 2], width[2])
         # Before pitch is known elevation is gated loosely; without elevation not at all.
-        elevation_gap = (lidar[:, None, :, 1] - radar[:, :, None, 1]) * tall[..., None]
         loose = torch.sqrt(width[1] ** 2 + (2.0 * np.pi / 180) ** 2)
+        away_elevation = _away(lidar[..., 1] * tall, radar[..., 1] * tall, loose)
         yaw_logits = self._profile(
-            kernel_range * _kernel(elevation_gap, loose), lidar[..., 0], radar[..., 0], self.yaws, 0
+            away_range + away_elevation, density, lidar[..., 0], radar[..., 0], self.yaws, 0
         )
         yaw_surface = (yaw_logits * weight[..., None]).sum(1) / total * torch.exp(self.log_sharpness[0])
         yaw_posterior = torch.softmax(yaw_surface, -1)
         yaw = (yaw_posterior * self.yaws).sum(-1)
         azimuth = radar[..., 0] + yaw[:, None]
-        kernel_azimuth = _kernel(lidar[:, None, :, 0] - azimuth[..., None], width[0])
-        pitch_logits = self._profile(
-            kernel_range * kernel_azimuth, lidar[..., 1], radar[..., 1], self.pitches, 1
-        )
+        away = away_range + _away(lidar[..., 0], azimuth, width[0])
+        pitch_logits = self._profile(away, density, lidar[..., 1], radar[..., 1], self.pitches, 1)
         pitch_surface, up, roll = self._tilt(pitch_logits, azimuth, weight, total)
         # Elevation ahead grows by a turn about -y, elevation to the left by one about x.
         omega = torch.stack([roll * tall[:, 0], -up * tall[:, 0], yaw], -1)
@@ -118,17 +120,24 @@ class OccupancyMatcher(nn.Module):
         return OccupancyMatch(twist, variance, profiles)
 
     def _profile(
-        self, kernel: Tensor, lidar_angle: Tensor, radar_angle: Tensor, shifts: Tensor, axis: int
+        self,
+        away: Tensor,
+        density: Tensor,
+        lidar_angle: Tensor,
+        radar_angle: Tensor,
+        shifts: Tensor,
+        axis: int,
     ) -> Tensor:
-        """B M S: log-likelihood of each detection at each shift of one angle.
+        """B M S: log-likelihood of each detection at each shift of one angle, `away` of the others (`_away`).
 
         The density is tabulated over absolute angles once (a matrix product) and looked up per detection.
         """
         step = float(np.radians((_YAW_STEP_DEG, _PITCH_STEP_DEG)[axis]))
         bins = round(2 * _FIELD_DEG[axis] / (_YAW_STEP_DEG, _PITCH_STEP_DEG)[axis])
         lowest = -bins / 2 * step
-        centres = lowest + step * torch.arange(bins + 1, device=kernel.device)
-        table = kernel @ _kernel(centres - lidar_angle[..., None], torch.exp(self.log_width[axis]))
+        centres = lowest + step * torch.arange(bins + 1, device=away.device)
+        width = torch.exp(self.log_width[axis])
+        table = _kernel(away) @ (_kernel(_away(centres, lidar_angle, width)) * density[..., None])
         at = ((radar_angle[..., None] + shifts - lowest) / step).clamp(0, bins - 1e-3)
         low = torch.floor(at)
         part = at - low
@@ -154,9 +163,13 @@ class OccupancyMatcher(nn.Module):
         place = torch.arange(len(self.pitches), device=logits.device, dtype=logits.dtype)
         at = place + (self.rolls[None, :, None] * side[:, None, :] / step)[..., None]
         blend = (1 - (at.clamp(0, len(self.pitches) - 1)[..., None] - place).abs()).clamp(min=0)
-        volume = torch.einsum("brgpq,bgq->brp", blend, sectors) * torch.exp(self.log_sharpness[1])
+        frames, rolls, pitches = len(blend), len(self.rolls), len(self.pitches)
+        # brgpq, bgq -> brp, as one product of matrices.
+        blend = blend.permute(0, 1, 3, 2, 4).reshape(frames, rolls * pitches, -1)
+        volume = (blend @ sectors.reshape(frames, -1, 1)).reshape(frames, rolls, pitches)
+        volume = volume * torch.exp(self.log_sharpness[1])
         volume = volume - (self.rolls[:, None] / self.roll_sigma_rad) ** 2 / 2
-        posterior = torch.softmax(volume.flatten(1), -1).reshape(volume.shape)
+        posterior = torch.softmax(volume.flatten(1), -1).reshape(frames, rolls, pitches)
         up = (posterior.sum(1) * self.pitches).sum(-1)
         roll = (posterior.sum(2) * self.rolls).sum(-1)
         return torch.logsumexp(volume, 1), up, roll
@@ -166,16 +179,15 @@ class OccupancyMatcher(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """One step of damped least squares towards the softly associated lidar points."""
         radar = _spherical(radar_lidar)
-        away = [lidar[:, None, :, axis] - radar[:, :, None, axis] for axis in range(3)]
-        near = (
-            (away[0] / width[0]) ** 2
-            + (away[1] / width[1]) ** 2 * tall[..., None]
-            + (away[2] / width[2]) ** 2
-        )
-        kernel = torch.exp(-near / 2) * density[:, None]
-        mass = kernel.sum(-1)
+        scale = torch.stack([torch.ones_like(tall), tall, torch.ones_like(tall)], -1) / width
+        near, far = radar * scale, lidar * scale
+        away_azimuth, away_elevation, away_range = (_away(far[..., i], near[..., i]) for i in range(3))
         # The mean gap is the mean place less the own one: a product, not another array of all pairs.
-        mean = (kernel @ lidar) / mass.clamp(min=1e-6)[..., None] - radar
+        summed = _kernel(away_azimuth + away_elevation + away_range) @ (
+            torch.cat([lidar, torch.ones_like(lidar[..., :1])], -1) * density[..., None]
+        )
+        mass = summed[..., 3]
+        mean = summed[..., :3] / mass.clamp(min=1e-6)[..., None] - radar
         mean = mean * (mass > 1e-6)[..., None].to(mean.dtype)
         inlier = mass / (mass + torch.exp(self.log_floor)) * weight
         one = torch.ones_like(tall)
@@ -183,15 +195,24 @@ class OccupancyMatcher(nn.Module):
         distance = radar[..., 2].clamp(min=0.5)
         J = spherical_jacobian(radar_lidar / distance[..., None], distance)
         information = inlier[..., None] * precision[:, None]
-        H = torch.einsum("bnij,bni,bnik->bjk", J, information, J)
+        rows = J.flatten(1, 2).transpose(1, 2)
+        H = (rows * information.flatten(1)[:, None]) @ J.flatten(1, 2)
         H = H + torch.eye(6, device=J.device) * torch.exp(-2 * self.log_prior_sigma)
         covariance = inverse_spd(H)
-        step = (covariance @ torch.einsum("bnij,bni->bj", J, information * mean)[..., None])[..., 0]
+        step = (covariance @ (rows @ (information * mean).flatten(1)[..., None]))[..., 0]
         return step, (covariance * torch.eye(6, device=J.device)).sum(-1)
 
 
-def _kernel(difference: Tensor, width: Tensor) -> Tensor:
-    return torch.exp(-((difference / width) ** 2) / 2)
+def _away(columns: Tensor, rows: Tensor, width: Tensor | float = 1.0) -> Tensor:
+    """B R C: half the squared distance of all pairs along one axis, in widths of the kernel."""
+    # Scaled before they are paired, and halved there too: what is done to all pairs is what costs.
+    scale = _HALF / width
+    gap = (columns * scale)[..., None, :] - (rows * scale)[..., None]
+    return gap * gap
+
+
+def _kernel(away: Tensor) -> Tensor:
+    return torch.exp(-away.clamp(max=_FARTHEST))
 
 
 def _spherical(points: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from onnxruntime import InferenceSession
 
 from pipeline.errors import ModelError
 from pipeline.extrinsics.estimates import Prior
@@ -17,6 +18,7 @@ from pipeline.learn.batches.collate import collate
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.compiled_rendering import frame_sensors, render_frame
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.infer.split_graph import split_graph
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.exported_weights import network_of_file, weight_places
 from pipeline.learn.network.inputs import NetworkInputs, crop, given_classes, sensor_inputs
@@ -53,6 +55,11 @@ def guess():
     wrong[:3, :3] = exp_so3(np.radians([1.0, -1.5, 0.5]))
     T_camera_lidar, T_lidar_radar = wrong @ solve_scenes.T_CAMERA_LIDAR, wrong @ solve_scenes.T_LIDAR_RADAR
     return T_camera_lidar, T_lidar_radar, T_camera_lidar @ T_lidar_radar
+
+
+def guess_by_pair():
+    T_camera_lidar, T_lidar_radar, T_camera_radar = guess()
+    return T_camera_lidar, T_camera_radar, T_lidar_radar
 
 
 def inputs():
@@ -111,6 +118,25 @@ def test_three_passes_agree_too(exported):
         assert ours[-1].of(pair) == pytest.approx(getattr(theirs[-1], f"T_{pair}")[0].numpy(), abs=2e-4)
         R = ours[-1].of(pair)[:3, :3]
         assert pytest.approx(np.eye(3), abs=1e-12) == R @ R.T
+
+
+def test_a_graph_cut_behind_the_camera_answers_as_the_whole(exported):
+    """Whatever is computed once: no value of it depends on the guess, and nothing is lost."""
+    network, path = exported
+    names = ["corrections", "log_variance"]
+    once, by_pass = split_graph(onnx.load(path), "camera", names)
+    view = render_frame(
+        frame_sensors(row(), GRID, classes()), *guess_by_pair(), GRID, network.config.camera_channels
+    )
+    feed = {i.name: view[i.name] for i in onnx.load(path).graph.input}
+    whole = InferenceSession(str(path)).run(names, feed)
+    assert once is not None
+    assert [i.name for i in once.graph.input] == ["camera"]
+    known = InferenceSession(once.SerializeToString()).run(None, {"camera": feed.pop("camera")})
+    assert "camera" not in {i.name for i in by_pass.graph.input}
+    feed |= dict(zip((o.name for o in once.graph.output), known, strict=True))
+    for a, b in zip(InferenceSession(by_pass.SerializeToString()).run(names, feed), whole, strict=True):
+        assert a == pytest.approx(b, abs=1e-5)
 
 
 def test_a_file_that_takes_classes_answers_without_them_and_otherwise(exported):

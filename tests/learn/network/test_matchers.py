@@ -9,6 +9,7 @@ import torch
 from pipeline.geometry.se3 import exp_se3, exp_so3
 from pipeline.geometry.spherical import camera_direction_angles, to_spherical
 from pipeline.learn.network.class_matcher import NEUTRAL, ClassMatcher
+from pipeline.learn.network.encoders import LidarEncoder
 from pipeline.learn.network.least_squares import (
     angular_jacobian,
     inverse_spd,
@@ -16,7 +17,7 @@ from pipeline.learn.network.least_squares import (
     spherical_jacobian,
 )
 from pipeline.learn.network.matching_network import MatchingCore, confusions_of, continued_beyond
-from pipeline.learn.network.occupancy_matcher import OccupancyMatcher
+from pipeline.learn.network.occupancy_matcher import OccupancyMatcher, _away, _kernel
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
 from pipeline.learn.sample.layout import CAMERA_CHANNELS, CLASS_CHANNELS
@@ -131,6 +132,27 @@ def test_a_narrow_image_does_not_push_points_out_of_itself():
             R = pose_of_twist(found.twist)[0, :3, :3].numpy() @ R
     left = np.degrees(np.arccos((np.trace(R @ exp_so3(np.radians([1.5, -2.0, 0.5]))) - 1) / 2))
     assert left < 0.5
+
+
+def test_single_cells_get_the_logits_that_the_whole_sweep_gives_them():
+    encoder = LidarEncoder(6, 10, 8)
+    generator = torch.Generator().manual_seed(3)
+    sweep = torch.rand(2, 6, 16, 32, generator=generator)
+    row, column = (torch.randint(side, (2, 50), generator=generator) for side in (16, 32))
+    with torch.no_grad():
+        whole = encoder(sweep)
+        single = encoder.logits_at(encoder.features(sweep), sweep, row, column)
+    wanted = whole[torch.arange(2)[:, None], :, row, column]
+    assert single.numpy() == pytest.approx(wanted.numpy(), abs=1e-5)
+
+
+@pytest.mark.parametrize("apart_m", [0.1, 60.0])
+def test_kernels_of_points_far_apart_are_no_subnormal_numbers(apart_m):
+    """Ten times as long does a product of matrices take with them."""
+    density = torch.tensor(0.1**2 / 400.0)  # of the nearest point there can be
+    kernel = _kernel(_away(torch.tensor([5.0]), torch.tensor([5.0 + apart_m]), torch.tensor(0.35)))
+    assert float(kernel * (kernel * density)) > torch.finfo(torch.float32).tiny
+    assert float(kernel) == pytest.approx(np.exp(-0.5 * (apart_m / 0.35) ** 2), abs=1e-15, rel=1e-5)
 
 
 def test_edges_find_the_boundaries_of_what_nobody_knows_the_class_of():

@@ -1,0 +1,49 @@
+"""A graph cut in two: what depends on the camera alone, and what depends on the guess.
+
+A frame is refined over several passes, and its image is the same in all of them. Where to cut is read off the graph,
+so files of any version gain by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import onnx
+import onnx.shape_inference
+import onnx.utils
+
+__all__ = ["split_graph"]
+
+
+def split_graph(
+    model: onnx.ModelProto, fixed: str, answers: Sequence[str]
+) -> tuple[onnx.ModelProto | None, onnx.ModelProto]:
+    """Two models that together put out `answers`: the second takes what the first puts out, under the same names.
+
+    Args:
+        model: checked, its nodes in topological order.
+        fixed: the input that stays the same over passes.
+        answers: outputs that are wanted.
+
+    Returns:
+        What `fixed` alone decides (None where that is nothing), and the rest.
+    """
+    others = [i.name for i in model.graph.input if i.name != fixed]
+    first, passed_on = _crossing(model.graph, fixed, others)
+    cut = onnx.utils.Extractor(onnx.shape_inference.infer_shapes(model, data_prop=True))
+    if not first:
+        return None, cut.extract_model([fixed, *others], list(answers))
+    return cut.extract_model([fixed], passed_on), cut.extract_model([*passed_on, *others], list(answers))
+
+
+def _crossing(graph: onnx.GraphProto, fixed: str, others: Sequence[str]) -> tuple[bool, list[str]]:
+    """Whether anything can be computed beforehand, and which tensors pass from that part into the other."""
+    early, late = {fixed}, set(others)
+    crossing: dict[str, None] = {}
+    for node in graph.node:
+        if any(name in late for name in node.input):
+            late.update(node.output)
+            crossing.update(dict.fromkeys(name for name in node.input if name in early))
+        elif any(name in early for name in node.input):
+            early.update(node.output)
+    return len(crossing) > 0 and fixed not in crossing, list(crossing)
