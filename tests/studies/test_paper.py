@@ -11,7 +11,7 @@ from pipeline.geometry.se3 import exp_se3
 from pipeline.report.overlays import Extrinsics, Scene
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies import drivable, paper_figures, paper_ssl, paper_table, reflector_table
-from tests.benchmarks.studies.engine import RESULTS
+from tests.benchmarks.studies.engine import RESULTS, read_results
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 from tests.makers.training_lakes import frame_of
 
@@ -36,6 +36,10 @@ def test_the_papers_columns_are_means_of_the_lines_measured_and_its_rows_stand_b
     assert len(urban) == len(highway) == 5
     committed = (RESULTS / "table1_paper.md").read_text()
     assert "\n".join(lines) in committed
+    runs = json.loads((RESULTS / "paper_ssl.json").read_text())["runs"]
+    own = paper_table.own_table(read_results(RESULTS / paper_table.OWN), runs)
+    assert own.count("one frame, one pass") == 2
+    assert own in committed
 
 
 def test_the_papers_own_training_is_told_by_single_passes_and_days_with_its_share_of_samples():

@@ -50,7 +50,7 @@ _GUESS = AugmentConfig(
     rotation_deg=3.0, translation_m=0.1, small_share=0.0, view_deg=0.0
 )  # as the recipes have it
 _SEED = 977
-_COLOURS = ("#3b82c4", "#e0813a", "#4c9a5b", "#8a5bb0")
+_COLOURS = ("#3b82c4", "#e0813a", "#4c9a5b", "#8a5bb0", "#c2407a")
 
 
 def main() -> None:
