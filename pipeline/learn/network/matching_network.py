@@ -20,6 +20,7 @@ from pipeline.learn.sample.layout import (
     CAMERA_CHANNELS,
     LIDAR_CHANNELS,
     LIDAR_FEATURES,
+    MARKED_POINTS,
     PAIRS,
     RADAR_FEATURES,
 )
@@ -139,9 +140,7 @@ class MatchingCore(nn.Module):
             points = view.points_camera
             if self.log_mark_worth is not None:
                 marked = view.mark_weight * self._worth(likelihood, view.marks_camera)
-                maps, probability = self._with_marks(
-                    view.camera, maps, probability, view.marks_camera.shape[1]
-                )
+                maps, probability = self._with_marks(view.camera, maps, probability)
                 points, weight = torch.cat([points, view.marks_camera], 1), torch.cat([weight, marked], 1)
             found = self.lidar_matcher(maps, points, probability, weight)
             bases["camera_lidar"] = found
@@ -185,15 +184,13 @@ class MatchingCore(nn.Module):
         worth = torch.exp(self.log_edge_worth) * edge
         return torch.cat([maps, log_boundaries(maps)], 1), torch.cat([probability, worth], -1)
 
-    def _with_marks(
-        self, camera: Tensor, maps: Tensor, probability: Tensor, count: int
-    ) -> tuple[Tensor, Tensor]:
-        """Paint as the last class, and behind the points as many that have no other."""
+    def _with_marks(self, camera: Tensor, maps: Tensor, probability: Tensor) -> tuple[Tensor, Tensor]:
+        """Paint as the last class, and behind the points MARKED_POINTS that have no other."""
         assert self.log_mark_worth is not None
         paint, enough = log_markings(camera, maps[:, :_CLASSES])
         frames, points, classes = probability.shape
-        worth = (torch.exp(self.log_mark_worth) * enough)[:, None, None].expand(frames, count, 1)
-        of_marks = torch.cat([probability.new_zeros(frames, count, classes), worth], -1)
+        worth = (torch.exp(self.log_mark_worth) * enough)[:, None, None].expand(frames, MARKED_POINTS, 1)
+        of_marks = torch.cat([probability.new_zeros(frames, MARKED_POINTS, classes), worth], -1)
         of_points = torch.cat([probability, probability.new_zeros(frames, points, 1)], -1)
         return torch.cat([maps, paint], 1), torch.cat([of_points, of_marks], 1)
 

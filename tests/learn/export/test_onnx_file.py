@@ -75,7 +75,8 @@ def exported(request, tmp_path_factory):
     architecture, pairs = request.param.split("-")
     takes_classes = architecture == "classes"
     architecture = "matching" if takes_classes else architecture
-    config = NetworkConfig(architecture, pairs, GRID, width=8, hidden=32, takes_classes=takes_classes)
+    more = {"takes_classes": takes_classes, "marks": takes_classes}
+    config = NetworkConfig(architecture, pairs, GRID, width=8, hidden=32, **more)
     network = build_network(config)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():

@@ -62,7 +62,7 @@ def turn_left_over(camera, likelihood, strength, points, turn):
     with torch.no_grad():
         for _ in range(3):
             marks = (points[cell[0]] @ torch.tensor(R.T, dtype=torch.float32))[None]
-            maps, share = core._with_marks(camera, likelihood, torch.zeros(1, 0, 10), MARKED_POINTS)
+            maps, share = core._with_marks(camera, likelihood, torch.zeros(1, 0, 10))
             found = core.lidar_matcher(maps, marks, share, weight)
             R = pose_of_twist(found.twist)[0, :3, :3].numpy() @ R
     return np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
