@@ -15,7 +15,7 @@ plane fitted to the sweep.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -68,7 +68,7 @@ NO_EDGE = -128  # in edge_offset: no boundary of this direction within reach
 
 TRAINING = TableSchema(
     "training",
-    1,
+    2,
     (
         scalar("frame_index", "int32", "row of table frames"),
         scalar("vehicle", "string", "vehicle id"),
@@ -182,6 +182,14 @@ TRAINING = TableSchema(
         ),
         # the whole
         scalar("ego_speed_mps", "float64", "as in observations; 0 where unknown"),
+        array(
+            "way_velocity_mps",
+            "<f8",
+            (3,),
+            "velocity of the radar by Doppler of static detections, radar axes; zeros where unknown",
+        ),
+        scalar("way_sigma_rad", "float64", "of its elevation, by the scan alone; 0 where unknown"),
+        scalar("road_slope", "float64", "of the road under the car along that way, lidar axes; up positive"),
         scalar("camera_lag_s", "float64", "camera_stamp - stamp"),
         scalar("radar_lag_s", "float64", "radar_stamp - stamp"),
         scalar("camera_model", "string", "as in frames, for reference"),
@@ -194,6 +202,7 @@ TRAINING = TableSchema(
     ),
     "One frame per row. Padded rows of arrays are 0.",
     made_by="prepare",
+    reads_versions=(1,),  # which knew no way_* and no road_slope
 )
 
 
@@ -275,3 +284,6 @@ class TrainingRow:
     prior_lidar_radar_tx_m: float
     prior_lidar_radar_ty_m: float
     prior_lidar_radar_tz_m: float
+    way_velocity_mps: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    way_sigma_rad: float = 0.0
+    road_slope: float = 0.0

@@ -111,6 +111,8 @@ def calibrate_frame(task: Task, frame: int) -> FrameCalibration:
     solution = single_frame_solution(
         shown, observation, prior, networks=networks, method=method.name, seed=seed
     )
+    if "doppler" in fleet.solve.terms:
+        solution = informed_by_way(solution, [observation], prior)
     return FrameCalibration(shown, observation, prior, solution)
 
 

@@ -47,6 +47,7 @@ def scene(rng, *, T=T_LIDAR_RADAR, noise_deg=2.0, mirrored=0.0, bias_deg=0.0, cu
         radar_residual_mps=(rate + u @ velocity).astype(np.float32), radar_motion=np.zeros(n, np.uint8),
         radar_cluster=np.full(n, -1, np.int32), radar_velocity_mps=velocity,
         lidar_map_xyz_m=np.concatenate([poles, ground]).astype(np.float32),
+        lidar_map_cluster=np.full(len(poles) + len(ground), -1, np.int32),
         lidar_map_is_ground=np.r_[np.zeros(len(poles)), np.ones(len(ground))].astype(np.uint8),
     )  # fmt: skip
 

@@ -24,6 +24,7 @@ from pipeline.geometry.se3 import exp_so3, inverse, log_se3
 from pipeline.learn.infer.aggregate import OBSERVABLE
 from pipeline.objective.radar.travel import (
     DOPPLER_PITCH_FLOOR_RAD,
+    TravelDirections,
     pitch_equations,
     pitch_residuals,
     travel_directions,
@@ -32,6 +33,9 @@ from schemas.observations import Observation
 
 __all__ = ["WayTurn", "informed_by_way", "updated_by_way", "way_turn"]
 
+# What ways differ by beyond the sigma of their scan: 0.3 to 0.6 deg on four simulated tuning days (3 on a log of
+# the real car, whose single frames the way does not help).
+_FRAME_SCATTER_RAD = np.radians(0.6)
 _STEPS = 12  # of the robust mean; it gains a digit in two
 _ROUNDS = 30  # of re-weighting the network
 _CAUCHY = 2.0  # sigmas, as for the way's own frames
@@ -83,9 +87,12 @@ def informed_by_way(solution: Solution, observations: Sequence[Observation], pri
 def way_turn(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]) -> WayTurn | None:
     """What a day's way says of a pose; None where too few frames show it.
 
-    The variance is that of the robust mean, no less than what differences between drives give.
+    The variance is that of the robust mean, no less than what differences between drives give. A single frame shows no
+    scatter and gets the usual one.
     """
     travel = travel_directions(observations, T_lidar_radar, 0.0)
+    if len(observations) == 1:
+        return _frame_turn(travel, T_lidar_radar)
     _, J = pitch_residuals(travel, T_lidar_radar)
     mean = np.append(J[:, :2].mean(axis=0), 0.0) if len(J) else np.zeros(3)
     if not mean.any():
@@ -106,6 +113,15 @@ def way_turn(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarra
     return WayTurn(axis, turn_rad, max(1 / information, between), DOPPLER_PITCH_FLOOR_RAD**2, travel.count)
 
 
+def _frame_turn(travel: TravelDirections, T_lidar_radar: Float[np.ndarray, "4 4"]) -> WayTurn | None:
+    if not travel.count:
+        return None
+    residual, J = pitch_residuals(travel, T_lidar_radar)
+    axis = -np.append(J[0, :2], 0.0) / np.linalg.norm(J[0, :2])
+    variance = float(travel.sigma_rad[0] ** 2) + _FRAME_SCATTER_RAD**2
+    return WayTurn(axis, float(residual[0]), variance, DOPPLER_PITCH_FLOOR_RAD**2, 1)
+
+
 def updated_by_way(
     estimate: PairEstimate, way: WayTurn, prior_covariance: Float[np.ndarray, "6 6"]
 ) -> PairEstimate:
@@ -113,7 +129,8 @@ def updated_by_way(
     row = np.append(way.axis, np.zeros(3))
     direction = np.append(way.axis, np.cross(estimate.T[:3, 3], way.axis))
     own, measured = float(row @ estimate.covariance @ row), way.variance + way.floor
-    doubt = _doubt(way.turn_rad, own, measured)
+    # One frame's way is no better than one frame's network: bumps, bridges, passing trucks.
+    doubt = _doubt(way.turn_rad, own, measured) if way.frames > 1 else 0.0
     gain = (own + doubt) / (own + doubt + measured)
     step, keep = gain * direction, np.eye(6) - gain * np.outer(direction, row)
 
@@ -126,7 +143,7 @@ def updated_by_way(
     observability = np.clip(1 - np.diag(covariance) / np.diag(prior_covariance), 0.0, 1.0)
     told = np.append(np.abs(way.axis) > _LEAST_SHARE, np.zeros(3, bool)) & (observability >= OBSERVABLE)
     apart = way.turn_rad / np.sqrt(own + measured)
-    notes = [_sentence(way, apart)] if abs(apart) > _CONTRADICTION_SIGMAS else []
+    notes = [_sentence(way, apart)] if abs(apart) > _CONTRADICTION_SIGMAS and way.frames > 1 else []
     return replace(
         estimate,
         T=_turned(estimate.T, gain * way.turn_rad * way.axis),

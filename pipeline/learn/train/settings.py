@@ -59,6 +59,9 @@ class LossConfig(_Section):
     static: NotNegative = 1.0
     tracks_lidar: NotNegative = 0.5
     drivable: NotNegative = 2.0
+    way: NotNegative = (
+        1.0  # the radar's velocity along the road: what sets right a radar whose elevations point wrong
+    )
     loop: NotNegative = 1.0
     prior: NotNegative = 0.1  # holds what frames do not determine, and is weaker than what they determine
     semantics: NotNegative = 1.0  # the encoders' cross-entropy to the precomputed classes
