@@ -68,7 +68,9 @@ def test_one_frame_counts_by_the_usual_scatter_and_outweighs_no_network(street):
     assert abs(way.turn_rad + np.radians(2.0)) < 3 * way.sigma_rad
     assert np.degrees(way.sigma_rad) > 0.6
     solution = solution_at(turned(T_LIDAR_RADAR, np.radians(2.0)), T_CAMERA_LIDAR @ T_LIDAR_RADAR)
-    told = informed_by_way(solution, street[:1], prior()).pairs["lidar_radar"]
+    every = informed_by_way(solution, street[:1], prior()).pairs
+    assert every["camera_radar"] is solution.pairs["camera_radar"]
+    told = every["lidar_radar"]
     moved = log_se3(told.T @ inverse(solution.pairs["lidar_radar"].T))[1]
     assert moved == pytest.approx(way.turn_rad * SIGMA[1] ** 2 / (SIGMA[1] ** 2 + way.sigma_rad**2), rel=0.01)
     assert told.covariance[1, 1] < SIGMA[1] ** 2
