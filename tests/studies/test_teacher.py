@@ -3,8 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.learn.infer.onnx_networks import SHIPPED
+from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.sample.grid import Grid, grid_rays
 from schemas.training import GRID_CLASSES, UNKNOWN_CLASS
 from tests.benchmarks.studies import ssl_teacher
@@ -48,3 +51,11 @@ def test_a_linear_probe_finds_classes_that_features_separate():
     known = np.where(rng.random(classes.shape) < 0.2, UNKNOWN_CLASS, classes)
     weights = ssl_teacher.linear_probe([noisy], [known])
     assert (ssl_teacher.probed(weights, noisy) == classes).all()
+
+
+@pytest.mark.parametrize("name", ["joint", "joint_classes"])
+def test_encoders_of_the_shipped_networks_are_cut_out_before_their_classes_are_normalised(name):
+    grid, channels = Grid(), SingleFrameCalibrator(SHIPPED / f"{name}.onnx").config.camera_channels
+    found = ssl_teacher.encoder_of(SHIPPED / f"{name}.onnx")(np.ones((1, channels, grid.height, grid.width)))
+    assert found.shape == (len(GRID_CLASSES), grid.height, grid.width)
+    assert np.abs(np.exp(found).sum(0) - 1).max() > 0.1  # no probabilities yet

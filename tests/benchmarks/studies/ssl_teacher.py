@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from pipeline.learn.infer.onnx_networks import open_networks
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.sample.camera_maps import class_likelihood
 from pipeline.learn.sample.grid import Grid, grid_rays
+from pipeline.learn.sample.layout import LIKELIHOOD
 from pipeline.objective.paper.classes import labels_of
 from pipeline.perceive.models.manifest import Manifest, load_manifest
 from pipeline.perceive.models.session import fit_image
@@ -151,24 +152,38 @@ class Features:
         return np.stack(planes)
 
 
-def encoder_of(path: Path) -> tuple[onnxruntime.InferenceSession, str]:
-    """A network's encoder of the camera up to its classes' logits, and how many channels it takes."""
+def encoder_of(path: Path) -> Callable[[np.ndarray], Float32[np.ndarray, "K H W"]]:
+    """A network's encoder: logits of the classes from its input `camera`, one frame."""
     model = onnx.load(str(path))
-    logits = next(n for n in model.graph.node if n.op_type == "LogSoftmax").input[0]
+    makers = {name: node for node in model.graph.node for name in node.output}
+    # Backwards from what the matchers are given to the only normalisation on the way, each name once.
+    ahead = [LIKELIHOOD]
+    for name in ahead:
+        node = makers.get(name)
+        if node is not None and node.op_type in {"LogSoftmax", "Softmax"}:
+            break
+        ahead += [n for n in (node.input if node is not None else ()) if n not in ahead]
+    logits = node.input[0]
     cut = onnx.utils.Extractor(onnx.shape_inference.infer_shapes(model)).extract_model(["camera"], [logits])
-    return onnxruntime.InferenceSession(cut.SerializeToString(), providers=["CPUExecutionProvider"]), logits
+    session = onnxruntime.InferenceSession(cut.SerializeToString(), providers=["CPUExecutionProvider"])
+
+    def encode(camera: np.ndarray) -> Float32[np.ndarray, "K H W"]:
+        [found] = session.run([logits], {"camera": camera.astype(np.float32)})[0]
+        return found if len(found) == len(GRID_CLASSES) else found.transpose(2, 0, 1)  # exporters differ
+
+    return encode
 
 
 def seen_by(models: ModelSet, day: SslDay, frames: Sequence[tuple[Frame, Observation]]) -> list[np.ndarray]:
     """Classes of the cells by a network's encoder, from images alone."""
     fleet = models.configured(day.fleet).changed(learn={"camera": "image"})
     [network] = open_networks(models.by_name, fleet.learn, fleet.prepare)
-    session, logits = encoder_of(models.files[0])
+    encode = encoder_of(models.files[0])
     channels, prior = SingleFrameCalibrator(models.files[0]).config.camera_channels, day.prior(0.0, 0.0, 0)
     out = []
     for frame, row in frames:
         camera = network.sensors(frame, row, prior).camera_channels(channels)
-        out.append(session.run([logits], {"camera": camera.astype(np.float32)})[0][0].argmax(0))
+        out.append(encode(camera).argmax(0))
     return out
 
 
