@@ -117,8 +117,10 @@ def render_frame(
     T_lidar_radar: Float[np.ndarray, "4 4"],
     grid: Grid,
     camera_channels: int = CAMERA_CHANNELS,
+    *,
+    marks: bool = True,
 ) -> dict[str, np.ndarray]:
-    """Inputs of the exported graph by name, batch 1."""
+    """Inputs of the exported graph by name, batch 1; without `marks` those of bright ground are empty."""
     lidar_camera = transform_points(T_camera_lidar, sensors.lidar_xyz_m).astype(np.float32)
     radar_camera = transform_points(T_camera_radar, sensors.radar_xyz_m).astype(np.float32)
     radar_lidar = transform_points(T_lidar_radar, sensors.radar_xyz_m).astype(np.float32)
@@ -130,7 +132,7 @@ def render_frame(
     weight = np.where(ground > 0.5, np.float32(GROUND_WEIGHT), np.float32(1))
     count = min(len(radar_camera), RADAR_POINTS)
     painted, index = _painted(lidar_camera, sensors.lidar_features, grid)
-    strength, marks = _marks(painted, index)
+    strength, marked = _marks(painted, index) if marks else (np.zeros(0, np.float32), index[:0])
     return {
         "camera": sensors.camera_channels(camera_channels),
         "lidar_grid": painted[None],
@@ -144,7 +146,7 @@ def render_frame(
         "radar_features": _padded(sensors.radar_features[:count], RADAR_POINTS),
         "radar_valid": _padded(np.ones(count, bool), RADAR_POINTS),
         "radar_has_elevation": np.array([sensors.radar_has_elevation]),
-        "marks_camera": _padded(lidar_camera[marks], MARKED_POINTS),
+        "marks_camera": _padded(lidar_camera[marked], MARKED_POINTS),
         "mark_weight": _padded(strength, MARKED_POINTS),
     }
 

@@ -101,7 +101,7 @@ class SingleFrameCalibrator:
         known = self._of_camera(sensors)
         found: list[FrameEstimate] = []
         for _ in range(iterations):
-            view = render_frame(sensors, *guess, self.grid, self._channels) | known
+            view = render_frame(sensors, *guess, self.grid, self._channels, marks=self.config.marks) | known
             feed = {name: view[name] for name in self._inputs}
             corrections, log_variance = self._network.run(_ANSWERS, feed)
             step = corrections[0].astype(np.float64)

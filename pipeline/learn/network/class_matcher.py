@@ -108,16 +108,17 @@ class ClassMatcher(nn.Module):
         return self._finish(self.levels[-1], by_group, _centres(sums), sharpness, omega, R)
 
     def _pyramid(self, log_likelihood: Tensor) -> list[Tensor]:
-        """Maps per level, padded by what a point at the border can reach, with channels last."""
+        """Maps per level, padded by what a point at the border can reach, classes last: of a cell and of the next."""
         maps = []
         for level in self.levels:
             pooled = log_likelihood
             if level.factor > 1:
                 pooled = torch.log(F.avg_pool2d(torch.exp(log_likelihood), level.factor).clamp(min=1e-6))
             pad = level.reach + 1
-            maps.append(
-                F.pad(pooled.clamp(min=FLOOR), (pad, pad, pad, pad), value=NEUTRAL).permute(0, 2, 3, 1)
-            )
+            table = F.pad(pooled.clamp(min=FLOOR), (pad, pad, pad, pad), value=NEUTRAL).permute(0, 2, 3, 1)
+            # Behind the last column comes itself: what lies beyond is looked up with weight zero only.
+            following = torch.cat([table[:, :, 1:], table[:, :, -1:]], 2)
+            maps.append(torch.cat([table, following], -1))
         return maps
 
     def _groups(self, angles: Tensor, cells: tuple[Tensor, Tensor], weight: Tensor) -> Tensor:
@@ -148,11 +149,12 @@ class ClassMatcher(nn.Module):
         first_row, first_column = torch.floor(row), torch.floor(column)
         offsets = torch.arange(-level.reach, level.reach + 2, device=table.device) + pad
         at_row = (first_row.long()[..., None] + offsets).clamp(0, rows - 1) * columns
-        at_column = (first_column.long()[..., None] + offsets).clamp(0, columns - 1)
+        at_column = (first_column.long()[..., None] + offsets[::2]).clamp(0, columns - 1)
         frame = torch.arange(frames, device=table.device)[:, None, None] * (rows * columns)
         index = (at_row + frame)[..., :, None] + at_column[..., None, :]
-        # One row of classes per lookup: contiguous, where an elementwise gather would be ten times slower.
+        # Two cells' classes per lookup: contiguous, where an elementwise gather would be ten times slower.
         picked = F.embedding(index.flatten(2), table.flatten(0, 2))
+        picked = picked.reshape(frames, -1, 4 * pad * pad, int(probability.shape[-1]))
         value = (picked @ probability[..., None]).squeeze(-1)
         # Groups are summed at the four corners, and shifted onto each other then: points outnumber groups.
         a, b = (row - first_row)[:, None], (column - first_column)[:, None]
