@@ -15,7 +15,7 @@ from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
 
 GOAL_MS = 40.0
-BUSY = 4.0  # a shared machine: the goal is for idle cores, and the best of many runs comes near it
+BUSY = 6.0  # a shared machine: the goal is for idle cores; three processes on two were seen to take three times as long
 T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.2], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
