@@ -117,7 +117,7 @@ def test_cron_mails_what_is_wrong_and_nothing_else(code, fake_night, monkeypatch
     assert (when, user) == (["30", "1", "*", "*", "*"], "boresight")
     command = (
         command.replace("\\%", "%")
-        .replace("/tmp/", f"{tmp_path}/")
+        .replace("/var/lib/boresight", str(tmp_path))
         .replace(". /etc/boresight/night.env;", "")
     )
     done = subprocess.run(["/bin/sh", "-c", command], capture_output=True, text=True, check=False)

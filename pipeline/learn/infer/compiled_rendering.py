@@ -21,6 +21,8 @@ from pipeline.learn.sample.layout import (
     INDEX_BITS,
     LIDAR_FEATURES,
     MARGIN_DEG,
+    MARK_FLAT,
+    MARK_LEAST_SHARE,
     MARK_SIGMAS,
     MARK_WINDOW,
     MARKED_POINTS,
@@ -201,8 +203,10 @@ def _marks(painted: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarr
     ground = painted[0] * painted[2 + _GROUND]
     values = painted[2 + _INTENSITY] * ground
     share = _row_sums(ground)
-    above = (painted[2 + _INTENSITY] - _row_sums(values) / np.maximum(share, 1e-4 * MARK_WINDOW)) * ground
-    spread = np.sqrt((above * above).sum() / max(ground.sum(), 1.0)) + 1e-3
+    above = (
+        painted[2 + _INTENSITY] - _row_sums(values) / np.maximum(share, MARK_LEAST_SHARE * MARK_WINDOW)
+    ) * ground
+    spread = np.sqrt((above * above).sum() / max(ground.sum(), 1.0)) + MARK_FLAT
     strength = np.clip((above / spread - 1) / (MARK_SIGMAS - 1), 0, 1).astype(np.float32).ravel()
     cells = np.flatnonzero(strength)
     cells = cells[np.argsort(-strength[cells], kind="stable")][:MARKED_POINTS]

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
-from pipeline.learn.sample.layout import LIDAR_FEATURES, MARK_SIGMAS, MARK_WINDOW
+from pipeline.learn.sample.layout import LIDAR_FEATURES, MARK_FLAT, MARK_LEAST_SHARE, MARK_SIGMAS, MARK_WINDOW
 
 __all__ = ["log_markings", "mark_strength"]
 
@@ -26,7 +26,6 @@ _FULL_SIGMAS = 2.0  # contrast that counts as paint for certain
 _NO_MARKING = 0.1  # likelihood of bright ground where the image has no paint: wet patches, kerbs, snow
 _LEAST_ROAD = 50.0  # cells; fewer show no line
 _ROAD, _VERGE = 0, 1  # of GRID_CLASSES
-_FLAT = 1e-3  # a spread below this is rounding
 
 
 def mark_strength(lidar_grid: Float[Tensor, "B C H W"]) -> Float[Tensor, "B H W"]:
@@ -59,7 +58,7 @@ def _above_beside(values: Tensor, mask: Tensor, window: tuple[int, int]) -> Tens
     """Values less their mean over the masked cells of a window about them, over the spread of that; 0 off the mask."""
     pad = (window[0] // 2, window[1] // 2)
     share = F.avg_pool2d(mask, window, 1, pad)
-    beside = F.avg_pool2d(values * mask, window, 1, pad) / share.clamp(min=1e-4)
+    beside = F.avg_pool2d(values * mask, window, 1, pad) / share.clamp(min=MARK_LEAST_SHARE)
     above = (values - beside) * mask
     spread = (above * above).sum((2, 3), keepdim=True) / mask.sum((2, 3), keepdim=True).clamp(min=1.0)
-    return above / (torch.sqrt(spread) + _FLAT)
+    return above / (torch.sqrt(spread) + MARK_FLAT)

@@ -22,6 +22,8 @@ __all__ = [
     "LIKELIHOOD",
     "MARGIN_DEG",
     "MARKED_POINTS",
+    "MARK_FLAT",
+    "MARK_LEAST_SHARE",
     "MARK_SIGMAS",
     "MARK_WINDOW",
     "MATCHED_POINTS",
@@ -58,6 +60,7 @@ MATCHED_POINTS = 1536  # lidar points whose classes are matched with the camera'
 MARKED_POINTS = 192  # points of bright ground that are matched with the image's paint
 # Ground of that many sigmas above what lies beside it is paint, within 10 deg to each side of the cell.
 MARK_SIGMAS, MARK_WINDOW = 3.0, 51
+MARK_FLAT, MARK_LEAST_SHARE = 1e-3, 1e-4  # a spread below, and ground about a cell below, are rounding
 OBJECT_POINTS = 512  # lidar points off the ground that radar detections are matched with
 RADAR_POINTS = 384  # as table training holds them
 # Added to a rank in 0..1 to choose points: edges first, then objects. Unequal fractions of a rank's step, so that no
