@@ -44,6 +44,7 @@ def models(*, json: bool = False) -> int:
 def _print_table(found: Sequence[ShippedModel]) -> None:
     """One block per model, for people, on stderr."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console(stderr=True, width=_WIDTH, highlight=False)
@@ -57,5 +58,5 @@ def _print_table(found: Sequence[ShippedModel]) -> None:
             "card": str(model.file.with_suffix(".md")), "file": "; ".join(model.problems) or "as its card says",
         }  # fmt: skip
         for name, value in rows.items():
-            table.add_row(f"  {name}", str(value))
+            table.add_row(f"  {name}", escape(str(value)))  # a card may say `[learn]`, which is no style
         console.print(table)

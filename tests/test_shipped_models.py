@@ -18,6 +18,8 @@ def test_every_shipped_model_is_the_file_that_its_card_speaks_of(capsys):
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert [m["name"] for m in told["models"]] == [model.name for model in found]
     assert all(set(REQUIRED) <= m.keys() for m in told["models"])
+    assert main(["models"]) == 0
+    assert "[learn] camera" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("spoil", ["file", "card", "missing"])
