@@ -46,8 +46,8 @@ def simulate(
         environments: what the drives lead through.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
         faults: vehicle:day:sensor:kind:amount, several with commas; kinds: yaw pitch roll [deg], x y z [m],
-            drift-... per day, time and stamp [s], missing, swap, intrinsics, centre, centre-v [px], labels, night,
-            dusk, few.
+            drift-... per day, warm-... over the day, time and stamp [s] (0.5@0.6: after .6 of the day's frames),
+            missing, swap, intrinsics, centre, centre-v [px], labels, night, dusk, few.
         remount_deg: sd per axis by which every day's mounting differs from the day before, as when a rig is taken off
             every evening; fixed sensors move by hundredths of a degree, which is the default.
         reflectors: also record three corner reflectors on every vehicle's last day, under OUT/reflectors.

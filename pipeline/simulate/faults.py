@@ -3,6 +3,8 @@
 Kinds: yaw, pitch, roll [deg] and x, y, z [m] are knocks from that day on, about the vehicle's axes at the sensor; the
 same with `drift-` before it grow by the amount per day, starting that day. From that day on `time` [s] lets a sensor
 measure earlier than its stamps say, which stay with the others'; `stamp` [s] shifts its stamps, and nothing else.
+All of these may begin within their day: amount `0.5@0.6` comes after six tenths of its frames. With `warm-` before it a
+turn or shift grows from nothing to the amount from the first frame of that day to its last, and is gone the next day.
 Only on that day: `missing` (no data), `swap` (the sensor's topic carries the other point cloud), `intrinsics` (logged
 focal length wrong by the fraction), `centre` and `centre-v` (logged principal point too far to the right, or down, by
 so many pixels), `labels` (classes permuted), `night` (dark images, outlines three times as loose, classes confused,
@@ -29,7 +31,8 @@ _AXES: Final = {"roll": 0, "pitch": 1, "yaw": 2, "x": 0, "y": 1, "z": 2}
 _CAMERA_ONLY: Final = ("intrinsics", "centre", "centre-v", "labels", "night", "dusk", "few")
 _DAY_ONLY: Final = ("missing", "swap", *_CAMERA_ONLY)
 _CLOCKS: Final = ("time", "stamp")
-KINDS: Final = (*_AXES, *(f"drift-{a}" for a in _AXES), *_CLOCKS, *_DAY_ONLY)
+_WARM: Final = "warm-"
+KINDS: Final = (*_AXES, *(f"{how}-{a}" for how in ("drift", "warm") for a in _AXES), *_CLOCKS, *_DAY_ONLY)
 _SENSORS: Final = {
     **dict.fromkeys(_CLOCKS, ("camera", "radar")),
     "missing": ("camera", "lidar", "radar"),
@@ -40,13 +43,17 @@ _SENSORS: Final = {
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that goes wrong; `day` counts from 0, amounts in deg, m, s, a fraction or a count, by kind."""
+    """One thing that goes wrong; `day` counts from 0, amounts in deg, m, s, a fraction or a count, by kind.
+
+    `after` is the share of the day's frames that a knock, a drift or a shifted clock spares.
+    """
 
     vehicle: str
     day: int
     sensor: str
     kind: str
     amount: float
+    after: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -85,26 +92,34 @@ def parse_faults(text: str, days: list[str]) -> tuple[Fault, ...]:
         number = days.index(day) if day in days else int(day) if day.isdigit() else -1
         if not 0 <= number < len(days):
             raise ConfigError("--faults", item, f"day {day!r} is not one of {', '.join(days)} nor its number")
+        size, at, after = amount.partition("@")
         try:
-            faults.append(Fault(vehicle, number, sensor, kind, float(amount)))
+            fault = Fault(vehicle, number, sensor, kind, float(size), float(after) if at else 0.0)
         except ValueError as err:
             raise ConfigError("--faults", item, f"amount {amount!r} is no number") from err
+        if at and (kind in _DAY_ONLY or kind.startswith(_WARM) or not 0 <= fault.after < 1):
+            raise ConfigError("--faults", item, f"{kind} cannot begin after {after} of its day")
+        faults.append(fault)
     return tuple(faults)
 
 
-def shaken(mounting: Mounting, faults: tuple[Fault, ...], vehicle: str, day: int) -> Mounting:
-    """The mounting after every knock and drift up to a day, and clocks after every shift."""
+def shaken(
+    mounting: Mounting, faults: tuple[Fault, ...], vehicle: str, day: int, share: float = 0.0
+) -> Mounting:
+    """The mounting after every knock and drift up to a share of a day's frames, and clocks after every shift."""
     changes: dict[str, object] = {}
     for fault in faults:
-        if fault.vehicle != vehicle or fault.day > day or fault.kind in _DAY_ONLY:
+        is_past = (fault.day, fault.after) <= (day, share)
+        is_over = fault.kind.startswith(_WARM) and fault.day < day
+        if fault.vehicle != vehicle or not is_past or is_over or fault.kind in _DAY_ONLY:
             continue
         if fault.kind in _CLOCKS:
             # A stamp that is late belongs to an event as much earlier: shifting both leaves the event where it was.
             for name in (f"{fault.sensor}_delay_s", f"{fault.sensor}_phase_s")[: 1 + (fault.kind == "stamp")]:
                 changes[name] = float(changes.get(name, getattr(mounting, name))) + fault.amount  # type: ignore[arg-type]
             continue
-        kind = fault.kind.removeprefix("drift-")
-        amount = fault.amount * (day - fault.day + 1 if kind != fault.kind else 1)
+        how, _, kind = fault.kind.rpartition("-")
+        amount = fault.amount * {"drift": day - fault.day + 1, "warm": share, "": 1}[how]
         name = f"T_vehicle_{fault.sensor}"
         T = np.array(changes.get(name, getattr(mounting, name)), np.float64)
         axis = np.eye(3)[_AXES[kind]]

@@ -174,8 +174,10 @@ def simulate_vehicle_day(
         def tick(n: int, base: int = done) -> None:
             progress(base + n, spec.frames, f"{name} {day_name}")
 
+        last = max(sum(shares) - 1, 1)
+        mountings = [mounting_on(spec, vehicle, day, (done + k) / last) for k in range(frames)]
         with open_log(path, container) as log:
-            record_drive(log, World(drive), setup, frames, spec.rate_hz, rng, tick)
+            record_drive(log, World(drive), setup, mountings, spec.rate_hz, rng, tick)
         done += frames
         drives.append(
             {"log": path.name, "frames": frames}
@@ -187,14 +189,14 @@ def simulate_vehicle_day(
     return len(shares)
 
 
-def mounting_on(spec: FleetSpec, vehicle: int, day: int) -> Mounting:
-    """Where the sensors of a vehicle are on a day, faults included."""
+def mounting_on(spec: FleetSpec, vehicle: int, day: int, share: float = 0.0) -> Mounting:
+    """Where the sensors of a vehicle are after a share of a day's frames, faults included."""
     rig = rig_named(spec.rig)
     if spec.remount_deg is not None:  # the paper takes its rig off every evening: lever arms move along
         shift_m = rig.remount_translation_m * max(spec.remount_deg / rig.remount_rotation_deg, 1.0) / 4
         rig = replace(rig, remount_rotation_deg=spec.remount_deg, remount_translation_m=shift_m)
     mounting = mounting_of(rig, spec.seed, vehicle, day)
-    return shaken(mounting, spec.faults, vehicle_names(spec)[vehicle], day)
+    return shaken(mounting, spec.faults, vehicle_names(spec)[vehicle], day, share)
 
 
 def _shares(frames: int, drives: int) -> list[int]:
@@ -237,4 +239,5 @@ def _truth(spec: FleetSpec, vehicle: int, day: int, m: Mounting) -> dict[str, An
         "camera_K_logged": misread(m.nominal_camera, faults_on(spec.faults, name, day)).K.tolist(),
         "camera_readout_s": rig_named(spec.rig).camera.readout_s,
         "faults": [asdict(f) | {"active": f.day <= day} for f in spec.faults if f.vehicle == name],
+        "at_end_of_day": {k: T.tolist() for k, T in mounting_on(spec, vehicle, day, 1.0).truth().items()},
     }

@@ -41,6 +41,50 @@ def test_a_slow_drift_grows_day_by_day():
     np.testing.assert_allclose(turned, [0.0, 0.2, 0.4], atol=1e-6)
 
 
+def test_a_knock_within_a_day_spares_its_first_frames_and_stays_for_good():
+    spec = spec_with(*parse_faults("vehicle-1:1:camera:yaw:0.5@0.6", DAYS))
+
+    def turned_deg(day, share):
+        T = mounting_on(spec, 0, day, share).truth()["T_camera_lidar"]
+        T0 = mounting_on(FleetSpec(**QUIET), 0, day).truth()["T_camera_lidar"]
+        return np.degrees(np.linalg.norm(log_so3((T @ inverse(T0))[:3, :3])))
+
+    turned = [
+        turned_deg(0, 1.0),
+        turned_deg(1, 0.0),
+        turned_deg(1, 0.59),
+        turned_deg(1, 0.61),
+        turned_deg(2, 0.0),
+    ]
+    np.testing.assert_allclose(turned, [0, 0, 0, 0.5, 0.5], atol=1e-6)
+
+
+def test_a_sensor_that_warms_up_moves_over_the_day_and_is_back_the_next():
+    spec = spec_with(*parse_faults("vehicle-1:1:lidar:warm-pitch:0.3", DAYS))
+    pitch = [mounting_on(spec, 0, d, s).T_vehicle_lidar for d, s in ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.5))]
+    still = [mounting_on(FleetSpec(**QUIET), 0, d).T_vehicle_lidar for d in (1, 1, 1, 2)]
+    turns = [log_so3(T[:3, :3] @ T0[:3, :3].T) for T, T0 in zip(pitch, still, strict=True)]
+    np.testing.assert_allclose(np.degrees(turns), [[0, a, 0] for a in (0, 0.15, 0.3, 0)], atol=1e-9)
+
+
+@pytest.mark.parametrize("item", ["night:1@0.5", "warm-yaw:1@0.5", "yaw:1@1.5", "yaw:1@noon"])
+def test_what_cannot_begin_within_a_day_is_refused(item):
+    with pytest.raises(ConfigError, match=r"cannot begin after|no number"):
+        parse_faults(f"vehicle-1:1:camera:{item}", DAYS)
+
+
+def test_a_knock_within_a_day_is_seen_by_its_later_frames_only(tmp_path, read, the_log):
+    quiet = {**QUIET, "vehicles": 1, "days": 1, "frames": 2}
+    clouds = {}
+    for name, faults in (("still", ""), ("knocked", "vehicle-1:0:lidar:yaw:5@0.5")):
+        spec = FleetSpec(**quiet, faults=parse_faults(faults, DAYS))
+        simulate_vehicle_day(spec, 0, 0, tmp_path / name)
+        messages = read(the_log(tmp_path / name))
+        clouds[name] = [bytes(m.data) for topic, _, m in messages if topic == TOPICS["lidar"]]
+    assert clouds["still"][0] == clouds["knocked"][0]
+    assert clouds["still"][1] != clouds["knocked"][1]
+
+
 def test_a_shift_moves_the_sensor_and_a_late_clock_the_stamps():
     spec = spec_with(Fault("vehicle-1", 1, "camera", "z", 0.05), Fault("vehicle-1", 1, "radar", "time", 0.03))
     before, after = (mounting_on(s, 0, 1) for s in (FleetSpec(**QUIET), spec))

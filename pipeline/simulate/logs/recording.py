@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -39,7 +39,7 @@ _NEIGHBOURS_EVERY: Final = 4
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A vehicle on one day: its rig, where the sensors really are, how well networks label, what is wrong."""
+    """A vehicle on one day: its rig, where its sensors are in the morning, how well networks label, what is wrong."""
 
     rig: RigSpec
     mounting: Mounting
@@ -51,7 +51,7 @@ def record_drive(
     log: OpenLog,
     world: World,
     setup: Setup,
-    frames: int,
+    mountings: Sequence[Mounting],
     rate_hz: float,
     rng: np.random.Generator,
     tick: Callable[[int], None],
@@ -62,7 +62,7 @@ def record_drive(
         log: open for writing.
         world: of the drive.
         setup: the vehicle that drives through it.
-        frames: trios to write.
+        mountings: where the sensors are at each trio to write.
         rate_hz: trios per second.
         rng: noise.
         tick: told the number of frames written, after each.
@@ -78,11 +78,11 @@ def record_drive(
     semantics = _labelled_in_the_dark(setup.semantics, setup.faults)
     free_hz = setup.rig.free_hz
     clocks = None if free_hz is None else free_clocks(free_hz, np.random.default_rng([drive.seed, 53]))
-    for k in range(frames):
+    for k, mounting in enumerate(mountings):
         stamp = FIRST_FRAME_S + k / rate_hz + rng.uniform(0, 0.02)
         stamp, near = (stamp, None) if clocks is None else _free_stamps(clocks, stamp)
         moment = world.moment(stamp - setup.rig.lidar.sweep_s / 2)
-        view = moment, scene, setup.rig, setup.mounting
+        view = moment, scene, setup.rig, mounting
         frame = frame_of(*view, stamp, rng, semantics, near and near[0])
         pending = trio(messages, frame, setup, at, rng)
         if near is not None and k % _NEIGHBOURS_EVERY == 0:
