@@ -110,6 +110,6 @@ class SolveError(BoresightError):
 
     exit_code = 3
 
-    def __init__(self, reason: str) -> None:
-        self.reason = reason
+    def __init__(self, reason: str, fault: str = "") -> None:
+        self.reason, self.fault = reason, fault  # a key of schemas.faults.FAULTS, where one is known
         super().__init__(reason)

@@ -35,7 +35,7 @@ DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 CALIBRATIONS = TableSchema(
     "calibrations",
-    3,
+    4,
     (
         scalar("vehicle", "string", "vehicle id"),
         scalar("day", "string", "YYYY-MM-DD"),
@@ -80,6 +80,7 @@ CALIBRATIONS = TableSchema(
             "accepted (use it), held (computed, the prior stays current), refused (nothing computed)",
         ),
         scalar("reason", "string", "why, in words; empty where accepted without remark"),
+        scalar("faults", "list<string>", "faults that the reason names, keys of FAULTS in schemas/faults.py"),
         scalar(
             "score",
             "float64",
@@ -160,7 +161,7 @@ CALIBRATIONS = TableSchema(
     ),
     "One row per pair and method. boresight show calibrations --json prints these names plus T, 4x4 row-major.",
     made_by="calibrate",
-    reads_versions=(1, 2),
+    reads_versions=(1, 2, 3),
     about=("vehicle", "day", "trio", "method", "pair"),
 )
 
@@ -219,6 +220,7 @@ class CalibrationRecord:
     trigger_after: dict[str, float] = field(default_factory=dict)
     frames_rejected: dict[str, int] = field(default_factory=dict)
     determined: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     assumptions: list[str] = field(default_factory=list)
     drive_missing: list[str] = field(default_factory=list)

@@ -73,6 +73,7 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         **_loop_fields(day.solution),
         status=verdict.status,
         reason=verdict.reason,
+        faults=list(verdict.faults),
         score=verdict.score,
         determined=list(verdict.determined),
         limit_rad=judged.claims["azimuth"].limit_rad,
@@ -96,10 +97,17 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
     )
 
 
-def refused_records(about: Inputs, reason: str, frames: int, prior: Prior | None) -> list[CalibrationRecord]:
+def refused_records(
+    about: Inputs, reason: str, frames: int, prior: Prior | None, fault: str = ""
+) -> list[CalibrationRecord]:
     """Records of a day that could not be calibrated at all."""
     return [
-        CalibrationRecord(**_identity(about, pair, frames, prior), status="refused", reason=reason)
+        CalibrationRecord(
+            **_identity(about, pair, frames, prior),
+            status="refused",
+            reason=reason,
+            faults=[fault] if fault else [],
+        )
         for pair in PAIRS
     ]
 

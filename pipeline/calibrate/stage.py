@@ -18,7 +18,7 @@ from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.calibrate.records import Inputs, Judged, SolvedDay, record_of, refused_records
 from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
 from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
-from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
+from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import held_out_update
@@ -94,7 +94,7 @@ def _records(task: Task, method: Method, about: Inputs, progress: Progress) -> l
         prior = replace(prior, T_camera_lidar_before=before)
         return calibrate_observations(rows, prior, fleet, about, progress, method.solver_of(task))
     except SolveError as err:
-        return refused_records(about, err.reason, len(rows), prior)
+        return refused_records(about, err.reason, len(rows), prior, err.fault)
 
 
 def _refusal(refused: Outcome, partition: Partition, method: Method, seed: int) -> Work:
@@ -221,23 +221,16 @@ def _judge_all(
     """Verdict and evidence of each pair; pairs that a method composes come after their factors."""
     limits, search = _limits(fleet.verify), search_range(prior, fleet.solve)
     composed = method_named(solution.method).composed
-    failed = _contradictions(solution, composed)
-    limit_rad = float(np.radians(fleet.verify.camera_lidar_limit_deg))
-    failed["camera_lidar"] = heading_failures(solution, prior, observations, limit_rad, limits)
+    failed = checks_of_day(FoundDay(observations, selection, prior, solution, composed, fleet, limits))
     found: dict[str, Judged] = {}
     for pair in sorted(PAIRS, key=lambda p: p in composed):
         estimate = solution.pairs[pair]
         held_out = [observations[i] for i in selection.holdout[pair]] if pair in active else []
         test, claims = _held_out_evidence(estimate, held_out, prior, fleet, limits)
-        checks = [
-            *solution.failed_checks.get(pair, []),
-            *failed.get(pair, []),
-            *loop_failures(solution, limits),
-        ]
         verdict = judge(
             estimate,
             prior,
-            Evidence(test, claims, checks),
+            Evidence(test, claims, failed[pair]),
             search,
             limits,
             triggered=pair in active,
@@ -250,17 +243,6 @@ def _judge_all(
 def _limits(verify: VerifyConfig) -> VerdictLimits:
     """The thresholds that `[verify]` of fleet.toml names as the verdict does."""
     return VerdictLimits(**{f.name: getattr(verify, f.name) for f in fields(VerdictLimits)})
-
-
-def _contradictions(solution: Solution, composed: Sequence[str]) -> dict[str, list[str]]:
-    """Checks that only a composed pair failed speak against a factor: two sensors contradict the third's registration.
-
-    Camera and lidar know their pose ten times better than either knows the radar's, so lidar-radar is held.
-    """
-    factors = [p for p in PAIRS if p not in composed]
-    known = {check for p in factors for check in solution.failed_checks.get(p, [])}
-    own = [check for p in composed for check in solution.failed_checks.get(p, []) if check not in known]
-    return {"lidar_radar": own} if own else {}
 
 
 def _held_out_evidence(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.geometry.se3 import adjoint
 from pipeline.rigs import CameraPrior
 
@@ -85,7 +86,7 @@ class Solution:
     pairs: dict[str, PairEstimate]
     loop_rotation_rad: float | None = None
     loop_translation_m: float | None = None
-    # By pair, checks that failed while solving, in words: restarts or halves disagree, camera contradicts radar.
-    failed_checks: dict[str, list[str]] = field(default_factory=dict)
+    # By pair, checks that failed while solving: restarts or halves disagree, camera contradicts radar.
+    failed_checks: dict[str, list[FailedCheck]] = field(default_factory=dict)
     # Solves again whatever rests on the pairs named, without them; None where no pair rests on another.
     without: Callable[[frozenset[str]], Solution] | None = None

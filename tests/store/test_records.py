@@ -257,7 +257,7 @@ def test_records_of_a_release_that_knew_fewer_columns_stay_readable_and_more_can
     assert (new.score, new.drive_missing) == (0.5, ["a"])
     np.testing.assert_array_equal(old.covariance, found.covariance)
     assert new.common_covariance.shape == (6, 6)
-    with pytest.raises(ContractError, match=r"holds calibrations/3, this version reads calibrations/2"):
+    with pytest.raises(ContractError, match=r"holds calibrations/4, this version reads calibrations/2"):
         read_records(lake, replace(fewer, reads_versions=()), CalibrationRecord)
 
 

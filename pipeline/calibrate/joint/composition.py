@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.calibrate.joint.failed_checks import open_loop
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_covariance, change_jacobian
 from pipeline.geometry.se3 import adjoint, compose_covariance, inverse, log_so3
@@ -19,7 +20,7 @@ _MOSTLY = 0.5  # of a variance: from there on it is called the prior's
 
 def compose_pairs(
     camera_lidar: PairEstimate, lidar_radar: PairEstimate, without_lidar: PairEstimate, prior: Prior
-) -> tuple[PairEstimate, float | None, list[str]]:
+) -> tuple[PairEstimate, float | None, list[FailedCheck]]:
     """Camera-radar by the loop, and how far the camera-radar estimate that never saw the lidar is from it.
 
     Returns:

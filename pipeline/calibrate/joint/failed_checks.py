@@ -1,6 +1,6 @@
 """Checks of method `joint` on its own estimates: origins of the search, halves, the camera, the loop.
 
-Each returns sentences, one per failed check; none where all is well.
+Each returns one value per failed check; none where all is well.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin
 from pipeline.calibrate.joint.lidar_radar.tilt_floors import radar_tilt_axes
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate
 
 __all__ = ["lidar_radar_failures", "open_loop", "unvouched_basin"]
@@ -35,7 +36,7 @@ def unvouched_basin(basin: Basin) -> str:
     )
 
 
-def lidar_radar_failures(estimate: PairEstimate) -> list[str]:
+def lidar_radar_failures(estimate: PairEstimate) -> list[FailedCheck]:
     """Restarts, halves, and the registration against the camera's boxes."""
     d = estimate.diagnostics
     if not d:
@@ -58,12 +59,12 @@ def lidar_radar_failures(estimate: PairEstimate) -> list[str]:
             failed.append(
                 f"the registration would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
             )
-    return failed
+    return [FailedCheck(sentence, "witnesses_disagree") for sentence in failed]
 
 
 def open_loop(
     difference: Float[np.ndarray, " 3"], sigma: Float[np.ndarray, " 3"], known: Bool[np.ndarray, " 3"]
-) -> list[str]:
+) -> list[FailedCheck]:
     """Camera-radar without the lidar contradicts the composed one.
 
     Args:
@@ -72,7 +73,11 @@ def open_loop(
         known: axes that the estimate without the lidar determined.
     """
     return [
-        f"without the lidar {name} turns by {np.degrees(d):+.2f} deg against the loop, sigma {np.degrees(s):.2f} deg"
+        FailedCheck(
+            f"without the lidar {name} turns by {np.degrees(d):+.2f} deg against the loop, "
+            f"sigma {np.degrees(s):.2f} deg",
+            "witnesses_disagree",
+        )
         for name, d, s, k in zip(("pitch", "yaw", "roll"), -difference, sigma, known, strict=True)
         if k and abs(d) > _SIGMAS * s
     ]

@@ -29,6 +29,7 @@ from pipeline.calibrate.joint.failed_checks import lidar_radar_failures, unvouch
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.results import Progress, silent
 from schemas.calibrations import PAIRS
@@ -65,13 +66,13 @@ def solve_joint(
     prior, config = _without_terms(prior, config)
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
     progress(0, 3, "camera-lidar")
-    aligned: Aligned | str = ""
+    aligned: Aligned | FailedCheck | None = None
     if "camera_lidar" in wanted:
         try:
             rng = np.random.default_rng([seed, 0])
             aligned = align_camera_lidar(observations["camera_lidar"], prior, config, rng)
         except SolveError as err:
-            aligned = err.reason
+            aligned = FailedCheck(err.reason, err.fault)
     return _Day(observations, prior, config, seed, frozenset(wanted), aligned, progress).solved(frozenset())
 
 
@@ -84,11 +85,11 @@ class _Day:
     config: SolveConfig
     seed: int
     wanted: frozenset[str]
-    aligned: Aligned | str  # or why not; empty where nobody asked
+    aligned: Aligned | FailedCheck | None  # or why not; None where nobody asked
     progress: Progress
     # Estimates made before, with the checks that they failed, by pair and what they rest on: solved again is only what
     # rests on a disbelieved pair.
-    made: dict[tuple[object, ...], tuple[PairEstimate, list[str]]] = field(default_factory=dict)
+    made: dict[tuple[object, ...], tuple[PairEstimate, list[FailedCheck]]] = field(default_factory=dict)
 
     def solved(self, disbelieved: frozenset[str]) -> Solution:
         """The solution in which no pair rests on a disbelieved one."""
@@ -120,13 +121,13 @@ class _Day:
         return Solution("joint", pairs, loop_rad, None, checks, self.solved)
 
     def _once(
-        self, key: tuple[object, ...], make: Callable[[], tuple[PairEstimate, list[str]]]
-    ) -> tuple[PairEstimate, list[str]]:
+        self, key: tuple[object, ...], make: Callable[[], tuple[PairEstimate, list[FailedCheck]]]
+    ) -> tuple[PairEstimate, list[FailedCheck]]:
         if key not in self.made:
             self.made[key] = make()
         return self.made[key]
 
-    def _camera_radar(self) -> tuple[PairEstimate, list[str]]:
+    def _camera_radar(self) -> tuple[PairEstimate, list[FailedCheck]]:
         """Without the lidar."""
         rng = np.random.default_rng([self.seed, 2])
         seen = self.observations["camera_radar"]
@@ -138,7 +139,7 @@ class _Day:
             return False
         return bool(self.aligned.basin.vouched_by)
 
-    def _lidar_radar(self, helped: bool) -> tuple[PairEstimate, list[str]]:
+    def _lidar_radar(self, helped: bool) -> tuple[PairEstimate, list[FailedCheck]]:
         """With the camera's boxes where it may help."""
         prior = self.prior
         if "lidar_radar" not in self.wanted:
@@ -157,16 +158,16 @@ class _Day:
                 covariance_camera_lidar=covariance,
             )
         except SolveError as err:
-            return _unchanged("lidar_radar", prior), [err.reason]
+            return _unchanged("lidar_radar", prior), [FailedCheck(err.reason, err.fault)]
         if not helped and "camera_lidar" in self.wanted:
             note = "camera-lidar is not believed: estimated without its help"
             found = replace(found, notes=[*found.notes, note])
         return found, lidar_radar_failures(found)
 
-    def _camera_lidar(self, lidar_radar: PairEstimate | None) -> tuple[PairEstimate, list[str]]:
+    def _camera_lidar(self, lidar_radar: PairEstimate | None) -> tuple[PairEstimate, list[FailedCheck]]:
         """Along the heading that lidar-radar shows; None = that is disbelieved."""
         if not isinstance(self.aligned, Aligned):
-            return _unchanged("camera_lidar", self.prior), [self.aligned] if self.aligned else []
+            return _unchanged("camera_lidar", self.prior), [] if self.aligned is None else [self.aligned]
         heading = None if lidar_radar is None else _heading(lidar_radar)
         found = analyse_camera_lidar(self.aligned, np.random.default_rng([self.seed, 3]), heading=heading)
         found = replace(found, disproved=unvouched_basin(self.aligned.basin))

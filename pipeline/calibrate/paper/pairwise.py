@@ -28,6 +28,7 @@ from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.paper.minimise import Minimum, Search, minimise, poses_about
 from pipeline.calibrate.paper.sandwich import sandwich_covariance
 from pipeline.config import SolveConfig
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.common_share import common_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import rotation_angle_rad
@@ -176,10 +177,10 @@ def loop_size(pairs: Mapping[str, PairEstimate]) -> tuple[float, float]:
     return float(rotation_angle_rad(loop)), float(np.linalg.norm(loop[:3, 3]))
 
 
-def border_failures(pairs: Mapping[str, PairEstimate]) -> dict[str, list[str]]:
+def border_failures(pairs: Mapping[str, PairEstimate]) -> dict[str, list[FailedCheck]]:
     """A minimum at the border of the search box is none: the loss may fall further outside."""
     return {
-        pair: ["the minimum lies at the border of the search range"]
+        pair: [FailedCheck("the minimum lies at the border of the search range")]
         for pair, estimate in pairs.items()
         if estimate.diagnostics.get("at_search_border")
     }

@@ -40,6 +40,7 @@ from pipeline.calibrate.tracking.object_tracks import (
 )
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.common_share import common_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import compose_covariance, inverse, log_so3
@@ -101,7 +102,7 @@ def solve_tracking(
     sensors = _tracked(frames, prior)
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
     pairs: dict[str, PairEstimate] = {}
-    failed_checks: dict[str, list[str]] = {pair: [] for pair in PAIRS}
+    failed_checks: dict[str, list[FailedCheck]] = {pair: [] for pair in PAIRS}
     for k, pair in enumerate(("camera_lidar", "lidar_radar")):
         progress(1 + k, 3, pair)
         pairs[pair] = _unchanged(pair, prior)
@@ -115,12 +116,14 @@ def solve_tracking(
                 pair, sensors[pair], prior, np.random.default_rng([seed, k]), frames=rows
             )
         except SolveError as err:
-            failed_checks[pair].append(err.reason)
+            failed_checks[pair].append(FailedCheck(err.reason, err.fault))
     failed = [pair for pair in pairs if pair in wanted and failed_checks[pair]]
     if failed and len(failed) == len(wanted & set(pairs)):
         raise SolveError(
             "; ".join(
-                f"{_SENSOR[pair]} against lidar: {why}" for pair in failed for why in failed_checks[pair]
+                f"{_SENSOR[pair]} against lidar: {check.sentence}"
+                for pair in failed
+                for check in failed_checks[pair]
             )
         )
     pairs["camera_radar"] = _composed(pairs["camera_lidar"], pairs["lidar_radar"], prior)

@@ -1,6 +1,6 @@
 """Checks of a solution as a whole, which no single pair can make: does the loop close, was the heading right?
 
-Each returns sentences for `judge`, one per failed check; none where all is well.
+Each returns one value per failed check for `judge`; none where all is well.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.geometry.changes import change_between
 from pipeline.geometry.se3 import adjoint, inverse
@@ -20,7 +21,7 @@ from schemas.observations import Observation
 __all__ = ["heading_failures", "loop_failures", "loop_sigmas"]
 
 
-def loop_failures(solution: Solution, limits: VerdictLimits | None = None) -> list[str]:
+def loop_failures(solution: Solution, limits: VerdictLimits | None = None) -> list[FailedCheck]:
     """A loop of independent estimates that does not close within its sigma: an error of any pair, so all fail."""
     limits = limits or VerdictLimits()
     found = loop_sigmas(solution)
@@ -35,7 +36,7 @@ def loop_failures(solution: Solution, limits: VerdictLimits | None = None) -> li
         failed.append(
             f"the loop is open by {solution.loop_translation_m:.3f} m, its sigma is {translation:.3f} m"
         )
-    return failed
+    return [FailedCheck(sentence, "witnesses_disagree") for sentence in failed]
 
 
 def heading_failures(
@@ -44,7 +45,7 @@ def heading_failures(
     observations: Sequence[Observation],
     limit_rad: float,
     limits: VerdictLimits | None = None,
-) -> list[str]:
+) -> list[FailedCheck]:
     """Camera-lidar solved along a heading that lidar-radar then turned.
 
     A camera's time offset moves the cloud along the car's heading, which the radar's prior mounting gives. Where
@@ -74,7 +75,7 @@ def heading_failures(
     if lateral_m * rad_per_metre < limits.max_heading_error_share * limit_rad:
         return []
     off = f"assumed heading off by {np.degrees(turn):.1f} deg by lidar-radar"
-    return [f"{off}: up to {lateral_m:.2f} m lateral error through the camera's time offset"]
+    return [FailedCheck(f"{off}: up to {lateral_m:.2f} m lateral error through the camera's time offset")]
 
 
 def loop_sigmas(solution: Solution) -> tuple[float, float] | None:

@@ -16,6 +16,7 @@ from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.limits import UNCHECKED_MOVE_SIGMAS, VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import Claim
+from pipeline.extrinsics.checks import FailedCheck, faults_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_covariance
 from schemas.calibrations import DOF_NAMES
@@ -49,7 +50,7 @@ class Evidence:
 
     held_out: HeldOutTest | None  # held-out frames at prior and result; None where none has both costs
     claims: Mapping[str, Claim]  # of azimuth and elevation at the targets
-    failed_checks: Sequence[str] = ()  # sentences, from the solver and from checks of the whole solution
+    failed_checks: Sequence[FailedCheck] = ()  # from the solver and from checks of the whole solution
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Verdict:
     # Of an accepted record: degrees of freedom that contradict the prior and that nothing checks, how far in sigmas.
     unchecked: Mapping[str, float] = field(default_factory=dict)
     unsure_only: bool = False  # held, but for nothing more than a sigma that is too large for the limits
+    faults: tuple[str, ...] = ()  # keys of schemas.faults.FAULTS that the failed checks name
 
 
 @dataclass(frozen=True)
@@ -102,10 +104,12 @@ def judge(
     """
     if not triggered:
         return Verdict("held", "not triggered: the prior stays", _FAILED)
+    faults = tuple(faults_of(evidence.failed_checks))
     if estimate.frames_used < limits.min_fit_frames:
         few = f"too few frames: {estimate.frames_used}, needs {limits.min_fit_frames}"
-        return Verdict("refused", "; ".join([*evidence.failed_checks, few]), _FAILED)
-    checks = [_Check(_FAILED, sentence) for sentence in evidence.failed_checks]
+        sentences = [check.sentence for check in evidence.failed_checks]
+        return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=faults)
+    checks = [_Check(_FAILED, check.sentence, check.disproves) for check in evidence.failed_checks]
     if estimate.disproved:
         checks.append(_Check(_FAILED, estimate.disproved, disproves=True))
     if factors:
@@ -126,7 +130,7 @@ def judge(
         disproved = any(c.disproves for c in failed) or any(f.disproved for f in factors)
         unsure_only = all(c.of_sigma for c in failed)
         reasons = "; ".join(c.reason for c in failed)
-        return Verdict("held", reasons, score, disproved=disproved, unsure_only=unsure_only)
+        return Verdict("held", reasons, score, disproved=disproved, unsure_only=unsure_only, faults=faults)
     certified = tuple(name for name, claim in evidence.claims.items() if claim.margin >= 0)
     unchecked = _unchecked(estimate, prior, certified)
     reason = "; ".join([*_reservations(estimate, evidence.claims), *_differences(estimate.pair, unchecked)])

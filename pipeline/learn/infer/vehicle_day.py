@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.errors import SolveError
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from pipeline.learn.infer.aggregate import Answers, day_estimate, mean_answer, twists_about
@@ -264,8 +265,10 @@ def _unchanged(pair: str, prior: Prior) -> PairEstimate:
     )
 
 
-def _halves_disagree(pair: str, answers: Answers, asked: _Asked, rng: np.random.Generator) -> list[str]:
-    """The reason, if estimates from the odd and from the even blocks differ by more than their sigmas allow."""
+def _halves_disagree(
+    pair: str, answers: Answers, asked: _Asked, rng: np.random.Generator
+) -> list[FailedCheck]:
+    """A failed check, if estimates from the odd and from the even blocks differ by more than their sigmas allow."""
     odd = np.unique(answers.block, return_inverse=True)[1].ravel() % 2 == 1
     halves = [_estimate(pair, _part(answers, rows), asked, rng) for rows in (odd, ~odd)]
     apart = log_se3(halves[0].T @ inverse(halves[1].T))
@@ -274,7 +277,8 @@ def _halves_disagree(pair: str, answers: Answers, asked: _Asked, rng: np.random.
     ratio = np.where(both, np.abs(apart) / sigma, 0.0)
     if ratio.max() <= _HALVES_SIGMAS:
         return []
-    return [f"two halves of the day differ by {ratio.max():.1f} of their sigmas"]
+    sentence = f"two halves of the day differ by {ratio.max():.1f} of their sigmas"
+    return [FailedCheck(sentence, "witnesses_disagree")]
 
 
 def _part(answers: Answers, rows: np.ndarray) -> Answers:

@@ -363,7 +363,7 @@ def test_a_day_on_which_nothing_moves_is_refused_and_says_so():
 def test_a_camera_that_sees_nobody_leaves_the_radar_calibrated(day):
     blind = [replace(o, road_user_boxes_px=np.zeros((0, 4), np.float32), road_user_classes=[]) for o in day]
     solution = solve(blind, PRIOR)
-    assert "too few moving objects" in solution.failed_checks["camera_lidar"][0]
+    assert "too few moving objects" in solution.failed_checks["camera_lidar"][0].sentence
     assert solution.pairs["camera_lidar"].frames_used == 0
     assert np.array_equal(solution.pairs["camera_lidar"].T, PRIOR.T_camera_lidar)
     assert solution.pairs["lidar_radar"].frames_used == 16

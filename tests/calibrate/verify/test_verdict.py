@@ -11,6 +11,7 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation
 from tests.makers.solve_scenes import make_day
@@ -35,7 +36,9 @@ SURE = {name: Claim(0.001, 0.0, 0.001, 0.001, np.radians(0.2), 0.995) for name i
 
 
 def verdict(result, test, failed=(), claims=SURE, limits=None, **changes):
-    return judge(result, PRIOR, Evidence(test, claims, failed), SEARCH, limits or VerdictLimits(), **changes)
+    checks = [f if isinstance(f, FailedCheck) else FailedCheck(f) for f in failed]
+    evidence = Evidence(test, claims, checks)
+    return judge(result, PRIOR, evidence, SEARCH, limits or VerdictLimits(), **changes)
 
 
 def test_a_better_alignment_is_accepted_without_remark():
@@ -83,6 +86,14 @@ def test_failed_checks_hold_and_are_repeated():
     )
     assert found.status == "held"
     assert found.reason == "restarts disagree by 0.8 deg; the camera contradicts radar roll"
+
+
+def test_the_faults_that_failed_checks_name_reach_the_verdict_each_once():
+    moved = FailedCheck("turned at noon", "moved_in_day")
+    again = FailedCheck("turned back at two", "moved_in_day")
+    found = verdict(estimate(1.5), BETTER, failed=[moved, FailedCheck("no name"), again])
+    assert found.faults == ("moved_in_day",)
+    assert verdict(estimate(1.5), BETTER).faults == ()
 
 
 @pytest.mark.parametrize(
@@ -238,8 +249,8 @@ def test_a_loop_within_its_sigma_fails_no_check():
 
 
 def test_a_loop_beyond_three_sigma_fails_the_check():
-    assert "open by 2.00 deg" in loop_failures(solution((np.radians(2), 0.05)))[0]
-    assert "open by 0.500 m" in loop_failures(solution((0.0, 0.5)))[0]
+    assert "open by 2.00 deg" in loop_failures(solution((np.radians(2), 0.05)))[0].sentence
+    assert "open by 0.500 m" in loop_failures(solution((0.0, 0.5)))[0].sentence
 
 
 def test_a_method_without_independent_pairs_has_no_loop_to_check():
@@ -311,7 +322,7 @@ def test_a_radar_that_turned_beyond_its_prior_holds_what_was_solved_along_its_he
         }
         return heading_failures(Solution("joint", pairs), PRIOR, day, limit)
 
-    (sentence,) = failures(9.0, 0.02)
+    sentence = failures(9.0, 0.02)[0].sentence
     assert "heading off by 9.0 deg" in sentence
     assert "up to 0.09 m lateral error" in sentence
     assert failures(9.0, 0.0) == []  # nothing was moved

@@ -151,7 +151,7 @@ def test_a_day_whose_halves_differ_fails_a_check(frames):
             return replace(said, T={pair: step @ T for pair, T in said.T.items()})
 
     solution = solve(frames, [Moved()], prior_off(0.01))
-    assert "halves" in solution.failed_checks["camera_lidar"][0]
+    assert "halves" in solution.failed_checks["camera_lidar"][0].sentence
 
 
 def test_a_flat_radar_keeps_its_elevations(frames):

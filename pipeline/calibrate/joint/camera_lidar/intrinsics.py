@@ -37,6 +37,7 @@ from pipeline.calibrate.numerics.bias_floors import (
     INTRINSICS_CONTRADICTION_SIGMAS,
     INTRINSICS_HALF_SIGMAS,
 )
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
@@ -111,8 +112,8 @@ class DayIntrinsics:
         ]
 
 
-def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[str]:
-    """Sentences, one for each intrinsic of CameraInfo that the day, and each half of it by itself, shows wrong."""
+def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[FailedCheck]:
+    """One failed check for each intrinsic of CameraInfo that the day, and each half of it by itself, shows wrong."""
     off = _off_by_sigmas(day, known)
     is_wrong = np.abs(off) > INTRINSICS_CONTRADICTION_SIGMAS
     for half in day.halves:
@@ -120,14 +121,20 @@ def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[str]:
     found = []
     if is_wrong[0]:
         found.append(
-            f"CameraInfo's focal length is contradicted by the day: measured {day.focal - 1:+.1%} "
-            f"+- {day.focal_sigma:.1%}"
+            FailedCheck(
+                f"CameraInfo's focal length is contradicted by the day: measured {day.focal - 1:+.1%} "
+                f"+- {day.focal_sigma:.1%}",
+                "camera_info",
+            )
         )
     if is_wrong[1:].any():
         (right, down), (u, v) = day.centre_px, day.centre_sigma_px
         found.append(
-            f"CameraInfo's principal point is contradicted by the day: measured {right:+.1f} +- {u:.1f} px right, "
-            f"{down:+.1f} +- {v:.1f} px down"
+            FailedCheck(
+                f"CameraInfo's principal point is contradicted by the day: measured {right:+.1f} +- {u:.1f} px "
+                f"right, {down:+.1f} +- {v:.1f} px down",
+                "camera_info",
+            )
         )
     return found
 

@@ -1,0 +1,76 @@
+"""Checks of a solved day, in one table: each looks at the day as a whole and fails some of its pairs.
+
+A new check is a function in a module of this folder and a line in `DAY_CHECKS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
+from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.config import FleetConfig
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.estimates import Prior, Solution
+from schemas.calibrations import PAIRS
+from schemas.observations import Observation
+
+__all__ = ["DAY_CHECKS", "DayCheck", "FoundDay", "checks_of_day"]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundDay:
+    """A solved day before its verdict."""
+
+    observations: Sequence[Observation]
+    selection: Selection
+    prior: Prior
+    solution: Solution
+    composed: Sequence[str]  # pairs that the method composes of the others
+    fleet: FleetConfig
+    limits: VerdictLimits
+
+
+DayCheck = Callable[[FoundDay], Mapping[str, Sequence[FailedCheck]]]
+
+
+def _solver(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+    """What the solver's own checks found."""
+    return day.solution.failed_checks
+
+
+def _contradictions(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+    """Checks that only a composed pair failed speak against a factor: two sensors contradict the third's registration.
+
+    Camera and lidar know their pose ten times better than either knows the radar's, so lidar-radar is held.
+    """
+    of_pair = day.solution.failed_checks
+    known = {check for p in PAIRS if p not in day.composed for check in of_pair.get(p, [])}
+    own = [check for p in day.composed for check in of_pair.get(p, []) if check not in known]
+    return {"lidar_radar": own}
+
+
+def _heading(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+    limit_rad = float(np.radians(day.fleet.verify.camera_lidar_limit_deg))
+    found = heading_failures(day.solution, day.prior, day.observations, limit_rad, day.limits)
+    return {"camera_lidar": found}
+
+
+def _loop(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+    return dict.fromkeys(PAIRS, loop_failures(day.solution, day.limits))
+
+
+# In the order in which a record states them.
+DAY_CHECKS: tuple[DayCheck, ...] = (_solver, _contradictions, _heading, _loop)
+
+
+def checks_of_day(day: FoundDay) -> dict[str, list[FailedCheck]]:
+    """Failed checks of every pair, each once."""
+    found = [check(day) for check in DAY_CHECKS]
+    return {
+        pair: list(dict.fromkeys(c for by_pair in found for c in by_pair.get(pair, ()))) for pair in PAIRS
+    }

@@ -1,0 +1,24 @@
+"""Names of the faults that records can state, so that programs need not read their sentences."""
+
+from __future__ import annotations
+
+from typing import Final
+
+__all__ = ["FAULTS"]
+
+FAULTS: Final = {
+    "camera_info": "the camera's intrinsics differ from its CameraInfo",
+    "doppler": "the sign, the unit or the period of the radar's Doppler is not as configured",
+    "few_scenes": "the day shows too few different scenes",
+    "labels_offset": "semantic labels lie beside the picture that they belong to",
+    "model_output": "a perception model returns values that cannot be right",
+    "moved_in_day": "a sensor moved during the day",
+    "odometry": "the odometry contradicts the other sources of motion",
+    "orientation": "a sensor points elsewhere than its prior says by far",
+    "prior": "the prior of a sensor's pose contradicts the day by many of its sigmas",
+    "silent_sensor": "a sensor delivered no usable data",
+    "stuck_sensor": "a sensor repeats the same data under new stamps",
+    "time_offset": "a clock is further off than is plausible",
+    "unit": "a sensor's points are in another unit than metres",
+    "witnesses_disagree": "independent parts of the evidence contradict each other",
+}
