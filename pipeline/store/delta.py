@@ -21,6 +21,7 @@ from deltalake import DeltaTable, Schema, WriterProperties
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
 from pipeline.errors import ContractError
+from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake
 from schemas.columns import TableSchema
 
@@ -155,12 +156,12 @@ def read_file(
     # Keys of maps are the same in every row: as places in a dictionary they are a fifth of the memory and time.
     coded = [f"{c}.key_value.key" for c in mapped if c not in whole]
     try:
-        with lake.files.opened(path) as stream, pq.ParquetFile(stream, read_dictionary=coded) as file:
-            there = [c for c in dict.fromkeys([*whole, *mapped]) if c in file.schema_arrow.names]
+        with opened_parquet(lake.files, path, coded) as file:
+            there = [c for c in dict.fromkeys([*whole, *mapped]) if c in file.names]
             # One by one: coded keys of maps of several row groups at once are not implemented in pyarrow 26.
             groups = _groups(file.metadata, wanted or Wanted())
-            parts = [file.read_row_group(g, columns=there) for g in groups]
-            table = pa.concat_tables(parts) if parts else file.read_row_groups([], columns=there)
+            parts = [file.groups([g], there) for g in groups]
+            table = pa.concat_tables(parts) if parts else file.groups([], there)
     except (PermissionError, pa.ArrowNotImplementedError):
         raise  # what we may not or cannot read is not damaged: left out, its records would be lost to every audit
     except (pa.ArrowException, OSError, EOFError) as err:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, TypeVar
 
-import pyarrow.parquet as pq
-
 from pipeline.errors import CollectedError, ContractError
+from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table
 from pipeline.store.tables import COLLECTED, naming_damage, read_manifest
@@ -39,8 +38,8 @@ def read_columns(
         DamagedError: its file cannot be read.
     """
     path = _checked(lake, schema, partition)
-    with lake.files.opened(path) as stream, pq.ParquetFile(stream) as file, naming_damage(path):
-        table = file.read(columns=list(names))
+    with naming_damage(path), opened_parquet(lake.files, path) as file:
+        table = file.groups(list(range(file.metadata.num_row_groups)), list(names))
     return {name: table.column(name).to_pylist() for name in names}
 
 
@@ -50,8 +49,8 @@ def row_groups(lake: Lake, schema: TableSchema, partition: Partition) -> list[Ro
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
     """
-    with lake.files.opened(_checked(lake, schema, partition)) as stream:
-        metadata = pq.read_metadata(stream)
+    with opened_parquet(lake.files, _checked(lake, schema, partition)) as file:
+        metadata = file.metadata
     return [RowGroup(partition, i, metadata.row_group(i).num_rows) for i in range(metadata.num_row_groups)]
 
 
@@ -63,8 +62,8 @@ def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[
     """
     path = lake.file(schema.name, group.partition)
     try:
-        with lake.files.opened(path) as stream, pq.ParquetFile(stream) as file, naming_damage(path):
-            return from_table(file.read_row_group(group.index), schema, row_type)
+        with naming_damage(path), opened_parquet(lake.files, path) as file:
+            return from_table(file.groups([group.index]), schema, row_type)
     except FileNotFoundError as err:
         raise ContractError(str(path), "the partition went away while it was read") from err
 

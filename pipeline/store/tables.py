@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import CollectedError, ContractError, DamagedError
+from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records, write_records
 from pipeline.store.rows import from_table, to_table
@@ -141,9 +142,9 @@ def iterate_rows(
     if COLLECTED in manifest.extra:
         raise CollectedError(str(path), manifest.extra[COLLECTED])
     wanted = None if rows is None else set(rows)
-    with lake.files.opened(path) as stream, pq.ParquetFile(stream) as file:
+    with opened_parquet(lake.files, path) as file:
         first = 0
-        for group in range(file.num_row_groups):
+        for group in range(file.metadata.num_row_groups):
             count = file.metadata.row_group(group).num_rows
             picked = (
                 list(range(count)) if wanted is None else [i for i in range(count) if first + i in wanted]
@@ -151,7 +152,7 @@ def iterate_rows(
             first += count
             if picked:
                 with naming_damage(path):
-                    table = file.read_row_group(group)
+                    table = file.groups([group])
                 yield from_table(table if len(picked) == count else table.take(picked), schema, row_type)
 
 
@@ -215,8 +216,8 @@ def naming_damage(path: PurePath) -> Iterator[None]:
 
 
 def _manifest(lake: Lake, path: PurePath, schema: TableSchema) -> Manifest:
-    with lake.files.opened(path) as stream, naming_damage(path):
-        raw = (pq.read_metadata(stream).metadata or {}).get(_KEY)
+    with naming_damage(path), opened_parquet(lake.files, path) as file:
+        raw = (file.metadata.metadata or {}).get(_KEY)
     if raw is None:
         raise ContractError(str(path), "was not written by Boresight (no manifest in the footer)")
     values = json.loads(raw)

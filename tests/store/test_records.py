@@ -142,10 +142,8 @@ def test_a_reader_gets_the_window_the_vehicle_and_the_columns_that_it_asks_for(l
     for row in rows:
         commit_records(lake, CALIBRATIONS, [row])
     opened = []
-    real = pipeline.store.delta.pq.ParquetFile
-    monkeypatch.setattr(
-        pipeline.store.delta.pq, "ParquetFile", lambda f, **k: (opened.append(f), real(f, **k))[1]
-    )
+    real = pipeline.store.delta.opened_parquet
+    monkeypatch.setattr(pipeline.store.delta, "opened_parquet", lambda *a: (opened.append(a), real(*a))[1])
     got = read(lake, vehicle="a", first="2026-02-01", columns=("qw",))
     assert [(r.vehicle, r.day) for r in got] == [("a", "2026-02-01"), ("a", "2026-02-03")]
     assert len(opened) == 2  # files of other days and vehicles are not opened
