@@ -32,7 +32,8 @@ def show(
         vehicle: only this vehicle.
         day: only this day, YYYY-MM-DD.
         method: only records of this method.
-        current: only the current record of each vehicle, day, method and pair; of outcomes and events, all are.
+        current: only the current record of each vehicle, day, method and pair; of drift, what the last audit said; of
+            outcomes and events, all are.
         json: print a JSON list and nothing else: oldest record first, names as the columns, and for
             calibrations "T", the 4x4 row-major T_parent_child (null where the day was refused).
     """
@@ -62,7 +63,7 @@ def _records(
     lake: Lake, table: Table, vehicle: str | None, day: str | None, method: str | None, *, current: bool
 ) -> list[dict[str, Any]]:
     from pipeline.store.current import current_drift, current_records, current_states, transform_of
-    from pipeline.store.records import read_records
+    from pipeline.store.records import last_assertion, read_records
     from schemas.calibrations import CalibrationRecord
     from schemas.drift import DriftFinding
     from schemas.outcomes import OutcomeRow
@@ -82,6 +83,9 @@ def _records(
     rows = [r for r in rows if method in (None, getattr(r, "method", None))]
     names = [c.name for c in TABLES[table].columns]
     chosen = current_of(rows) if current else rows
+    if current and table == "drift":  # vehicles that the last audit did not look at are none of what it said
+        last = {m: last_assertion(lake, TABLES[table], m) for m in {r.method for r in chosen}}
+        chosen = [r for r in chosen if last[r.method] == (r.day, r.asserted_at)]
     shown = [{n: getattr(r, n) for n in names} for r in chosen]
     if table == "calibrations":
         return [row | {"T": transform_of(r)} for row, r in zip(shown, chosen, strict=True)]

@@ -16,9 +16,9 @@ from pipeline.config import config_hash
 from pipeline.errors import BoresightError, ContractError, DamagedError
 from pipeline.results import Outcome, Progress, measured
 from pipeline.store.partitions import Partition, work_key
-from pipeline.store.records import assert_records, commit_records, read_records
+from pipeline.store.records import assert_records, commit_last, commit_records, read_records
 from pipeline.store.tables import Manifest, read_manifest, write_partition
-from pipeline.work import NothingUsable, Run, Task, Work
+from pipeline.work import NothingUsable, Run, Task, Window, Work
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
@@ -242,7 +242,7 @@ def _add_records(stage: Stage, task: Task, work: Work, run: Run, schema: TableSc
         for records in batches:
             written += records.rows
     if task.commit:
-        commit_records(task.lake, schema, written)
+        (commit_last if isinstance(task.of, Window) else commit_records)(task.lake, schema, written)
     outcome = _record_outcome(stage, task, work, "done", run.work_key, written, where if written else [])
     return replace(outcome, inputs=run.inputs)
 

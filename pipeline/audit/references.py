@@ -17,7 +17,6 @@ from pipeline.audit.days import PairDays, Reference, reference_of
 from pipeline.audit.estimates import day_name
 from pipeline.audit.service import restart_of
 from pipeline.geometry.se3 import from_quaternion, to_quaternion
-from pipeline.store.current import current_states
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_columns, read_latest
 from schemas.calibrations import CALIBRATIONS, PAIRS
@@ -66,7 +65,9 @@ def read_kept(
     first, last = window
     eve = (dt.date.fromisoformat(first) - dt.timedelta(days=1)).isoformat()
     rows = read_latest(lake, STATES, StateRow, first=eve, last=last, columns=_COLUMNS)
-    states = [s for s in current_states(rows) if s.method == method and s.reference_days is not None]
+    # Of a night that was run again the last one counts.
+    last_said = {(s.vehicle, s.pair): s for s in rows if s.method == method}
+    states = [s for s in last_said.values() if s.reference_days is not None]
     changed = _changed_since(lake, last, {s.vehicle: s.recorded_at for s in states})
     kept = {}
     for state in states:

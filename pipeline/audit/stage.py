@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,9 +19,8 @@ from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.errors import ConfigError
 from pipeline.results import Progress
-from pipeline.store.current import current_drift
-from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.records import read_latest, read_records
+from pipeline.store.partitions import Lake, Partition, content_hash, work_key
+from pipeline.store.records import read_last, read_records
 from pipeline.work import Records, Task, Told, Window, Work
 from schemas.calibrations import DOF_NAMES, PAIRS
 from schemas.drift import DRIFT, DriftFinding
@@ -162,16 +161,17 @@ def _findings(
     )
     inputs = records.keys()
     config = config_hash(fleet.audit, {"from": first, "to": last, "method": method})
-    key = work_key("audit", CODE_VERSION, config, inputs)
-    audit = VehicleAudit(name, last, method, key, inputs)
+    audit = VehicleAudit(name, last, method, "", inputs)
     rows = vehicle_findings(audit, records, verdict, fleet.audit, _remarks(vehicle, last, shifts), before)
-    return Records(rows, Partition(name, last), key, inputs)
+    # All vehicles are judged side by side, so a verdict rests on more than this vehicle's records: the key has it too.
+    key = work_key("audit", CODE_VERSION, config, [*inputs, content_hash(rows)])
+    return Records([replace(row, work_key=key) for row in rows], Partition(name, last), key, inputs)
 
 
 def _found_before(
     lake: Lake, method: str, verdicts: Mapping[str, VehicleVerdict], first: str
 ) -> dict[str, dict[tuple[str, str], DriftFinding]]:
-    """By vehicle, the latest earlier audit's rows, where a change may have begun before the window did."""
+    """By vehicle, the last audit's rows, where a change may have begun before the window did."""
     window = dt.date.fromisoformat(first).toordinal()
     asked = {
         name
@@ -180,8 +180,7 @@ def _found_before(
     }
     before: dict[str, dict[tuple[str, str], DriftFinding]] = {}
     if asked:
-        rows = read_latest(lake, DRIFT, DriftFinding, first=first, vehicle=asked, columns=_OF_BEFORE)
-        for finding in current_drift([f for f in rows if f.method == method]):
+        for finding in read_last(lake, DRIFT, DriftFinding, method, vehicle=asked, columns=_OF_BEFORE):
             before.setdefault(finding.vehicle, {})[finding.pair, finding.dof] = finding
     return before
 

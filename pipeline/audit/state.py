@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 
 __all__ = ["DayEstimate", "State", "fuse"]
@@ -49,12 +50,15 @@ class State:
     left_out: tuple[str, ...]
 
 
-def fuse(days: Sequence[DayEstimate], *, scale: float = 1.0, autocorrelation: float = 0.0) -> State | None:
+def fuse(
+    days: Sequence[DayEstimate], *, scale: Float[np.ndarray, " 6"] | None = None, autocorrelation: float = 0.0
+) -> State | None:
     """One estimate from several days; None where there is no day.
 
     Args:
         days: accepted ones since the last change, rising.
-        scale: factor by which days scatter more than they say.
+        scale: by DoF of a change (rotation vector, shift of the child's origin), by which factor days scatter more than
+            they say; None = by no more.
         autocorrelation: of successive days.
     """
     if not days:
@@ -64,7 +68,9 @@ def fuse(days: Sequence[DayEstimate], *, scale: float = 1.0, autocorrelation: fl
     spread = _varying(days)
     kept = _belonging(changes, spread, np.stack([d.observable for d in days]))
     own, x = [days[i] for i in kept], changes[kept]
-    varying = spread[kept] * scale**2
+    J = change_jacobian(origin)
+    S = np.eye(6) if scale is None else np.linalg.solve(J, scale[:, None] * J)
+    varying = S @ spread[kept] @ S.T
     information = np.linalg.inv(varying)
     total = np.linalg.inv(information.sum(axis=0))
     G = total @ information

@@ -8,19 +8,21 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Float
 from scipy.special import ndtri
 
+from pipeline.audit.days import DOFS, charts_of_fleet
 from pipeline.audit.estimates import Estimates, day_name, days_of, estimates_of, joined
 from pipeline.audit.history import History
+from pipeline.audit.noise import estimate_noise
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
 from pipeline.audit.service import restart_of, what_was_done
 from pipeline.audit.state import DayEstimate, State, fuse
 from pipeline.config import AuditConfig, FleetConfig, VerifyConfig, config_hash
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.target_sigmas import target_sigmas
-from pipeline.store.current import current_drift
-from pipeline.store.partitions import Partition, work_key
-from pipeline.store.records import last_day, read_latest, read_records
+from pipeline.store.partitions import Partition, content_hash, work_key
+from pipeline.store.records import last_day, read_last, read_records
 from pipeline.work import Records, Run, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS
 from schemas.drift import DRIFT, DriftFinding
@@ -36,6 +38,7 @@ _DAYS_BACK = 60
 # can give.
 _AUTOCORRELATION = 0.6
 _END = dt.date.max.toordinal()
+_CHANGE = ("start_day", "start_day_latest")  # what is asked of the audit's rows
 
 
 _Row = TypeVar("_Row", ServiceEvent, DriftFinding)
@@ -58,28 +61,21 @@ def work(task: Task) -> Work:
     history = History(task.lake, method, last)
     records = history.read(first, last) if last else estimates_of(None)
     events = _by_vehicle(read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last or None))
-    found = read_latest(
-        task.lake,
-        DRIFT,
-        DriftFinding,
-        first=first,
-        last=last or None,
-        columns=("start_day", "start_day_latest"),
-    )
-    changes = _by_vehicle(current_drift([f for f in found if f.method == method]))
-
+    changes = _by_vehicle(read_last(task.lake, DRIFT, DriftFinding, method, columns=_CHANGE))
     references = _references(history, records, (first, last), events, fleet.audit) if last else {}
 
     def rows(run: Run) -> Generator[Records, None, None]:
+        scales = _scales(records, fleet.audit)
         for done, vehicle in enumerate(records.vehicles):
             run.progress(done, len(records.vehicles), vehicle)
             since = {p: _since(p, events.get(vehicle, ()), changes.get(vehicle, ()), last) for p in PAIRS}
-            own = _states(fleet, (vehicle, last, method), records.of(vehicle), since)
+            own = _states(fleet, (vehicle, last, method), records.of(vehicle), since, scales[done])
             kept = [references[vehicle, PAIRS.index(row.pair)] for row in own.rows]
             count = fleet.audit.reference_days
-            yield replace(
-                own, rows=[replace(r, **kept_columns(k, count)) for r, k in zip(own.rows, kept, strict=True)]
-            )
+            whole = [replace(r, **kept_columns(k, count)) for r, k in zip(own.rows, kept, strict=True)]
+            config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method, "since": since})
+            key = work_key("state", CODE_VERSION, config, [*(own.inputs or ()), content_hash(whole)])
+            yield replace(own, rows=[replace(r, work_key=key) for r in whole], work_key=key)
 
     settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
     return Work(settings, rows, inputs=tuple(records.keys()), tell=_told, again=True)
@@ -113,6 +109,13 @@ def _references(
     return found
 
 
+def _scales(records: Estimates, config: AuditConfig) -> Float[np.ndarray, "V P 6"]:
+    """By vehicle, pair and DoF of a change, how much more its days scatter than they say, as the charts see it."""
+    days = [days_of(records.of(vehicle), config.held_sigma_factor) for vehicle in records.vehicles]
+    charts = charts_of_fleet([{pair: own.at(own.accepted) for pair, own in of.items()} for of in days])
+    return estimate_noise(charts, DOFS, len(PAIRS)).scale.reshape(len(days), len(PAIRS), DOFS)
+
+
 def _by_vehicle(rows: Iterable[_Row]) -> dict[str, list[_Row]]:
     found: dict[str, list[_Row]] = {}
     for row in rows:
@@ -142,23 +145,22 @@ def _states(
     about: tuple[str, str, str],
     records: Estimates,
     since: Mapping[str, tuple[str, str]],
+    scales: Float[np.ndarray, "P 6"],
 ) -> Records:
     vehicle, last, method = about
     inputs = records.keys()
-    config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method, "since": since})
-    key = work_key("state", CODE_VERSION, config, inputs)
     rows = []
-    for pair in PAIRS:
+    for pair, scale in zip(PAIRS, scales, strict=True):
         first, why = since[pair]
         begin = dt.date.fromisoformat(first).toordinal() if first else 0
         usable = records.accepted & records.has_estimate & (records.day >= begin)
         own = records.at(np.flatnonzero(usable & (records.pair == PAIRS.index(pair))))
-        found = fuse(_days(own), autocorrelation=_AUTOCORRELATION)
+        found = fuse(_days(own), scale=scale, autocorrelation=_AUTOCORRELATION)
         parent, child = FRAMES_OF_PAIR[pair]
         words = _words(why, found)
-        base = StateRow(vehicle, last, method, pair, parent, child, "none", words, key, since=first or None)
+        base = StateRow(vehicle, last, method, pair, parent, child, "none", words, since=first or None)
         rows.append(base if found is None else _with_state(base, found, own, fleet.verify))
-    return Records(rows, Partition(vehicle, last), key, inputs)
+    return Records(rows, Partition(vehicle, last), inputs=inputs)
 
 
 def _words(why: str, found: State | None) -> str:

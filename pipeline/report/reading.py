@@ -12,9 +12,9 @@ from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.privacy import without_road_users
 from pipeline.report.scenes import choose_frames
 from pipeline.sections import ReportConfig
-from pipeline.store.current import current_drift, current_records, prior_of, transform_of
+from pipeline.store.current import current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import last_day, read_latest, read_records
+from pipeline.store.records import last_day, read_last, read_records
 from pipeline.store.tables import COLLECTED, iterate_rows, read_manifest
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
@@ -35,7 +35,6 @@ __all__ = [
 
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _COMPARED = (*_POSE, *(f"prior_{name}" for name in _POSE), "covariance", "observable", "determined")
-_AUDIT_DAYS = 61  # whose findings are older is audited no more: it left fleet.toml, or nobody audits
 _FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 
 
@@ -85,13 +84,8 @@ def records_of_day(
 
 
 def drift_of(lake: Lake, method: str, vehicle: str) -> list[DriftFinding]:
-    """Current findings of a vehicle, where the lake's last audits, of two months, looked at it."""
-    last = last_day(lake, DRIFT)
-    if last is None:
-        return []
-    first = _days_before(last, _AUDIT_DAYS)
-    findings = read_latest(lake, DRIFT, DriftFinding, first=first, vehicle=vehicle)
-    return current_drift([f for f in findings if f.method == method])
+    """What the last audit said of a vehicle."""
+    return read_last(lake, DRIFT, DriftFinding, method, vehicle=vehicle)
 
 
 def _days_before(day: str, days: int) -> str:

@@ -95,7 +95,7 @@ def _read(album: Album) -> tuple[FleetWindow, FleetVerdicts]:
     # Drives of tomorrow are days to come, but not everywhere on earth.
     tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
     window = read_window(album.lake, album.method, album.fleet.audit.window_days, tomorrow)
-    return window, read_verdicts(album.lake, album.method, tomorrow)
+    return window, read_verdicts(album.lake, album.method)
 
 
 def _keys_of(album: Album, days: Iterable[Partition]) -> dict[tuple[str, str], list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -14,7 +13,7 @@ from jaxtyping import Float, Int
 from pipeline.store.columns import known_rows, ordinals, places
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
-from pipeline.store.records import last_day, read_columns
+from pipeline.store.records import read_last_columns
 from pipeline.store.rows import from_table
 from schemas.calibrations import DOF_NAMES, PAIRS
 from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding
@@ -23,7 +22,6 @@ __all__ = ["ChartVerdicts", "FleetVerdicts", "read_verdicts"]
 
 # `inputs` is most of a row and says nothing that a page shows.
 _COLUMNS = tuple(c.name for c in DRIFT.columns if c.name not in {"inputs", "recorded_at"})
-_AUDIT_DAYS = 61  # whose findings are older is audited no more: it left fleet.toml, or nobody audits
 _ALARMS = ("RED", "YELLOW")
 
 
@@ -67,21 +65,14 @@ class FleetVerdicts:
     work_keys: list[str] = field(default_factory=list)
 
 
-def read_verdicts(lake: Lake, method: str, latest: str) -> FleetVerdicts:
-    """The current findings of the last audit that looked at the method; audits look at all vehicles.
+def read_verdicts(lake: Lake, method: str) -> FleetVerdicts:
+    """The findings of the last audit of the method; audits look at all vehicles.
 
     Args:
         lake: where they are.
         method: of the audited records.
-        latest: audits of days after it are left out.
     """
-    last = min(last_day(lake, DRIFT) or "", latest)
-    found = _of_method(lake, method, last, last) if last else None
-    if found is None and last:  # audits of another method are newer, or one was of days to come
-        first = (dt.date.fromisoformat(last) - dt.timedelta(days=_AUDIT_DAYS)).isoformat()
-        found = _of_method(lake, method, first, last)
-        if found is not None:
-            found = found.filter(pc.equal(found["day"], pc.max(found["day"])))
+    found = read_last_columns(lake, DRIFT, method, _COLUMNS)
     if found is None:
         none = np.zeros(0, np.int64)
         empty = ChartVerdicts(none, none, none, none, np.zeros(0), np.zeros((0, 3), np.int64))
@@ -98,13 +89,6 @@ def read_verdicts(lake: Lake, method: str, latest: str) -> FleetVerdicts:
         sorted(found["day"].unique().to_pylist()),
         sorted(found["work_key"].unique().to_pylist()),
     )
-
-
-def _of_method(lake: Lake, method: str, first: str, last: str) -> pa.Table | None:
-    found = read_columns(lake, DRIFT, _COLUMNS, first=first, last=last)
-    if found is not None:
-        found = found.filter(pc.equal(found["method"], method))
-    return found if found is not None and found.num_rows else None
 
 
 def _findings(found: pa.Table, owner: Int[np.ndarray, " N"]) -> dict[str, list[DriftFinding]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +24,9 @@ __all__ = [
     "prior_of",
     "transform_of",
 ]
+
+
+_Said = TypeVar("_Said", DriftFinding, StateRow)
 
 
 def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRecord]:
@@ -63,37 +67,30 @@ def _ranks(column: pa.DictionaryArray) -> np.ndarray:
 
 
 def current_drift(findings: Sequence[DriftFinding]) -> list[DriftFinding]:
-    """The current findings of each vehicle and method's latest audited day, in order.
+    """The findings of the last audit that looked at a vehicle, by vehicle and method, in order.
 
     Args:
-        findings: as `read_records` returns them, the last asserted last.
+        findings: as `read_records` returns them.
     """
-    newest: dict[tuple[str, str], str] = {}
-    for finding in findings:
-        key = (finding.vehicle, finding.method)
-        newest[key] = max(newest.get(key, ""), finding.day)
-    last = {
-        (f.vehicle, f.method, f.trio, f.pair, f.dof): f
-        for f in findings
-        if f.day == newest[(f.vehicle, f.method)]
-    }
-    return [last[key] for key in sorted(last)]
+    return sorted(_asserted_last(findings), key=lambda f: (f.vehicle, f.method, f.trio, f.pair, f.dof))
 
 
 def current_states(states: Sequence[StateRow]) -> list[StateRow]:
-    """The current states of each vehicle and method's latest night, in order.
+    """The states that the last night said of a vehicle, by vehicle and method, in order.
 
     Args:
-        states: as `read_records` returns them, the last asserted last.
+        states: as `read_records` returns them.
     """
-    newest: dict[tuple[str, str], str] = {}
-    for state in states:
-        key = (state.vehicle, state.method)
-        newest[key] = max(newest.get(key, ""), state.day)
-    last = {
-        (s.vehicle, s.method, s.trio, s.pair): s for s in states if s.day == newest[(s.vehicle, s.method)]
-    }
-    return [last[key] for key in sorted(last)]
+    return sorted(_asserted_last(states), key=lambda s: (s.vehicle, s.method, s.trio, s.pair))
+
+
+def _asserted_last(rows: Sequence[_Said]) -> list[_Said]:
+    """Rows of each vehicle and method under the latest stamp."""
+    last: dict[tuple[str, str], str] = {}
+    for row in rows:
+        key = (row.vehicle, row.method)
+        last[key] = max(last.get(key, ""), row.asserted_at)
+    return [row for row in rows if row.asserted_at == last[row.vehicle, row.method]]
 
 
 def transform_of(record: CalibrationRecord | StateRow) -> Float[np.ndarray, "4 4"] | None:

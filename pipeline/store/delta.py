@@ -86,6 +86,7 @@ class LiveFile:
     name: str
     days: tuple[str, str] | None = None
     vehicles: tuple[str, str] | None = None
+    written_s: float = 0.0  # since 1970
 
 
 def stored_schema(schema: TableSchema) -> pa.Schema:
@@ -136,7 +137,10 @@ def live_files(table: DeltaTable) -> list[LiveFile]:
         low, high = (columns.get(f"{end}.{name}", nothing)[i] for end in ("min", "max"))
         return None if low is None or high is None else (low, high)
 
-    return [LiveFile(name, span("day", i), span("vehicle", i)) for i, name in enumerate(columns["path"])]
+    return [
+        LiveFile(name, span("day", i), span("vehicle", i), columns["modification_time"][i] / 1000)
+        for i, name in enumerate(columns["path"])
+    ]
 
 
 def read_file(

@@ -5,16 +5,20 @@ from __future__ import annotations
 import datetime as dt
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
+from typing import Any
 from urllib.parse import quote, unquote
+
+import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.names import is_vehicle
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.object_store import Bucket
 
-__all__ = ["Lake", "Partition", "is_day", "work_key"]
+__all__ = ["Lake", "Partition", "content_hash", "is_day", "work_key"]
 
 
 def is_day(text: str) -> bool:
@@ -155,3 +159,9 @@ def work_key(stage: str, code_version: str, config: str, inputs: list[str]) -> s
     """Hash that changes exactly when a stage's output may change: code version, config hash, input work keys."""
     payload = json.dumps([stage, code_version, config, sorted(inputs)])
     return hashlib.sha256(payload.encode()).hexdigest()[:20]
+
+
+def content_hash(rows: Sequence[Any]) -> str:
+    """Hash of all that record rows say, arrays included."""
+    plain = [[v.tolist() if isinstance(v, np.ndarray) else v for v in vars(row).values()] for row in rows]
+    return hashlib.sha256(json.dumps(plain).encode()).hexdigest()[:20]

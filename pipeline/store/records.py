@@ -25,16 +25,22 @@ from schemas.columns import TableSchema
 __all__ = [
     "RecordIndex",
     "assert_records",
+    "commit_last",
     "commit_records",
     "first_day",
+    "last_assertion",
     "last_day",
     "read_columns",
+    "read_last",
+    "read_last_columns",
     "read_latest",
     "read_records",
     "write_records",
 ]
 
 Row = TypeVar("Row")
+# Of machines that write a table: a file is at most this much older than the rows in it.
+_CLOCKS_DIFFER_S = 86_400.0
 
 
 def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
@@ -67,6 +73,25 @@ def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
     if changed:
         merge_rows(lake, schema, _stored(schema, changed))
     return len(changed)
+
+
+def commit_last(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
+    """Add what a stage says of the whole fleet, all rows under one later stamp than any before: `read_last` finds them.
+
+    Returns:
+        How many rows were added or became current again; 0 where the same rows were the last already.
+
+    Raises:
+        ContractError, OSError: as `commit_records`.
+    """
+    if not rows:
+        return 0
+    known = read_last_columns(lake, schema, rows[0].method, ())
+    keys = [] if known is None else known["work_key"].to_pylist()
+    if sorted(keys) == sorted(row.work_key for row in rows):
+        return 0
+    stamp = _after(dt.datetime.now(dt.UTC), "" if known is None else pc.max(known["asserted_at"]).as_py())
+    return commit_records(lake, schema, [replace(row, asserted_at=stamp) for row in rows])
 
 
 def assert_records(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
@@ -256,6 +281,63 @@ def read_latest(
         of_day: list[Any] = read_records(lake, schema, row_type, vehicle=vehicle, day=day, columns=columns)
         found += [row for row in of_day if day_of[row.vehicle, row.method] == day]
     return sorted(found, key=lambda row: row.vehicle)
+
+
+def last_assertion(lake: Lake, schema: TableSchema, method: str) -> tuple[str, str] | None:
+    """Day and `asserted_at` of the rows of a method that were asserted last; None where there are none.
+
+    Files are looked at from the last written on, until the others are older than what was found.
+    """
+    table = open_table(lake, schema)
+    found: tuple[str, str] | None = None
+    files = live_files(table) if table is not None else []
+    for file in sorted(files, key=lambda f: f.written_s, reverse=True):
+        if found and file.written_s + _CLOCKS_DIFFER_S < dt.datetime.fromisoformat(found[1]).timestamp():
+            break
+        wanted = Wanted(asserted_after=found[1] if found else None)
+        part = read_file(lake, schema, file.name, ["day", "method", "asserted_at"], wanted)
+        part = part.filter(pc.equal(part["method"], method)) if part is not None else None
+        if part is not None and part.num_rows:
+            last = part.take(pc.sort_indices(part, [("asserted_at", "descending")])[:1]).to_pylist()[0]
+            found = max(found or ("", ""), (last["day"], last["asserted_at"]), key=lambda f: f[1])
+    return found
+
+
+def read_last(
+    lake: Lake,
+    schema: TableSchema,
+    row_type: type[Row],
+    method: str,
+    *,
+    vehicle: str | AbstractSet[str] | None = None,
+    columns: Sequence[str] | None = None,
+) -> list[Row]:
+    """What a stage of the whole fleet said last of a method: the rows that it asserted together, by `commit_last`.
+
+    Args:
+        lake: where the table is.
+        schema: of the table.
+        row_type: its dataclass.
+        method: of the records.
+        vehicle: only this vehicle's, or only these'.
+        columns: see `read_records`.
+    """
+    last = last_assertion(lake, schema, method)
+    if last is None:
+        return []
+    rows: list[Any] = read_records(lake, schema, row_type, vehicle=vehicle, day=last[0], columns=columns)
+    return [row for row in rows if (row.method, row.asserted_at) == (method, last[1])]
+
+
+def read_last_columns(
+    lake: Lake, schema: TableSchema, method: str, columns: Sequence[str]
+) -> pa.Table | None:
+    """The same as columns, in no order; None where there is no such row."""
+    last = last_assertion(lake, schema, method)
+    found = read_columns(lake, schema, columns, first=last[0], last=last[0]) if last is not None else None
+    if last is None or found is None:
+        return None
+    return found.filter(pc.and_(pc.equal(found["method"], method), pc.equal(found["asserted_at"], last[1])))
 
 
 def first_day(lake: Lake, schema: TableSchema) -> str | None:

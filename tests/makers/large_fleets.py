@@ -40,7 +40,7 @@ def some_of_each_kind(lake, fleet, days=28, seed=21):
         ]  # fmt: skip
     commit_records(lake, CALIBRATIONS, rows)
     audit_fleet(lake, fleet)
-    return read_window(lake, "joint", days, "2100-01-01"), read_verdicts(lake, "joint", "2100-01-01")
+    return read_window(lake, "joint", days, "2100-01-01"), read_verdicts(lake, "joint")
 
 
 def repeated(window, verdicts, count, rare=25):
