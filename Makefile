@@ -43,6 +43,12 @@ bench: setup ## speed and memory, measured as ratios against the committed basel
 bench-accept: setup ## the same, and writes what it measures into the baseline
 	$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks -p no:xdist -s --accept-baseline
 
+results: setup ## write the result tables of both READMEs from what was measured
+	$(BIN)/python -m tests.benchmarks.results_table
+
+accuracy-accept: setup ## measure the fixed days of tests/accuracy and write their baseline
+	$(ONE_THREAD) $(BIN)/python -m tests.accuracy.days --accept
+
 licenses: setup ## write jobs/deploy/THIRD_PARTY_LICENSES.md anew
 	$(BIN)/python -m tests.makers.third_party > jobs/deploy/THIRD_PARTY_LICENSES.md
 
@@ -63,4 +69,4 @@ audit-dependencies: $(LOOKERS)/.ready ## known vulnerabilities of what constrain
 clean: ## remove what the other targets made
 	rm -rf .venv $(LOOKERS) sbom.json demo .pytest_cache .mypy_cache .ruff_cache
 
-.PHONY: help setup demo test browser lint bench bench-accept licenses sbom audit-dependencies clean
+.PHONY: help setup demo test browser lint bench bench-accept results accuracy-accept licenses sbom audit-dependencies clean

@@ -16,7 +16,7 @@ from typing import Any
 
 from tests.benchmarks.studies.commits import is_same_code
 
-__all__ = ["RECORD", "Look", "heading", "look", "read_looks"]
+__all__ = ["RECORD", "Look", "freshness", "heading", "look", "read_looks"]
 
 RECORD = Path(__file__).parents[1] / "results" / "seeds.toml"
 _REAL = 0
@@ -69,6 +69,14 @@ def heading(results: Sequence[dict[str, Any]], record: Path = RECORD) -> str:
         for seed in _seeds(results, commit):
             said.setdefault(_freshness(seed, commit, known), set()).add(seed)
     return "; ".join(f"{what}: days of seeds {_ranges(seeds)}" for what, seeds in said.items())
+
+
+def freshness(seed: int, commit: str, known: Sequence[Look]) -> str:
+    """In a word, "tuned on", "first" or "second": the latter two by commits' names alone, whatever git has of them."""
+    if seed == _REAL or seed in _TUNING:
+        return "tuned on"
+    first = next((e for e in known if seed in e.seeds), None)
+    return "first" if first is None or first.commit == commit else "second"
 
 
 def _freshness(seed: int, commit: str, known: Sequence[Look]) -> str:

@@ -1,0 +1,200 @@
+"""How a row of the result tables computes its number from result lines, each by a name that rows.toml uses.
+
+A measure takes the chosen lines and the row, and returns the text of the cell. Rates come with a 95 % interval over
+what is independent: days, never records, for the three records of a day share their frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from schemas.calibrations import PAIRS
+from tests.benchmarks.studies.basin import in_basin
+from tests.benchmarks.studies.in_use import answer_of_log
+from tests.benchmarks.studies.metrics import within
+from tests.benchmarks.studies.priors import LIMIT_DEG
+
+__all__ = ["MEASURES", "interval", "rate"]
+
+Lines = Sequence[Mapping[str, Any]]
+Row = Mapping[str, Any]
+_CONFIDENCE = 0.95
+
+
+def interval(hits: int, trials: int) -> tuple[float, float]:
+    """Clopper and Pearson's 95 % interval of a rate; of none or all the one-sided one (some 3 / trials wide)."""
+    if not 0 <= hits <= trials or trials < 1:
+        raise ValueError(f"{hits} of {trials} is no rate")
+    outside = 1 - _CONFIDENCE if hits in {0, trials} else (1 - _CONFIDENCE) / 2
+    low = float(beta.ppf(outside, hits, trials - hits + 1)) if hits else 0.0
+    high = float(beta.ppf(1 - outside, hits + 1, trials - hits)) if hits < trials else 1.0
+    return low, high
+
+
+def rate(hits: int, trials: int) -> str:
+    """`k of n (low to high %)`."""
+    low, high = (100 * end for end in interval(hits, trials))
+    if hits == 0:
+        return f"{hits} of {trials} (< {high:.1f} %)"
+    if hits == trials:
+        return f"{hits} of {trials} (> {low:.1f} %)"
+    return f"{hits} of {trials} ({low:.0f} to {high:.0f} %)"
+
+
+def errors(lines: Lines, row: Row) -> str:
+    """Mean errors of `pairs`: azimuth / elevation [deg], and with `range = true` / range [m]."""
+    names = ["az_deg", "el_deg", *(["range_m"] if row.get("range") else [])]
+    cells = []
+    for pair in row.get("pairs", PAIRS):
+        found = [r["pairs"][pair] for r in lines if "az_deg" in r["pairs"].get(pair, {})]
+        cells.append("/".join(f"{np.mean([p[name] for p in found]):.3f}" for name in names))
+    return ", ".join(cells)
+
+
+def wrong_days(lines: Lines, _row: Row) -> str:
+    """Days on which a record was accepted with an angle that it certifies beyond its limit."""
+    days: dict[tuple[str, ...], bool] = {}
+    for r in lines:
+        key = tuple(str(r["day"][name]) for name in ("rig", "environment", "seed"))
+        accepted = [(pair, p) for pair, p in r["pairs"].items() if p["status"] == "accepted"]
+        days[key] = days.get(key, False) or any(not within(pair, p, claimed=True) for pair, p in accepted)
+    return rate(sum(days.values()), len(days))
+
+
+def mounting(lines: Lines, row: Row) -> str:
+    """Accepted records of the camera on days of a wrong principal point: how far the mounting is off by it."""
+    records = [p for r in lines for pair, p in r["pairs"].items() if pair.startswith("camera")]
+    accepted = sum(p["status"] == "accepted" for p in records)
+    return f"{accepted} of {len(records)} records, {row['off']} off"
+
+
+def accepted_days(lines: Lines, row: Row) -> str:
+    """Days on which every pair of `pairs` was accepted."""
+    pairs = row.get("pairs", PAIRS)
+    good = [all(r["pairs"].get(pair, {}).get("status") == "accepted" for pair in pairs) for r in lines]
+    return f"{rate(sum(good), len(good))}{row.get('unit', '')}"
+
+
+def inside(lines: Lines, _row: Row) -> str:
+    """Share of determined degrees of freedom within 1 and 3 sigma; the interval is of days' own shares."""
+    days = []
+    for r in lines:
+        known = [p for p in r["pairs"].values() if "error" in p]
+        seen = np.concatenate([np.array(p["observable"], bool) for p in known])
+        error, sigma = (np.concatenate([np.array(p[key]) for p in known]) for key in ("error", "sigma"))
+        days.append((np.abs(error) / sigma)[seen])
+    shares = np.array([np.mean(z <= 1) for z in days])
+    half = 196 * shares.std(ddof=1) / np.sqrt(len(days))
+    all_within = sum(bool((z <= 3).all()) for z in days)
+    one = 100 * np.mean(np.concatenate(days) <= 1)
+    return f"{one:.0f} % (+- {half:.0f}); in three: {rate(all_within, len(days))}"
+
+
+def found(lines: Lines, row: Row) -> str:
+    """Days that end in the right basin by the size of the start's error; the bound is of the worst size.
+
+    Of camera-lidar and lidar-radar; with `everything = true` of all pairs, azimuth and elevation, to the limits of the
+    study `priors`.
+    """
+    sizes: dict[float, list[bool]] = {}
+    for r in lines:
+        sizes.setdefault(r["prior"][1], []).append(_is_home(r["pairs"], bool(row.get("everything"))))
+    hits = [sum(home) for _, home in sorted(sizes.items())]
+    [trials] = {len(home) for home in sizes.values()}
+    return f"{', '.join(map(str, hits))} of {trials} (> {100 * interval(min(hits), trials)[0]:.0f} %)"
+
+
+def _is_home(pairs: Mapping[str, Any], everything: bool) -> bool:
+    if everything:
+        angles = ("az_deg", "el_deg")
+        return all(pairs.get(pair, {}).get(a, np.inf) < LIMIT_DEG[pair] for pair in PAIRS for a in angles)
+    return all(in_basin(pair, pairs.get(pair, {})) for pair in ("camera_lidar", "lidar_radar"))
+
+
+def clocks(lines: Lines, row: Row) -> str:
+    """Time offsets of a pair within 5 ms, and their RMS error."""
+    known = [r["pairs"][row["pairs"][0]] for r in lines if "dt_s" in r["pairs"].get(row["pairs"][0], {})]
+    off = np.array([p["dt_s"] - p["dt_true_s"] for p in known])
+    hits = int(np.sum(np.abs(off) <= 0.005))
+    return f"{rate(hits, len(off))}, RMS {1e3 * np.sqrt(np.mean(off**2)):.1f} ms"
+
+
+def verified(lines: Lines, row: Row) -> str:
+    """Answers of `boresight verify` that are `answer`."""
+    hits = [answer_of_log(dict(r)) == row["answer"] for r in lines]
+    return rate(sum(hits), len(hits))
+
+
+def total(lines: Lines, row: Row) -> str:
+    """Sum of a field over all lines."""
+    return row.get("text", "{}").format(sum(r[row["field"]] for r in lines))
+
+
+def value(lines: Lines, row: Row) -> str:
+    """Fields of one line ("a.b"), put into `text`."""
+    [line] = lines
+    values = []
+    for name in row["fields"]:
+        at: Any = line
+        for part in name.split("."):
+            at = at[int(part)] if isinstance(at, list) else at[part]
+        values.append(at)
+    return str(row["text"]).format(*values)
+
+
+def by_noise(lines: Lines, row: Row) -> str:
+    """A field of the drift study's lines, one value per kind of errors of `noises`, times `scale`."""
+    known = {r["noise"]: r[row["field"]] for r in lines}
+    return row.get("text", "{}").format(
+        ", ".join(f"{row.get('scale', 1) * known[noise]:.{row.get('digits', 0)}f}" for noise in row["noises"])
+    )
+
+
+def efficiency(lines: Lines, _row: Row) -> str:
+    """Two workers by the clock, pool and Ray: half of the inline night over the shared one, waits included."""
+    by = {r["executor"]: r["wall_s"] for r in lines}
+    return ", ".join(f"{by['inline'] / 2 / by[way]:.2f}" for way in ("process", "ray"))
+
+
+def starts(lines: Lines, row: Row) -> str:
+    """Real car: by start, runs whose camera-lidar lies within .15/.20 deg of the given calibration."""
+    cells = []
+    for start in row["starts"]:
+        mine = [r["pairs"].get("camera_lidar", {}) for r in lines if r["start"] == start]
+        near = [p.get("az_deg", 9) <= 0.15 and p.get("el_deg", 9) <= 0.20 for p in mine]
+        cells.append(f"{sum(near)} of {len(near)}")
+    return ", ".join(cells)
+
+
+def shown(lines: Lines, row: Row) -> str:
+    """Days of a network on the real car, mean over draws: azimuth/elevation of camera-lidar, and how many held."""
+    days = lines[0][row["key"]]["days"]
+    mean = [np.mean([d["camera_lidar"][name] for d in days]) for name in ("az_deg", "el_deg")]
+    accepted = sum(d["camera_lidar"]["status"] == "accepted" for d in days)
+    return f"{mean[0]:.2f}/{mean[1]:.2f}, {accepted} of {len(days)} accepted"
+
+
+def knocked(lines: Lines, _row: Row) -> str:
+    """Vehicles that were knocked and are RED with sensor and day; and others that are RED."""
+    vehicles = [v for r in lines for v in r["vehicles"]]
+    bad = [v for v in vehicles if v["knocked"]]
+    red = sum(v["told"]["status"] == "RED" for v in vehicles if not v["knocked"])
+    return f"{rate(sum(v['right'] for v in bad), len(bad))}; others RED: {red} of {len(vehicles) - len(bad)}"
+
+
+def last(lines: Lines, row: Row) -> str:
+    """As `value`, of the last line that was chosen."""
+    return value(lines[-1:], row)
+
+
+MEASURES: dict[str, Callable[[Lines, Row], str]] = {
+    f.__name__: f
+    for f in (
+        accepted_days, by_noise, clocks, efficiency, errors, found, inside, knocked, last, mounting, shown, starts,
+        total, value, verified, wrong_days,
+    )
+}  # fmt: skip

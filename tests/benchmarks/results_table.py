@@ -1,0 +1,181 @@
+"""The result tables of both READMEs, made of results/rows.toml and of the files that it names.
+
+    python -m tests.benchmarks.results_table          writes them (make results)
+    python -m tests.benchmarks.results_table --check  says whether they are what the results give
+
+A row names a question, its goal, its files and how the number is computed (`results_measures.py`). What else a reader
+must know to believe the number is computed: the release of the code (results/releases.toml, kept because commits are
+rebased), whether its seeds were looked at before (results/seeds.toml), on how many distinct days it rests, and for a
+rate its 95 % interval.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.benchmarks.results_measures import MEASURES
+from tests.benchmarks.studies.looks import freshness, read_looks
+
+__all__ = ["TARGETS", "WIDEST", "lines_of", "release_now", "release_of", "render", "rows", "written"]
+
+RESULTS = Path(__file__).parent / "results"
+REPO = Path(__file__).resolve().parents[2]
+ROWS = RESULTS / "rows.toml"
+RELEASES = RESULTS / "releases.toml"
+BEGIN, END = "<!-- results: written by make results -->", "<!-- end of results -->"
+TARGETS = {REPO / "README.md": True, RESULTS / "README.md": False}  # the first has rows of `top` alone
+WIDEST = 110  # characters of a line of the first
+
+
+def rows(path: Path = ROWS) -> list[dict[str, Any]]:
+    """All rows, in order."""
+    return list(tomllib.loads(path.read_text())["row"])
+
+
+def lines_of(row: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Lines of the row's files that its `where` chooses; a JSON file is one line."""
+    found: list[dict[str, Any]] = []
+    for name in _files(row):
+        path = RESULTS / name
+        text = path.read_text()
+        found += [json.loads(text)] if path.suffix == ".json" else [json.loads(x) for x in text.splitlines()]
+    chosen = [r for r in found if all(_at(r, key) in _listed(v) for key, v in row.get("where", {}).items())]
+    if not chosen:
+        raise SystemExit(f"rows.toml: no line of {row['file']} is chosen for {row['question']!r}")
+    return chosen
+
+
+def render(top_only: bool) -> str:
+    """The table as Markdown."""
+    heads = ["question", "goal", "measured (95 % interval)", "days, look", "release"]
+    heads += [] if top_only else ["file"]
+    chosen = [row for row in rows() if row.get("top") or not top_only]
+    body = [_cells(row, top_only) for row in chosen]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in [heads, ["---"] * len(heads), *body])
+
+
+def _cells(row: Mapping[str, Any], top_only: bool) -> list[str]:
+    lines = lines_of(row)
+    text = MEASURES[row["measure"]](lines, row)
+    cells = [row["question"], row.get("goal", ""), text, f"{_days(lines, row)}, {_look(lines, row)}"]
+    cells.append(_release(lines, row))
+    return cells if top_only else [*cells, ", ".join(f"[{name}]({name})" for name in _files(row))]
+
+
+def _files(row: Mapping[str, Any]) -> list[str]:
+    return list(_listed(row["file"]))
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
+def _at(line: Mapping[str, Any], key: str) -> Any:
+    """Value at "day.rig"; None where there is none."""
+    value: Any = line
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value
+
+
+def _days(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
+    """Distinct drives: a day that is calibrated twice, or with another fault put into its rows, is one."""
+    if "days" in row:
+        return str(row["days"])
+    seen = {(d.get("rig"), d.get("environment"), d["seed"]) for r in lines if "seed" in (d := r["day"])}
+    return str(len(seen))
+
+
+def _look(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
+    """First or second look, by the seeds that were noted; a row of other lines says it itself."""
+    if "look" in row:
+        return str(row["look"])
+    known = read_looks()
+    said = {freshness(int(r["day"]["seed"]), str(r["commit"]), known) for r in lines}
+    return "tuned on" if "tuned on" in said else "second" if "second" in said else "first"
+
+
+def _release(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
+    """Releases whose code was measured, the oldest first, and whether the code has gone on since."""
+    commits = {str(c) for r in lines if (c := r.get("commit"))} or {str(row["commit"])}
+    found = sorted({release_of(commit) for commit in commits}, key=_order)
+    return " to ".join(dict.fromkeys((found[0], found[-1]))) + (
+        "" if found[0] == release_now() else ", older"
+    )
+
+
+def release_now() -> str:
+    """The release that the code is on its way to: the topmost of the changelog."""
+    return _topmost((REPO / "CHANGELOG.md").read_text())
+
+
+def _topmost(changelog: str) -> str:
+    found = re.search(r"^## (\d+\.\d+\.\d+)", changelog, re.MULTILINE)
+    assert found is not None, "a changelog without a release"
+    return found[1]
+
+
+def release_of(commit: str) -> str:
+    """The release that a commit was on its way to, as releases.toml has it or else git, which is then written down."""
+    known = tomllib.loads(RELEASES.read_text())["releases"]
+    commit = commit.removesuffix("+")
+    if commit in known:
+        return str(known[commit])
+    release = _by_git(commit)
+    with RELEASES.open("a") as file:
+        file.write(f'"{commit}" = "{release}"\n')
+    return release
+
+
+def _by_git(commit: str) -> str:
+    """Topmost release of the changelog at a commit."""
+    changelog = _git("show", f"{commit}:CHANGELOG.md")
+    if changelog is None:
+        raise SystemExit(f"{RELEASES.name}: name the release of commit {commit}, which git does not know")
+    return _topmost(changelog)
+
+
+def _git(*arguments: str) -> str | None:
+    done = subprocess.run(["git", *arguments], capture_output=True, text=True, check=False, cwd=REPO)
+    return None if done.returncode else done.stdout
+
+
+def _order(release: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in release.split("."))
+
+
+def written(path: Path, top_only: bool) -> str:
+    """The file with its table made anew."""
+    text = path.read_text()
+    before, found, rest = text.partition(BEGIN)
+    after = rest.partition(END)[2]
+    if not found:
+        raise SystemExit(f"{path} has no line {BEGIN}")
+    return f"{before}{BEGIN}\n{render(top_only)}\n{END}{after}"
+
+
+def main() -> None:
+    """Write both tables, or say which is not what the results give."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", action="store_true")
+    args = parser.parse_args()
+    stale = [path for path, top_only in TARGETS.items() if written(path, top_only) != path.read_text()]
+    if args.check:
+        sys.exit(f"not what the results give: {', '.join(map(str, stale))}; make results" if stale else 0)
+    for path in stale:
+        path.write_text(written(path, TARGETS[path]))
+        print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    main()
