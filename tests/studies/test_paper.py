@@ -78,6 +78,11 @@ def test_the_page_of_figures_needs_nothing_from_outside_and_tells_errors_against
     assert "joint: camera-lidar 0.00 / 0.00, camera-radar 0.00 / 0.00" in page
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
     assert len(re.findall(r"<figure>", page)) == 2 + 8 + 12
+    halves = [dict.fromkeys(paper_figures.HALVES, state) for state in (right, wrong)]
+    both = paper_figures.extended_page("days", [(day, scenes[:2]), (day, scenes[:1])], halves)
+    assert "Extended data figure 1" in both
+    assert len(re.findall(r"<figure>", both)) == 8 + 4
+    assert "joint-ssl: camera-lidar 1.50 / 0.0" in both.partition("Extended data figure 2")[2]
     empty = paper_figures.without_lidar(scenes[0])
     assert len(empty.frame.lidar_xyz_m) == 0
     assert len(empty.observation.radar_track_xyz_m) == len(scenes[0].observation.radar_track_xyz_m)
