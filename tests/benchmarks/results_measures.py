@@ -14,6 +14,7 @@ from scipy.stats import beta
 
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.basin import in_basin
+from tests.benchmarks.studies.faults import is_right, outcome_of
 from tests.benchmarks.studies.in_use import answer_of_log
 from tests.benchmarks.studies.metrics import within
 from tests.benchmarks.studies.priors import LIMIT_DEG
@@ -186,6 +187,21 @@ def knocked(lines: Lines, _row: Row) -> str:
     return f"{rate(sum(v['right'] for v in bad), len(bad))}; others RED: {red} of {len(vehicles) - len(bad)}"
 
 
+def faulty(lines: Lines, _row: Row) -> str:
+    """Of records of the study `faults` that were accepted, those that are wrong; all records in brackets."""
+    records = [(r["rig"], pair, p) for r in lines for pair, p in r["pairs"].items()]
+    wrong = [not is_right(pair, p, rig) for rig, pair, p in records if p["status"] == "accepted"]
+    return f"{sum(wrong)} of {len(wrong)} accepted ({len(records)} records)"
+
+
+def named(lines: Lines, _row: Row) -> str:
+    """Of records that a fault stopped, those whose fault is named rightly."""
+    good = {(r["rig"], r["seed"]): r for r in lines if r["case"] == "good"}
+    told = [outcome_of(pair, r, good.get((r["rig"], r["seed"]))) for r in lines for pair in r["pairs"]]
+    stopped = [what for what in told if what.startswith("stopped")]
+    return f"{stopped.count('stopped, named rightly')} of {len(stopped)}"
+
+
 def last(lines: Lines, row: Row) -> str:
     """As `value`, of the last line that was chosen."""
     return value(lines[-1:], row)
@@ -194,7 +210,7 @@ def last(lines: Lines, row: Row) -> str:
 MEASURES: dict[str, Callable[[Lines, Row], str]] = {
     f.__name__: f
     for f in (
-        accepted_days, by_noise, clocks, efficiency, errors, found, inside, knocked, last, mounting, shown, starts,
-        total, value, verified, wrong_days,
+        accepted_days, by_noise, clocks, efficiency, errors, faulty, found, inside, knocked, last, mounting, named,
+        shown, starts, total, value, verified, wrong_days,
     )
 }  # fmt: skip

@@ -90,7 +90,7 @@ def _days(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
     """Distinct drives: a day that is calibrated twice, or with another fault put into its rows, is one."""
     if "days" in row:
         return str(row["days"])
-    seen = {(d.get("rig"), d.get("environment"), d["seed"]) for r in lines if "seed" in (d := r["day"])}
+    seen = {(d.get("rig"), d.get("environment"), d["seed"]) for d in (r.get("day", r) for r in lines)}
     return str(len(seen))
 
 
@@ -99,7 +99,7 @@ def _look(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
     if "look" in row:
         return str(row["look"])
     known = read_looks()
-    said = {freshness(int(r["day"]["seed"]), str(r["commit"]), known) for r in lines}
+    said = {freshness(int(r.get("day", r)["seed"]), str(r["commit"]), known) for r in lines}
     return "tuned on" if "tuned on" in said else "second" if "second" in said else "first"
 
 
