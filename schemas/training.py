@@ -68,7 +68,7 @@ NO_EDGE = -128  # in edge_offset: no boundary of this direction within reach
 
 TRAINING = TableSchema(
     "training",
-    2,
+    3,
     (
         scalar("frame_index", "int32", "row of table frames"),
         scalar("vehicle", "string", "vehicle id"),
@@ -119,8 +119,6 @@ TRAINING = TableSchema(
             "road users: azimuth left, elevation top, azimuth right, elevation bottom of the box (azimuth to the left "
             "and elevation upwards are positive)",
         ),
-        array("detection_class", "|u1", (24,), "index into GRID_CLASSES"),
-        array("detection_score", "<f4", (24,), "0..1"),
         scalar("detection_count", "int32", "road users among the 24 rows"),
         # lidar
         array(
@@ -146,11 +144,9 @@ TRAINING = TableSchema(
         array("cluster_id", "<i2", ("N",), "row of cluster_centre_m, -1 = beyond its rows"),
         scalar("cluster_point_count", "int32", "points among the rows of cluster_xyz_m"),
         array("cluster_centre_m", "<f4", (48, 3), "centres of the largest object clusters, lidar frame"),
-        array("cluster_size_m", "<f4", (48, 3), "sides of their axis-aligned boxes"),
         scalar("cluster_count", "int32", "clusters among the 48 rows"),
         array("edge_xyz_m", "<f4", ("N", 3), "depth jumps, lidar frame; for losses"),
         array("edge_side", "|u1", ("N",), "EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies"),
-        array("edge_gap_rad", "<f4", ("N",), "angle between the two beams"),
         scalar("edge_count", "int32", "jumps among the rows of edge_*"),
         array(
             "drivable_xyz_m", "<f4", (512, 3), "sample of the drivable ground's 1 m cells ahead, lidar frame"
@@ -170,8 +166,6 @@ TRAINING = TableSchema(
         scalar("radar_count", "int32", "detections among the 384 rows"),
         scalar("radar_has_elevation", "bool", "False where all elevations are 0"),
         array("track_xyz_m", "<f4", (24, 3), "centres of tracked moving clusters, radar frame"),
-        array("track_velocity_mps", "<f4", (24, 3), "over ground, radar axes"),
-        array("track_age", "<i4", (24,), "frames in which the track was seen so far"),
         scalar("track_count", "int32", "tracks among the 24 rows"),
         array(
             "radar_drivable",
@@ -202,7 +196,10 @@ TRAINING = TableSchema(
     ),
     "One frame per row. Padded rows of arrays are 0.",
     made_by="prepare",
-    reads_versions=(1,),  # which knew no way_* and no road_slope
+    reads_versions=(
+        1,
+        2,
+    ),  # 1 knew no way_* and no road_slope; both hold six columns more, which nothing read
 )
 
 
@@ -230,8 +227,6 @@ class TrainingRow:
     edge_offset: np.ndarray
     sky_depth: np.ndarray
     detection_box_rad: np.ndarray
-    detection_class: np.ndarray
-    detection_score: np.ndarray
     detection_count: int
     lidar_xyz_m: np.ndarray
     lidar_intensity: np.ndarray
@@ -241,11 +236,9 @@ class TrainingRow:
     cluster_id: np.ndarray
     cluster_point_count: int
     cluster_centre_m: np.ndarray
-    cluster_size_m: np.ndarray
     cluster_count: int
     edge_xyz_m: np.ndarray
     edge_side: np.ndarray
-    edge_gap_rad: np.ndarray
     edge_count: int
     drivable_xyz_m: np.ndarray
     drivable_count: int
@@ -258,8 +251,6 @@ class TrainingRow:
     radar_count: int
     radar_has_elevation: bool
     track_xyz_m: np.ndarray
-    track_velocity_mps: np.ndarray
-    track_age: np.ndarray
     track_count: int
     radar_drivable: np.ndarray
     ego_speed_mps: float

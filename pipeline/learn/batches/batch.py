@@ -35,8 +35,6 @@ class TrainingBatch:
     edge_offset: Int8[Tensor, "B 4 H W"]  # 0.05 deg, by EDGE_LEFT/RIGHT/ABOVE/BELOW, NO_EDGE
     sky_depth: UInt8[Tensor, "B H W"]  # 0.1 deg
     detection_box_rad: Float[Tensor, "B G 4"]  # azimuth left, elevation top, azimuth right, elevation bottom
-    detection_class: UInt8[Tensor, "B G"]
-    detection_score: Float[Tensor, "B G"]
     detection_valid: Bool[Tensor, "B G"]
     # lidar frame
     lidar_xyz_m: Float[Tensor, "B N 3"]
@@ -47,11 +45,9 @@ class TrainingBatch:
     cluster_id: Int16[Tensor, "B C"]
     cluster_point_valid: Bool[Tensor, "B C"]
     cluster_centre_m: Float[Tensor, "B K 3"]
-    cluster_size_m: Float[Tensor, "B K 3"]
     cluster_valid: Bool[Tensor, "B K"]
     edge_xyz_m: Float[Tensor, "B E 3"]
     edge_side: UInt8[Tensor, "B E"]
-    edge_gap_rad: Float[Tensor, "B E"]
     edge_valid: Bool[Tensor, "B E"]
     drivable_xyz_m: Float[Tensor, "B D 3"]
     drivable_valid: Bool[Tensor, "B D"]
@@ -65,8 +61,6 @@ class TrainingBatch:
     radar_valid: Bool[Tensor, "B R"]
     radar_has_elevation: Bool[Tensor, " B"]
     track_xyz_m: Float[Tensor, "B T 3"]
-    track_velocity_mps: Float[Tensor, "B T 3"]
-    track_age: Int32[Tensor, "B T"]
     track_valid: Bool[Tensor, "B T"]
     radar_drivable: UInt8[Tensor, "B X Y"]  # soft, cells of 1 m: x = r + 1/2, y = c - Y/2 + 1/2
     # the whole

@@ -24,21 +24,21 @@ _MAPS = {
     "sky_depth": (),
 }
 _ARRAYS = (
-    "detection_box_rad", "detection_class", "detection_score", "lidar_xyz_m", "lidar_intensity", "lidar_flags",
-    "cluster_xyz_m", "cluster_id", "cluster_centre_m", "cluster_size_m", "edge_xyz_m", "edge_side", "edge_gap_rad",
+    "detection_box_rad", "lidar_xyz_m", "lidar_intensity", "lidar_flags",
+    "cluster_xyz_m", "cluster_id", "cluster_centre_m", "edge_xyz_m", "edge_side",
     "drivable_xyz_m", "radar_xyz_m", "radar_residual_mps", "radar_power_db", "radar_motion", "track_xyz_m",
-    "track_velocity_mps", "track_age", "radar_drivable",
+    "radar_drivable",
 )  # fmt: skip
 # Mask -> how many rows are real, and an array that has all of them.
 _MASKS = {
-    "detection_valid": ("detection_count", "detection_score"),
+    "detection_valid": ("detection_count", "detection_box_rad"),
     "lidar_valid": ("lidar_count", "lidar_flags"),
     "cluster_point_valid": ("cluster_point_count", "cluster_id"),
     "cluster_valid": ("cluster_count", "cluster_centre_m"),
     "edge_valid": ("edge_count", "edge_side"),
     "drivable_valid": ("drivable_count", "drivable_xyz_m"),
     "radar_valid": ("radar_count", "radar_motion"),
-    "track_valid": ("track_count", "track_age"),
+    "track_valid": ("track_count", "track_xyz_m"),
 }
 _NUMBERS = (
     "ego_speed_mps", "way_sigma_rad", "road_slope", "camera_lag_s", "radar_lag_s", "drivable_area_m2",

@@ -137,8 +137,6 @@ def radar_columns(observation: Observation, rng: np.random.Generator) -> dict[st
         "radar_count": len(picked),
         "radar_has_elevation": observation.radar_has_elevation,
         "track_xyz_m": padded_rows(observation.radar_track_xyz_m[:_TRACKS], _TRACKS),
-        "track_velocity_mps": padded_rows(observation.radar_track_velocity_mps[:_TRACKS], _TRACKS),
-        "track_age": padded_rows(observation.radar_track_age[:_TRACKS], _TRACKS),
         "track_count": min(len(observation.radar_track_xyz_m), _TRACKS),
         "radar_drivable": np.rint(np.clip(metres, 0, 1) * 255).astype(np.uint8),
     }
@@ -196,13 +194,11 @@ def _cluster_columns(
     number = np.full(len(observation.lidar_cluster_centre_m) + 1, -1, np.int16)
     number[largest] = np.arange(len(largest))
     picked = rows[_some(len(rows), count, rng)]
-    size = observation.lidar_cluster_max_m - observation.lidar_cluster_min_m
     return {
         "cluster_xyz_m": padded_rows(cloud[picked], count),
         "cluster_id": padded_rows(number[cluster[picked]], count),
         "cluster_point_count": len(picked),
         "cluster_centre_m": padded_rows(observation.lidar_cluster_centre_m[largest], _CLUSTERS),
-        "cluster_size_m": padded_rows(size[largest], _CLUSTERS),
         "cluster_count": len(largest),
     }
 
@@ -215,7 +211,6 @@ def _edge_columns(
     return {
         "edge_xyz_m": padded_rows(observation.lidar_edge_xyz_m[picked], count),
         "edge_side": padded_rows(observation.lidar_edge_side[picked], count),
-        "edge_gap_rad": padded_rows(observation.lidar_edge_gap_rad[picked], count),
         "edge_count": len(picked),
     }
 

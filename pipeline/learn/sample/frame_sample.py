@@ -22,7 +22,7 @@ from pipeline.objective.paper.classes import labels_of
 from pipeline.objective.radar.travel import travel_directions
 from schemas.frames import Frame
 from schemas.observations import Observation
-from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, TrainingRow
+from schemas.training import DISTANCE_GROUPS, TrainingRow
 
 __all__ = [
     "About",
@@ -39,9 +39,6 @@ _MARGIN_RAD = np.radians(6.0)  # beyond the grid: what a guess wrong by so much 
 _MIN_POINTS = 300  # fewer in view show a network no shape
 _LEAST_WAY_SIGMA_RAD = 1e-4  # made scenes have no noise, and 0 says that the way is unknown
 _MIN_SEEN = 0.2  # of the grid: a camera narrower than that has another grid
-_CLASS_OF_USER = {
-    "person": "person", "rider": "person", "bicycle": "two_wheeler", "motorcycle": "two_wheeler",
-}  # fmt: skip
 
 
 class SampleReason(StrEnum):
@@ -144,8 +141,6 @@ def sensor_row(
         edge_offset=np.zeros((4, cells), np.int8),
         sky_depth=np.zeros(cells, np.uint8),
         detection_box_rad=np.zeros((_DETECTIONS, 4), np.float32),
-        detection_class=np.zeros(_DETECTIONS, np.uint8),
-        detection_score=np.zeros(_DETECTIONS, np.float32),
         detection_count=0,
         **lidar,
         **radar_columns(observation, rng),
@@ -198,13 +193,8 @@ def _detection_columns(observation: Observation, camera: Camera) -> dict[str, An
     angles = _box_angles(boxes, camera)
     rows = np.flatnonzero(np.isfinite(angles).all(axis=1))
     rows = rows[np.argsort(-observation.road_user_scores[rows], kind="stable")][:_DETECTIONS]
-    names = [_CLASS_OF_USER.get(observation.road_user_classes[i], "vehicle") for i in rows]
     return {
         "detection_box_rad": padded_rows(angles[rows].astype(np.float32), _DETECTIONS),
-        "detection_class": padded_rows(
-            np.array([GRID_CLASSES.index(n) for n in names], np.uint8), _DETECTIONS
-        ),
-        "detection_score": padded_rows(observation.road_user_scores[rows], _DETECTIONS),
         "detection_count": len(rows),
     }
 
