@@ -6,7 +6,7 @@ stay.
 
     python -m tests.benchmarks.studies.drift_power gather --name demo --fleet F --lake LAKE
     python -m tests.benchmarks.studies.drift_power gather --name "real car" --fleet F --lake LAKE --parts
-    python -m tests.benchmarks.studies.drift_power run [--movers 100] [--first-seed 63000]
+    python -m tests.benchmarks.studies.drift_power run [--movers 60] [--first-seed 63000]
 
 `gather` keeps covariances of a lake's days in results/day_covariances.json, `run` writes drift_power.jsonl and .md.
 Fleets are judged whole, as the audit does, on nights 1 to 5 and 12 after the step. Seeds below 200 are for tuning and
@@ -306,7 +306,7 @@ def main() -> None:
     gathering.add_argument("--parts", action="store_true")
     gathering.set_defaults(do=gather)
     running = commands.add_parser("run")
-    running.add_argument("--movers", type=int, default=100)
+    running.add_argument("--movers", type=int, default=60)
     running.add_argument("--first-seed", type=int, default=63_000)
     running.add_argument("--names", nargs="+", default=["demo", "real car"])
     running.add_argument("--fleets", nargs="+", type=int, choices=FLEETS, default=list(FLEETS))
