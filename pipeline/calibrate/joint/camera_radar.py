@@ -20,7 +20,7 @@ from pipeline.calibrate.numerics.bias_floors import (
     PRIOR_CONTRADICTION_SIGMAS,
 )
 from pipeline.calibrate.numerics.covariance import Posterior, covariance_with_fixed, posterior
-from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
+from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.cameras import camera_of
@@ -108,7 +108,7 @@ def estimate_camera_radar(
     before = np.append(np.diag(prior_covariance), np.full(len(BOX_CLASSES), BIAS_SIGMA_RAD**2))
     T_start, rival = _scan_azimuth(seen.clusters, prior.T_camera_radar, config)
     T, last = _solve(seen, prior.T_camera_radar, T_start, before)
-    block = bootstrap_blocks(np.array([o.drive for o in observations]), config.bootstrap_blocks)
+    block = blocks_of(observations, config.bootstrap_blocks)
     information = last.H.sum(0) + np.diag(1 / before)
     covariance = covariance_with_fixed(last.H, last.g, before, information, _FIXED, block, rng)[:6, :6]
     # Left perturbations about the camera carry the radar along; these were turns about the radar.

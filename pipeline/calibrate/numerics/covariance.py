@@ -2,11 +2,14 @@
 
 The inverse of an information matrix alone is too small (on real logs 6 times in yaw): residuals of one scene err
 together. Blocks of frames that share no scene are resampled instead: each resampled day moves the estimate by one
-Newton step, and the spread of these steps, plus what the prior leaves open, is the covariance. No direction becomes
+Newton step, and the spread of these steps, plus what the prior leaves open, is the covariance. A block that makes up
+much of the day draws the estimate to itself and so seems to err little: its step counts as if it had been left out. Few
+blocks do not know their own spread: it is as much wider as Student's t is. No direction becomes
 surer than the information allows. A bias common to all frames, which no resampling shows, is added as a floor per
 degree of freedom.
 
-Source: Efron & Tibshirani 1993, ch. 8 (blocks); White 1982 (the sandwich that one Newton step per resample tends to).
+Source: Efron & Tibshirani 1993, ch. 8 (blocks); White 1982 (the sandwich that one Newton step per resample tends to);
+MacKinnon & White 1985 (HC3, what is left out); Satterthwaite 1946 (blocks of unequal weight).
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
+from scipy.special import ndtri, stdtrit
 
 __all__ = [
     "OBSERVABLE",
@@ -24,9 +28,11 @@ __all__ = [
     "posterior",
     "response",
     "spread_to_covariance",
+    "widening",
 ]
 
 OBSERVABLE = 0.5  # the day at least halved the variance
+_WIDENED_AT = 0.975  # where Student's t and the normal are compared: 95 % of what is told by two sigmas
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +63,8 @@ def bootstrap_covariance(
         resamples: number of resampled days.
 
     Returns:
-        Spread of the resampled estimates plus the prior's share, nowhere below the inverse of all information.
+        Spread of the resampled estimates plus the prior's share, nowhere below the inverse of all information. A single
+        block has no spread: that inverse is then widened as for two.
     """
     P = score.shape[1]
     count = int(block.max()) + 1 if len(block) else 0
@@ -66,12 +73,20 @@ def bootstrap_covariance(
     np.add.at(g, block, score)
     total = H.sum(0) + prior_information
     inverse = _inverse(total)
+    share = np.maximum(np.einsum("ij,bji->b", inverse, H) / P, 0.0)
+    few = widening(float(share.sum() ** 2 / max((share**2).sum(), 1e-300)))
     if count < 2:
-        return inverse
+        return inverse * few**2
     draws = rng.multinomial(count, np.full(count, 1 / count), size=resamples).astype(float)
-    steps = (draws @ (g - g.mean(0))) @ inverse.T
-    spread = np.cov(steps.T, ddof=1) * count / (count - 1)
+    left_out = (g - g.mean(0)) / np.maximum(1 - share, 1 / count)[:, None]
+    steps = (draws @ (left_out - left_out.mean(0))) @ inverse.T
+    spread = np.cov(steps.T, ddof=1) * few**2 * (count - 1) / count
     return spread_to_covariance(spread + inverse @ prior_information @ inverse, inverse)
+
+
+def widening(blocks: float) -> float:
+    """By how much Student's t reaches further than a normal does, for the spread over so many equal blocks."""
+    return float(stdtrit(max(blocks - 1, 1.0), _WIDENED_AT) / ndtri(_WIDENED_AT))
 
 
 def response(

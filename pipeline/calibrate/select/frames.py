@@ -17,7 +17,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Int
 
+from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES, scenes_of
 from pipeline.calibrate.select.coverage import choose_for_information, contents_of, missing_in_view
 from pipeline.config import SelectConfig
 from pipeline.errors import SolveError
@@ -73,12 +75,13 @@ def select_frames(
     Raises:
         SolveError: fewer than MIN_FRAMES frames are left for a pair.
     """
-    held_out = hold_out(observations, config.holdout_fraction)
+    scene = scenes_of(observations)
+    held_out = hold_out(observations, config.holdout_fraction, scene)
     fit, holdout, passed, rejected, notes, missing = {}, {}, {}, {}, {}, {}
     for pair in PAIRS:
         reasons = [unmet_conditions(o, pair, config, sync_gate_s) for o in observations]
         usable = [i for i, r in enumerate(reasons) if "sync" not in r and "empty" not in r]
-        candidates = [i for i in usable if held_out[i] is False]
+        candidates = _few_of_each([i for i in usable if held_out[i] is False], scene)
         ideal = [i for i in candidates if not reasons[i]]
         contents = contents_of(observations, pair)
         chosen = choose_for_information(ideal if paper else candidates, contents, config.frames)
@@ -141,26 +144,47 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
         and np.mean([len(o.road_user_boxes_px) > 0 for o in observations]) < _SCARCE
     ):
         missing.append("hardly any road users in the images")
+    if len(np.unique(scenes_of(observations))) < FEWEST_SCENES:
+        missing.append(
+            "hardly any way: the frames show the same street from the same place, drive on for some 100 m"
+        )
     return missing + missing_in_view(observations, pair)
 
 
-def hold_out(observations: Sequence[Observation], fraction: float) -> list[bool | None]:
+def _few_of_each(candidates: Sequence[int], scene: np.ndarray) -> list[int]:
+    """At most MIN_FRAMES of a scene, evenly spread: a wait at a light would outweigh the day that it interrupts."""
+    kept = []
+    for number in np.unique(scene[list(candidates)]):
+        of_scene = [i for i in candidates if scene[i] == number]
+        some = np.linspace(0, len(of_scene) - 1, min(len(of_scene), MIN_FRAMES)).astype(int)
+        kept += [of_scene[k] for k in some]
+    return sorted(kept)
+
+
+def hold_out(
+    observations: Sequence[Observation], fraction: float, scene: Int[np.ndarray, " F"] | None = None
+) -> list[bool | None]:
     """Split a day into blocks of time: True = judges, False = fits, None = too near in time to a frame of the fit.
 
-    Every k-th block judges, so that both parts see all of the day; blocks never cross a drive. Of several
-    lengths of block the split is taken that comes nearest to the fraction, loses few frames next to the fit,
-    and judges by at least _JUDGING_BLOCKS blocks.
+    Every k-th block judges, so that both parts see all of the day; blocks never cross a drive, and a scene is in one of
+    them as a whole, with its first frame, however often the car returns to it. Of several lengths of block the split is
+    taken that comes nearest to the fraction, loses few frames next to the fit, and judges by at least _JUDGING_BLOCKS
+    blocks. A day of one scene is split within it: nothing that it judges is proof, and the record says so.
     """
     if not observations:
         return []
     stamps = np.array([o.stamp_ns for o in observations]) * 1e-9
     drives = np.unique([o.drive for o in observations], return_inverse=True)[1].ravel()
     start = np.array([stamps[drives == d].min() for d in range(drives.max() + 1)])
+    _, begins, scene = np.unique(
+        scenes_of(observations) if scene is None else scene, return_index=True, return_inverse=True
+    )
+    begins = begins[scene.ravel()] if len(begins) > 1 else np.arange(len(stamps))
     best, best_score = np.zeros(len(stamps), int), np.inf
     for block_s in _BLOCKS_S:
         count = 1 + int((stamps - start[drives]).max() // block_s)
         block = drives * count + ((stamps - start[drives]) // block_s).astype(int)
-        order = np.unique(block, return_inverse=True)[1].ravel()
+        order = np.unique(block[begins], return_inverse=True)[1].ravel()
         for every in {max(2, round(1 / fraction) + step) for step in (-2, -1, 0)}:
             # The middle one of every k, so that a day of fewer than k blocks still holds one out.
             judges = order % every == min(every // 2, order.max())

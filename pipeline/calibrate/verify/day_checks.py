@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.calibrate.verify.scene_count import scene_failures
 from pipeline.config import FleetConfig
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import Prior, Solution
@@ -64,8 +65,13 @@ def _loop(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
     return dict.fromkeys(PAIRS, loop_failures(day.solution, day.limits))
 
 
+def _scenes(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+    fitted = day.selection.fit
+    return {pair: scene_failures([day.observations[i] for i in fitted[pair]]) for pair in PAIRS}
+
+
 # In the order in which a record states them.
-DAY_CHECKS: tuple[DayCheck, ...] = (_solver, _contradictions, _heading, _loop)
+DAY_CHECKS: tuple[DayCheck, ...] = (_solver, _contradictions, _heading, _loop, _scenes)
 
 
 def checks_of_day(day: FoundDay) -> dict[str, list[FailedCheck]]:

@@ -9,6 +9,7 @@ from pipeline.calibrate.numerics.covariance import (
     posterior,
     response,
     spread_to_covariance,
+    widening,
 )
 from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 
@@ -38,7 +39,9 @@ def test_errors_shared_by_a_drive_widen_the_covariance_and_cover_the_truth():
     for seed in range(120):
         rng = np.random.default_rng(seed)
         estimate, H, g, drive = linear_day(rng, shared=0.5)
-        covariance = bootstrap_covariance(H, g, np.zeros((2, 2)), bootstrap_blocks(drive), rng)
+        covariance = bootstrap_covariance(
+            H, g, np.zeros((2, 2)), bootstrap_blocks(drive, np.arange(len(drive))), rng
+        )
         z.append(estimate[0] / np.sqrt(covariance[0, 0]))
         naive.append(estimate[0] / np.sqrt(np.linalg.inv(H.sum(0))[0, 0]))
     assert np.std(naive) > 1.7
@@ -62,11 +65,39 @@ def test_no_direction_is_surer_than_the_information():
     assert np.linalg.eigvalsh(found - least).min() > -1e-12
 
 
-def test_a_single_block_falls_back_to_the_information():
+def test_a_single_block_has_no_spread_and_is_as_unsure_as_two():
     rng = np.random.default_rng(0)
     _, H, g, _ = linear_day(rng)
     found = bootstrap_covariance(H, g, np.eye(2), np.zeros(200, np.int64), rng)
-    assert np.allclose(found, np.linalg.inv(H.sum(0) + np.eye(2)))
+    assert np.allclose(found, widening(2.0) ** 2 * np.linalg.inv(H.sum(0) + np.eye(2)))
+
+
+@pytest.mark.parametrize("blocks", [3, 5, 9, 20])
+def test_the_covariance_covers_the_truth_with_few_blocks_too(blocks):
+    """Blocks whose frames err alike: within two sigmas as often as two sigmas say, however few they are."""
+    z = []
+    for seed in range(400):
+        rng = np.random.default_rng([seed, blocks])
+        block = np.repeat(np.arange(blocks), 10)
+        noise = rng.normal(size=blocks)[block] + 0.1 * rng.normal(size=len(block))
+        g = (noise.mean() - noise)[:, None]
+        H = np.full((len(block), 1, 1), 1.0)
+        covariance = bootstrap_covariance(H, g, np.zeros((1, 1)), block, rng)
+        z.append(noise.mean() / np.sqrt(covariance[0, 0]))
+    assert 0.9 < np.mean(np.abs(z) < 1.96) < 0.985
+
+
+def test_a_block_that_outweighs_the_day_is_not_taken_for_sure():
+    """Sixty frames of one view and forty of others: the estimate follows the one, whose residual is small for that."""
+    z = []
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        block = np.r_[np.zeros(60, int), 1 + np.arange(40) // 2]
+        noise = rng.normal(size=21)[block]
+        g = (noise.mean() - noise)[:, None]
+        covariance = bootstrap_covariance(np.ones((100, 1, 1)), g, np.zeros((1, 1)), block, rng)
+        z.append(noise.mean() / np.sqrt(covariance[0, 0]))
+    assert np.mean(np.abs(z) < 1.96) > 0.93
 
 
 def test_the_larger_of_two_covariances_contains_both():
@@ -81,7 +112,7 @@ def test_the_larger_of_two_covariances_contains_both():
     "drive", [np.zeros(100, int), np.arange(100), np.repeat(np.arange(5), [3, 50, 7, 20, 20])]
 )
 def test_blocks_are_runs_of_frames_of_similar_size(drive):
-    block = bootstrap_blocks(drive)
+    block = bootstrap_blocks(drive, np.arange(len(drive)))
     assert np.all(np.diff(block) >= 0)
     assert np.all(np.diff(block) <= 1)
     assert 8 <= block.max() + 1 <= 30
@@ -89,7 +120,7 @@ def test_blocks_are_runs_of_frames_of_similar_size(drive):
 
 
 def test_no_frames_have_no_blocks():
-    assert len(bootstrap_blocks(np.zeros(0, int))) == 0
+    assert len(bootstrap_blocks(np.zeros(0, int), np.zeros(0, int))) == 0
 
 
 def test_an_unobservable_dof_keeps_the_prior_sigma_and_says_so():

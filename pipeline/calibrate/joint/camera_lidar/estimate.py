@@ -31,6 +31,7 @@ from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, s_per_metre
 from pipeline.calibrate.numerics.bias_floors import HEADING_SIGMA_RAD, MAX_GAP_PX
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
+from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
@@ -151,7 +152,7 @@ def align_camera_lidar(
         sharp,
         prior,
         config,
-        [o.drive for o in frames],
+        blocks_of(frames, config.bootstrap_blocks),
         int(rng.integers(2**32)),
         prior.translation_sigma_m**2,
         MotionSigmas(heading_sigma, sweep_s_per_rad(frames)),

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, motion_biases
 from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ, TzProfile, profile_tz, with_tz
@@ -32,7 +32,6 @@ from pipeline.calibrate.joint.camera_lidar.time_offset import (
 )
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, CAMERA_LIDAR_DT_FLOOR_S, FOCAL_SIGMA
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed, response
-from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.common_share import prior_share
 from pipeline.extrinsics.estimates import Prior
@@ -61,7 +60,7 @@ class CameraLidarProblem:
     terms: Terms
     prior: Prior
     config: SolveConfig
-    drives: list[int]
+    blocks: Int[np.ndarray, " F"]  # of frames, for the bootstrap
     seed: int  # of the bootstrap: solutions compare on the same resampled days
     tz_variance: float  # [m2]
     motion: MotionSigmas
@@ -203,14 +202,13 @@ def day_covariance(
     # After `weighted`, the scatter of the frames' gradients is the curvature, without its roughness
     # (Bartlett's identity).
     information = gradient[:, :, None] * gradient[:, None, :]
-    block = bootstrap_blocks(np.array(problem.drives), problem.config.bootstrap_blocks)
     covariance = covariance_with_fixed(
         information,
         -gradient,
         prior_variance,
         curvature,
         fixed,
-        block,
+        problem.blocks,
         np.random.default_rng(problem.seed),
     )
     floor = np.where(fixed, 0.0, np.append(CAMERA_LIDAR_BIAS, [CAMERA_LIDAR_DT_FLOOR_S, 0.0]))

@@ -39,7 +39,7 @@ from pipeline.calibrate.numerics.bias_floors import (
     LIDAR_RADAR_DT_FLOOR_S,
 )
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
-from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
+from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.common_share import common_part, prior_share
@@ -226,7 +226,7 @@ def _analyse_observability(
     rng: np.random.Generator,
 ) -> ObservabilityAnalysis:
     """Solve, fix what the day did not determine, and solve again until nothing more has to be fixed."""
-    block = bootstrap_blocks(np.array([o.drive for o in problem.observations]), config.bootstrap_blocks)
+    block = blocks_of(problem.observations, config.bootstrap_blocks)
     before = np.append(np.diag(problem.prior.covariance("lidar_radar")), problem.dt_sigma_s**2)
     fixed, observability = NONE_FIXED.copy(), np.ones(DT + 1)
     while True:
