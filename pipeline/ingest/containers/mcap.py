@@ -19,7 +19,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import ChunkIndex, Footer, Schema, Statistics
 
 from pipeline.errors import LogError
-from pipeline.ingest.containers.bounded import unpack_lz4, unpack_zstd
+from pipeline.ingest.containers.bounded import MOST_CHUNK_BYTES, OversizedError, unpack_lz4, unpack_zstd
 from pipeline.ingest.containers.reader import (
     BYTES_AS_TEXT,
     PROTOBUF,
@@ -40,7 +40,6 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish tim
 # Start and end time, uncompressed size and CRC, length of the compression's name.
 _CHUNK = struct.Struct("<QQQII")
 _FOOTER_SIZE = _RECORD.size + 20
-_MAX_CHUNK_BYTES = 1 << 30  # a larger claim is a damaged length, not a chunk
 _LAST_OPCODE = max(Opcode)
 _DAMAGED = (*READ_ERRORS, struct.error, zstandard.ZstdError)
 
@@ -115,6 +114,9 @@ class McapLog:
 
     def _indexed_chunk(self, indexed: Chunk) -> bytes | None:
         """The records of a chunk that the summary names, in one read; None (and counted) where it is damaged."""
+        if indexed.length > MOST_CHUNK_BYTES:
+            self.damage["oversized_chunks"] += 1
+            return None
         record = self._content(indexed.position, indexed.length)
         is_chunk = len(record) > _RECORD.size and record[0] == Opcode.CHUNK
         if not is_chunk or _RECORD.unpack_from(record)[1] != indexed.length - _RECORD.size:
@@ -174,7 +176,10 @@ class McapLog:
                 position = next_chunk
                 continue
             if opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-                yield opcode, start, length
+                if length <= MOST_CHUNK_BYTES:
+                    yield opcode, start, length
+                else:
+                    self.damage["oversized_chunks"] += 1
             position = end
 
     def _next_chunk(self, position: int) -> int | None:
@@ -187,7 +192,8 @@ class McapLog:
             tail = self._content(max(self._size - _FOOTER_SIZE - _MAGIC_SIZE, 0), _FOOTER_SIZE)
             footer = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :])))
             summary_end = self._size - _FOOTER_SIZE - _MAGIC_SIZE
-            if tail[0] != Opcode.FOOTER or not 0 < footer.summary_start < summary_end:
+            first = max(summary_end - MOST_CHUNK_BYTES, 1)
+            if tail[0] != Opcode.FOOTER or not first <= footer.summary_start < summary_end:
                 return []
             summary = self._content(footer.summary_start, summary_end - footer.summary_start)
             if footer.summary_crc and zlib.crc32(summary + tail[: _FOOTER_SIZE - 4]) != footer.summary_crc:
@@ -230,6 +236,9 @@ class McapLog:
             data = _decompress(compression, memoryview(content)[name_end + 8 :], size)
             if len(data) != size or (check and crc and zlib.crc32(data) != crc):
                 raise ValueError("checksum")  # counted below with what the codecs raise
+        except OversizedError:
+            self.damage["oversized_chunks"] += 1
+            return None
         except _DAMAGED:
             self.damage["damaged_chunks"] += 1
             return None
@@ -291,8 +300,6 @@ def _inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _decompress(compression: str, data: memoryview, size: int) -> bytes:
-    if size > _MAX_CHUNK_BYTES:
-        raise ValueError("damaged length")
     if compression == "zstd":
         return unpack_zstd(data, size)
     if compression == "lz4":

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 
 from pipeline.errors import LogError
-from pipeline.ingest.containers.bounded import unpack_bz2, unpack_lz4
+from pipeline.ingest.containers.bounded import MOST_CHUNK_BYTES, OversizedError, unpack_bz2, unpack_lz4
 from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
 from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
 from pipeline.store.remote_logs import LogPath
@@ -24,7 +24,6 @@ _KNOWN = (_MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION)
 _U32 = struct.Struct("<I")
 _PAIR = struct.Struct("<II")
 _MAX_HEADER_BYTES = 1 << 20
-_MAX_CHUNK_BYTES = 1 << 30
 _DAMAGED = (*READ_ERRORS, struct.error)
 
 
@@ -206,11 +205,13 @@ class BagLog:
     def _open_chunk(self, header: dict[str, bytes], start: int, length: int) -> bytes | None:
         try:
             size = _U32.unpack(header["size"])[0]
-            if size > _MAX_CHUNK_BYTES:
-                raise ValueError("damaged length")
-            data = _decompress(header["compression"], self._content(start, length), size)
+            packed = self._content(start, min(length, MOST_CHUNK_BYTES))
+            data = _decompress(header["compression"], packed, size)
             if len(data) != size:
                 raise ValueError("damaged chunk")
+        except OversizedError:
+            self.damage["oversized_chunks"] += 1
+            return None
         except _DAMAGED:
             self.damage["damaged_chunks"] += 1
             return None

@@ -16,6 +16,7 @@ from typing import BinaryIO, cast
 import zstandard
 
 from pipeline.errors import LogError
+from pipeline.ingest.containers.bounded import most_bytes
 from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.store.remote_logs import LogPath
@@ -25,6 +26,7 @@ __all__ = ["CompressedLog", "FetchedLog", "FolderLog"]
 # Of one object: a worker's scratch is no archive. MCAP and .bag have no limit.
 _MOST_FETCHED_BYTES = 16 << 30
 
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _UNPACKED = "boresight-unpacked-"  # then the process that unpacked it
 _LEFT_BEHIND_S = 86400.0  # longer than any log is open
 _FILES = ("*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd")
@@ -123,9 +125,16 @@ class CompressedLog(_CopiedLog):
 
     def _copied(self, folder: Path) -> Path:
         plain = folder / self.path.name.removesuffix(".zstd")
+        most = most_bytes(self.path.stat().st_size)
         with self.path.open("rb") as source, plain.open("wb") as target:
-            packed = cast("BinaryIO", source)
-            shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed), target, 1 << 22)
+            unpacked = zstandard.ZstdDecompressor().stream_reader(cast("BinaryIO", source))
+            while block := unpacked.read(1 << 22):
+                if target.tell() + len(block) > most:
+                    raise LogError(str(self.path), f"unpacks to more than {most} bytes, as no recording does")
+                target.write(block)
+        with plain.open("rb") as content:
+            if content.read(len(_ZSTD_MAGIC)) == _ZSTD_MAGIC:
+                raise LogError(str(self.path), "is compressed twice, as no recording is")
         return plain
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import zstandard
 
 from pipeline.errors import LogError
-from pipeline.ingest.containers.bounded import unpack_zstd
+from pipeline.ingest.containers.bounded import OversizedError, most_bytes, unpack_zstd
 from pipeline.ingest.containers.reader import Channel, ChunkCache, Position, RawMessage
 from pipeline.ingest.containers.timeline import Counted, Stretches, Timeline
 
@@ -25,7 +25,6 @@ __all__ = ["Db3Log"]
 
 # rosbag2 can compress single messages; CDR starts with a zero byte, so this is unambiguous.
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_MAX_MESSAGE_BYTES = 1 << 30
 _MOST_ROWS_SKIPPED = 1 << 20  # as many unreadable rows on end are a lost tail
 # To count the rows of a topic, all rows would have to be read: there is no index of topics. A minute of a car's day has
 # some thousand rows, and among so many every topic that recurs has its share.
@@ -76,7 +75,11 @@ class Db3Log:
         indexed = within is not None and self._has_time_index()
         found = self._rows_in(wanted, within) if within is not None and indexed else self._rows(wanted)
         for row, topic_id, stamp, data in found:
-            payload = _payload(data)
+            try:
+                payload = _payload(data)
+            except OversizedError:
+                self.damage["oversized_rows"] += 1
+                continue
             if payload is None or not isinstance(stamp, int):
                 self.damage["damaged_rows"] += 1
             elif within is None or stamp in within:
@@ -219,6 +222,10 @@ def _payload(data: object) -> bytes | None:
     if data[:4] != _ZSTD_MAGIC:
         return data
     try:
-        return unpack_zstd(data, _MAX_MESSAGE_BYTES)
+        announced = zstandard.get_frame_parameters(data).content_size
+        is_known = announced != zstandard.CONTENTSIZE_UNKNOWN
+        return unpack_zstd(data, announced if is_known else most_bytes(len(data)))
+    except OversizedError:
+        raise
     except (zstandard.ZstdError, ValueError):
         return None

@@ -15,6 +15,7 @@ from pipeline.geometry.cameras import Camera
 from pipeline.ingest.messages.other_codecs import decode_other
 
 __all__ = [
+    "MOST_PIXELS",
     "EncodedImage",
     "encode_pixels",
     "encode_raw_image",
@@ -63,8 +64,8 @@ _CHANNELS = {
     "yuyv": 2,
 }
 _LEAST_FOCAL_PX = 10.0  # a fisheye of 190 deg on 64 pixels has 20
-# Twelve times what cars' cameras have (8 Mpx): to decode what a forged header claims takes minutes and all memory.
-_MAX_PIXELS = 100_000_000
+# Four times what cars' cameras have (8 Mpx): to decode what a forged header claims takes minutes and all memory.
+MOST_PIXELS = 32_000_000
 _BYTES = {"mono16": 2, "16uc1": 2}
 
 
@@ -91,7 +92,7 @@ def inspect_image(data: bytes) -> EncodedImage:
     if data[:8] == _PNG_MAGIC:
         width, height, *_ = _png_header(data)
         return EncodedImage(data, "png", *_possible(width, height))
-    return encode_pixels(decode_other(data))
+    return encode_pixels(decode_other(data, _possible))
 
 
 def encode_pixels(pixels: np.ndarray) -> EncodedImage:
@@ -196,7 +197,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
 
 
 def _possible(width_px: int, height_px: int) -> tuple[int, int]:
-    if width_px * height_px > _MAX_PIXELS:
+    if width_px * height_px > MOST_PIXELS:
         raise ValueError(f"{width_px} x {height_px} pixels are more than a camera has: a damaged header")
     return width_px, height_px
 

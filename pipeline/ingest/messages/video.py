@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Int64, UInt8
 
 from pipeline.errors import MissingExtraError
+from pipeline.ingest.messages.image import MOST_PIXELS
 
 __all__ = ["VideoPictures", "video_codec"]
 
@@ -106,7 +107,8 @@ def _packet(av: ModuleType, data: bytes, place: int) -> Any:
 def _decoder(av: ModuleType, format_: str) -> Any:
     # One thread and low delay: a picture comes out with its packet. Errors are raised, not painted over.
     decoder = av.CodecContext.create(video_codec(format_), "r")
-    decoder.thread_count, decoder.options = 1, {"err_detect": "explode"}
+    decoder.thread_count = 1
+    decoder.options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
     decoder.flags |= av.codec.context.Flags.low_delay
     return decoder
 

@@ -35,7 +35,7 @@ def test_content_of_the_size_announced_comes_back_and_more_is_refused(unpack):
 def test_a_zstd_frame_that_does_not_say_its_size_is_read_up_to_the_limit():
     frame = zstandard.ZstdCompressor(write_content_size=False).compress(CONTENT)
     assert unpack_zstd(frame, len(CONTENT)) == CONTENT
-    assert unpack_zstd(frame, 1 << 30) == CONTENT
+    assert unpack_zstd(frame, 1 << 24) == CONTENT
     with pytest.raises(ValueError, match="announced"):
         unpack_zstd(frame, len(CONTENT) - 1)
 
