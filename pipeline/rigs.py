@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 __all__ = [
     "CameraPrior",
@@ -26,6 +27,8 @@ __all__ = [
 Positive = Annotated[float, Field(gt=0)]
 Topic = Annotated[str, Field(pattern=r"^/\S+$")]
 TF_STATIC = "/tf_static"
+# By the unit in a number's name, the least and the most that it can mean on a car. 0 has a meaning of its own.
+_OF_THIS_WORLD = {"deg": (1e-4, 180.0), "m": (1e-4, 1e3), "s": (1e-6, 86_400.0), "mps": (0.01, 1000.0)}
 # What labels can mean (Cityscapes' classes), and which of them are road users.
 StreetClass = Literal[
     "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation",
@@ -39,6 +42,16 @@ class Section(BaseModel):
     """A section of fleet.toml: unknown keys, nan and inf are errors, and nothing changes after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _is_of_this_world(cls, value: Any, info: Any) -> Any:
+        """A number is one of its unit: 180 deg is all there is, and no car's radar measures nanometres a second."""
+        unit = (info.field_name or "").rpartition("_")[2]
+        least, most = _OF_THIS_WORLD.get(unit, (0.0, math.inf))
+        if isinstance(value, float) and value and not least <= abs(value) <= most:
+            raise ValueError(f"{value:g} {unit} is not between {least:g} and {most:g} {unit}")
+        return value
 
 
 class TopicSemantics(Section):

@@ -47,6 +47,19 @@ def test_a_small_file_is_enough_and_defaults_are_physical(tmp_path):
         (("[fleet]", "[audit]\nmethod = 'best'\n[fleet]"), "audit.method"),
         (("[fleet]", "[audit]\nwindow_days = 1_000_000_000\n[fleet]"), "audit.window_days"),
         (("[fleet]", "[perceive]\nlabel_scale = 1e-9\n[fleet]"), "perceive.label_scale"),
+        (
+            ("[fleet]", "[solve]\nsearch_rotation_deg = 1e9\n[fleet]"),
+            "solve.search_rotation_deg: Value error, 1e+09 deg",
+        ),
+        (("[fleet]", "[rigs.default.prior]\nrotation_sigma_deg = 181\n[fleet]"), "prior.rotation_sigma_deg"),
+        (
+            ("[fleet]", "[rigs.default.prior]\ntranslation_sigma_m = 1e9\n[fleet]"),
+            "prior.translation_sigma_m",
+        ),
+        (
+            ('points = "/radar/points"', 'points = "/radar/points"\ndoppler_period_mps = 1e-9'),
+            "radar.doppler_period_mps",
+        ),
         (("[fleet]", "[solve]\nseed = -1\n[fleet]"), "solve.seed"),
         (("[fleet]", "[prepare]\nseed = -1\n[fleet]"), "prepare.seed"),
         (('points = "/radar/points"', 'points = "/lidar/points"'), "/lidar/points"),

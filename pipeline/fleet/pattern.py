@@ -116,22 +116,23 @@ def _shell_token(token: str) -> str:
 def _owned(pattern: str) -> dict[str, _Owner]:
     """Whose each log file and bag folder is that matches, or that lies in a folder that does.
 
-    Folders are listed once each, so the work grows with the number of files. What a link leads to a second time is
-    passed over: a link to its own parent would show every log forty times.
+    Folders are listed once each, so the work grows with the number of files. What a link leads to a second time within
+    a vehicle-day is passed over: a link to its own parent would show every log forty times. Linked into two
+    vehicle-days it is a log of both, as a copy would be.
     """
     matcher, listings = _matcher(pattern), _Listings()
     shell = re.sub(r"\{(vehicle|day)\}", "*", pattern)
     owner: dict[str, _Owner] = {}
-    seen: dict[tuple[int, int], str] = {}
+    seen: dict[tuple[_Owner, int, int], str] = {}
     for name in sorted(glob.iglob(shell, recursive=True, include_hidden=False)):
         path = name.rstrip("/")
         match = matcher.fullmatch(path)
         if not match or not is_day(match["day"]):
             continue
         for log in listings.logs_at(path):
-            about = os.stat(log)
-            if seen.setdefault((about.st_dev, about.st_ino), log) == log:
-                owner[log] = (match["day"], match["vehicle"])
+            about, own = os.stat(log), (match["day"], match["vehicle"])
+            if seen.setdefault((own, about.st_dev, about.st_ino), log) == log:
+                owner[log] = own
     return owner
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 from collections import Counter
 from collections.abc import Generator, Iterator
 from dataclasses import replace
@@ -33,6 +34,7 @@ __all__ = ["find_trios", "pick_trios", "read_file_prior", "work"]
 
 _PROBLEMS_SHOWN = 3
 _SAME_IMAGE_NS = 5_000_000  # labels and detections carry the stamp of the image that they were computed on
+_FAR_FROM_DAY = dt.timedelta(hours=12 + 14 + 12)  # half a day, the earliest time zone, and a night's drive
 _UNUSABLE = (
     Rejection.IMAGE_DAMAGED,
     Rejection.IMAGE_SIZE,
@@ -89,10 +91,21 @@ def _rows(
         run.kept.update(_reading_counts(index))
         if not made:
             raise NothingUsable(refusal(index, rig, rejected, config))
+        _complain_of_date(index, task.partition.day)
         run.extra |= {"problems": index.problems, "logs": index.log_names}
         run.remarks = _shorten(index.problems)
     finally:
         index.close()
+
+
+def _complain_of_date(index: DayIndex, day: str) -> None:
+    """Name a day whose sweeps were stamped on another one, whatever the time zone and also of a drive over midnight."""
+    stamps_ns = index.stream("lidar").stamps_ns
+    stamped = dt.datetime.fromtimestamp(float(np.median(stamps_ns)) * 1e-9, dt.UTC)
+    if abs(stamped - dt.datetime.fromisoformat(f"{day}T12:00+00:00")) > _FAR_FROM_DAY:
+        index.complain(
+            f"sweeps are stamped {stamped:%Y-%m-%d %H:%M} UTC, far from the day {day} that they are filed under"
+        )
 
 
 def pick_trios(index: DayIndex, config: IngestConfig) -> tuple[list[Trio], Counter[str]]:

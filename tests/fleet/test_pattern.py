@@ -136,6 +136,17 @@ def test_links_that_lead_round_in_a_circle_show_a_log_once_and_pipes_are_no_logs
     assert found("{vehicle}/{day}/**/*.mcap", tmp_path) == {("car", "2026-03-02"): ["car/2026-03-02/a.mcap"]}
 
 
+def test_a_log_that_is_linked_into_two_places_is_a_log_of_both(tmp_path):
+    touch(tmp_path / "car/2026-03-02/a.mcap")
+    for place in ("bus/2026-03-02", "car/2026-03-03"):
+        (tmp_path / place).mkdir(parents=True)
+        os.link(tmp_path / "car/2026-03-02/a.mcap", tmp_path / place / "a.mcap")
+    assert found("{vehicle}/{day}/*.mcap", tmp_path) == {
+        (v, d): [f"{v}/{d}/a.mcap"]
+        for v, d in (("bus", "2026-03-02"), ("car", "2026-03-02"), ("car", "2026-03-03"))
+    }
+
+
 def test_each_folder_is_listed_once_however_many_logs_it_holds(tmp_path, monkeypatch):
     touch(*(tmp_path / f"car-{i:03d}_2026-03-02.mcap" for i in range(300)))
     listed = []

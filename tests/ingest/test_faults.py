@@ -11,6 +11,7 @@ from pipeline.ingest.sync import Rejection
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest
 from schemas.frames import FRAMES
+from tests.makers.stages import ingest_day
 
 
 def test_a_missing_file_or_unknown_vehicle_is_a_mistake_of_the_caller(kit, tmp_path, run_ingest):
@@ -269,6 +270,15 @@ def test_the_manifest_tells_inputs_counts_and_problems(kit, tmp_path, run_ingest
     assert manifest.kept == {"frames": 4}
     assert manifest.inputs[0].startswith("a.mcap:")
     assert any("no prior" in p for p in manifest.extra["problems"])
+
+
+@pytest.mark.parametrize(
+    ("day", "is_far"), [("2023-11-13", False), ("2023-11-15", False), ("2023-11-18", True)]
+)
+def test_a_day_whose_sweeps_are_stamped_far_from_it_is_named(day, is_far, kit, tmp_path):
+    log = kit.Kit().drive().mcap(tmp_path / "a.mcap")  # stamped on the evening of the 14th
+    result = ingest_day([log], Partition("car", day), kit.fleet(), Lake.at(tmp_path / "lake"))
+    assert (f"stamped 2023-11-14 22:13 UTC, far from the day {day}" in result.reason) == is_far
 
 
 def test_max_frames_keeps_an_even_spread_and_counts_the_rest(kit, tmp_path, run_ingest):
