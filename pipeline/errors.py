@@ -13,6 +13,7 @@ __all__ = [
     "LogError",
     "MissingExtraError",
     "ModelError",
+    "ModelOutputError",
     "SolveError",
     "StorageError",
 ]
@@ -95,6 +96,10 @@ class ModelError(BoresightError):
     def __init__(self, manifest: str, problem: str) -> None:
         self.manifest, self.problem = manifest, problem
         super().__init__(f"{manifest}: {problem}")
+
+
+class ModelOutputError(ModelError):
+    """Values of a model that cannot be right, whatever it was shown: the day is refused."""
 
 
 class StorageError(BoresightError):

@@ -34,6 +34,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_rows
 from pipeline.work import Records, Run, Task, Told, Work
 from schemas.calibrations import PAIRS, STATUSES, CalibrationRecord
+from schemas.faults import FAULTS
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
 
@@ -100,10 +101,11 @@ def _records(task: Task, method: Method, about: Inputs, progress: Progress) -> l
 def _refusal(refused: Outcome, partition: Partition, method: Method, seed: int) -> Work:
     """Records of a day that never reached the solver, so that whoever reads the lake finds the reason."""
     reason = f"{refused.stage}: {refused.reason}"
+    fault = next((code for code, sentence in FAULTS.items() if refused.reason.startswith(sentence)), "")
 
     def rows(run: Run) -> Generator[Records, None, None]:
         about = Inputs(partition, method.name, run.work_key, seed, run.inputs)
-        yield Records(refused_records(about, reason, 0, None))
+        yield Records(refused_records(about, reason, 0, None, fault))
 
     inputs = (refused.work_key,) if refused.work_key else ()
     # Recorded each time: an older record of a day that was not refused then must not pass for the current one.

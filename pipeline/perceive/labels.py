@@ -17,6 +17,7 @@ from pipeline.rigs import RoadUser, StreetClass
 __all__ = [
     "CITYSCAPES",
     "DETECTOR_SETS",
+    "LABEL_COUNTS",
     "LABEL_SETS",
     "REFLECTING_IDS",
     "ROAD_ID",
@@ -55,6 +56,9 @@ LABEL_SETS: dict[str, dict[str, tuple[int, ...]]] = {
     "ade20k": _ADE20K,
     "coco": _COCO_STUFF,
 }
+
+# Classes that a model of a set gives; Cityscapes' also with void as the last.
+LABEL_COUNTS: dict[str, tuple[int, ...]] = {"cityscapes": (19, 20), "ade20k": (150,), "coco": (182,)}
 
 DETECTOR_SETS: dict[str, dict[int, str]] = {
     "coco": {0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 6: "train", 7: "truck"},

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from pipeline.config import FleetConfig, PerceiveConfig
+from pipeline.errors import ModelOutputError
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.radar_grid import Scan
 from pipeline.geometry.se3 import from_quaternion
@@ -26,7 +27,8 @@ from pipeline.perceive.road_markings import lidar_markings, road_contrast
 from pipeline.perceive.tracks import EgoMotion, Tracks, TrackState, advance_tracks, measure_clusters
 from pipeline.rigs import LidarTopics, OnnxSemantics, RadarTopics, TopicSemantics
 from pipeline.store.tables import iterate_rows
-from pipeline.work import Run, Task, Work
+from pipeline.work import NothingUsable, Run, Task, Work
+from schemas.faults import FAULTS
 from schemas.frames import FRAMES, Frame
 from schemas.observations import Observation
 
@@ -90,6 +92,8 @@ def _rows(task: Task, perceive: Callable[..., Perceived], run: Run) -> Generator
                 found = perceive(frame, tracks=state)
             except FrameRejectedError as rejection:
                 run.rejected[rejection.reason.value] += 1
+            except ModelOutputError as err:
+                raise NothingUsable(f"{FAULTS['model_output']}: {err}") from err
             seen += 1
             run.progress(seen, total, "perceive")
             if found is not None:

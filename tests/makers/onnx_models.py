@@ -17,9 +17,10 @@ def _save(path, nodes, inputs, outputs, constants):
     onnx.save(model, path)
 
 
-def save_segmenter(path, size, stride, colours):
-    """Logits at 1/stride of the input: how near the mean colour is to each class's colour."""
+def save_segmenter(path, size, stride, colours, classes=150):
+    """Logits at 1/stride of the input: how near the mean colour is to each class's colour; further ones have none."""
     rows, columns = size
+    colours = [*colours, *[[9.0, 9.0, 9.0]] * (classes - len(colours))]
     small = [1, len(colours), rows // stride, columns // stride]
     weights = 2 * np.array(colours, np.float32)[:, :, None, None]
     bias = -np.sum(np.array(colours, np.float32) ** 2, axis=1)

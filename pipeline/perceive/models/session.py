@@ -10,7 +10,7 @@ import numpy as np
 import onnxruntime as ort
 from jaxtyping import Float32, UInt8
 
-from pipeline.errors import ModelError
+from pipeline.errors import ModelError, ModelOutputError
 from pipeline.perceive.models.manifest import InputSpec, Manifest
 
 __all__ = ["Fit", "Session", "fit_image", "open_session"]
@@ -41,11 +41,15 @@ class Session:
 
         Raises:
             ModelError: the model does not run on this input.
+            ModelOutputError: it answers with what is no number.
         """
         try:
-            return self._session.run(None, {self._input: tensor})[0]
+            output: np.ndarray = self._session.run(None, {self._input: tensor})[0]
         except Exception as err:
             raise ModelError(str(self._manifest.file), f"the model failed to run: {err}") from err
+        if np.isnan(output).any():
+            raise ModelOutputError(str(self._manifest.file), "the model gives NaN")
+        return output
 
     def _checked_input(self) -> str:
         file, size = str(self._manifest.file), self._manifest.input.size

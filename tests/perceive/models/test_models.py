@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import load_fleet
-from pipeline.errors import ModelError
+from pipeline.errors import ModelError, ModelOutputError
 from pipeline.perceive.models.detector import Candidates, Detector, decode_head, suppress
 from pipeline.perceive.models.manifest import InputSpec, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
@@ -218,6 +218,41 @@ def test_a_head_of_another_shape_than_its_layout_is_refused(tmp_path, shape, lay
     model = detector(tmp_path, np.zeros(shape, np.float32), layout)
     with pytest.raises(ModelError, match=words):
         model.detect(np.zeros((96, 160, 3), np.uint8))
+
+
+def answering(folder, answer, layout, label_set="cityscapes"):
+    """A segmenter that gives this answer to every picture."""
+    save_constant(folder / "m.onnx", answer)
+    given, output = {"size": [96, 160], "fit": "stretch"}, {"layout": layout, "label_set": label_set}
+    return Segmenter(
+        load_manifest(
+            write_manifest(folder / "m.toml", folder / "m.onnx", "segment", given, output), "segment"
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ("answer", "layout", "words"),
+    [
+        (np.zeros((1, 150, 24, 40)), "logits", "must be 1 x 19 or 20 x h x w"),
+        (np.full((1, 24, 40), 42.0), "labels", r"must be one image of 0\.\.19 or 255.* 42 to 42"),
+        (np.full((1, 19, 24, 40), np.nan), "logits", "NaN"),
+        (np.full((1, 24, 40), np.nan), "labels", "NaN"),
+    ],
+)
+def test_answers_of_other_classes_or_of_no_numbers_are_refused(tmp_path, answer, layout, words):
+    model = answering(tmp_path, answer, layout)
+    with pytest.raises(ModelError, match=words):
+        model.segment(np.zeros((96, 160, 3), np.uint8), (48, 80))
+
+
+def test_a_model_that_answers_every_picture_alike_is_refused_and_a_stuck_camera_is_not_its_fault(tmp_path):
+    model = answering(tmp_path, np.zeros((1, 19, 24, 40)), "logits")
+    pictures = [np.full((96, 160, 3), shade, np.uint8) for shade in range(4)]
+    for picture in [pictures[0]] * 9 + pictures[:3]:
+        model.segment(picture, (48, 80))
+    with pytest.raises(ModelOutputError, match="same labels for 4 different pictures"):
+        model.segment(pictures[3], (48, 80))
 
 
 def test_a_size_that_the_model_does_not_take_is_refused_on_loading(tmp_path):
