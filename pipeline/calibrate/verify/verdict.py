@@ -247,10 +247,10 @@ def _claims_hold(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[_C
 
 
 def _known(claim: Claim) -> str:
-    shifted = claim.shift_rad > claim.remaining_sigma_rad
+    shifted = claim.shift_rad > claim.sigma_rad
     off = f"{_deg(claim.shift_rad)} off by held-out frames and " if shifted else ""
     within = f"not within {_deg(claim.limit_rad)} at {100 * claim.confidence:.3g} %"
-    return f"{off}known to {_deg(claim.remaining_sigma_rad)} (1 sigma), {within}"
+    return f"{off}known to {_deg(claim.sigma_rad)} (1 sigma), {within}"
 
 
 def _differences(pair: str, unchecked: Mapping[int, float]) -> list[str]:

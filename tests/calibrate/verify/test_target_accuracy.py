@@ -47,17 +47,23 @@ def test_the_bound_is_the_quantile_of_the_absolute_error():
         (1.0, 0.1, 0.995),
         (0.02, 0.1, 0.9),
     ):
-        bound = Claim(9.0, shift, 9.0, sigma, 0.2, confidence).bound_rad
+        bound = Claim(sigma, shift, 1e-3, 9.0, 0.2, confidence).bound_rad
         inside = norm.cdf(bound, shift, sigma) - norm.cdf(-bound, shift, sigma)
         assert inside == pytest.approx(confidence, abs=1e-9)
 
 
-def test_the_own_sigma_is_enough_until_held_out_frames_contradict_it():
+def test_the_own_sigma_decides_until_held_out_frames_contradict_it():
     agreed = Claim(0.05, 0.1, 0.05, 0.045, 0.2, 0.995)
     assert agreed.bound_rad == pytest.approx(0.05 * norm.ppf(0.9975))
     contradicted = Claim(0.05, 0.1, 0.03, 0.045, 0.2, 0.995)
     assert contradicted.agreement < 0
     assert contradicted.bound_rad > 0.2 > agreed.bound_rad
+
+
+def test_held_out_frames_certify_nothing_that_the_fit_left_open():
+    surer = Claim(1.2, 0.0, 1.2, 0.05, 0.4, 0.995)
+    assert surer.agreement > 0
+    assert surer.margin < 0
 
 
 def quadratic_frames(truth, blocks, rng, scatter=1.0, information=400.0):
