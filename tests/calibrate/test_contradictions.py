@@ -9,6 +9,7 @@ from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import FleetConfig
 from pipeline.errors import SolveError
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, perturb_exactly
 from pipeline.geometry.targets import errors_at_targets
@@ -177,7 +178,7 @@ def test_what_rests_on_a_pair_that_is_not_accepted_is_solved_again_until_nothing
     def solution(disbelieved):
         asked.append(disbelieved)
         pairs = {pair: at_prior(pair, PRIOR.of(pair)) for pair in PAIRS}
-        checks = {} if disbelieved else {"camera_lidar": ["lost"]}
+        checks = {} if disbelieved else {"camera_lidar": [FailedCheck("lost")]}
         return Solution("joint", pairs, None, None, checks, solution)
 
     records = records_of(street, solver=lambda *_, **__: solution(frozenset()))
