@@ -16,7 +16,7 @@ EDGE_LEFT, EDGE_RIGHT, EDGE_ABOVE, EDGE_BELOW = 0, 1, 2, 3
 
 OBSERVATIONS = TableSchema(
     "observations",
-    1,
+    2,
     (
         scalar("frame_index", "int32", "row of table frames"),
         scalar("log", "string", "as in frames"),
@@ -56,6 +56,14 @@ OBSERVATIONS = TableSchema(
             "road_contrast_png",
             "binary",
             "PNG mono8: top-hat contrast inside the road mask (0 outside), at label size; null without an image",
+            nullable=True,
+        ),
+        array(
+            "label_gradients",
+            "<f4",
+            (4, 6, 33),
+            "image gradients across the labels' borders: by EDGE_* side, sixth of the image and distance "
+            "from -16 to 16 label pixels; null in version 1",
             nullable=True,
         ),
         # lidar
@@ -147,6 +155,7 @@ OBSERVATIONS = TableSchema(
     ),
     "Perception of one frame per row; points stay in the frame of the sensor that saw them.",
     made_by="perceive",
+    reads_versions=(1,),  # which knew no label_gradients
 )
 
 
@@ -219,3 +228,4 @@ class Observation:
     radar_track_points: np.ndarray
     radar_drivable_azimuth_rad: np.ndarray
     radar_drivable_range_m: np.ndarray
+    label_gradients: np.ndarray | None = None

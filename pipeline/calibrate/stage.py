@@ -22,6 +22,7 @@ from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import held_out_update
+from pipeline.calibrate.verify.label_offset import with_label_offset
 from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.calibrate.verify.verdict import Evidence, judge
@@ -148,6 +149,8 @@ def calibrate_observations(
         triggered=active,
         progress=lambda done, total, what: progress(1, 4, f"{what} ({done}/{total})"),
     )
+    if "camera_lidar" in active:
+        solution = with_label_offset(solution, observations)
     progress(2, 4, "judge on held-out frames")
     solution, judged = _believed(
         solution, lambda found: _judge_all(observations, selection, prior, found, fleet, active), active

@@ -20,6 +20,7 @@ from pipeline.perceive.deskew import deskew_straight, velocity_ahead
 from pipeline.perceive.drivable import DrivableSource, free_sector
 from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
 from pipeline.perceive.ground import PointSource, find_ground
+from pipeline.perceive.label_gradients import label_gradients
 from pipeline.perceive.labels import ROAD_ID
 from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
@@ -166,6 +167,7 @@ def perceive_frame(
         road_user_classes=users.classes,
         road_user_scores=users.scores,
         road_contrast_png=encode_png(contrast),
+        label_gradients=label_gradients(grey, semantics.labels),
     )
     how = None if own is None else AS_LOGGED if swept is frame else BY_DOPPLER
     return Perceived(observation, state, has_rows, how)

@@ -1,0 +1,113 @@
+"""Image gradients across the borders of the labels: shows labels that lie beside their picture, without extrinsics.
+
+Along a border the gradients of the image are summed with their sign, so that noise cancels. Their size, by distance
+from the border, has its maximum at the picture's own border. Sums are kept by side of the foreground: labels that are
+too wide move the maxima of opposite sides apart, a shift moves them the same way. They are kept by place too: a slip
+of scale moves the two ends of the image apart.
+"""
+
+from __future__ import annotations
+
+from typing import Final, no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+__all__ = ["BINS", "REACH_PX", "label_gradients"]
+
+REACH_PX: Final = (
+    16  # gradients are kept from -16 to +16 label pixels: 2 % of 912 pixels shift the image's ends by 9
+)
+BINS: Final = 6  # equal parts of the image's width (left, right) or height (above, below)
+_RUN_PX = (
+    16  # length of border over which gradients are summed with their sign: on nights twice the contrast of 1
+)
+_FLOOR_GREY = 5.0  # gradients of a border without contrast count less than those of one with this much
+_SKY, _BACKDROP, _OBJECT, _GROUND = (10,), (2, 3, 4, 8), (5, 6, 7, 11, 12, 13, 14, 15, 16, 17, 18), (0, 1, 9)
+
+
+def _foregrounds() -> UInt8[np.ndarray, "256 256"]:
+    """Nearer side of a border between labels a (left or above) and b: 1 = a, 2 = b, 0 = not used.
+
+    Not used: two labels of a group, and the ground before walls and plants. There kerbs and shadows lie beside the
+    border: on eight simulated days and the real car they moved the vertical offset by .1 to .6 px.
+    """
+    nearer = np.zeros((256, 256), np.uint8)
+    for far, near in ((_SKY, _BACKDROP), (_SKY, _OBJECT), (_BACKDROP, _OBJECT), (_GROUND, _OBJECT)):
+        nearer[np.ix_(near, far)] = 1
+        nearer[np.ix_(far, near)] = 2
+    return nearer
+
+
+_FOREGROUND = _foregrounds()
+
+
+def label_gradients(
+    grey: UInt8[np.ndarray, "H W"], labels: UInt8[np.ndarray, "H W"]
+) -> Float32[np.ndarray, "4 6 33"]:
+    """Sums of normalised gradients across borders, by EDGE_* side, place and distance from the border.
+
+    Args:
+        grey: the image at label size.
+        labels: Cityscapes train ids.
+
+    Returns:
+        Element d is the gradient between the pixels d - REACH_PX before and one pixel further, counted from the border
+        to the right (left, right) or down (above, below). Each run of border counts by its length.
+    """
+    out = np.zeros((4, BINS, 2 * REACH_PX + 1), np.float32)
+    _add_runs(_FOREGROUND, labels, grey, out[:2])
+    _add_runs(_FOREGROUND, np.ascontiguousarray(labels.T), np.ascontiguousarray(grey.T), out[2:])
+    return out
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True)
+def _add_runs(foreground: np.ndarray, labels: np.ndarray, grey: np.ndarray, out: np.ndarray) -> None:
+    """Add the runs of borders between columns, followed down the rows."""
+    height, width = labels.shape
+    reach = out.shape[2] // 2
+    done = np.zeros((height, width), np.bool_)
+    total = np.zeros(out.shape[2], np.int32)
+    for i in range(height):
+        for j in range(reach, width - 1 - reach):
+            a, b = labels[i, j], labels[i, j + 1]
+            if a == b or done[i, j] or foreground[a, b] == 0:
+                continue
+            length = _sum_run(labels, grey, done, i, j, total)
+            size = np.float32(length * _FLOOR_GREY)
+            for d in range(total.shape[0]):
+                size += abs(total[d])
+            mine = out[foreground[a, b] - 1, j * out.shape[1] // width]
+            for d in range(total.shape[0]):
+                mine[d] += length * abs(total[d]) / size
+
+
+@no_type_check
+@numba.njit(cache=True, nogil=True, inline="always")
+def _sum_run(
+    labels: np.ndarray, grey: np.ndarray, done: np.ndarray, i: int, j: int, total: np.ndarray
+) -> int:
+    """Length of the run from (i, j) on; its signed gradients into `total`."""
+    height, width = labels.shape
+    reach, a, b, length = total.shape[0] // 2, labels[i, j], labels[i, j + 1], 0
+    total[:] = 0
+    while j >= 0:
+        done[i, j] = True
+        length += 1
+        for d in range(total.shape[0]):
+            at = j - reach + d
+            total[d] += np.int32(grey[i, at + 1]) - np.int32(grey[i, at])
+        i += 1
+        if length == _RUN_PX or i == height:
+            break
+        follows = -1
+        for step in (0, -1, 1, -2, 2):
+            k = j + step
+            inside = k >= reach and k < width - 1 - reach
+            if inside and labels[i, k] == a and labels[i, k + 1] == b and not done[i, k]:
+                follows = k
+                break
+        j = follows
+    return length

@@ -1,0 +1,56 @@
+"""Gradients across label borders peak where the picture's border lies, by side of the foreground."""
+
+import numpy as np
+import pytest
+
+from pipeline.perceive.label_gradients import BINS, REACH_PX, label_gradients
+from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
+
+CAR, BUILDING, ROAD = 13, 2, 0
+
+
+def a_car(width=120, height=90, noise=0.0):
+    labels = np.full((height, width), BUILDING, np.uint8)
+    labels[30:60, 40:80] = CAR
+    grey = np.where(labels == CAR, 50, 150) + np.random.default_rng(0).normal(0, noise, labels.shape)
+    return np.clip(grey, 0, 255).astype(np.uint8), labels
+
+
+@pytest.mark.parametrize(("right", "down"), [(0, 0), (3, 0), (-2, 0), (0, 4), (0, -1), (2, 3)])
+def test_each_sides_maximum_lies_where_the_picture_s_border_does(right, down):
+    grey, labels = a_car(noise=6.0)
+    found = label_gradients(np.roll(grey, (down, right), (0, 1)), labels)
+    for side, wanted in (
+        (EDGE_RIGHT, right), (EDGE_LEFT, right), (EDGE_ABOVE, down), (EDGE_BELOW, down),
+    ):  # fmt: skip
+        assert found[side].sum(0).argmax() - REACH_PX == wanted
+
+
+def test_labels_too_wide_move_opposite_sides_apart():
+    grey, labels = a_car()
+    labels[28:62, 38:82] = CAR
+    peaks = label_gradients(grey, labels).sum(1).argmax(1) - REACH_PX
+    assert peaks[EDGE_LEFT] == peaks[EDGE_ABOVE] == -2  # the foreground lies before the border
+    assert peaks[EDGE_RIGHT] == peaks[EDGE_BELOW] == 2
+
+
+def test_sums_are_kept_by_place():
+    grey, labels = a_car()
+    found = label_gradients(grey, labels)
+    seen = found[EDGE_RIGHT].sum(1) > 0
+    assert seen.tolist() == [i == 40 * BINS // 120 - 1 or i == 39 * BINS // 120 for i in range(BINS)]
+
+
+def test_kerbs_and_labels_of_one_group_are_left_out():
+    grey, labels = a_car()
+    labels[labels == CAR] = ROAD  # before a building
+    assert not label_gradients(grey, labels).any()
+    labels[labels == ROAD] = 3  # a wall before a building
+    assert not label_gradients(grey, labels).any()
+
+
+def test_noise_cancels_along_a_border():
+    _, labels = a_car()
+    grey = np.random.default_rng(1).integers(90, 110, labels.shape, dtype=np.uint8)
+    noisy, _ = a_car(noise=12.0)
+    assert label_gradients(noisy, labels).max() > 2.5 * label_gradients(grey, labels).max()
