@@ -69,9 +69,19 @@ def _calibrate_day(task: Task) -> int:
     from dataclasses import replace
 
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+    from pipeline.errors import ConfigError
     from pipeline.fleet.ledger import record_outcome
     from pipeline.stages import CALIBRATE
+    from pipeline.store.tables import read_manifest
+    from schemas.observations import OBSERVATIONS
 
+    vehicle, day = task.partition.vehicle, task.partition.day
+    task.fleet.rig_of(vehicle)  # raises, naming the vehicles there are
+    if read_manifest(task.lake, OBSERVATIONS, task.partition) is None:
+        problem = (
+            f"the lake has no observations of {vehicle} on {day}: run `boresight ingest` and `perceive` first"
+        )
+        raise ConfigError("command line", "day", problem)
     with progress_reporter(f"calibrate {task.partition.vehicle} {task.partition.day}") as progress:
         outcome = CALIBRATE.run(replace(task, progress=progress))
     record_outcome(task.lake, outcome, task.method or "")

@@ -23,12 +23,14 @@ def ingest(*logs: str, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     from pipeline.extrinsics.prior import require_named_files
     from pipeline.fleet.ledger import record_outcome
     from pipeline.stages import INGEST
-    from pipeline.store.partitions import Lake, Partition
+    from pipeline.store.partitions import Lake, Partition, last_possible_day
     from pipeline.store.remote_logs import log_at
     from pipeline.work import Task
 
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the day")
+    if day > last_possible_day():
+        raise ConfigError("command line", "day", f"{day} has not come yet")
     config = load_fleet(fleet)
     require_named_files(config)
     tables = Lake.at(lake)

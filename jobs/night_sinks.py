@@ -59,7 +59,7 @@ class NightSinks:
         """The night ended with this exit code, and the audit found this."""
         from jobs.terminal.vehicle_status import count_statuses, moved_sensors
 
-        self._state = "FAIL" if exit_code == 1 else "COMPLETE"
+        self._state = "FAIL" if exit_code in (1, 2) else "COMPLETE"
         if self._metrics is None:
             return
         from pipeline.fleet.metrics import NightEnd, write_metrics

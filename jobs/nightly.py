@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -65,6 +65,7 @@ def nightly(
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.extrinsics.prior import require_named_files
+    from pipeline.fleet.misconfigured import night_statuses, rigs_to_mend
     from pipeline.fleet.nightly import Night
     from pipeline.fleet.pattern import find_vehicle_days
     from pipeline.store.partitions import Lake
@@ -86,9 +87,9 @@ def nightly(
             close_night(night, to_day, drawing, outcomes, sinks.take_stage) if outcomes else ([], [])
         )
         tidy(tables)
-        code = exit_code([o.status for o in outcomes])
+        code = exit_code(night_statuses(outcomes, config))
         sinks.ended(code, findings)
-    _print_end(tables, code, outcomes, findings, pages)
+    _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config))
     return held_exit_code if code == 3 else code
 
 
@@ -98,6 +99,7 @@ def _print_end(
     outcomes: Sequence[DayOutcome],
     findings: Sequence[DriftFinding],
     pages: Sequence[str],
+    mend: Mapping[str, str],
 ) -> None:
     """The night's summary: what became of the vehicle-days and of the vehicles, and where to read about it."""
     from jobs.terminal.summary import left_out, print_summary
@@ -105,12 +107,13 @@ def _print_end(
 
     print_summary(
         "nightly",
-        {0: "done", 1: "failed", 3: "held"}[code],
+        {0: "done", 1: "failed", 2: "failed", 3: "held"}[code],
         vehicle_days=len(outcomes),
         **{s: sum(o.status == s for o in outcomes) for s in ("done", "cached", "held", "refused", "failed")},
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
+        misconfigured=mend,
         damaged=left_out(tables),
         report=pages[0] if pages else None,
     )
@@ -163,11 +166,11 @@ def watch_night(
     """
     from jobs.terminal.night_view import night_view
     from pipeline.errors import ConfigError
-    from pipeline.fleet.nightly import run_night
+    from pipeline.fleet.nightly import refused_at_once, run_night
 
     if workers is not None and workers < 1:
         raise ConfigError("command line", "--workers", f"{workers} is less than one")
-    known = [d.partition for d in days if d.partition.vehicle in night.fleet.vehicles]
+    known = [d.partition for d in days if not refused_at_once(night, d.partition)]
     outcomes = []
     with night_view([f"{p.vehicle} {p.day}" for p in known], len(days)) as view:
         for outcome in run_night(night, days, executor, workers, view.watch):

@@ -33,7 +33,7 @@ def show(
         day: only this day, YYYY-MM-DD.
         method: only records of this method.
         current: only the current record of each vehicle, day, method and pair; of drift, what the last audit said; of
-            outcomes and events, all are.
+            events, those not withdrawn; of outcomes, all are.
         json: print a JSON list and nothing else: oldest record first, names as the columns, and for
             calibrations "T", the 4x4 row-major T_parent_child (null where the day was refused).
     """
@@ -62,8 +62,14 @@ def show(
 def _records(
     lake: Lake, table: Table, vehicle: str | None, day: str | None, method: str | None, *, current: bool
 ) -> list[dict[str, Any]]:
-    from pipeline.store.current import current_drift, current_records, current_states, transform_of
-    from pipeline.store.records import last_assertion, read_records
+    from pipeline.store.current import (
+        current_drift,
+        current_events,
+        current_records,
+        current_states,
+        transform_of,
+    )
+    from pipeline.store.records import Assertion, last_assertion, read_records
     from schemas.calibrations import CalibrationRecord
     from schemas.drift import DriftFinding
     from schemas.outcomes import OutcomeRow
@@ -76,7 +82,7 @@ def _records(
         "drift": (DriftFinding, current_drift),
         "states": (StateRow, current_states),
         "outcomes": (OutcomeRow, list),
-        "service_events": (ServiceEvent, list),
+        "service_events": (ServiceEvent, current_events),
     }
     kind, current_of = kinds[table]
     rows = read_records(lake, TABLES[table], kind, vehicle=vehicle, day=day)
@@ -84,8 +90,8 @@ def _records(
     names = [c.name for c in TABLES[table].columns]
     chosen = current_of(rows) if current else rows
     if current and table == "drift":  # vehicles that the last audit did not look at are none of what it said
-        last = {m: last_assertion(lake, TABLES[table], m) for m in {r.method for r in chosen}}
-        chosen = [r for r in chosen if last[r.method] == (r.day, r.asserted_at)]
+        last = {last_assertion(lake, TABLES[table], m) for m in {r.method for r in chosen}}
+        chosen = [r for r in chosen if Assertion(r.asserted_at, r.day, r.method) in last]
     shown = [{n: getattr(r, n) for n in names} for r in chosen]
     if table == "calibrations":
         return [row | {"T": transform_of(r)} for row, r in zip(shown, chosen, strict=True)]

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 if TYPE_CHECKING:
     from pipeline.fleet.status import DayStatus
+    from pipeline.store.partitions import Lake
 
 __all__ = ["status"]
 
@@ -25,12 +26,12 @@ def status(
     to_day: Annotated[str | None, Parameter(name="--to")] = None,
     json: bool = False,
 ) -> int:
-    """Tell how every vehicle-day stands, and why: what a person should look at first comes first.
+    """Tell how every vehicle and vehicle-day stands, and why: what a person should look at first comes first.
 
     Args:
         lake: folder of the tables.
         vehicle: only this vehicle.
-        method: only calibrations of this method.
+        method: of the calibrations; default: the one that the last audit looked at. A vehicle-day counts once.
         from_day: first day, YYYY-MM-DD; default: 31 days before the last.
         to_day: last day; default: the last day that any night was about.
         json: the summary's "days" lists every vehicle-day.
@@ -38,11 +39,13 @@ def status(
     from dataclasses import asdict
 
     from jobs.terminal.summary import left_out, print_summary
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors, status_lines
     from pipeline.fleet.status import DAY_STATUSES, day_statuses
     from pipeline.store.delta import open_table
     from pipeline.store.partitions import Lake
-    from pipeline.store.records import last_day, read_records
+    from pipeline.store.records import last_day, read_last, read_records
     from schemas.calibrations import CALIBRATIONS
+    from schemas.drift import DRIFT, DriftFinding
     from schemas.outcomes import OUTCOMES, OutcomeRow
 
     tables = Lake.existing(lake)
@@ -52,22 +55,37 @@ def status(
     last = to_day or last_day(tables, OUTCOMES)
     first = from_day or (None if last is None else _month_before(last))
     rows = read_records(tables, OUTCOMES, OutcomeRow, first=first, last=last)
-    found = [s for s in day_statuses(rows) if method in (None, s.method) or not s.method]
-    found = [s for s in found if vehicle in (None, s.vehicle)]
+    method = method or _audited_method(tables, {r.method for r in rows if r.method})
+    found = [s for s in day_statuses(rows, method) if vehicle in (None, s.vehicle)]
+    findings = read_last(tables, DRIFT, DriftFinding, method, vehicle=vehicle)
     if not json:
-        _print_table(found)
+        _print_table(found, status_lines(findings))
     print_summary(
         "status",
         "done",
         lake=lake,
         first=first,
         last=last,
+        method=method,
         vehicles=len({s.vehicle for s in found}),
         **{name: sum(s.status == name for s in found) for name in DAY_STATUSES},
+        statuses=count_statuses(findings),
+        moved=moved_sensors(findings),
         damaged=left_out(tables),
         **({"days": [asdict(s) for s in found]} if json else {}),
     )
     return 0
+
+
+def _audited_method(lake: Lake, others: set[str]) -> str:
+    """The method of the last audit; without an audit the default one, or what there is of others."""
+    from pipeline.store.records import last_assertion
+    from schemas.drift import DRIFT
+
+    last = last_assertion(lake, DRIFT)
+    if last is not None:
+        return last.method
+    return "joint" if "joint" in others or not others else min(others)
 
 
 def _month_before(day: str) -> str:
@@ -81,7 +99,7 @@ def _month_before(day: str) -> str:
         raise ConfigError("command line", "to", f"{day!r} is no day of the form YYYY-MM-DD") from err
 
 
-def _print_table(days: Sequence[DayStatus]) -> None:
+def _print_table(days: Sequence[DayStatus], vehicles: Sequence[str]) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -99,3 +117,5 @@ def _print_table(days: Sequence[DayStatus]) -> None:
     if len(wanting) > _ROWS:
         console.print(f"and {len(wanting) - _ROWS} more: --json lists them all")
     console.print(f"{len(days) - len(wanting)} of {len(days)} vehicle-days are done")
+    for line in vehicles[:_ROWS]:
+        console.print(line, highlight=False)

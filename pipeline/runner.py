@@ -22,6 +22,7 @@ from pipeline.work import NothingUsable, Run, Task, Window, Work
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
+from schemas.outcomes import MENDED_IN_FLEET_TOML
 from schemas.states import STATES, StateRow
 from schemas.versions import CODE_VERSION
 
@@ -145,7 +146,12 @@ def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
             return stage.run(replace(task, progress=progress))
         except (BoresightError, OSError) as err:
             damaged = err.path if isinstance(err, DamagedError) else ""
-            return _outcome(stage, task, "failed", "", reason=str(err), damaged=damaged, effort=effort())
+            told = {
+                "misconfigured": getattr(err, "exit_code", 1) == 2,
+                "damaged": damaged,
+                "effort": effort(),
+            }
+            return _outcome(stage, task, "failed", "", reason=str(err), **told)
 
 
 def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
@@ -284,6 +290,8 @@ def _write_files(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
 
 def _outcome(stage: Stage, task: Task, status: str, key: str, **told: Any) -> Outcome:
     of = task.of
+    if status == "refused" and MENDED_IN_FLEET_TOML in told.get("reason", ""):
+        told["misconfigured"] = True
     where = (of.vehicle, of.day) if isinstance(of, Partition) else ("", "")
     return Outcome(stage.name, *where, status, key, **told)
 

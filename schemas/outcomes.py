@@ -6,7 +6,10 @@ from dataclasses import dataclass, field
 
 from schemas.columns import DEFAULT_TRIO, TableSchema, record_columns, scalar
 
-__all__ = ["OUTCOMES", "OUTCOME_STATUSES", "OutcomeRow"]
+__all__ = ["MENDED_IN_FLEET_TOML", "OUTCOMES", "OUTCOME_STATUSES", "OutcomeRow"]
+
+# In the reason of a refusal that no other log, but only another configuration can end.
+MENDED_IN_FLEET_TOML = "in fleet.toml"
 
 OUTCOME_STATUSES = ("done", "refused", "failed")
 

@@ -13,17 +13,19 @@ EVENT_SENSORS = ("camera", "lidar", "radar", "all")
 
 SERVICE_EVENTS = TableSchema(
     "service_events",
-    1,
+    2,
     (
         scalar("vehicle", "string", "vehicle id"),
         scalar("day", "string", "YYYY-MM-DD; its own records count neither to before nor to after"),
         scalar("sensor", "string", "camera, lidar, radar or all"),
         scalar("kind", "string", "re-mount, repair or software release"),
         scalar("note", "string", "for people"),
+        scalar("withdrawn", "bool", "it was noted by mistake: it counts no more"),
         *record_columns(),
     ),
     "Of events of one vehicle, day, sensor and kind, the last noted counts.",
     made_by="service",
+    reads_versions=(1,),
     about=("vehicle", "day", "trio", "sensor", "kind"),
 )
 
@@ -41,3 +43,4 @@ class ServiceEvent:
     trio: str = DEFAULT_TRIO
     recorded_at: str = ""  # written when the row is
     asserted_at: str = ""
+    withdrawn: bool = False

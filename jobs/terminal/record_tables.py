@@ -124,7 +124,8 @@ def _outcome_cells(row: dict[str, Any]) -> dict[str, str]:
 
 
 def _event_cells(row: dict[str, Any]) -> dict[str, str]:
-    return {name: row[name] for name in ("vehicle", "day", "sensor", "kind", "note")}
+    told = {name: row[name] for name in ("vehicle", "day", "sensor", "kind", "note")}
+    return told | {"withdrawn": "yes" if row["withdrawn"] else ""}
 
 
 def _partition_cells(row: dict[str, Any]) -> dict[str, str]:

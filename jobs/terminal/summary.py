@@ -36,11 +36,12 @@ def print_json(value: Any, *, indent: int | None = None) -> None:
 def exit_code(statuses: Iterable[str]) -> int:
     """Exit code of a job from the statuses of what it did.
 
-    1 where anything "failed" (a retry may help), else 3 where anything was "held" or "refused", else 0.
+    1 where anything "failed" (a retry may help), else 2 where anything is "misconfigured" (a person must mend it),
+    else 3 where anything was "held" or "refused", else 0.
     """
     seen = set(statuses)
-    if "failed" in seen:
-        return 1
+    if seen & {"failed", "misconfigured"}:
+        return 1 if "failed" in seen else 2
     return 3 if seen & {"held", "refused"} else 0
 
 

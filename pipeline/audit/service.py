@@ -4,10 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from pipeline.store.current import current_events
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_records
 from schemas.calibrations import FRAMES_OF_PAIR
-from schemas.service_events import ServiceEvent
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 
-__all__ = ["restart_of", "what_was_done"]
+__all__ = ["events_until", "restart_of", "what_was_done"]
+
+
+def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
+    """Events that count, by vehicle in order of day: each as it was last noted, none that was withdrawn.
+
+    Args:
+        lake: where they are.
+        last: later events are not known yet; None = there is no last day.
+    """
+    events: dict[str, list[ServiceEvent]] = {}
+    for event in current_events(read_records(lake, SERVICE_EVENTS, ServiceEvent, last=last)):
+        events.setdefault(event.vehicle, []).append(event)
+    return events
 
 
 def restart_of(events: Sequence[ServiceEvent], pair: str, last_day: str) -> ServiceEvent | None:

@@ -14,17 +14,17 @@ from pipeline.audit.estimates import Estimates, days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
 from pipeline.audit.history import History, last_audited_day
-from pipeline.audit.service import restart_of, what_was_done
+from pipeline.audit.service import events_until, restart_of, what_was_done
 from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.errors import ConfigError
 from pipeline.results import Progress
-from pipeline.store.partitions import Lake, Partition, content_hash, work_key
-from pipeline.store.records import read_last, read_records
+from pipeline.store.partitions import Lake, Partition, content_hash, last_possible_day, work_key
+from pipeline.store.records import read_last
 from pipeline.work import Records, Task, Told, Window, Work
 from schemas.calibrations import DOF_NAMES, PAIRS
 from schemas.drift import DRIFT, DriftFinding
-from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.service_events import ServiceEvent
 from schemas.versions import CODE_VERSION
 
 __all__ = ["work"]
@@ -59,15 +59,11 @@ def work(task: Task) -> Work:
     """
     assert isinstance(task.of, Window), "an audit looks at all vehicles"
     fleet, method = task.fleet, task.method or task.fleet.audit.method
-    # Drives of tomorrow are days to come, but not everywhere on earth.
-    tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
-    latest = max(tomorrow, task.of.last or "")
+    latest = max(last_possible_day(), task.of.last or "")
     first, last = _window(task, last_audited_day(task.lake, latest))
     history = History(task.lake, method, latest)
     history.read(_after(latest), None)  # days to come are named
-    events: dict[str, list[ServiceEvent]] = {}
-    for event in read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last):
-        events.setdefault(event.vehicle, []).append(event)
+    events = events_until(task.lake, last)
     enough = (FEWEST_DAYS, fleet.audit.reference_days)
     records, references = history.window((first, last), events, enough, fleet.vehicles)
     names = sorted({*records.vehicles, *fleet.vehicles})

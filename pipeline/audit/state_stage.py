@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -16,17 +15,17 @@ from pipeline.audit.estimates import Estimates, day_name, days_of, estimates_of,
 from pipeline.audit.history import History
 from pipeline.audit.noise import estimate_noise
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
-from pipeline.audit.service import restart_of, what_was_done
+from pipeline.audit.service import events_until, restart_of, what_was_done
 from pipeline.audit.state import DayEstimate, State, fuse
 from pipeline.config import AuditConfig, FleetConfig, VerifyConfig, config_hash
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.target_sigmas import target_sigmas
-from pipeline.store.partitions import Partition, content_hash, work_key
-from pipeline.store.records import last_day, read_last, read_records
+from pipeline.store.partitions import Partition, content_hash, last_possible_day, work_key
+from pipeline.store.records import last_day, read_last
 from pipeline.work import Records, Run, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS
 from schemas.drift import DRIFT, DriftFinding
-from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
 from schemas.versions import CODE_VERSION
 
@@ -41,9 +40,6 @@ _END = dt.date.max.toordinal()
 _CHANGE = ("start_day", "start_day_latest")  # what is asked of the audit's rows
 
 
-_Row = TypeVar("_Row", ServiceEvent, DriftFinding)
-
-
 def work(task: Task) -> Work:
     """The state of every vehicle that has a record in the window, one row per pair.
 
@@ -55,17 +51,18 @@ def work(task: Task) -> Work:
     """
     assert isinstance(task.of, Window), "states are of all vehicles"
     fleet, method = task.fleet, task.method or task.fleet.audit.method
-    tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
-    last = task.of.last or min(last_day(task.lake, CALIBRATIONS) or "", tomorrow)
+    last = task.of.last or min(last_day(task.lake, CALIBRATIONS) or "", last_possible_day())
     first = (dt.date.fromisoformat(last) - dt.timedelta(days=_DAYS_BACK - 1)).isoformat() if last else ""
     history = History(task.lake, method, last)
     records = history.read(first, last) if last else estimates_of(None)
-    events = _by_vehicle(read_records(task.lake, SERVICE_EVENTS, ServiceEvent, last=last or None))
-    changes = _by_vehicle(read_last(task.lake, DRIFT, DriftFinding, method, columns=_CHANGE))
+    events = events_until(task.lake, last or None)
+    changes: dict[str, list[DriftFinding]] = {}
+    for finding in read_last(task.lake, DRIFT, DriftFinding, method, columns=_CHANGE):
+        changes.setdefault(finding.vehicle, []).append(finding)
     references = _references(history, records, (first, last), events, fleet.audit) if last else {}
 
     def rows(run: Run) -> Generator[Records, None, None]:
-        scales = _scales(records, fleet.audit)
+        scales = _scales(records, fleet.audit) if records.vehicles else np.ones((0, 0, 0))
         for done, vehicle in enumerate(records.vehicles):
             run.progress(done, len(records.vehicles), vehicle)
             since = {p: _since(p, events.get(vehicle, ()), changes.get(vehicle, ()), last) for p in PAIRS}
@@ -114,13 +111,6 @@ def _scales(records: Estimates, config: AuditConfig) -> Float[np.ndarray, "V P 6
     days = [days_of(records.of(vehicle), config.held_sigma_factor) for vehicle in records.vehicles]
     charts = charts_of_fleet([{pair: own.at(own.accepted) for pair, own in of.items()} for of in days])
     return estimate_noise(charts, DOFS, len(PAIRS)).scale.reshape(len(days), len(PAIRS), DOFS)
-
-
-def _by_vehicle(rows: Iterable[_Row]) -> dict[str, list[_Row]]:
-    found: dict[str, list[_Row]] = {}
-    for row in rows:
-        found.setdefault(row.vehicle, []).append(row)
-    return found
 
 
 def _since(

@@ -68,7 +68,11 @@ def _about_the_night(
     add("boresight_last_run_timestamp_seconds", "When the last night ended.", {(): end.ended_s})
     if last_success_s is not None:
         add(_LAST_SUCCESS, "When the last night ended without a failure.", {(): last_success_s})
-    add("boresight_exit_code", "Of the last night: 0, 1 failed, 3 held or refused.", {(): end.exit_code})
+    add(
+        "boresight_exit_code",
+        "Of the last night: 0, 1 failed, 2 to be mended, 3 held or refused.",
+        {(): end.exit_code},
+    )
     add("boresight_duration_seconds", "Of the last night.", {(): end.ended_s - end.began_s})
     days = {(s,): tally.vehicle_days[s] for s in _DAY_STATUSES}
     add("boresight_vehicle_days", "Vehicle-days of the last night.", days, ("status",))

@@ -25,10 +25,10 @@ from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import Outcome, Progress, silent
 from pipeline.runner import Stage, try_stage
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake, Partition, last_possible_day
 from pipeline.work import Task
 
-__all__ = ["DayOutcome", "Night", "run_night", "run_vehicle_day", "task_of"]
+__all__ = ["DayOutcome", "Night", "refused_at_once", "run_night", "run_vehicle_day", "task_of"]
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,8 @@ class DayOutcome:
     """What became of a vehicle-day.
 
     `status`: "done", "cached" (nothing was to do), "held" or "refused" (a pair's record says so, or no record
-    could be made), "failed" (something broke; another try may help).
+    could be made), "failed" (something broke; another try may help). `misconfigured`: it ended so for what fleet.toml
+    says, or a file that it names, and will until that is mended.
     """
 
     vehicle: str
@@ -57,6 +58,7 @@ class DayOutcome:
     pairs: dict[str, str] = field(default_factory=dict)
     frames: int = 0
     trace: str = ""
+    misconfigured: bool = False
     results: tuple[Outcome, ...] = field(default=(), repr=False)  # of the stages, with the records to commit
 
 
@@ -67,7 +69,7 @@ _Job = tuple[dict[str, Any], VehicleDay, Known]
 def run_night(
     night: Night, days: Sequence[VehicleDay], executor: str, workers: int | None, watch: Watch
 ) -> Iterator[DayOutcome]:
-    """Outcome of every vehicle-day as it comes; vehicles that fleet.toml does not know are refused at once.
+    """Outcome of every vehicle-day as it comes; unknown vehicles and days to come are refused at once.
 
     Args:
         night: what the vehicle-days share.
@@ -76,10 +78,13 @@ def run_night(
         workers: processes or tasks at a time; None = as many as the executor finds CPUs for.
         watch: told what the i-th of the days known to fleet.toml is doing.
     """
-    known = [d for d in days if d.partition.vehicle in night.fleet.vehicles]
-    for unknown in (d.partition for d in days if d.partition.vehicle not in night.fleet.vehicles):
-        reason = f"{night.fleet.file} has no vehicle {unknown.vehicle!r}"
-        yield DayOutcome(unknown.vehicle, unknown.day, "refused", reason)
+    known = []
+    for day in days:
+        reason = refused_at_once(night, day.partition)
+        if reason:
+            yield DayOutcome(day.partition.vehicle, day.partition.day, "refused", reason)
+        else:
+            known.append(day)
     ledger = Ledger(night.lake, [d.partition for d in known])
     jobs, run = _Jobs(night, known, ledger), partial(_run_job, _shared(night))
     try:
@@ -92,6 +97,13 @@ def run_night(
                 yield outcome
     finally:
         ledger.commit()
+
+
+def refused_at_once(night: Night, of: Partition) -> str:
+    """Why logs cannot be of the vehicle and day that their path names; empty where they can."""
+    if of.vehicle not in night.fleet.vehicles:
+        return f"{night.fleet.file} has no vehicle {of.vehicle!r}"
+    return f"{of.day} has not come yet: mend the logs' path" if of.day > last_possible_day() else ""
 
 
 def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Progress) -> DayOutcome:
@@ -213,4 +225,5 @@ def _summarise(partition: Partition, results: Sequence[Outcome]) -> DayOutcome:
         {r.stage: r.status for r in results},
         pairs,
         next((r.rows for r in results if r.stage == INGEST.name), 0),
+        misconfigured=worst is not None and worst.misconfigured,
     )

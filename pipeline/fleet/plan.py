@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pipeline.errors import BoresightError
 from pipeline.fleet.ledger import Ledger
-from pipeline.fleet.nightly import Night, task_of
+from pipeline.fleet.nightly import Night, refused_at_once, task_of
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.runner import why_to_run
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
@@ -33,12 +33,13 @@ def plan_night(night: Night, days: Sequence[VehicleDay]) -> Iterator[DayPlan]:
 
     What runs anew may turn out as before, and then what follows it is up to date after all.
     """
-    known = [d for d in days if d.partition.vehicle in night.fleet.vehicles]
+    known = [d for d in days if not refused_at_once(night, d.partition)]
     ledger = Ledger(night.lake, [d.partition for d in known])
     for day in days:
         vehicle, date = day.partition.vehicle, day.partition.day
-        if vehicle not in night.fleet.vehicles:
-            yield DayPlan(vehicle, date, (), f"{night.fleet.file} has no vehicle {vehicle!r}: refused")
+        why_not = refused_at_once(night, day.partition)
+        if why_not:
+            yield DayPlan(vehicle, date, (), f"{why_not}: refused")
             continue
         task = task_of(night, day, ledger.known(day.partition))
         try:

@@ -45,7 +45,7 @@ class DayStatus:
     bytes_written: int | None = None
 
 
-def day_statuses(rows: Sequence[OutcomeRow]) -> list[DayStatus]:
+def day_statuses(rows: Sequence[OutcomeRow], method: str | None = None) -> list[DayStatus]:
     """Every vehicle on every day that any vehicle was run on, in order of day, vehicle and method.
 
     A vehicle that has no outcome on a day on which others have is missing there: no logs of it were found. So is a day
@@ -53,6 +53,7 @@ def day_statuses(rows: Sequence[OutcomeRow]) -> list[DayStatus]:
 
     Args:
         rows: as `read_records` returns them, the last asserted last.
+        method: each vehicle-day once, by this method, whatever others calibrated it too; None = once per method.
     """
     stages: dict[tuple[str, str], dict[tuple[str, str], OutcomeRow]] = {}
     for row in rows:
@@ -66,8 +67,9 @@ def day_statuses(rows: Sequence[OutcomeRow]) -> list[DayStatus]:
                 reason = "no logs of this vehicle were found on a day of which others have some"
                 found.append(DayStatus(vehicle, day, "", "missing", reason=reason))
                 continue
-            methods = sorted({method for stage, method in current if stage == _LAST_STAGE}) or [""]
-            found += [_of_method(vehicle, day, method, list(current.values())) for method in methods]
+            known = sorted({of for stage, of in current if stage == _LAST_STAGE}) or [""]
+            methods = known if method is None else [method]
+            found += [_of_method(vehicle, day, of, list(current.values())) for of in methods]
     return found
 
 

@@ -29,6 +29,7 @@ from pipeline.results import Progress
 from pipeline.rigs import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.frames import SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ, Frame
+from schemas.outcomes import MENDED_IN_FLEET_TOML
 
 __all__ = ["find_trios", "pick_trios", "read_file_prior", "work"]
 
@@ -148,9 +149,8 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestCon
     topics = {role: topic for topic, role in topics_of(rig).items()}
     absent = [f"{topics[r]} ({r})" for r in ("image", "lidar", "radar") if not index.stream(r).stamps]
     if absent:
-        what = (
-            f"no usable message on {', '.join(absent)}: mend the topics in fleet.toml (see `boresight check`)"
-        )
+        mend = f"mend the topics {MENDED_IN_FLEET_TOML} (see `boresight check`)"
+        what = f"no usable message on {', '.join(absent)}: {mend}"
     elif rejected.get(Rejection.CAMERA_INFO):
         what = f"no usable intrinsics on {topics['info']}: log a sensor_msgs/CameraInfo with a calibrated K"
     elif not set(rejected) & set(_UNUSABLE):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import PurePath
@@ -18,7 +17,7 @@ from pipeline.report.verdicts import FleetVerdicts, read_verdicts
 from pipeline.report.window import FleetWindow, read_window
 from pipeline.results import Progress, silent
 from pipeline.store.files import Files, LocalFiles
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake, Partition, last_possible_day
 from pipeline.work import Run, Task, Work
 
 __all__ = ["Pages", "work", "write_day_page", "write_day_picture", "write_fleet_page", "write_fleet_report"]
@@ -92,9 +91,7 @@ def write_fleet_report(
 
 
 def _read(album: Album) -> tuple[FleetWindow, FleetVerdicts]:
-    # Drives of tomorrow are days to come, but not everywhere on earth.
-    tomorrow = (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
-    window = read_window(album.lake, album.method, album.fleet.audit.window_days, tomorrow)
+    window = read_window(album.lake, album.method, album.fleet.audit.window_days, last_possible_day())
     return window, read_verdicts(album.lake, album.method)
 
 

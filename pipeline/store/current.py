@@ -14,10 +14,12 @@ from pipeline.geometry.se3 import from_quaternion
 from schemas.calibrations import CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DriftFinding
+from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
 
 __all__ = [
     "current_drift",
+    "current_events",
     "current_records",
     "current_rows",
     "current_states",
@@ -91,6 +93,16 @@ def _asserted_last(rows: Sequence[_Said]) -> list[_Said]:
         key = (row.vehicle, row.method)
         last[key] = max(last.get(key, ""), row.asserted_at)
     return [row for row in rows if row.asserted_at == last[row.vehicle, row.method]]
+
+
+def current_events(events: Sequence[ServiceEvent]) -> list[ServiceEvent]:
+    """Each event as it was last noted, without those that were withdrawn.
+
+    Args:
+        events: as `read_records` returns them, the last asserted last.
+    """
+    noted = {(e.vehicle, e.day, e.trio, e.sensor, e.kind): e for e in events}
+    return [event for event in noted.values() if not event.withdrawn]
 
 
 def transform_of(record: CalibrationRecord | StateRow) -> Float[np.ndarray, "4 4"] | None:

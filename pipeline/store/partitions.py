@@ -18,7 +18,7 @@ from pipeline.names import is_vehicle
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.object_store import Bucket
 
-__all__ = ["Lake", "Partition", "content_hash", "is_day", "work_key"]
+__all__ = ["Lake", "Partition", "content_hash", "is_day", "last_possible_day", "work_key"]
 
 
 def is_day(text: str) -> bool:
@@ -27,6 +27,11 @@ def is_day(text: str) -> bool:
         return dt.date.fromisoformat(text).isoformat() == text
     except ValueError:
         return False
+
+
+def last_possible_day() -> str:
+    """Tomorrow: elsewhere on earth it has begun; a drive of a later day cannot be."""
+    return (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
 
 
 @dataclass(frozen=True, order=True)

@@ -12,7 +12,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import MISSING, fields, replace
 from itertools import groupby
 from operator import itemgetter
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -23,6 +23,7 @@ from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
 
 __all__ = [
+    "Assertion",
     "RecordIndex",
     "assert_records",
     "commit_last",
@@ -41,6 +42,14 @@ __all__ = [
 Row = TypeVar("Row")
 # Of machines that write a table: a file is at most this much older than the rows in it.
 _CLOCKS_DIFFER_S = 86_400.0
+
+
+class Assertion(NamedTuple):
+    """What rows that a stage of the whole fleet asserted together have in common."""
+
+    asserted_at: str
+    day: str
+    method: str = ""
 
 
 def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
@@ -283,23 +292,24 @@ def read_latest(
     return sorted(found, key=lambda row: row.vehicle)
 
 
-def last_assertion(lake: Lake, schema: TableSchema, method: str) -> tuple[str, str] | None:
-    """Day and `asserted_at` of the rows of a method that were asserted last; None where there are none.
+def last_assertion(lake: Lake, schema: TableSchema, method: str | None = None) -> Assertion | None:
+    """Which rows of a method (None = of any) were asserted last; None where there are none.
 
     Files are looked at from the last written on, until the others are older than what was found.
     """
     table = open_table(lake, schema)
-    found: tuple[str, str] | None = None
+    found: Assertion | None = None
     files = live_files(table) if table is not None else []
     for file in sorted(files, key=lambda f: f.written_s, reverse=True):
-        if found and file.written_s + _CLOCKS_DIFFER_S < dt.datetime.fromisoformat(found[1]).timestamp():
+        stamp = found.asserted_at if found else None
+        if stamp and file.written_s + _CLOCKS_DIFFER_S < dt.datetime.fromisoformat(stamp).timestamp():
             break
-        wanted = Wanted(asserted_after=found[1] if found else None)
-        part = read_file(lake, schema, file.name, ["day", "method", "asserted_at"], wanted)
-        part = part.filter(pc.equal(part["method"], method)) if part is not None else None
+        part = read_file(lake, schema, file.name, Assertion._fields, Wanted(asserted_after=stamp))
+        if part is not None and method is not None:
+            part = part.filter(pc.equal(part["method"], method))
         if part is not None and part.num_rows:
             last = part.take(pc.sort_indices(part, [("asserted_at", "descending")])[:1]).to_pylist()[0]
-            found = max(found or ("", ""), (last["day"], last["asserted_at"]), key=lambda f: f[1])
+            found = max(found or Assertion("", ""), Assertion(**last))
     return found
 
 
@@ -325,8 +335,8 @@ def read_last(
     last = last_assertion(lake, schema, method)
     if last is None:
         return []
-    rows: list[Any] = read_records(lake, schema, row_type, vehicle=vehicle, day=last[0], columns=columns)
-    return [row for row in rows if (row.method, row.asserted_at) == (method, last[1])]
+    rows: list[Any] = read_records(lake, schema, row_type, vehicle=vehicle, day=last.day, columns=columns)
+    return [row for row in rows if (row.method, row.asserted_at) == (method, last.asserted_at)]
 
 
 def read_last_columns(
@@ -334,10 +344,11 @@ def read_last_columns(
 ) -> pa.Table | None:
     """The same as columns, in no order; None where there is no such row."""
     last = last_assertion(lake, schema, method)
-    found = read_columns(lake, schema, columns, first=last[0], last=last[0]) if last is not None else None
+    found = last and read_columns(lake, schema, columns, first=last.day, last=last.day)
     if last is None or found is None:
         return None
-    return found.filter(pc.and_(pc.equal(found["method"], method), pc.equal(found["asserted_at"], last[1])))
+    is_last = pc.equal(found["asserted_at"], last.asserted_at)
+    return found.filter(pc.and_(pc.equal(found["method"], method), is_last))
 
 
 def first_day(lake: Lake, schema: TableSchema) -> str | None:

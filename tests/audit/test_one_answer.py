@@ -13,6 +13,7 @@ from jobs.service import service
 from jobs.show import show
 from jobs.terminal.vehicle_status import count_statuses
 from pipeline.config import FleetConfig
+from pipeline.errors import ConfigError
 from pipeline.report.stage import write_fleet_page
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.partitions import Lake
@@ -113,3 +114,22 @@ def test_a_vehicle_whose_days_scatter_more_than_they_say_has_a_state_as_unsure_a
         sigma[noise] = {row.pair: row.azimuth_sigma_rad for row in rows}
     for pair, stated in sigma[1.0].items():
         assert 1.8 < sigma[3.0][pair] / stated < 3.3, pair
+
+
+def test_a_service_event_is_withdrawn_and_an_impossible_one_is_refused(
+    lake: Lake, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, where = fleet("v", "w"), str(lake.root)
+    event = {"lake": where, "vehicle": "v", "day": "2026-03-15", "kind": "repair", "sensor": "radar"}
+    for wrong, words in (
+        ({"vehicle": "vehicle-22"}, "the lake has no day of 'vehicle-22'; it has v, w"),
+        ({"day": "2036-03-04"}, "2036-03-04 has not come yet"),
+        ({"withdraw": True}, "no such event of v is noted; noted are: none"),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(words)):
+            service(**event | wrong)
+    for noted, status in (({}, "GREEN"), ({"withdraw": True}, "RED"), ({}, "GREEN")):
+        assert service(**event | noted) == 0
+        assert said_everywhere(lake, config, audit_of(lake, config), capsys)["v"] == status
+    assert show("service_events", lake=where, current=True, json=True) == 0
+    assert [row["withdrawn"] for row in json.loads(capsys.readouterr().out)] == [False]

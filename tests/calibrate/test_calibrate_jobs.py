@@ -76,9 +76,12 @@ def test_a_command_by_itself_says_what_became_of_the_day_too(workplace, capsys):
     assert sum(days["2024-05-06"]["pairs"].values()) == 3
 
 
-def test_a_day_without_observations_returns_3(workplace, capsys):
-    assert run(workplace, day="2024-01-01") == 3
-    assert last_line(capsys)["pairs"] == {"accepted": 0, "held": 0, "refused": 3}
+def test_a_day_without_observations_is_an_error_and_no_record(workplace):
+    with pytest.raises(ConfigError, match="no observations of v on 2024-01-01: run `boresight ingest`"):
+        run(workplace, day="2024-01-01")
+    assert read_records(Lake.at(workplace / "lake"), OUTCOMES, OutcomeRow, day="2024-01-01") == []
+    with pytest.raises(ConfigError, match="unknown vehicle"):
+        calibrate(fleet=workplace / "fleet.toml", lake=str(workplace / "lake"), vehicle="w", day="2024-05-06")
 
 
 def test_evaluate_compares_with_a_folder_or_a_file_of_truth_and_writes_the_table(workplace, capsys):

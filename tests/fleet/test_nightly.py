@@ -8,6 +8,7 @@ import pytest
 import pipeline.fleet.ledger
 from pipeline.config import FleetConfig
 from pipeline.errors import CollectedError, ConfigError, DamagedError, LogError
+from pipeline.fleet.misconfigured import night_statuses
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.fleet.status import day_statuses
@@ -234,4 +235,14 @@ def test_a_wrong_configuration_fails_the_day_that_shows_it(night, monkeypatch):
     StagesThatSay(
         monkeypatch, night.lake, ingest=ConfigError("prior.json", "T_camera_lidar", "is no transform")
     )
-    assert outcomes(replace(night, seed=3))["car"].reason == "prior.json: T_camera_lidar: is no transform"
+    car = outcomes(replace(night, seed=3))["car"]
+    assert (car.reason, car.misconfigured) == ("prior.json: T_camera_lidar: is no transform", True)
+    assert night_statuses([car], night.fleet) == ["misconfigured"]
+
+
+def test_a_day_that_has_not_come_yet_is_refused_at_once(night, monkeypatch):
+    script = StagesThatSay(monkeypatch, night.lake)
+    days = [VehicleDay(Partition("car", "2099-01-01"), (Path("a.mcap"),))]
+    [car] = run_night(night, days, "inline", 1, lambda *_: None)
+    assert (car.status, car.reason) == ("refused", "2099-01-01 has not come yet: mend the logs' path")
+    assert not script.called

@@ -61,5 +61,16 @@ def test_methods_stand_apart_and_efforts_add_up():
     assert joint.bytes_written is None
 
 
+def test_a_vehicle_day_counts_once_by_the_method_that_is_asked_for():
+    rows = [
+        row("a", "d1", "calibrate", kept={"accepted": 3}),
+        row("a", "d1", "calibrate", method="joint-ssl", kept={"held": 3}),
+        row("b", "d1", "ingest"), row("b", "d1", "calibrate", method="joint-ssl"),
+    ]  # fmt: skip
+    assert len(day_statuses(rows)) == 3
+    assert [(s.vehicle, s.status) for s in day_statuses(rows, "joint")] == [("a", "done"), ("b", "missing")]
+    assert [s.status for s in day_statuses(rows, "joint-ssl")] == ["held", "done"]
+
+
 def test_nothing_was_run_nothing_is_said():
     assert day_statuses([]) == []

@@ -1,0 +1,129 @@
+"""Every exit code of the table in pipeline/fleet/README.md, by real commands on real logs."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from jobs.cli import main
+from tests.makers.fleet_files import fleet_toml
+from tests.makers.written_logs import Kit
+
+DAY = "2023-11-14"  # of the written logs
+README = Path(__file__).parents[2] / "pipeline" / "fleet" / "README.md"
+MISTYPED = """
+[rigs.mistyped.camera]
+image = "/camera/imag"
+info = "/camera/inf"
+semantics = { source = "topics", labels = "/perception/labels", detections = "/perception/detections" }
+[rigs.mistyped.lidar]
+points = "/lidar/point"
+[rigs.mistyped.radar]
+points = "/radar/point"
+"""
+
+# A command of a shell's background, as tests may be, ignores SIGINT from birth.
+LISTENING = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from jobs.cli import main
+sys.exit(main())
+"""
+
+
+def table() -> dict[int, str]:
+    """Exit codes that the README lists, each with the summary's status."""
+    rows = re.findall(r"^\| (\d+) \| ([a-z, ]+) \|", README.read_text(), re.MULTILINE)
+    return {int(code): status for code, status in rows}
+
+
+def rig_of(folder: Path, **rigs: str) -> Path:
+    """A fleet.toml whose vehicles are on these rigs, and a short drive of each."""
+    for vehicle in rigs:
+        log = folder / "logs" / vehicle / DAY
+        log.mkdir(parents=True)
+        Kit(frames=4).drive().mcap(log / "a.mcap")
+    named = "".join(f'[vehicles."{v}"]\nrig = "{rig}"\n' for v, rig in rigs.items())
+    (folder / "fleet.toml").write_text(fleet_toml() + MISTYPED + named)
+    return folder
+
+
+def night(folder: Path) -> list[str]:
+    logs = f"{folder}/logs/{{vehicle}}/{{day}}/*"
+    options = ["--lake", f"{folder}/lake", "--logs", logs, "--executor", "inline", "--no-pictures"]
+    return ["nightly", "--fleet", f"{folder}/fleet.toml", *options]
+
+
+def nothing_new(folder: Path) -> list[str]:
+    return ["export", "schemas", "--out", f"{folder}/schemas"]
+
+
+def full_disk(folder: Path) -> list[str]:
+    command = night(rig_of(folder, car="default"))
+    (folder / "lake").mkdir()
+    (folder / "lake" / "frames").touch()  # no folder can be made here
+    return command
+
+
+def mistyped_rig(folder: Path) -> list[str]:
+    return night(rig_of(folder, car="default", van="mistyped"))
+
+
+def short_drive(folder: Path) -> list[str]:
+    return night(rig_of(folder, car="default"))
+
+
+@pytest.mark.parametrize(
+    ("code", "command"), [(0, nothing_new), (1, full_disk), (2, mistyped_rig), (3, short_drive)]
+)
+def test_each_code_of_the_table_is_what_a_command_returns_with_the_status_it_lists(
+    code, command, tmp_path, capsys
+):
+    assert main(command(tmp_path)) == code
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert summary["status"] in table()[code].split(", ")
+
+
+@pytest.mark.parametrize("code", [130, 143])
+def test_a_stopped_command_ends_with_the_code_of_its_signal(code, tmp_path):
+    options = ["--out", str(tmp_path / "fleet"), "--vehicles", "1", "--days", "9", "--frames", "300"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", LISTENING, "simulate", *options], stdout=subprocess.PIPE, text=True
+    )
+    while not list(tmp_path.rglob("logs/*/*")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    process.send_signal(signal.Signals(code - 128))
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert json.loads(out.splitlines()[-1])["status"] in table()[code].split(", ")
+
+
+def test_the_table_lists_no_code_that_is_not_tried_here():
+    assert set(table()) == {0, 1, 2, 3, 130, 143}
+
+
+def test_a_rig_whose_days_are_all_misconfigured_is_named_and_the_others_go_on(tmp_path, capsys):
+    assert main(mistyped_rig(tmp_path)) == 2
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert set(summary["misconfigured"]) == {"mistyped"}
+    assert "/camera/imag" in summary["misconfigured"]["mistyped"]
+    why = {p["vehicle"]: p["reason"] for p in summary["problems"]}
+    assert "in fleet.toml" in why["van"]
+    assert "in fleet.toml" not in why["car"]
+    assert main(mistyped_rig_again(tmp_path)) == 2  # what is known to be refused is still misconfigured
+    # One day of several without its topic says nothing of fleet.toml.
+    (tmp_path / "fleet.toml").write_text(
+        (tmp_path / "fleet.toml").read_text().replace('rig = "mistyped"', 'rig = "default"')
+    )
+    Kit(frames=4).drive().without("/lidar/points").mcap(tmp_path / "logs" / "van" / DAY / "a.mcap")
+    assert main(night(tmp_path)) == 3
+
+
+def mistyped_rig_again(folder: Path) -> list[str]:
+    return night(folder)
