@@ -10,6 +10,7 @@ from pipeline.errors import ConfigError
 if TYPE_CHECKING:
     import numpy as np
 
+    from jobs.frame_options import FrameOptions
     from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
     from pipeline.export.compare import Side
     from pipeline.geometry.transform_tree import TransformTree
@@ -24,17 +25,28 @@ def read_calibration(
     method: str,
     *,
     force: bool,
-    names: FrameNames,
-    T_base_lidar: np.ndarray | None,
+    unchecked: bool,
+    frames: FrameOptions,
+    own_frames: bool,
+    mount: str | None,
 ) -> ExportedCalibration:
     """A day's records, or without a day the vehicle's state, ready for a file.
+
+    `own_frames`: frames that no option names are called as the logs call them.
 
     Raises:
         ConfigError: there is none.
     """
     from jobs.terminal.summary import left_out as tell_damage
     from pipeline.export.calibration import ExportedCalibration
-    from pipeline.export.lake import choose_pairs, pairs_of_day, pairs_of_state, read_camera
+    from pipeline.export.lake import (
+        choose_pairs,
+        pairs_of_day,
+        pairs_of_state,
+        read_camera,
+        read_frame_ids,
+        rest_at_prior,
+    )
     from pipeline.store.partitions import Lake
     from schemas.versions import CODE_VERSION
 
@@ -44,9 +56,12 @@ def read_calibration(
     else:
         found, source = pairs_of_day(lake, vehicle, day, method), f"record of {day}"
     pairs, without = choose_pairs(found, force=force)
+    pairs = pairs if unchecked else rest_at_prior(lake, vehicle, method, pairs)
     details = [p.details for p in pairs.values()]
     days = {str(d) for detail in details for d in _listed(detail.get("days"))} | ({day} if day else set())
     camera = read_camera(lake, vehicle, days)
+    names = frames.names(read_frame_ids(lake, vehicle, days) if own_frames else None)
+    T_base_lidar = None if mount is None else mounting(mount, names)
     if day is None:
         source = f"state of {max((str(d['day']) for d in details), default='no day')}"
     tell_damage(lake)
@@ -103,7 +118,9 @@ def _logged(path: Path) -> TransformTree:
     return tree
 
 
-def read_side(text: str, location: str | None, vehicle: str | None, method: str, names: FrameNames) -> Side:
+def read_side(
+    text: str, location: str | None, vehicle: str | None, method: str, frames: FrameOptions
+) -> Side:
     """What `boresight compare` calls A or B: FORMAT:FILE[,FILE], a prior file, or of the lake [VEHICLE@]DAY[/METHOD].
 
     METHOD may be "prior": what was known before the day; DAY may be "state": what to load tonight.
@@ -115,7 +132,8 @@ def read_side(text: str, location: str | None, vehicle: str | None, method: str,
 
     form, colon, files = text.partition(":")
     if (colon and form in FORMATS) or text.endswith(".json"):
-        return _side_of_files(text, form if colon and form in FORMATS else "", files, names)
+        named = form if colon and form in FORMATS else ""
+        return _side_of_files(text, named, files, frames.names_in((files if named else text).split(",")))
     return _side_of_lake(text, location, vehicle, method)
 
 

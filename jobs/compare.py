@@ -46,7 +46,7 @@ def compare(
     from pipeline.errors import ConfigError
     from pipeline.export.compare import compare as compare_sides
 
-    names = (frames or FrameOptions()).names()
+    names = frames or FrameOptions()
     sides = [read_side(text, lake, vehicle, method, names) for text in (a, b)]
     found, notes = compare_sides(*sides)
     titles = [side.title for side in sides]

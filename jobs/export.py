@@ -30,9 +30,11 @@ def export(
     day: str | None = None,
     method: str = "joint",
     force: bool = False,
+    unchecked: bool = False,
     mount: str | None = None,
     update: Path | None = None,
     frames: FrameOptions | None = None,
+    generic_frames: bool = False,
     most_frames: Annotated[int, Parameter(validator=Number(gte=1))] = 100,
     run: Path | None = None,
     notes: Path | None = None,
@@ -51,16 +53,20 @@ def export(
         day: YYYY-MM-DD: this day's records; default: the vehicle's state.
         method: of the calibration.
         force: write held pairs too, marked as such; the exit code stays 3.
+        unchecked: write axes too that lie far from the prior and that nothing checks; default: they rest at the prior.
         mount: where the lidar sits on the car (frames --base-frame and --lidar-frame): log:FILE, whose /tf_static says
             it, or FORMAT:FILE, as urdf:car.urdf; default: the lidar is the root of the tree.
         update: of "autoware": your sensor_kit_calibration.yaml; --out is that file with new numbers for camera and
             radar, all else as it was.
         frames: names of the frames.
+        generic_frames: call them camera, lidar and radar, not as the car's own logs do (autoware always does).
         most_frames: of "foxglove", which shows the drive of --day: so many frames, evenly spread.
         run: folder of `boresight train`; needed for "onnx".
         notes: JSON object for the card: what was measured, what the data was.
     """
+    from jobs.calibration_sources import read_calibration
     from jobs.terminal.summary import print_summary
+    from pipeline.errors import ConfigError
 
     if what == "schemas":
         from schemas.versions import write_json_schemas
@@ -71,29 +77,17 @@ def export(
         paths = _export_onnx(out, run, notes)
         print_summary("export", "done", what=what, outputs=paths, bytes=out.stat().st_size)
         return 0
-    calibration = _calibration(lake, vehicle, day, method, force, mount, frames or FrameOptions())
+    if lake is None or vehicle is None:
+        raise ConfigError("command line", "lake, vehicle", "a calibration needs --lake and --vehicle")
+    # Autoware's kit holds the camera's link, and logs name its optical frame.
+    own_frames = not (generic_frames or what == "autoware")
+    calibration = read_calibration(
+        lake, vehicle, day, method, force=force, unchecked=unchecked, frames=frames or FrameOptions(),
+        own_frames=own_frames, mount=mount,
+    )  # fmt: skip
     if what == "foxglove":
         return _export_drive(out, calibration, lake, day, most_frames)
     return _export_calibration(what, out, calibration, update)
-
-
-def _calibration(
-    lake: str | None,
-    vehicle: str | None,
-    day: str | None,
-    method: str,
-    force: bool,
-    mount: str | None,
-    frames: FrameOptions,
-) -> ExportedCalibration:
-    from jobs.calibration_sources import mounting, read_calibration
-    from pipeline.errors import ConfigError
-
-    if lake is None or vehicle is None:
-        raise ConfigError("command line", "lake, vehicle", "a calibration needs --lake and --vehicle")
-    names = frames.names()
-    T_base_lidar = None if mount is None else mounting(mount, names)
-    return read_calibration(lake, vehicle, day, method, force=force, names=names, T_base_lidar=T_base_lidar)
 
 
 def _export_calibration(what: str, out: Path, calibration: ExportedCalibration, update: Path | None) -> int:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -16,21 +18,32 @@ __all__ = ["FrameOptions"]
 @Parameter(name="*")
 @dataclass(frozen=True)
 class FrameOptions:
-    """What the frames are called in the file."""
+    """What the frames are called in the file; default: as the car's own log calls them, else by the sensor."""
 
-    camera: Annotated[str, Parameter(name="--camera-frame", help="optical frame (Autoware: the link)")] = (
-        "camera"
-    )
-    lidar: Annotated[str, Parameter(name="--lidar-frame", help="frame of the lidar")] = "lidar"
-    radar: Annotated[str, Parameter(name="--radar-frame", help="frame of the radar")] = "radar"
-    base: Annotated[str, Parameter(name="--base-frame", help="frame of the car, of --mount")] = "base_link"
+    camera: Annotated[
+        str | None, Parameter(name="--camera-frame", help="optical frame (Autoware: the link)")
+    ] = None
+    lidar: Annotated[str | None, Parameter(name="--lidar-frame", help="frame of the lidar")] = None
+    radar: Annotated[str | None, Parameter(name="--radar-frame", help="frame of the radar")] = None
+    base: Annotated[str | None, Parameter(name="--base-frame", help="frame of the car, of --mount")] = None
 
-    def names(self) -> FrameNames:
-        """The same for the pipeline.
+    def names(self, known: Mapping[str, str] | None = None) -> FrameNames:
+        """The same for the pipeline; `known` names what no option does.
 
         Raises:
             ConfigError: no names of frames.
         """
         from pipeline.export.calibration import FrameNames
 
-        return FrameNames(**asdict(self))
+        asked = {sensor: name for sensor, name in asdict(self).items() if name is not None}
+        return FrameNames(**{**(known or {}), **asked})
+
+    def names_in(self, files: Iterable[str | Path]) -> FrameNames:
+        """Names in files to read: those that an export noted in them or beside them.
+
+        Raises:
+            ConfigError: no names of frames.
+        """
+        from pipeline.export.files import noted_frames
+
+        return self.names(noted_frames([Path(file) for file in files]))

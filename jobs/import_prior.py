@@ -34,7 +34,7 @@ def import_prior(
     from pipeline.extrinsics.prior import read_transforms
 
     read = read_files(files)
-    pairs = format_named(form).pairs(read, (frames or FrameOptions()).names())
+    pairs = format_named(form).pairs(read, (frames or FrameOptions()).names_in(files))
     taken = sorted(pairs)
     if also is not None:
         known = read_transforms(also)

@@ -62,6 +62,7 @@ def show(
 def _records(
     lake: Lake, table: Table, vehicle: str | None, day: str | None, method: str | None, *, current: bool
 ) -> list[dict[str, Any]]:
+    from jobs.terminal.state_rows import state_rows
     from pipeline.store.current import (
         current_drift,
         current_events,
@@ -92,6 +93,8 @@ def _records(
     if current and table == "drift":  # vehicles that the last audit did not look at are none of what it said
         last = {last_assertion(lake, TABLES[table], m) for m in {r.method for r in chosen}}
         chosen = [r for r in chosen if Assertion(r.asserted_at, r.day, r.method) in last]
+    if table == "states":
+        return state_rows(lake, chosen)
     shown = [{n: getattr(r, n) for n in names} for r in chosen]
     if table == "calibrations":
         return [row | {"T": transform_of(r)} for row, r in zip(shown, chosen, strict=True)]

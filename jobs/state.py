@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 __all__ = ["state"]
 
@@ -17,11 +16,12 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
         lake: folder of the tables.
         vehicle: only this vehicle.
         method: of the calibrations.
-        json: print a JSON list and nothing else: names as the columns of table states, and "T", the 4x4 row-major
-            T_parent_child (null where there is no accepted day).
+        json: print a JSON list and nothing else: names as the columns of table states, and "T" and "T_prior", the
+            4x4 row-major T_parent_child and what it was before the last day (null where there is none).
     """
+    from jobs.terminal.state_rows import state_rows
     from jobs.terminal.summary import left_out, print_json
-    from pipeline.store.current import current_states, transform_of
+    from pipeline.store.current import current_states
     from pipeline.store.partitions import Lake
     from pipeline.store.records import read_records
     from schemas.states import STATES, StateRow
@@ -29,10 +29,7 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
     tables = Lake.existing(lake)
     found = [r for r in read_records(tables, STATES, StateRow, vehicle=vehicle) if r.method == method]
     left_out(tables)
-    names = [c.name for c in STATES.columns]
-    rows: list[dict[str, Any]] = [
-        {n: getattr(r, n) for n in names} | {"T": transform_of(r)} for r in current_states(found)
-    ]
+    rows = state_rows(tables, current_states(found))
     if json:
         print_json(rows, indent=2)
     elif rows:

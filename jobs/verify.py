@@ -113,7 +113,7 @@ def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, na
     from pipeline.errors import ConfigError
     from pipeline.export.files import prior_text
 
-    side = read_side(calibration, lake, vehicle, "joint", named.names())
+    side = read_side(calibration, lake, vehicle, "joint", named)
     for pair, why in side.missing.items():
         raise ConfigError(side.title, pair, f"no transform to verify: {why}")
     file = folder / "in_use.json"
@@ -180,10 +180,12 @@ def _print_table(checks: list[AxisCheck], answer: str) -> None:
     from numpy import degrees
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(title="The calibration in use", title_justify="left")
     for heading in ("pair", "axis", "", "off [deg]", "sigma [deg]", "shows from [deg]"):
-        table.add_column(heading, justify="right" if "deg" in heading else "left")
+        # Text: rich reads square brackets as styles.
+        table.add_column(Text(heading), justify="right" if "deg" in heading else "left")
     for c in checks:
         numbers = [f"{degrees(v):.2f}" for v in (c.off_rad, c.sigma_rad, c.shown_rad)]
         table.add_row(c.pair, c.axis, f"[{_COLOUR[c.status]}]{c.status}[/]", *numbers)

@@ -12,7 +12,7 @@ __all__ = ["STATES", "StateRow"]
 
 STATES = TableSchema(
     "states",
-    2,
+    3,
     (
         scalar("vehicle", "string", "vehicle id"),
         scalar("day", "string", "last day of the audited window, YYYY-MM-DD"),
@@ -46,6 +46,11 @@ STATES = TableSchema(
         ),
         scalar("azimuth_sigma_rad", "float64", "sigma of a target's azimuth", nullable=True),
         scalar("elevation_sigma_rad", "float64", "sigma of its elevation", nullable=True),
+        scalar(
+            "unchecked",
+            "map<string,float64>",
+            "DoF that at least half of its days found far from the prior and that nothing checks: the most sigmas",
+        ),
         scalar("since", "string", "first day that may count; null where all may", nullable=True),
         scalar("days", "list<string>", "days that it rests on"),
         scalar("inputs", "list<string>", "work keys of their records"),
@@ -82,7 +87,7 @@ STATES = TableSchema(
     ),
     "boresight state prints the latest rows.",
     made_by="state",
-    reads_versions=(1,),
+    reads_versions=(1, 2),
     about=("vehicle", "day", "trio", "method", "pair"),
 )
 
@@ -132,3 +137,4 @@ class StateRow:
     trio: str = DEFAULT_TRIO
     recorded_at: str = ""  # written when the row is
     asserted_at: str = ""
+    unchecked: dict[str, float] = field(default_factory=dict)

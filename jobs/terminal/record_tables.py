@@ -16,7 +16,7 @@ STATUS_STYLES = {
     "RED": "bold red",
     "UNKNOWN": "dim",
 }
-_PIPE_WIDTH = 200  # characters; into a pipe or file nothing needs to fit a window
+_PIPE_WIDTH = 280  # characters; into a pipe or file nothing needs to fit a window
 
 
 def print_table(table: str, rows: list[dict[str, Any]]) -> None:
@@ -56,11 +56,39 @@ def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
         "method": row["method"],
         "pair": row["pair"],
         "status": row["status"],
-        "sigma rx ry rz [deg]": degrees,
-        "sigma tx ty tz [m]": metres,
+        **_pose_cells(row["T"], _prior_of(row)),
+        "sigma [deg, m]": f"{degrees} deg\n{metres} m",
         "frames": str(row["frames_used"]),
         "reason": row["reason"],
     }
+
+
+def _prior_of(row: dict[str, Any]) -> Any:
+    import numpy as np
+
+    from pipeline.geometry.se3 import from_quaternion
+
+    values = [row[f"prior_{name}"] for name in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")]
+    return None if None in values else from_quaternion(np.array(values[:4]), np.array(values[4:]))
+
+
+def _pose_cells(T: Any, T_prior: Any) -> dict[str, str]:
+    """Pose of the child in the parent, and how far that lies from the prior, along the parent's axes."""
+    import numpy as np
+
+    from pipeline.geometry.changes import change_between
+    from pipeline.geometry.se3 import to_quaternion
+
+    def words(numbers: Any, form: str) -> str:
+        return " ".join(f"{number:{form}}" for number in numbers)
+
+    pose = moved = ""
+    if T is not None:
+        pose = f"{words(to_quaternion(T), '.5f')}\n{words(T[:3, 3], '.3f')} m"
+        change = None if T_prior is None else change_between(T_prior, T)
+        if change is not None:
+            moved = f"{words(np.degrees(change[:3]), '+.3f')} deg\n{words(change[3:], '+.3f')} m"
+    return {"qw qx qy qz, x y z": pose, "change from prior": moved}
 
 
 def _sigma(sigma: float, observable: bool, digits: int) -> str:
@@ -101,12 +129,20 @@ def _state_cells(row: dict[str, Any]) -> dict[str, str]:
         "vehicle": row["vehicle"],
         "pair": row["pair"],
         "state": row["status"],
+        **_pose_cells(row["T"], row["T_prior"]),
         "sigma azimuth [deg]": degrees(row["azimuth_sigma_rad"]),
         "elevation [deg]": degrees(row["elevation_sigma_rad"]),
         "certified": ", ".join(row["determined"]),
         "days": f"{len(days)}: {days[0]} to {days[-1]}" if days else "0",
-        "reason": row["reason"],
+        "reason": "; ".join(text for text in (row["reason"], _unchecked(row["unchecked"] or {})) if text),
     }
+
+
+def _unchecked(sigmas: dict[str, float]) -> str:
+    """Axes that nothing checks, as `rx lies 3.3 sigma from the prior and nothing checks it`."""
+    return "; ".join(
+        f"{d} lies {s:.1f} sigma from the prior and nothing checks it" for d, s in sigmas.items()
+    )
 
 
 def _outcome_cells(row: dict[str, Any]) -> dict[str, str]:

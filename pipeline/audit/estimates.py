@@ -17,7 +17,7 @@ from pipeline.audit.days import PairDays, pair_days
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
-from schemas.calibrations import CALIBRATIONS, PAIRS, STATUSES
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, STATUSES
 
 __all__ = ["COLUMNS", "Estimates", "day_name", "days_of", "estimates_of", "faults_of", "joined"]
 
@@ -25,8 +25,18 @@ _ROUNDING = 1e-3  # of what should be 1
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _SHIFTS = tuple(f"diagnostics.holdout_{n}_shift_rad" for n in ("azimuth", "elevation"))
 _DISPROVED = "diagnostics.disproved"
+_UNCHECKED = tuple(f"diagnostics.unchecked_{dof}_sigmas" for dof in DOF_NAMES)
 # What is asked of a record besides what identifies it.
-COLUMNS = ("status", *_POSE, "covariance", "common_covariance", "observable", _DISPROVED, *_SHIFTS)
+COLUMNS = (
+    "status",
+    *_POSE,
+    "covariance",
+    "common_covariance",
+    "observable",
+    _DISPROVED,
+    *_SHIFTS,
+    *_UNCHECKED,
+)
 _ACCEPTED, _HELD, _REFUSED = (STATUSES.index(name) for name in ("accepted", "held", "refused"))
 
 
@@ -50,6 +60,7 @@ class Estimates:
         observable: what the day determined; all of it where a record does not say.
         disproved: a check shows that the pose is wrong.
         shown_wrong_rad: the angle that the checks of a held record found it off by.
+        unchecked_sigmas: by DoF, how far it lies from the prior where that is far and nothing checks it, else 0.
         work_key: of each record.
     """
 
@@ -66,6 +77,7 @@ class Estimates:
     observable: Bool[np.ndarray, "N 6"]
     disproved: Bool[np.ndarray, " N"]
     shown_wrong_rad: Float[np.ndarray, " N"]
+    unchecked_sigmas: Float[np.ndarray, "N 6"]
     work_key: pa.Array
 
     def at(self, rows: slice | np.ndarray) -> Estimates:
@@ -74,7 +86,8 @@ class Estimates:
         return Estimates(
             self.vehicles, self.owner[rows], self.day[rows], self.pair[rows], self.status[rows], self.pose[rows],
             self.has_estimate[rows], self.covariance[rows], self.common[rows], self.has_common[rows],
-            self.observable[rows], self.disproved[rows], self.shown_wrong_rad[rows], keys,
+            self.observable[rows], self.disproved[rows], self.shown_wrong_rad[rows],
+            self.unchecked_sigmas[rows], keys,
         )  # fmt: skip
 
     def of(self, vehicle: str) -> Estimates:
@@ -116,7 +129,7 @@ def estimates_of(table: pa.Table | None) -> Estimates:
     """
     if table is None:
         table = CALIBRATIONS.arrow_schema().empty_table()
-        for name in (_DISPROVED, *_SHIFTS):
+        for name in (_DISPROVED, *_SHIFTS, *_UNCHECKED):
             table = table.append_column(name, pa.array([], pa.float64()))
     found = current_rows(table, CALIBRATIONS)
     names = found["vehicle"].combine_chunks().dictionary_encode()
@@ -128,13 +141,14 @@ def estimates_of(table: pa.Table | None) -> Estimates:
     is_there = np.all([there(found[name]) for name in (*_POSE, "covariance")], axis=0)
     shifts = np.abs(np.stack([pc.fill_null(found[name], 0.0).to_numpy() for name in _SHIFTS], axis=1))
     worst = shifts.max(axis=1, initial=0.0)
+    unchecked = np.stack([pc.fill_null(found[name], 0.0).to_numpy() for name in _UNCHECKED], axis=1)
     return Estimates(
         names.dictionary.to_pylist(),  # rows are in order of vehicle, and so is what they are first met in
         owner[order], day[order], pair[order], places(found["status"], STATUSES), pose,
         is_there, matrices(found["covariance"]), matrices(found["common_covariance"]),
         there(found["common_covariance"]), observable_dofs(found["observable"]),
         pc.fill_null(found[_DISPROVED], 0.0).to_numpy() != 0.0, np.where(np.isfinite(worst), worst, 0.0),
-        found["work_key"].combine_chunks(),
+        unchecked, found["work_key"].combine_chunks(),
     )  # fmt: skip
 
 

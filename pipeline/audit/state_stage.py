@@ -23,7 +23,7 @@ from pipeline.geometry.target_sigmas import target_sigmas
 from pipeline.store.partitions import Partition, content_hash, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
 from pipeline.work import Records, Run, Task, Told, Window, Work
-from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES, FRAMES_OF_PAIR, PAIRS
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
@@ -37,6 +37,7 @@ _DAYS_BACK = 60
 # can give.
 _AUTOCORRELATION = 0.6
 _END = dt.date.max.toordinal()
+_OFTEN = 0.5  # share of a state's days: one day in 300 lies that far from the prior by chance
 _CHANGE = ("start_day", "start_day_latest")  # what is asked of the audit's rows
 
 
@@ -182,6 +183,7 @@ def _with_state(base: StateRow, found: State, records: Estimates, verify: Verify
     reach = float(ndtri(0.5 + verify.confidence / 2)) * np.degrees(sigma)
     names = ("azimuth", "elevation")
     T, q = found.T, to_quaternion(found.T)
+    own = records.at(np.flatnonzero([day_name(day) in found.days for day in records.day.tolist()]))
     return replace(
         base,
         status="current",
@@ -194,10 +196,15 @@ def _with_state(base: StateRow, found: State, records: Estimates, verify: Verify
         azimuth_sigma_rad=float(sigma[0]),
         elevation_sigma_rad=float(sigma[1]),
         days=list(found.days),
-        inputs=records.at(
-            np.flatnonzero([day_name(day) in found.days for day in records.day.tolist()])
-        ).keys(),
+        unchecked=_unchecked(own),
+        inputs=own.keys(),
     )  # fmt: skip
+
+
+def _unchecked(days: Estimates) -> dict[str, float]:
+    """DoF that at least half of the days found far from the prior, with nothing to check them: the most sigmas."""
+    often = np.mean(days.unchecked_sigmas > 0, axis=0) >= _OFTEN
+    return {dof: float(days.unchecked_sigmas[:, k].max()) for k, dof in enumerate(DOF_NAMES) if often[k]}
 
 
 def _told(rows: Sequence[StateRow]) -> Told:

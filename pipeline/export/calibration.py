@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.errors import ConfigError
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.changes import change_covariance
-from pipeline.geometry.se3 import adjoint, inverse
+from pipeline.geometry.changes import change_between, change_covariance, change_jacobian
+from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
 from schemas.calibrations import DOF_NAMES
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "ExportedPair",
     "FrameNames",
     "edges_of",
+    "is_frame",
     "needed_camera",
     "needed_pair",
     "sigmas_of",
@@ -31,6 +32,11 @@ __all__ = [
 USABLE = ("accepted", "current")
 # Of a ROS frame; also what needs no quoting in XML, YAML, a shell or a xacro expression.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]*")
+
+
+def is_frame(name: str) -> bool:
+    """True for a name that a frame can have in every format."""
+    return _FRAME.fullmatch(name) is not None
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ class FrameNames:
     def __post_init__(self) -> None:
         values = {"camera": self.camera, "lidar": self.lidar, "radar": self.radar, "base": self.base}
         for option, name in values.items():
-            if not _FRAME.fullmatch(name):
+            if not is_frame(name):
                 problem = f"{name!r} is no frame name: letters, digits and _ - . / only, no / in front"
                 raise ConfigError("command line", f"{option}-frame", problem)
         if len(set(values.values())) < len(values):
@@ -70,6 +76,8 @@ class ExportedPair:
         certified: of azimuth and elevation, those within their limit.
         common: the part of the covariance that all days of a vehicle err by alike; None where nobody says.
         details: what else is known of its origin, in plain values (work key, days, time offset, notes).
+        unchecked: by DoF, how many sigmas it lies from the prior where that is far and nothing checks it.
+        resting: those of `unchecked` that were put back to the prior.
     """
 
     pair: str
@@ -81,11 +89,30 @@ class ExportedPair:
     certified: tuple[str, ...] = ("azimuth", "elevation")
     common: Float[np.ndarray, "6 6"] | None = None
     details: Mapping[str, object] = field(default_factory=dict)
+    unchecked: Mapping[str, float] = field(default_factory=dict)
+    resting: tuple[str, ...] = ()
 
     @property
     def at_prior(self) -> list[str]:
         """Degrees of freedom that the data did not determine."""
         return [name for name, seen in zip(DOF_NAMES, self.observable, strict=True) if not seen]
+
+    def resting_at(
+        self, T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"]
+    ) -> ExportedPair:
+        """The pair with what nothing checks back at the prior, as unsure as that; the others follow as they covary."""
+        rows = [DOF_NAMES.index(dof) for dof in self.unchecked]
+        if not rows or self.covariance is None:
+            return self
+        J = change_jacobian(self.T)
+        C, P = J @ self.covariance @ J.T, change_covariance(T_prior, prior_covariance)
+        gain = C[:, rows] @ np.linalg.inv(C[np.ix_(rows, rows)])
+        change = change_between(T_prior, self.T)
+        change = change - gain @ change[rows]
+        C = C + gain @ (P - C)[np.ix_(rows, rows)] @ gain.T
+        T = from_rotation_translation(exp_so3(change[:3]) @ T_prior[:3, :3], T_prior[:3, 3] + change[3:])
+        K = np.linalg.inv(change_jacobian(T))
+        return replace(self, T=T, covariance=K @ C @ K.T, resting=tuple(self.unchecked))
 
 
 @dataclass(frozen=True, eq=False)

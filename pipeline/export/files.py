@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,18 @@ from pipeline.export.texts import to_json
 from pipeline.export.tree import ESTIMATED_PAIRS
 from pipeline.store.atomic_write import atomic_write
 
-__all__ = ["SIDE_FILE", "prior_text", "read_files", "updated_file", "write_files", "written_files"]
+__all__ = [
+    "SIDE_FILE",
+    "noted_frames",
+    "prior_text",
+    "read_files",
+    "updated_file",
+    "write_files",
+    "written_files",
+]
 
 SIDE_FILE = ".provenance.json"
+_FRAMES = ("camera", "lidar", "radar", "base")
 _MOST_BYTES = 1 << 30  # a calibration is kilobytes; a log that is read for /tf_static may be larger
 
 
@@ -83,6 +94,27 @@ def read_files(paths: Sequence[Path]) -> dict[str, bytes]:
     if not found:
         raise ConfigError("command line", "files", "none given")
     return found
+
+
+def noted_frames(paths: Sequence[Path]) -> dict[str, str]:
+    """Frame of each sensor as an export noted it, in the files or beside them; empty where none did."""
+    for path in paths:
+        for file in (path.with_name(path.name.partition(".")[0] + SIDE_FILE), path):
+            if file.suffix == ".json" and file.is_file() and file.stat().st_size <= _MOST_BYTES:
+                with suppress(ValueError):
+                    found = _within(json.loads(file.read_bytes()), "frame_names")
+                    if isinstance(found, dict):
+                        return {sensor: str(name) for sensor, name in found.items() if sensor in _FRAMES}
+    return {}
+
+
+def _within(content: object, key: str) -> object:
+    """The value of a key, however deep; None where there is none."""
+    if isinstance(content, dict):
+        return content[key] if key in content else _within(list(content.values()), key)
+    if isinstance(content, list):
+        return next((found for part in content if (found := _within(part, key)) is not None), None)
+    return None
 
 
 def prior_text(pairs: Mapping[str, np.ndarray], form: str, files: Sequence[str]) -> bytes:

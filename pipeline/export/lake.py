@@ -7,17 +7,26 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from pipeline.errors import ConfigError, ContractError
-from pipeline.export.calibration import USABLE, ExportedPair
+from pipeline.export.calibration import USABLE, ExportedPair, is_frame
 from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.store.current import current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.tables import iterate_rows, read_manifest
-from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.states import STATES, StateRow
 
-__all__ = ["choose_pairs", "pairs_of_day", "pairs_of_state", "priors_of_day", "read_camera"]
+__all__ = [
+    "choose_pairs",
+    "pairs_of_day",
+    "pairs_of_state",
+    "priors_of_day",
+    "read_camera",
+    "read_frame_ids",
+    "rest_at_prior",
+]
 
 # What a record or state says of itself beside its numbers, as far as it has it.
 _DETAILS = (
@@ -99,7 +108,33 @@ def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
         tuple(row.determined),
         row.common_covariance,
         details,
+        _unchecked(row),
     )
+
+
+def _unchecked(row: CalibrationRecord | StateRow) -> dict[str, float]:
+    if isinstance(row, StateRow):
+        return row.unchecked
+    found = {dof: row.diagnostics.get(f"unchecked_{dof}_sigmas") for dof in DOF_NAMES}
+    return {dof: sigmas for dof, sigmas in found.items() if sigmas is not None}
+
+
+def rest_at_prior(
+    lake: Lake, vehicle: str, method: str, pairs: Mapping[str, ExportedPair]
+) -> dict[str, ExportedPair]:
+    """Pairs with what is far from the prior and checked by nothing put back to it: that of their last day's record."""
+    return {name: _rested(lake, vehicle, method, pair) for name, pair in pairs.items()}
+
+
+def _rested(lake: Lake, vehicle: str, method: str, pair: ExportedPair) -> ExportedPair:
+    days = pair.details.get("days") or [pair.details.get("day")]
+    if not pair.unchecked or not isinstance(days, list):
+        return pair
+    for record in _records(lake, vehicle, str(days[-1]), method):
+        T = prior_of(record)
+        if record.pair == pair.pair and T is not None and record.prior_covariance is not None:
+            return pair.resting_at(T, record.prior_covariance)
+    return pair
 
 
 def choose_pairs(
@@ -138,3 +173,20 @@ def read_camera(lake: Lake, vehicle: str, days: Iterable[str]) -> Camera | None:
         except ContractError as err:  # damaged, or collected after its time
             lake.damage.append(str(err))
     return None
+
+
+def read_frame_ids(lake: Lake, vehicle: str, days: Iterable[str]) -> dict[str, str]:
+    """Frame of each sensor as the logs of the latest of these days call it; none of a sensor that has several names."""
+    for day in sorted(days, reverse=True):
+        try:
+            manifest = read_manifest(lake, FRAMES, Partition(vehicle, day))
+        except ContractError as err:  # damaged
+            lake.damage.append(str(err))
+            continue
+        known = {} if manifest is None else manifest.extra.get("frame_ids", {})
+        names = {sensor: ids[0].lstrip("/") for sensor, ids in known.items() if len(ids) == 1}
+        if names:
+            return (
+                names if len(set(names.values())) == len(names) and all(map(is_frame, names.values())) else {}
+            )
+    return {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ def provenance_of(calibration: ExportedCalibration) -> dict[str, Any]:
         "warnings": warnings_of(calibration),
         "convention": _CONVENTION,
         "frames": _frames(calibration),
+        "frame_names": asdict(calibration.names),
         "poses": [_pose(edge) for edge in edges_of(calibration)],
         "pairs": {name: _pair(pair) for name, pair in calibration.pairs.items()},
         "left_out": dict(calibration.left_out),
@@ -53,7 +55,16 @@ def warnings_of(calibration: ExportedCalibration) -> list[str]:
             found.append(
                 f"{pair.pair}: {', '.join(pair.at_prior)} not determined by the data, kept at the prior"
             )
+        found += [f"{pair.pair}: {_far(pair, dof, sigmas)}" for dof, sigmas in pair.unchecked.items()]
     return [" ".join(words.split()) for words in found]
+
+
+def _far(pair: ExportedPair, dof: str, sigmas: float) -> str:
+    """What becomes of an axis that nothing checks, in words."""
+    became = (
+        "it rests at the prior (--unchecked writes it)" if dof in pair.resting else "written all the same"
+    )
+    return f"{dof} lies {sigmas:.1f} sigma from the prior and nothing checks it: {became}"
 
 
 def not_certified(calibration: ExportedCalibration) -> dict[str, str]:
@@ -116,7 +127,8 @@ def _pair(pair: ExportedPair) -> dict[str, Any]:
         "status": pair.status,
         "reason": pair.reason,
         "certified": list(pair.certified),
-        "kept_at_prior": pair.at_prior,
+        "kept_at_prior": [*pair.at_prior, *pair.resting],
+        "unchecked_sigmas": dict(pair.unchecked),
         f"T_{parent}_{child}": pair.T.tolist(),
         "sigma": sigmas_of(pair.T, pair.covariance),
         "covariance": None if pair.covariance is None else pair.covariance.tolist(),

@@ -93,7 +93,7 @@ def _rows(
         if not made:
             raise NothingUsable(refusal(index, rig, rejected, config))
         _complain_of_date(index, task.partition.day)
-        run.extra |= {"problems": index.problems, "logs": index.log_names}
+        run.extra |= {"problems": index.problems, "logs": index.log_names, "frame_ids": builder.frame_ids}
         run.remarks = _shorten(index.problems)
     finally:
         index.close()

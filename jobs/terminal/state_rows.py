@@ -1,0 +1,38 @@
+"""States as commands show them: columns, the transform, and what was known before its last day."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipeline.store.partitions import Lake
+    from schemas.states import StateRow
+
+__all__ = ["state_rows"]
+
+
+def state_rows(lake: Lake, states: Sequence[StateRow]) -> list[dict[str, Any]]:
+    """Each state by the names of its columns, with "T", and "T_prior" of its last day (4x4 or None)."""
+    from pipeline.store.current import current_records, prior_of, transform_of
+    from pipeline.store.records import read_records
+    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+    from schemas.states import STATES
+
+    priors = {}
+    prior_columns = [c.name for c in CALIBRATIONS.columns if c.name.startswith("prior_")]
+    for day in sorted({s.days[-1] for s in states if s.days}):
+        among = {s.vehicle for s in states if s.days and s.days[-1] == day}
+        rows = read_records(
+            lake, CALIBRATIONS, CalibrationRecord, day=day, vehicle=among, columns=prior_columns
+        )
+        for record in current_records(rows):
+            priors[record.vehicle, record.method, record.pair, day] = prior_of(record)
+    return [
+        {c.name: getattr(s, c.name) for c in STATES.columns}
+        | {
+            "T": transform_of(s),
+            "T_prior": priors.get((s.vehicle, s.method, s.pair, s.days[-1] if s.days else "")),
+        }
+        for s in states
+    ]
