@@ -48,7 +48,7 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
         print_json(asdict(report))
     else:
         _print_report(report, name)
-        verdicts = {p: _worst(report, p) for p in ("camera_lidar", "lidar_radar", "camera_radar")}
+        verdicts = {p: _worst(report, p) for p in dict.fromkeys(v.pair for v in report.verdicts)}
         print_summary(
             "check",
             report.answer,
@@ -112,16 +112,17 @@ def _measured(report: CheckReport) -> list[str]:
         "odometry": "yes" if report.has_odometry else "no",
     }
     gate = "near enough by motion" if s.gate_ms is None else f"within {s.gate_ms:g} ms"
-    sync = f"{s.trios} of {s.sweeps} sweeps have image and scan {gate}"
-    offsets = f"constant offsets: camera {s.camera_offset_ms:+.1f} ms, radar {s.radar_offset_ms:+.1f} ms"
-    nearest = f"median to image {_number(s.camera_median_ms)}, to scan {_number(s.radar_median_ms)}"
+    found = {
+        "image": ("camera", s.camera_median_ms, s.camera_offset_ms),
+        "scan": ("radar", s.radar_median_ms, s.radar_offset_ms),
+    }
+    met = {name: of for name, of in found.items() if of[1] is not None}
+    offsets = ", ".join(f"{sensor} {offset:+.1f} ms" for sensor, _, offset in met.values())
+    nearest = ", ".join(f"to {name} {median:.2f} ms" for name, (_, median, _) in met.items())
+    sync = f"{s.trios} of {s.sweeps} sweeps have {' and '.join(met) or 'no partner'} {gate}"
     known = "; ".join(f"{name}: {value}" for name, value in facts.items())
     return [
-        f"sync: {sync} ({nearest}; {offsets})",
+        f"sync: {sync}" + (f" (median {nearest}; constant offsets: {offsets})" if met else ""),
         f"frame ids: {', '.join(frame_ids) or 'none'}",
         known if e.frames else f"not known, for want of a frame: {', '.join(facts)}",
     ]
-
-
-def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.2f} ms"

@@ -31,7 +31,8 @@ def convert(
     """Write OUT/logs/VEHICLE/DAY/*.mcap and OUT/fleet.toml from a folder of a data set.
 
     Args:
-        data_set: nuscenes; vod (View-of-Delft); kitti: image_2, velodyne, calib (with Tr_radar_to_velo) and radar.
+        data_set: nuscenes; vod (View-of-Delft); kitti: image_2, velodyne and calib, and
+            radar (with Tr_radar_to_velo in calib) where there is one.
         folder: of the data set.
         out: folder to write into.
         vehicle: of vod and kitti; default: the data set's name. nuScenes names its own, and its days.
@@ -70,7 +71,8 @@ def convert(
     has_ego = all(any(e.kind == "ego" for e in r.events) for r in recordings)
     vehicles = sorted({r.vehicle for r in recordings})
     fleet = out / "fleet.toml"
-    fleet.write_text(fleet_text(data_set, vehicles, models, ego=has_ego))
+    has_radar = any("radar" in r.T_base for r in recordings)
+    fleet.write_text(fleet_text(data_set, vehicles, models, ego=has_ego, radar=has_radar))
     print_summary("convert", "done", fleet=fleet, logs=paths, messages=messages)
     return 0
 

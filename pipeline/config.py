@@ -116,12 +116,12 @@ class FleetConfig(Section):
     def _named_files(self) -> Iterator[tuple[str, str]]:
         for name in sorted({v.rig for v in self.vehicles.values()}):
             rig, key = self.rigs[name], f"rigs.{name}"
-            if isinstance(rig.camera.semantics, OnnxSemantics):
-                yield f"{key}.camera.semantics.segmenter", rig.camera.semantics.segmenter
-                yield f"{key}.camera.semantics.detector", rig.camera.semantics.detector
-            if rig.lidar.semantics is not None:
+            if isinstance(rig.semantics, OnnxSemantics):
+                yield f"{key}.camera.semantics.segmenter", rig.semantics.segmenter
+                yield f"{key}.camera.semantics.detector", rig.semantics.detector
+            if rig.lidar is not None and rig.lidar.semantics is not None:
                 yield f"{key}.lidar.semantics.segmenter", rig.lidar.semantics.segmenter
-            if rig.radar.drivable is not None:
+            if rig.radar is not None and rig.radar.drivable is not None:
                 yield f"{key}.radar.drivable.model", rig.radar.drivable.model
             if rig.prior.file is not None:
                 yield f"{key}.prior.file", rig.prior.file

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from schemas.calibrations import SENSORS
+
 __all__ = [
     "CameraPrior",
     "CameraTopics",
@@ -194,18 +196,36 @@ class PriorConfig(Section):
 
 
 class Rig(Section):
-    """One rig model; a vehicle names its rig."""
+    """One rig model; a vehicle names its rig. It has at least two of the three sensors."""
 
-    camera: CameraTopics
-    lidar: LidarTopics
-    radar: RadarTopics
+    camera: CameraTopics | None = None
+    lidar: LidarTopics | None = None
+    radar: RadarTopics | None = None
     ego: EgoTopics | None = None
     prior: PriorConfig = PriorConfig()
 
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Those of camera, lidar and radar that it has."""
+        return tuple(sensor for sensor in SENSORS if getattr(self, sensor) is not None)
+
+    @property
+    def semantics(self) -> TopicSemantics | OnnxSemantics | None:
+        """Where the camera's labels and road users come from; None without a camera."""
+        return None if self.camera is None else self.camera.semantics
+
+    @model_validator(mode="after")
+    def _two_sensors(self) -> Rig:
+        if len(self.sensors) < 2:
+            has = f"only a {self.sensors[0]}" if self.sensors else "no sensor"
+            raise ValueError(f"the rig has {has}: a calibration needs two of camera, lidar and radar")
+        return self
+
     @model_validator(mode="after")
     def _topics_differ(self) -> Rig:
-        semantics = self.camera.semantics
-        topics = [self.camera.image, self.camera.info, self.lidar.points, self.radar.points]
+        semantics = self.semantics
+        topics = [] if self.camera is None else [self.camera.image, self.camera.info]
+        topics += [sensor.points for sensor in (self.lidar, self.radar) if sensor is not None]
         topics.append(self.prior.topic)
         topics += [semantics.labels, semantics.detections] if isinstance(semantics, TopicSemantics) else []
         topics += [] if self.ego is None else [self.ego.odometry]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,10 +16,13 @@ __all__ = [
     "FRAMES_OF_PAIR",
     "METHODS",
     "PAIRS",
+    "SENSORS",
     "STATUSES",
     "CalibrationRecord",
+    "pairs_of",
 ]
 
+SENSORS = ("camera", "lidar", "radar")
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
 FRAMES_OF_PAIR = {
     "camera_lidar": ("camera", "lidar"),
@@ -164,6 +168,11 @@ CALIBRATIONS = TableSchema(
     reads_versions=(1, 2, 3),
     about=("vehicle", "day", "trio", "method", "pair"),
 )
+
+
+def pairs_of(sensors: Collection[str]) -> tuple[str, ...]:
+    """The pairs of which both sensors are among the given ones, in order of PAIRS."""
+    return tuple(pair for pair in PAIRS if set(FRAMES_OF_PAIR[pair]) <= set(sensors))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,32 +1,51 @@
-"""Table `frames`: one row per synchronised camera-lidar-radar trio of a vehicle-day. From ingest, for perceive."""
+"""Table `frames`: one row per moment that synchronised sensors of a vehicle-day saw. From ingest, for perceive."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float32
 
+from schemas.calibrations import SENSORS
 from schemas.columns import TableSchema, array, scalar, transform_columns
 
-__all__ = ["FRAMES", "SWEEPS_LOGGED", "SWEEPS_PLANNED", "SWEEPS_READ", "Frame"]
+__all__ = [
+    "FRAMES",
+    "SAME_SCENE_NS",
+    "SENSORS_ABSENT",
+    "SWEEPS_LOGGED",
+    "SWEEPS_PLANNED",
+    "SWEEPS_READ",
+    "Frame",
+]
 
 # Among the manifest's kept, of a day that was read in bursts: sweeps that its logs hold by their indices, that the
 # plan was about, and that were read.
 SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ = "sweeps_in_logs", "sweeps_planned", "sweeps_read"
+# Among the manifest's extra: why moments lack a sensor, in words by sensor.
+SENSORS_ABSENT = "sensors_absent"
+# Moments nearer in time than this show the same scene: one without all sensors adds nothing to a whole one beside it.
+SAME_SCENE_NS = 10**9
 
 FRAMES = TableSchema(
     "frames",
-    1,
+    2,
     (
         scalar("frame_index", "int32", "0, 1, 2, ... in order of stamp within the vehicle-day"),
-        scalar("log", "string", "file name of the log that the trio came from"),
+        scalar("log", "string", "file name of the log that the moment came from"),
         scalar(
             "drive",
             "int32",
             "continuous stretch of driving; grows where the log changes or stamps gap by more than 10 s",
         ),
-        scalar("stamp_ns", "int64", "the trio's time = the lidar's stamp"),
+        scalar(
+            "sensors",
+            "list<string>",
+            "of camera, lidar and radar those that the moment has; of another one arrays and bytes are empty, camera_K "
+            "is NaN and the stamp is the moment's. All three in rows of version 1",
+        ),
+        scalar("stamp_ns", "int64", "the moment's time = the lidar's stamp, the radar's where no sweep is"),
         scalar("camera_stamp_ns", "int64", "stamp of the image"),
         scalar("lidar_stamp_ns", "int64", "stamp of the sweep; per-point times count from it"),
         scalar("radar_stamp_ns", "int64", "stamp of the radar scan"),
@@ -98,9 +117,13 @@ FRAMES = TableSchema(
         *transform_columns(
             "prior_lidar_radar_", "T_lidar_radar from tf_static or the prior file", nullable=True
         ),
+        *transform_columns(
+            "prior_camera_radar_", "T_camera_radar likewise, where the moment has no lidar", nullable=True
+        ),
     ),
-    "One trio per row, in order of stamp. Camera: optical frame; lidar and radar: x forward, y left, z up.",
+    "One moment per row, in order of stamp. Camera: optical frame; lidar and radar: x forward, y left, z up.",
     made_by="ingest",
+    reads_versions=(1,),
 )
 
 
@@ -163,6 +186,14 @@ class Frame:
     prior_lidar_radar_tx_m: float | None
     prior_lidar_radar_ty_m: float | None
     prior_lidar_radar_tz_m: float | None
+    prior_camera_radar_qw: float | None = None
+    prior_camera_radar_qx: float | None = None
+    prior_camera_radar_qy: float | None = None
+    prior_camera_radar_qz: float | None = None
+    prior_camera_radar_tx_m: float | None = None
+    prior_camera_radar_ty_m: float | None = None
+    prior_camera_radar_tz_m: float | None = None
+    sensors: list[str] = field(default_factory=lambda: list(SENSORS))
 
     @property
     def lidar_xyz_m(self) -> Float32[np.ndarray, "N 3"]:

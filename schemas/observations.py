@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from schemas.calibrations import SENSORS
 from schemas.columns import TableSchema, array, scalar, transform_columns
 
 __all__ = ["EDGE_ABOVE", "EDGE_BELOW", "EDGE_LEFT", "EDGE_RIGHT", "OBSERVATIONS", "Observation"]
@@ -21,6 +22,11 @@ OBSERVATIONS = TableSchema(
         scalar("frame_index", "int32", "row of table frames"),
         scalar("log", "string", "as in frames"),
         scalar("drive", "int32", "as in frames: the block of the bootstrap"),
+        scalar(
+            "sensors",
+            "list<string>",
+            "as in frames, less those whose image, sweep or scan was of no use; what they would show is empty",
+        ),
         scalar("stamp_ns", "int64", "as in frames"),
         scalar("camera_stamp_ns", "int64", "as in frames"),
         scalar("radar_stamp_ns", "int64", "as in frames"),
@@ -31,6 +37,7 @@ OBSERVATIONS = TableSchema(
         array("camera_D", "<f8", ("N",), "as in frames"),
         *transform_columns("prior_camera_lidar_", "as in frames", nullable=True),
         *transform_columns("prior_lidar_radar_", "as in frames", nullable=True),
+        *transform_columns("prior_camera_radar_", "as in frames", nullable=True),
         scalar(
             "ego_speed_mps",
             "float64",
@@ -155,7 +162,7 @@ OBSERVATIONS = TableSchema(
     ),
     "Perception of one frame per row; points stay in the frame of the sensor that saw them.",
     made_by="perceive",
-    reads_versions=(1,),  # which knew no label_gradients
+    reads_versions=(1,),  # which knew no label_gradients, and saw with all three sensors
 )
 
 
@@ -229,3 +236,11 @@ class Observation:
     radar_drivable_azimuth_rad: np.ndarray
     radar_drivable_range_m: np.ndarray
     label_gradients: np.ndarray | None = None
+    prior_camera_radar_qw: float | None = None
+    prior_camera_radar_qx: float | None = None
+    prior_camera_radar_qy: float | None = None
+    prior_camera_radar_qz: float | None = None
+    prior_camera_radar_tx_m: float | None = None
+    prior_camera_radar_ty_m: float | None = None
+    prior_camera_radar_tz_m: float | None = None
+    sensors: list[str] = field(default_factory=lambda: list(SENSORS))

@@ -99,9 +99,9 @@ def attribute(shifts: Mapping[str, PairShift], known_by: float = np.inf) -> Attr
     """
     pairs = tuple(shifts)
     if len(pairs) < 2:
-        return Attribution(
-            None, "only one pair has data, which two sensors share", {}, np.zeros(6), np.eye(6)
-        )
+        which = " or ".join(pairs[0].split("_")) if pairs else "any sensor"
+        told = f"{which}: one pair alone has data, which both share"
+        return Attribution(None, told, {}, np.zeros(6), np.eye(6))
     total = sum(float(s.xi @ np.linalg.solve(s.covariance, s.xi)) for s in shifts.values())
     fits = {sensor: _fit(sensor, {p: shifts[p] for p in pairs}) for sensor in SENSORS}
     cost = {sensor: fit[0] for sensor, fit in fits.items()}

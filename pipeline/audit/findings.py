@@ -40,7 +40,7 @@ def vehicle_findings(
     remarks: Mapping[tuple[str, str], str],
     before: Mapping[tuple[str, str], DriftFinding] | None = None,
 ) -> list[DriftFinding]:
-    """Rows in order of pair and DoF; a DoF without a chart says why it has none.
+    """Rows in order of pair and DoF; a DoF without a chart says why it has none, a pair without a record has no row.
 
     Args:
         audit: what all rows have in common.
@@ -51,7 +51,7 @@ def vehicle_findings(
         before: by pair and DoF, the latest earlier audit's rows: they knew days that have left the window since.
     """
     findings = []
-    for pair in PAIRS:
+    for pair in (PAIRS[p] for p in np.unique(records.pair[records.pair >= 0])):
         without_data, last_estimate = _without_data(records, pair), _last_estimate(records, pair)
         for dof in DOF_NAMES:
             chart = verdict.charts.get((pair, dof)) or without_data

@@ -142,6 +142,8 @@ def _states(
     inputs = records.keys()
     rows = []
     for pair, scale in zip(PAIRS, scales, strict=True):
+        if not np.any(records.pair == PAIRS.index(pair)):
+            continue  # the rig has it not
         first, why = since[pair]
         begin = dt.date.fromisoformat(first).toordinal() if first else 0
         usable = records.accepted & records.has_estimate & (records.day >= begin)

@@ -19,7 +19,7 @@ __all__ = ["METHODS", "Method", "Solver", "method_named"]
 
 @runtime_checkable
 class Solver(Protocol):
-    """What a method is: selected frames per pair and a prior in, a solution out."""
+    """What a method is: selected frames per pair and a prior in, a solution of these pairs out."""
 
     def __call__(  # noqa: D102
         self,
@@ -45,6 +45,7 @@ class Method:
             objects from frame to frame.
         paper_selection: takes the paper's frame conditions (section 4.5.1).
         needs_images: looks at images and sweeps (table frames) by networks, and not at observations alone.
+        needs_all: estimates all three pairs or none; else a pair without frames costs the others nothing.
         settings: import path of `(method's name, task) -> dict`: what else its answer depends on.
     """
 
@@ -54,6 +55,7 @@ class Method:
     frames: Literal["selected", "all"] = "selected"
     paper_selection: bool = False
     needs_images: bool = False
+    needs_all: bool = False
     settings: str | None = None
 
     def solver(self) -> Solver:
@@ -86,15 +88,17 @@ METHODS = (
         "pipeline.calibrate.tracking.solve:solve_tracking",
         composed=("camera_radar",),
         frames="all",
+        needs_all=True,
     ),
     Method("pairwise-optimisation", "pipeline.calibrate.paper.pairwise:solve_pairwise", paper_selection=True),
     Method(
         "joint-optimisation",
         "pipeline.calibrate.paper.joint_optimisation:solve_joint_optimisation",
         paper_selection=True,
+        needs_all=True,
     ),
-    Method("pairwise-ssl", _NETWORKS, needs_images=True, settings=_FILES),
-    Method("joint-ssl", _NETWORKS, needs_images=True, settings=_FILES),
+    Method("pairwise-ssl", _NETWORKS, needs_images=True, needs_all=True, settings=_FILES),
+    Method("joint-ssl", _NETWORKS, needs_images=True, needs_all=True, settings=_FILES),
 )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from pipeline.calibrate.verify.failed_checks import loop_sigmas
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim, target_sigmas
 from pipeline.calibrate.verify.verdict import Verdict
+from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import to_quaternion
@@ -22,7 +23,15 @@ from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRe
 from schemas.observations import Observation
 from schemas.versions import CODE_VERSION
 
-__all__ = ["Inputs", "Judged", "SolvedDay", "environment_of", "record_of", "refused_records"]
+__all__ = [
+    "Inputs",
+    "Judged",
+    "SolvedDay",
+    "environment_of",
+    "record_of",
+    "refused_record",
+    "refused_records",
+]
 
 # Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
 _FAST_MPS = 20.0
@@ -38,6 +47,8 @@ class Inputs:
     work_key: str
     seed: int
     inputs: tuple[str, ...]
+    pairs: tuple[str, ...] = PAIRS  # of the rig: others have no record
+    absent: Mapping[str, str] = field(default_factory=dict)  # why frames lack a sensor, in words by sensor
 
 
 @dataclass(frozen=True)
@@ -97,6 +108,25 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
     )
 
 
+def refused_record(
+    about: Inputs,
+    pair: str,
+    why: SolveError,
+    observations: Sequence[Observation],
+    prior: Prior,
+    counts: Mapping[str, int],
+) -> CalibrationRecord:
+    """The record of one pair that the day cannot calibrate; `counts` of frames not used, by reason."""
+    return CalibrationRecord(
+        **_identity(about, pair, len(observations), prior),
+        status="refused",
+        reason=why.reason,
+        environment=environment_of(observations),
+        frames_rejected=dict(counts),
+        faults=[why.fault] if why.fault else [],
+    )
+
+
 def refused_records(
     about: Inputs, reason: str, frames: int, prior: Prior | None, fault: str = ""
 ) -> list[CalibrationRecord]:
@@ -108,7 +138,7 @@ def refused_records(
             reason=reason,
             faults=[fault] if fault else [],
         )
-        for pair in PAIRS
+        for pair in about.pairs
     ]
 
 
@@ -141,7 +171,7 @@ def _identity(about: Inputs, pair: str, frames: int, prior: Prior | None) -> dic
         "inputs": list(about.inputs),
         "frames_total": frames,
     }
-    if prior is not None:
+    if prior is not None and prior.knows(pair):
         fields |= _transform_fields("prior_", prior.of(pair)) | {"prior_covariance": prior.covariance(pair)}
     return fields
 
@@ -160,9 +190,9 @@ def _unobservable(observable: np.ndarray) -> list[str]:
 def _assumed(pair: str, observations: Sequence[Observation]) -> list[str]:
     """What every method takes as known, and what an error of it is worth."""
     assumed = ["sensors are rigid, clocks keep their offsets and scales over the day"]
-    if "camera" not in FRAMES_OF_PAIR[pair] or not observations:
+    o = next((o for o in observations if "camera" in o.sensors), None)
+    if "camera" not in FRAMES_OF_PAIR[pair] or o is None:
         return assumed
-    o = observations[0]
     camera = camera_of(o)
     wrong = replace(camera, K=_scaled(o.camera_K, 1.001))
     edge = np.array([[0.0, o.image_height_px / 2], [o.image_width_px - 1.0, o.image_height_px / 2]])
@@ -233,7 +263,8 @@ def _estimate_fields(estimate: PairEstimate) -> dict[str, Any]:
 
 def _loop_fields(solution: Solution) -> dict[str, Any]:
     """Residual of the loop, with sigmas from three pairs estimated apart or from the method's own check."""
-    checked = solution.pairs["camera_radar"].diagnostics.get("loop_rotation_sigma_rad")
+    composed = solution.pairs.get("camera_radar")
+    checked = None if composed is None else composed.diagnostics.get("loop_rotation_sigma_rad")
     rotation, translation = loop_sigmas(solution) or (checked, None)
     return {
         "loop_rotation_rad": solution.loop_rotation_rad,

@@ -6,7 +6,7 @@ record.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 
 import numpy as np
@@ -15,7 +15,14 @@ from pipeline.calibrate.earlier import accepted_before
 from pipeline.calibrate.methods import Method, Solver, method_named
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.calibrate.records import Inputs, Judged, SolvedDay, record_of, refused_records
+from pipeline.calibrate.records import (
+    Inputs,
+    Judged,
+    SolvedDay,
+    record_of,
+    refused_record,
+    refused_records,
+)
 from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
 from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
 from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
@@ -29,14 +36,21 @@ from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.config import FleetConfig, VerifyConfig
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.extrinsics.prior import perturbed, prior_key, read_prior
+from pipeline.extrinsics.prior import no_prior, perturbed, prior_key, read_prior
 from pipeline.results import Outcome, Progress, silent
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_rows
 from pipeline.work import Records, Run, Task, Told, Work
-from schemas.calibrations import PAIRS, STATUSES, CalibrationRecord
+from schemas.calibrations import (
+    FRAMES_OF_PAIR,
+    PAIRS,
+    SENSORS,
+    STATUSES,
+    CalibrationRecord,
+    pairs_of,
+)
 from schemas.faults import FAULTS
-from schemas.frames import FRAMES
+from schemas.frames import FRAMES, SENSORS_ABSENT
 from schemas.observations import OBSERVATIONS, Observation
 
 __all__ = ["calibrate_observations", "work"]
@@ -60,22 +74,24 @@ def work(task: Task) -> Work:
     seed = fleet.solve.seed if task.seed is None else task.seed
     if seed < 0:
         raise ConfigError("command line", "seed", f"{seed} is less than 0")
-    if task.given is not None:
-        return _refusal(task.given, task.partition, method, seed)
     rig = fleet.rig_of(task.partition.vehicle)
+    if task.given is not None:
+        return _refusal(task.given, task.partition, method, seed, pairs_of(rig.sensors))
     settings = {"method": method.name} | method.settings_of(task)
     settings |= {
         "perturb": task.perturb,
         "seed": seed,
         "prior_file": prior_key(fleet, task.partition.vehicle),
-        "camera": asdict(rig.camera.known),
+        "camera": {} if rig.camera is None else asdict(rig.camera.known),
     }
     prior = rig.prior
     tables = (FRAMES, OBSERVATIONS) if method.needs_images else (OBSERVATIONS,)
     manifests = [read_manifest(task.lake, table, task.partition) for table in tables]
 
     def rows(run: Run) -> Generator[Records, None, None]:
-        about = Inputs(task.partition, method.name, run.work_key, seed, run.inputs)
+        pairs = pairs_of(rig.sensors)
+        absent = _absent(task.lake, task.partition)
+        about = Inputs(task.partition, method.name, run.work_key, seed, run.inputs, pairs, absent)
         yield Records(_records(task, method, about, run.progress))
 
     return Work(
@@ -99,13 +115,15 @@ def _records(task: Task, method: Method, about: Inputs, progress: Progress) -> l
         return refused_records(about, err.reason, len(rows), prior, err.fault)
 
 
-def _refusal(refused: Outcome, partition: Partition, method: Method, seed: int) -> Work:
+def _refusal(
+    refused: Outcome, partition: Partition, method: Method, seed: int, pairs: tuple[str, ...]
+) -> Work:
     """Records of a day that never reached the solver, so that whoever reads the lake finds the reason."""
     reason = f"{refused.stage}: {refused.reason}"
     fault = next((code for code, sentence in FAULTS.items() if refused.reason.startswith(sentence)), "")
 
     def rows(run: Run) -> Generator[Records, None, None]:
-        about = Inputs(partition, method.name, run.work_key, seed, run.inputs)
+        about = Inputs(partition, method.name, run.work_key, seed, run.inputs, pairs)
         yield Records(refused_records(about, reason, 0, None, fault))
 
     inputs = (refused.work_key,) if refused.work_key else ()
@@ -121,7 +139,7 @@ def calibrate_observations(
     progress: Progress = silent,
     solver: Solver | None = None,
 ) -> list[CalibrationRecord]:
-    """Select, trigger, solve, judge: the records of one day, without writing anything.
+    """Select, trigger, solve, judge: the records of one day, without writing anything; each pair by its own frames.
 
     `solver` is for methods that need more than observations (`Method.needs_images`); None = the method's own.
 
@@ -133,12 +151,25 @@ def calibrate_observations(
     if method.frames == "all":
         select = select.model_copy(update={"frames": max(len(observations), 1)})
     selection = select_frames(
-        observations, select, paper=method.paper_selection, sync_gate_s=_sync_gate_s(method, fleet)
+        observations,
+        select,
+        paper=method.paper_selection,
+        sync_gate_s=_sync_gate_s(method, fleet),
+        pairs=about.pairs,
+        absent=about.absent,
     )
-    frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in PAIRS}
-    sample = _spread(observations, selection)
-    before = trigger_metrics(sample, {pair: prior.of(pair) for pair in PAIRS})
-    fired = {pair: exceeded(before[pair], fleet.trigger) for pair in PAIRS}
+    refused = _refused(method, about.pairs, selection, prior)
+    pairs = [pair for pair in about.pairs if pair not in refused]
+    refusals = {
+        pair: refused_record(about, pair, why, observations, prior, selection.rejected[pair])
+        for pair, why in refused.items()
+    }
+    if not pairs:
+        return list(refusals.values())
+    frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in pairs}
+    sample = _spread(observations, frames)
+    before = trigger_metrics(sample, {pair: prior.of(pair) for pair in pairs})
+    fired = {pair: exceeded(before[pair], fleet.trigger) for pair in pairs}
     active = _to_calibrate(method, fired, fleet.trigger.when)
     progress(1, 4, f"solve by {about.method}")
     solution = (solver or method.solver())(
@@ -155,7 +186,7 @@ def calibrate_observations(
     solution, judged = _believed(
         solution, lambda found: _judge_all(observations, selection, prior, found, fleet, active), active
     )
-    after = trigger_metrics(sample, {pair: solution.pairs[pair].T for pair in PAIRS})
+    after = trigger_metrics(sample, {pair: solution.pairs[pair].T for pair in pairs})
     day = SolvedDay(
         observations,
         selection,
@@ -164,11 +195,37 @@ def calibrate_observations(
         judged,
         before,
         after,
-        {pair: bool(fired[pair]) for pair in PAIRS},
+        {pair: bool(fired[pair]) for pair in pairs},
     )
-    records = [record_of(about, pair, day) for pair in PAIRS]
     progress(4, 4, "done")
-    return records
+    return [refusals[pair] if pair in refusals else record_of(about, pair, day) for pair in about.pairs]
+
+
+def _absent(lake: Lake, partition: Partition) -> dict[str, str]:
+    """Why frames lack a sensor, by the manifests of perceive and of ingest, which says more."""
+    perceived, ingested = (read_manifest(lake, table, partition) for table in (OBSERVATIONS, FRAMES))
+    found = {}
+    for sensor in SENSORS:
+        counts = {} if perceived is None else perceived.rejected
+        own = {name: n for name, n in counts.items() if name.startswith(f"without_{sensor}_")}
+        if own:
+            most = max(own, key=lambda name: own[name])
+            found[sensor] = f"most often {most.removeprefix(f'without_{sensor}_')}, {own[most]} times"
+    return found | ({} if ingested is None else ingested.extra.get(SENSORS_ABSENT, {}))
+
+
+def _refused(
+    method: Method, pairs: Sequence[str], selection: Selection, prior: Prior
+) -> dict[str, SolveError]:
+    """Pairs that the day cannot calibrate: too few frames, no prior, or a method that needs what is missing."""
+    refused = dict(selection.refused)
+    refused |= {p: SolveError(no_prior(p)) for p in pairs if p not in refused and not prior.knows(p)}
+    if method.needs_all and (refused or len(pairs) < len(PAIRS)):
+        missing = [s for s in SENSORS if not any(s in FRAMES_OF_PAIR[p] for p in pairs)]
+        why = f"the rig has no {missing[0]}" if missing else next(iter(refused.values())).reason
+        alone = SolveError(f"method {method.name} needs camera, lidar and radar: {why}")
+        refused = {pair: refused.get(pair, alone) for pair in pairs}
+    return {pair: refused[pair] for pair in pairs if pair in refused}
 
 
 def _believed(
@@ -202,11 +259,15 @@ def _to_calibrate(method: Method, fired: Mapping[str, Sequence[str]], when: str)
 
     A composed pair is as good as its factors: where it is asked for, so are they.
     """
-    wanted = {p for p in PAIRS if fired[p] or when == "always"}
-    composed = set(method.composed)
-    if wanted & composed:
-        wanted |= set(PAIRS) - composed
-    return [p for p in PAIRS if p in wanted]
+    wanted = {p for p in fired if fired[p] or when == "always"}
+    if wanted & set(_composed_of(method, fired)):
+        wanted = set(fired)
+    return [p for p in fired if p in wanted]
+
+
+def _composed_of(method: Method, pairs: Collection[str]) -> tuple[str, ...]:
+    """Pairs that the method composes of the others: none where one of these is missing."""
+    return method.composed if len(pairs) == len(PAIRS) else ()
 
 
 def _observations(lake: Lake, partition: Partition) -> list[Observation]:
@@ -225,10 +286,10 @@ def _judge_all(
 ) -> dict[str, Judged]:
     """Verdict and evidence of each pair; pairs that a method composes come after their factors."""
     limits, search = _limits(fleet.verify), search_range(prior, fleet.solve)
-    composed = method_named(solution.method).composed
+    composed = _composed_of(method_named(solution.method), solution.pairs)
     failed = checks_of_day(FoundDay(observations, selection, prior, solution, composed, fleet, limits))
     found: dict[str, Judged] = {}
-    for pair in sorted(PAIRS, key=lambda p: p in composed):
+    for pair in sorted(solution.pairs, key=lambda p: p in composed):
         estimate = solution.pairs[pair]
         held_out = [observations[i] for i in selection.holdout[pair]] if pair in active else []
         test, claims = _held_out_evidence(estimate, held_out, prior, fleet, limits)
@@ -285,11 +346,14 @@ def _held_out_evidence(
     return test, claims
 
 
-def _spread(observations: Sequence[Observation], selection: Selection) -> list[Observation]:
+def _spread(
+    observations: Sequence[Observation], frames: Mapping[str, Sequence[Observation]]
+) -> list[Observation]:
     """Frames that the triggers look at: those of the fit of all pairs, thinned."""
-    rows = sorted(set().union(*selection.fit.values()))
+    used = {id(o) for own in frames.values() for o in own}
+    rows = [o for o in observations if id(o) in used]
     picked = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _TRIGGER_FRAMES)).astype(int))
-    return [observations[rows[i]] for i in picked]
+    return [rows[i] for i in picked]
 
 
 def _told(records: Sequence[CalibrationRecord]) -> Told:

@@ -1,4 +1,4 @@
-"""KITTI-shaped folders with a radar: View-of-Delft's two trees, and one tree with a folder `radar`.
+"""KITTI-shaped folders: View-of-Delft's two trees, and one tree, with a folder `radar` or without.
 
 The data sets give no stamps: frames count at 10 Hz from noon of the day that the caller names, and all sensors of a
 frame have the same stamp. Where poses jump farther than a car drives between frames, another drive begins a minute
@@ -43,7 +43,7 @@ class Layout:
     Args:
         images: folder of images, named by frame.
         lidar: folder of .bin.
-        radar: folder of .bin.
+        radar: folder of .bin; empty: there is none.
         calib: folder of .txt.
         radar_calib: folder of the radar's own, whose Tr_velo_to_cam is the radar's; empty: Tr_radar_to_velo in calib.
         poses: folder of .json; may be missing.
@@ -79,7 +79,7 @@ def read_view_of_delft(folder: Path, vehicle: str, day: str) -> list[Recording]:
 
 
 def read_kitti(folder: Path, vehicle: str, day: str, radar_columns: Sequence[str]) -> list[Recording]:
-    """The one recording of a folder with image_2, velodyne, radar and calib (with Tr_radar_to_velo).
+    """The one recording of a folder with image_2, velodyne and calib; radar, with Tr_radar_to_velo, where there is one.
 
     Raises:
         ConfigError: as `read_view_of_delft`, or the radar's columns lack x, y, z or doppler.
@@ -87,21 +87,21 @@ def read_kitti(folder: Path, vehicle: str, day: str, radar_columns: Sequence[str
     missing = [name for name in ("x", "y", "z", "doppler") if name not in radar_columns]
     if missing:
         raise ConfigError("command line", "radar-columns", f"lacks {', '.join(missing)}")
-    layout = Layout("image_2", "velodyne", "radar", "calib", "", "pose", tuple(radar_columns))
+    radar = "radar" if (folder / "radar").is_dir() else ""
+    layout = Layout("image_2", "velodyne", radar, "calib", "", "pose", tuple(radar_columns))
     return [_read(folder, layout, vehicle, day)]
 
 
 def _read(folder: Path, layout: Layout, vehicle: str, day: str) -> Recording:
     images = {p.stem: p for p in sorted((folder / layout.images).glob("*")) if p.suffix in (".jpg", ".png")}
-    frames = [
-        n for n in images if all((folder / f / f"{n}.bin").is_file() for f in (layout.lidar, layout.radar))
-    ]
+    points = [f for f in (layout.lidar, layout.radar) if f]
+    frames = [n for n in images if all((folder / f / f"{n}.bin").is_file() for f in points)]
     if not frames:
-        where = f"{layout.images}, {layout.lidar} and {layout.radar}"
-        raise ConfigError(str(folder), "", f"no frame is in all of {where}")
+        raise ConfigError(str(folder), "", f"no frame is in all of {', '.join([layout.images, *points])}")
     camera, T_camera_lidar, T_lidar_radar = _calibration(folder, layout, frames[0], images[frames[0]])
     # The lidar is the base: nothing says where it sits on the car.
-    T_base = {"camera": inverse(T_camera_lidar), "lidar": np.eye(4), "radar": T_lidar_radar}
+    T_base = {"camera": inverse(T_camera_lidar), "lidar": np.eye(4)}
+    T_base |= {} if T_lidar_radar is None else {"radar": T_lidar_radar}
     poses = {n: T for n in frames if (T := _pose(folder / layout.poses / f"{n}.json")) is not None}
     T_odom_base = {n: T @ T_camera_lidar for n, T in poses.items()}
     stamps = _stamps(frames, T_odom_base, day)
@@ -110,8 +110,10 @@ def _read(folder: Path, layout: Layout, vehicle: str, day: str) -> Recording:
         events += [
             Event(stamp, "image", partial(read_bytes, images[n])),
             Event(stamp, "lidar", partial(_points, folder / layout.lidar / f"{n}.bin", _LIDAR_COLUMNS)),
-            Event(stamp, "radar", partial(_points, folder / layout.radar / f"{n}.bin", layout.radar_columns)),
         ]
+        if layout.radar:
+            scan = folder / layout.radar / f"{n}.bin"
+            events.append(Event(stamp, "radar", partial(_points, scan, layout.radar_columns)))
     for drive in _drives(stamps, T_odom_base):
         events += ego_events([stamps[n] for n in drive], [T_odom_base[n] for n in drive])
     events.sort(key=lambda event: event.stamp_ns)
@@ -120,7 +122,8 @@ def _read(folder: Path, layout: Layout, vehicle: str, day: str) -> Recording:
 
 def _calibration(
     folder: Path, layout: Layout, frame: str, image: Path
-) -> tuple[Camera, Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]]:
+) -> tuple[Camera, Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"] | None]:
+    """The camera, T_camera_lidar and T_lidar_radar, None without a radar."""
     path = folder / layout.calib / f"{frame}.txt"
     lines = _lines(path)
     data = np.frombuffer(read_bytes(image), np.uint8)
@@ -130,6 +133,8 @@ def _calibration(
     P = _matrix(path, lines, "P2")
     camera = Camera("plumb_bob", P[:3, :3].copy(), np.zeros(5), pixels.shape[1], pixels.shape[0])
     T_camera_lidar = _rectified(path, lines, P) @ _matrix(path, lines, "Tr_velo_to_cam")
+    if not layout.radar:
+        return camera, T_camera_lidar, None
     if not layout.radar_calib:
         return camera, T_camera_lidar, _matrix(path, lines, "Tr_radar_to_velo")
     path = folder / layout.radar_calib / f"{frame}.txt"

@@ -55,7 +55,9 @@ def write_log(path: Path, recording: Recording) -> int:
         return log.finish()
 
 
-def fleet_text(name: str, vehicles: Sequence[str], models: tuple[str, str] | None, *, ego: bool) -> str:
+def fleet_text(
+    name: str, vehicles: Sequence[str], models: tuple[str, str] | None, *, ego: bool, radar: bool = True
+) -> str:
     """fleet.toml of converted logs.
 
     Args:
@@ -63,6 +65,7 @@ def fleet_text(name: str, vehicles: Sequence[str], models: tuple[str, str] | Non
         vehicles: all on one rig.
         models: manifests of a segmenter and a detector; None names topics for semantics that the logs do not hold.
         ego: the logs hold odometry.
+        radar: the logs hold scans of a radar.
     """
     if models is None:
         semantics = {
@@ -73,11 +76,12 @@ def fleet_text(name: str, vehicles: Sequence[str], models: tuple[str, str] | Non
     else:
         semantics = {"source": "onnx", "segmenter": models[0], "detector": models[1]}
     inline = ", ".join(f"{key} = {json.dumps(value)}" for key, value in semantics.items())
+    scans = f'points = "{TOPICS["radar"]}"\ndoppler_field = "doppler"\ndoppler_positive = "receding"'
     lines = [
         f"[fleet]\nname = {json.dumps(name)}",
         f'[rigs.default.camera]\nimage = "{TOPICS["image"]}"\ninfo = "{TOPICS["info"]}"\nsemantics = {{ {inline} }}',
         f'[rigs.default.lidar]\npoints = "{TOPICS["lidar"]}"',
-        f'[rigs.default.radar]\npoints = "{TOPICS["radar"]}"\ndoppler_field = "doppler"\ndoppler_positive = "receding"',
+        *([f"[rigs.default.radar]\n{scans}"] if radar else []),
         *([f'[rigs.default.ego]\nodometry = "{TOPICS["ego"]}"'] if ego else []),
         '[rigs.default.prior]\nsource = "tf_static"',
         *(f'[vehicles.{json.dumps(vehicle)}]\nrig = "default"' for vehicle in vehicles),

@@ -41,7 +41,7 @@ class Recording:
         day: YYYY-MM-DD.
         name: of the log.
         camera: intrinsics.
-        T_base: T_base_sensor of camera (optical), lidar and radar (both x forward, y left, z up).
+        T_base: T_base_sensor of camera (optical), lidar and, where there is one, radar (both x forward, y left, z up).
         events: in order of their stamps; radar columns hold x, y, z, doppler (range rate, positive = receding).
     """
 

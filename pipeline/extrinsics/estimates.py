@@ -17,7 +17,10 @@ __all__ = ["PairEstimate", "Prior", "Solution"]
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known before the day: two transforms, the third composed of them, each with isotropic sigmas."""
+    """What is known before the day: two transforms, the third composed of them, each with isotropic sigmas.
+
+    A transform that the rig or the day lacks is NaN; a rig without a lidar has the third one alone.
+    """
 
     T_camera_lidar: np.ndarray
     T_lidar_radar: np.ndarray
@@ -26,14 +29,21 @@ class Prior:
     # What an earlier day found, where one was accepted: a place to look at, no information.
     T_camera_lidar_before: np.ndarray | None = None
     camera: CameraPrior = field(default_factory=CameraPrior)
+    T_camera_radar_alone: np.ndarray | None = None  # of a rig, or a day, without a lidar
 
     @property
     def T_camera_radar(self) -> Float[np.ndarray, "4 4"]:
-        """T_camera_lidar @ T_lidar_radar."""
-        return self.T_camera_lidar @ self.T_lidar_radar
+        """T_camera_lidar @ T_lidar_radar; the one given alone where these are unknown."""
+        composed = self.T_camera_lidar @ self.T_lidar_radar
+        alone = self.T_camera_radar_alone
+        return composed if alone is None or np.isfinite(composed).all() else alone
+
+    def knows(self, pair: str) -> bool:
+        """Whether there is a prior of this pair."""
+        return bool(np.isfinite(self.of(pair)).all())
 
     def of(self, pair: str) -> Float[np.ndarray, "4 4"]:
-        """Prior transform of camera_lidar, camera_radar or lidar_radar."""
+        """Prior transform of camera_lidar, camera_radar or lidar_radar; NaN where it is unknown."""
         return {
             "camera_lidar": self.T_camera_lidar,
             "camera_radar": self.T_camera_radar,
@@ -43,7 +53,7 @@ class Prior:
     def covariance(self, pair: str) -> Float[np.ndarray, "6 6"]:
         """Prior covariance (rotation vector, translation; left perturbation); camera_radar composes the other two."""
         base = np.diag([self.rotation_sigma_rad**2] * 3 + [self.translation_sigma_m**2] * 3)
-        if pair != "camera_radar":
+        if pair != "camera_radar" or not (self.knows("camera_lidar") and self.knows("lidar_radar")):
             return base
         # Each prior is isotropic about its own sensor: the second one is only rotated into camera axes, no lever arm.
         A = adjoint(self.T_camera_lidar).copy()
@@ -76,7 +86,7 @@ class PairEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """All three pairs, and how far the loop of three independent estimates is open, where the method made three.
+    """The pairs of the day, and how far the loop of three independent estimates is open, where the method made three.
 
     The loop's angle counts the rotations that were estimated independently; its translation is None where none was, as
     in `joint`, whose camera-radar estimate without the lidar takes its position from the prior.

@@ -16,13 +16,14 @@ from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.geometry.spherical import to_spherical
 from pipeline.ingest.doppler_speed import doppler_speed
-from pipeline.ingest.frame_builder import FrameBuilder, Rejected
+from pipeline.ingest.frame_builder import FrameBuilder, Rejected, lacks_prior
 from pipeline.ingest.index import ACCEPTED_TYPES, NEEDED, DayIndex, index_logs, topics_of
 from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
 from pipeline.ingest.stage import pick_trios, read_file_prior
 from pipeline.ingest.sync import constant_gap_ns
 from pipeline.results import Progress, silent
-from pipeline.rigs import OnnxSemantics, Rig
+from pipeline.rigs import OnnxSemantics, RadarTopics, Rig
+from schemas.calibrations import SENSORS, pairs_of
 from schemas.frames import Frame
 
 __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
@@ -45,7 +46,7 @@ class TopicFinding:
 
 @dataclass(frozen=True)
 class SyncQuality:
-    """How sweeps meet images and scans: median distance to the nearest, and trios within the gate.
+    """How sweeps meet images and scans: median distance to the nearest, and moments within the gate.
 
     `gate_ms` is of raw stamps, None where the gate is by motion; `camera_offset_ms` and `radar_offset_ms` are the
     constant parts of the gaps, 0 where sensors run freely.
@@ -106,6 +107,7 @@ def check_logs(
                 index.complain(str(outcome))
             progress(done, len(picked), "frames looked at")
         frame_ids = builder.frame_ids
+        without = Counter({k: n for k, n in builder.counts.items() if k.startswith("without_")})
     finally:
         index.close()
     usable = round(len(trios) * len(frames) / len(picked)) if trios else 0
@@ -122,7 +124,7 @@ def check_logs(
         frame_ids=frame_ids,
         has_point_time=any(f.lidar_time_s is not None for f in frames),
         has_odometry=any(f.ego_speed_mps is not None for f in frames),
-        rejected={str(k): int(v) for k, v in (rejected + index.damage).items() if v},
+        rejected={str(k): int(v) for k, v in (rejected + index.damage + without).items() if v},
         problems=index.problems,
         advice=_advice(frames, rig, topics, usable),
     )
@@ -132,22 +134,27 @@ def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:
     def share(flags: list[bool]) -> float:
         return float(np.mean(flags)) if flags else 0.0
 
-    uses_models = isinstance(rig.camera.semantics, OnnxSemantics)
+    # A rig without a camera lacks no labels, but has no boxes either.
+    has_labels = rig.camera is None or isinstance(rig.semantics, OnnxSemantics)
     moving, problem = _motion(frames, rig)
     rings = max((_rings(f) for f in frames), default=0)
+    seen, swept, scanned = ([f for f in frames if sensor in f.sensors] for sensor in SENSORS)
     return Evidence(
         frames=usable,
-        has_prior=share(
-            [f.prior_camera_lidar_qw is not None and f.prior_lidar_radar_qw is not None for f in frames]
-        )
-        > 0.5,
-        labels_share=1.0 if uses_models else share([f.labels_png is not None for f in frames]),
-        detections_share=1.0 if uses_models else share([f.detection_boxes_px is not None for f in frames]),
-        has_intensity=share([f.lidar_intensity is not None for f in frames]) > 0.5,
+        has_prior=share([not lacks_prior(f.sensors, f.__dict__) for f in frames]) > 0.5,
+        labels_share=1.0 if has_labels else share([f.labels_png is not None for f in seen]),
+        detections_share=1.0
+        if isinstance(rig.semantics, OnnxSemantics)
+        else share([f.detection_boxes_px is not None for f in seen]),
+        has_intensity=share([f.lidar_intensity is not None for f in swept]) > 0.5,
         rings=rings,
-        elevation_share=share([f.radar_has_elevation for f in frames]),
+        elevation_share=share([f.radar_has_elevation for f in scanned]),
         moving_share=moving,
         doppler_problem=problem,
+        frames_of={
+            pair: round(usable * share([pair in pairs_of(f.sensors) for f in frames]))
+            for pair in pairs_of(rig.sensors)
+        },
     )
 
 
@@ -163,19 +170,19 @@ def _rings(frame: Frame) -> int:
 
 def _motion(frames: list[Frame], rig: Rig) -> tuple[float | None, str]:
     """Share of frames in which the car moves, by odometry or else Doppler, and what is wrong with the Doppler."""
-    period = rig.radar.doppler_period_mps
-    fits = []
-    for f in frames:
+    period = None if rig.radar is None else rig.radar.doppler_period_mps
+    fits, scanned = [], [f for f in frames if "radar" in f.sensors]
+    for f in scanned:
         # A radar may look anywhere; a lidar's x axis is taken to point ahead.
         xyz = f.radar_xyz_m.astype(np.float64) @ _prior_rotation(f, "lidar_radar").T
         directions = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
         fits.append(doppler_speed(directions, f.radar_range_rate_mps.astype(np.float64), period))
     speeds = np.array([s for s, share in fits if share > 1 / 3])
     odometry = np.array([f.ego_speed_mps for f in frames if f.ego_speed_mps is not None])
-    fitted = speeds if len(speeds) >= len(frames) / 2 else np.zeros(0)
+    fitted = speeds if len(speeds) >= len(scanned) / 2 else np.zeros(0)
     known = odometry if len(odometry) else fitted
     moving = float(np.mean(np.abs(known) > _MOVING_MPS)) if len(known) else None
-    return moving, _doppler_problem(frames, speeds, rig)
+    return moving, "" if rig.radar is None else _doppler_problem(scanned, speeds, rig.radar)
 
 
 def _prior_rotation(frame: Frame, pair: str) -> Float[np.ndarray, "3 3"]:
@@ -186,8 +193,8 @@ def _prior_rotation(frame: Frame, pair: str) -> Float[np.ndarray, "3 3"]:
     return from_quaternion(np.array(q, np.float64), np.zeros(3))[:3, :3]
 
 
-def _doppler_problem(frames: list[Frame], speeds: Float[np.ndarray, " N"], rig: Rig) -> str:
-    period = rig.radar.doppler_period_mps
+def _doppler_problem(frames: list[Frame], speeds: Float[np.ndarray, " N"], radar: RadarTopics) -> str:
+    period = radar.doppler_period_mps
     spans = [float(np.ptp(f.radar_range_rate_mps)) for f in frames]
     if period is not None and spans and max(spans) > 1.05 * period:
         return f"Doppler spans {max(spans):.1f} m/s, more than doppler_period_mps = {period:g} allows"
@@ -197,9 +204,9 @@ def _doppler_problem(frames: list[Frame], speeds: Float[np.ndarray, " N"], rig: 
         )
     moving = speeds[np.abs(speeds) > _MOVING_MPS]
     if len(moving) >= 3 and np.mean(moving < 0) > 2 / 3:
-        if rig.radar.velocity_fields is not None:
+        if radar.velocity_fields is not None:
             return "the car would drive backwards: velocity_fields must be relative to the radar, x ahead"
-        other = "receding" if rig.radar.doppler_positive == "approaching" else "approaching"
+        other = "receding" if radar.doppler_positive == "approaching" else "approaching"
         return f'the car would drive backwards: doppler_positive is probably "{other}"'
     return ""
 
@@ -224,9 +231,12 @@ def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
 
 
 def _sync(index: DayIndex, trios: int, config: IngestConfig) -> SyncQuality:
-    lidar, image, radar = (np.unique(index.stream(role).stamps_ns) for role in ("lidar", "image", "radar"))
+    lidar, image, radar = (
+        np.unique(index.stream(role).stamps_ns) for role in (index.anchor, "image", "radar")
+    )
+    radar = radar if index.anchor == "lidar" else radar[:0]
     return SyncQuality(
-        sweeps=len(index.stream("lidar").stamps),
+        sweeps=len(index.stream(index.anchor).stamps),
         trios=trios,
         camera_median_ms=_median_distance_ms(lidar, image),
         radar_median_ms=_median_distance_ms(lidar, radar),
@@ -257,7 +267,11 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
             advice.append(
                 "the image's frame id is no optical frame (x right, y down, z forward): check /tf_static"
             )
-    if rig.ego is None:
+    if rig.ego is None and rig.radar is None:
+        advice.append(
+            "no odometry configured, and no radar: the car's speed and the time offset stay unknown"
+        )
+    elif rig.ego is None:
         advice.append(
             "no odometry configured: ego speed comes from Doppler, by which the lidar is de-skewed but for turns"
         )
@@ -265,7 +279,7 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
         advice.append(
             f"{rig.ego.odometry} never brackets a sweep: the lidar is de-skewed by Doppler, but for turns"
         )
-    if frames and all(f.lidar_time_s is None for f in frames):
+    if any("lidar" in f.sensors for f in frames) and all(f.lidar_time_s is None for f in frames):
         advice.append("the lidar logs no time per point: sweeps cannot be de-skewed")
     if 0 < usable < 100:
         advice.append(f"{usable} frames: a calibration takes 100 where it can, so log a longer drive")

@@ -54,7 +54,7 @@ ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
 }
 _MOST_OPEN_FILES = 65536  # as many minutes are 45 days: more than one vehicle-day has
 _MOST_CAMERAS = 1000  # distinct camera_info contents remembered: a bound where a driver writes noise into it
-# Roles without which there is no frame.
+# Roles without which a sensor is missing.
 NEEDED = ("image", "info", "lidar", "radar")
 
 
@@ -99,9 +99,14 @@ class DayIndex:
     camera_of_bytes: dict[bytes, Camera | str] = field(default_factory=dict)
     reading: Reading | None = None  # None: all of the day is read
 
+    @property
+    def anchor(self) -> str:
+        """The role whose messages moments are built about: the lidar's, the radar's where there is no sweep."""
+        return "lidar" if self.stream("lidar").stamps or not self.stream("radar").stamps else "radar"
+
     def sweeps_in_bursts(self) -> Int64[np.ndarray, " N"]:
         """Places of the sweeps that may become trios: all, or those that the plan is about."""
-        located = self.stream("lidar").located
+        located = self.stream(self.anchor).located
         if self.reading is None:
             return np.arange(len(located), dtype=np.int64)
         return np.array([i for i, at in enumerate(located) if at.logged_ns in self.reading.bursts], np.int64)
@@ -133,15 +138,16 @@ class DayIndex:
 
 def topics_of(rig: Rig) -> dict[str, str]:
     """Role of each topic that the rig names."""
-    topics = {
-        rig.camera.image: "image",
-        rig.camera.info: "info",
-        rig.lidar.points: "lidar",
-        rig.radar.points: "radar",
-    }
+    topics: dict[str, str] = {}
+    if rig.camera is not None:
+        topics |= {rig.camera.image: "image", rig.camera.info: "info"}
+    if rig.lidar is not None:
+        topics[rig.lidar.points] = "lidar"
+    if rig.radar is not None:
+        topics[rig.radar.points] = "radar"
     topics[rig.prior.topic] = "tf_static"
-    if isinstance(rig.camera.semantics, TopicSemantics):
-        topics |= {rig.camera.semantics.labels: "labels", rig.camera.semantics.detections: "detections"}
+    if isinstance(rig.semantics, TopicSemantics):
+        topics |= {rig.semantics.labels: "labels", rig.semantics.detections: "detections"}
     if rig.ego is not None:
         topics[rig.ego.odometry] = "odometry"
     return topics
@@ -180,7 +186,7 @@ def _read_day(index: DayIndex, rig: Rig, budget: int | None, *, survey: bool) ->
             _read_log(index, number, topics, survey=survey)
         else:
             _read_bursts(index, number, topics, timeline, index.reading.around)
-    if budget is not None and index.reading is None and len(index.stream("lidar").stamps) > budget:
+    if budget is not None and index.reading is None and len(index.stream(index.anchor).stamps) > budget:
         _take_bursts(index, timelines, budget)
     for topic, role in topics.items():
         if role in NEEDED and topic not in index.topics_seen:
@@ -238,12 +244,12 @@ def _read_bursts(
 
 def _take_bursts(index: DayIndex, timelines: Sequence[Timeline | None], budget: int) -> None:
     """Of a long day that had to be read whole, the bursts that become frames; and which logs made it so."""
-    lidar = index.stream("lidar")
-    logged_ns = np.array([at.logged_ns for at in lidar.located], np.int64)
-    index.reading = plan_sweeps(logged_ns, lidar.stamps_ns, index.ego, budget)
+    sweeps = index.stream(index.anchor)
+    logged_ns = np.array([at.logged_ns for at in sweeps.located], np.int64)
+    index.reading = plan_sweeps(logged_ns, sweeps.stamps_ns, index.ego, budget)
     unusable = [n for n, t in zip(index.log_names, timelines, strict=True) if t is None]
     why = f"{', '.join(unusable[:3])}: no usable index" if unusable else "log times do not follow the stamps"
-    index.complain(f"{why}, so all of the day's {len(lidar.stamps)} sweeps were read to take some")
+    index.complain(f"{why}, so all of the day's {len(sweeps.stamps)} sweeps were read to take some")
 
 
 def _allow_open_files() -> None:

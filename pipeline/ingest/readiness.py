@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 __all__ = ["DofVerdict", "Evidence", "judge", "overall"]
 
 # 30 frames give camera-lidar within 0.1 deg and lidar-radar yaw within 0.15 deg on real logs, 10 twice that.
 _ENOUGH_FRAMES, _FEW_FRAMES = 30, 10
 _MOVING_SHARE = 0.2  # time offsets show only where the car moves
+_ORDER = ("camera_lidar", "lidar_radar", "camera_radar")  # in which they are shown: the composed one last
 _DENSE_RINGS = 32  # below, reflectivity on the road has to carry pitch
 
 
@@ -16,7 +18,8 @@ _DENSE_RINGS = 32  # below, reflectivity on the road has to carry pitch
 class Evidence:
     """What a verdict rests on; shares are of the frames looked at, and say nothing where there are none.
 
-    `missing` names the topics without which no frame can be put together: no message of theirs, or of another type.
+    `missing` names the topics without which a sensor is silent: no message of theirs, or of another type. `frames_of`
+    counts by pair of the rig the frames that have both sensors; None = all have all.
     """
 
     frames: int
@@ -29,6 +32,7 @@ class Evidence:
     moving_share: float | None
     doppler_problem: str = ""
     missing: tuple[str, ...] = ()
+    frames_of: Mapping[str, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -43,9 +47,14 @@ class DofVerdict:
 
 def judge(evidence: Evidence) -> list[DofVerdict]:
     """One verdict per pair and class of DoF, the weakest of what it needs."""
-    if evidence.frames == 0:
-        return [_verdict(pair, dof, _without_frames(evidence)) for pair, dof, _ in _needs(evidence)]
-    return [_verdict(pair, dof, needs) for pair, dof, needs in _needs(evidence)]
+    of_pair = dict.fromkeys(_ORDER, evidence.frames) if evidence.frames_of is None else evidence.frames_of
+    found = []
+    for pair in sorted(of_pair, key=_ORDER.index):
+        count = of_pair[pair]
+        own = replace(evidence, frames=count)
+        needs = [(dof, needs) for of, dof, needs in _needs(own) if of == pair]
+        found += [_verdict(pair, dof, needs if count else _without_frames(own)) for dof, needs in needs]
+    return found
 
 
 def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
@@ -93,9 +102,7 @@ def _common_needs(e: Evidence) -> _Needs:
     elif e.frames < _ENOUGH_FRAMES:
         needs.append(("weak", f"{e.frames} usable frames; {_ENOUGH_FRAMES} or more make it sharp"))
     if not e.has_prior:
-        needs.append(
-            ("no", "no prior: log /tf_static with a chain between the three sensors, or give prior.file")
-        )
+        needs.append(("no", "no prior: log /tf_static with a chain between the sensors, or give prior.file"))
     return needs
 
 

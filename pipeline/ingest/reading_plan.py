@@ -78,11 +78,12 @@ def plan_reading(
         roles: of the rig's topics.
         budget: sweeps that shall be read.
     """
-    lidar = next(topic for topic, role in roles.items() if role == "lidar")
     indexed = {log: t for log, t in logs.items() if t is not None}
-    timeline = Timeline.joined(t for t in indexed.values() if t.messages.get(lidar))
-    sweeps = timeline.messages.get(lidar, 0)
-    counted = timeline.counted.get(lidar)
+    anchor = next((r for r in ("lidar", "radar") if any(_holds(t, r, roles) for t in indexed.values())), "")
+    about = next((topic for topic, role in roles.items() if role == anchor), "")
+    timeline = Timeline.joined(t for t in indexed.values() if t.messages.get(about))
+    sweeps = timeline.messages.get(about, 0)
+    counted = timeline.counted.get(about)
     if counted is None or sweeps <= budget or 2 * len(indexed) < len(logs) or not timeline.recorded.length_ns:
         return None
     day = _Day(tuple(indexed), rig, roles)
@@ -90,7 +91,7 @@ def plan_reading(
     possible = possible_bursts(counted.times_ns(), budget, is_motion_known=bool(by))
     motion = _motion_at(day, possible.middle_ns, by)
     needed = {r for r in ("image", "lidar", "radar") if any(_holds(t, r, roles) for t in indexed.values())}
-    margin_ns = _margin_ns(day, possible.middle_ns, needed)
+    margin_ns = _margin_ns(day, possible.middle_ns, needed, anchor)
     if margin_ns is None:
         return None
     return _reading(possible, motion, sweeps, budget, margin_ns)
@@ -166,6 +167,7 @@ def _by_odometry(message: RawMessage) -> Float[np.ndarray, " 4"]:
 
 def _speed_by_doppler(message: RawMessage, rig: Rig) -> float:
     """Speed by a scan, NaN where it shows no static world."""
+    assert rig.radar is not None, "only a rig with a radar has scans"
     cloud = read_radar(decode(message.channel, message.data), message.channel.msgtype, rig.radar)
     distance = np.linalg.norm(cloud.xyz_m, axis=1, keepdims=True)
     directions = (cloud.xyz_m / np.maximum(distance, 1e-3)).astype(np.float64)
@@ -184,10 +186,10 @@ def _ego_motion(ego: EgoTrack, stamps_ns: Int64[np.ndarray, " M"]) -> BurstMotio
     return motion
 
 
-def _margin_ns(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], needed: set[str]) -> int | None:
+def _margin_ns(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], needed: set[str], anchor: str) -> int | None:
     """By how much longer than a burst the stretch must be that is read for it.
 
-    None where that is too much, or where of the needed roles one is never logged when the lidar is.
+    None where that is too much, or where of the needed roles one is never logged when the anchor is.
     """
     glances = middle_ns[np.unique(np.linspace(0, len(middle_ns) - 1, _LATENCY_GLANCES).round().astype(int))]
     edges = _between(glances)
@@ -200,11 +202,11 @@ def _margin_ns(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], needed: set[str])
             late.setdefault((glance, role), []).append(message.log_time_ns - stamp)
     median = {key: int(np.median(values)) for key, values in late.items()}
     apart = [
-        abs(value - median[glance, "lidar"])
+        abs(value - median[glance, anchor])
         for (glance, _), value in median.items()
-        if (glance, "lidar") in median
+        if (glance, anchor) in median
     ]
-    seen = {role for glance, role in median if (glance, "lidar") in median}
+    seen = {role for glance, role in median if (glance, anchor) in median}
     margin_ns = _MARGIN_NS + max(apart, default=0)
     return margin_ns if needed <= seen and margin_ns <= _MOST_MARGIN_NS else None
 

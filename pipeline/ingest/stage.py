@@ -28,12 +28,13 @@ from pipeline.ingest.sync import (
 from pipeline.results import Progress
 from pipeline.rigs import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
-from schemas.frames import SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ, Frame
+from schemas.frames import SENSORS_ABSENT, SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ, Frame
 from schemas.outcomes import MENDED_IN_FLEET_TOML
 
 __all__ = ["find_trios", "pick_trios", "read_file_prior", "work"]
 
 _PROBLEMS_SHOWN = 3
+_NO_STAMP_NS = -(10**18)  # long before any log
 _SAME_IMAGE_NS = 5_000_000  # labels and detections carry the stamp of the image that they were computed on
 _FAR_FROM_DAY = dt.timedelta(hours=12 + 14 + 12)  # half a day, the earliest time zone, and a night's drive
 _UNUSABLE = (
@@ -50,9 +51,9 @@ _UNUSABLE = (
 def work(task: Task) -> Work:
     """The partition of `frames` that the task's logs give.
 
-    A day without a single usable trio is refused: nothing is written (an empty table would look like a day that was
-    looked at and gave nothing), a partition of earlier inputs stays, and the reason names topics and what to do.
-    `rejected` counts each sweep that became no frame under one Rejection, and damage, dropped points and missing
+    A day without a single moment that two sensors saw is refused: nothing is written (an empty table would look like a
+    day that was looked at and gave nothing), a partition of earlier inputs stays, and the reason names topics and what
+    to do. `rejected` counts each sweep that became no frame under one Rejection, and damage, dropped points and missing
     parts under names of their own.
 
     Raises:
@@ -63,7 +64,7 @@ def work(task: Task) -> Work:
     if missing:
         raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
     file_prior = read_file_prior(rig, task.fleet)
-    prior_key = {} if file_prior is None else {"prior": [T.tolist() for T in file_prior]}
+    prior_key = {} if file_prior is None else {"prior": [T.tolist() for T in file_prior.values()]}
     config = task.fleet.ingest
     wider = (config.wider, config.wider.wider)  # as a night reads a long day that asked for more
     return Work(
@@ -75,7 +76,7 @@ def work(task: Task) -> Work:
 
 
 def _rows(
-    task: Task, rig: Rig, file_prior: tuple[np.ndarray, np.ndarray] | None, run: Run
+    task: Task, rig: Rig, file_prior: dict[str, np.ndarray] | None, run: Run
 ) -> Generator[Frame, None, None]:
     """The day's frames in order of time, one at a time."""
     config = task.fleet.ingest
@@ -94,6 +95,7 @@ def _rows(
             raise NothingUsable(refusal(index, rig, rejected, config))
         _complain_of_date(index, task.partition.day)
         run.extra |= {"problems": index.problems, "logs": index.log_names, "frame_ids": builder.frame_ids}
+        run.extra[SENSORS_ABSENT] = absences(index, rig, builder.counts, config)
         run.remarks = _shorten(index.problems)
     finally:
         index.close()
@@ -101,7 +103,7 @@ def _rows(
 
 def _complain_of_date(index: DayIndex, day: str) -> None:
     """Name a day whose sweeps were stamped on another one, whatever the time zone and also of a drive over midnight."""
-    stamps_ns = index.stream("lidar").stamps_ns
+    stamps_ns = index.stream(index.anchor).stamps_ns
     stamped = dt.datetime.fromtimestamp(float(np.median(stamps_ns)) * 1e-9, dt.UTC)
     if abs(stamped - dt.datetime.fromisoformat(f"{day}T12:00+00:00")) > _FAR_FROM_DAY:
         index.complain(
@@ -112,27 +114,38 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
 def pick_trios(index: DayIndex, config: IngestConfig) -> tuple[list[Trio], Counter[str]]:
     """Trios in order of time, thinned evenly to `max_frames`, and why the other sweeps are left out."""
     found, drives = find_trios(index, config), _drives(index)
-    images_ns = index.stream("image").stamps_ns[found.camera]
+    # Both are as long as there are moments; of one without an image they match nothing.
+    images_ns = np.append(index.stream("image").stamps_ns, _NO_STAMP_NS)[found.camera]
     labels = match_nearest(images_ns, index.stream("labels").stamps_ns, _SAME_IMAGE_NS)
     detections = match_nearest(images_ns, index.stream("detections").stamps_ns, _SAME_IMAGE_NS)
     picked = _spread(len(found.lidar), config.max_frames)
+    anchors = found.lidar if index.anchor == "lidar" else found.radar
     trios = [
         Trio(
-            camera=int(found.camera[i]),
-            lidar=int(found.lidar[i]),
-            radar=int(found.radar[i]),
-            labels=int(labels[i]) if labels[i] >= 0 else None,
-            detections=int(detections[i]) if detections[i] >= 0 else None,
-            drive=int(drives[found.lidar[i]]),
+            camera=_place(found.camera[i]),
+            lidar=_place(found.lidar[i]),
+            radar=_place(found.radar[i]),
+            labels=_place(labels[i]),
+            detections=_place(detections[i]),
+            drive=int(drives[anchors[i]]),
         )
         for i in picked
     ]
     return trios, +(found.rejected + Counter({Rejection.NOT_PICKED: len(found.lidar) - len(picked)}))
 
 
+def _place(at: np.int64) -> int | None:
+    return int(at) if at >= 0 else None
+
+
 def find_trios(index: DayIndex, config: IngestConfig) -> Trios:
-    """All trios of the day, or of its bursts, within the gate that the configuration asks for."""
-    lidar, camera, radar = (index.stream(role).stamps_ns for role in ("lidar", "image", "radar"))
+    """All trios of the day, or of its bursts, within the gate that the configuration asks for.
+
+    Without a sweep all day, the radar's scans with an image.
+    """
+    lidar, camera, radar = (index.stream(role).stamps_ns for role in (index.anchor, "image", "radar"))
+    is_swept = index.anchor == "lidar"
+    radar = radar if is_swept else radar[:0]
     wanted = index.sweeps_in_bursts()
     lidar = lidar[wanted]
     if config.sync_gate_s is not None:
@@ -141,27 +154,56 @@ def find_trios(index: DayIndex, config: IngestConfig) -> Trios:
         speed, yaw_rate = index.ego.motion_at(lidar)
         gates = motion_gates_ns(speed, yaw_rate, config.sync_gate_m, float(np.radians(config.sync_gate_deg)))
         found = match_by_motion(lidar, camera, radar, gates)
-    return replace(found, lidar=wanted[found.lidar])
+    taken = wanted[found.lidar]
+    return replace(found, lidar=taken) if is_swept else replace(found, lidar=found.radar, radar=taken)
 
 
 def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig) -> str:
     """Why a day gives no frame, in words: which topic, and what to do."""
     topics = {role: topic for topic, role in topics_of(rig).items()}
-    absent = [f"{topics[r]} ({r})" for r in ("image", "lidar", "radar") if not index.stream(r).stamps]
-    if absent:
-        mend = f"mend the topics {MENDED_IN_FLEET_TOML} (see `boresight check`)"
-        what = f"no usable message on {', '.join(absent)}: {mend}"
+    streams = [r for r in ("image", "lidar", "radar") if r in topics]
+    absent = [f"{topics[r]} ({r})" for r in streams if not index.stream(r).stamps]
+    if len(streams) - len(absent) < 2:
+        what = _nothing_on(", ".join(absent))
     elif rejected.get(Rejection.CAMERA_INFO):
-        what = f"no usable intrinsics on {topics['info']}: log a sensor_msgs/CameraInfo with a calibrated K"
+        what = _no_intrinsics(topics["info"])
     elif not set(rejected) & set(_UNUSABLE):
-        what = (
-            f"no sweep of {topics['lidar']} has an image of {topics['image']} and a scan of "
-            f"{topics['radar']} {_near_enough(config)}"
-        )
+        of = {"image": "an image", "lidar": "a sweep", "radar": "a scan"}
+        met = " and ".join(f"{of[r]} of {topics[r]}" for r in streams if f"{topics[r]} ({r})" not in absent)
+        what = f"{met} never come {_near_enough(config)}"
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
-        what = f"every synchronised trio was unusable, most often {reason} ({rejected[reason]})"
+        what = f"of no moment two sensors were usable, most often {reason} ({rejected[reason]})"
     return _shorten([what, *index.problems])
+
+
+def absences(index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConfig) -> dict[str, str]:
+    """Why moments lack a sensor of the rig, in words, by sensor: which topic, and what to do."""
+    topics = {role: topic for topic, role in topics_of(rig).items()}
+    found = {}
+    for sensor in rig.sensors:
+        role = "image" if sensor == "camera" else sensor
+        own = Counter({r: counts[f"without_{sensor}_{r}"] for r in Rejection})
+        reason, count = own.most_common(1)[0]
+        if not count:
+            continue
+        if not index.stream(role).stamps:
+            found[sensor] = _nothing_on(f"{topics[role]} ({role})")
+        elif reason == Rejection.CAMERA_INFO:
+            found[sensor] = _no_intrinsics(topics["info"])
+        elif reason in (Rejection.NO_CAMERA, Rejection.NO_RADAR):
+            found[sensor] = f"nothing of {topics[role]} is near enough: not {_near_enough(config)}"
+        else:
+            found[sensor] = f"{topics[role]} was unusable, most often {reason} ({count})"
+    return found
+
+
+def _nothing_on(topics: str) -> str:
+    return f"no usable message on {topics}: mend the topics {MENDED_IN_FLEET_TOML} (see `boresight check`)"
+
+
+def _no_intrinsics(topic: str) -> str:
+    return f"no usable intrinsics on {topic}: log a sensor_msgs/CameraInfo with a calibrated K"
 
 
 def _near_enough(config: IngestConfig) -> str:
@@ -176,24 +218,24 @@ def _near_enough(config: IngestConfig) -> str:
     )
 
 
-def read_file_prior(rig: Rig, fleet: FleetConfig) -> tuple[np.ndarray, np.ndarray] | None:
-    """T_camera_lidar and T_lidar_radar of a prior file, None where the prior comes from /tf_static.
+def read_file_prior(rig: Rig, fleet: FleetConfig) -> dict[str, np.ndarray] | None:
+    """Transforms of a prior file by pair, None where the prior comes from /tf_static.
 
     Raises:
-        ConfigError: no such file, or no two rigid 4x4 transforms in it.
+        ConfigError: no such file, or not the rigid 4x4 transforms in it that the rig needs.
     """
     if rig.prior.file is None:
         return None
-    transforms = read_transforms(fleet.path_of(rig.prior.file))
-    return transforms["camera_lidar"], transforms["lidar_radar"]
+    found = read_transforms(fleet.path_of(rig.prior.file), rig.sensors)
+    return {pair: T for pair, T in found.items() if len(found) == 1 or pair != "camera_radar"}
 
 
 def _drives(index: DayIndex) -> Int64[np.ndarray, " N"]:
     """Drive of each sweep, by its place in the stream."""
-    lidar = index.stream("lidar")
-    order = np.argsort(lidar.stamps_ns, kind="stable")
+    sweeps = index.stream(index.anchor)
+    order = np.argsort(sweeps.stamps_ns, kind="stable")
     drives = np.zeros(len(order), np.int64)
-    drives[order] = number_drives([lidar.stamps[i] for i in order], [lidar.located[i].log for i in order])
+    drives[order] = number_drives([sweeps.stamps[i] for i in order], [sweeps.located[i].log for i in order])
     return drives
 
 

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Float, Int, Int64
+from jaxtyping import Bool, Float, Int, Int64
+
+from schemas.frames import SAME_SCENE_NS
 
 __all__ = [
     "Rejection",
@@ -31,10 +33,14 @@ _UNKNOWN_MPS, _UNKNOWN_RADPS, _OTHERS_MPS = 40.0, float(np.radians(30.0)), 10.0
 
 
 class Rejection(StrEnum):
-    """Why a lidar sweep became no frame; each sweep is kept or counted under exactly one of these."""
+    """Why a lidar sweep became no frame; each sweep is kept or counted under exactly one of these.
+
+    Of a moment that is kept without a sensor, why it lacks that is counted as `without_SENSOR_REASON`.
+    """
 
     DUPLICATE_STAMP = "duplicate_stamp"
     NO_CAMERA = "no_camera_in_gate"
+    NO_LIDAR = "no_lidar_all_day"
     NO_RADAR = "no_radar_in_gate"
     SPREAD = "camera_radar_outside_gate"
     NOT_PICKED = "beyond_max_frames"
@@ -51,7 +57,7 @@ class Rejection(StrEnum):
 class Trios:
     """Indices into the three stamp lists, in order of the lidar's stamp, and why sweeps found no partner.
 
-    `len(lidar) + sum(rejected.values())` is the number of sweeps.
+    -1 where a moment has no image or no scan. `len(lidar) + sum(rejected.values())` is the number of sweeps.
     """
 
     lidar: Int64[np.ndarray, " N"]
@@ -103,6 +109,8 @@ def match_trios(
     gate_ns: int,
 ) -> Trios:
     """Synchronised trios: every two stamps of one lie within the gate (paper, section 4.5.1: under 5 ms).
+
+    A sweep with an image or a scan alone is taken where no whole trio within a second shows the same scene.
 
     Stamps may come in any order and more than once: the first of equal stamps counts.
     """
@@ -203,6 +211,8 @@ def _gated(
 ) -> Trios:
     """The trios of which every two stamps, less the constant gaps, lie within the sweep's gate; the others counted.
 
+    Sweeps with one partner are taken far from whole trios only: there a sensor is silent or the rig has none.
+
     `once` are the places of the stamps that count, of lidar, camera and radar; `partners` are places in those of camera
     and radar, -1 = none.
     """
@@ -216,17 +226,35 @@ def _gated(
     has_camera = (partners[0] >= 0) & (np.abs(gaps[0]) <= gates)
     has_radar = (partners[1] >= 0) & (np.abs(gaps[1]) <= gates)
     both = has_camera & has_radar
-    kept = both & (np.abs(gaps[0] - gaps[1]) <= gates)
+    whole = both & (np.abs(gaps[0] - gaps[1]) <= gates)
+    kept = whole | ((has_camera ^ has_radar) & _far_from(own, own[whole]))
+    lacks_camera = ~kept & ~has_camera & (len(stamps_ns[1]) > 0 or len(stamps_ns[2]) == 0)
     rejected = Counter[str](
         {
             Rejection.DUPLICATE_STAMP: len(stamps_ns[0]) - len(lidar),
-            Rejection.NO_CAMERA: int(np.sum(~has_camera)),
-            Rejection.NO_RADAR: int(np.sum(has_camera & ~has_radar)),
+            Rejection.NO_CAMERA: int(np.sum(lacks_camera)),
+            Rejection.NO_RADAR: int(np.sum(~kept & ~has_radar & ~lacks_camera)),
             Rejection.SPREAD: int(np.sum(both & ~kept)),
         }
     )
-    camera, radar = (once[i + 1][partners[i][kept]] for i in (0, 1))
+    camera, radar = (
+        np.where(has[kept], _at(once[i + 1], partners[i][kept]), -1)
+        for i, has in enumerate((has_camera, has_radar))
+    )
     return Trios(lidar[kept], camera, radar, +rejected, *constant_ns)
+
+
+def _at(places: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """`places[index]`, -1 where the index is."""
+    return np.append(places, -1)[index]
+
+
+def _far_from(
+    stamps_ns: Int64[np.ndarray, " N"], others_ns: Int64[np.ndarray, " M"]
+) -> Bool[np.ndarray, " N"]:
+    """True where none of `others_ns`, in order, is so near in time that it shows the same scene."""
+    first = np.searchsorted(others_ns, stamps_ns - SAME_SCENE_NS, "left")
+    return first == np.searchsorted(others_ns, stamps_ns + SAME_SCENE_NS, "right")
 
 
 def number_drives(stamps_ns: Sequence[int], logs: Sequence[int]) -> Int64[np.ndarray, " N"]:

@@ -20,13 +20,15 @@ __all__ = ["camera_gaps_s", "constant_gap_s", "radar_gaps_s", "scan_to_image_s"]
 
 
 def camera_gaps_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:
-    """Image stamp minus sweep stamp of each frame [s]."""
-    return np.array([(o.camera_stamp_ns - o.stamp_ns) * 1e-9 for o in observations], np.float64)
+    """Image stamp minus sweep stamp of each frame [s]; the others' median of a frame without a camera."""
+    gaps = np.array([(o.camera_stamp_ns - o.stamp_ns) * 1e-9 for o in observations], np.float64)
+    return _filled(gaps, "camera", observations)
 
 
 def radar_gaps_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:
-    """Scan stamp minus sweep stamp of each frame [s]."""
-    return np.array([(o.radar_stamp_ns - o.stamp_ns) * 1e-9 for o in observations], np.float64)
+    """Scan stamp minus sweep stamp of each frame [s]; the others' median of a frame without a radar."""
+    gaps = np.array([(o.radar_stamp_ns - o.stamp_ns) * 1e-9 for o in observations], np.float64)
+    return _filled(gaps, "radar", observations)
 
 
 def constant_gap_s(gaps_s: Float[np.ndarray, " F"]) -> float:
@@ -38,3 +40,9 @@ def scan_to_image_s(observations: Sequence[Observation]) -> Float[np.ndarray, " 
     """By how much each scan was taken after its image [s], if the constant gaps of both are errors of their clocks."""
     radar, camera = radar_gaps_s(observations), camera_gaps_s(observations)
     return (radar - constant_gap_s(radar)) - (camera - constant_gap_s(camera))
+
+
+def _filled(gaps_s: np.ndarray, sensor: str, observations: Sequence[Observation]) -> np.ndarray:
+    """The gaps, with the constant one where the sensor is absent, so that it counts for nothing."""
+    there = np.array([sensor in o.sensors for o in observations], bool)
+    return gaps_s if there.all() else np.where(there, gaps_s, constant_gap_s(gaps_s[there]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, NamedTuple
@@ -29,8 +29,9 @@ from pipeline.perceive.tracks import EgoMotion, Tracks, TrackState, advance_trac
 from pipeline.rigs import LidarTopics, OnnxSemantics, RadarTopics, TopicSemantics
 from pipeline.store.tables import iterate_rows
 from pipeline.work import NothingUsable, Run, Task, Work
+from schemas.calibrations import PAIRS
 from schemas.faults import FAULTS
-from schemas.frames import FRAMES, Frame
+from schemas.frames import FRAMES, SAME_SCENE_NS, Frame
 from schemas.observations import Observation
 
 __all__ = ["perceive_frame", "work"]
@@ -42,9 +43,7 @@ WITHOUT_ROWS: Final = "frames_without_lidar_rows"
 BY_DOPPLER: Final = "frames_deskewed_by_doppler"
 AS_LOGGED: Final = "frames_not_deskewed"
 _PRIOR_FIELDS = [
-    f"prior_{pair}_{part}"
-    for pair in ("camera_lidar", "lidar_radar")
-    for part in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    f"prior_{pair}_{part}" for pair in PAIRS for part in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 ]
 _COPIED_FIELDS = [
     "frame_index", "log", "drive", "stamp_ns", "camera_stamp_ns", "radar_stamp_ns",
@@ -52,11 +51,34 @@ _COPIED_FIELDS = [
     "radar_power_db", "radar_has_elevation", *_PRIOR_FIELDS,
 ]  # fmt: skip
 
+_XYZ, _EACH, _LABEL = np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32)
+_BYTE = np.zeros(0, np.uint8)
+# What an observation holds of a sensor that it goes without.
+_NO_CAMERA: dict[str, Any] = {
+    "labels_png": b"", "sky_fraction": 0.0, "drivable_fraction": 0.0, "road_contrast_png": None,
+    "road_user_boxes_px": np.zeros((0, 4), np.float32), "road_user_classes": [], "road_user_scores": _EACH,
+}  # fmt: skip
+_NO_LIDAR: dict[str, Any] = {
+    "lidar_map_xyz_m": _XYZ, "lidar_map_is_ground": _BYTE, "lidar_map_cluster": _LABEL,
+    "lidar_cluster_centre_m": _XYZ, "lidar_cluster_min_m": _XYZ, "lidar_cluster_max_m": _XYZ,
+    "lidar_edge_xyz_m": _XYZ, "lidar_edge_side": _BYTE, "lidar_edge_jump_m": _EACH,
+    "lidar_edge_gap_rad": _EACH, "lidar_edge_points": _LABEL, "marking_xyz_m": _XYZ, "marking_z": _EACH,
+    "ground_plane": None, "lidar_drivable_xyz_m": _XYZ,
+}  # fmt: skip
+_NO_RADAR: dict[str, Any] = {
+    "radar_xyz_m": _XYZ, "radar_residual_mps": _EACH, "radar_motion": _BYTE, "radar_cluster": _LABEL,
+    "radar_velocity_mps": None, "radar_velocity_cov": None,
+    "radar_track_xyz_m": _XYZ, "radar_track_velocity_mps": _XYZ, "radar_track_id": _LABEL,
+    "radar_track_age": _LABEL, "radar_track_points": _LABEL,
+    "radar_drivable_azimuth_rad": _EACH, "radar_drivable_range_m": _EACH,
+}  # fmt: skip
+
 
 def work(task: Task) -> Work:
     """The partition of `observations` of a day's frames.
 
-    A frame that cannot be used is left out and counted by reason. Where none is left, the partition is empty and the
+    A sensor that cannot be used is left out of its frame, a frame without two sensors is left out, counted by reason.
+    Where none is left, the partition is empty and the
     outcome "refused".
 
     Raises:
@@ -64,7 +86,7 @@ def work(task: Task) -> Work:
         ModelError: a model does not do what its manifest says.
     """
     rig = task.fleet.rig_of(task.partition.vehicle)
-    source, semantics_key = _source(rig.camera.semantics, task.fleet)
+    source, semantics_key = _source(rig.semantics, task.fleet)
     drivable, points = _drivable(rig.radar, task.fleet), _points(rig.lidar, task.fleet)
     for model in (drivable, points):
         semantics_key |= {} if model is None else model.provenance
@@ -86,11 +108,12 @@ def work(task: Task) -> Work:
 def _rows(task: Task, perceive: Callable[..., Perceived], run: Run) -> Generator[Observation, None, None]:
     """The day's observations, a row group of frames in memory at a time."""
     total, state, seen = task.inputs[FRAMES.name].rows, TrackState.empty(), 0
+    whole_ns = -SAME_SCENE_NS
     for group in iterate_rows(task.lake, FRAMES, task.partition, Frame):
         for frame in group:
             found: Perceived | None = None
             try:
-                found = perceive(frame, tracks=state)
+                found = perceive(frame, tracks=state, alone=frame.stamp_ns - whole_ns > SAME_SCENE_NS)
             except FrameRejectedError as rejection:
                 run.rejected[rejection.reason.value] += 1
             except ModelOutputError as err:
@@ -99,8 +122,10 @@ def _rows(task: Task, perceive: Callable[..., Perceived], run: Run) -> Generator
             run.progress(seen, total, "perceive")
             if found is not None:
                 state = found.tracks
+                whole_ns = whole_ns if found.unusable else frame.stamp_ns
                 run.kept.update([] if found.lidar_has_rows else [WITHOUT_ROWS])
                 run.kept.update([] if found.deskew is None else [found.deskew])
+                run.rejected.update(f"without_{sensor}_{why.value}" for sensor, why in found.unusable.items())
                 yield found.observation
 
 
@@ -111,66 +136,70 @@ class Perceived(NamedTuple):
     tracks: TrackState
     lidar_has_rows: bool  # a rosette has none
     deskew: str | None  # of a sweep that came as logged though its points have times: BY_DOPPLER or AS_LOGGED
+    unusable: Mapping[
+        str, FrameReason
+    ] = {}  # sensors that the observation goes without, beside the frame's own
 
 
 def perceive_frame(
     frame: Frame,
-    source: SemanticsSource,
+    source: SemanticsSource | None,
     config: PerceiveConfig,
     tracks: TrackState,
     drivable: DrivableSource | None = None,
     points: PointSource | None = None,
     *,
     deskew: bool = True,
+    alone: bool = True,
 ) -> Perceived:
     """Everything that one frame shows, and the radar tracks carried on.
 
     Args:
         frame: the next of the day.
-        source: of the camera's semantics.
+        source: of the camera's semantics; None for a rig without a camera.
         config: gates and sizes.
         tracks: from the frame before.
         drivable: network for the radar's drivable area, which remembers the scans before; None = geometry.
         points: model that tells what lidar points are; None = geometry.
         deskew: sweeps that ingest had no odometry for, by the radar's velocity.
+        alone: no frame with all its sensors shows the same scene; else one that lacks a sensor is not worth having.
 
     Raises:
         ModelError: a model does not do what its manifest says.
-        FrameRejectedError: the frame cannot be used; `tracks` stay as they were.
+        FrameRejectedError: a sensor cannot be used, and not two are left or the frame is not alone; `tracks` stay.
     """
-    _check(frame)
-    semantics = source.read(frame)
-    grey = decode_grey(frame, config.label_scale)
-    contrast = road_contrast(grey, semantics.labels == ROAD_ID)
+    unusable = _unusable(frame)
+    camera = _NO_CAMERA
+    if "camera" in frame.sensors and "camera" not in unusable:
+        try:
+            camera = _perceive_camera(frame, source, config)
+        except FrameRejectedError as why:
+            unusable["camera"] = why.reason
+    sensors = [sensor for sensor in frame.sensors if sensor not in unusable]
+    if len(sensors) < 2 or (unusable and not alone):
+        raise FrameRejectedError(next(iter(unusable.values())))
     # One generator per frame: the result does not depend on which frames came before.
     seed = [frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index]
     rng, own = np.random.default_rng(seed), None
     if deskew and not frame.lidar_deskewed and frame.lidar_time_s is not None:
         own = _motion(frame, config, np.random.default_rng([*seed, 1]))
     swept = frame if own is None else _deskewed(frame, own)
-    lidar, has_rows = _perceive_lidar(swept, config, rng, points)
+    lidar, has_rows = _perceive_lidar(swept, config, rng, points) if "lidar" in sensors else (_NO_LIDAR, True)
     motion = _motion(frame, config, rng) if own is None else own
     radar, state = _perceive_radar(frame, motion, tracks, drivable)
     copied = {name: getattr(frame, name) for name in _COPIED_FIELDS}
-    users = semantics.detections
     observation = Observation(
         **copied,
+        **camera,
         **lidar,
         **radar,
+        sensors=sensors,
         ego_speed_mps=_ego_speed(frame, motion),
         ego_yaw_rate_radps=frame.ego_yaw_rate_radps,
-        labels_png=encode_png(semantics.labels),
         label_scale=config.label_scale,
-        sky_fraction=semantics.sky_fraction,
-        drivable_fraction=semantics.drivable_fraction,
-        road_user_boxes_px=users.boxes_px,
-        road_user_classes=users.classes,
-        road_user_scores=users.scores,
-        road_contrast_png=encode_png(contrast),
-        label_gradients=label_gradients(grey, semantics.labels),
     )
     how = None if own is None else AS_LOGGED if swept is frame else BY_DOPPLER
-    return Perceived(observation, state, has_rows, how)
+    return Perceived(observation, state, has_rows, how, unusable)
 
 
 def _motion(frame: Frame, config: PerceiveConfig, rng: np.random.Generator) -> RadarMotion:
@@ -200,9 +229,11 @@ class _Sweep:
 
 
 def _source(
-    wanted: TopicSemantics | OnnxSemantics, fleet: FleetConfig
-) -> tuple[SemanticsSource, dict[str, Any]]:
-    """Where semantics come from, and what of it belongs into the work key."""
+    wanted: TopicSemantics | OnnxSemantics | None, fleet: FleetConfig
+) -> tuple[SemanticsSource | None, dict[str, Any]]:
+    """Where semantics come from, and what of it belongs into the work key; nowhere without a camera."""
+    if wanted is None:
+        return None, {}
     if isinstance(wanted, TopicSemantics):
         keyed = wanted.model_dump(mode="json", include={"source", "label_set", "classes"})
         return TopicSource(wanted, fleet.perceive), keyed
@@ -213,15 +244,43 @@ def _source(
     return models, {"source": "onnx", **models.provenance}
 
 
-def _check(frame: Frame) -> None:
-    try:
-        camera_of(frame)
-    except ValueError as err:
-        raise FrameRejectedError(FrameReason.CAMERA_MODEL) from err
-    if len(frame.lidar_x_m) < _MIN_LIDAR_POINTS:
-        raise FrameRejectedError(FrameReason.FEW_LIDAR_POINTS)
-    if not len(frame.radar_x_m):
-        raise FrameRejectedError(FrameReason.FEW_RADAR_POINTS)
+def _unusable(frame: Frame) -> dict[str, FrameReason]:
+    """Sensors of the frame whose columns say too little, and why; the image itself is not looked at."""
+    found = {}
+    if "camera" in frame.sensors:
+        try:
+            camera_of(frame)
+        except ValueError:
+            found["camera"] = FrameReason.CAMERA_MODEL
+    finite = np.isfinite(frame.lidar_xyz_m).all(axis=1)
+    if "lidar" in frame.sensors and finite.sum() < _MIN_LIDAR_POINTS:
+        found["lidar"] = FrameReason.FEW_LIDAR_POINTS
+    if "radar" in frame.sensors and not len(frame.radar_x_m):
+        found["radar"] = FrameReason.FEW_RADAR_POINTS
+    return found
+
+
+def _perceive_camera(frame: Frame, source: SemanticsSource | None, config: PerceiveConfig) -> dict[str, Any]:
+    """The columns of labels and road users.
+
+    Raises:
+        FrameRejectedError: no image, labels or detections that could be read.
+    """
+    assert source is not None, "only a rig with a camera has images"
+    semantics = source.read(frame)
+    grey = decode_grey(frame, config.label_scale)
+    contrast = road_contrast(grey, semantics.labels == ROAD_ID)
+    users = semantics.detections
+    return {
+        "labels_png": encode_png(semantics.labels),
+        "sky_fraction": semantics.sky_fraction,
+        "drivable_fraction": semantics.drivable_fraction,
+        "road_user_boxes_px": users.boxes_px,
+        "road_user_classes": users.classes,
+        "road_user_scores": users.scores,
+        "road_contrast_png": encode_png(contrast),
+        "label_gradients": label_gradients(grey, semantics.labels),
+    }
 
 
 def _perceive_lidar(
@@ -260,8 +319,10 @@ def _perceive_lidar(
 def _perceive_radar(
     frame: Frame, motion: RadarMotion, tracks: TrackState, drivable: DrivableSource | None
 ) -> tuple[dict[str, Any], TrackState]:
-    """The radar_* columns but those copied from the frame."""
+    """The radar_* columns but those copied from the frame; without a scan, tracks stay as they were."""
     xyz = frame.radar_xyz_m
+    if not len(xyz):
+        return _NO_RADAR, tracks
     returns = measure_clusters(xyz, motion.residual_mps, motion.cluster, frame.doppler_period_mps)
     state, found = advance_tracks(
         tracks, frame.radar_stamp_ns, frame.drive, _ego_motion(frame, motion), returns,
@@ -286,16 +347,16 @@ def _perceive_radar(
     return columns, state
 
 
-def _drivable(radar: RadarTopics, fleet: FleetConfig) -> DrivableSource | None:
-    if radar.drivable is None:
+def _drivable(radar: RadarTopics | None, fleet: FleetConfig) -> DrivableSource | None:
+    if radar is None or radar.drivable is None:
         return None
     from pipeline.perceive.models.radar_drivable import RadarDrivable  # noqa: PLC0415 - as in _source
 
     return RadarDrivable.load(radar.drivable, fleet)
 
 
-def _points(lidar: LidarTopics, fleet: FleetConfig) -> PointSource | None:
-    if lidar.semantics is None:
+def _points(lidar: LidarTopics | None, fleet: FleetConfig) -> PointSource | None:
+    if lidar is None or lidar.semantics is None:
         return None
     from pipeline.perceive.models.range_image import RangeImageSegmenter  # noqa: PLC0415 - as in _source
 
@@ -339,8 +400,6 @@ def _track_columns(tracks: Tracks) -> dict[str, np.ndarray]:
 def _finite_sweep(frame: Frame) -> _Sweep:
     xyz = frame.lidar_xyz_m
     finite = np.isfinite(xyz).all(axis=1)
-    if finite.sum() < _MIN_LIDAR_POINTS:
-        raise FrameRejectedError(FrameReason.FEW_LIDAR_POINTS)
     if finite.all():
         return _Sweep(xyz, frame.lidar_intensity, frame.lidar_ring)
     intensity = None if frame.lidar_intensity is None else frame.lidar_intensity[finite]

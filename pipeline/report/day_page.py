@@ -29,7 +29,7 @@ from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_o
 from pipeline.sections import ReportConfig
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition
-from schemas.calibrations import PAIRS, CalibrationRecord
+from schemas.calibrations import PAIRS, CalibrationRecord, pairs_of
 from schemas.drift import DriftFinding
 
 __all__ = ["DayRead", "write_day_page", "write_day_picture"]
@@ -111,11 +111,12 @@ def write_day_picture(
     records = day_records(lake, partition, method or fleet.audit.method)
     states = states_of(records)
     spread = spread_observations(lake, partition) if has_frames(lake, partition) else []
-    if states is None or not spread:
-        problem = f"{partition.vehicle} has no frame with a prior on {partition.day}"
+    if states is None or not any("camera" in o.sensors for o in spread):
+        problem = f"{partition.vehicle} has no image with a prior on {partition.day}"
         raise ConfigError("command line", "picture", problem)
     before, after = states
-    scene = scenes_among(lake, partition, spread, after.T_camera_lidar, 1, fleet.report)[0]
+    seen = [o for o in spread if "camera" in o.sensors]
+    scene = scenes_among(lake, partition, seen, after.T_camera_lidar, 1, fleet.report)[0]
     stamped = as_stamped(after, scene.observation, time_offsets_of(records))
     labels = ("prior", _after_label([pair_view(r) for r in records.values()]))
     return write_picture(out, scene, before, stamped, labels)
@@ -201,7 +202,9 @@ def _drawn(
     spread = spread_observations(lake, partition)
     if not spread:
         return [], "", "no frame of the day could be used"
-    residuals = residual_figure(*frame_residuals(spread, (before, after), (TimeOffsets(), offsets)))
+    at_prior, at_result = frame_residuals(spread, (before, after), (TimeOffsets(), offsets))
+    there = [pair for pair in PAIRS if any(pair in pairs_of(o.sensors) for o in spread)]
+    residuals = residual_figure(at_prior, at_result, there)
     scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, _SCENES, config)
     pictures = [
         scene_pictures([s], before, as_stamped(after, s.observation, offsets), labels)[0] for s in scenes
@@ -218,7 +221,7 @@ def _sigma_svg(records: Mapping[str, CalibrationRecord]) -> str:
         if after is not None:
             sigma[pair] = after
             observable[pair] = record.observable or [True] * 6
-    return sigma_figure(prior, sigma, observable)
+    return sigma_figure(prior, sigma, observable, [p for p in PAIRS if p in records])
 
 
 def _provenance(records: Sequence[CalibrationRecord]) -> list[tuple[str, str]]:

@@ -21,10 +21,11 @@ def sigma_figure(
     prior_sigma: Mapping[str, np.ndarray],
     sigma: Mapping[str, np.ndarray],
     observable: Mapping[str, Sequence[bool]],
+    pairs: Sequence[str] = PAIRS,
 ) -> Markup:
     """Sigma of each DoF beside that of the prior, on a log scale; hollow where the day did not determine it."""
     parts: list[str] = []
-    for column, pair in enumerate(PAIRS):
+    for column, pair in enumerate(pairs):
         for row, dofs in enumerate((DOF_NAMES[:3], DOF_NAMES[3:])):
             values = [
                 s
@@ -56,7 +57,12 @@ def sigma_figure(
                     observable.get(pair),
                 )
             parts += plot.parts
-    return document(1210.0, 272.0, parts, "Sigma of each degree of freedom, of the prior and of the result")
+    return document(
+        410.0 * len(pairs) - 20.0,
+        272.0,
+        parts,
+        "Sigma of each degree of freedom, of the prior and of the result",
+    )
 
 
 def _sigma_bars(
@@ -80,10 +86,12 @@ def _sigma_bars(
     plot.text(u + 5, v + 3.5, f"{value:.2g}" + ("" if observable[k] else " not determined"), size=10.0)
 
 
-def residual_figure(before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> Markup:
+def residual_figure(
+    before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], pairs: Sequence[str] = PAIRS
+) -> Markup:
     """Measures of `frame_residuals` over the day's frames."""
     parts: list[str] = []
-    for column, pair in enumerate(PAIRS):
+    for column, pair in enumerate(pairs):
         finite = np.concatenate([v[np.isfinite(v)] for v in (before[pair], after[pair])])
         # A few frames in poor surroundings must not flatten the rest.
         top = 1.1 * float(np.quantile(finite, 0.97)) if len(finite) else 1.0
@@ -102,7 +110,10 @@ def residual_figure(before: Mapping[str, np.ndarray], after: Mapping[str, np.nda
             _residual_dots(plot, series[pair], colour, label, plot.left + 130 * k)
         parts += plot.parts
     return document(
-        1210.0, 192.0, parts, "Agreement of the sensors in each frame, at the prior and calibrated"
+        410.0 * len(pairs) - 20.0,
+        192.0,
+        parts,
+        "Agreement of the sensors in each frame, at the prior and calibrated",
     )
 
 

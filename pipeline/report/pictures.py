@@ -12,6 +12,7 @@ from pipeline.report.above import top_view
 from pipeline.report.encode import jpeg_uri
 from pipeline.report.overlays import Extrinsics, Scene, close_up, front_view
 from pipeline.report.scenes import choose_windows
+from schemas.calibrations import SENSORS
 
 __all__ = ["CloseUps", "ScenePictures", "close_ups_of", "scene_pictures"]
 
@@ -30,12 +31,13 @@ class CloseUps:
 
 @dataclass(frozen=True)
 class ScenePictures:
-    """One frame on the page; pictures as data URIs."""
+    """One frame on the page; pictures as data URIs, empty where the frame lacks a sensor that they need."""
 
     frame_index: int
     log: str
     drive: int
     front: str
+    shown: str  # in the front view, in words
     top: str
     close_ups: list[tuple[str, str]]
     zoom: int
@@ -63,13 +65,16 @@ def close_ups_of(scene: Scene, before: Extrinsics, after: Extrinsics) -> CloseUp
 
 
 def _pictures(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> ScenePictures:
-    enlarged = close_ups_of(scene, before, after)
+    camera, lidar, radar = (sensor in scene.observation.sensors for sensor in SENSORS)
+    enlarged = close_ups_of(scene, before, after) if camera and lidar else CloseUps([], 1, "")
+    kinds = ["lidar by range"] * lidar + ["moving radar clusters as white +"] * radar
     return ScenePictures(
         scene.frame.frame_index,
         scene.frame.log,
         scene.frame.drive,
-        jpeg_uri(front_view(scene, before, after, labels)),
-        top_view(scene, before, after, labels),
+        jpeg_uri(front_view(scene, before, after, labels)) if camera else "",
+        ", ".join([*kinds, "detected road users as boxes"]).capitalize(),
+        top_view(scene, before, after, labels) if lidar and radar else "",
         enlarged.pairs,
         enlarged.zoom,
         enlarged.window_deg,

@@ -93,15 +93,15 @@ def _days_before(day: str, days: int) -> str:
 
 
 def states_of(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics, Extrinsics] | None:
-    """Extrinsics at the prior and at the result; a pair without a result stays at its prior.
+    """Extrinsics at the prior and at the result; a pair without a result stays at its prior, one without either is NaN.
 
-    None where a pair has neither.
+    None where no pair has either.
     """
     prior = {p: prior_of(r) for p, r in records.items()}
     result = {p: transform_of(r) for p, r in records.items()}
     before = {p: T for p, T in prior.items() if T is not None}
     after = before | {p: T for p, T in result.items() if T is not None}
-    if set(PAIRS) - set(before):
+    if not after:
         return None
     return _extrinsics(before), _extrinsics(after)
 
@@ -135,7 +135,9 @@ def scenes_among(
     count: int,
     config: ReportConfig,
 ) -> list[Scene]:
-    """Frames with much to see, spread over the given observations, read from the lake."""
+    """Frames with much to see, spread over the given observations with most sensors, read from the lake."""
+    most = max((len(o.sensors) for o in observations), default=0)
+    observations = [o for o in observations if len(o.sensors) == most]
     chosen = [observations[i] for i in choose_frames(observations, T_camera_lidar, count)]
     rows = [o.frame_index for o in chosen]
     frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
@@ -144,4 +146,4 @@ def scenes_among(
 
 
 def _extrinsics(pairs: Mapping[str, np.ndarray]) -> Extrinsics:
-    return Extrinsics(pairs["camera_lidar"], pairs["camera_radar"], pairs["lidar_radar"])
+    return Extrinsics(*(pairs.get(pair, np.full((4, 4), np.nan)) for pair in PAIRS))

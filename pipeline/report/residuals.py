@@ -18,6 +18,7 @@ from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import transform_points
 from pipeline.report.overlays import Extrinsics
 from pipeline.report.time_offsets import TimeOffsets, as_stamped
+from schemas.calibrations import pairs_of
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["MEASURES", "at_pixels", "boundary_distance_px", "frame_residuals"]
@@ -45,14 +46,16 @@ def frame_residuals(
     offsets = offsets or [TimeOffsets()] * len(states)
     values = np.full((len(states), len(MEASURES), len(observations)), np.nan)
     for f, observation in enumerate(observations):
+        there = pairs_of(observation.sensors)
         boundary = boundary_distance_px(observation)
         for s, (unmoved, offset) in enumerate(zip(states, offsets, strict=True)):
             state = as_stamped(unmoved, observation, offset)
-            values[s, :, f] = (
-                _on_silhouette(observation, boundary, state.T_camera_lidar),
-                _in_boxes(observation, state.T_camera_radar),
-                _on_structure(observation, state.T_lidar_radar),
-            )
+            if "camera_lidar" in there:
+                values[s, 0, f] = _on_silhouette(observation, boundary, state.T_camera_lidar)
+            if "camera_radar" in there:
+                values[s, 1, f] = _in_boxes(observation, state.T_camera_radar)
+            if "lidar_radar" in there:
+                values[s, 2, f] = _on_structure(observation, state.T_lidar_radar)
     return [dict(zip(MEASURES, of_state, strict=True)) for of_state in values]
 
 
@@ -84,7 +87,8 @@ def at_pixels(
 
 
 def _decode_labels(observation: Observation) -> np.ndarray:
-    labels = cv2.imdecode(np.frombuffer(observation.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    bytes_ = np.frombuffer(observation.labels_png, np.uint8)
+    labels = cv2.imdecode(bytes_, cv2.IMREAD_GRAYSCALE) if len(bytes_) else None
     return np.zeros((1, 1), np.uint8) if labels is None else labels
 
 

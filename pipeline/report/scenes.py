@@ -56,7 +56,8 @@ def choose_windows(observation: Observation, T_camera_lidar: np.ndarray, count: 
 
 
 def _richness(observation: Observation, T_camera_lidar: np.ndarray) -> float:
-    edges = np.maximum(_weighted_edges(observation, T_camera_lidar)[1], 0).sum()
+    both = {"camera", "lidar"} <= set(observation.sensors)
+    edges = np.maximum(_weighted_edges(observation, T_camera_lidar)[1], 0).sum() if both else 0.0
     users, tracks = len(observation.road_user_boxes_px), len(observation.radar_track_xyz_m)
     return float(2 * np.sqrt(edges) + 3 * min(users, 6) + 3 * min(tracks, 6))
 

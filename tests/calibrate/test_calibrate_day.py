@@ -177,8 +177,17 @@ def test_a_prior_that_changes_over_the_day_is_refused(tmp_path, day):
 
 
 def test_a_missing_prior_is_refused_and_some_frames_without_one_are_not(tmp_path, day):
+    none = [
+        replace(o, **prior_columns("camera_lidar", None), **prior_columns("lidar_radar", None)) for o in day
+    ]
+    assert "no tf_static chain for any pair" in refusal(tmp_path / "none", none)
     bare = [replace(o, **prior_columns("lidar_radar", None)) for o in day]
-    assert "no tf_static chain for lidar_radar" in refusal(tmp_path / "a", bare)
+    lake = lake_with(tmp_path / "a", bare)
+    calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation")
+    records = {r.pair: r for r in records_of(lake)}
+    assert records["camera_lidar"].status in ("accepted", "held")
+    for pair in ("camera_radar", "lidar_radar"):
+        assert f"no tf_static chain for {pair}" in records[pair].reason
     lake = lake_with(tmp_path / "b", [*bare[:3], *day[3:]])
     assert calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation").status == "done"
 

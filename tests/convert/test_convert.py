@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from jobs.cli import main
+from pipeline.config import load_fleet
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
@@ -63,6 +65,23 @@ def test_every_frame_of_the_data_set_becomes_a_trio(converted):
     assert (first.image_width_px, first.image_height_px) == (data_sets.WIDTH, data_sets.HEIGHT)
     np.testing.assert_array_equal(first.camera_K, data_sets.K)
     assert first.image_format == ("png" if name == "kitti" else "jpeg")
+
+
+def test_a_folder_of_kitti_s_own_without_a_radar_becomes_a_rig_of_camera_and_lidar(tmp_path):
+    data_sets.kitti(tmp_path / "data")
+    shutil.rmtree(tmp_path / "data" / "radar")
+    assert main(["convert", "kitti", str(tmp_path / "data"), "--out", str(tmp_path), "--vehicle", "k"]) == 0
+    fleet = load_fleet(tmp_path / "fleet.toml")
+    assert fleet.rigs["default"].sensors == ("camera", "lidar")
+    logs = [str(p) for p in (tmp_path / "logs" / "k" / "2000-01-01").iterdir()]
+    lake = tmp_path / "lake"
+    about = ["--fleet", str(tmp_path / "fleet.toml"), "--lake", str(lake), "--vehicle", "k"]
+    assert main(["ingest", *logs, *about, "--day", "2000-01-01"]) == 0
+    frames = read_rows(Lake.at(lake), FRAMES, Partition("k", "2000-01-01"), Frame)
+    assert len(frames) == WHAT["kitti"][2]
+    assert all(f.sensors == ["camera", "lidar"] and not len(f.radar_x_m) for f in frames)
+    wanted = np.linalg.inv(T_BASE_CAMERA) @ T_BASE_LIDAR
+    np.testing.assert_allclose(transform_in(frames[0], "prior_camera_lidar"), wanted, atol=1e-9)
 
 
 def test_sensors_are_where_the_data_set_says(converted):

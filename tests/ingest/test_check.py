@@ -12,6 +12,7 @@ from pipeline.errors import ConfigError, ModelError
 from pipeline.ingest.check import check_logs
 from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.ingest.readiness import Evidence, judge, overall
+from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from tests.makers.fleet_files import fleet_toml
 
 GOOD = Evidence(
@@ -93,7 +94,8 @@ def test_a_complete_drive_is_fit_and_its_facts_are_right(kit, tmp_path):
     report = report_on(kit, tmp_path, kit.Kit(frames=40).drive())
     assert report.answer == "yes"
     # Its points lie anywhere, whatever their ring numbers say: no rows.
-    assert report.evidence == Evidence(40, True, 1.0, 1.0, True, 0, 1.0, 1.0, "")
+    frames_of = dict.fromkeys(PAIRS, 40)
+    assert report.evidence == Evidence(40, True, 1.0, 1.0, True, 0, 1.0, 1.0, "", frames_of=frames_of)
     assert (report.sync.sweeps, report.sync.trios) == (40, 40)
     assert report.sync.camera_median_ms == pytest.approx(1.0)
     assert report.sync.radar_median_ms == pytest.approx(2.0)
@@ -109,20 +111,38 @@ def test_a_missing_topic_is_named_with_those_that_it_might_be(kit, tmp_path):
     drive = kit.Kit(frames=12).drive()
     drive.messages = [("/radar/rear", *m[1:]) if m[0] == kit.RADAR else m for m in drive.messages]
     report = report_on(kit, tmp_path, drive)
-    assert report.answer == "no"
+    assert report.answer == "partly"
     assert any(kit.RADAR in line and "/radar/rear" in line for line in report.advice)
 
 
-@pytest.mark.parametrize("role", ["LIDAR", "RADAR", "IMAGE"])
-def test_without_a_sensors_topic_nothing_else_is_said_to_be_missing(kit, tmp_path, role):
+@pytest.mark.parametrize(("role", "sensor"), [("LIDAR", "lidar"), ("RADAR", "radar"), ("IMAGE", "camera")])
+def test_without_a_sensors_topic_its_pairs_alone_fail_and_nothing_else_is_said_to_be_missing(
+    kit, tmp_path, role, sensor
+):
     topic = getattr(kit, role)
     drive = kit.Kit(frames=12).drive()
     drive.messages = [("/mistyped", *m[1:]) if m[0] == topic else m for m in drive.messages]
-    for found in report_on(kit, tmp_path, drive).verdicts:
+    verdicts = report_on(kit, tmp_path, drive).verdicts
+    others = [v for v in verdicts if sensor not in FRAMES_OF_PAIR[v.pair]]
+    assert {v.pair for v in verdicts} == set(PAIRS)
+    assert all(v.reasons[0].startswith("12 usable frames") for v in others if v.verdict != "no")
+    assert any(v.verdict == "weak" for v in others)
+    for found in (v for v in verdicts if sensor in FRAMES_OF_PAIR[v.pair]):
         assert found.verdict == "no"
         assert topic in found.reasons[0]
         assert "/mistyped" in found.reasons[0]
         assert found.reasons[1:] == ["so prior, labels and motion could not be judged"]
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_rig_of_two_sensors_is_judged_by_its_one_pair(kit, tmp_path, sensor):
+    config = kit.fleet(ingest={"min_lidar_points": 500})
+    rig = config.rigs["default"].model_copy(update={sensor: None})
+    report = check_logs([kit.Kit(frames=40).drive().mcap(tmp_path / "a.mcap")], rig, config)
+    (pair,) = {v.pair for v in report.verdicts}
+    assert sensor not in FRAMES_OF_PAIR[pair]
+    assert report.answer in ("yes", "partly")
+    assert (report.sync.sweeps, report.sync.trios) == (40, 40)
 
 
 def test_sensors_that_never_meet_are_told_from_absent_ones():
@@ -140,7 +160,8 @@ def test_a_planar_radar_a_missing_field_and_a_wrong_sign_are_noticed(kit, tmp_pa
     assert report.answer == "partly"
     assert report.evidence.elevation_share == 0.0
     report = report_on(kit, tmp_path, drive, radar={"doppler_field": "speed"})
-    assert report.answer == "no"
+    assert report.answer == "partly"
+    assert {v.pair for v in report.verdicts if v.verdict != "no"} == {"camera_lidar"}
     assert any("x, y, z, doppler, power" in p for p in report.problems)
     report = report_on(kit, tmp_path, drive, radar={"doppler_positive": "receding"})
     assert 'probably "approaching"' in report.evidence.doppler_problem

@@ -10,7 +10,8 @@ from pipeline.ingest.containers.mcap import McapLog
 from pipeline.ingest.sync import Rejection
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest
-from schemas.frames import FRAMES
+from schemas.calibrations import SENSORS
+from schemas.frames import FRAMES, SENSORS_ABSENT
 from tests.makers.stages import ingest_day
 
 
@@ -108,12 +109,43 @@ def test_reordered_and_repeated_messages_give_each_frame_once_in_order(kit, tmp_
     assert result.rejected["duplicate_stamp"] == 2
 
 
-@pytest.mark.parametrize("topic", ["IMAGE", "LIDAR", "RADAR", "INFO"])
-def test_a_sensor_that_is_missing_is_refused_by_its_topic(kit, tmp_path, run_ingest, topic):
+@pytest.mark.parametrize(
+    ("topic", "sensor"), [("IMAGE", "camera"), ("LIDAR", "lidar"), ("RADAR", "radar"), ("INFO", "camera")]
+)
+def test_a_sensor_that_is_missing_is_named_by_its_topic_and_leaves_the_others(
+    kit, tmp_path, run_ingest, topic, sensor
+):
     name = getattr(kit, topic)
-    result, _ = run_ingest(kit.Kit().drive().without(name).mcap(tmp_path / "a.mcap"))
-    assert (result.status, result.rows) == ("refused", 0)
+    result, frames = run_ingest(kit.Kit().drive().without(name).mcap(tmp_path / "a.mcap"))
+    assert (result.status, result.rows) == ("done", 4)
     assert name in result.reason
+    assert all(set(f.sensors) == set(SENSORS) - {sensor} for f in frames)
+    assert sum(n for key, n in result.rejected.items() if key.startswith(f"without_{sensor}_")) == 4
+    manifest = read_manifest(Lake.at(tmp_path / "lake"), FRAMES, Partition("car", "2023-11-14"))
+    assert name in manifest.extra[SENSORS_ABSENT][sensor]
+    if sensor == "lidar":
+        assert all(f.prior_camera_radar_qw is not None for f in frames)
+        assert all(f.stamp_ns == f.radar_stamp_ns for f in frames)
+
+
+def test_a_day_of_one_sensor_is_refused_by_the_topics_of_the_others(kit, tmp_path, run_ingest):
+    drive = kit.Kit().drive().without(kit.RADAR).without(kit.IMAGE)
+    result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    assert (result.status, result.rows) == ("refused", 0)
+    assert kit.RADAR in result.reason
+    assert kit.IMAGE in result.reason
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_rig_without_a_sensor_reads_the_other_two(kit, tmp_path, run_ingest, sensor):
+    fleet = kit.fleet()
+    rig = fleet.rigs["default"].model_copy(update={sensor: None})
+    fleet = fleet.model_copy(update={"rigs": {"default": rig}})
+    result, frames = run_ingest(kit.Kit().drive().mcap(tmp_path / "a.mcap"), fleet=fleet)
+    assert (result.status, result.rows) == ("done", 4)
+    assert all(set(f.sensors) == set(SENSORS) - {sensor} for f in frames)
+    assert not any(key.startswith("without_") for key in result.rejected)
+    assert not any(key.startswith("frames_without") for key in result.rejected)
 
 
 def test_a_wrong_type_on_a_topic_is_named(kit, tmp_path, run_ingest):
@@ -121,7 +153,8 @@ def test_a_wrong_type_on_a_topic_is_named(kit, tmp_path, run_ingest):
     for i in range(4):
         drive.replaced(kit.RADAR, i, drive.info(kit.START_NS))
     result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
-    assert result.status == "refused"
+    assert result.status == "done"
+    assert result.rejected["without_radar_no_radar_in_gate"] == 4
     assert result.rejected["wrong_type"] == 4
     assert kit.RADAR in result.reason
     assert "sensor_msgs/msg/CameraInfo, not sensor_msgs/msg/PointCloud2" in result.reason
@@ -187,19 +220,22 @@ def test_an_image_that_is_late_by_as_much_as_all_others_costs_nothing_and_one_th
     assert [f.frame_index for f in frames] == list(range(23))
     assert {f.camera_stamp_ns - f.stamp_ns for f in frames} == {late}
     assert result.rejected["no_camera_in_gate"] == 1
-    paper, none = run_ingest(log, fleet=kit.fleet(ingest={"sync_gate_s": 0.005}), name="paper")
-    assert (paper.status, none) == ("refused", [])
-    assert "leave it out to gate by motion" in paper.reason
+    _, without = run_ingest(log, fleet=kit.fleet(ingest={"sync_gate_s": 0.005}), name="paper")
+    assert {tuple(f.sensors) for f in without} == {("lidar", "radar")}
+    manifest = read_manifest(Lake.at(tmp_path / "paper"), FRAMES, Partition("car", "2023-11-14"))
+    assert "leave it out to gate by motion" in manifest.extra[SENSORS_ABSENT]["camera"]
 
 
-def test_intrinsics_that_are_not_calibrated_are_refused_with_what_to_do(kit, tmp_path, run_ingest):
+def test_intrinsics_that_are_not_calibrated_cost_the_camera_with_what_to_do(kit, tmp_path, run_ingest):
     drive = kit.Kit().drive()
     for i in range(4):
         drive.replaced(kit.INFO, i, drive.info(kit.START_NS + i * kit.PERIOD_NS, focal_px=0.0))
     result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
-    assert result.status == "refused"
     assert "zero K" in result.reason
     assert result.rejected["camera_info_unusable"] == 4
+    assert result.rejected["without_camera_no_usable_camera_info"] == 4
+    manifest = read_manifest(Lake.at(tmp_path / "lake"), FRAMES, Partition("car", "2023-11-14"))
+    assert "CameraInfo with a calibrated K" in manifest.extra[SENSORS_ABSENT]["camera"]
 
 
 def test_without_a_chain_of_transforms_there_is_no_prior_rather_than_an_identity(kit, tmp_path, run_ingest):
@@ -255,7 +291,7 @@ def test_an_unchanged_day_is_cached_and_a_changed_one_is_made_anew(kit, tmp_path
 def test_a_refused_day_leaves_the_lake_as_it_was(kit, tmp_path, run_ingest):
     log = kit.Kit().drive().mcap(tmp_path / "a.mcap")
     lake, day = Lake.at(tmp_path / "lake"), Partition("car", "2023-11-14")
-    refused = kit.Kit().drive().without(kit.RADAR).mcap(tmp_path / "b.mcap")
+    refused = kit.Kit().drive().without(kit.RADAR).without(kit.LIDAR).mcap(tmp_path / "b.mcap")
     assert run_ingest(refused)[0].status == "refused"
     assert lake.partitions("frames") == []
     key = run_ingest(log)[0].work_key

@@ -28,8 +28,8 @@ def test_ingest_exits_0_when_done_or_cached_and_3_when_refused(kit, tmp_path, fl
         assert ingest(str(log), **common) == 0
         summary = last_line(capsys)
         assert (summary["command"], summary["status"], summary["rows"]) == ("ingest", status, 4)
-    without_lidar = kit.Kit().drive().without(kit.LIDAR).mcap(tmp_path / "b.mcap")
-    assert ingest(str(without_lidar), **common) == 3
+    image_alone = kit.Kit().drive().without(kit.LIDAR).without(kit.RADAR).mcap(tmp_path / "b.mcap")
+    assert ingest(str(image_alone), **common) == 3
     assert kit.LIDAR in last_line(capsys)["reason"]
     with pytest.raises(ConfigError, match="at least one log"):
         ingest(**common)

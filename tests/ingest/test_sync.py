@@ -20,14 +20,23 @@ GATE = 7
 MS = 1_000_000
 
 
+def seen(stamps_ns, places):
+    """Stamps at the places, NaN where there is none."""
+    return np.append(stamps_ns.astype(float), np.nan)[places]
+
+
 @settings(max_examples=200, deadline=None)
 @given(stamps, stamps, stamps)
 def test_trios_lie_within_the_gate_are_one_to_one_and_no_sweep_is_lost(lidar, camera, radar):
     trios = match_trios(lidar, camera, radar, GATE)
     for own, stamps_ns in ((trios.lidar, lidar), (trios.camera, camera), (trios.radar, radar)):
-        assert len(set(stamps_ns[own])) == len(own)
-    together = np.stack([lidar[trios.lidar], camera[trios.camera], radar[trios.radar]])
-    assert together.size == 0 or np.ptp(together, axis=0).max() <= GATE
+        assert len(set(stamps_ns[own[own >= 0]])) == np.sum(own >= 0)
+    together = np.stack([lidar[trios.lidar], seen(camera, trios.camera), seen(radar, trios.radar)])
+    apart = np.nanmax(together, axis=0) - np.nanmin(together, axis=0)
+    assert apart.size == 0 or apart.max() <= GATE
+    whole = (trios.camera >= 0) & (trios.radar >= 0)
+    assert whole.all() or not whole.any()  # stamps of these days are less than a second apart
+    assert np.all((trios.camera >= 0) | (trios.radar >= 0))
     assert np.all(np.diff(lidar[trios.lidar]) > 0)
     assert len(trios.lidar) + sum(trios.rejected.values()) == len(lidar)
 
@@ -39,8 +48,8 @@ def test_the_order_of_logging_does_not_matter(lidar, camera, radar, seed):
     mixed = [rng.permutation(s) for s in (lidar, camera, radar)]
     a, b = match_trios(lidar, camera, radar, GATE), match_trios(*mixed, GATE)
     assert lidar[a.lidar].tolist() == mixed[0][b.lidar].tolist()
-    assert camera[a.camera].tolist() == mixed[1][b.camera].tolist()
-    assert radar[a.radar].tolist() == mixed[2][b.radar].tolist()
+    np.testing.assert_array_equal(seen(camera, a.camera), seen(mixed[1], b.camera))
+    np.testing.assert_array_equal(seen(radar, a.radar), seen(mixed[2], b.radar))
     assert a.rejected == b.rejected
 
 
@@ -91,15 +100,15 @@ def test_by_motion_too_no_sweep_is_lost_and_gaps_beyond_the_constant_ones_stay_w
 ):
     trios = match_by_motion(lidar, camera, radar, np.full(len(lidar), gate))
     for own, stamps_ns in ((trios.lidar, lidar), (trios.camera, camera), (trios.radar, radar)):
-        assert len(set(stamps_ns[own])) == len(own)
+        assert len(set(stamps_ns[own[own >= 0]])) == np.sum(own >= 0)
     apart = np.stack(
         [
-            camera[trios.camera] - lidar[trios.lidar] - trios.camera_gap_ns,
-            radar[trios.radar] - lidar[trios.lidar] - trios.radar_gap_ns,
+            seen(camera, trios.camera) - lidar[trios.lidar] - trios.camera_gap_ns,
+            seen(radar, trios.radar) - lidar[trios.lidar] - trios.radar_gap_ns,
             np.zeros(len(trios.lidar)),
         ]
     )
-    assert apart.size == 0 or np.ptp(apart, axis=0).max() <= gate
+    assert apart.size == 0 or (np.nanmax(apart, axis=0) - np.nanmin(apart, axis=0)).max() <= gate
     assert np.all(np.diff(lidar[trios.lidar]) > 0)
     assert len(trios.lidar) + sum(trios.rejected.values()) == len(lidar)
 
@@ -108,11 +117,13 @@ def test_every_sweep_of_free_running_sensors_gets_the_image_and_scan_nearest_to_
     sweeps, images, scans = ticks(10.03, 3, jitter_ms=0.1), ticks(30, 11), ticks(13, 40)
     trios = match_by_motion(sweeps, images, scans, gates(sweeps, speed=35.0))
     assert (trios.camera_gap_ns, trios.radar_gap_ns) == (0, 0)
+    assert min(trios.radar) >= 0
     assert len(trios.lidar) >= len(sweeps) - 2  # the last ones outlive the radar
     for stamps_ns, own in ((images, trios.camera), (scans, trios.radar)):
         distance = np.abs(stamps_ns[None] - sweeps[trios.lidar][:, None])
         np.testing.assert_array_equal(distance.argmin(1), own)
-    assert len(match_trios(sweeps, images, scans, 5 * MS).lidar) < 0.1 * len(sweeps)
+    strict = match_trios(sweeps, images, scans, 5 * MS)
+    assert np.sum((strict.camera >= 0) & (strict.radar >= 0)) < 0.1 * len(sweeps)
 
 
 @pytest.mark.parametrize("offset_ms", [-60.0, -25.0, 0.0, 25.0, 49.0, 50.0, 60.0])
@@ -133,6 +144,21 @@ def test_where_a_message_is_missing_the_sweep_goes_and_takes_no_neighbour_s():
     trios = match_by_motion(sweeps, images, sweeps, gates(sweeps, speed=0.0))
     assert dict(trios.rejected) == {"no_camera_in_gate": 3}
     np.testing.assert_array_equal(np.setdiff1d(np.arange(len(sweeps)), trios.lidar), [5, 6, 17])
+
+
+def test_a_sensor_that_falls_silent_leaves_the_others_their_moments():
+    sweeps = ticks(10, 0)
+    scans = sweeps[:300] + MS
+    trios = match_by_motion(sweeps, sweeps + 2 * MS, scans, gates(sweeps, speed=0.0))
+    without = np.flatnonzero(trios.radar < 0)
+    # Beside the last whole moment a second long nothing new is to be seen.
+    np.testing.assert_array_equal(trios.lidar[without], np.arange(310, len(sweeps)))
+    assert dict(trios.rejected) == {"no_radar_in_gate": 10}
+    assert trios.camera.min() >= 0
+    silent = match_by_motion(sweeps, sweeps[:0], scans, gates(sweeps, speed=0.0))
+    np.testing.assert_array_equal(silent.lidar, np.arange(300))
+    assert set(silent.camera) == {-1}
+    assert dict(silent.rejected) == {"no_radar_in_gate": 300}
 
 
 def test_the_faster_a_car_drives_or_turns_the_nearer_the_stamps_must_be():

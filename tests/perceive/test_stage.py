@@ -10,6 +10,7 @@ from pipeline.errors import ConfigError, ContractError
 from pipeline.perceive.stage import WITHOUT_ROWS
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_rows, write_partition
+from schemas.calibrations import SENSORS
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
 from tests.makers.stages import perceive_day
@@ -174,12 +175,48 @@ def test_sensors_that_say_little_are_enough(lake, made_frame):
 
 def test_a_day_without_a_usable_frame_is_refused_and_leaves_no_stale_observations(lake, made_frame):
     perceive_day(DAY, fleet(), lake)
-    write_frames(lake, [replace(made_frame(i), labels_png=None) for i in range(3)], key="unlabelled")
+    unlabelled = [replace(made_frame(i), labels_png=None, sensors=["camera", "lidar"]) for i in range(3)]
+    write_frames(lake, unlabelled, key="unlabelled")
     for _ in range(2):
         result = perceive_day(DAY, fleet(), lake)
         assert result.status == "refused"
         assert "3 labels_missing" in result.reason
         assert rows(lake) == []
+
+
+def test_a_day_without_labels_keeps_lidar_and_radar(lake, made_frame):
+    perceive_day(DAY, fleet(), lake)
+    whole = rows(lake)
+    write_frames(lake, [replace(made_frame(i), labels_png=None) for i in range(5)], key="unlabelled")
+    result = perceive_day(DAY, fleet(), lake)
+    assert (result.status, result.rejected) == ("done", {"without_camera_labels_missing": 5})
+    for a, b in zip(rows(lake), whole, strict=True):
+        assert a.sensors == ["lidar", "radar"]
+        assert (a.labels_png, len(a.road_user_boxes_px), a.road_contrast_png) == (b"", 0, None)
+        np.testing.assert_array_equal(a.lidar_edge_xyz_m, b.lidar_edge_xyz_m)
+        np.testing.assert_array_equal(a.radar_track_xyz_m, b.radar_track_xyz_m)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_what_a_missing_sensor_would_show_is_empty_and_the_others_are_perceived(lake, made_frame, sensor):
+    perceive_day(DAY, fleet(), lake)
+    whole, others = rows(lake), [s for s in SENSORS if s != sensor]
+    none = np.zeros(0, np.float32)
+    gone = {
+        "camera": {"image": b"", "camera_model": "", "camera_K": np.full((3, 3), np.nan), "labels_png": None},
+        "lidar": {f"lidar_{axis}_m": none for axis in "xyz"} | {"lidar_ring": None, "lidar_intensity": None},
+        "radar": {f"radar_{axis}_m": none for axis in "xyz"} | {"radar_range_rate_mps": none},
+    }[sensor]
+    frames = [replace(made_frame(i), sensors=others, **gone) for i in range(5)]
+    write_frames(lake, frames, key=f"no {sensor}")
+    result = perceive_day(DAY, fleet(), lake)
+    assert (result.status, result.rows, result.rejected) == ("done", 5, {})
+    for a, b in zip(rows(lake), whole, strict=True):
+        assert a.sensors == others
+        shown = {"camera": a.labels_png, "lidar": a.lidar_map_xyz_m, "radar": a.radar_xyz_m}
+        was = {"camera": b.labels_png, "lidar": b.lidar_map_xyz_m, "radar": b.radar_xyz_m}
+        assert len(shown.pop(sensor)) == 0
+        assert all(np.array_equal(shown[s], was[s]) for s in shown)
 
 
 def test_a_day_without_frames_and_an_unknown_vehicle_are_named(lake):

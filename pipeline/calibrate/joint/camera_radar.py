@@ -1,7 +1,8 @@
 """Camera-radar without the lidar: moving clusters against boxes in azimuth, detections in boxes in elevation.
 
 Its translation stays at the prior (angles of far objects hardly depend on it). Method `joint` composes camera-radar
-from the other two pairs; this independent estimate is what that composition is checked against.
+from the other two pairs; this independent estimate is what that composition is checked against, and the result where a
+rig or a day has no lidar.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pipeline.calibrate.numerics.bias_floors import (
 from pipeline.calibrate.numerics.covariance import Posterior, covariance_with_fixed, posterior
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.config import SolveConfig
+from pipeline.extrinsics.common_share import common_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.changes import change_jacobian
@@ -136,6 +138,9 @@ def estimate_camera_radar(
         {"no moving cluster": len(observations) - frames},
         diagnostics={k: v for k, v in diagnostics.items() if np.isfinite(v)},
         notes=notes,
+        common_covariance=J
+        @ common_of(after.covariance, prior_covariance, np.diag(CAMERA_RADAR_BIAS**2))
+        @ J.T,
     )
 
 

@@ -9,6 +9,9 @@ So the two pairs rest on each other, and an error of one would be the other's: o
 boxes read through it put lidar-radar 1.6 deg off. What is not believed in the end is taken out: `Solution.without`
 solves again whatever rested on it.
 
+Where a sensor is missing, the pairs of the others are solved without it: camera-lidar along the lidar's own x axis,
+lidar-radar without boxes, camera-radar alone by what it is otherwise checked with.
+
 A loop that is closed by construction checks nothing, so estimates that took no part are compared with it: camera-radar
 without the lidar, disjoint halves of the day, other origins of the search, and the registration's own roll and pitch
 (`failed_checks`). A CameraInfo that the day contradicts holds camera-lidar: with a better one its pose is another.
@@ -50,10 +53,10 @@ def solve_joint(
     triggered: Sequence[str] = PAIRS,
     progress: Progress = silent,
 ) -> Solution:
-    """Solve all three pairs.
+    """Solve the pairs that have frames.
 
     Args:
-        observations: selected frames per pair.
+        observations: selected frames per pair; a pair that is left out costs the others its help, no more.
         prior: start and weak prior.
         config: effort.
         seed: decides everything random.
@@ -65,6 +68,7 @@ def solve_joint(
     """
     prior, config = _without_terms(prior, config)
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
+    wanted &= observations.keys()
     progress(0, 3, "camera-lidar")
     aligned: Aligned | FailedCheck | None = None
     if "camera_lidar" in wanted:
@@ -94,30 +98,27 @@ class _Day:
     def solved(self, disbelieved: frozenset[str]) -> Solution:
         """The solution in which no pair rests on a disbelieved one."""
         self.progress(1, 3, "lidar-radar")
-        helped, headed = self._camera_helps(disbelieved), "lidar_radar" not in disbelieved
-        lidar_radar, radar_failed = self._once(("lidar_radar", helped), lambda: self._lidar_radar(helped))
-        camera_lidar, camera_failed = self._once(
-            ("camera_lidar", helped, headed), lambda: self._camera_lidar(lidar_radar if headed else None)
-        )
+        helped = self._camera_helps(disbelieved)
+        headed = "lidar_radar" in self.observations and "lidar_radar" not in disbelieved
+        found: dict[str, tuple[PairEstimate, list[FailedCheck]]] = {}
+        if "lidar_radar" in self.observations:
+            found["lidar_radar"] = self._once(("lidar_radar", helped), lambda: self._lidar_radar(helped))
+        if "camera_lidar" in self.observations:
+            along = found["lidar_radar"][0] if headed else None
+            found["camera_lidar"] = self._once(
+                ("camera_lidar", helped, headed), lambda: self._camera_lidar(along)
+            )
         self.progress(2, 3, "camera-radar")
-        without_lidar, _ = self._once(("camera_radar",), self._camera_radar)
-        camera_radar, loop_rad, contradictions = compose_pairs(
-            camera_lidar, lidar_radar, without_lidar, self.prior
-        )
-        if isinstance(self.aligned, Aligned) and not self.aligned.basin.vouched_by:
-            # A lost camera contradicts a lidar-radar that is right: the prior, and its sigma, stand in for it. One that
-            # is only unsure is compared with its sigma, like any other.
-            camera = _unchanged("camera_lidar", self.prior)
-            _, _, contradictions = compose_pairs(camera, lidar_radar, without_lidar, self.prior)
-        camera_radar = replace(camera_radar, disproved=camera_lidar.disproved)
+        loop_rad = None
+        if "camera_radar" in self.observations:
+            found["camera_radar"] = self._once(("camera_radar",), self._camera_radar)
+            if len(found) == len(PAIRS):
+                found["camera_radar"], loop_rad = self._composed(found)
+            elif "camera_radar" not in self.wanted:
+                found["camera_radar"] = _unchanged("camera_radar", self.prior), []
         self.progress(3, 3, "done")
-        pairs = {"camera_lidar": camera_lidar, "camera_radar": camera_radar, "lidar_radar": lidar_radar}
-        failed = {
-            "camera_lidar": camera_failed,
-            "lidar_radar": radar_failed,
-            "camera_radar": [*camera_failed, *radar_failed, *contradictions],
-        }
-        checks = {pair: why for pair, why in failed.items() if why}
+        pairs = {pair: found[pair][0] for pair in PAIRS if pair in found}
+        checks = {pair: found[pair][1] for pair in pairs if found[pair][1]}
         return Solution("joint", pairs, loop_rad, None, checks, self.solved)
 
     def _once(
@@ -128,10 +129,28 @@ class _Day:
         return self.made[key]
 
     def _camera_radar(self) -> tuple[PairEstimate, list[FailedCheck]]:
-        """Without the lidar."""
+        """Without the lidar: what the composed one is compared with, or the result where there is none."""
         rng = np.random.default_rng([self.seed, 2])
         seen = self.observations["camera_radar"]
         return estimate_camera_radar(seen, self.prior, self.config, rng), []
+
+    def _composed(
+        self, found: Mapping[str, tuple[PairEstimate, list[FailedCheck]]]
+    ) -> tuple[tuple[PairEstimate, list[FailedCheck]], float | None]:
+        """Camera-radar by the loop, with the checks that it and its factors failed; the loop's angle."""
+        camera_lidar, camera_failed = found["camera_lidar"]
+        lidar_radar, radar_failed = found["lidar_radar"]
+        without_lidar, _ = found["camera_radar"]
+        camera_radar, loop_rad, contradictions = compose_pairs(
+            camera_lidar, lidar_radar, without_lidar, self.prior
+        )
+        if isinstance(self.aligned, Aligned) and not self.aligned.basin.vouched_by:
+            # A lost camera contradicts a lidar-radar that is right: the prior, and its sigma, stand in for it. One that
+            # is only unsure is compared with its sigma, like any other.
+            camera = _unchanged("camera_lidar", self.prior)
+            _, _, contradictions = compose_pairs(camera, lidar_radar, without_lidar, self.prior)
+        camera_radar = replace(camera_radar, disproved=camera_lidar.disproved)
+        return (camera_radar, [*camera_failed, *radar_failed, *contradictions]), loop_rad
 
     def _camera_helps(self, disbelieved: frozenset[str]) -> bool:
         """Whether lidar-radar may rest on the camera's alignment: not where nobody vouches for its basin."""
@@ -145,7 +164,8 @@ class _Day:
         if "lidar_radar" not in self.wanted:
             return _unchanged("lidar_radar", prior), []
         # Without an alignment the prior stays current: where that is exact enough, boxes are read through it.
-        T, covariance = prior.T_camera_lidar, prior.covariance("camera_lidar")
+        T = prior.T_camera_lidar if prior.knows("camera_lidar") else None
+        covariance = prior.covariance("camera_lidar")
         if helped and isinstance(self.aligned, Aligned):
             T, covariance = self.aligned.T_camera_lidar, self.aligned.covariance
         try:

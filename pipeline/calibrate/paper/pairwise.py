@@ -101,7 +101,7 @@ def solve_pairwise(
     """Calibrate each triggered pair alone; the others keep the prior.
 
     Args:
-        observations: selected frames of each pair.
+        observations: selected frames of each pair; others are left out.
         prior: start and centre of the search box.
         config: box and effort.
         seed: decides everything random; each pair draws from a stream of its own.
@@ -110,6 +110,8 @@ def solve_pairwise(
     """
     pairs = {}
     for k, pair in enumerate(PAIRS):
+        if pair not in observations:
+            continue
         progress(k, len(PAIRS), f"{pair}: differential evolution")
         problem = pair_problem(pair, observations[pair], prior, config)
         minimum = solve_pair(problem, config, np.random.default_rng([seed, k])) if pair in triggered else None
@@ -171,8 +173,10 @@ def estimate_of(
     )
 
 
-def loop_size(pairs: Mapping[str, PairEstimate]) -> tuple[float, float]:
-    """Angle [rad] and translation [m] of the loop of the pair estimates."""
+def loop_size(pairs: Mapping[str, PairEstimate]) -> tuple[float | None, float | None]:
+    """Angle [rad] and translation [m] of the loop of the pair estimates; None where there are not three."""
+    if len(pairs) < len(PAIRS):
+        return None, None
     loop = loop_transform(pairs["camera_lidar"].T, pairs["lidar_radar"].T, pairs["camera_radar"].T)
     return float(rotation_angle_rad(loop)), float(np.linalg.norm(loop[:3, 3]))
 

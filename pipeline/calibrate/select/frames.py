@@ -23,7 +23,7 @@ from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES, scenes_of
 from pipeline.calibrate.select.coverage import choose_for_information, contents_of, missing_in_view
 from pipeline.config import SelectConfig
 from pipeline.errors import SolveError
-from schemas.calibrations import FRAMES_OF_PAIR, PAIRS
+from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from schemas.observations import Observation
 
 __all__ = [
@@ -39,6 +39,9 @@ __all__ = [
 PAPER_SYNC_GATE_S = 0.005  # section 4.5.1
 
 MIN_FRAMES = 8  # fewer carry no calibration: 10 frames already scatter by 0.1 deg (evidence on the real logs)
+_HARD = frozenset(
+    {"sync", "empty", *(f"no_{sensor}" for sensor in SENSORS)}
+)  # no method can use such a frame
 _SCARCE, _BRISK_MPS = 0.1, 5.0
 _BLOCKS_S = (10.0, 7.0, 5.0, 4.0, 3.0, 20.0)
 _JUDGING_BLOCKS = 4
@@ -49,12 +52,13 @@ _GUARD_S = 1.0  # frames nearer in time than this show the same scene
 class Selection:
     """Row numbers of the observations per pair, in order of time, and the counts behind them."""
 
-    fit: dict[str, list[int]]
+    fit: dict[str, list[int]]  # of pairs that have frames enough; the others are refused
     holdout: dict[str, list[int]]
     passed: dict[str, int]  # frames that meet the paper's conditions
     rejected: dict[str, dict[str, int]]  # frames not used for the fit, by reason
     notes: dict[str, list[str]] = field(default_factory=dict)
     missing: dict[str, list[str]] = field(default_factory=dict)  # what the day did not show, in words
+    refused: dict[str, SolveError] = field(default_factory=dict)  # pairs with too few frames, and why
 
 
 def select_frames(
@@ -63,24 +67,26 @@ def select_frames(
     *,
     paper: bool,
     sync_gate_s: float | None = PAPER_SYNC_GATE_S,
+    pairs: Sequence[str] = PAIRS,
+    absent: Mapping[str, str] | None = None,
 ) -> Selection:
-    """Choose frames to fit and to judge, the same way whenever it is asked.
+    """Choose frames to fit and to judge, the same way whenever it is asked; pair by pair, of frames that have both.
 
     Args:
         observations: the day in order of time.
         config: thresholds, number of frames, share held out.
         paper: prefer frames that meet the paper's conditions; else choose by content alone.
         sync_gate_s: largest difference of a pair's stamps; None = any that ingest let in.
-
-    Raises:
-        SolveError: fewer than MIN_FRAMES frames are left for a pair.
+        pairs: those of the rig. One for which fewer than MIN_FRAMES frames are left is refused.
+        absent: why frames lack a sensor, in words by sensor, as far as the caller knows.
     """
     scene = scenes_of(observations)
     held_out = hold_out(observations, config.holdout_fraction, scene)
     fit, holdout, passed, rejected, notes, missing = {}, {}, {}, {}, {}, {}
-    for pair in PAIRS:
+    refused: dict[str, SolveError] = {}
+    for pair in pairs:
         reasons = [unmet_conditions(o, pair, config, sync_gate_s) for o in observations]
-        usable = [i for i, r in enumerate(reasons) if "sync" not in r and "empty" not in r]
+        usable = [i for i, r in enumerate(reasons) if not _HARD & set(r)]
         candidates = _few_of_each([i for i in usable if held_out[i] is False], scene)
         ideal = [i for i in candidates if not reasons[i]]
         contents = contents_of(observations, pair)
@@ -90,15 +96,18 @@ def select_frames(
             fewest = rest[: max(0, 2 * (config.frames - len(chosen)))]
             chosen += choose_for_information(fewest, contents, config.frames - len(chosen))
             chosen = sorted(chosen)
+        rejected[pair] = _count_rejected(reasons, held_out, chosen, paper=paper)
         if len(chosen) < MIN_FRAMES:
-            raise SolveError(_too_few(pair, chosen, reasons))
+            refused[pair] = _silent(pair, observations, absent or {}) or SolveError(
+                _too_few(pair, chosen, reasons)
+            )
+            continue
         fit[pair] = chosen
         holdout[pair] = [i for i in usable if held_out[i] is True]
         passed[pair] = sum(1 for r in reasons if not r)
-        rejected[pair] = _count_rejected(reasons, held_out, chosen, paper=paper)
         notes[pair] = _notes(pair, passed[pair], [i for i in chosen if reasons[i]], len(chosen), paper=paper)
         missing[pair] = missing_content([observations[i] for i in chosen], pair)
-    return Selection(fit, holdout, passed, rejected, notes, missing)
+    return Selection(fit, holdout, passed, rejected, notes, missing, refused)
 
 
 def unmet_conditions(
@@ -107,7 +116,10 @@ def unmet_conditions(
     config: SelectConfig,
     sync_gate_s: float | None = PAPER_SYNC_GATE_S,
 ) -> list[str]:
-    """The paper's conditions that a frame does not meet for a pair, by name; "empty" where it has nothing to align."""
+    """The paper's conditions that a frame does not meet for a pair, by name.
+
+    "empty" where it has nothing to align; "no_radar" and the like alone where it lacks a sensor.
+    """
     camera, lidar, radar = (s in FRAMES_OF_PAIR[pair] for s in ("camera", "lidar", "radar"))
     stamps = {
         "camera": observation.camera_stamp_ns,
@@ -125,7 +137,8 @@ def unmet_conditions(
         "empty": (lidar and not len(observation.lidar_map_xyz_m))
         or (radar and not len(observation.radar_xyz_m)),
     }
-    return [name for name, is_unmet in unmet.items() if is_unmet]
+    absent = [f"no_{sensor}" for sensor in FRAMES_OF_PAIR[pair] if sensor not in observation.sensors]
+    return absent or [name for name, is_unmet in unmet.items() if is_unmet]
 
 
 def missing_content(observations: Sequence[Observation], pair: str) -> list[str]:
@@ -215,7 +228,7 @@ def _count_rejected(
     for i, unmet in enumerate(reasons):
         if i in taken:
             continue
-        hard = [r for r in unmet if r in ("sync", "empty")]
+        hard = [r for r in unmet if r in _HARD]
         if hard:
             counts[hard[0]] += 1
         elif held_out[i] is not False:
@@ -232,6 +245,17 @@ def _notes(pair: str, passed: int, below: Sequence[int], chosen: int, *, paper: 
         kept = f"the paper's frame conditions hold for {passed} frames of {pair}"
         return [f"{kept}; {len(below)} of the {chosen} frames used are below them"]
     return []
+
+
+def _silent(pair: str, observations: Sequence[Observation], absent: Mapping[str, str]) -> SolveError | None:
+    """What refuses a pair of which a sensor has too few frames; None where both have enough."""
+    for sensor in FRAMES_OF_PAIR[pair]:
+        seen = sum(sensor in o.sensors for o in observations)
+        if seen < MIN_FRAMES <= len(observations):
+            told = f"the {sensor} is silent: {seen} of {len(observations)} frames have it, {MIN_FRAMES} are needed"
+            why = f" ({absent[sensor]})" if sensor in absent else ""
+            return SolveError(told + why, fault="silent_sensor")
+    return None
 
 
 def _too_few(pair: str, chosen: Sequence[int], reasons: Sequence[Sequence[str]]) -> str:

@@ -23,6 +23,7 @@ from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.objective.paper.camera_lidar import cluster_points
 from pipeline.objective.paper.classes import REFLECTING, camera_at_label_size, in_camera, labels_of
 from pipeline.objective.paper.lidar_radar import CELL_M, FAR_M, drivable_map
+from schemas.calibrations import pairs_of
 from schemas.observations import Observation
 
 __all__ = ["THRESHOLDS", "exceeded", "trigger_metrics"]
@@ -45,26 +46,26 @@ def trigger_metrics(
 
     Args:
         observations: frames to look at.
-        transforms: T of each pair.
+        transforms: T of each pair to measure.
     """
     found: dict[str, dict[str, list[float]]] = {
-        pair: {m: [] for m in metrics} for pair, metrics in THRESHOLDS.items()
+        pair: {m: [] for m in THRESHOLDS[pair]} for pair in transforms
     }
     for observation in observations:
-        labels = labels_of(observation)
-        _append(
-            found["camera_lidar"],
-            lidar_outside_fraction=_lidar_outside(observation, labels, transforms["camera_lidar"]),
-        )
-        _append(
-            found["camera_radar"],
-            radar_outside_image=_radar_outside_image(observation, labels, transforms["camera_radar"]),
-        )
-        _append(
-            found["lidar_radar"],
-            radar_outside_lidar=_radar_outside_lidar(observation, transforms["lidar_radar"]),
-            drivable_outside_fraction=_drivable_outside(observation, transforms["lidar_radar"]),
-        )
+        there = set(pairs_of(observation.sensors)) & transforms.keys()
+        labels = labels_of(observation) if "camera" in observation.sensors else np.zeros((0, 0), np.uint8)
+        if "camera_lidar" in there:
+            outside = _lidar_outside(observation, labels, transforms["camera_lidar"])
+            _append(found["camera_lidar"], lidar_outside_fraction=outside)
+        if "camera_radar" in there:
+            outside = _radar_outside_image(observation, labels, transforms["camera_radar"])
+            _append(found["camera_radar"], radar_outside_image=outside)
+        if "lidar_radar" in there:
+            _append(
+                found["lidar_radar"],
+                radar_outside_lidar=_radar_outside_lidar(observation, transforms["lidar_radar"]),
+                drivable_outside_fraction=_drivable_outside(observation, transforms["lidar_radar"]),
+            )
     return {p: {name: float(np.mean(v)) for name, v in metrics.items() if v} for p, metrics in found.items()}
 
 

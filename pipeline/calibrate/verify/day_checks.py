@@ -66,8 +66,8 @@ def _loop(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
 
 
 def _scenes(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
-    fitted = day.selection.fit
-    return {pair: scene_failures([day.observations[i] for i in fitted[pair]]) for pair in PAIRS}
+    fitted = day.selection.fit.items()
+    return {pair: scene_failures([day.observations[i] for i in frames]) for pair, frames in fitted}
 
 
 # In the order in which a record states them.

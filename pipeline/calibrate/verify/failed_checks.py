@@ -53,13 +53,15 @@ def heading_failures(
     side by time offset times speed times the turn.
 
     Args:
-        solution: with camera-lidar and lidar-radar.
+        solution: without camera-lidar or lidar-radar no check fails.
         prior: whose T_lidar_radar gave the heading.
         observations: for the car's speed.
         limit_rad: largest error that camera-lidar may have at the targets.
         limits: from where on the heading is wrong, and what share of `limit_rad` that may cost; None = the defaults.
     """
     limits = limits or VerdictLimits()
+    if not {"camera_lidar", "lidar_radar"} <= solution.pairs.keys():
+        return []
     dt_s, expected_s = (
         solution.pairs["camera_lidar"].time_offset_s,
         constant_gap_s(camera_gaps_s(observations)),

@@ -317,8 +317,8 @@ def lidar_velocities(
 ) -> Float[np.ndarray, "F 3"]:
     """Own velocity in lidar axes [m/s]: the speed along the heading that the radar's Doppler shows (0 where unknown).
 
-    One heading for the day, in the horizontal plane: the mount's yaw. A single frame's heading is noisier
-    than it varies, and the radar's vertical velocity is no measurement.
+    One heading for the day, in the horizontal plane: the mount's yaw; the lidar's x axis where no radar tells. A
+    single frame's heading is noisier than it varies, and the radar's vertical velocity is no measurement.
     """
     speed = np.array([o.ego_speed_mps if o.ego_speed_mps is not None else 0.0 for o in observations])
     moving = [
@@ -327,7 +327,7 @@ def lidar_velocities(
         if o.radar_velocity_mps is not None and (o.ego_speed_mps or 0.0) > 3.0
     ]
     heading = 0.0
-    if len(moving) >= 5:
+    if len(moving) >= 5 and np.isfinite(T_lidar_radar).all():
         v = np.stack(moving) @ T_lidar_radar[:3, :3].T
         heading = float(np.median(np.arctan2(v[:, 1], v[:, 0])))
     return speed[:, None] * np.array([np.cos(heading), np.sin(heading), 0.0])

@@ -21,9 +21,9 @@ def check_models(rig: Rig, fleet: FleetConfig) -> None:
     Raises:
         ModelError: a manifest or model is missing, wrong, or not the one that its hash says.
     """
-    if isinstance(rig.camera.semantics, OnnxSemantics):
-        load_manifest(fleet.path_of(rig.camera.semantics.segmenter), "segment")
-        load_manifest(fleet.path_of(rig.camera.semantics.detector), "detect")
+    if isinstance(rig.semantics, OnnxSemantics):
+        load_manifest(fleet.path_of(rig.semantics.segmenter), "segment")
+        load_manifest(fleet.path_of(rig.semantics.detector), "detect")
 
 
 class ModelSource:

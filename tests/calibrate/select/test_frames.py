@@ -1,5 +1,7 @@
 """Which frames are chosen, which are held out, and what is said about the others."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -12,8 +14,7 @@ from pipeline.calibrate.select.frames import (
     unmet_conditions,
 )
 from pipeline.config import SelectConfig
-from pipeline.errors import SolveError
-from schemas.calibrations import PAIRS
+from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from tests.makers.solve_scenes import make_day
 
 CONFIG = SelectConfig(frames=30)
@@ -151,10 +152,40 @@ def test_parts_of_the_view_without_content_are_named(day):
     )
 
 
-def test_too_few_frames_are_an_error_that_names_the_pair_and_the_reasons():
+def test_a_pair_with_too_few_frames_is_refused_alone_with_its_reasons():
     day = [make_changed(o, radar_stamp_ns=0) if i >= 5 else o for i, o in enumerate(make_day(30))]
-    with pytest.raises(SolveError, match=f"camera_radar has . of 30, needs {MIN_FRAMES}.*sync 25"):
-        select_frames(day, CONFIG, paper=True)
+    chosen = select_frames(day, CONFIG, paper=True)
+    assert set(chosen.fit) == set(chosen.holdout) == {"camera_lidar"}
+    assert set(chosen.refused) == {"camera_radar", "lidar_radar"}
+    reason = chosen.refused["camera_radar"].reason
+    assert re.search(f"camera_radar has . of 30, needs {MIN_FRAMES}.*sync 25", reason)
+    whole = select_frames(make_day(30), CONFIG, paper=True)
+    assert chosen.fit["camera_lidar"] == whole.fit["camera_lidar"]
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_silent_sensor_costs_its_own_pairs_only_and_is_named(sensor):
+    day = [
+        make_changed(o, sensors=[s for s in SENSORS if s != sensor or i < 5])
+        for i, o in enumerate(make_day(30))
+    ]
+    chosen = select_frames(day, CONFIG, paper=False, absent={sensor: "nothing on /topic"})
+    assert {pair for pair in PAIRS if sensor not in FRAMES_OF_PAIR[pair]} == set(chosen.fit)
+    for pair, why in chosen.refused.items():
+        assert sensor in FRAMES_OF_PAIR[pair]
+        assert why.fault == "silent_sensor"
+        assert f"the {sensor} is silent: 5 of 30 frames have it" in why.reason
+        assert "(nothing on /topic)" in why.reason
+        assert chosen.rejected[pair][f"no_{sensor}"] == 25
+
+
+def test_a_radar_that_dies_at_noon_leaves_its_pairs_the_morning():
+    day = make_day(60)
+    half = [make_changed(o, sensors=["camera", "lidar"]) if i >= 30 else o for i, o in enumerate(day)]
+    chosen = select_frames(half, CONFIG, paper=False)
+    assert not chosen.refused
+    assert max(chosen.fit["lidar_radar"]) < 30
+    assert max(chosen.fit["camera_lidar"]) >= 30
 
 
 def make_changed(observation, **changes):

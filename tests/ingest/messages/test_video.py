@@ -99,7 +99,9 @@ def video_log(kit, data, name, path):
 def test_a_log_of_video_gives_frames_from_its_first_key_frame_on(kit, tmp_path, run_ingest, streams, name):
     log = video_log(kit, streams[name][2:], name, tmp_path / "video.mcap")  # it begins between key frames
     result, frames = run_ingest(log)
-    assert result.rejected["image_damaged"] == KEY_EVERY - 2
+    assert result.rejected["without_camera_image_damaged"] == KEY_EVERY - 2
+    assert {tuple(f.sensors) for f in frames[: KEY_EVERY - 2]} == {("lidar", "radar")}
+    frames = frames[KEY_EVERY - 2 :]
     assert len(frames) == COUNT - KEY_EVERY
     seen = video(streams[name], name).picture(KEY_EVERY)
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(frames[0].image, np.uint8), 1), seen)
