@@ -1,0 +1,25 @@
+"""The same calibration, spelled otherwise, is the same calibration."""
+
+import numpy as np
+
+from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, log_se3
+from pipeline.in_use.spelling import on_grid
+
+
+def test_digits_beyond_any_measurement_do_not_matter_and_the_pose_stays_where_it_is():
+    rng = np.random.default_rng(4)
+    alike = 0
+    for _ in range(300):
+        T = exp_se3(rng.normal(size=6))
+        otherwise = T + rng.uniform(-3e-8, 3e-8, (4, 4)) * (np.arange(4)[:, None] < 3)
+        alike += np.array_equal(on_grid(T), on_grid(otherwise))
+        assert np.abs(log_se3(on_grid(T) @ inverse(T))).max() < 4e-4
+    assert alike > 295
+
+
+def test_numbers_as_files_hold_them_lie_off_the_borders():
+    for metres in np.round(np.arange(0, 2, 0.00101), 5):
+        near = [
+            from_rotation_translation(exp_so3(np.zeros(3)), np.full(3, metres + e)) for e in (-1e-7, 1e-7)
+        ]
+        assert np.array_equal(on_grid(near[0]), on_grid(near[1]))
