@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -94,6 +94,9 @@ class CameraPrior:
     # or two pixels (Zhang 2000, table 2); the better ones of these.
     focal_sigma: float = 0.003
     centre_sigma_px: float = 1.0
+    centre_is_stated: bool = (
+        False  # else nobody promised it: enough to doubt a day, not to certify the camera's turn
+    )
 
 
 class CameraTopics(Section):
@@ -108,18 +111,20 @@ class CameraTopics(Section):
     readout_s: Annotated[float, Field(ge=0, le=0.1)] = Field(default=0.0, exclude=True)
 
     # How surely CameraInfo is right (1 sigma): focal length, and principal point in either direction.
-    # 0 = surely: the day then needs no more than its own sigma to contradict it.
+    # 0 = surely: the day then needs no more than its own sigma to contradict it. With `centre_sigma_px` records can
+    # certify how the camera is mounted; without it only where things appear in the image with this CameraInfo.
     focal_sigma_relative: Annotated[float, Field(ge=0, le=0.05)] = Field(
         default=CameraPrior.focal_sigma, exclude=True
     )
-    centre_sigma_px: Annotated[float, Field(ge=0, le=100)] = Field(
-        default=CameraPrior.centre_sigma_px, exclude=True
-    )
+    centre_sigma_px: Annotated[float, Field(ge=0, le=100)] | None = Field(default=None, exclude=True)
 
     @property
     def known(self) -> CameraPrior:
         """What calibration takes as known of the camera."""
-        return CameraPrior(self.readout_s, self.focal_sigma_relative, self.centre_sigma_px)
+        known = CameraPrior(self.readout_s, self.focal_sigma_relative)
+        if self.centre_sigma_px is None:
+            return known
+        return replace(known, centre_sigma_px=self.centre_sigma_px, centre_is_stated=True)
 
 
 class OnnxPointSemantics(Section):

@@ -107,6 +107,32 @@ CALIBRATIONS = TableSchema(
             "azimuth_sigma_rad", "float64", "sigma of a target's azimuth, from the covariance", nullable=True
         ),
         scalar("elevation_sigma_rad", "float64", "sigma of its elevation", nullable=True),
+        scalar(
+            "mounting_determined",
+            "list<string>",
+            "of `determined`, the directions in which the mounting is within the limit as well; the others hold with "
+            "this CameraInfo (and for the radar's detections) only",
+        ),
+        scalar(
+            "mounting_azimuth_sigma_rad",
+            "float64",
+            "sigma of a target's azimuth by the mounting: with what is not known of CameraInfo's principal point; null "
+            "where nothing says how well that is known",
+            nullable=True,
+        ),
+        scalar(
+            "mounting_elevation_sigma_rad",
+            "float64",
+            "and of its elevation: with a radar's own constant elevation error, too",
+            nullable=True,
+        ),
+        array(
+            "mounting_covariance",
+            "<f8",
+            (6, 6),
+            "covariance of the pose as that of what is mounted, same order; null as its sigmas",
+            nullable=True,
+        ),
         scalar("trigger_before", "map<string,float64>", "the paper's trigger metrics at the prior"),
         scalar("trigger_after", "map<string,float64>", "the same at the result"),
         scalar("triggered", "bool", "a trigger metric exceeded its threshold at the prior"),
@@ -223,12 +249,16 @@ class CalibrationRecord:
     limit_rad: float | None = None
     azimuth_sigma_rad: float | None = None
     elevation_sigma_rad: float | None = None
+    mounting_azimuth_sigma_rad: float | None = None
+    mounting_elevation_sigma_rad: float | None = None
+    mounting_covariance: np.ndarray | None = None
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     trigger_before: dict[str, float] = field(default_factory=dict)
     trigger_after: dict[str, float] = field(default_factory=dict)
     frames_rejected: dict[str, int] = field(default_factory=dict)
     determined: list[str] = field(default_factory=list)
+    mounting_determined: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     assumptions: list[str] = field(default_factory=list)

@@ -59,6 +59,8 @@ def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
         **_pose_cells(row["T"], _prior_of(row)),
         "sigma [deg, m]": f"{degrees} deg\n{metres} m",
         "frames": str(row["frames_used"]),
+        "certified": ", ".join(row["determined"]),
+        "of the mounting": ", ".join(row["mounting_determined"]),
         "reason": row["reason"],
     }
 

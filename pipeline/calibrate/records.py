@@ -36,6 +36,7 @@ __all__ = [
 # Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
 _FAST_MPS = 20.0
 _MOVING_MPS = 1.0
+_OF_K = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Judged:
     verdict: Verdict
     test: HeldOutTest | None
     claims: Mapping[str, Claim]
+    mounting_covariance: np.ndarray | None = None  # 6 6; None where nothing says how the camera hangs
 
 
 @dataclass(frozen=True)
@@ -80,13 +82,14 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
     verdict, test = judged.verdict, judged.test
     return CalibrationRecord(
         **_identity(about, pair, len(day.observations), day.prior),
-        **({} if verdict.status == "refused" else _estimate_fields(estimate)),
+        **({} if verdict.status == "refused" else _estimate_fields(estimate) | _mounting_fields(judged)),
         **_loop_fields(day.solution),
         status=verdict.status,
         reason=verdict.reason,
         faults=list(verdict.faults),
         score=verdict.score,
         determined=list(verdict.determined),
+        mounting_determined=list(verdict.mounting),
         limit_rad=judged.claims["azimuth"].limit_rad,
         frames_used=estimate.frames_used,
         frames_rejected=_add(selection.rejected[pair], estimate.frames_rejected),
@@ -104,6 +107,7 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         diagnostics=dict(estimate.diagnostics)
         | _test_numbers(test)
         | _claim_numbers(judged)
+        | _camera_numbers(pair, day.observations)
         | {"paper_frames": float(selection.passed[pair])},
     )
 
@@ -259,6 +263,23 @@ def _estimate_fields(estimate: PairEstimate) -> dict[str, Any]:
         "elevation_sigma_rad": float(sigma[1]),
         **_transform_fields("", estimate.T),
     }
+
+
+def _mounting_fields(judged: Judged) -> dict[str, Any]:
+    """How surely the record knows what is mounted; nothing where nobody knows the principal point."""
+    if judged.mounting_covariance is None:
+        return {}
+    sigmas = {f"mounting_{n}_sigma_rad": claim.mounting_sigma_rad for n, claim in judged.claims.items()}
+    return sigmas | {"mounting_covariance": judged.mounting_covariance}
+
+
+def _camera_numbers(pair: str, observations: Sequence[Observation]) -> dict[str, float]:
+    """The CameraInfo that the record's directions hold with, so that days of another one are told apart."""
+    o = next((o for o in observations if "camera" in o.sensors), None)
+    if "camera" not in FRAMES_OF_PAIR[pair] or o is None:
+        return {}
+    K = o.camera_K
+    return {f"camera_{name}_px": float(K[at]) for name, at in _OF_K.items()}
 
 
 def _loop_fields(solution: Solution) -> dict[str, Any]:

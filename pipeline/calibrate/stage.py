@@ -31,6 +31,7 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.label_offset import with_label_offset
 from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.calibrate.verify.mounting import camera_turn_sigma_rad, mounting_covariance
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.config import FleetConfig, VerifyConfig
@@ -287,12 +288,15 @@ def _judge_all(
     """Verdict and evidence of each pair; pairs that a method composes come after their factors."""
     limits, search = _limits(fleet.verify), search_range(prior, fleet.solve)
     composed = _composed_of(method_named(solution.method), solution.pairs)
+    seen_by = next((o for o in observations if "camera" in o.sensors), None)
+    turn = None if seen_by is None else camera_turn_sigma_rad(solution, prior.camera, seen_by.camera_K)
     failed = checks_of_day(FoundDay(observations, selection, prior, solution, composed, fleet, limits))
     found: dict[str, Judged] = {}
     for pair in sorted(solution.pairs, key=lambda p: p in composed):
         estimate = solution.pairs[pair]
         held_out = [observations[i] for i in selection.holdout[pair]] if pair in active else []
-        test, claims = _held_out_evidence(estimate, held_out, prior, fleet, limits)
+        mounting = mounting_covariance(pair, estimate.T, estimate.covariance, turn)
+        test, claims = _held_out_evidence(estimate, held_out, prior, fleet, limits, mounting)
         verdict = judge(
             estimate,
             prior,
@@ -302,7 +306,7 @@ def _judge_all(
             triggered=pair in active,
             factors=tuple(f.verdict for f in found.values()) if pair in composed else (),
         )
-        found[pair] = Judged(verdict, test, claims)
+        found[pair] = Judged(verdict, test, claims, mounting)
     return found
 
 
@@ -317,6 +321,7 @@ def _held_out_evidence(
     prior: Prior,
     fleet: FleetConfig,
     limits: VerdictLimits,
+    mounting: np.ndarray | None,
 ) -> tuple[HeldOutTest | None, dict[str, Claim]]:
     """Held-out frames at the prior and at the result, and what they leave to claim."""
     pair, verify = estimate.pair, fleet.verify
@@ -342,6 +347,7 @@ def _held_out_evidence(
         verify.confidence,
         limits.held_out_contradiction_sigmas,
         float(np.radians(elevation_deg)),
+        mounting,
     )
     return test, claims
 

@@ -32,6 +32,7 @@ __all__ = [
 _DETAILS = (
     *("day", "days", "since", "work_key", "recorded_at", "inputs", "notes", "assumptions"),
     *("time_offset_s", "time_offset_sigma_s", "azimuth_sigma_rad", "elevation_sigma_rad"),
+    *("mounting_determined", "mounting_azimuth_sigma_rad", "mounting_elevation_sigma_rad"),
 )
 
 

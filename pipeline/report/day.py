@@ -62,6 +62,7 @@ class PairView:
     time_offset: str
     loop: str
     certified: str
+    mounting: str  # what of it holds for the mounting, beside the direction in the image
     unchecked: str  # of an accepted record, what contradicts the prior and nothing checks
     notes: list[str]
     assumptions: list[str]
@@ -113,6 +114,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
         time_offset=_time_offset(record),
         loop=_loop(record),
         certified=_certified(record),
+        mounting=_mounting(record),
         unchecked=_unchecked(record),
         notes=[note for note in record.notes if not note.startswith(_SAID_BY_THE_AXES)],
         assumptions=list(record.assumptions),
@@ -132,8 +134,21 @@ def _certified(record: CalibrationRecord) -> str:
     same = len({limits[name] for name in record.determined}) == 1
     each = [f"{name} within {np.degrees(limits[name]):.2g} deg" for name in record.determined]
     together = f"{' and '.join(record.determined)} within {np.degrees(record.limit_rad):.2g} deg"
-    what = f"{together if same else ' and '.join(each)} at 15 to 40 m"
+    where = "at 15 to 40 m" + (", in the image with this CameraInfo" * record.pair.startswith("camera"))
+    what = f"{together if same else ' and '.join(each)} {where}"
     return f"{what if record.determined else 'nothing'}; score {record.score:.2f}"
+
+
+def _mounting(record: CalibrationRecord) -> str:
+    """Directions that the record certifies of what is mounted, and how surely; empty where it was never judged."""
+    if record.score is None or record.limit_rad is None:
+        return ""
+    azimuth, elevation = record.mounting_azimuth_sigma_rad, record.mounting_elevation_sigma_rad
+    if azimuth is None or elevation is None:
+        return "not certified: nothing says how well CameraInfo's principal point is known (centre_sigma_px)"
+    certified = " and ".join(record.mounting_determined) or "not"
+    known = f"{np.degrees(azimuth):.2f} deg of azimuth and {np.degrees(elevation):.2f} deg of elevation"
+    return f"{certified} certified; known to {known} (1 sigma)"
 
 
 def _unchecked(record: CalibrationRecord) -> str:

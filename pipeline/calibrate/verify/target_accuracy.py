@@ -39,6 +39,7 @@ class Claim:
     limit_rad: float  # largest error that the purpose allows
     confidence: float  # probability with which the error must stay within the limit
     contradiction_sigmas: float = VerdictLimits.held_out_contradiction_sigmas
+    mounting_sigma_rad: float = np.inf  # of the estimate as the pose of what is mounted: see `mounting.py`
 
     @property
     def bound_rad(self) -> float:
@@ -46,13 +47,22 @@ class Claim:
 
         A shift by which held-out frames contradict the estimate counts as error.
         """
-        shift = self.shift_rad if self.agreement < 0 else 0.0
-        return _quantile(shift, self.sigma_rad, self.confidence)
+        return self._bound_rad(self.sigma_rad)
 
     @property
     def margin(self) -> float:
         """1 = far inside the limit, 0 = at it, negative = not certified."""
         return 1 - self.bound_rad / self.limit_rad
+
+    @property
+    def certifies_mounting(self) -> bool:
+        """The mounting's own error is within the limit as well."""
+        sigma = self.mounting_sigma_rad
+        return bool(np.isfinite(sigma) and self._bound_rad(sigma) <= self.limit_rad)
+
+    def _bound_rad(self, sigma_rad: float) -> float:
+        shift = self.shift_rad if self.agreement < 0 else 0.0
+        return _quantile(shift, sigma_rad, self.confidence)
 
     @property
     def agreement(self) -> float:
@@ -81,6 +91,7 @@ def claims_of(
     confidence: float,
     contradiction_sigmas: float = VerdictLimits.held_out_contradiction_sigmas,
     elevation_limit_rad: float | None = None,
+    mounting: Float[np.ndarray, "6 6"] | None = None,
 ) -> dict[str, Claim]:
     """What can be claimed of each direction, by name.
 
@@ -93,9 +104,11 @@ def claims_of(
         confidence: probability with which an error has to stay within it.
         contradiction_sigmas: sigmas of the shift from which held-out frames contradict the estimate.
         elevation_limit_rad: for elevation, where it differs from azimuth's.
+        mounting: covariance of the estimate as the pose of what is mounted; None where nobody knows it.
     """
     limits_rad = (limit_rad, limit_rad if elevation_limit_rad is None else elevation_limit_rad)
     own = target_sigmas(pair, T, covariance)
+    mounted = np.full(2, np.inf) if mounting is None else target_sigmas(pair, T, mounting)
     claims = {}
     for d, name in enumerate(DIRECTIONS):
         sigma = float(own[d])
@@ -111,6 +124,13 @@ def claims_of(
             remaining = min(sigma, max(updated, bias))
             shift = float(np.sqrt(np.mean((J @ update.shift) ** 2)))
         claims[name] = Claim(
-            sigma, shift, shift_sigma, remaining, limits_rad[d], confidence, contradiction_sigmas
+            sigma,
+            shift,
+            shift_sigma,
+            remaining,
+            limits_rad[d],
+            confidence,
+            contradiction_sigmas,
+            float(mounted[d]),
         )
     return claims

@@ -1,8 +1,9 @@
 """Accept, hold or refuse: each check has a margin, the smallest is the score, and one below zero holds the record.
 
 Accepted: the record certifies what it names in `determined` (azimuth, and elevation where the day shows it, of targets
-15 to 40 m away), within its stated limit. Held: computed and recorded, but a check failed and the prior stays current.
-Refused: too little to compute from.
+15 to 40 m away), within its stated limit: in the image with this CameraInfo, and as the sensors are mounted where
+`mounting` names it. Held: computed and recorded, but a check failed and the prior stays current. Refused: too little to
+compute from.
 """
 
 from __future__ import annotations
@@ -65,6 +66,9 @@ class Verdict:
     # Of an accepted record: degrees of freedom that contradict the prior and that nothing checks, how far in sigmas.
     unchecked: Mapping[str, float] = field(default_factory=dict)
     unsure_only: bool = False  # held, but for nothing more than a sigma that is too large for the limits
+    mounting: tuple[
+        str, ...
+    ] = ()  # of the certified directions, those in which the mounting is within the limit too
     faults: tuple[str, ...] = ()  # keys of schemas.faults.FAULTS that the failed checks name
 
 
@@ -135,7 +139,8 @@ def judge(
     unchecked = _unchecked(estimate, prior, certified)
     reason = "; ".join([*_reservations(estimate, evidence.claims), *_differences(estimate.pair, unchecked)])
     named = {DOF_NAMES[k]: sigmas for k, sigmas in unchecked.items()}
-    return Verdict("accepted", reason, score, certified, unchecked=named)
+    mounting = tuple(name for name in certified if evidence.claims[name].certifies_mounting)
+    return Verdict("accepted", reason, score, certified, unchecked=named, mounting=mounting)
 
 
 def _moves_little(

@@ -348,6 +348,7 @@ def _measured(
     out["sigma_deg"] = _deg([record.azimuth_sigma_rad, record.elevation_sigma_rad])
     out["error_deg"] = _deg(_direction_errors(record, T, T_image))
     out["mounting_error_deg"] = _deg(_direction_errors(record, T, T_mounted))
+    out["mounting_determined"] = record.mounting_determined
     out["error"] = [float(f"{v:.4g}") for v in change_between(T_mounted, T)]
     offset_s = _offset_s(pair, case, truth)
     if record.time_offset_s is not None and offset_s is not None:
@@ -387,6 +388,10 @@ def is_right(pair: str, found: Mapping[str, Any], rig: str, *, every: bool = Fal
     for k in asked:
         error, sigma = found["error_deg"][k], float(np.hypot(found["sigma_deg"][k], reference))
         if error > SIGMAS * sigma or error > np.hypot(found["limit_deg"][k], SIGMAS * reference):
+            return False
+        # What a record certifies of the mounting must hold there, whatever CameraInfo says.
+        certified = names[k] in found.get("mounting_determined", ())
+        if certified and found["mounting_error_deg"][k] > np.hypot(found["limit_deg"][k], SIGMAS * reference):
             return False
     return True
 

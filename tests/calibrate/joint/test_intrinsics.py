@@ -73,9 +73,10 @@ def test_a_contradicted_camera_info_holds_camera_lidar_with_the_measured_value(d
         )
         d = solution.pairs["camera_lidar"].diagnostics
         assert (d["day_focal_scale"] > 1.02) == is_told
-        # What the principal point leaves open in the mounting: at most what CameraInfo alone would.
-        one_px_rad = 1 / rows[0].camera_K[0, 0]
-        assert 0.5 * one_px_rad < d["mounting_yaw_sigma_rad"] <= one_px_rad
+        # What the principal point leaves open in the mounting: nobody stated it, so what the day measured.
+        assert d["mounting_yaw_sigma_rad"] * rows[0].camera_K[0, 0] == pytest.approx(
+            d["day_centre_u_sigma_px"]
+        )
         assert any("CameraInfo's principal point" in note for note in solution.pairs["camera_lidar"].notes)
 
 
@@ -110,7 +111,7 @@ def test_a_contradicted_camera_info_was_asked_of_both_halves(day):
 
 
 def test_diagnostics_say_what_the_day_determined_and_what_stays_open_in_the_mounting():
-    known = CameraPrior(focal_sigma=0.003, centre_sigma_px=4.0)
+    known = CameraPrior(focal_sigma=0.003, centre_sigma_px=4.0, centre_is_stated=True)
     d = day_of(1.01, 0.002, (5.0, -2.0)).diagnostics(known)
     assert (d["day_focal_observable"], d["day_centre_u_observable"], d["day_centre_v_observable"]) == (
         1,
@@ -119,5 +120,6 @@ def test_diagnostics_say_what_the_day_determined_and_what_stays_open_in_the_moun
     )
     assert (d["day_centre_u_px"], d["day_centre_v_px"]) == (5.0, -2.0)
     assert d["mounting_pitch_sigma_rad"] == pytest.approx(2.4 / 900)  # 3 px and 4 px together
-    sure = day_of().diagnostics(CameraPrior(centre_sigma_px=0.0))
+    assert day_of().diagnostics(CameraPrior())["mounting_yaw_sigma_rad"] == pytest.approx(20 / 900)
+    sure = day_of().diagnostics(CameraPrior(centre_sigma_px=0.0, centre_is_stated=True))
     assert sure["mounting_yaw_sigma_rad"] == 0.0

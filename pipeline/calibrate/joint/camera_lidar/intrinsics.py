@@ -76,7 +76,7 @@ class DayIntrinsics:
 
     def diagnostics(self, known: CameraPrior) -> dict[str, float]:
         """Numbers of the record; `mounting_*` is what the principal point leaves open in the camera's turn."""
-        centre = _together(self.centre_sigma_px, known.centre_sigma_px)
+        yaw_rad, pitch_rad = self._turn_sigma_rad(known)
         return {
             "day_focal_scale": self.focal,
             "day_focal_sigma": self.focal_sigma,
@@ -87,20 +87,22 @@ class DayIntrinsics:
                 f"day_centre_{n}_observable": float(v <= known.centre_sigma_px)
                 for n, v in zip("uv", self.centre_sigma_px, strict=True)
             },
-            "mounting_yaw_sigma_rad": float(centre[0] / self.focal_px[0]),
-            "mounting_pitch_sigma_rad": float(centre[1] / self.focal_px[1]),
+            "mounting_yaw_sigma_rad": yaw_rad,
+            "mounting_pitch_sigma_rad": pitch_rad,
         }
 
     def notes(self, known: CameraPrior) -> list[str]:
         """In words: what was assumed, and what the day could have told."""
-        u, v = _together(self.centre_sigma_px, known.centre_sigma_px)
-        yaw, pitch = np.degrees([u / self.focal_px[0], v / self.focal_px[1]])
+        yaw, pitch = np.degrees(self._turn_sigma_rad(known))
+        source = (
+            "centre_sigma_px and the day" if known.centre_is_stated else "the day, without centre_sigma_px"
+        )
         (right, down), (right_sigma, down_sigma) = self.centre_px, self.centre_sigma_px
         return [
             (
-                "azimuth and elevation hold with CameraInfo's principal point, which is known to "
-                f"{u:.1f} px right and {v:.1f} px down (1 sigma): of the camera's mounting that leaves "
-                f"{yaw:.2f} deg of yaw and {pitch:.2f} deg of pitch"
+                "azimuth and elevation are directions in the image with CameraInfo's principal point; by "
+                f"{source}, what is not known of that point leaves {yaw:.2f} deg of yaw and {pitch:.2f} deg of pitch "
+                "(1 sigma) open in the camera's mounting"
             ),
             (
                 f"by the day alone the focal length is {self.focal - 1:+.1%} +- {self.focal_sigma:.1%} off "
@@ -110,6 +112,12 @@ class DayIntrinsics:
             # By a profile like the time offset's it errs by tens of ms: study `intrinsics.py`.
             f"image rows are exposed within {1e3 * known.readout_s:.0f} ms (readout_s): a day does not tell",
         ]
+
+    def _turn_sigma_rad(self, known: CameraPrior) -> tuple[float, float]:
+        """Of the camera's yaw and pitch, as far as the principal point is known: a default promises nothing."""
+        stated_px = known.centre_sigma_px if known.centre_is_stated else np.inf
+        yaw, pitch = _together(self.centre_sigma_px, stated_px) / np.array(self.focal_px)
+        return float(yaw), float(pitch)
 
 
 def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[FailedCheck]:
@@ -304,6 +312,6 @@ def _off_by_sigmas(day: DayIntrinsics, known: CameraPrior) -> Float[np.ndarray, 
     return off / np.hypot(sigma, [known.focal_sigma, known.centre_sigma_px, known.centre_sigma_px])
 
 
-def _together(day_px: Float[np.ndarray, " 2"], known_px: float) -> Float[np.ndarray, " 2"]:
-    """Sigma of the principal point by CameraInfo and day together."""
-    return known_px * day_px / np.hypot(known_px, day_px)
+def _together(day_px: Float[np.ndarray, " 2"], stated_px: float) -> Float[np.ndarray, " 2"]:
+    """Sigma of the principal point by what is stated (infinite: nothing) and the day together."""
+    return day_px / np.hypot(1.0, day_px / stated_px) if stated_px else np.zeros(2)

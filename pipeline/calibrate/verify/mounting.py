@@ -1,0 +1,63 @@
+"""How surely a record knows the mounting, beside where things appear: covariances of the two, one out of the other.
+
+A principal point wrong by d pixels is, but for second order, a camera turned by d / f. No alignment tells the two
+apart, and whoever projects with the same CameraInfo gets the right pixel all the same: through camera-radar as well,
+where both factors see through the same camera, and in lidar-radar, whose boxes are read through it. So what is
+certified in the image does not say how the camera hangs. That is known as surely as the principal point: as fleet.toml
+states it (`centre_sigma_px`), else as the day itself measures it, else not at all. Likewise a radar's own constant
+elevation error turns its detections, which a record is about, and not its mounting.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD
+from pipeline.extrinsics.estimates import Solution
+from pipeline.geometry.se3 import hat
+from pipeline.rigs import CameraPrior
+
+__all__ = ["camera_turn_sigma_rad", "mounting_covariance"]
+
+
+def camera_turn_sigma_rad(
+    solution: Solution, known: CameraPrior, K: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, " 2"] | None:
+    """Sigmas of the camera's pitch and yaw (turns about its x and y) that the principal point leaves open.
+
+    As the method measured them on the day; of one that measures none as stated, and None where nobody stated any.
+    """
+    camera_lidar = solution.pairs.get("camera_lidar")
+    measured = {} if camera_lidar is None else camera_lidar.diagnostics
+    names = ("mounting_pitch_sigma_rad", "mounting_yaw_sigma_rad")
+    if all(name in measured for name in names):
+        return np.array([measured[name] for name in names])
+    return known.centre_sigma_px / np.diag(K)[[1, 0]] if known.centre_is_stated else None
+
+
+def mounting_covariance(
+    pair: str,
+    T: Float[np.ndarray, "4 4"],
+    covariance: Float[np.ndarray, "6 6"],
+    turn_sigma_rad: Float[np.ndarray, " 2"] | None,
+) -> Float[np.ndarray, "6 6"] | None:
+    """Covariance of an estimate as the pose of what is mounted; None where nothing says how the camera hangs.
+
+    Args:
+        pair: which one.
+        T: the estimate.
+        covariance: of its left perturbation, for whoever uses the same CameraInfo and the radar's detections.
+        turn_sigma_rad: of the camera, about its x and y.
+    """
+    wider = np.array(covariance, np.float64)
+    if pair.startswith("camera"):
+        if turn_sigma_rad is None:
+            return None
+        wider[[0, 1], [0, 1]] += turn_sigma_rad**2
+    if pair.endswith("radar"):
+        # A turn about the radar's own y, as a twist about the parent's origin.
+        axis = T[:3, 1]
+        twist = RADAR_ELEVATION_BIAS_RAD * np.concatenate([axis, hat(T[:3, 3]) @ axis])
+        wider += np.outer(twist, twist)
+    return wider
