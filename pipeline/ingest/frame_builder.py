@@ -1,7 +1,7 @@
 """One synchronised moment to one row of `frames`: only here are payloads decoded, only those of kept moments.
 
-A sensor whose payload is damaged or says too little is left out of its moment, which goes on with the other two where
-no whole moment within the second before shows the same scene.
+A sensor whose payload is damaged, says too little or repeats an earlier one is left out of its moment, which goes on
+with the other two where no whole moment within the second before shows the same scene.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from pipeline.ingest.messages.odometry import EgoState
 from pipeline.ingest.messages.point_cloud import LidarCloud, read_lidar
 from pipeline.ingest.messages.radar import RadarCloud, read_radar
 from pipeline.ingest.messages.video import VideoPictures, video_codec
+from pipeline.ingest.repetition import REPEATED, Repetitions
 from pipeline.ingest.sync import Rejection
 from pipeline.rigs import Rig, TopicSemantics
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, pairs_of
@@ -65,7 +66,7 @@ class Trio:
     drive: int
 
 
-_Part = TypeVar("_Part")
+_Part = TypeVar("_Part", bound=tuple[Any, str])
 _NONE_NEAR = {"camera": Rejection.NO_CAMERA, "lidar": Rejection.NO_LIDAR, "radar": Rejection.NO_RADAR}
 _NO_IMAGE: dict[str, Any] = {
     "image": b"", "image_format": "", "image_width_px": 0, "image_height_px": 0, "camera_model": "",
@@ -94,6 +95,7 @@ class FrameBuilder:
         self._video = VideoPictures(self._image_packet, index.stream("image").stamps_ns)
         self.counts: Counter[str] = Counter()
         self.frame_ids: dict[str, list[str]] = {}
+        self._repetitions = Repetitions()
         self._whole_ns = -SAME_SCENE_NS  # of the last moment with all sensors
 
     def build(self, trio: Trio, frame_index: int) -> Frame:
@@ -149,8 +151,11 @@ class FrameBuilder:
         """What a sensor of the rig adds to the moment; None, and why in `missing`, where it adds nothing."""
         try:
             if place is not None:
-                return read(place)
-            if sensor in self._rig.sensors:
+                part = read(place)
+                if self._repetitions.is_new(part[0]):
+                    return part
+                missing[sensor] = Rejected(REPEATED[sensor])
+            elif sensor in self._rig.sensors:
                 missing[sensor] = Rejected(_NONE_NEAR[sensor])
         except Rejected as why:
             missing[sensor] = why

@@ -16,6 +16,7 @@ from pipeline.extrinsics.prior import read_transforms
 from pipeline.ingest.containers.reader import content_identity
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected, Trio
 from pipeline.ingest.index import DayIndex, index_logs, topics_of
+from pipeline.ingest.repetition import REPEATED
 from pipeline.ingest.sync import (
     Rejection,
     Trios,
@@ -28,12 +29,14 @@ from pipeline.ingest.sync import (
 from pipeline.results import Progress
 from pipeline.rigs import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
+from schemas.faults import FAULTS
 from schemas.frames import SENSORS_ABSENT, SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ, Frame
 from schemas.outcomes import MENDED_IN_FLEET_TOML
 
 __all__ = ["find_trios", "pick_trios", "read_file_prior", "work"]
 
 _PROBLEMS_SHOWN = 3
+_STUCK = FAULTS["stuck_sensor"]
 _NO_STAMP_NS = -(10**18)  # long before any log
 _SAME_IMAGE_NS = 5_000_000  # labels and detections carry the stamp of the image that they were computed on
 _FAR_FROM_DAY = dt.timedelta(hours=12 + 14 + 12)  # half a day, the earliest time zone, and a night's drive
@@ -45,6 +48,7 @@ _UNUSABLE = (
     Rejection.LIDAR_SPARSE,
     Rejection.RADAR_DAMAGED,
     Rejection.RADAR_SPARSE,
+    *REPEATED.values(),
 )
 
 
@@ -174,6 +178,7 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestCon
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
         what = f"of no moment two sensors were usable, most often {reason} ({rejected[reason]})"
+        what = f"{_STUCK}: {what}" if reason in REPEATED.values() else what
     return _shorten([what, *index.problems])
 
 
@@ -194,7 +199,8 @@ def absences(index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConf
         elif reason in (Rejection.NO_CAMERA, Rejection.NO_RADAR):
             found[sensor] = f"nothing of {topics[role]} is near enough: not {_near_enough(config)}"
         else:
-            found[sensor] = f"{topics[role]} was unusable, most often {reason} ({count})"
+            stuck = f"{_STUCK}: " if reason == REPEATED[sensor] else ""
+            found[sensor] = f"{stuck}{topics[role]} was unusable, most often {reason} ({count})"
     return found
 
 

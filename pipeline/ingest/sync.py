@@ -51,6 +51,9 @@ class Rejection(StrEnum):
     LIDAR_SPARSE = "too_few_lidar_points"
     RADAR_DAMAGED = "radar_undecodable"
     RADAR_SPARSE = "too_few_radar_points"
+    IMAGE_REPEATED = "image_repeats_an_earlier_one"
+    LIDAR_REPEATED = "lidar_repeats_an_earlier_sweep"
+    RADAR_REPEATED = "radar_repeats_an_earlier_scan"
 
 
 @dataclass(frozen=True, eq=False)

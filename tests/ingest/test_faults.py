@@ -1,5 +1,6 @@
 """Faulty logs: what is whole is kept, what is not is counted and named, nothing is made up."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -344,3 +345,33 @@ def test_a_prior_file_stands_in_for_tf_static_and_enters_the_work_key(kit, tmp_p
     file.write_text(json.dumps({"T_camera_lidar": T.tolist(), "T_lidar_radar": np.eye(4).tolist()}))
     with pytest.raises(ConfigError, match="no rotation"):
         run_ingest(log, fleet=fleet, file=toml)
+
+
+def stuck(kit, path, topic, frames=12):
+    """A day in which one sensor delivers its first data again and again; its stamps go on."""
+    log = kit.Kit(frames=frames).drive()
+    of_topic = [k for k, message in enumerate(log.messages) if message[0] == topic]
+    first = log.messages[of_topic[0]][3]
+    for k in of_topic:
+        name, kind, stamp, message = log.messages[k]
+        log.messages[k] = (name, kind, stamp, dataclasses.replace(first, header=message.header))
+    return log.mcap(path)
+
+
+@pytest.mark.parametrize(
+    ("topic", "sensor", "reason"),
+    [
+        ("IMAGE", "camera", Rejection.IMAGE_REPEATED),
+        ("LIDAR", "lidar", Rejection.LIDAR_REPEATED),
+        ("RADAR", "radar", Rejection.RADAR_REPEATED),
+    ],
+)
+def test_data_that_a_sensor_repeats_under_new_stamps_are_counted_and_named(
+    kit, tmp_path, run_ingest, topic, sensor, reason
+):
+    result, frames = run_ingest(stuck(kit, tmp_path / "a.mcap", getattr(kit, topic)))
+    assert sum(sensor in f.sensors for f in frames) == 1
+    assert result.rejected[reason] + result.rejected.get(f"without_{sensor}_{reason}", 0) == 11
+    whole, frames = run_ingest(kit.Kit(frames=12).drive().mcap(tmp_path / "b.mcap"), name="other")
+    assert len(frames) == 12
+    assert not [name for name in whole.rejected if "repeat" in name]

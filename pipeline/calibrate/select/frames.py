@@ -24,6 +24,7 @@ from pipeline.calibrate.select.coverage import choose_for_information, contents_
 from pipeline.config import SelectConfig
 from pipeline.errors import SolveError
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
+from schemas.faults import FAULTS
 from schemas.observations import Observation
 
 __all__ = [
@@ -254,7 +255,9 @@ def _silent(pair: str, observations: Sequence[Observation], absent: Mapping[str,
         if seen < MIN_FRAMES <= len(observations):
             told = f"the {sensor} is silent: {seen} of {len(observations)} frames have it, {MIN_FRAMES} are needed"
             why = f" ({absent[sensor]})" if sensor in absent else ""
-            return SolveError(told + why, fault="silent_sensor")
+            # Whoever knows the fault begins with its sentence.
+            known = (code for code, sentence in FAULTS.items() if absent.get(sensor, "").startswith(sentence))
+            return SolveError(told + why, fault=next(known, "silent_sensor"))
     return None
 
 
