@@ -81,6 +81,7 @@ class PairEstimate:
     notes: list[str] = field(default_factory=list)
     # 6 6, what all days of a vehicle err by alike; part of covariance.
     common_covariance: np.ndarray | None = None
+    failed_checks: list[FailedCheck] = field(default_factory=list)  # of the solver's, on this pair alone
     disproved: str = ""  # why it cannot be right, where a check of the solver's shows that
 
 

@@ -193,7 +193,7 @@ class _Day:
         found = replace(found, disproved=unvouched_basin(self.aligned.basin))
         # Of a basin that is lost, nobody knows what its intrinsics are worth.
         told = [] if found.disproved else contradictions(self.aligned.intrinsics, self.prior.camera)
-        return found, told
+        return found, [*told, *found.failed_checks]
 
 
 def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfig]:

@@ -29,6 +29,13 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
 from pipeline.calibrate.joint.camera_lidar.refine import NONE_FIXED, AlignmentState, Scored, refine, weighted
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, s_per_metre
+from pipeline.calibrate.joint.camera_lidar.witnesses import (
+    Witness,
+    ask_witnesses,
+    disagreement,
+    widening,
+    witness_numbers,
+)
 from pipeline.calibrate.numerics.bias_floors import HEADING_SIGMA_RAD, MAX_GAP_PX
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
@@ -193,7 +200,8 @@ def analyse_camera_lidar(
         half = replace(scored, terms=problem.terms.of_frames(np.arange(k, problem.terms.frames, 2)))
         halves.append(refine(half, analysis.state, steps=SCHEDULE.half_steps, fixed=fixed))
     diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves)
-    return _conclude(analysis, aligned, problem.config, diagnostics)
+    witnesses = ask_witnesses(problem.terms, analysis.state, analysis.kernel, problem.blocks, problem.seed)
+    return _conclude(analysis, aligned, problem.config, diagnostics, witnesses)
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
@@ -279,8 +287,10 @@ def _conclude(
     aligned: Aligned,
     config: SolveConfig,
     diagnostics: dict[str, float],
+    witnesses: Sequence[Witness],
 ) -> PairEstimate:
     """The estimate, its covariance by left perturbation, notes."""
+    covariance = analysis.covariance[:6, :6] + np.diag([*widening(witnesses) ** 2, 0, 0, 0, 0])
     dt_sigma = float(np.sqrt(analysis.covariance[6, 6]))
     known = analysis.prior.camera
     notes = aligned.intrinsics.notes(known)
@@ -290,16 +300,17 @@ def _conclude(
     return PairEstimate(
         "camera_lidar",
         analysis.state.T_camera_lidar,
-        to_left @ analysis.covariance[:6, :6] @ to_left.T,
+        to_left @ covariance @ to_left.T,
         analysis.observability,
         analysis.observability >= OBSERVABLE,
         frames_used=len(aligned.frames),
         frames_rejected=aligned.rejected,
         time_offset_s=aligned.expected_dt_s + analysis.state.dt_s,
         time_offset_sigma_s=dt_sigma,
-        diagnostics=diagnostics | aligned.intrinsics.diagnostics(known),
+        diagnostics=diagnostics | aligned.intrinsics.diagnostics(known) | witness_numbers(witnesses),
         notes=notes,
         common_covariance=common_part(
-            to_left @ analysis.common[:6, :6] @ to_left.T, to_left @ analysis.covariance[:6, :6] @ to_left.T
+            to_left @ analysis.common[:6, :6] @ to_left.T, to_left @ covariance @ to_left.T
         ),
+        failed_checks=disagreement(witnesses),
     )

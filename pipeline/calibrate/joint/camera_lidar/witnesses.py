@@ -1,0 +1,151 @@
+"""Parts of camera-lidar's evidence against each other: where each alone would put pitch and yaw.
+
+The fit takes their mean, and its sigma is as small as if they agreed. Where a surface of the cloud has no border in the
+labels (the sill of a car's window, whose nearest border is the roof), one kind of edge is biased by a degree, and
+neither halves nor held-out frames show it: they share the bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms
+from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
+
+__all__ = ["Witness", "ask_witnesses", "disagreement", "widening", "witness_numbers"]
+
+_REACH_RAD = np.radians(2.0)
+_STEP_PX = 0.5  # of the label image
+_RESAMPLES = 64
+_FEWEST_BLOCKS = 8  # with fewer, frames are resampled: two blocks know no scatter
+_FEWEST = 100  # edges, or markings, of a kind
+_WIDENING_SIGMAS, _SIGMAS = 2.0, 3.0
+# Labels too wide, and edges anywhere between two beams, move opposite sides apart. On 34 good days of thirteen rigs a
+# side is off by up to half its beams' gap, or by 2.5 label pixels where that is small; paint by 0.4.
+_FLOOR_PX, _FLOOR_OF_GAP, _PAINT_FLOOR_PX = 1.0, 0.4, 0.5
+# Those that see a turn about an axis (0 pitch, 1 yaw); a turn along an edge moves it within its border.
+_SIDES: Final = {
+    0: (("edges below a foreground", EDGE_ABOVE), ("edges above a foreground", EDGE_BELOW)),
+    1: (("edges right of a foreground", EDGE_LEFT), ("edges left of a foreground", EDGE_RIGHT)),
+}
+_AXES: Final = ("pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class Witness:
+    """What one part of the evidence alone would turn the solution by."""
+
+    name: str
+    axis: int  # 0 pitch, 1 yaw: about the camera's x and y
+    offset_rad: float
+    scatter_rad: float  # over blocks of frames
+    floor_rad: float  # of what all scenes share: labels too wide, beams too far apart
+
+    @property
+    def sigma_rad(self) -> float:
+        """Of the offset."""
+        return float(np.hypot(self.scatter_rad, self.floor_rad))
+
+    @property
+    def sentence(self) -> str:
+        """Who, by how much."""
+        return f"{self.name} by {np.degrees(self.offset_rad):+.2f} +- {np.degrees(self.sigma_rad):.2f} deg"
+
+
+def ask_witnesses(
+    terms: Terms, state: AlignmentState, kernel: KernelSettings, blocks: Int[np.ndarray, " F"], seed: int
+) -> list[Witness]:
+    """Where each side of the edges, and the markings, would turn the solution about the camera's x and y.
+
+    Each score's maximum within 2 deg, the other unknowns as they are; sigma by resampling blocks of frames, so that a
+    score of several maxima is unsure.
+    """
+    px_rad = 1 / float(terms.camera[1])
+    steps = int(_REACH_RAD / (_STEP_PX * px_rad))
+    turn_rad = np.arange(-steps, steps + 1) * _STEP_PX * px_rad
+    found = []
+
+    def ask(name: str, axis: int, score: np.ndarray, floor_rad: float) -> None:
+        rng = np.random.default_rng(seed)
+        offset, scatter = _maximum(turn_rad, score.astype(np.float64), blocks, rng)
+        found.append(Witness(name, axis, offset, scatter, floor_rad))
+
+    for axis, sides in _SIDES.items():
+        at = state.changed(turn_rad[:, None] * (np.arange(8) == axis))
+        for name, side in sides:
+            edges = terms.edges.chosen(terms.edges.side == side)
+            if kernel.edge_weight > 0 and len(edges.xyz_m) >= _FEWEST:
+                floor_rad = float(np.hypot(_FLOOR_PX * px_rad, _FLOOR_OF_GAP * np.median(edges.gap_rad)))
+                ask(name, axis, replace(terms, edges=edges).edge_score(at, kernel), floor_rad)
+        if kernel.marking_weight > 0 and len(terms.markings.xyz_m) >= _FEWEST:
+            ask("paint", axis, terms.marking_score(at, kernel), _PAINT_FLOOR_PX * px_rad)
+    return found
+
+
+def disagreement(witnesses: Sequence[Witness]) -> list[FailedCheck]:
+    """A failed check for each axis about which two of them differ by more than three sigmas."""
+    return [
+        FailedCheck(
+            f"the evidence disagrees on {_AXES[a.axis]}: {a.sentence}, {b.sentence}", "witnesses_disagree"
+        )
+        for a, b in _contradictions(witnesses, _SIGMAS)
+    ]
+
+
+def widening(witnesses: Sequence[Witness]) -> Float[np.ndarray, " 2"]:
+    """Sigma of pitch and of yaw [rad] to add: half of what two differ by, if more than two sigmas, else 0."""
+    sigma = np.zeros(2)
+    for a, b in _contradictions(witnesses, _WIDENING_SIGMAS):
+        sigma[a.axis] = abs(a.offset_rad - b.offset_rad) / 2
+    return sigma
+
+
+def witness_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
+    """Offsets and sigmas, for the record's diagnostics."""
+    return {
+        f"{w.name.replace(' ', '_')}_{_AXES[w.axis]}_{what}_rad": value
+        for w in witnesses
+        for what, value in (("offset", w.offset_rad), ("sigma", w.sigma_rad))
+    }
+
+
+def _contradictions(witnesses: Sequence[Witness], sigmas: float) -> list[tuple[Witness, Witness]]:
+    """Of each axis the two that differ most, if by more than so many sigmas and three of their floors."""
+    worst: dict[int, tuple[float, tuple[Witness, Witness]]] = {}
+    for a, b in combinations(witnesses, 2):
+        apart = abs(a.offset_rad - b.offset_rad)
+        least = max(
+            sigmas * float(np.hypot(a.sigma_rad, b.sigma_rad)),
+            _SIGMAS * float(np.hypot(a.floor_rad, b.floor_rad)),
+        )
+        if a.axis == b.axis and apart > max(least, worst.get(a.axis, (0.0,))[0]):
+            worst[a.axis] = (apart, (a, b))
+    return [pair for _, pair in worst.values()]
+
+
+def _maximum(
+    turn_rad: Float[np.ndarray, " P"],
+    score: Float[np.ndarray, "P F"],
+    blocks: Int[np.ndarray, " F"],
+    rng: np.random.Generator,
+) -> tuple[float, float]:
+    """Turn at the highest score, and its scatter over resampled blocks [rad]."""
+    names, index = np.unique(blocks, return_inverse=True)
+    if len(names) < _FEWEST_BLOCKS:
+        index = np.arange(len(blocks))
+    count = int(index.max()) + 1
+    by_block = np.zeros((len(score), count))
+    np.add.at(by_block.T, index, score.T)
+    drawn = rng.multinomial(count, np.full(count, 1 / count), _RESAMPLES)
+    best = turn_rad[np.argmax(by_block @ np.column_stack([np.ones(count), drawn.T]), axis=0)]
+    # Of n blocks resamples scatter by (n - 1) / n too little.
+    spread = np.sqrt(np.mean((best[1:] - best[0]) ** 2) * count / max(count - 1, 1))
+    return float(best[0]), float(spread)

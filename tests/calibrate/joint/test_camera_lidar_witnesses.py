@@ -1,0 +1,86 @@
+"""Sides of the edges and paint against each other: where they contradict, pitch is held and its sigma covers both."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.joint.camera_lidar.estimate import estimate_camera_lidar
+from pipeline.calibrate.joint.camera_lidar.witnesses import Witness, disagreement, widening
+from pipeline.config import SolveConfig
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.se3 import inverse, log_so3, perturb_exactly
+from schemas.observations import EDGE_BELOW
+from tests.makers.traced_scenes import DENSE, GROUND_M, T_TRUE, traced_day
+
+ROOF_M = GROUND_M + 1.6  # of the cars
+
+
+def with_windows(day, depth_rad=0.02, sills=3):
+    """Beams go through rear windows: their sills are edges above a foreground, and no label ends there."""
+    out = []
+    for o in day:
+        xyz, side = o.lidar_edge_xyz_m, o.lidar_edge_side
+        roof = np.flatnonzero((side == EDGE_BELOW) & (np.abs(xyz[:, 2] - ROOF_M) < 0.2))
+        more = np.repeat(roof, sills)
+        changed = {
+            name: np.concatenate([getattr(o, name), getattr(o, name)[more]])
+            for name in (
+                "lidar_edge_side", "lidar_edge_jump_m", "lidar_edge_gap_rad", "lidar_edge_points"
+            )
+        }  # fmt: skip
+        sill = xyz[more] - np.linalg.norm(xyz[more], axis=1, keepdims=True) * np.float32([0, 0, depth_rad])
+        out.append(replace(o, lidar_edge_xyz_m=np.concatenate([xyz, sill]), **changed))
+    return out
+
+
+def solved(day):
+    T = perturb_exactly(T_TRUE, np.radians(0.5), 0.02, np.random.default_rng(0))
+    prior = Prior(T, np.eye(4), float(np.radians(2.0)), 0.05)
+    return estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def day():
+    return traced_day(DENSE, 12, seed=1)
+
+
+def test_cars_without_windows_leave_edges_and_paint_in_agreement(day):
+    found = solved(day)
+    assert found.failed_checks == []
+    assert np.degrees(np.sqrt(found.covariance[0, 0])) < 0.1
+    for name in ("edges_above_a_foreground", "paint"):
+        assert abs(found.diagnostics[f"{name}_pitch_offset_rad"]) < np.radians(0.2)
+
+
+def test_cars_with_windows_are_held_and_pitch_is_as_unsure_as_the_evidence_is_apart(day):
+    found = solved(with_windows(day))
+    (check,) = found.failed_checks
+    assert check.fault == "witnesses_disagree"
+    assert "on pitch" in check.sentence
+    assert "edges above a foreground" in check.sentence
+    turn = log_so3((found.T @ inverse(T_TRUE))[:3, :3])
+    assert 1.0 < np.degrees(abs(turn[0])) < 3 * np.degrees(np.sqrt(found.covariance[0, 0]))
+
+
+def witness(name, offset_deg, scatter_deg=0.02, floor_deg=0.1, axis=0):
+    return Witness(name, axis, *np.radians([offset_deg, scatter_deg, floor_deg]))
+
+
+def test_two_that_differ_beyond_three_sigmas_are_named_and_widen_by_half_of_that():
+    asked = [witness("a", -0.4), witness("b", 0.8), witness("c", 0.1), witness("d", 3.0, axis=1)]
+    (check,) = disagreement(asked)
+    assert check.sentence == "the evidence disagrees on pitch: a by -0.40 +- 0.10 deg, b by +0.80 +- 0.10 deg"
+    np.testing.assert_allclose(widening(asked), np.radians([0.6, 0.0]))
+
+
+def test_between_two_and_three_sigmas_they_widen_without_a_failed_check():
+    asked = [witness("a", 0.0, 0.3), witness("b", 1.1, 0.3)]
+    assert disagreement(asked) == []
+    assert widening(asked)[0] == pytest.approx(np.radians(0.55))
+
+
+def test_what_labels_too_wide_explain_contradicts_nothing():
+    asked = [witness("a", 0.2), witness("b", -0.2)]
+    assert disagreement(asked) == []
+    assert not widening(asked).any()
