@@ -93,7 +93,7 @@ def test_a_camera_that_contradicts_the_loop_fails_a_check():
     assert loop_rad == pytest.approx(np.radians(2.0), rel=1e-3)
     assert found.diagnostics["alone_ry_rad"] == pytest.approx(np.radians(2.0), rel=1e-3)
     assert len(failed) == 1
-    assert "yaw" in failed[0]
+    assert "yaw" in failed[0].sentence
 
 
 def test_pairs_that_cannot_be_solved_keep_the_prior_and_fail_a_check():
