@@ -94,8 +94,8 @@ CALIBRATIONS = TableSchema(
         scalar(
             "determined",
             "list<string>",
-            "of azimuth and elevation at targets 15 to 40 m away: those whose error is below limit_rad with "
-            "probability verify.confidence",
+            "of azimuth and elevation at targets 15 to 40 m away that both sensors see: those whose error is below "
+            "limit_rad with probability verify.confidence",
         ),
         scalar(
             "limit_rad",
@@ -107,6 +107,14 @@ CALIBRATIONS = TableSchema(
             "azimuth_sigma_rad", "float64", "sigma of a target's azimuth, from the covariance", nullable=True
         ),
         scalar("elevation_sigma_rad", "float64", "sigma of its elevation", nullable=True),
+        array(
+            "targets_m",
+            "<f8",
+            (3, 3),
+            "the targets, in child_frame: 15, 25 and 40 m away, where both sensors see; null where refused and in rows "
+            "of version 3, whose targets lie before the child at -10, 8 and 0 deg",
+            nullable=True,
+        ),
         scalar(
             "mounting_determined",
             "list<string>",
@@ -249,6 +257,7 @@ class CalibrationRecord:
     limit_rad: float | None = None
     azimuth_sigma_rad: float | None = None
     elevation_sigma_rad: float | None = None
+    targets_m: np.ndarray | None = None
     mounting_azimuth_sigma_rad: float | None = None
     mounting_elevation_sigma_rad: float | None = None
     mounting_covariance: np.ndarray | None = None

@@ -11,13 +11,14 @@ import numpy as np
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.failed_checks import loop_sigmas
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
-from pipeline.calibrate.verify.target_accuracy import Claim, target_sigmas
+from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.calibrate.verify.verdict import Verdict
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.observations import Observation
@@ -60,6 +61,7 @@ class Judged:
     test: HeldOutTest | None
     claims: Mapping[str, Claim]
     mounting_covariance: np.ndarray | None = None  # 6 6; None where nothing says how the camera hangs
+    targets: np.ndarray = field(default_factory=lambda: DEFAULT_TARGETS)  # 3 3, in the child's frame
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,6 @@ class SolvedDay:
     trigger_before: Mapping[str, Mapping[str, float]]  # metrics of each pair at the prior
     trigger_after: Mapping[str, Mapping[str, float]]  # and at the result
     triggered: Mapping[str, bool]  # pairs with a metric beyond its threshold at the prior
-    numbers: Mapping[str, float] = field(default_factory=dict)  # of checks of the day, for every record
 
 
 def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
@@ -83,7 +84,11 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
     verdict, test = judged.verdict, judged.test
     return CalibrationRecord(
         **_identity(about, pair, len(day.observations), day.prior),
-        **({} if verdict.status == "refused" else _estimate_fields(estimate) | _mounting_fields(judged)),
+        **(
+            {}
+            if verdict.status == "refused"
+            else _estimate_fields(estimate, judged) | _mounting_fields(judged)
+        ),
         **_loop_fields(day.solution),
         status=verdict.status,
         reason=verdict.reason,
@@ -109,7 +114,6 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         | _test_numbers(test)
         | _claim_numbers(judged)
         | _camera_numbers(pair, day.observations)
-        | dict(day.numbers)
         | {"paper_frames": float(selection.passed[pair])},
     )
 
@@ -253,16 +257,17 @@ def _claim_numbers(judged: Judged) -> dict[str, float]:
     }
 
 
-def _estimate_fields(estimate: PairEstimate) -> dict[str, Any]:
+def _estimate_fields(estimate: PairEstimate, judged: Judged) -> dict[str, Any]:
     """What a refused record does not have: the transform and how well the day determines it."""
-    sigma = target_sigmas(estimate.pair, estimate.T, estimate.covariance)
+    sigma = {name: claim.sigma_rad for name, claim in judged.claims.items()}
     return {
         "covariance": estimate.covariance,
         "common_covariance": estimate.common_covariance,
         "observability": [float(v) for v in estimate.observability],
         "observable": [bool(v) for v in estimate.observable],
-        "azimuth_sigma_rad": float(sigma[0]),
-        "elevation_sigma_rad": float(sigma[1]),
+        "azimuth_sigma_rad": sigma["azimuth"],
+        "elevation_sigma_rad": sigma["elevation"],
+        "targets_m": judged.targets,
         **_transform_fields("", estimate.T),
     }
 

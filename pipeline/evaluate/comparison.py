@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from pipeline.geometry.se3 import from_quaternion, inverse, log_se3
 from pipeline.geometry.targets import (
-    DEFAULT_TARGETS,
     Picks,
     PickUncertainty,
     error_sigma_at_picks,
@@ -19,6 +18,7 @@ from pipeline.geometry.targets import (
     loop_error_sigma,
     loop_errors,
 )
+from pipeline.store.current import targets_of
 from schemas.calibrations import PAIRS, CalibrationRecord
 
 __all__ = ["Comparison", "compare", "current_runs"]
@@ -80,14 +80,17 @@ def compare(
         return None
     T = {pair: _transform(run[pair], "") for pair in PAIRS}
     priors = {pair: _transform(run[pair], "prior_") for pair in PAIRS}
+    first = run["camera_lidar"]
 
     def errors(of: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         if picks is not None:
             found = {pair: errors_of_picks(pair, of[pair], picks) for pair in PAIRS}
         else:
             assert truth is not None, "either truth or picks"
-            found = {pair: errors_at_targets(pair, of[pair], truth[pair]) for pair in PAIRS}
-        return found | {"loop": loop_errors(of, DEFAULT_TARGETS if picks is None else picks.lidar_m)}
+            found = {
+                pair: errors_at_targets(pair, of[pair], truth[pair], targets_of(run[pair])) for pair in PAIRS
+            }
+        return found | {"loop": loop_errors(of, targets_of(first) if picks is None else picks.lidar_m)}
 
     def pick_sigmas(uncertainty: PickUncertainty | None) -> dict[str, np.ndarray]:
         if picks is None or uncertainty is None:
@@ -95,7 +98,6 @@ def compare(
         found = {pair: error_sigma_at_picks(pair, T[pair], picks, uncertainty) for pair in PAIRS}
         return found | {"loop": loop_error_sigma(T, picks, uncertainty)}
 
-    first = run["camera_lidar"]
     return Comparison(
         first.method,
         first.environment,

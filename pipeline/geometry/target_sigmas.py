@@ -36,8 +36,11 @@ def _nudges() -> tuple[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]]
 
 
 def target_sigmas(
-    pair: str, T: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
+    pair: str,
+    T: Float[np.ndarray, "4 4"],
+    covariance: Float[np.ndarray, "6 6"],
+    targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS,
 ) -> Float[np.ndarray, " 2"]:
     """One sigma of azimuth and elevation [rad] at the targets, root mean square over them."""
-    J = target_jacobian(pair, T)
+    J = target_jacobian(pair, T, targets)
     return np.sqrt(np.einsum("dni,ij,dnj->dn", J, covariance, J).mean(axis=1))

@@ -28,7 +28,8 @@ __all__ = [
     "loop_errors",
 ]
 
-# Three reflectors inside the field of view that all three sensors share: azimuth, elevation [rad], range [m].
+# Three reflectors inside the field of view that sensors share which look ahead: azimuth, elevation [rad], range [m].
+# A record has its own, where both of its sensors see them (`calibrate/verify/seen_targets.py`).
 DEFAULT_TARGETS = from_spherical(
     np.array([[np.radians(-10), 0, 15.0], [np.radians(8), 0, 25.0], [0.0, 0, 40.0]])
 )

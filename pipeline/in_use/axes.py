@@ -23,7 +23,7 @@ from pipeline.config import VerifyConfig
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import inverse, log_se3
 from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
-from pipeline.store.current import prior_of, transform_of
+from pipeline.store.current import prior_of, targets_of, transform_of
 from schemas.calibrations import CalibrationRecord
 
 __all__ = ["NEEDED_AXES", "AxisCheck", "AxisLimits", "answer_of", "check_axes", "limits_of"]
@@ -95,7 +95,7 @@ def check_axes(record: CalibrationRecord, limits: Mapping[str, AxisLimits]) -> l
     blocked = _why_not(record)
     if in_use is None or found is None or record.covariance is None:
         return [_silent(record.pair, axis, of, blocked or record.reason) for axis, of in limits.items()]
-    off = _off(record.pair, in_use, found, np.asarray(record.covariance))
+    off = _off(record.pair, in_use, found, np.asarray(record.covariance), targets_of(record))
     return [_checked(record.pair, axis, limits[axis], *off[axis], blocked) for axis in limits if axis in off]
 
 
@@ -112,11 +112,12 @@ def _off(
     in_use: Float[np.ndarray, "4 4"],
     found: Float[np.ndarray, "4 4"],
     covariance: Float[np.ndarray, "6 6"],
+    targets: Float[np.ndarray, "N 3"],
 ) -> dict[str, tuple[float, float]]:
     """Distance of the calibration in use from the answer, and the answer's sigma, by axis [rad]."""
     xi = log_se3(in_use @ inverse(found))
-    distance = np.sqrt(np.mean((target_jacobian(pair, found) @ xi) ** 2, axis=1))
-    sigma = target_sigmas(pair, found, covariance)
+    distance = np.sqrt(np.mean((target_jacobian(pair, found, targets) @ xi) ** 2, axis=1))
+    sigma = target_sigmas(pair, found, covariance, targets)
     off = {name: (float(distance[i]), float(sigma[i])) for i, name in enumerate(("azimuth", "elevation"))}
     if pair.startswith("camera"):
         roll_sigma = np.sqrt(change_covariance(found, covariance)[_ROLL, _ROLL])

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.se3 import transform_points
-from pipeline.geometry.targets import DEFAULT_TARGETS, Picks
+from pipeline.geometry.targets import Picks
 from pipeline.report.evaluation import EvaluatedRun, TableView, View, evaluation_page
 from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.scenes import choose_frames
 from pipeline.report.time_offsets import as_stamped, time_offsets_of
-from pipeline.store.current import prior_of, transform_of
+from pipeline.store.current import prior_of, targets_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import iterate_rows, read_manifest
 from schemas.calibrations import PAIRS, CalibrationRecord
@@ -93,7 +93,7 @@ def _evaluated(compared: Compared) -> EvaluatedRun:
         radar, lidar = compared.picks.radar_m, compared.picks.lidar_m
     else:
         assert compared.truth is not None, "either truth or picks"
-        radar = DEFAULT_TARGETS
+        radar = targets_of(first)
         lidar = transform_points(compared.truth["lidar_radar"], radar)
     return EvaluatedRun(
         f"{first.vehicle} {first.day}",

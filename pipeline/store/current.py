@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 from jaxtyping import Float
 
 from pipeline.geometry.se3 import from_quaternion
+from pipeline.geometry.targets import DEFAULT_TARGETS
 from schemas.calibrations import CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DriftFinding
@@ -24,6 +25,7 @@ __all__ = [
     "current_rows",
     "current_states",
     "prior_of",
+    "targets_of",
     "transform_of",
 ]
 
@@ -116,6 +118,11 @@ def prior_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
         record.prior_qw, record.prior_qx, record.prior_qy, record.prior_qz,
         record.prior_tx_m, record.prior_ty_m, record.prior_tz_m,
     )  # fmt: skip
+
+
+def targets_of(record: CalibrationRecord) -> Float[np.ndarray, "N 3"]:
+    """Targets that a record's sigmas are stated at, in the child's frame; those of older releases where it has none."""
+    return DEFAULT_TARGETS if record.targets_m is None else np.asarray(record.targets_m)
 
 
 def _transform(*columns: float | None) -> np.ndarray | None:

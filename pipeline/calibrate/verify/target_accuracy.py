@@ -1,7 +1,7 @@
 """What a record may claim: how far off targets 15 to 40 m away can be, and how sure that is.
 
-What an error of the pose costs depends on where it puts things. Azimuth and elevation at the targets of
-`pipeline.geometry.targets` are linear in the pose, so its covariance gives their sigmas, with every correlation and
+What an error of the pose costs depends on where it puts things. Azimuth and elevation at the targets that both sensors
+see (`seen_targets.py`) are linear in the pose, so its covariance gives their sigmas, with every correlation and
 every degree of freedom that the day left to the prior. A direction is certified where its error stays, by that sigma,
 within the limit of `[verify]` with the probability asked for there.
 
@@ -22,6 +22,7 @@ from scipy.special import ndtr, ndtri
 from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
 from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
+from pipeline.geometry.targets import DEFAULT_TARGETS
 
 __all__ = ["DIRECTIONS", "Claim", "claims_of", "target_jacobian", "target_sigmas"]
 
@@ -92,6 +93,7 @@ def claims_of(
     contradiction_sigmas: float = VerdictLimits.held_out_contradiction_sigmas,
     elevation_limit_rad: float | None = None,
     mounting: Float[np.ndarray, "6 6"] | None = None,
+    targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS,
 ) -> dict[str, Claim]:
     """What can be claimed of each direction, by name.
 
@@ -105,17 +107,18 @@ def claims_of(
         contradiction_sigmas: sigmas of the shift from which held-out frames contradict the estimate.
         elevation_limit_rad: for elevation, where it differs from azimuth's.
         mounting: covariance of the estimate as the pose of what is mounted; None where nobody knows it.
+        targets: in the child's frame, where both sensors see them.
     """
     limits_rad = (limit_rad, limit_rad if elevation_limit_rad is None else elevation_limit_rad)
-    own = target_sigmas(pair, T, covariance)
-    mounted = np.full(2, np.inf) if mounting is None else target_sigmas(pair, T, mounting)
+    own = target_sigmas(pair, T, covariance, targets)
+    mounted = np.full(2, np.inf) if mounting is None else target_sigmas(pair, T, mounting, targets)
     claims = {}
     for d, name in enumerate(DIRECTIONS):
         sigma = float(own[d])
         if update is None:
             shift, shift_sigma, remaining = 0.0, 0.0, sigma
         else:
-            J = target_jacobian(pair, T)[d]
+            J = target_jacobian(pair, T, targets)[d]
             shift_sigma, updated, bias = (
                 float(np.sqrt(np.einsum("ni,ij,nj->n", J, C, J).mean()))
                 for C in (update.shift_covariance, update.covariance, update.bias)

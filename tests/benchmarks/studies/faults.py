@@ -360,8 +360,9 @@ def _measured(
 def _direction_errors(record: CalibrationRecord, T: np.ndarray, T_true: np.ndarray) -> tuple[float, float]:
     """Azimuth and elevation error at the targets, root mean square [rad]."""
     from pipeline.geometry.targets import errors_at_targets
+    from pipeline.store.current import targets_of
 
-    azimuth, elevation, _ = errors_at_targets(record.pair, T, T_true)
+    azimuth, elevation, _ = errors_at_targets(record.pair, T, T_true, targets_of(record))
     return float(azimuth), float(elevation)
 
 

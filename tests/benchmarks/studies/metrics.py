@@ -12,6 +12,7 @@ from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.geometry.targets import errors_at_targets
+from pipeline.store.current import targets_of
 from schemas.calibrations import CalibrationRecord
 
 __all__ = [
@@ -43,7 +44,7 @@ def measure(
     """
     pair = record.pair
     T_prior = prior.of(pair)
-    azimuth, elevation, range_m = errors_at_targets(pair, T_prior, T_true)
+    azimuth, elevation, range_m = errors_at_targets(pair, T_prior, T_true, targets_of(record))
     out: dict[str, Any] = {
         "status": record.status,
         "reason": record.reason,
@@ -56,7 +57,7 @@ def measure(
     T = transform_of(record)
     if T is None or record.covariance is None:
         return out
-    azimuth, elevation, range_m = errors_at_targets(pair, T, T_true)
+    azimuth, elevation, range_m = errors_at_targets(pair, T, T_true, targets_of(record))
     out |= {
         "az_deg": _number(np.degrees(azimuth)),
         "el_deg": _number(np.degrees(elevation)),
