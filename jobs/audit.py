@@ -55,16 +55,18 @@ def audit(
         with progress_reporter("report") as progress:
             task = Task(config, tables, Window(), method, given=Pages(report), progress=progress)
             outputs = REPORT.run(task).outputs
+    damaged = left_out(tables)
+    status = "incomplete" if damaged and outcome.status in ("done", "cached") else outcome.status
     print_summary(
         "audit",
-        outcome.status,
+        status,
         reason=outcome.reason,
         vehicles=len({f.vehicle for f in findings}),
         statuses=count_statuses(findings),
         charts={s: charts.count(s) for s in DRIFT_STATUSES},
         moved=moved_sensors(findings),
-        damaged=left_out(tables),
+        damaged=damaged,
         report=report,
         outputs=outputs,
     )
-    return exit_code([outcome.status])
+    return exit_code([status])

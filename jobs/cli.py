@@ -65,6 +65,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "import": ("jobs.import_prior:import_prior", "Calibration files of other programs to a prior file."),
     "compare": ("jobs.compare:compare", "Two calibrations, axis by axis: records, days, methods, files."),
     "migrate": ("jobs.migrate:migrate", "A lake of an older release to the tables of this one."),
+    "repair": ("jobs.repair:repair", "A lake with a damaged log or lost files: what is left, made whole."),
     "convert": (
         "jobs.convert:convert",
         "Folders of public data sets (nuScenes, View-of-Delft, KITTI) to logs.",

@@ -87,7 +87,7 @@ def nightly(
             close_night(night, to_day, drawing, outcomes, sinks.take_stage) if outcomes else ([], [])
         )
         tidy(tables)
-        code = exit_code(night_statuses(outcomes, config))
+        code = exit_code([*night_statuses(outcomes, config), *(["incomplete"] if tables.damage else [])])
         sinks.ended(code, findings)
     _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config))
     return held_exit_code if code == 3 else code
@@ -105,9 +105,10 @@ def _print_end(
     from jobs.terminal.summary import left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
 
+    held = any(o.status in ("held", "refused") for o in outcomes)
     print_summary(
         "nightly",
-        {0: "done", 1: "failed", 2: "failed", 3: "held"}[code],
+        {0: "done", 1: "failed", 2: "failed", 3: "held" if held else "incomplete"}[code],
         vehicle_days=len(outcomes),
         **{s: sum(o.status == s for o in outcomes) for s in ("done", "cached", "held", "refused", "failed")},
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],

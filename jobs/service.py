@@ -74,7 +74,7 @@ def _require_known(lake: Lake, of: Partition) -> None:
     for table in (CALIBRATIONS, OUTCOMES):
         rows = read_columns(lake, table, (), first=None, last=None)
         known |= set() if rows is None else set(rows["vehicle"].unique().to_pylist())
-    if of.vehicle not in known:
+    if of.vehicle not in known and not any(rows.may_be_of(of.vehicle) for rows in lake.lost):
         like = get_close_matches(of.vehicle, sorted(known)) or sorted(known)[:5]
         problem = f"the lake has no day of {of.vehicle!r}; it has {', '.join(like) or 'no vehicle'}"
         raise ConfigError("command line", "vehicle", problem)

@@ -45,7 +45,6 @@ def show(
         rows = _partitions(tables, table, vehicle, day)
     else:
         rows = _records(tables, table, vehicle, day, method, current=current)
-    left_out(tables)
     if json:
         from jobs.terminal.summary import print_json
 
@@ -56,7 +55,7 @@ def show(
         print_table(table, rows)
     else:
         sys.stdout.write(f"{table}: nothing of this choice in {lake}\n")
-    return 0
+    return 3 if left_out(tables) else 0
 
 
 def _records(

@@ -28,7 +28,6 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
 
     tables = Lake.existing(lake)
     found = [r for r in read_records(tables, STATES, StateRow, vehicle=vehicle) if r.method == method]
-    left_out(tables)
     rows = state_rows(tables, current_states(found))
     if json:
         print_json(rows, indent=2)
@@ -38,4 +37,4 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
         print_table("states", rows)
     else:
         sys.stdout.write(f"states: none in {lake}; boresight nightly and boresight audit write them\n")
-    return 0
+    return 3 if left_out(tables) else 0

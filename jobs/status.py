@@ -38,10 +38,10 @@ def status(
     """
     from dataclasses import asdict
 
-    from jobs.terminal.summary import left_out, print_summary
+    from jobs.terminal.summary import exit_code, left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors, status_lines
     from pipeline.fleet.status import DAY_STATUSES, day_statuses
-    from pipeline.store.delta import open_table
+    from pipeline.store.data_files import data_files
     from pipeline.store.partitions import Lake
     from pipeline.store.records import last_day, read_last, read_records
     from schemas.calibrations import CALIBRATIONS
@@ -49,7 +49,7 @@ def status(
     from schemas.outcomes import OUTCOMES, OutcomeRow
 
     tables = Lake.existing(lake)
-    open_table(
+    data_files(
         tables, CALIBRATIONS
     )  # records that a release before 0.6 wrote are named, and how to move them
     last = to_day or last_day(tables, OUTCOMES)
@@ -60,9 +60,11 @@ def status(
     findings = read_last(tables, DRIFT, DriftFinding, method, vehicle=vehicle)
     if not json:
         _print_table(found, status_lines(findings))
+    damaged = left_out(tables)
+    ended = "incomplete" if damaged else "done"
     print_summary(
         "status",
-        "done",
+        ended,
         lake=lake,
         first=first,
         last=last,
@@ -71,10 +73,10 @@ def status(
         **{name: sum(s.status == name for s in found) for name in DAY_STATUSES},
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
-        damaged=left_out(tables),
+        damaged=damaged,
         **({"days": [asdict(s) for s in found]} if json else {}),
     )
-    return 0
+    return exit_code([ended])
 
 
 def _audited_method(lake: Lake, others: set[str]) -> str:

@@ -10,6 +10,7 @@ __all__ = [
     "ConfigError",
     "ContractError",
     "DamagedError",
+    "DamagedLogError",
     "LogError",
     "MissingExtraError",
     "ModelError",
@@ -67,6 +68,13 @@ class DamagedError(ContractError):
 
     def __init__(self, path: str, problem: str) -> None:
         super().__init__(path, f"is damaged, make it anew: {problem}")
+
+
+class DamagedLogError(ContractError):
+    """A record table whose log cannot be read; what its data files hold, `boresight repair` puts under a new one."""
+
+    def __init__(self, path: str, problem: str, lake: str) -> None:
+        super().__init__(path, f"its log is damaged ({problem}): run `boresight repair --lake {lake}`")
 
 
 class CollectedError(DamagedError):

@@ -15,6 +15,7 @@ from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
 from pipeline.audit.history import History, last_audited_day
 from pipeline.audit.service import events_until, restart_of, what_was_done
+from pipeline.audit.standing import said_before, standing
 from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.errors import ConfigError
@@ -43,6 +44,7 @@ class _Vehicle:
     references: Mapping[
         str, Reference
     ]  # by pair, that an earlier night made of records that are not among these
+    said: Sequence[DriftFinding]  # by the last audit, where some of the vehicle's records cannot be read
 
 
 def work(task: Task) -> Work:
@@ -66,11 +68,14 @@ def work(task: Task) -> Work:
     events = events_until(task.lake, last)
     enough = (FEWEST_DAYS, fleet.audit.reference_days)
     records, references = history.window((first, last), events, enough, fleet.vehicles)
-    names = sorted({*records.vehicles, *fleet.vehicles})
+    said = said_before(task.lake, method)
+    names = sorted({*records.vehicles, *fleet.vehicles, *said})
     made: dict[str, dict[str, Reference]] = {}
     for (name, pair), reference in references.items():
         made.setdefault(name, {})[PAIRS[pair]] = reference
-    vehicles = {v: _Vehicle(records.of(v), events.get(v, ()), made.get(v, {})) for v in names}
+    vehicles = {
+        v: _Vehicle(records.of(v), events.get(v, ()), made.get(v, {}), said.get(v, ())) for v in names
+    }
     done = sorted([e.vehicle, e.day, e.sensor, e.kind] for v in vehicles.values() for e in v.events)
     settings = (fleet.audit, {"from": first, "to": last, "method": method, "events": done})
     return Work(
@@ -88,7 +93,7 @@ def _judged(
     """The findings of one vehicle after the other; all of them are judged side by side."""
     fleet, (first, _, method) = task.fleet, window
     begin = dt.date.fromisoformat(first).toordinal()
-    if not any((v.records.day >= begin).any() for v in vehicles.values()):
+    if not any(v.said or (v.records.day >= begin).any() for v in vehicles.values()):
         return
     days = [_charted(vehicle, window, fleet.audit) for vehicle in vehicles.values()]
     verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit)
@@ -159,6 +164,7 @@ def _findings(
     config = config_hash(fleet.audit, {"from": first, "to": last, "method": method})
     audit = VehicleAudit(name, last, method, "", inputs)
     rows = vehicle_findings(audit, records, verdict, fleet.audit, _remarks(vehicle, last, shifts), before)
+    rows = standing(rows, vehicle.said, vehicle.events, last)
     # All vehicles are judged side by side, so a verdict rests on more than this vehicle's records: the key has it too.
     key = work_key("audit", CODE_VERSION, config, [*inputs, content_hash(rows)])
     return Records([replace(row, work_key=key) for row in rows], Partition(name, last), key, inputs)

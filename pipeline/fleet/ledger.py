@@ -8,12 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.results import Outcome
+from pipeline.store.delta import open_table
 from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.records import RecordIndex, assert_records, commit_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.outcomes import OUTCOMES, OutcomeRow
-from schemas.versions import CODE_VERSION
+from schemas.versions import CODE_VERSION, TABLES
 
 __all__ = ["Known", "Ledger", "outcome_row", "record_outcome"]
 
@@ -46,9 +47,17 @@ class Ledger:
     Args:
         lake: where the tables are.
         partitions: the night's vehicle-days.
+
+    Raises:
+        DamagedLogError: a table cannot be written to.
     """
 
     def __init__(self, lake: Lake, partitions: Sequence[Partition]) -> None:
+        for schema in TABLES.values():
+            if schema.is_record_table:
+                open_table(
+                    lake, schema
+                )  # one that could not be written to after a night's work is named before it
         self._lake = lake
         self._waiting = [_Waiting(CALIBRATIONS), _Waiting(OUTCOMES)]
         self._committed_at = time.monotonic()

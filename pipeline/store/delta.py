@@ -20,19 +20,23 @@ import pyarrow.parquet as pq
 from deltalake import DeltaTable, Schema, WriterProperties
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
-from pipeline.errors import ContractError
+from pipeline.errors import ContractError, DamagedLogError
 from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake
 from schemas.columns import TableSchema
 
 __all__ = [
+    "DAMAGED",
+    "LOG",
     "LiveFile",
     "Wanted",
+    "create_table",
     "live_files",
     "merge_rows",
     "open_table",
     "read_file",
     "set_aside_damaged",
+    "spans_of_file",
     "stored_schema",
     "tidy_table",
 ]
@@ -51,7 +55,8 @@ _KEEP_HOURS = 7 * 24
 # Every writer that comes in between costs one more try; none comes in forty times while others wait for seconds.
 _TRIES = 40
 _PAUSE_S = 0.05
-_DAMAGED = "_damaged"  # a name with an underscore: Delta's own tools leave it alone
+DAMAGED = "_damaged"  # a name with an underscore: Delta's own tools leave it alone
+LOG = "_delta_log"
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,7 @@ class LiveFile:
     days: tuple[str, str] | None = None
     vehicles: tuple[str, str] | None = None
     written_s: float = 0.0  # since 1970
+    in_log: bool = True  # False: found without one, and others may hold the same rows
 
 
 def stored_schema(schema: TableSchema) -> pa.Schema:
@@ -103,6 +109,7 @@ def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
     """The table as it is now; None where nothing was recorded yet.
 
     Raises:
+        DamagedLogError: the table's log cannot be read, or lacks an entry.
         ContractError: the lake holds records of a release that kept them as Parquet files, or of a newer one.
     """
     where = lake.table(schema.name)
@@ -113,12 +120,20 @@ def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
         raise ContractError(where, problem)
     try:
         table = DeltaTable(where, storage_options=lake.files.delta_options())
-    except TableNotFoundError:
+    except TableNotFoundError as err:
+        if any(True for _ in lake.files.find(lake.root / schema.name, "month=*/*.parquet")):
+            raise DamagedLogError(where, "it is gone", str(lake)) from err
         return None
     except DeltaError as err:
-        raise ContractError(where, f"its log is damaged: {err}") from err
+        raise DamagedLogError(where, str(err).splitlines()[0], str(lake)) from err
     except OSError as err:  # says neither what it is nor where
         raise OSError(errno.EIO, " ".join(str(err).split()), where) from err
+    # Taken for an entry that says nothing: what a machine leaves that lost its power.
+    empty = [
+        n for n, size in lake.files.sizes(lake.root / schema.name / LOG) if n.endswith(".json") and not size
+    ]
+    if empty:
+        raise DamagedLogError(where, f"{', '.join(sorted(empty))} of no bytes", str(lake))
     found = table.metadata().configuration.get(_VERSION, "")
     readable = {str(v) for v in (schema.version, *schema.reads_versions)}
     if table.protocol().min_reader_version > 1 or found not in readable:
@@ -204,6 +219,25 @@ def _groups(metadata: pq.FileMetaData, wanted: Wanted) -> list[int]:
     ]
 
 
+def spans_of_file(
+    lake: Lake, schema: TableSchema, name: str
+) -> tuple[tuple[str, str] | None, tuple[str, str] | None]:
+    """Days and vehicles of a data file, as its own footer says; None where that cannot be read."""
+    found: list[tuple[str, str] | None] = []
+    try:
+        with opened_parquet(lake.files, lake.record_file(schema.name, name)) as file:
+            metadata = file.metadata
+    except (pa.ArrowException, OSError):
+        return None, None
+    place = {metadata.schema.column(i).path: i for i in range(metadata.num_columns)}
+    for column in ("day", "vehicle"):
+        spans = [_span(metadata.row_group(g), place.get(column)) for g in range(metadata.num_row_groups)]
+        known = [s for s in spans if s is not None]
+        whole = known and len(known) == len(spans)
+        found.append((min(s[0] for s in known), max(s[1] for s in known)) if whole else None)
+    return found[0], found[1]
+
+
 def _span(group: pq.RowGroupMetaData, column: int | None) -> tuple[str, str] | None:
     statistics = group.column(column).statistics if column is not None else None
     return (statistics.min, statistics.max) if statistics is not None and statistics.has_min_max else None
@@ -239,7 +273,7 @@ def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool 
     """
     for attempt in range(_TRIES):
         try:
-            table = open_table(lake, schema) or _created(lake, schema)
+            table = open_table(lake, schema) or create_table(lake, schema)
             _merge(table, schema, rows, insert=insert)
         except CommitFailedError:  # another writer was first
             time.sleep(_PAUSE_S * random.uniform(1, 1 + min(attempt, 10)))
@@ -275,7 +309,7 @@ def _quoted(values: Sequence[str]) -> str:
     return ", ".join(f"'{v}'" for v in values)
 
 
-def _created(lake: Lake, schema: TableSchema) -> DeltaTable:
+def create_table(lake: Lake, schema: TableSchema) -> DeltaTable:
     """An empty table; another writer may have made it meanwhile."""
     if isinstance(lake.root, Path):
         (lake.root / schema.name).mkdir(parents=True, exist_ok=True)
@@ -308,7 +342,7 @@ def set_aside_damaged(lake: Lake, schema: TableSchema) -> list[str]:
         if read_file(lake, schema, file.name, [c.name for c in schema.columns]) is None:
             bad.append(file.name)
             path = lake.record_file(schema.name, file.name)
-            lake.files.move(path, lake.root / schema.name / _DAMAGED / file.name.replace("/", "_"))
+            lake.files.move(path, lake.root / schema.name / DAMAGED / file.name.replace("/", "_"))
     if bad and table is not None:
         table.repair()  # the log forgets files that are not there
     return bad

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path, PurePath
@@ -46,6 +47,10 @@ class Files(Protocol):
 
     def size(self, path: PurePath) -> int:
         """Bytes of a file; 0 where there is none."""
+        ...
+
+    def sizes(self, folder: PurePath) -> Iterator[tuple[str, int]]:
+        """Name and bytes of each file that lies in a folder; none where there is no folder."""
         ...
 
     def delta_options(self) -> dict[str, str]:
@@ -94,6 +99,13 @@ class LocalFiles:
     def size(self, path: PurePath) -> int:
         """Bytes of a file; 0 where there is none."""
         return Path(path).stat().st_size if Path(path).is_file() else 0
+
+    def sizes(self, folder: PurePath) -> Iterator[tuple[str, int]]:
+        """Name and bytes of each file that lies in a folder; none where there is no folder."""
+        with suppress(FileNotFoundError), os.scandir(folder) as entries:
+            for entry in entries:
+                if entry.is_file():
+                    yield entry.name, entry.stat().st_size
 
     def delta_options(self) -> dict[str, str]:
         """Nothing."""

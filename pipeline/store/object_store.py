@@ -140,6 +140,13 @@ class Bucket:
             return int(obstore.head(_store(self.name), str(key))["size"])
         return 0
 
+    def sizes(self, folder: PurePath) -> Iterator[tuple[str, int]]:
+        """Name and bytes of each object right below a key."""
+        for key, size, _ in self.listed(folder):
+            name = PurePosixPath(key).relative_to(folder)
+            if len(name.parts) == 1:
+                yield str(name), size
+
     def delta_options(self) -> dict[str, str]:
         """The same patience for `deltalake`."""
         return {

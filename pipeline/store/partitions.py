@@ -18,7 +18,7 @@ from pipeline.names import is_vehicle
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.object_store import Bucket
 
-__all__ = ["Lake", "Partition", "content_hash", "is_day", "last_possible_day", "work_key"]
+__all__ = ["Lake", "LostRows", "Partition", "content_hash", "is_day", "last_possible_day", "work_key"]
 
 
 def is_day(text: str) -> bool:
@@ -54,6 +54,19 @@ class Partition:
 
 
 @dataclass(frozen=True)
+class LostRows:
+    """Records that cannot be read: of these days and vehicles, first and last (None: not known)."""
+
+    table: str
+    days: tuple[str, str] | None
+    vehicles: tuple[str, str] | None
+
+    def may_be_of(self, vehicle: str) -> bool:
+        """False where none of them can be of this vehicle."""
+        return self.vehicles is None or self.vehicles[0] <= vehicle <= self.vehicles[1]
+
+
+@dataclass(frozen=True)
 class Lake:
     """The root of the tables: a folder, or a prefix of a bucket.
 
@@ -62,12 +75,14 @@ class Lake:
         files: where its files are.
         migrating: True for who moves the records of an older release, and meets them beside the new ones.
         damage: what was left out because it could not be read, as it is found: file and reason, in words.
+        lost: whose records were in what was left out.
     """
 
     root: PurePath
     files: Files = field(default_factory=LocalFiles)
     migrating: bool = False
     damage: list[str] = field(default_factory=list, compare=False, repr=False)
+    lost: list[LostRows] = field(default_factory=list, compare=False, repr=False)
 
     @classmethod
     def at(cls, location: str | Path) -> Lake:

@@ -17,7 +17,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.store.delta import Wanted, live_files, merge_rows, open_table, read_file, stored_schema
+from pipeline.store.data_files import data_files, note_lost, once
+from pipeline.store.delta import Wanted, merge_rows, read_file, stored_schema
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
@@ -297,10 +298,8 @@ def last_assertion(lake: Lake, schema: TableSchema, method: str | None = None) -
 
     Files are looked at from the last written on, until the others are older than what was found.
     """
-    table = open_table(lake, schema)
     found: Assertion | None = None
-    files = live_files(table) if table is not None else []
-    for file in sorted(files, key=lambda f: f.written_s, reverse=True):
+    for file in sorted(data_files(lake, schema), key=lambda f: f.written_s, reverse=True):
         stamp = found.asserted_at if found else None
         if stamp and file.written_s + _CLOCKS_DIFFER_S < dt.datetime.fromisoformat(stamp).timestamp():
             break
@@ -353,15 +352,13 @@ def read_last_columns(
 
 def first_day(lake: Lake, schema: TableSchema) -> str | None:
     """The first day that any record of a table is about, as its log says; None where there is none."""
-    table = open_table(lake, schema)
-    spans = [f.days for f in live_files(table)] if table is not None else []
+    spans = [f.days for f in data_files(lake, schema)]
     return min((days[0] for days in spans if days is not None), default=None)
 
 
 def last_day(lake: Lake, schema: TableSchema) -> str | None:
     """The last day that any record of a table is about, as its log says; None where there is none."""
-    table = open_table(lake, schema)
-    spans = [f.days for f in live_files(table)] if table is not None else []
+    spans = [f.days for f in data_files(lake, schema)]
     return max((days[1] for days in spans if days is not None), default=None)
 
 
@@ -373,13 +370,19 @@ def _wanted(vehicle: str | AbstractSet[str] | None, first: str | None, last: str
 
 
 def _rows_of(lake: Lake, schema: TableSchema, columns: Sequence[str], wanted: Wanted) -> pa.Table | None:
-    table = open_table(lake, schema)
-    files = live_files(table) if table is not None else []
-    files = [f for f in files if wanted.may_be_within(f.days, f.vehicles)]
-    read = (read_file(lake, schema, file.name, columns, wanted) for file in files)
-    parts = [_chosen(part, wanted) for part in read if part is not None]
+    files = [f for f in data_files(lake, schema) if wanted.may_be_within(f.days, f.vehicles)]
+    parts = []
+    for file in files:
+        part = read_file(lake, schema, file.name, columns, wanted)
+        if part is None:
+            note_lost(lake, schema, file)
+        else:
+            parts.append(_chosen(part, wanted))
     parts = [p for p in parts if p.num_rows]
-    return pa.concat_tables(parts, promote_options="default").combine_chunks() if parts else None
+    if not parts:
+        return None
+    found = pa.concat_tables(parts, promote_options="default").combine_chunks()
+    return found if all(f.in_log for f in files) else once(found, schema)
 
 
 def _chosen(rows: pa.Table, wanted: Wanted) -> pa.Table:

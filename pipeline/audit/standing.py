@@ -1,0 +1,68 @@
+"""Verdicts that stand although records that they rested on cannot be read: with fewer rows none gets better."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_last
+from schemas.calibrations import CALIBRATIONS
+from schemas.drift import DRIFT, DriftFinding
+from schemas.service_events import ServiceEvent
+from schemas.states import STATES
+
+__all__ = ["said_before", "standing"]
+
+# From what needs nobody's eye to what does.
+_CALMEST_FIRST = ("GREEN", "UNKNOWN", "YELLOW", "RED")
+_LESS = "some of its records cannot be read"
+_KEPT = f"kept, for {_LESS}"
+
+
+def said_before(lake: Lake, method: str) -> Mapping[str, list[DriftFinding]]:
+    """By vehicle, what the last audit said of those of which records may be among what could not be read."""
+    lost = [rows for rows in lake.lost if rows.table in (CALIBRATIONS.name, STATES.name)]
+    said: dict[str, list[DriftFinding]] = {}
+    for finding in read_last(lake, DRIFT, DriftFinding, method) if lost else ():
+        if any(rows.may_be_of(finding.vehicle) for rows in lost):
+            said.setdefault(finding.vehicle, []).append(finding)
+    return said
+
+
+def standing(
+    found: list[DriftFinding], said: Sequence[DriftFinding], events: Sequence[ServiceEvent], day: str
+) -> list[DriftFinding]:
+    """The findings of a vehicle that hold tonight, with the reason: the last audit's where tonight's are calmer.
+
+    Args:
+        found: tonight's, of the records that could be read.
+        said: the last audit's; none where all of the vehicle's records could be read.
+        events: what was done to the vehicle; what was noted since the last audit ends what that said.
+        day: tonight's.
+    """
+    if not said or any(event.recorded_at > said[0].asserted_at for event in events):
+        return found
+    again = [replace(row, day=day, recorded_at="", asserted_at="") for row in said]
+    if not found:  # nothing of the vehicle can be read
+        found = [
+            replace(row, status="UNKNOWN", vehicle_status="UNKNOWN", reason=_LESS, vehicle_reason=_LESS)
+            for row in again
+        ]
+    before, now = (_CALMEST_FIRST.index(rows[0].vehicle_status or "UNKNOWN") for rows in (said, found))
+    alarmed = before >= _CALMEST_FIRST.index("YELLOW")
+    if before < now or (before == now and not alarmed):
+        return [replace(row, vehicle_reason=_with_less(row.vehicle_reason or "")) for row in found]
+    since = said[0].day
+    return [
+        replace(row, reason=_kept(row.reason, since), vehicle_reason=_kept(row.vehicle_reason or "", since))
+        for row in again
+    ]
+
+
+def _with_less(reason: str) -> str:
+    return reason if _LESS in reason else f"{reason}; {_LESS}"
+
+
+def _kept(reason: str, day: str) -> str:
+    return reason if reason.startswith(_KEPT) else f"{_KEPT} (said on {day}): {reason}"

@@ -1,0 +1,56 @@
+"""Which files hold a record table's rows: as its log says, or all that are there where the log is damaged."""
+
+from __future__ import annotations
+
+import math
+from pathlib import PurePosixPath
+
+import pyarrow as pa
+
+from pipeline.errors import DamagedLogError
+from pipeline.store.delta import LiveFile, live_files, open_table, spans_of_file
+from pipeline.store.partitions import Lake, LostRows
+from schemas.columns import TableSchema
+
+__all__ = ["data_files", "files_there", "note_lost", "once"]
+
+
+def data_files(lake: Lake, schema: TableSchema) -> list[LiveFile]:
+    """The data files of a table; `lake.damage` names a log that cannot be read, and they are those that are there.
+
+    Raises:
+        ContractError: the lake is of another release.
+        OSError: the storage does not answer.
+    """
+    try:
+        table = open_table(lake, schema)
+    except DamagedLogError as err:
+        lake.damage.append(str(err))
+        return [
+            LiveFile(name, *spans_of_file(lake, schema, name), math.inf, in_log=False)
+            for name in files_there(lake, schema)
+        ]
+    return live_files(table) if table is not None else []
+
+
+def files_there(lake: Lake, schema: TableSchema) -> list[str]:
+    """Names of all data files of a table, whether its log knows them or not."""
+    folder = lake.root / schema.name
+    found = lake.files.find(folder, "month=*/*.parquet")
+    return sorted(str(PurePosixPath(path.relative_to(folder))) for path in found)
+
+
+def once(rows: pa.Table, schema: TableSchema) -> pa.Table:
+    """Rows of files of which some may stand for others: of the same work about the same, the last asserted."""
+    names = [*schema.about, "work_key", "asserted_at"]
+    if not set(names) <= set(rows.column_names):
+        return rows
+    last: dict[tuple[str, ...], tuple[str, int]] = {}
+    for at, (*key, asserted) in enumerate(zip(*(rows[n].to_pylist() for n in names), strict=True)):
+        last[tuple(key)] = max(last.get(tuple(key), ("", -1)), (asserted, at))
+    return rows.take(pa.array(sorted(at for _, at in last.values()), pa.int64()))
+
+
+def note_lost(lake: Lake, schema: TableSchema, file: LiveFile) -> None:
+    """Remember of which vehicles and days rows cannot be read."""
+    lake.lost.append(LostRows(schema.name, file.days, file.vehicles))

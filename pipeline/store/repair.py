@@ -1,0 +1,146 @@
+"""A record table with a damaged log, or without some of its files, made whole again from what its files hold."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import pyarrow as pa
+
+from pipeline.errors import DamagedLogError
+from pipeline.store.data_files import files_there, once
+from pipeline.store.delta import (
+    DAMAGED,
+    LOG,
+    create_table,
+    live_files,
+    merge_rows,
+    open_table,
+    read_file,
+    set_aside_damaged,
+    stored_schema,
+)
+from pipeline.store.partitions import Lake
+from schemas.columns import TableSchema
+
+__all__ = ["Repaired", "repair_table"]
+
+
+@dataclass
+class Repaired:
+    """What was wrong with a table, in words; how many files gave their rows anew; whose rows are lost."""
+
+    found: str = ""
+    files: int = 0
+    lost: list[str] = field(default_factory=list)
+
+
+def repair_table(lake: Lake, schema: TableSchema) -> Repaired:
+    """Take the rows of all data files into the table that its log does not know; nothing that is recorded doubles.
+
+    A log that cannot be read goes to `_damaged`, and another one begins. So do files that cannot be read, and those
+    whose rows were taken in. Where a file is gone that replaced others, the others still hold its rows for a week.
+    Killed, it goes on when it is run again.
+
+    Raises:
+        ContractError: the lake is of another release.
+        OSError: the storage does not answer.
+    """
+    done, said = Repaired(), _said_by_entries(lake, schema)
+    try:
+        table = open_table(lake, schema)
+    except DamagedLogError as err:
+        done.found = err.problem
+        _set_log_aside(lake, schema)
+        create_table(lake, schema)
+        live, known = [], set[str]()
+    else:
+        live = live_files(table) if table is not None else []
+        known = set(said)
+    words = {n: w for n, w in said.items() if w} | {f.name: _words(f.name, f.vehicles, f.days) for f in live}
+    there = files_there(lake, schema)
+    bad = {name for name in words if name not in there} if done.found else set[str]()
+    bad |= set(set_aside_damaged(lake, schema)) if live else set()
+    # What a lost file replaced is known as removed, and may still be there.
+    beside = {f.name for f in live} | (set() if bad else known)
+    for name in [n for n in there if n not in beside]:
+        _take_in(lake, schema, name, done, bad)
+    if done.files or bad:
+        done.found = (
+            done.found or f"{done.files} files that its log does not know, {len(bad)} that cannot be read"
+        )
+    done.lost = [words.get(name) or f"{name}: rows of which nothing is known" for name in sorted(bad)]
+    return done
+
+
+def _take_in(lake: Lake, schema: TableSchema, name: str, done: Repaired, bad: set[str]) -> None:
+    """Merge the rows of a file into the table and put the file aside."""
+    rows = _whole_rows(lake, schema, name)
+    if rows is None:
+        bad.add(name)
+    elif rows.num_rows:
+        merge_rows(lake, schema, rows)
+        done.files += 1
+    lake.files.move(
+        lake.record_file(schema.name, name), lake.root / schema.name / DAMAGED / name.replace("/", "_")
+    )
+
+
+def _words(name: str, vehicles: tuple[str, str] | None, days: tuple[str, str] | None) -> str:
+    spans = [
+        f"{what} {of[0]} to {of[1]}"
+        for what, of in (("vehicles", vehicles), ("days", days))
+        if of is not None
+    ]
+    return f"{name}: rows of {', '.join(spans) or 'which nothing is known'}"
+
+
+def _said_by_entries(lake: Lake, schema: TableSchema) -> dict[str, str]:
+    """What the entries that can be read say of files: name to words; none of those that were removed."""
+    said: dict[str, str] = {}
+    folder = lake.root / schema.name / LOG
+    for name in sorted(n for n, _ in lake.files.sizes(folder) if n.endswith(".json")):
+        with lake.files.opened(folder / name) as stream:
+            lines = stream.read().splitlines()
+        for line in lines:
+            try:
+                action = json.loads(line)
+                if "remove" in action:
+                    said[action["remove"]["path"]] = ""
+                elif "add" in action:
+                    file = action["add"]["path"]
+                    said[file] = _words(file, *_spans(json.loads(action["add"].get("stats") or "{}")))
+            except (ValueError, TypeError, KeyError, AttributeError):
+                continue  # the damage
+    return said
+
+
+def _spans(stats: dict[str, Any]) -> list[tuple[str, str] | None]:
+    """First and last vehicle and day."""
+    least, most = stats.get("minValues", {}), stats.get("maxValues", {})
+    return [(least[c], most[c]) if c in least and c in most else None for c in ("vehicle", "day")]
+
+
+def _set_log_aside(lake: Lake, schema: TableSchema) -> None:
+    folder = lake.root / schema.name
+    before = {path.parent.name for path in lake.files.find(folder / DAMAGED, f"{LOG}*/*")}
+    for name, _ in list(lake.files.sizes(folder / LOG)):
+        lake.files.move(folder / LOG / name, folder / DAMAGED / f"{LOG}-{len(before) + 1}" / name)
+
+
+def _whole_rows(lake: Lake, schema: TableSchema, name: str) -> pa.Table | None:
+    """All rows of a file with all columns of the table, null where the file is of a release that had fewer."""
+    rows = read_file(lake, schema, name, [c.name for c in schema.columns])
+    if rows is None:
+        return None
+    rows = once(rows, schema)
+    stored = stored_schema(schema)
+    months = pa.array([day[:7] for day in rows["day"].to_pylist()], pa.string())
+    columns = [
+        months if f.name not in rows.column_names and f.name == "month"
+        else rows[f.name] if f.name in rows.column_names
+        else pa.nulls(rows.num_rows, f.type)
+        for f in stored
+    ]  # fmt: skip
+    return pa.table(columns, schema=stored)
