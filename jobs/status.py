@@ -57,6 +57,7 @@ def status(
     rows = read_records(tables, OUTCOMES, OutcomeRow, first=first, last=last)
     method = method or _audited_method(tables, {r.method for r in rows if r.method})
     found = [s for s in day_statuses(rows, method) if vehicle in (None, s.vehicle)]
+    found = _with_faults(tables, found, method)
     findings = read_last(tables, DRIFT, DriftFinding, method, vehicle=vehicle)
     if not json:
         _print_table(found, status_lines(findings))
@@ -77,6 +78,26 @@ def status(
         **({"days": [asdict(s) for s in found]} if json else {}),
     )
     return exit_code([ended])
+
+
+def _with_faults(lake: Lake, days: Sequence[DayStatus], method: str) -> list[DayStatus]:
+    """The vehicle-days with the faults that their current records name."""
+    from dataclasses import replace
+
+    from pipeline.store.current import current_rows
+    from pipeline.store.records import read_columns
+    from schemas.calibrations import CALIBRATIONS
+
+    known: dict[tuple[str, str], dict[str, None]] = {}
+    span = [d.day for d in days]
+    rows = read_columns(lake, CALIBRATIONS, ("faults",), first=min(span), last=max(span)) if span else None
+    if rows is not None and "faults" in rows.column_names:  # older releases have none
+        current = current_rows(rows, CALIBRATIONS)
+        names = ("vehicle", "day", "method", "faults")
+        for vehicle, day, of, faults in zip(*(current[n].to_pylist() for n in names), strict=True):
+            if of == method:
+                known.setdefault((vehicle, day), {}).update(dict.fromkeys(faults or ()))
+    return [replace(d, faults=list(known.get((d.vehicle, d.day), ()))) for d in days]
 
 
 def _audited_method(lake: Lake, others: set[str]) -> str:
@@ -107,12 +128,14 @@ def _print_table(days: Sequence[DayStatus], vehicles: Sequence[str]) -> None:
     from rich.text import Text
 
     from pipeline.fleet.status import DAY_STATUSES
+    from schemas.faults import in_words
 
     wanting = sorted((d for d in days if d.status != "done"), key=lambda d: DAY_STATUSES.index(d.status))
     table = Table("vehicle", "day", "status", "stage", "why")
     for day in wanting[:_ROWS]:
         # Text: names and reasons are not markup.
-        table.add_row(*(Text(t) for t in (day.vehicle, day.day, day.status, day.stage, day.reason)))
+        why = "; ".join(text for text in (in_words(day.faults), day.reason) if text)
+        table.add_row(*(Text(t) for t in (day.vehicle, day.day, day.status, day.stage, why)))
     console = Console()
     if wanting:
         console.print(table)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
-__all__ = ["FAULTS"]
+__all__ = ["FAULTS", "in_words"]
 
 FAULTS: Final = {
     "camera_info": "the camera's intrinsics differ from its CameraInfo",
@@ -22,3 +23,8 @@ FAULTS: Final = {
     "unit": "a sensor's points are in another unit than metres",
     "witnesses_disagree": "independent parts of the evidence contradict each other",
 }
+
+
+def in_words(faults: Iterable[str]) -> str:
+    """Faults as sentences; a name that this release does not know stays as it is."""
+    return "; ".join(FAULTS.get(fault, fault) for fault in faults)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+from schemas.faults import in_words
+
 __all__ = ["STATUS_STYLES", "print_table"]
 
 STATUS_STYLES = {
@@ -61,7 +63,7 @@ def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
         "frames": str(row["frames_used"]),
         "certified": ", ".join(row["determined"]),
         "of the mounting": ", ".join(row["mounting_determined"]),
-        "reason": row["reason"],
+        "reason": "; ".join(text for text in (in_words(row["faults"] or ()), row["reason"]) if text),
     }
 
 

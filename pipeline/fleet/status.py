@@ -30,6 +30,7 @@ class DayStatus:
         seconds: that its stages took when they last ran.
         bytes_read: by them; None where unknown.
         bytes_written: likewise.
+        faults: that its records name, keys of `schemas.faults.FAULTS`.
     """
 
     vehicle: str
@@ -43,6 +44,7 @@ class DayStatus:
     seconds: float = 0.0
     bytes_read: int | None = None
     bytes_written: int | None = None
+    faults: list[str] = field(default_factory=list)
 
 
 def day_statuses(rows: Sequence[OutcomeRow], method: str | None = None) -> list[DayStatus]:

@@ -13,6 +13,7 @@ from pipeline.report.words import AXIS_NAMES, PAIR_TITLES, dof_title, motion_in_
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
 from schemas.drift import DriftFinding, status_of
+from schemas.faults import in_words
 
 __all__ = ["DofRow", "PairView", "answer_for", "clearest_alarm", "pair_view", "sigmas_of", "status_sentence"]
 
@@ -47,6 +48,7 @@ class PairView:
     status: str
     advice: str
     reason: str
+    faults: str
     known_to: str
     undetermined: str
     moved_by: str
@@ -99,6 +101,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
         reason="; ".join(
             part for part in record.reason.split("; ") if not part.startswith(_SAID_BY_THE_AXES)
         ),
+        faults=in_words(record.faults or ()),
         known_to=_known_to(sigma, observable),
         undetermined=", ".join(unseen) if sigma is not None else "",
         moved_by=_moved_by(T, T_prior),

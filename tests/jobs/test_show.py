@@ -1,7 +1,9 @@
 """`boresight show` and `boresight status` on tables that are not calibrations."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from jobs.show import show
@@ -9,8 +11,10 @@ from jobs.status import status
 from pipeline.errors import ContractError
 from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records
+from schemas.calibrations import CALIBRATIONS
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from tests.audit.fleet_records import vehicle_records
 
 
 def test_every_record_table_is_shown_for_people_and_for_machines(tmp_path, capsys):
@@ -40,3 +44,24 @@ def test_status_names_the_command_that_moves_records_of_older_releases(tmp_path)
     (old / "joint-abc.parquet").touch()
     with pytest.raises(ContractError, match="boresight migrate"):
         status(lake=str(tmp_path))
+
+
+def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    held = [
+        replace(r, status="held", faults=["labels_offset"] if r.pair == "camera_lidar" else [])
+        for r in vehicle_records("car", 1, rng)
+    ]
+    lake = Lake.at(tmp_path)
+    commit_records(lake, CALIBRATIONS, held)
+    row = OutcomeRow(
+        "car", held[0].day, "calibrate", "joint", "done", "sky beside roofs", "k", kept={"held": 3}
+    )
+    commit_records(lake, OUTCOMES, [row])
+    words = "semantic labels lie beside the picture"
+    assert show("calibrations", lake=str(tmp_path)) == 0
+    assert words in " ".join(capsys.readouterr().out.split())
+    assert status(lake=str(tmp_path), json=True) == 0
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert summary["method"] == "joint"
+    assert [day["faults"] for day in summary["days"]] == [["labels_offset"]]
