@@ -31,6 +31,7 @@ _PILOT_ROUNDS, _CONVERGED_RAD = 3, np.radians(0.3)
 _MIN_FRAMES, _MAX_FRAMES = 8, 160
 _BLOCKS = 8  # of the bootstrap, at least
 _GUESSES_OF_ONE_FRAME, _FEWEST_GUESSES = 16, 8  # a regression on fewer answers has no scatter
+_STARTS_OF_ONE_FRAME, _SEARCH_ROUNDS = 12, 2  # as many passes as pilot frames take, spread over the prior
 _HALVES_SIGMAS = 4.0  # beyond it two halves of a day disagree
 # Degrees of freedom that only elevations tell: unobservable with a radar that measures none.
 _BY_ELEVATION = {
@@ -102,9 +103,39 @@ def single_frame_solution(
         raise SolveError(f"frame {frame.frame_index}: {rejection.reason.value}") from rejection
     asked = _Asked(networks, prior, [sensors], [observation])
     rng = np.random.default_rng([seed, 7])
-    centre = _pilot_centre(asked, rng)
+    centre, ends = _searched(asked, rng)
     found = _ask(asked, [0] * _GUESSES_OF_ONE_FRAME, centre, rng, lambda _: None)
-    return Solution(method, {pair: _estimate(pair, found[pair], asked, rng) for pair in PAIRS})
+    estimates = {
+        pair: _estimate(pair, replace(found[pair], ends=twists_about(centre[pair], ends[pair])), asked, rng)
+        for pair in PAIRS
+    }
+    if not estimates["camera_lidar"].observable.any():  # the picture cannot tell: nor can it about the radar
+        estimates["camera_radar"] = _unchanged("camera_radar", prior)
+    return Solution(method, estimates)
+
+
+def _searched(asked: _Asked, rng: np.random.Generator) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Where searches from all over the prior end on one frame: by pair their median, and each end.
+
+    From guesses near each other a frame that looks alike from several places ends in one of them; only far ones tell.
+    """
+    prior, networks = asked.prior, asked.networks
+    starts = _scattered(_STARTS_OF_ONE_FRAME, rng, prior.rotation_sigma_rad, prior.translation_sigma_m)
+    guess = {pair: prior.of(pair) for pair in PAIRS}
+    composed = any(n.composed for n in networks)
+    ends: dict[str, list[np.ndarray]] = {pair: [] for pair in PAIRS}
+    for offsets in starts:
+        at = _guess(guess, offsets, composed=composed)
+        for _ in range(_SEARCH_ROUNDS):
+            for network, sensors in zip(networks, asked.sensors[0], strict=True):
+                at |= network.answer(sensors, at).T
+        for pair in PAIRS:
+            ends[pair].append(at[pair])
+    stacked = {pair: np.stack(own) for pair, own in ends.items()}
+    centre = {
+        p: exp_se3(np.median(twists_about(prior.of(p), T), axis=0)) @ prior.of(p) for p, T in stacked.items()
+    }
+    return centre, stacked
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,9 +260,11 @@ def _ask(
     }
 
 
-def _scattered(count: int, rng: np.random.Generator) -> Float[np.ndarray, "N 3 6"]:
+def _scattered(
+    count: int, rng: np.random.Generator, sigma_rad: float = _SCATTER_RAD, sigma_m: float = _SCATTER_M
+) -> Float[np.ndarray, "N 3 6"]:
     """Twists by row and pair with mean 0, so that the effect of the guesses on the answers is no offset."""
-    sd = np.array([_SCATTER_RAD] * 3 + [_SCATTER_M] * 3)
+    sd = np.array([sigma_rad] * 3 + [sigma_m] * 3)
     offsets = rng.normal(size=(count, len(PAIRS), 6)).clip(-2, 2) * sd
     return np.asarray(offsets - offsets.mean(axis=0))
 

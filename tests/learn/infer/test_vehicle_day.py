@@ -176,6 +176,33 @@ def test_one_frame_is_a_calibration_with_the_sigma_of_one_frame(frames):
     assert np.sqrt(estimate.covariance[0, 0]) > 0.8 * NOISE[0]
 
 
+class Alike(Oracle):
+    """A network whose frame looks alike from two places, 5 deg of azimuth apart: it goes to the nearer one."""
+
+    def answer(self, sensors, guess):
+        found = super().answer(sensors, guess)
+        other = exp_se3(np.array([0.0, np.radians(5.0), 0.0, 0.0, 0.0, 0.0]))
+        apart = log_se3(guess["camera_lidar"] @ inverse(TRUTH["camera_lidar"]))[1]
+        if apart > np.radians(2.5):
+            found.T["camera_lidar"] = other @ found.T["camera_lidar"]
+        return found
+
+
+def test_a_frame_that_looks_alike_from_two_places_cannot_tell_and_says_so(frames):
+    observations, images = frames
+    for shift_deg in (2.0, 3.0):  # of the prior, from where most searches go to either place
+        shift = exp_se3(np.array([0.0, np.radians(shift_deg), 0.0, 0.0, 0.0, 0.0]))
+        prior = replace(Prior(shift @ T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05))
+        found = single_frame_solution(
+            images[3], observations[3], prior, networks=[Alike(noise=0.02)], method="joint-ssl", seed=0
+        )
+        for pair in ("camera_lidar", "camera_radar"):
+            assert not found.pairs[pair].observable.any()
+            np.testing.assert_allclose(found.pairs[pair].T, prior.of(pair), atol=1e-6)
+        assert found.pairs["camera_lidar"].diagnostics["ends_apart_deg"] > 1.5
+        assert found.pairs["lidar_radar"].observable[2]
+
+
 @pytest.fixture(scope="module")
 def lake(tmp_path_factory):
     """One day of 24 frames, a fleet.toml, and untrained networks of every kind."""
