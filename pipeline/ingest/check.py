@@ -30,6 +30,7 @@ __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
 
 _SAMPLE = 40  # frames looked into; the rest only by their stamps
 _MOVING_MPS = 1.0
+_BACKWARDS = "the car would drive backwards"
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,7 @@ def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:
         elevation_share=share([f.radar_has_elevation for f in scanned]),
         moving_share=moving,
         doppler_problem=problem,
+        doppler_is_wrong=problem.startswith(_BACKWARDS),
         frames_of={
             pair: round(usable * share([pair in pairs_of(f.sensors) for f in frames]))
             for pair in pairs_of(rig.sensors)
@@ -205,9 +207,9 @@ def _doppler_problem(frames: list[Frame], speeds: Float[np.ndarray, " N"], radar
     moving = speeds[np.abs(speeds) > _MOVING_MPS]
     if len(moving) >= 3 and np.mean(moving < 0) > 2 / 3:
         if radar.velocity_fields is not None:
-            return "the car would drive backwards: velocity_fields must be relative to the radar, x ahead"
+            return f"{_BACKWARDS}: velocity_fields must be relative to the radar, x ahead"
         other = "receding" if radar.doppler_positive == "approaching" else "approaching"
-        return f'the car would drive backwards: doppler_positive is probably "{other}"'
+        return f'{_BACKWARDS}: doppler_positive is probably "{other}"'
     return ""
 
 

@@ -31,6 +31,7 @@ class Evidence:
     elevation_share: float
     moving_share: float | None
     doppler_problem: str = ""
+    doppler_is_wrong: bool = False  # its sign or unit surely is, by which calibrate holds every pair
     missing: tuple[str, ...] = ()
     frames_of: Mapping[str, int] | None = None
 
@@ -96,7 +97,7 @@ def _without_frames(e: Evidence) -> _Needs:
 
 
 def _common_needs(e: Evidence) -> _Needs:
-    needs: _Needs = []
+    needs: _Needs = [("no", e.doppler_problem)] if e.doppler_is_wrong else []
     if e.frames < _FEW_FRAMES:
         needs.append(("no", f"{e.frames} usable synchronised frames; at least {_FEW_FRAMES} are needed"))
     elif e.frames < _ENOUGH_FRAMES:
@@ -119,7 +120,7 @@ def _pitch_needs(e: Evidence) -> _Needs:
 
 
 def _radar_needs(e: Evidence) -> _Needs:
-    return [("weak", e.doppler_problem)] if e.doppler_problem else []
+    return [("weak", e.doppler_problem)] if e.doppler_problem and not e.doppler_is_wrong else []
 
 
 def _elevation_needs(e: Evidence) -> _Needs:

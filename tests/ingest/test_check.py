@@ -165,6 +165,8 @@ def test_a_planar_radar_a_missing_field_and_a_wrong_sign_are_noticed(kit, tmp_pa
     assert any("x, y, z, doppler, power" in p for p in report.problems)
     report = report_on(kit, tmp_path, drive, radar={"doppler_positive": "receding"})
     assert 'probably "approaching"' in report.evidence.doppler_problem
+    assert report.answer == "no"
+    assert all('doppler_positive is probably "approaching"' in v.reasons[0] for v in report.verdicts)
     report = report_on(kit, tmp_path, drive, radar={"doppler_period_mps": 2.0})
     assert "doppler_period_mps = 2" in report.evidence.doppler_problem
 
