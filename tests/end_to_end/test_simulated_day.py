@@ -12,13 +12,16 @@ from tests.makers.simulated_days import simulated_day
 SPEC = DaySpec(4900, "urban", 32, "demo")
 BOUNDS_DEG = {"camera_lidar": (0.2, 0.2), "camera_radar": (0.4, 0.6), "lidar_radar": (0.4, 0.6)}
 RANGE_M = 0.10
+# Both sensors measure so much beside their stamps that the sign of what is found counts [s].
+CLOCKS = "vehicle-1:0:camera:time:0.03,vehicle-1:0:radar:time:-0.03"
 
 
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory):
     """The demo's rig, 32 frames, both transforms started exactly 2 deg and 0.1 m off."""
     folder = tmp_path_factory.mktemp("day")
-    made = simulated_day(folder, frames=SPEC.frames, environment=SPEC.environment, seed=SPEC.seed)
+    about = {"frames": SPEC.frames, "environment": SPEC.environment, "seed": SPEC.seed}
+    made = simulated_day(folder, faults=CLOCKS, **about)
     day = Day(SPEC, made.observations, made.told, made.fleet, {})
     return calibrate_once(Run(SPEC, prior=("exact", 2.0, 0.1), seed=SPEC.seed), day)["pairs"]
 
@@ -35,3 +38,11 @@ def test_a_simulated_day_is_calibrated_to_its_truth(pairs, pair):
 @pytest.mark.slow
 def test_the_range_between_lidar_and_radar_is_right(pairs):
     assert pairs["lidar_radar"]["range_m"] <= RANGE_M
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", ["camera_lidar", "lidar_radar"])
+def test_the_record_s_time_offset_is_the_truth_s_with_its_sign(pairs, pair):
+    found = pairs[pair]
+    assert abs(found["dt_s"] - found["dt_true_s"]) < 3 * found["dt_sigma_s"]
+    assert abs(-found["dt_s"] - found["dt_true_s"]) > 4 * found["dt_sigma_s"]

@@ -3,6 +3,7 @@
 Poles, house fronts, parked and moving cars; the car drives at various speeds, and the radar's clock is off.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,11 +21,20 @@ BEAM_GAP_RAD = np.radians(0.4)
 
 
 def street_day(
-    frames: int = 30, seed: int = 0, *, dt_s: float = DT_S, elevation: bool = True, **changes
+    frames: int = 30,
+    seed: int = 0,
+    *,
+    dt_s: float = DT_S,
+    elevation: bool = True,
+    gaps_s: Sequence[float] = (),
+    **changes,
 ) -> list[Observation]:
-    """A day of streets; `changes` replace columns of every frame."""
+    """A day of streets; `changes` replace columns of every frame; `gaps_s` are radar stamps less the sweeps'."""
     rng = np.random.default_rng(seed)
     base = make_day(frames=frames, seed=seed, per_drive=3)
+    if len(gaps_s):
+        stamps = [o.stamp_ns + round(gap * 1e9) for o, gap in zip(base, gaps_s, strict=True)]
+        base = [replace(o, radar_stamp_ns=ns) for o, ns in zip(base, stamps, strict=True)]
     return [replace(o, **(_street(rng, o, dt_s, elevation) | changes)) for o in base]
 
 

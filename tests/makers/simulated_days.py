@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config import FleetConfig, load_fleet
+from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows
@@ -30,7 +31,13 @@ class SimulatedDay:
 
 
 def simulated_day(
-    folder: Path, *, frames: int, environment: str = "urban", rig: str = "demo", seed: int = 21
+    folder: Path,
+    *,
+    frames: int,
+    environment: str = "urban",
+    rig: str = "demo",
+    seed: int = 21,
+    faults: str = "",
 ) -> SimulatedDay:
     """Simulate, ingest and perceive one day into a folder: about 0.3 CPU seconds a frame for the demo rig."""
     simulate_fleet(
@@ -42,6 +49,7 @@ def simulated_day(
             rig=rig,
             environments=environment,
             seed=seed,
+            faults=parse_faults(faults, [DATE]),
         ),
         folder,
     )

@@ -220,6 +220,18 @@ def test_stamps_that_are_all_late_by_as_much_change_the_time_offset_by_it_and_no
     assert b.time_offset_s - a.time_offset_s == pytest.approx(-0.06, abs=1e-5)
 
 
+def test_stamps_whose_gaps_vary_lead_to_the_same_pose_and_time_offset():
+    """Each scan is moved to its sweep by its own gap: the other way round, detections lie up to 1.3 m beside."""
+    gaps_s = np.random.default_rng(8).uniform(-0.04, 0.04, 40)
+    found = solve(street_day(40, gaps_s=gaps_s), prior_off_by(1.0, 0.03))
+    error, sigma = error_of(found), np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(error[:5]) < 3 * sigma[:5])
+    assert abs(error[2]) < np.radians(0.12)
+    assert np.abs(error[3:5]).max() < 0.06
+    assert abs(found.time_offset_s - DT_S) < 3 * found.time_offset_sigma_s
+    assert found.time_offset_sigma_s < 0.006
+
+
 def test_a_standing_car_does_not_determine_the_time_offset():
     still = [replace(o, radar_velocity_mps=np.zeros(3)) for o in street_day(16, dt_s=0.0)]
     found = solve(still, prior_off_by(1, 0.02))
