@@ -57,12 +57,7 @@ def sigma_figure(
                     observable.get(pair),
                 )
             parts += plot.parts
-    return document(
-        410.0 * len(pairs) - 20.0,
-        272.0,
-        parts,
-        "Sigma of each degree of freedom, of the prior and of the result",
-    )
+    return document(1210.0, 272.0, parts, "Sigma of each degree of freedom, of the prior and of the result")
 
 
 def _sigma_bars(
@@ -110,7 +105,7 @@ def residual_figure(
             _residual_dots(plot, series[pair], colour, label, plot.left + 130 * k)
         parts += plot.parts
     return document(
-        410.0 * len(pairs) - 20.0,
+        1210.0,
         192.0,
         parts,
         "Agreement of the sensors in each frame, at the prior and calibrated",

@@ -87,7 +87,8 @@ def front_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tupl
     cv2.line(image, (middle, 0), (middle, image.shape[0]), _WHITE, 3)
     _tag(image, labels[0], (14, 34))
     _tag(image, labels[1], (middle + 14, 34))
-    _colour_bar(image)
+    if "lidar" in scene.observation.sensors:
+        _colour_bar(image)
     return image
 
 
