@@ -40,7 +40,7 @@ def vehicle_findings(
     remarks: Mapping[tuple[str, str], str],
     before: Mapping[tuple[str, str], DriftFinding] | None = None,
 ) -> list[DriftFinding]:
-    """Rows in order of pair and DoF; a DoF without a chart says why it has none, a pair without a record has no row.
+    """Rows in order of pair and DoF; a DoF without a chart says why. A pair that the vehicle has not has none.
 
     Args:
         audit: what all rows have in common.
@@ -51,7 +51,8 @@ def vehicle_findings(
         before: by pair and DoF, the latest earlier audit's rows: they knew days that have left the window since.
     """
     findings = []
-    for pair in (PAIRS[p] for p in np.unique(records.pair[records.pair >= 0])):
+    known = {PAIRS[p] for p in records.pair.tolist() if p >= 0} | {pair for pair, _ in before or ()}
+    for pair in (p for p in PAIRS if p in known or not known):
         without_data, last_estimate = _without_data(records, pair), _last_estimate(records, pair)
         for dof in DOF_NAMES:
             chart = verdict.charts.get((pair, dof)) or without_data

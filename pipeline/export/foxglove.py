@@ -114,28 +114,32 @@ def _log_scene(
 ) -> None:
     now, names = frame.stamp_ns, calibration.names
     topics.tf.log(fg.FrameTransforms(transforms=_transforms(calibration, priors, now)), log_time=now)
-    at = _time(frame.camera_stamp_ns)
-    picture = fg.CompressedImage(
-        timestamp=at, frame_id=names.camera, data=frame.image, format=frame.image_format
-    )
-    topics.image.log(picture, log_time=now)
-    topics.camera.log(_intrinsics(camera_of(frame), names.camera, at), log_time=now)
+    at, has_image = _time(frame.camera_stamp_ns), "camera" in frame.sensors
+    if has_image:
+        picture = fg.CompressedImage(
+            timestamp=at, frame_id=names.camera, data=frame.image, format=frame.image_format
+        )
+        topics.image.log(picture, log_time=now)
+        topics.camera.log(_intrinsics(camera_of(frame), names.camera, at), log_time=now)
     lidar, radar = _lidar_columns(frame), _radar_columns(frame)
     clouds = {"lidar": (lidar, names.lidar, now), "radar": (radar, names.radar, frame.radar_stamp_ns)}
     for sensor, pair in (("lidar", "camera_lidar"), ("radar", "lidar_radar")):
+        if sensor not in frame.sensors:
+            continue
         columns, frame_id, stamp_ns = clouds[sensor]
         topics.cloud[sensor].log(_cloud(columns, frame_id, stamp_ns), log_time=now)
         if pair in priors:
             topics.cloud[f"{sensor}_prior"].log(_cloud(columns, f"{frame_id}_prior", stamp_ns), log_time=now)
-    if observation is not None:
+    if observation is not None and has_image and "camera" in observation.sensors:
         topics.drawn["boxes"].log(_boxes(observation, at), log_time=now)
+    if observation is not None:
         topics.clusters.log(_clusters(observation, names.lidar, now), log_time=now)
         estimate = calibration.pairs.get("camera_lidar")
         for name, T, colour in (
             ("overlay", None if estimate is None else estimate.T, _CALIBRATED),
             ("overlay_prior", priors.get("camera_lidar"), _PRIOR),
         ):
-            if T is not None:
+            if T is not None and has_image and "camera" in observation.sensors:
                 topics.drawn[name].log(_edges(observation, T, colour, at), log_time=now)
 
 

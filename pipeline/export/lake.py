@@ -162,8 +162,9 @@ def read_camera(lake: Lake, vehicle: str, days: Iterable[str]) -> Camera | None:
             if read_manifest(lake, OBSERVATIONS, partition) is None:
                 continue
             for rows in iterate_rows(lake, OBSERVATIONS, partition, Observation):
-                if rows:
-                    camera = camera_of(rows[0])
+                seen = [row for row in rows if "camera" in row.sensors]
+                if seen:
+                    camera = camera_of(seen[0])
                     return Camera(
                         camera.model,
                         np.array(camera.K),

@@ -23,6 +23,7 @@ from pipeline.report.reading import scene_of
 from pipeline.report.residuals import MEASURES, boundary_distance_px, frame_residuals
 from pipeline.report.scenes import choose_frames, choose_windows
 from pipeline.sections import ReportConfig
+from schemas.calibrations import SENSORS
 from schemas.frames import Frame
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
@@ -52,7 +53,7 @@ def _blank(row_type: Any, **known: Any) -> Any:
         if values[f.name] is None and kind == "np.ndarray":
             values[f.name] = np.zeros((0, 3) if "xyz" in f.name or "centre" in f.name else (0,), np.float32)
         elif kind.startswith("list"):
-            values[f.name] = []
+            values[f.name] = list(SENSORS) if f.name == "sensors" else []
     return row_type(**(values | known))
 
 

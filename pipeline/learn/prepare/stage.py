@@ -23,6 +23,7 @@ from pipeline.learn.sample.frame_sample import About, SampleReason, SampleReject
 from pipeline.store.partitions import Lake
 from pipeline.store.tables import iterate_rows, read_manifest
 from pipeline.work import Run, Task, Work
+from schemas.calibrations import PAIRS, SENSORS
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.training import TRAINING, TrainingRow
@@ -94,16 +95,29 @@ def _samples(task: Task, about: Mapping[int, About], rejected: Counter[str]) -> 
     lake, partition, fleet = task.lake, task.partition, task.fleet
     observations = itertools.chain.from_iterable(iterate_rows(lake, OBSERVATIONS, partition, Observation))
     frames = itertools.chain.from_iterable(iterate_rows(lake, FRAMES, partition, Frame, rows=sorted(about)))
-    observation = next(observations)
+    whole = (o for o in observations if len(o.sensors) == len(SENSORS))
+    observation = next(whole, None)
+    if observation is None:
+        rejected[SampleReason.SENSOR_MISSING.value] += len(about)
+        return
     try:
         prior = read_prior([observation], fleet, partition.vehicle)
     except SolveError:
+        prior = None
+    if prior is None or not all(prior.knows(pair) for pair in PAIRS):
         rejected[SampleReason.NO_PRIOR.value] += len(about)
         return
     first = _logged_prior(observation)
     for row, frame in zip(sorted(about), frames, strict=True):
         while observation.frame_index < frame.frame_index:
-            observation = next(observations)
+            following = next(whole, None)
+            if following is None:
+                break
+            observation = following
+        if observation.frame_index != frame.frame_index:
+            rejected[SampleReason.SENSOR_MISSING.value] += 1
+            yield None
+            continue
         try:
             yield _sample(frame, observation, prior, first, about[row], fleet.prepare)
         except SampleRejectedError as rejection:

@@ -45,6 +45,7 @@ class SampleReason(StrEnum):
     """Why a frame is no sample."""
 
     NOT_PERCEIVED = "not_perceived"
+    SENSOR_MISSING = "sensor_missing"
     HARDLY_MOVED = "hardly_moved"
     SPLIT_CONFLICT = "split_conflict"
     NEXT_TO_OTHER_SPLIT = "next_to_other_split"
