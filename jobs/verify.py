@@ -168,10 +168,11 @@ def _spelled_alike(config: FleetConfig, lake: Lake, partition: Partition) -> Fle
     off.
     """
     from pipeline.errors import SolveError
-    from pipeline.export.files import prior_text
+    from pipeline.export.texts import to_json
     from pipeline.extrinsics.prior import read_prior
     from pipeline.in_use.spelling import on_grid
     from pipeline.store.tables import read_manifest, read_rows
+    from schemas.calibrations import pairs_of
     from schemas.observations import OBSERVATIONS, Observation
 
     if read_manifest(lake, OBSERVATIONS, partition) is None:
@@ -181,8 +182,12 @@ def _spelled_alike(config: FleetConfig, lake: Lake, partition: Partition) -> Fle
     except SolveError:  # no prior: calibrate refuses the log and says why
         return config
     file = lake.local_root / "on_grid.json"
-    pairs = {pair: on_grid(prior.of(pair)) for pair in ("camera_lidar", "lidar_radar")}
-    file.write_bytes(prior_text(pairs, "prior", []))
+    has = pairs_of(config.rig_of(partition.vehicle).sensors)
+    given = [pair for pair in has if pair != "camera_radar" or len(has) == 1]
+    if not all(prior.knows(pair) for pair in given):  # a sensor is silent: its prior stays as logged
+        return config
+    transforms = {f"T_{pair}": on_grid(prior.of(pair)).tolist() for pair in given}
+    file.write_bytes(to_json(transforms))
     return config.with_prior_file(partition.vehicle, file)
 
 

@@ -130,3 +130,20 @@ def test_methods_that_need_all_three_refuse_and_name_the_missing_sensor(night, m
         own = [r for r in found if r.method == method]
         assert {r.status for r in own} == {"refused"}
         assert all(words in r.reason for r in own)
+
+
+def test_a_rig_without_a_lidar_is_verified_by_its_one_pair(night, capsys):
+    logs = [str(p) for p in (night / "logs" / "no-lidar" / DAY).iterdir()]
+    main(["verify", *logs, "--fleet", str(night / "fleet.toml"), "--vehicle", "no-lidar", "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["answer"] in ("right", "wrong", "inconclusive")
+    assert {axis["pair"] for axis in answer["axes"]} == {"camera_radar"}
+
+
+@pytest.mark.parametrize("vehicle", ["no-camera", "no-radar"])
+def test_what_a_rig_of_two_sensors_has_goes_out(night, vehicle, tmp_path):
+    about = ["--lake", str(night / "lake"), "--vehicle", vehicle]
+    assert main(["export", "ros2", "--out", str(tmp_path / "ros2"), *about]) in (0, 3)
+    drive = ["export", "foxglove", "--out", str(tmp_path / "drive.mcap"), "--day", DAY, "--force"]
+    assert main([*drive, *about]) in (0, 3)
+    assert (tmp_path / "drive.mcap").stat().st_size > 0
