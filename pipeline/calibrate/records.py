@@ -76,6 +76,7 @@ class SolvedDay:
     trigger_before: Mapping[str, Mapping[str, float]]  # metrics of each pair at the prior
     trigger_after: Mapping[str, Mapping[str, float]]  # and at the result
     triggered: Mapping[str, bool]  # pairs with a metric beyond its threshold at the prior
+    numbers: Mapping[str, float] = field(default_factory=dict)  # of checks of the day, for every record
 
 
 def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
@@ -114,6 +115,7 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         | _test_numbers(test)
         | _claim_numbers(judged)
         | _camera_numbers(pair, day.observations)
+        | dict(day.numbers)
         | {"paper_frames": float(selection.passed[pair])},
     )
 

@@ -31,6 +31,7 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.label_offset import with_label_offset
 from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.calibrate.verify.motion_sources import MotionFindings, compared_sources
 from pipeline.calibrate.verify.mounting import camera_turn_sigma_rad, mounting_covariance
 from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure, views_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
@@ -149,6 +150,31 @@ def calibrate_observations(
     Raises:
         SolveError: the day cannot be calibrated.
     """
+    motion = compared_sources(observations, prior.T_lidar_radar)
+    try:
+        return _solved(observations, prior, fleet, about, motion, progress, solver)
+    except SolveError as err:
+        raise _named(err, motion) from err
+
+
+def _named(refusal: SolveError, motion: MotionFindings) -> SolveError:
+    """A refusal that says first which source of motion is wrong, where one is."""
+    if not motion.wrong:
+        return refusal
+    sentences = [*(check.sentence for check in motion.wrong), refusal.reason]
+    return SolveError("; ".join(sentences), motion.wrong[0].fault)
+
+
+def _solved(
+    observations: Sequence[Observation],
+    prior: Prior,
+    fleet: FleetConfig,
+    about: Inputs,
+    motion: MotionFindings,
+    progress: Progress,
+    solver: Solver | None,
+) -> list[CalibrationRecord]:
+    """The records of a day whose sources of motion were compared."""
     progress(0, 4, "select frames")
     method, select = method_named(about.method), fleet.select
     if method.frames == "all":
@@ -161,7 +187,7 @@ def calibrate_observations(
         pairs=about.pairs,
         absent=about.absent,
     )
-    refused = _refused(method, about.pairs, selection, prior)
+    refused = {p: _named(e, motion) for p, e in _refused(method, about.pairs, selection, prior).items()}
     pairs = [pair for pair in about.pairs if pair not in refused]
     refusals = {
         pair: refused_record(about, pair, why, observations, prior, selection.rejected[pair])
@@ -187,7 +213,9 @@ def calibrate_observations(
         solution = with_label_offset(solution, observations)
     progress(2, 4, "judge on held-out frames")
     solution, judged = _believed(
-        solution, lambda found: _judge_all(observations, selection, prior, found, fleet, active), active
+        solution,
+        lambda found: _judge_all(observations, selection, prior, found, fleet, active, motion),
+        active,
     )
     after = trigger_metrics(sample, {pair: solution.pairs[pair].T for pair in pairs})
     day = SolvedDay(
@@ -199,6 +227,7 @@ def calibrate_observations(
         before,
         after,
         {pair: bool(fired[pair]) for pair in pairs},
+        motion.numbers,
     )
     progress(4, 4, "done")
     return [refusals[pair] if pair in refusals else record_of(about, pair, day) for pair in about.pairs]
@@ -286,13 +315,15 @@ def _judge_all(
     solution: Solution,
     fleet: FleetConfig,
     active: Sequence[str],
+    motion: MotionFindings,
 ) -> dict[str, Judged]:
     """Verdict and evidence of each pair; pairs that a method composes come after their factors."""
     limits, search = _limits(fleet.verify), search_range(prior, fleet.solve)
     composed = _composed_of(method_named(solution.method), solution.pairs)
     seen_by = next((o for o in observations if "camera" in o.sensors), None)
     turn = None if seen_by is None else camera_turn_sigma_rad(solution, prior.camera, seen_by.camera_K)
-    failed = checks_of_day(FoundDay(observations, selection, prior, solution, composed, fleet, limits))
+    about = FoundDay(observations, selection, prior, solution, composed, fleet, limits, motion)
+    failed = checks_of_day(about)
     found: dict[str, Judged] = {}
     views = views_of(observations)
     for pair in sorted(solution.pairs, key=lambda p: p in composed):

@@ -5,7 +5,8 @@ the Doppler period where the radar is ambiguous. Wide fields of view lift that: 
 see 13 % less than points ahead, so a wrong multiple of the period does not fit.
 
 The search lies about the direction of travel that the mounting prior gives, so a radar that looks to a corner or back
-is none different from one that looks ahead. Where there is no prior, or nothing is found there, it goes wider.
+is none different from one that looks ahead. Where there is no prior, or nothing is found there, it goes wider, and
+where still nothing is found, it goes without odometry and prior: these may be wrong.
 
 Source: Kellner et al. 2013, "Instantaneous ego-motion estimation using Doppler radar" (their sine fit, here
 with wrapped residuals and a grid of hypotheses instead of RANSAC, which makes it deterministic).
@@ -42,6 +43,9 @@ _PEAKS, _APART_MPS = 4, 1.0
 _MIN_POINTS = 12  # fewer say nothing about which of them stand still
 _MIN_STATIC_FRACTION = 0.35
 _MIN_STATIC_FRACTION_WITH_HINT = 0.1
+# What fits by chance fills the gate evenly, with a noise of .74 of it; what stands fits finely, even beside a bus that
+# fills the scan. And by so much more of a scan must fit without odometry and mounting.
+_COARSE, _MISLED = 0.45, 0.2
 _NOISE_FLOOR_MPS = 0.03
 
 
@@ -101,7 +105,7 @@ def radar_motion(
     u = _directions(xyz_m[usable].astype(np.float64), has_elevation)
     rate = range_rate_mps[usable].astype(np.float64)
     power = None if power_db is None else power_db[usable].astype(np.float64)
-    fit = _fit_static_world(u, rate, power, period_mps or 0.0, travel, config.static_gate_mps, rng)
+    fit = _fit(u, rate, power, period_mps or 0.0, travel, config.static_gate_mps, rng)
     if fit is None:
         return undecided
     velocity, covariance, noise = fit
@@ -119,6 +123,36 @@ def _directions(xyz: np.ndarray, has_elevation: bool) -> np.ndarray:
     """Unit vectors; flat ones where elevations mean nothing."""
     xyz = xyz if has_elevation else xyz * [1.0, 1.0, 0.0]
     return xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+
+
+def _fit(
+    u: np.ndarray,
+    rate: np.ndarray,
+    power: np.ndarray | None,
+    period: float,
+    travel: Travel,
+    gate: float,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """The fit of the static world as odometry and mounting suggest, or as the scan alone shows where they mislead.
+
+    A wrong odometry, mounting or sign of the Doppler would else be filled with what little of the scan fits it; what
+    the scan alone shows tells which of them is wrong (`calibrate/verify/motion_sources.py`).
+    """
+    fit = _fit_static_world(u, rate, power, period, travel, gate, rng)
+    share = 0.0 if fit is None else _static_share(u, rate, fit, period, gate)
+    is_fine = fit is not None and fit[2] < _COARSE * gate
+    if travel == Travel() or share >= _MIN_STATIC_FRACTION or is_fine:
+        return fit
+    alone = _fit_static_world(u, rate, power, period, Travel(), gate, rng)
+    is_better = alone is not None and _static_share(u, rate, alone, period, gate) > share + _MISLED
+    return alone if is_better else fit
+
+
+def _static_share(
+    u: np.ndarray, rate: np.ndarray, fit: tuple[np.ndarray, np.ndarray, float], period: float, gate: float
+) -> float:
+    return float(np.mean(np.abs(wrapped(rate + u @ fit[0], period)) < gate))
 
 
 def _fit_static_world(
@@ -145,10 +179,10 @@ def _fit_static_world(
             best = wide
     if best is None:
         return None
-    static = np.abs(wrapped(rate + u @ best[0], period)) < gate
+    share = _static_share(u, rate, best, period, gate)
     # A bus alongside may answer with most detections of a scan; odometry tells which of the others stand still.
     least = _MIN_STATIC_FRACTION if travel.speed_mps is None else _MIN_STATIC_FRACTION_WITH_HINT
-    return best if static.sum() >= _MIN_POINTS and np.mean(static) >= least else None
+    return best if share * len(u) >= _MIN_POINTS - 0.5 and share >= least else None
 
 
 def _ahead(travel: Travel) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.calibrate.verify.motion_sources import MotionFindings
 from pipeline.calibrate.verify.scene_count import scene_failures
 from pipeline.config import FleetConfig
 from pipeline.extrinsics.checks import FailedCheck
@@ -34,9 +35,15 @@ class FoundDay:
     composed: Sequence[str]  # pairs that the method composes of the others
     fleet: FleetConfig
     limits: VerdictLimits
+    motion: MotionFindings
 
 
 DayCheck = Callable[[FoundDay], Mapping[str, Sequence[FailedCheck]]]
+
+
+def _motion(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+    """Sweeps are de-skewed, and stamps bridged, by the car's motion: where that is wrong, no pair is right."""
+    return dict.fromkeys(PAIRS, day.motion.wrong)
 
 
 def _solver(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
@@ -71,7 +78,7 @@ def _scenes(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
 
 
 # In the order in which a record states them.
-DAY_CHECKS: tuple[DayCheck, ...] = (_solver, _contradictions, _heading, _loop, _scenes)
+DAY_CHECKS: tuple[DayCheck, ...] = (_motion, _solver, _contradictions, _heading, _loop, _scenes)
 
 
 def checks_of_day(day: FoundDay) -> dict[str, list[FailedCheck]]:

@@ -1,0 +1,161 @@
+"""Odometry, Doppler and the lidar's sweeps against each other: the one that is wrong is named, and by what."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.verify.motion_sources import compared_sources
+from pipeline.calibrate.verify.sweep_motion import sweep_motion
+from pipeline.geometry.se3 import exp_so3
+from tests.makers.solve_scenes import T_LIDAR_RADAR, make_day
+
+STEP_S = 0.5
+
+
+def driven(frames=36, seed=5, turn_radps=0.12):
+    """A car that speeds up, brakes and turns among posts and walls, as all three sources show it."""
+    rng = np.random.default_rng(seed)
+    posts = rng.uniform([-60, -200], [420, 200], size=(1500, 2))
+    time = np.arange(frames) * STEP_S
+    fine = np.arange(0, frames * STEP_S + 1, 0.01)
+    speed = 9 + 4 * np.sin(0.7 * fine)
+    rate = turn_radps * np.sin(0.4 * fine)
+    yaw = np.cumsum(rate) * 0.01
+    at = np.cumsum(np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], 1), axis=0) * 0.01
+    day = []
+    for k, o in enumerate(make_day(frames, per_drive=frames, step_s=STEP_S)):
+        i = round(time[k] * 100)
+        c, s = np.cos(yaw[i]), np.sin(yaw[i])
+        seen = (posts - at[i]) @ np.array([[c, -s], [s, c]])
+        seen = seen[np.hypot(*seen.T) < 55] + rng.normal(0, 0.03, size=(np.sum(np.hypot(*seen.T) < 55), 2))
+        cloud = np.column_stack([seen, np.zeros(len(seen))])
+        ahead = cloud[cloud[:, 0] > 3][:120]
+        day.append(
+            replace(
+                o,
+                lidar_map_xyz_m=cloud.astype(np.float32),
+                lidar_map_is_ground=np.zeros(len(cloud), np.uint8),
+                ego_speed_mps=float(speed[i]),
+                ego_yaw_rate_radps=float(rate[i]),
+                radar_velocity_mps=T_LIDAR_RADAR[:3, :3].T @ [speed[i], 0.0, 0.0] + rng.normal(0, 0.05, 3),
+                radar_xyz_m=((ahead - T_LIDAR_RADAR[:3, 3]) @ T_LIDAR_RADAR[:3, :3]).astype(np.float32),
+                radar_motion=np.zeros(len(ahead), np.uint8),
+            )
+        )
+    return day
+
+
+@pytest.fixture(scope="module")
+def day():
+    return driven()
+
+
+def with_odometry(day, speed=1.0, turn=1.0):
+    return [
+        replace(o, ego_speed_mps=speed * o.ego_speed_mps, ego_yaw_rate_radps=turn * o.ego_yaw_rate_radps)
+        for o in day
+    ]
+
+
+def with_doppler(day, factor):
+    return [replace(o, radar_velocity_mps=factor * o.radar_velocity_mps) for o in day]
+
+
+def without_odometry(day):
+    return [replace(o, ego_speed_mps=None, ego_yaw_rate_radps=None) for o in day]
+
+
+def without_lidar(day):
+    return [replace(o, lidar_map_is_ground=np.ones_like(o.lidar_map_is_ground)) for o in day]
+
+
+def late(day, lag_s):
+    stamps, speeds = np.arange(len(day)) * STEP_S, [o.ego_speed_mps for o in day]
+    return [
+        replace(o, ego_speed_mps=float(np.interp(t - lag_s, stamps, speeds)))
+        for o, t in zip(day, stamps, strict=True)
+    ]
+
+
+def told(day, T=T_LIDAR_RADAR):
+    """Fault and sentence of each finding."""
+    return [(check.fault, check.sentence) for check in compared_sources(day, T).wrong]
+
+
+def test_the_lidar_alone_shows_speed_and_yaw_rate_of_the_car(day):
+    motion = sweep_motion(day)
+    assert len(motion.first) >= 25
+    ends = list(zip(motion.first, motion.last, strict=True))
+    speed = np.array([(day[i].ego_speed_mps + day[j].ego_speed_mps) / 2 for i, j in ends])
+    turn = np.array([(day[i].ego_yaw_rate_radps + day[j].ego_yaw_rate_radps) / 2 for i, j in ends])
+    assert np.abs(motion.speed_mps - speed).max() < 0.8
+    assert np.abs(motion.yaw_rate_radps - turn).max() < 0.04
+
+
+def test_sources_that_agree_raise_no_alarm(day):
+    for good in (day, without_odometry(day), without_lidar(day), with_odometry(day, 1.05), late(day, 0.05)):
+        assert told(good) == []
+    numbers = compared_sources(day, T_LIDAR_RADAR).numbers
+    assert numbers["motion_odometry_by_doppler"] == pytest.approx(1, abs=0.01)
+    assert numbers["motion_yaw_rate_by_lidar"] == pytest.approx(1, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda d: with_odometry(d, -1), "the other sign fits"),
+        (lambda d: with_odometry(d, 2), "its scale is wrong"),
+        (lambda d: with_odometry(d, 3.6), "km/h for m/s fits"),
+        (lambda d: with_odometry(d, 1, -1), "turns -"),
+        (lambda d: with_odometry(d, 1, 180 / np.pi), "deg/s for rad/s fits"),
+        (lambda d: without_lidar(with_odometry(d, -1)), "the other sign fits"),
+        (lambda d: without_lidar(with_odometry(d, 2)), "its scale is wrong"),
+    ],
+)
+def test_a_wrong_odometry_is_named_with_what_would_fit(day, change, says):
+    (fault, sentence), *_ = told(change(day))
+    assert fault == "odometry"
+    assert says in sentence
+
+
+def test_an_odometry_that_lags_is_named_with_the_sign_of_its_lag(day):
+    assert [f for f, _ in told(late(day, 0.25))] == ["odometry"]
+    assert "behind the radar's Doppler" in told(late(day, 0.25))[0][1]
+    assert "ahead of the radar's Doppler" in told(late(day, -0.25))[0][1]
+
+
+@pytest.mark.parametrize("factor", [-1.0, 3.6, -3.6])
+@pytest.mark.parametrize("left", [lambda d: d, without_odometry, without_lidar])
+def test_a_doppler_of_the_wrong_sign_or_unit_is_named(day, factor, left):
+    (fault, sentence), *_ = told(left(with_doppler(day, factor)))
+    assert fault == "doppler"
+    assert ("other sign" in sentence) == (factor < 0)
+    assert ("km/h for m/s" in sentence) == (abs(factor) > 2)
+
+
+def test_a_doppler_that_drives_backwards_all_day_is_named_where_nothing_else_tells(day):
+    alone = without_lidar(without_odometry(day))
+    assert told(alone) == []
+    assert [f for f, _ in told(with_doppler(alone, -1))] == ["doppler"]
+    assert told(without_lidar(without_odometry(with_doppler(day, 3.6)))) == []  # nobody can know
+
+
+def test_a_radar_that_looks_back_is_not_taken_for_a_wrong_sign(day):
+    turned = T_LIDAR_RADAR.copy()
+    turned[:3, :3] = turned[:3, :3] @ exp_so3(np.array([0.0, 0.0, np.pi]))
+    assert [f for f, _ in told(day, turned)] == ["orientation"]
+
+
+def test_scans_that_no_velocity_explains_are_named(day):
+    undecided = [np.full(len(o.radar_xyz_m), 2, np.uint8) for o in day]
+    silent = [
+        replace(o, radar_velocity_mps=None, radar_motion=m) for o, m in zip(day, undecided, strict=True)
+    ]
+    assert [f for f, _ in told(silent)] == ["doppler"]
+    assert told(day[:20] + silent[20:]) == []
+
+
+def test_a_lidar_mounted_backwards_is_named(day):
+    back = [replace(o, lidar_map_xyz_m=o.lidar_map_xyz_m * np.float32([-1, -1, 1])) for o in day]
+    assert [f for f, _ in told(back)] == ["orientation"]
