@@ -81,6 +81,7 @@ class _Check:
     disproves: bool = False  # where it fails, the pose is wrong, not only unproved
     # Where it fails, the pose may be as good as its sigma says; that is not good enough.
     of_sigma: bool = False
+    fault: str = ""  # key of schemas.faults.FAULTS that it names
 
 
 def judge(
@@ -108,18 +109,20 @@ def judge(
     """
     if not triggered:
         return Verdict("held", "not triggered: the prior stays", _FAILED)
-    faults = tuple(faults_of(evidence.failed_checks))
+    held_factors = [f for f in factors if f.status != "accepted"]
+    faults = dict.fromkeys(
+        [*faults_of(evidence.failed_checks), *(name for f in held_factors for name in f.faults)]
+    )
     if estimate.frames_used < limits.min_fit_frames:
         few = f"too few frames: {estimate.frames_used}, needs {limits.min_fit_frames}"
         sentences = [check.sentence for check in evidence.failed_checks]
-        return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=faults)
+        return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=tuple(faults))
     checks = [_Check(_FAILED, check.sentence, check.disproves) for check in evidence.failed_checks]
     if estimate.disproved:
         checks.append(_Check(_FAILED, estimate.disproved, disproves=True))
     if factors:
-        good = all(f.status == "accepted" for f in factors)
-        margin = min(f.score for f in factors) if good else _FAILED
-        of_sigma = all(f.status == "accepted" or f.unsure_only for f in factors)
+        margin = _FAILED if held_factors else min(f.score for f in factors)
+        of_sigma = all(f.unsure_only for f in held_factors)
         checks.append(_Check(margin, "composed of a pair that is not accepted", of_sigma=of_sigma))
         checks += _aligns_no_worse(estimate, prior, evidence.held_out, limits)
     else:
@@ -134,13 +137,14 @@ def judge(
         disproved = any(c.disproves for c in failed) or any(f.disproved for f in factors)
         unsure_only = all(c.of_sigma for c in failed)
         reasons = "; ".join(c.reason for c in failed)
-        return Verdict("held", reasons, score, disproved=disproved, unsure_only=unsure_only, faults=faults)
+        named = tuple(faults | dict.fromkeys(c.fault for c in failed if c.fault))
+        return Verdict("held", reasons, score, disproved=disproved, unsure_only=unsure_only, faults=named)
     certified = tuple(name for name, claim in evidence.claims.items() if claim.margin >= 0)
     unchecked = _unchecked(estimate, prior, certified)
     reason = "; ".join([*_reservations(estimate, evidence.claims), *_differences(estimate.pair, unchecked)])
-    named = {DOF_NAMES[k]: sigmas for k, sigmas in unchecked.items()}
+    far = {DOF_NAMES[k]: sigmas for k, sigmas in unchecked.items()}
     mounting = tuple(name for name in certified if evidence.claims[name].certifies_mounting)
-    return Verdict("accepted", reason, score, certified, unchecked=named, mounting=mounting)
+    return Verdict("accepted", reason, score, certified, unchecked=far, mounting=mounting)
 
 
 def _moves_little(
@@ -158,15 +162,18 @@ def _moves_little(
             1 - rotation / reach,
             f"moved {np.degrees(rotation):.1f} deg, beyond the search range",
             disproves=True,
+            fault="prior",
         ),
         _Check(
             1 - translation / search.translation_m,
             f"moved {translation:.2f} m, beyond the search range",
             disproves=True,
+            fault="prior",
         ),
         _Check(
             1 - ratio[worst] / limits.max_move_prior_sigmas,
             f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} prior sigmas",
+            fault="prior",
         ),
     ]
 

@@ -96,6 +96,17 @@ def test_the_faults_that_failed_checks_name_reach_the_verdict_each_once():
     assert verdict(estimate(1.5), BETTER).faults == ()
 
 
+def test_a_composed_pair_names_the_faults_of_the_factor_that_is_held():
+    bad = verdict(estimate(1.5), BETTER, failed=[FailedCheck("turned at noon", "moved_in_day")])
+    good = verdict(estimate(1.5), BETTER)
+    assert verdict(estimate(1.0), BETTER, factors=[good, bad]).faults == ("moved_in_day",)
+
+
+def test_a_pose_far_from_its_prior_names_the_prior():
+    assert verdict(estimate(8.5), BETTER).faults == ("prior",)
+    assert verdict(estimate(0.5, 0.31), BETTER).faults == ("prior",)
+
+
 @pytest.mark.parametrize(
     ("rotation_deg", "shift_m", "words"),
     [
