@@ -28,9 +28,11 @@ T_BASE_CAMERA = pose([1.3, 0, 1.5], R_BODY_OPTICAL)
 T_BASE_RADAR = pose([3.0, 0, 0.6])
 
 
-def image_bytes(extension):
+def image_bytes(extension, n=0):
+    """Of frame n: no two pictures of a camera are the same."""
     pixels = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     pixels[60:] = 40
+    pixels[:16, :16] = 2 * n
     return cv2.imencode(extension, pixels)[1].tobytes()
 
 
@@ -45,13 +47,13 @@ def posts(x_base):
 
 
 def lidar_points(x_base):
-    points = posts(x_base) - T_BASE_LIDAR[:3, 3]
+    points = posts(x_base) - T_BASE_LIDAR[:3, 3] + [0, 0, 1e-4 * x_base]  # no two sweeps are the same
     return np.hstack([points, np.full((len(points), 1), 20.0)]).astype(np.float32)
 
 
 def radar_points(x_base):
     """x, y, z, rcs and the range rate of what stands still."""
-    points = posts(x_base)[:720:12] - T_BASE_RADAR[:3, 3]
+    points = posts(x_base)[:720:12] - T_BASE_RADAR[:3, 3] + [0, 0, 1e-4 * x_base]
     points = points[points[:, 0] > 2]
     rate = -SPEED_MPS * points[:, 0] / np.linalg.norm(points, axis=1)
     return np.column_stack([points, np.full(len(points), 5.0), rate])
@@ -68,7 +70,7 @@ def view_of_delft(folder, frames=12, jump_at=None):
     P2 = " ".join(map(str, np.hstack([K, np.zeros((3, 1))]).ravel()))
     for n in range(frames):
         name = f"{n:05d}"
-        (lidar / "image_2" / f"{name}.jpg").write_bytes(image_bytes(".jpg"))
+        (lidar / "image_2" / f"{name}.jpg").write_bytes(image_bytes(".jpg", n))
         x = SPEED_MPS * 0.1 * n + (500 if jump_at is not None and n >= jump_at else 0)
         (lidar / "velodyne" / f"{name}.bin").write_bytes(lidar_points(x).tobytes())
         points = radar_points(x)
@@ -94,7 +96,7 @@ def kitti(folder, frames=6):
     T_lidar_radar = np.linalg.inv(T_BASE_LIDAR) @ T_BASE_RADAR
     for n in range(frames):
         name = f"{n:06d}"
-        (folder / "image_2" / f"{name}.png").write_bytes(image_bytes(".png"))
+        (folder / "image_2" / f"{name}.png").write_bytes(image_bytes(".png", n))
         (folder / "velodyne" / f"{name}.bin").write_bytes(lidar_points(n).tobytes())
         (folder / "radar" / f"{name}.bin").write_bytes(radar_points(n).astype(np.float32).tobytes())
         lines = {
@@ -141,7 +143,7 @@ def nuscenes(folder, frames=12):
         points = lidar_points(x)
         own = np.column_stack([-points[:, 1], points[:, 0], points[:, 2:4], np.arange(len(points)) % 32])
         contents = {
-            "CAM_FRONT": (".jpg", image_bytes(".jpg")),
+            "CAM_FRONT": (".jpg", image_bytes(".jpg", n)),
             "LIDAR_TOP": (".pcd.bin", own.astype(np.float32).tobytes()),
             "RADAR_FRONT": (".pcd", pcd(radar_points(x))),
             "CAM_BACK": (".jpg", image_bytes(".jpg")),

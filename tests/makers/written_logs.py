@@ -276,6 +276,7 @@ class Kit:
 
     def drive(self, start_ns: int = START_NS) -> Kit:
         """Append a drive: tf_static once, then the six messages of every frame."""
+        begun = (start_ns - START_NS) // PERIOD_NS  # of two drives no message is the same
         optical = (0.5, -0.5, 0.5, -0.5)
         self.add(
             "/tf_static",
@@ -291,7 +292,10 @@ class Kit:
             stamp = start_ns + i * PERIOD_NS
             self.add(INFO, "sensor_msgs/msg/CameraInfo", stamp, self.info(stamp + 1_000_000))
             self.add(
-                IMAGE, "sensor_msgs/msg/CompressedImage", stamp, self.compressed(stamp + 1_000_000, jpeg(i))
+                IMAGE,
+                "sensor_msgs/msg/CompressedImage",
+                stamp,
+                self.compressed(stamp + 1_000_000, jpeg(i + begun)),
             )
             labels = self.compressed(stamp + 1_000_000, label_png(i), "mono8; png compressed")
             self.add(LABELS, "sensor_msgs/msg/CompressedImage", stamp, labels)
@@ -302,8 +306,8 @@ class Kit:
                 stamp,
                 self.detections(stamp + 1_000_000, boxes),
             )
-            self.add(LIDAR, "sensor_msgs/msg/PointCloud2", stamp, self.cloud(stamp, lidar_columns(i)))
-            scan = self.cloud(stamp - 2_000_000, radar_columns(i), frame_id="radar")
+            self.add(LIDAR, "sensor_msgs/msg/PointCloud2", stamp, self.cloud(stamp, lidar_columns(i + begun)))
+            scan = self.cloud(stamp - 2_000_000, radar_columns(i + begun), frame_id="radar")
             self.add(RADAR, "sensor_msgs/msg/PointCloud2", stamp, scan)
         return self
 

@@ -153,7 +153,7 @@ def test_raw_image_and_label_topics_go_through_the_whole_stage(kit, tmp_path, ru
     labels = RNG.integers(0, 19, (kit.HEIGHT // 2, kit.WIDTH // 2), np.uint8)
     for i in range(4):
         stamp = kit.START_NS + i * kit.PERIOD_NS
-        drive.replaced(kit.IMAGE, i, drive.image(stamp, pixels, "rgb8"))
+        drive.replaced(kit.IMAGE, i, drive.image(stamp, np.roll(pixels, i - 1, axis=0), "rgb8"))
         drive.replaced(kit.LABELS, i, drive.image(stamp, labels, "mono8"))
     _, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"))
     assert frames[1].image_format == "png"
