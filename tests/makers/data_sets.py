@@ -47,13 +47,13 @@ def posts(x_base):
 
 
 def lidar_points(x_base):
-    points = posts(x_base) - T_BASE_LIDAR[:3, 3] + [0, 0, 1e-4 * x_base]  # no two sweeps are the same
+    points = posts(x_base) - T_BASE_LIDAR[:3, 3] + [0, 1e-4 * x_base, 1e-4 * x_base]  # no two sweeps are the same
     return np.hstack([points, np.full((len(points), 1), 20.0)]).astype(np.float32)
 
 
 def radar_points(x_base):
     """x, y, z, rcs and the range rate of what stands still."""
-    points = posts(x_base)[:720:12] - T_BASE_RADAR[:3, 3] + [0, 0, 1e-4 * x_base]
+    points = posts(x_base)[:720:12] - T_BASE_RADAR[:3, 3] + [0, 1e-4 * x_base, 1e-4 * x_base]
     points = points[points[:, 0] > 2]
     rate = -SPEED_MPS * points[:, 0] / np.linalg.norm(points, axis=1)
     return np.column_stack([points, np.full(len(points), 5.0), rate])
