@@ -47,7 +47,8 @@ def posts(x_base):
 
 
 def lidar_points(x_base):
-    points = posts(x_base) - T_BASE_LIDAR[:3, 3] + [0, 1e-4 * x_base, 1e-4 * x_base]  # no two sweeps are the same
+    shift = [0, 1e-4 * x_base, 1e-4 * x_base]  # no two sweeps are the same
+    points = posts(x_base) - T_BASE_LIDAR[:3, 3] + shift
     return np.hstack([points, np.full((len(points), 1), 20.0)]).astype(np.float32)
 
 
