@@ -38,6 +38,7 @@ from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.config import FleetConfig, VerifyConfig
 from pipeline.errors import ConfigError, SolveError
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.extrinsics.prior import no_prior, perturbed, prior_key, read_prior
 from pipeline.geometry.targets import DEFAULT_TARGETS
@@ -154,15 +155,14 @@ def calibrate_observations(
     try:
         return _solved(observations, prior, fleet, about, motion, progress, solver)
     except SolveError as err:
-        raise _named(err, motion) from err
+        raise _named(err, motion.wrong) from err
 
 
-def _named(refusal: SolveError, motion: MotionFindings) -> SolveError:
+def _named(refusal: SolveError, wrong: Sequence[FailedCheck]) -> SolveError:
     """A refusal that says first which source of motion is wrong, where one is."""
-    if not motion.wrong:
+    if not wrong:
         return refusal
-    sentences = [*(check.sentence for check in motion.wrong), refusal.reason]
-    return SolveError("; ".join(sentences), motion.wrong[0].fault)
+    return SolveError("; ".join([*(check.sentence for check in wrong), refusal.reason]), wrong[0].fault)
 
 
 def _solved(
@@ -187,7 +187,7 @@ def _solved(
         pairs=about.pairs,
         absent=about.absent,
     )
-    refused = {p: _named(e, motion) for p, e in _refused(method, about.pairs, selection, prior).items()}
+    refused = {p: _named(e, motion.of(p)) for p, e in _refused(method, about.pairs, selection, prior).items()}
     pairs = [pair for pair in about.pairs if pair not in refused]
     refusals = {
         pair: refused_record(about, pair, why, observations, prior, selection.rejected[pair])

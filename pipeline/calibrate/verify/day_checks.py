@@ -42,8 +42,8 @@ DayCheck = Callable[[FoundDay], Mapping[str, Sequence[FailedCheck]]]
 
 
 def _motion(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
-    """Sweeps are de-skewed, and stamps bridged, by the car's motion: where that is wrong, no pair is right."""
-    return dict.fromkeys(PAIRS, day.motion.wrong)
+    """Sweeps are de-skewed, and stamps bridged, by the car's motion: a pair is right where its source of it is."""
+    return {pair: day.motion.of(pair) for pair in PAIRS}
 
 
 def _solver(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:

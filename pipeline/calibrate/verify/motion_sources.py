@@ -51,6 +51,12 @@ class MotionFindings:
 
     wrong: list[FailedCheck] = field(default_factory=list)
     numbers: dict[str, float] = field(default_factory=dict)
+    # Those of `wrong` that cost camera-lidar nothing: the radar's own, where odometry moves camera and lidar.
+    of_radar: list[FailedCheck] = field(default_factory=list)
+
+    def of(self, pair: str) -> list[FailedCheck]:
+        """What makes a pair wrong."""
+        return [c for c in self.wrong if "radar" in pair or c not in self.of_radar]
 
 
 @dataclass(frozen=True)
@@ -92,7 +98,13 @@ def compared_sources(
     sources = _sources(observations, T_lidar_radar)
     slopes = _slopes(observations, sources)
     wrong = _wrong_speeds(slopes, sources.doppler_mps) or _silent_doppler(observations)
-    wrong = [_or_turned_round(check, observations, T_lidar_radar) for check in wrong]
+    found = [(_or_turned_round(check, observations, T_lidar_radar), check.fault) for check in wrong]
+    has_odometry = any(
+        o.ego_speed_mps is not None and (o.ego_yaw_rate_radps is not None or o.radar_velocity_mps is None)
+        for o in observations
+    )
+    of_radar = [check for check, fault in found if fault == "doppler" and has_odometry]
+    wrong = [check for check, _ in found]
     turning, lag = slopes.get("yaw_rate_by_lidar"), slopes.get("odometry_lag_s")
     if turning is not None and turning.is_off(1.0, _TURN_SHARE):
         shown = f"odometry turns {turning.slope:+.2f} times as fast as the lidar's sweeps"
@@ -102,9 +114,8 @@ def compared_sources(
         shown = f"odometry is {abs(1e3 * lag.slope):.0f} ms {way} the radar's Doppler"
         wrong.append(FailedCheck(f"{shown}: check the stamps of both", "odometry"))
     numbers = {f"motion_{name}": s.slope for name, s in slopes.items()}
-    return MotionFindings(
-        wrong, numbers | {f"motion_{n}_same": s.same for n, s in slopes.items() if n in _SPEEDS}
-    )
+    same = {f"motion_{n}_same": s.same for n, s in slopes.items() if n in _SPEEDS}
+    return MotionFindings(wrong, numbers | same, of_radar)
 
 
 def _sources(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> _Sources:

@@ -318,7 +318,8 @@ def lidar_velocities(
     """Own velocity in lidar axes [m/s]: the speed along the heading that the radar's Doppler shows (0 where unknown).
 
     One heading for the day, in the horizontal plane: the mount's yaw; the lidar's x axis where no radar tells. A
-    single frame's heading is noisier than it varies, and the radar's vertical velocity is no measurement.
+    single frame's heading is noisier than it varies, and the radar's vertical velocity is no measurement. Which way
+    along it is the speed's sign: the lidar's x axis points ahead, and a Doppler's sign may be wrong.
     """
     speed = np.array([o.ego_speed_mps if o.ego_speed_mps is not None else 0.0 for o in observations])
     moving = [
@@ -329,7 +330,8 @@ def lidar_velocities(
     heading = 0.0
     if len(moving) >= 5 and np.isfinite(T_lidar_radar).all():
         v = np.stack(moving) @ T_lidar_radar[:3, :3].T
-        heading = float(np.median(np.arctan2(v[:, 1], v[:, 0])))
+        ahead = np.where(v[:, 0] < 0, -1.0, 1.0)
+        heading = float(np.median(np.arctan2(ahead * v[:, 1], ahead * v[:, 0])))
     return speed[:, None] * np.array([np.cos(heading), np.sin(heading), 0.0])
 
 

@@ -8,6 +8,8 @@ import pytest
 from pipeline.calibrate.verify.motion_sources import compared_sources
 from pipeline.calibrate.verify.sweep_motion import sweep_motion
 from pipeline.geometry.se3 import exp_so3
+from pipeline.objective.camera_lidar.score import lidar_velocities
+from schemas.calibrations import PAIRS
 from tests.makers.solve_scenes import T_LIDAR_RADAR, make_day
 
 STEP_S = 0.5
@@ -159,3 +161,20 @@ def test_scans_that_no_velocity_explains_are_named(day):
 def test_a_lidar_mounted_backwards_is_named(day):
     back = [replace(o, lidar_map_xyz_m=o.lidar_map_xyz_m * np.float32([-1, -1, 1])) for o in day]
     assert [f for f, _ in told(back)] == ["orientation"]
+
+
+@pytest.mark.parametrize("turned_by", [0.0, np.pi])
+def test_a_wrong_radar_costs_camera_and_lidar_their_day_only_where_their_motion_rests_on_it(day, turned_by):
+    T = T_LIDAR_RADAR.copy()
+    T[:3, :3] = T[:3, :3] @ exp_so3(np.array([0.0, 0.0, turned_by]))
+    wrong = with_doppler(day, -1.0 if turned_by == 0 else 1.0)
+    for left, pairs in ((wrong, {"camera_radar", "lidar_radar"}), (without_odometry(wrong), set(PAIRS))):
+        found = compared_sources(left, T)
+        assert {pair for pair in PAIRS if found.of(pair)} == pairs
+    assert all(compared_sources(with_odometry(day, 3.6), T_LIDAR_RADAR).of(pair) for pair in PAIRS)
+
+
+def test_the_car_drives_ahead_whatever_sign_its_doppler_has(day):
+    as_logged, turned = (lidar_velocities(rows, T_LIDAR_RADAR) for rows in (day, with_doppler(day, -1.0)))
+    np.testing.assert_allclose(as_logged, turned, atol=1e-9)
+    assert (as_logged[:, 0] > 0).all()
