@@ -24,7 +24,17 @@ from typing import Any
 from tests.benchmarks.results_measures import MEASURES
 from tests.benchmarks.studies.looks import freshness, read_looks
 
-__all__ = ["TARGETS", "WIDEST", "lines_of", "release_now", "release_of", "render", "rows", "written"]
+__all__ = [
+    "TARGETS",
+    "WIDEST",
+    "learn_releases",
+    "lines_of",
+    "release_now",
+    "release_of",
+    "render",
+    "rows",
+    "written",
+]
 
 RESULTS = Path(__file__).parent / "results"
 REPO = Path(__file__).resolve().parents[2]
@@ -105,8 +115,7 @@ def _look(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
 
 def _release(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
     """Releases whose code was measured, the oldest first, and whether the code has gone on since."""
-    commits = {str(c) for r in lines if (c := r.get("commit"))} or {str(row["commit"])}
-    found = sorted({release_of(commit) for commit in commits}, key=_order)
+    found = sorted({release_of(commit) for commit in _commits(lines, row)}, key=_order)
     return " to ".join(dict.fromkeys((found[0], found[-1]))) + (
         "" if found[0] == release_now() else ", older"
     )
@@ -124,23 +133,29 @@ def _topmost(changelog: str) -> str:
 
 
 def release_of(commit: str) -> str:
-    """The release that a commit was on its way to, as releases.toml has it or else git, which is then written down."""
+    """The release that a commit was on its way to, as releases.toml has it."""
     known = tomllib.loads(RELEASES.read_text())["releases"]
-    commit = commit.removesuffix("+")
-    if commit in known:
-        return str(known[commit])
-    release = _by_git(commit)
-    with RELEASES.open("a") as file:
-        file.write(f'"{commit}" = "{release}"\n')
-    return release
+    if commit not in known:
+        raise SystemExit(f"{RELEASES.name} has no release of commit {commit}: make results")
+    return str(known[commit])
 
 
-def _by_git(commit: str) -> str:
-    """Topmost release of the changelog at a commit."""
-    changelog = _git("show", f"{commit}:CHANGELOG.md")
-    if changelog is None:
-        raise SystemExit(f"{RELEASES.name}: name the release of commit {commit}, which git does not know")
-    return _topmost(changelog)
+def learn_releases() -> None:
+    """Write down the releases of commits that releases.toml does not have: the topmost of the changelog there."""
+    known = tomllib.loads(RELEASES.read_text())["releases"]
+    for commit in dict.fromkeys(c for row in rows() for c in _commits(lines_of(row), row)):
+        if commit in known:
+            continue
+        changelog = _git("show", f"{commit}:CHANGELOG.md")
+        if changelog is None:
+            raise SystemExit(f"{RELEASES.name}: name the release of commit {commit}, which git does not know")
+        with RELEASES.open("a") as file:
+            file.write(f'"{commit}" = "{_topmost(changelog)}"\n')
+
+
+def _commits(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> set[str]:
+    """Commits of lines, less the + of a working tree with changes; of a row whose lines have none, its own."""
+    return {str(c).removesuffix("+") for r in lines if (c := r.get("commit"))} or {str(row["commit"])}
 
 
 def _git(*arguments: str) -> str | None:
@@ -169,6 +184,8 @@ def main() -> None:
     )
     parser.add_argument("--check", action="store_true")
     args = parser.parse_args()
+    if not args.check:
+        learn_releases()
     stale = [path for path, top_only in TARGETS.items() if written(path, top_only) != path.read_text()]
     if args.check:
         sys.exit(f"not what the results give: {', '.join(map(str, stale))}; make results" if stale else 0)
