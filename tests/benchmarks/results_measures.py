@@ -202,6 +202,14 @@ def named(lines: Lines, _row: Row) -> str:
     return f"{stopped.count('stopped, named rightly')} of {len(stopped)}"
 
 
+def power(lines: Lines, row: Row) -> str:
+    """Study drift_power: RED with the right sensor within `nights`, by whose days; the interval is of the rarer."""
+    found = {r["records"]: (r[f"right_within_{row['nights']}"], r["movers"]) for r in lines}
+    shares = ", ".join(f"{name} {100 * hits / movers:.0f} %" for name, (hits, movers) in found.items())
+    low, high = interval(*min(found.values(), key=lambda pair: pair[0] / pair[1]))
+    return f"{shares} ({100 * low:.0f} to {100 * high:.0f})"
+
+
 def last(lines: Lines, row: Row) -> str:
     """As `value`, of the last line that was chosen."""
     return value(lines[-1:], row)
@@ -211,6 +219,6 @@ MEASURES: dict[str, Callable[[Lines, Row], str]] = {
     f.__name__: f
     for f in (
         accepted_days, by_noise, clocks, efficiency, errors, faulty, found, inside, knocked, last, mounting, named,
-        shown, starts, total, value, verified, wrong_days,
+        power, shown, starts, total, value, verified, wrong_days,
     )
 }  # fmt: skip

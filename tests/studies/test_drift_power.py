@@ -15,7 +15,8 @@ def records(sigma_deg):
     one = np.diag([np.radians(sigma_deg)] * 3 + [0.003] * 3) ** 2
     T = {"camera_lidar": exp_se3(np.array([1.2, -1.2, 1.2, 0.0, 0.1, 0.2])), "lidar_radar": np.eye(4)}
     varying = {pair: np.stack([one, 4 * one]) for pair in PAIRS}
-    return Records(T, varying, {pair: np.zeros((2, 6, 6)) for pair in PAIRS})
+    everything = {pair: np.ones((2, 6), bool) for pair in (*PAIRS, "camera_radar")}
+    return Records(T, varying, {pair: np.zeros((2, 6, 6)) for pair in PAIRS}, everything)
 
 
 def test_days_scatter_as_their_records_say_and_are_as_alike_as_asked():

@@ -6,7 +6,7 @@ stay.
 
     python -m tests.benchmarks.studies.drift_power gather --name demo --fleet F --lake LAKE
     python -m tests.benchmarks.studies.drift_power gather --name "real car" --fleet F --lake LAKE --parts
-    python -m tests.benchmarks.studies.drift_power run [--movers 60] [--first-seed 63000]
+    python -m tests.benchmarks.studies.drift_power run [--movers 40] [--first-seed 63000]
 
 `gather` keeps covariances of a lake's days in results/day_covariances.json, `run` writes drift_power.jsonl and .md.
 Fleets are judged whole, as the audit does, on nights 1 to 5 and 12 after the step. Seeds below 200 are for tuning and
@@ -60,11 +60,13 @@ class Records:
         T: by pair.
         varying: by pair (N, 6, 6), what differs from day to day.
         common: by pair (N, 6, 6), what all days err by alike.
+        observable: by pair (N, 6), what each day determined; camera_radar too.
     """
 
     T: dict[str, np.ndarray]
     varying: dict[str, np.ndarray]
     common: dict[str, np.ndarray]
+    observable: dict[str, np.ndarray]
 
     def turn_sigmas_deg(self, pair: str) -> list[float]:
         """Median over records of the sigmas of rx, ry, rz that vary."""
@@ -79,11 +81,12 @@ def read_records(name: str, path: Path = RECORDS) -> Records:
         raise SystemExit(f"{path} has no records of {name!r}: gather them first")
 
     def stacked(pair: str, key: str) -> np.ndarray:
-        return np.array([r["pairs"][pair][key] for r in mine], np.float64)
+        return np.array([r["pairs"][pair][key] for r in mine])
 
     T = {pair: stacked(pair, "T")[0] for pair in _OWN}
     common = {pair: stacked(pair, "common") for pair in _OWN}
-    return Records(T, {pair: stacked(pair, "covariance") - common[pair] for pair in _OWN}, common)
+    varying = {pair: stacked(pair, "covariance") - common[pair] for pair in _OWN}
+    return Records(T, varying, common, {pair: stacked(pair, "observable") for pair in PAIRS})
 
 
 def make_vehicle(records: Records, phi: float, case: Case, rng: np.random.Generator) -> Vehicle:
@@ -107,14 +110,13 @@ def make_vehicle(records: Records, phi: float, case: Case, rng: np.random.Genera
     A = adjoint(records.T["camera_lidar"])
     for part in (varying, common):
         part["camera_radar"] = part["camera_lidar"] + A @ part["lidar_radar"] @ A.T
-    return Vehicle({pair: _days(T[pair], varying[pair], common[pair]) for pair in PAIRS})
+    seen = {pair: records.observable[pair][drawn] for pair in PAIRS}
+    return Vehicle({pair: _days(T[pair], varying[pair], common[pair], seen[pair]) for pair in PAIRS})
 
 
-def _days(T: np.ndarray, varying: np.ndarray, common: np.ndarray) -> PairDays:
+def _days(T: np.ndarray, varying: np.ndarray, common: np.ndarray, observable: np.ndarray) -> PairDays:
     every = np.ones(len(T), bool)
-    return pair_days(
-        np.arange(len(T)), T, varying + common, np.asarray(common), np.ones((len(T), 6), bool), every
-    )
+    return pair_days(np.arange(len(T)), T, varying + common, np.asarray(common), observable, every)
 
 
 def _roots(covariance: np.ndarray) -> np.ndarray:
@@ -246,7 +248,7 @@ def _cell(line: dict[str, Any]) -> str:
 
 
 def gather(args: argparse.Namespace) -> None:
-    """Calibrate all days of a lake from their prior (with `--parts` their halves too); keep accepted covariances."""
+    """Calibrate a lake's days (with `--parts` their halves too); keep covariances of those accepted whole."""
     fleet, lake = load_fleet(args.fleet), Lake.at(args.lake)
     known = json.loads(RECORDS.read_text())["records"] if RECORDS.exists() else []
     found = [r for r in known if r["name"] != args.name]
@@ -277,20 +279,17 @@ def _accepted(
         return []
     by = {r.pair: r for r in records if r.status == "accepted"}
     print(partition, about["part"], {r.pair: r.status for r in records}, flush=True)
-    if any(pair not in by for pair in _OWN):
+    if any(pair not in by for pair in PAIRS):
         return []
     pairs = {}
-    for pair in _OWN:
-        T, covariance, common = transform_of(by[pair]), by[pair].covariance, by[pair].common_covariance
+    for pair, record in by.items():
+        T, covariance, common = transform_of(record), record.covariance, record.common_covariance
         assert T is not None, pair
         assert covariance is not None, pair
         assert common is not None, pair
-        pairs[pair] = {"T": _short(T), "covariance": _short(covariance), "common": _short(common)}
+        pairs[pair] = {"T": T.tolist(), "covariance": covariance.tolist(), "common": common.tolist()}
+        pairs[pair]["observable"] = [bool(v) for v in record.observable or []]
     return [{**about, "vehicle": partition.vehicle, "day": partition.day, "pairs": pairs}]
-
-
-def _short(matrix: np.ndarray) -> list[list[float]]:
-    return [[float(f"{v:.7g}") for v in row] for row in matrix]
 
 
 def main() -> None:
@@ -306,7 +305,7 @@ def main() -> None:
     gathering.add_argument("--parts", action="store_true")
     gathering.set_defaults(do=gather)
     running = commands.add_parser("run")
-    running.add_argument("--movers", type=int, default=60)
+    running.add_argument("--movers", type=int, default=40)
     running.add_argument("--first-seed", type=int, default=63_000)
     running.add_argument("--names", nargs="+", default=["demo", "real car"])
     running.add_argument("--fleets", nargs="+", type=int, choices=FLEETS, default=list(FLEETS))
