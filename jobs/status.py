@@ -57,7 +57,6 @@ def status(
     rows = read_records(tables, OUTCOMES, OutcomeRow, first=first, last=last)
     method = method or _audited_method(tables, {r.method for r in rows if r.method})
     found = [s for s in day_statuses(rows, method) if vehicle in (None, s.vehicle)]
-    found = _with_faults(tables, found, method)
     findings = read_last(tables, DRIFT, DriftFinding, method, vehicle=vehicle)
     if not json:
         _print_table(found, status_lines(findings))
@@ -78,26 +77,6 @@ def status(
         **({"days": [asdict(s) for s in found]} if json else {}),
     )
     return exit_code([ended])
-
-
-def _with_faults(lake: Lake, days: Sequence[DayStatus], method: str) -> list[DayStatus]:
-    """The vehicle-days with the faults that their current records name."""
-    from dataclasses import replace
-
-    from pipeline.store.current import current_rows
-    from pipeline.store.records import read_columns
-    from schemas.calibrations import CALIBRATIONS
-
-    known: dict[tuple[str, str], dict[str, None]] = {}
-    span = [d.day for d in days]
-    rows = read_columns(lake, CALIBRATIONS, ("faults",), first=min(span), last=max(span)) if span else None
-    if rows is not None and "faults" in rows.column_names:  # older releases have none
-        current = current_rows(rows, CALIBRATIONS)
-        names = ("vehicle", "day", "method", "faults")
-        for vehicle, day, of, faults in zip(*(current[n].to_pylist() for n in names), strict=True):
-            if of == method:
-                known.setdefault((vehicle, day), {}).update(dict.fromkeys(faults or ()))
-    return [replace(d, faults=list(known.get((d.vehicle, d.day), ()))) for d in days]
 
 
 def _audited_method(lake: Lake, others: set[str]) -> str:

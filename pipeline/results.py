@@ -49,7 +49,7 @@ class Outcome:
     rejected: dict[str, int] = field(default_factory=dict)
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
-    misconfigured: bool = False  # it ends so until fleet.toml, or a file that it names, is mended
+    faults: tuple[str, ...] = ()  # that the reason states, keys of `schemas.faults.FAULTS`
     damaged: str = ""  # the file that could not be read, where that made it fail
     inputs: tuple[str, ...] = ()
     effort: Effort = field(default=Effort(), compare=False, repr=False)
@@ -59,7 +59,7 @@ class Outcome:
 
     def counts(self) -> dict[str, Any]:
         """What a command's summary says beside the status."""
-        left_out = ("status", "records", "damaged", "inputs", "effort", "misconfigured")
+        left_out = ("status", "records", "damaged", "inputs", "effort")
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
 
 

@@ -22,7 +22,6 @@ from pipeline.work import NothingUsable, Run, Task, Window, Work
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
-from schemas.outcomes import MENDED_IN_FLEET_TOML
 from schemas.states import STATES, StateRow
 from schemas.versions import CODE_VERSION
 
@@ -147,7 +146,7 @@ def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
         except (BoresightError, OSError) as err:
             damaged = err.path if isinstance(err, DamagedError) else ""
             told = {
-                "misconfigured": getattr(err, "exit_code", 1) == 2,
+                "faults": ("configuration",) if getattr(err, "exit_code", 1) == 2 else (),
                 "damaged": damaged,
                 "effort": effort(),
             }
@@ -187,9 +186,8 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
             out.describe(**counts, remarks=run.remarks, **run.extra)
     except NothingUsable as refusal:
         counts = {"kept": {"frames": 0, **run.kept}, "rejected": dict(run.rejected)}
-        return _outcome(
-            stage, task, "refused", run.work_key, reason=str(refusal), inputs=run.inputs, **counts
-        )
+        told = counts | {"reason": str(refusal), "faults": refusal.faults, "inputs": run.inputs}
+        return _outcome(stage, task, "refused", run.work_key, **told)
     written = read_manifest(task.lake, schema, task.partition)
     assert written is not None, "the partition was just written"
     outcome = _partition_outcome(stage, task, work, "done", written)
@@ -201,9 +199,8 @@ def _refused_before(stage: Stage, task: Task, run: Run) -> Outcome | None:
     for row in task.before:
         if (row.stage, row.status, row.work_key) == (stage.name, "refused", run.work_key):
             counts = {"rows": row.rows, "kept": row.kept, "rejected": row.rejected}
-            return _outcome(
-                stage, task, "refused", run.work_key, reason=row.reason, inputs=run.inputs, **counts
-            )
+            told = counts | {"reason": row.reason, "faults": tuple(row.faults), "inputs": run.inputs}
+            return _outcome(stage, task, "refused", run.work_key, **told)
     return None
 
 
@@ -276,6 +273,7 @@ def _record_outcome(
         kept=told.kept,
         rejected=told.rejected,
         reason=told.reason,
+        faults=told.faults,
         outputs=outputs,
         records=tuple(rows),
     )
@@ -290,8 +288,6 @@ def _write_files(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
 
 def _outcome(stage: Stage, task: Task, status: str, key: str, **told: Any) -> Outcome:
     of = task.of
-    if status == "refused" and MENDED_IN_FLEET_TOML in told.get("reason", ""):
-        told["misconfigured"] = True
     where = (of.vehicle, of.day) if isinstance(of, Partition) else ("", "")
     return Outcome(stage.name, *where, status, key, **told)
 

@@ -76,6 +76,7 @@ class Told:
     rejected: dict[str, int] = field(default_factory=dict)
     reason: str = ""
     refused: bool = False
+    faults: tuple[str, ...] = ()
 
 
 @dataclass
@@ -128,4 +129,13 @@ class Work:
 
 
 class NothingUsable(Exception):  # noqa: N818 - an outcome, not an error: the day is refused with this reason
-    """Nothing of the input can be used: nothing is written, and what was written before stays."""
+    """Nothing of the input can be used: nothing is written, and what was written before stays.
+
+    Args:
+        reason: in words.
+        faults: that it states, keys of `schemas.faults.FAULTS`.
+    """
+
+    def __init__(self, reason: str, *faults: str) -> None:
+        self.faults = faults
+        super().__init__(reason)

@@ -9,6 +9,7 @@ __all__ = ["FAULTS", "in_words"]
 
 FAULTS: Final = {
     "camera_info": "the camera's intrinsics differ from its CameraInfo",
+    "configuration": "fleet.toml, or a file that it names, must be mended: no other log helps",
     "doppler": "the sign, the unit or the period of the radar's Doppler is not as configured",
     "few_scenes": "the day shows too few different scenes",
     "labels_offset": "semantic labels lie beside the picture that they belong to",

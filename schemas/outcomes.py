@@ -6,16 +6,13 @@ from dataclasses import dataclass, field
 
 from schemas.columns import DEFAULT_TRIO, TableSchema, record_columns, scalar
 
-__all__ = ["MENDED_IN_FLEET_TOML", "OUTCOMES", "OUTCOME_STATUSES", "OutcomeRow"]
-
-# In the reason of a refusal that no other log, but only another configuration can end.
-MENDED_IN_FLEET_TOML = "in fleet.toml"
+__all__ = ["OUTCOMES", "OUTCOME_STATUSES", "OutcomeRow"]
 
 OUTCOME_STATUSES = ("done", "refused", "failed")
 
 OUTCOMES = TableSchema(
     "outcomes",
-    1,
+    2,
     (
         scalar("vehicle", "string", "vehicle id"),
         scalar("day", "string", "YYYY-MM-DD"),
@@ -27,6 +24,7 @@ OUTCOMES = TableSchema(
             "done, refused (the same inputs are not tried again) or failed (tried again every night)",
         ),
         scalar("reason", "string", "why, in words; empty where there is nothing to say"),
+        scalar("faults", "list<string>", "faults that the reason states, keys of schemas/faults.py"),
         scalar("rows", "int64", "frames, observations or records that it made"),
         scalar("kept", "map<string,int64>", "how many of which kind; of calibrate by status of the pair"),
         scalar("rejected", "map<string,int64>", "what was left out, by reason"),
@@ -42,6 +40,7 @@ OUTCOMES = TableSchema(
     ),
     "What was up to date already adds no row: rows tell of work.",
     made_by="nightly",
+    reads_versions=(1,),
     about=("vehicle", "day", "trio", "stage", "method"),
 )
 
@@ -66,6 +65,7 @@ class OutcomeRow:
     bytes_written: int | None = None
     code_version: str = ""
     inputs: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
     trio: str = DEFAULT_TRIO
     recorded_at: str = ""  # written when the row is
     asserted_at: str = ""

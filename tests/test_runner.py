@@ -212,11 +212,12 @@ def test_where_nothing_is_usable_nothing_is_written_and_the_day_is_refused(task,
 
 def test_inputs_that_were_refused_are_not_worked_out_again_and_others_are(task, stage):
     def rows(_run):
-        raise NothingUsable("no usable message on /points")
+        raise NothingUsable("no usable message on /points", "configuration")
         yield
 
     refusing, made = stage(rows)
     first = refusing.run(task)
+    assert first.faults == ("configuration",)
     task = replace(task, before=[outcome_row(first, "")])
     again = refusing.run(task)
     assert (again, made.asked) == (first, 1)

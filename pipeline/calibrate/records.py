@@ -140,7 +140,7 @@ def refused_record(
 
 
 def refused_records(
-    about: Inputs, reason: str, frames: int, prior: Prior | None, fault: str = ""
+    about: Inputs, reason: str, frames: int, prior: Prior | None, *faults: str
 ) -> list[CalibrationRecord]:
     """Records of a day that could not be calibrated at all."""
     return [
@@ -148,7 +148,7 @@ def refused_records(
             **_identity(about, pair, frames, prior),
             status="refused",
             reason=reason,
-            faults=[fault] if fault else [],
+            faults=[fault for fault in faults if fault],
         )
         for pair in about.pairs
     ]

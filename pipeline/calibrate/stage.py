@@ -54,7 +54,6 @@ from schemas.calibrations import (
     CalibrationRecord,
     pairs_of,
 )
-from schemas.faults import FAULTS
 from schemas.frames import FRAMES, SENSORS_ABSENT
 from schemas.observations import OBSERVATIONS, Observation
 
@@ -125,11 +124,10 @@ def _refusal(
 ) -> Work:
     """Records of a day that never reached the solver, so that whoever reads the lake finds the reason."""
     reason = f"{refused.stage}: {refused.reason}"
-    fault = next((code for code, sentence in FAULTS.items() if refused.reason.startswith(sentence)), "")
 
     def rows(run: Run) -> Generator[Records, None, None]:
         about = Inputs(partition, method.name, run.work_key, seed, run.inputs, pairs)
-        yield Records(refused_records(about, reason, 0, None, fault))
+        yield Records(refused_records(about, reason, 0, None, *refused.faults))
 
     inputs = (refused.work_key,) if refused.work_key else ()
     # Recorded each time: an older record of a day that was not refused then must not pass for the current one.
@@ -408,4 +406,5 @@ def _told(records: Sequence[CalibrationRecord]) -> Told:
         dict(records[0].frames_rejected) if records else {},
         "; ".join(f"{r.pair}: {r.reason}" for r in records if r.reason),
         refused=counts["refused"] == len(records),
+        faults=tuple(dict.fromkeys(fault for r in records for fault in r.faults)),
     )

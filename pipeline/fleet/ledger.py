@@ -67,7 +67,9 @@ class Ledger:
         self._records = RecordIndex(
             lake, CALIBRATIONS, CalibrationRecord, *span, ("frames_rejected", "inputs")
         )
-        self._outcomes = RecordIndex(lake, OUTCOMES, OutcomeRow, *span, ("rows", "kept", "rejected"))
+        self._outcomes = RecordIndex(
+            lake, OUTCOMES, OutcomeRow, *span, ("rows", "kept", "rejected", "faults")
+        )
 
     def known(self, partition: Partition) -> Known:
         """What the lake had of a vehicle-day when the night began; the current one of a kind comes last."""
@@ -140,6 +142,7 @@ def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
         effort.bytes_written,
         CODE_VERSION,
         list(outcome.inputs),
+        list(outcome.faults),
     )
 
 

@@ -225,5 +225,5 @@ def _summarise(partition: Partition, results: Sequence[Outcome]) -> DayOutcome:
         {r.stage: r.status for r in results},
         pairs,
         next((r.rows for r in results if r.stage == INGEST.name), 0),
-        misconfigured=worst is not None and worst.misconfigured,
+        misconfigured=worst is not None and "configuration" in worst.faults,
     )

@@ -30,7 +30,7 @@ class DayStatus:
         seconds: that its stages took when they last ran.
         bytes_read: by them; None where unknown.
         bytes_written: likewise.
-        faults: that its records name, keys of `schemas.faults.FAULTS`.
+        faults: that the reason states, keys of `schemas.faults.FAULTS`.
     """
 
     vehicle: str
@@ -99,6 +99,7 @@ def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) 
         sum(r.seconds for r in own),
         _total([r.bytes_read for r in own]),
         _total([r.bytes_written for r in own]),
+        [] if said is None else list(said.faults),
     )
 
 

@@ -31,7 +31,6 @@ from pipeline.rigs import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.faults import FAULTS
 from schemas.frames import SENSORS_ABSENT, SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ, Frame
-from schemas.outcomes import MENDED_IN_FLEET_TOML
 
 __all__ = ["find_trios", "pick_trios", "read_file_prior", "work"]
 
@@ -96,7 +95,7 @@ def _rows(
         run.rejected.update(_all_counts(rejected, index, builder))
         run.kept.update(_reading_counts(index))
         if not made:
-            raise NothingUsable(refusal(index, rig, rejected, config))
+            raise NothingUsable(*refusal(index, rig, rejected, config))
         _complain_of_date(index, task.partition.day)
         run.extra |= {"problems": index.problems, "logs": index.log_names, "frame_ids": builder.frame_ids}
         run.extra[SENSORS_ABSENT] = absences(index, rig, builder.counts, config)
@@ -162,13 +161,14 @@ def find_trios(index: DayIndex, config: IngestConfig) -> Trios:
     return replace(found, lidar=taken) if is_swept else replace(found, lidar=found.radar, radar=taken)
 
 
-def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig) -> str:
-    """Why a day gives no frame, in words: which topic, and what to do."""
+def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig) -> tuple[str, ...]:
+    """Why a day gives no frame, in words: which topic, and what to do; then the faults that this states."""
     topics = {role: topic for topic, role in topics_of(rig).items()}
     streams = [r for r in ("image", "lidar", "radar") if r in topics]
     absent = [f"{topics[r]} ({r})" for r in streams if not index.stream(r).stamps]
+    faults: tuple[str, ...] = ()
     if len(streams) - len(absent) < 2:
-        what = _nothing_on(", ".join(absent))
+        what, faults = _nothing_on(", ".join(absent)), ("configuration",)
     elif rejected.get(Rejection.CAMERA_INFO):
         what = _no_intrinsics(topics["info"])
     elif not set(rejected) & set(_UNUSABLE):
@@ -178,8 +178,9 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestCon
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
         what = f"of no moment two sensors were usable, most often {reason} ({rejected[reason]})"
-        what = f"{_STUCK}: {what}" if reason in REPEATED.values() else what
-    return _shorten([what, *index.problems])
+        if reason in REPEATED.values():
+            what, faults = f"{_STUCK}: {what}", ("stuck_sensor",)
+    return _shorten([what, *index.problems]), *faults
 
 
 def absences(index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConfig) -> dict[str, str]:
@@ -205,7 +206,7 @@ def absences(index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConf
 
 
 def _nothing_on(topics: str) -> str:
-    return f"no usable message on {topics}: mend the topics {MENDED_IN_FLEET_TOML} (see `boresight check`)"
+    return f"no usable message on {topics}: mend the topics in fleet.toml (see `boresight check`)"
 
 
 def _no_intrinsics(topic: str) -> str:

@@ -117,7 +117,7 @@ def _rows(task: Task, perceive: Callable[..., Perceived], run: Run) -> Generator
             except FrameRejectedError as rejection:
                 run.rejected[rejection.reason.value] += 1
             except ModelOutputError as err:
-                raise NothingUsable(f"{FAULTS['model_output']}: {err}") from err
+                raise NothingUsable(f"{FAULTS['model_output']}: {err}", "model_output") from err
             seen += 1
             run.progress(seen, total, "perceive")
             if found is not None:

@@ -240,6 +240,23 @@ def test_a_wrong_configuration_fails_the_day_that_shows_it(night, monkeypatch):
     assert night_statuses([car], night.fleet) == ["misconfigured"]
 
 
+@pytest.mark.parametrize(("faults", "misconfigured"), [(("configuration",), True), ((), False)])
+def test_a_refusal_is_one_of_the_configuration_by_its_fault_and_not_by_its_words(
+    faults, misconfigured, night, monkeypatch
+):
+    def say(stage, task):
+        of = (stage.name, task.partition.vehicle, task.partition.day)
+        return Outcome(*of, "refused", "key", reason="mend the topics in fleet.toml", faults=faults)
+
+    real = Stage.run
+    monkeypatch.setattr(Stage, "run", lambda s, task: real(s, task) if task.given else say(s, task))
+    car = outcomes(night)["car"]
+    assert (car.status, car.misconfigured) == ("refused", misconfigured)
+    assert [r.faults for r in records(night)] == [list(faults)] * 3
+    [row] = [r for r in read_records(night.lake, OUTCOMES, OutcomeRow) if r.stage == "ingest"]
+    assert row.faults == list(faults)
+
+
 def test_a_day_that_has_not_come_yet_is_refused_at_once(night, monkeypatch):
     script = StagesThatSay(monkeypatch, night.lake)
     days = [VehicleDay(Partition("car", "2099-01-01"), (Path("a.mcap"),))]

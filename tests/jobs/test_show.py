@@ -55,8 +55,9 @@ def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, 
     lake = Lake.at(tmp_path)
     commit_records(lake, CALIBRATIONS, held)
     row = OutcomeRow(
-        "car", held[0].day, "calibrate", "joint", "done", "sky beside roofs", "k", kept={"held": 3}
-    )
+        "car", held[0].day, "calibrate", "joint", "done", "sky beside roofs", "k", kept={"held": 3},
+        faults=["labels_offset"],
+    )  # fmt: skip
     commit_records(lake, OUTCOMES, [row])
     words = "semantic labels lie beside the picture"
     assert show("calibrations", lake=str(tmp_path)) == 0
