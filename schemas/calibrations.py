@@ -173,6 +173,14 @@ CALIBRATIONS = TableSchema(
             nullable=True,
         ),
         scalar("loop_translation_sigma_m", "float64", "and for the translation", nullable=True),
+        array(
+            "half_days",
+            "<f8",
+            (2, 2, 6),
+            "of a day in which a sensor moved: how its first and its last part change the estimate (rx ry rz [rad], "
+            "tx ty tz [m] of the child's origin, parent axes), and the sigmas of that; null on any other day",
+            nullable=True,
+        ),
         scalar("environment", "string", "highway, urban, mixed or unknown"),
         scalar(
             "time_offset_s",
@@ -273,6 +281,7 @@ class CalibrationRecord:
     assumptions: list[str] = field(default_factory=list)
     drive_missing: list[str] = field(default_factory=list)
     diagnostics: dict[str, float] = field(default_factory=dict)
+    half_days: np.ndarray | None = None
     inputs: list[str] = field(default_factory=list)
     trio: str = DEFAULT_TRIO
     recorded_at: str = ""  # written when the row is

@@ -14,7 +14,8 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.days import PairDays, pair_days
-from pipeline.geometry.se3 import from_quaternion
+from pipeline.geometry.changes import change_jacobian
+from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation
 from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, STATUSES
@@ -33,6 +34,7 @@ COLUMNS = (
     "covariance",
     "common_covariance",
     "observable",
+    "half_days",
     _DISPROVED,
     *_SHIFTS,
     *_UNCHECKED,
@@ -61,6 +63,7 @@ class Estimates:
         disproved: a check shows that the pose is wrong.
         shown_wrong_rad: the angle that the checks of a held record found it off by.
         unchecked_sigmas: by DoF, how far it lies from the prior where that is far and nothing checks it, else 0.
+        half_days: of a day within which a sensor moved, changes from the pose and their sigmas, by part of the day.
         work_key: of each record.
     """
 
@@ -78,6 +81,7 @@ class Estimates:
     disproved: Bool[np.ndarray, " N"]
     shown_wrong_rad: Float[np.ndarray, " N"]
     unchecked_sigmas: Float[np.ndarray, "N 6"]
+    half_days: Float[np.ndarray, "N 2 2 6"]
     work_key: pa.Array
 
     def at(self, rows: slice | np.ndarray) -> Estimates:
@@ -87,7 +91,7 @@ class Estimates:
             self.vehicles, self.owner[rows], self.day[rows], self.pair[rows], self.status[rows], self.pose[rows],
             self.has_estimate[rows], self.covariance[rows], self.common[rows], self.has_common[rows],
             self.observable[rows], self.disproved[rows], self.shown_wrong_rad[rows],
-            self.unchecked_sigmas[rows], keys,
+            self.unchecked_sigmas[rows], self.half_days[rows], keys,
         )  # fmt: skip
 
     def of(self, vehicle: str) -> Estimates:
@@ -148,7 +152,7 @@ def estimates_of(table: pa.Table | None) -> Estimates:
         is_there, matrices(found["covariance"]), matrices(found["common_covariance"]),
         there(found["common_covariance"]), observable_dofs(found["observable"]),
         pc.fill_null(found[_DISPROVED], 0.0).to_numpy() != 0.0, np.where(np.isfinite(worst), worst, 0.0),
-        unchecked, found["work_key"].combine_chunks(),
+        unchecked, matrices(found["half_days"], (2, 2, 6)), found["work_key"].combine_chunks(),
     )  # fmt: skip
 
 
@@ -190,9 +194,26 @@ def days_of(records: Estimates, held_sigma_factor: float) -> dict[str, PairDays]
         common = np.where(own.has_common[:, None, None], own.common, 0.0)
         covariance, held = own.covariance.copy(), ~own.accepted
         covariance[held] = common[held] + (covariance - common)[held] * held_sigma_factor**2
-        covariance[held, :3, :3] += np.eye(3) * own.shown_wrong_rad[held, None, None] ** 2
-        pairs[pair] = pair_days(own.day, own.transforms(), covariance, common, own.observable, own.accepted)
+        T, cut = own.transforms(), np.isfinite(own.half_days).all(axis=(1, 2, 3))
+        off = held & ~cut
+        covariance[off, :3, :3] += np.eye(3) * own.shown_wrong_rad[off, None, None] ** 2
+        if cut.any():
+            T[cut], covariance[cut] = _since_it_moved(T[cut], covariance[cut], own.half_days[cut, 1])
+        pairs[pair] = pair_days(own.day, T, covariance, common, own.observable, own.accepted)
     return pairs
+
+
+def _since_it_moved(
+    T: Float[np.ndarray, "N 4 4"], covariance: Float[np.ndarray, "N 6 6"], last: Float[np.ndarray, "N 2 6"]
+) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "N 6 6"]]:
+    """Estimates of the last part of days within which a sensor moved: a mean of two places is neither.
+
+    Days after it are held against that part, days before it against their own: so the day of the change is this one.
+    """
+    change, sigma = last[:, 0], last[:, 1]
+    there = from_rotation_translation(exp_so3(change[:, :3]) @ T[:, :3, :3], T[:, :3, 3] + change[:, 3:])
+    to_twist = np.linalg.inv(change_jacobian(there))
+    return there, covariance + to_twist @ (np.eye(6) * sigma[:, None] ** 2) @ to_twist.swapaxes(1, 2)
 
 
 def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.audit.attribution import Attribution
 from pipeline.audit.estimates import Estimates, day_name
 from pipeline.audit.status import decide_status
 from pipeline.audit.vehicle import VehicleVerdict, limit_of
 from pipeline.audit.verdicts import ChartVerdict
 from pipeline.config import AuditConfig
+from pipeline.extrinsics.attribution import Attribution
 from schemas.calibrations import DOF_NAMES, PAIRS, STATUSES
 from schemas.drift import DriftFinding
 

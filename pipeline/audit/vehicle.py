@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from pipeline.audit.attribution import Attribution, PairShift, attribute, pair_shift
 from pipeline.audit.changes import Change, start_interval
 from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, clipped_days
 from pipeline.audit.noise import Noise, estimate_noise
 from pipeline.audit.verdicts import ChartVerdict, judge_charts
 from pipeline.config import AuditConfig
+from pipeline.extrinsics.attribution import Attribution, PairShift, attribute, pair_shift
 from schemas.calibrations import DOF_NAMES, PAIRS
 
 __all__ = ["VehicleVerdict", "independent_pairs", "judge_fleet", "limit_of"]

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.calibrate.half_days import half_days_of
 from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
 from pipeline.calibrate.verify.failed_checks import loop_sigmas
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
@@ -109,14 +111,18 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         time_offset_s=estimate.time_offset_s,
         time_offset_sigma_s=estimate.time_offset_sigma_s,
         notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable)],
-        assumptions=[*_assumed(pair, day.observations), *estimate.notes],
+        assumptions=[*_assumed(estimate, day.observations), *estimate.notes],
         drive_missing=selection.missing.get(pair, []),
         diagnostics=dict(estimate.diagnostics)
         | _test_numbers(test)
         | _claim_numbers(judged)
         | _camera_numbers(pair, day.observations)
         | dict(day.numbers)
+        | _parts_numbers(estimate)
         | {"paper_frames": float(selection.passed[pair])},
+        half_days=half_days_of(
+            pair, day.solution.pairs, {p: judged.verdict.faults for p, judged in day.judged.items()}
+        ),
     )
 
 
@@ -199,11 +205,15 @@ def _unobservable(observable: np.ndarray) -> list[str]:
     return [f"not determined by the day: {', '.join(names)}"] if names else []
 
 
-def _assumed(pair: str, observations: Sequence[Observation]) -> list[str]:
+def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> list[str]:
     """What every method takes as known, and what an error of it is worth."""
-    assumed = ["sensors are rigid, clocks keep their offsets and scales over the day"]
+    rigid = "sensors are rigid over the day"
+    if estimate.parts is not None:
+        sigmas = float(np.abs(estimate.parts.sigmas(PART_FLOOR_RAD)).max())
+        rigid += f" (tested: its first and its last part differ by {sigmas:.1f} sigma)"
+    assumed = [rigid, "clocks keep their offsets and scales over the day"]
     o = next((o for o in observations if "camera" in o.sensors), None)
-    if "camera" not in FRAMES_OF_PAIR[pair] or o is None:
+    if "camera" not in FRAMES_OF_PAIR[estimate.pair] or o is None:
         return assumed
     camera = camera_of(o)
     wrong = replace(camera, K=_scaled(o.camera_K, 1.001))
@@ -224,6 +234,15 @@ def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
     out = np.array(K, np.float64)
     out[[0, 1], [0, 1]] *= factor
     return out
+
+
+def _parts_numbers(estimate: PairEstimate) -> dict[str, float]:
+    """How far the last part of the day turns from its first, and in how many sigmas."""
+    parts = estimate.parts
+    if parts is None:
+        return {}
+    numbers = {f"parts_{DOF_NAMES[k]}_rad": float(parts.step[k]) for k in parts.tested}
+    return numbers | {"parts_sigmas": float(np.abs(parts.sigmas(PART_FLOOR_RAD)).max())}
 
 
 def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:

@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.extrinsics.checks import FailedCheck
+from pipeline.geometry.changes import change_between
 from pipeline.geometry.se3 import adjoint
 from pipeline.rigs import CameraPrior
 
-__all__ = ["PairEstimate", "Prior", "Solution"]
+__all__ = ["DayParts", "PairEstimate", "Prior", "Solution"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,30 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
+class DayParts:
+    """A pair turned to fit the first and the last part of a day, cut where they differ most. Its position stays."""
+
+    T: tuple[np.ndarray, np.ndarray]  # 4 4 of each part
+    spread: tuple[np.ndarray, np.ndarray]  # 3 3 of each part's rotation vector, less what both err by alike
+    cut_ns: tuple[int, int]  # stamps of the last frame before the cut and of the first one after it
+    tested: tuple[int, ...]  # rotations (0, 1, 2) that the parts know by themselves
+
+    @property
+    def step(self) -> Float[np.ndarray, " 3"]:
+        """Turn from the first part to the last, in the parent's axes [rad]."""
+        return change_between(*self.T)[:3]
+
+    def sigmas(self, floor_rad: float) -> Float[np.ndarray, " 3"]:
+        """The step's rotations in units of their sigmas; 0 where the parts are not compared.
+
+        Args:
+            floor_rad: by which parts of one day differ though nothing moved, as their scenes differ.
+        """
+        sigma = np.sqrt(np.diag(self.spread[0] + self.spread[1]) + floor_rad**2)
+        return np.where(np.isin(np.arange(3), self.tested), self.step / sigma, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
 class PairEstimate:
     """One pair's result: T, its covariance, and which degrees of freedom the day determined.
 
@@ -82,6 +107,7 @@ class PairEstimate:
     # 6 6, what all days of a vehicle err by alike; part of covariance.
     common_covariance: np.ndarray | None = None
     failed_checks: list[FailedCheck] = field(default_factory=list)  # of the solver's, on this pair alone
+    parts: DayParts | None = None  # of the day; None where it is too short, or the method does not cut it
     disproved: str = ""  # why it cannot be right, where a check of the solver's shows that
 
 

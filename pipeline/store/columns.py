@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,7 +14,6 @@ from jaxtyping import Bool, Float, Int
 __all__ = ["known_rows", "matrices", "observable_dofs", "ordinals", "places", "there"]
 
 _DOFS = 6
-_MATRIX_BYTES = 8 * _DOFS**2
 
 
 def known_rows(table: pa.Table, names: Mapping[str, Sequence[str]]) -> pa.Table:
@@ -28,13 +28,14 @@ def there(column: pa.ChunkedArray) -> Bool[np.ndarray, " N"]:
     return np.asarray(column.is_valid().combine_chunks()).astype(bool)
 
 
-def matrices(column: pa.ChunkedArray) -> Float[np.ndarray, "N 6 6"]:
-    """Covariances of a column; not finite where it has none, or a blob of another size."""
-    whole = there(column) & (pc.binary_length(column).fill_null(0).to_numpy() == _MATRIX_BYTES)
-    found = np.full((len(whole), _DOFS, _DOFS), np.nan)
+def matrices(column: pa.ChunkedArray, shape: tuple[int, ...] = (_DOFS, _DOFS)) -> Float[np.ndarray, "N ..."]:
+    """Covariances, or arrays of another shape; not finite where a column has none, or a blob of another size."""
+    size = 8 * math.prod(shape)
+    whole = there(column) & (pc.binary_length(column).fill_null(0).to_numpy() == size)
+    found = np.full((len(whole), *shape), np.nan)
     if whole.any():
         blobs = b"".join(column.filter(pa.array(whole)).to_pylist())
-        found[whole] = np.frombuffer(blobs, "<f8").reshape(-1, _DOFS, _DOFS)
+        found[whole] = np.frombuffer(blobs, "<f8").reshape(-1, *shape)
     return found
 
 

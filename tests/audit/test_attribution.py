@@ -6,9 +6,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from pipeline.audit.attribution import PairShift, attribute, pair_shift
 from pipeline.audit.days import PairDays
 from pipeline.audit.vehicle import independent_pairs
+from pipeline.extrinsics.attribution import PairShift, attribute, pair_shift
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse, log_se3
 
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])  # a turned bracket: yaw and a little sideways

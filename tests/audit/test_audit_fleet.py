@@ -11,6 +11,8 @@ import pytest
 from pipeline.audit.vehicle import judge_fleet
 from pipeline.config import AuditConfig, FleetConfig
 from pipeline.errors import ConfigError
+from pipeline.geometry.changes import change_between
+from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation, to_quaternion
 from pipeline.stages import AUDIT
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
@@ -300,3 +302,34 @@ def test_a_vehicle_that_drives_weekly_and_one_after_months_have_sensible_statuse
     _write(lake, [r for r in days if not 10 < int(r.work_key.split("-")[1]) < 120])
     assert _status(audit_fleet(lake, _fleet("v"), None, _day(10)))[0] == "GREEN"
     assert _status(audit_fleet(lake, _fleet("v"), None, _day(123)))[:2] == ("RED", "radar")
+
+
+@pytest.mark.parametrize("since", [0.0, 0.5])
+def test_a_knock_within_a_day_is_found_on_that_day(tmp_path: Path, maker: ModuleType, since: float) -> None:
+    """The record of the day lies between its two places; the charts take what its last part says."""
+    lake = Lake.at(tmp_path)
+    before, after = (
+        maker.vehicle_records("a", 8, np.random.default_rng(11), motion=lambda d, m=m: m if d >= 4 else {})
+        for m in ({}, {"radar": KNOCK})
+    )
+    records = [b if b.day < "2026-03-05" else a for b, a in zip(before, after, strict=True)]
+    for k, (b, a) in enumerate(zip(before, after, strict=True)):
+        if b.day != "2026-03-05" or b.pair == "camera_lidar":
+            continue
+        T_b, T_a = (
+            from_quaternion(np.array([r.qw, r.qx, r.qy, r.qz]), np.array([r.tx_m, r.ty_m, r.tz_m]))
+            for r in (b, a)
+        )
+        half = since * change_between(T_b, T_a)
+        T = from_rotation_translation(exp_so3(half[:3]) @ T_b[:3, :3], T_b[:3, 3] + half[3:])
+        q = to_quaternion(T)
+        sigma = np.full(6, 1e-4)
+        half_days = np.array([[change_between(T, T_b), sigma], [change_between(T, T_a), sigma]])
+        records[k] = replace(
+            b, status="held", reason="yaw turned within the day", faults=["moved_in_day"], half_days=half_days,
+            qw=q[0], qx=q[1], qy=q[2], qz=q[3], tx_m=T[0, 3], ty_m=T[1, 3], tz_m=T[2, 3],
+        )  # fmt: skip
+    _write(lake, records)
+    red = [f for f in audit_fleet(lake, _fleet("a"), None, None, "joint") if f.status == "RED"]
+    assert {f.moved_sensor for f in red} == {"radar"}
+    assert {f.start_day for f in red} == {"2026-03-05"}

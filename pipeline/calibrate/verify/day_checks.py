@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.verify.constancy import constancy_failures
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.motion_sources import MotionFindings
@@ -77,8 +78,20 @@ def _scenes(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
     return {pair: scene_failures([day.observations[i] for i in frames]) for pair, frames in fitted}
 
 
+def _constancy(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+    return constancy_failures(day.solution.pairs)
+
+
 # In the order in which a record states them.
-DAY_CHECKS: tuple[DayCheck, ...] = (_motion, _solver, _contradictions, _heading, _loop, _scenes)
+DAY_CHECKS: tuple[DayCheck, ...] = (
+    _motion,
+    _solver,
+    _contradictions,
+    _heading,
+    _loop,
+    _scenes,
+    _constancy,
+)
 
 
 def checks_of_day(day: FoundDay) -> dict[str, list[FailedCheck]]:

@@ -26,7 +26,15 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     analyse_observability,
     day_covariance,
 )
-from pipeline.calibrate.joint.camera_lidar.refine import NONE_FIXED, AlignmentState, Scored, refine, weighted
+from pipeline.calibrate.joint.camera_lidar.refine import (
+    NONE_FIXED,
+    AlignmentState,
+    Scored,
+    derivatives,
+    refine,
+    scales,
+    weighted,
+)
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, s_per_metre
 from pipeline.calibrate.joint.camera_lidar.witnesses import (
@@ -37,13 +45,14 @@ from pipeline.calibrate.joint.camera_lidar.witnesses import (
     witness_numbers,
 )
 from pipeline.calibrate.numerics.bias_floors import HEADING_SIGMA_RAD, MAX_GAP_PX
-from pipeline.calibrate.numerics.covariance import OBSERVABLE
+from pipeline.calibrate.numerics.change_point import parts_of_day
+from pipeline.calibrate.numerics.covariance import OBSERVABLE, bootstrap_covariance
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.common_share import common_part
-from pipeline.extrinsics.estimates import PairEstimate, Prior
+from pipeline.extrinsics.estimates import DayParts, PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
@@ -61,6 +70,7 @@ _FEWEST_FRAMES = 5
 _FEWEST_EDGES = 20  # per frame
 _MARGIN_RAD = np.radians(2.0)  # points further out of view than this stay out of it
 _NEAR_PRIOR_M = 0.25
+_IS_TURN = np.arange(8) < 3
 _UNKNOWN_SHARE = 0.7  # of the prior's sigma: from there on the day's speeds did not determine the time offset
 
 
@@ -201,7 +211,8 @@ def analyse_camera_lidar(
         halves.append(refine(half, analysis.state, steps=SCHEDULE.half_steps, fixed=fixed))
     diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves)
     witnesses = ask_witnesses(problem.terms, analysis.state, analysis.kernel, problem.blocks, problem.seed)
-    return _conclude(analysis, aligned, problem.config, diagnostics, witnesses)
+    found = _conclude(analysis, aligned, problem.config, diagnostics, witnesses)
+    return replace(found, parts=_parts(problem, analysis, aligned.frames))
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
@@ -247,6 +258,36 @@ def _at_prior_tz(state: AlignmentState, prior: Prior, terms: Terms) -> Alignment
     """Reset tz to the prior; adjust dt so that static points keep their pixels."""
     shift_m = float(state.T_camera_lidar[2, 3] - prior.T_camera_lidar[2, 3])
     return replace(state, dt_s=state.dt_s + s_per_metre(terms, state) * shift_m).with_fixed(prior, IS_TZ)
+
+
+def _parts(
+    problem: CameraLidarProblem, analysis: ObservabilityAnalysis, frames: Sequence[Observation]
+) -> DayParts | None:
+    """First and last part of the day, turned alone, from wide kernels to sharp ones: knocks may be wider than those."""
+    kernels = [replace(analysis.kernel, sigma_px=SCHEDULE.kernels[0][0]), analysis.kernel]
+    start, terms = analysis.state, problem.terms
+    at_start = replace(problem.prior, T_camera_lidar=start.T_camera_lidar)
+    gradients = [derivatives(terms, start, k, scales(terms, k))[0][:, :3] for k in kernels]
+
+    def solve(rows: np.ndarray) -> tuple[AlignmentState, np.ndarray, np.ndarray]:
+        part, state = terms.of_frames(rows), start
+        for kernel in kernels:
+            scored = Scored(part, kernel, at_start, problem.config)
+            state = refine(scored, state, steps=SCHEDULE.part_steps, fixed=~_IS_TURN)
+        # Weighted anew: the scatter of the whole day counts the step itself as noise.
+        kernel, scale = weighted(part, state, analysis.kernel), scales(part, analysis.kernel)
+        g = (derivatives(part, state, kernel, scale)[0] / scale)[:, :3]
+        blocks = np.unique(problem.blocks[rows], return_inverse=True)[1].ravel()
+        prior_information = np.eye(3) / problem.prior.rotation_sigma_rad**2
+        rng = np.random.default_rng(problem.seed)
+        spread = bootstrap_covariance(g[:, :, None] * g[:, None, :], -g, prior_information, blocks, rng)
+        return state, state.T_camera_lidar, spread
+
+    def score(state: AlignmentState) -> Float[np.ndarray, " F"]:
+        return np.sum([terms.score(state.alone, k)[0] for k in kernels], axis=0)
+
+    stamps = [o.stamp_ns for o in frames]
+    return parts_of_day(np.concatenate(gradients, axis=1), stamps, solve, score, (0, 1, 2))
 
 
 def _diagnostics(

@@ -61,6 +61,8 @@ class Schedule:
 
     # Disjoint halves, from the solution of the whole.
     half_steps: int = 3
+    # First and last part of the day, at each of two kernels.
+    part_steps: int = 3
 
 
 SCHEDULE = Schedule()

@@ -38,12 +38,13 @@ from pipeline.calibrate.numerics.bias_floors import (
     LIDAR_RADAR_BIAS,
     LIDAR_RADAR_DT_FLOOR_S,
 )
-from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
+from pipeline.calibrate.numerics.change_point import parts_of_day
+from pipeline.calibrate.numerics.covariance import OBSERVABLE, bootstrap_covariance, covariance_with_fixed
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.common_share import common_part, prior_share
-from pipeline.extrinsics.estimates import PairEstimate, Prior
+from pipeline.extrinsics.estimates import DayParts, PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
@@ -58,6 +59,7 @@ _FEWEST_FRAMES = 5
 _CLEARLY = 4.0  # standard errors by which frames reject the end of another start
 _CAMERA_SIGMA_RAD = np.radians(0.5)  # a camera less sure than what its boxes show is left out
 _REMAINING_STEPS = 10.0  # of dt, that count as uncertainty: the valley is flat
+_YAW, _ANY_RAD = 2, np.radians(20.0)
 _MEASURED_SHARE = (0.02, 1.0)  # range of the measured curvature, as a share of the predicted one
 
 
@@ -115,7 +117,8 @@ def estimate_lidar_radar(
         # Annealed ends lie a few steps before their optimum: only where they end up do they agree or not.
         rival = finish(problem, rival.with_fixed(problem.prior, analysis.fixed), analysis.fixed)[0]
     compared = [analysis.state, analysis.state if rival is best else rival]
-    return _conclude(problem, analysis, compared, halves, rejected)
+    found = _conclude(problem, analysis, compared, halves, rejected)
+    return replace(found, parts=_parts(problem, analysis, config, rng))
 
 
 def _problem(
@@ -156,6 +159,28 @@ def _problem(
         gap_s,
     )
     return problem, rejected
+
+
+def _parts(
+    problem: RadarProblem, analysis: ObservabilityAnalysis, config: SolveConfig, rng: np.random.Generator
+) -> DayParts | None:
+    """First and last part of the day, turned alone; compared in yaw, for the tilt rests on few detections."""
+    frames, start = problem.frames.frame, analysis.state
+    about = replace(problem, prior=replace(problem.prior, T_lidar_radar=start.T_lidar_radar))
+    fixed = np.isin(np.arange(len(analysis.fixed)), (0, 1, 3, 4, 5))
+
+    def solve(rows: np.ndarray) -> tuple[RadarState, np.ndarray, np.ndarray]:
+        part = about.of_frames(rows)
+        state, linear = finish(part, start, fixed)
+        H, g, P = (a[..., ~fixed] for a in (linear.information, linear.g, linear.prior_information))
+        block = blocks_of(part.observations, config.bootstrap_blocks)
+        found = bootstrap_covariance(H[:, ~fixed], g, P[~fixed], block, rng)  # yaw comes first
+        return state, state.T_lidar_radar, np.diag([_ANY_RAD**2, _ANY_RAD**2, found[0, 0]])
+
+    stamps = [problem.observations[k].stamp_ns for k in frames]
+    gradient = analysis.linear.g[frames][:, [_YAW]]
+    tested = () if analysis.fixed[_YAW] else (_YAW,)
+    return parts_of_day(gradient, stamps, solve, lambda state: -comparison_cost(problem, state), tested)
 
 
 def _with_way(

@@ -1,0 +1,49 @@
+"""What a day within which a sensor moved says before and after that, as changes of the record's estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.extrinsics.estimates import PairEstimate
+from pipeline.geometry.changes import change_between
+
+__all__ = ["half_days_of"]
+
+_SAME_M = 1e-6  # of a composed pose and the product of its factors
+
+
+def half_days_of(
+    pair: str, estimates: Mapping[str, PairEstimate], faults: Mapping[str, Sequence[str]]
+) -> Float[np.ndarray, "2 2 6"] | None:
+    """Changes of a pair from its estimate to its first and its last part, and their sigmas; None where it stayed.
+
+    Args:
+        pair: which one; camera_radar composed of the other two changes as they do.
+        estimates: by pair.
+        faults: that the verdict of each pair names.
+    """
+    parts, own = {p: _parts(e, "moved_in_day" in faults[p]) for p, e in estimates.items()}, estimates[pair]
+    poses, sigmas = parts[pair]
+    if pair == "camera_radar" and own.parts is None:
+        (T_cl, s_cl), (T_lr, s_lr) = parts["camera_lidar"], parts["lidar_radar"]
+        product = estimates["camera_lidar"].T @ estimates["lidar_radar"].T
+        if np.abs(product - own.T).max() < _SAME_M:
+            poses, sigmas = [a @ b for a, b in zip(T_cl, T_lr, strict=True)], np.hypot(s_cl, s_lr)
+    change = np.array([change_between(own.T, T) for T in poses])
+    if not change.any():
+        return None
+    # A turn of the parent carries the child's origin along.
+    shift = np.where(np.abs(change[:, 3:]).max() > 0, sigmas.max(axis=1) * np.linalg.norm(own.T[:3, 3]), 0.0)
+    return np.stack([change, np.column_stack([sigmas, *[shift] * 3])], axis=1)
+
+
+def _parts(estimate: PairEstimate, has_moved: bool) -> tuple[list[np.ndarray], Float[np.ndarray, "2 3"]]:
+    """Poses of the two parts and sigmas of their turns; the estimate itself where it stayed."""
+    if estimate.parts is None or not has_moved:
+        return [estimate.T, estimate.T], np.zeros((2, 3))
+    compared = np.isin(np.arange(3), estimate.parts.tested)
+    sigma = [np.where(compared, np.sqrt(np.diag(s)), 0.0) for s in estimate.parts.spread]
+    return list(estimate.parts.T), np.array(sigma)

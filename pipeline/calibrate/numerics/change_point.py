@@ -1,0 +1,87 @@
+"""A day in two parts, cut where a sensor may have moved, and how far the parts are apart.
+
+At the solution of the whole day the gradients of all frames sum to nothing. If a sensor moved, those before the change
+pull to one side and those after it to the other, so that the running sum is furthest from zero at the change. Each part
+is then solved by itself; where the two contradict each other, the cut is moved to where the frames begin to score
+better at the last part's solution.
+
+Source: Page 1954 (cumulative sums); Hinkley 1970 (one step at an unknown time, and its likelihood).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES
+from pipeline.extrinsics.estimates import DayParts
+
+__all__ = ["likeliest_cut", "parts_of_day"]
+
+_LEAST_SHARE = 0.2  # of the frames, on either side of a cut
+_SUSPICIOUS_SIGMAS = 2.0  # of a step: from there on its cut is looked for again
+_MOST_CUTS = 3
+
+State = TypeVar("State")
+# Rows of frames -> their solution, its pose (4 4) and the covariance of its rotation (3 3).
+_Solve = Callable[[Int[np.ndarray, " R"]], tuple[State, np.ndarray, np.ndarray]]
+
+
+def parts_of_day(
+    gradient: Float[np.ndarray, "F P"],
+    stamp_ns: Sequence[int],
+    solve: _Solve[State],
+    score: Callable[[State], Float[np.ndarray, " F"]],
+    tested: tuple[int, ...],
+) -> DayParts | None:
+    """First and last part of a day; None where it is too short to be cut.
+
+    Args:
+        gradient: of each frame at the solution of all, in order of time, by what may have changed.
+        stamp_ns: of each frame.
+        solve: some frames alone.
+        score: of each frame at a solution, higher is better.
+        tested: rotations (0, 1, 2) that are compared.
+    """
+    cut = likeliest_cut(gradient)
+    if cut is None:
+        return None
+    for _ in range(_MOST_CUTS):
+        first, last = (solve(rows) for rows in np.split(np.arange(len(stamp_ns)), [cut]))
+        cut_ns = int(stamp_ns[cut - 1]), int(stamp_ns[cut])
+        parts = DayParts((first[1], last[1]), (first[2], last[2]), cut_ns, tested)
+        if np.abs(parts.sigmas(0.0)).max() < _SUSPICIOUS_SIGMAS:
+            break
+        allowed = _cuts(len(stamp_ns))
+        lost = np.cumsum(score(last[0]) - score(first[0]))[allowed - 1]
+        again = int(allowed[np.argmin(lost)])
+        if again == cut:
+            break
+        cut = again
+    return parts
+
+
+def likeliest_cut(gradient: Float[np.ndarray, "F P"]) -> int | None:
+    """Number of frames before the likeliest change; None where there are too few frames on either side.
+
+    Args:
+        gradient: of each frame, in order of time, by what may have changed.
+    """
+    F, k = len(gradient), _cuts(len(gradient))
+    if not len(k):
+        return None
+    apart = gradient - gradient.mean(axis=0)
+    apart = apart / np.maximum(np.sqrt((apart**2).mean(axis=0)), 1e-300)
+    correlation = apart.T @ apart / F + 1e-6 * np.eye(gradient.shape[1])
+    run = np.cumsum(apart, axis=0)[k - 1]
+    pull = np.einsum("ki,ij,kj->k", run, np.linalg.inv(correlation), run) / (k * (1 - k / F))
+    return int(k[np.argmax(pull)])
+
+
+def _cuts(frames: int) -> Int[np.ndarray, " K"]:
+    """Numbers of frames that may lie before a cut."""
+    least = max(FEWEST_SCENES, int(np.ceil(_LEAST_SHARE * frames)))
+    return np.arange(least, frames - least + 1)

@@ -1,0 +1,78 @@
+"""Whether sensors stayed where they were over the day: its first part against its last, and which sensor moved.
+
+All else that is asked of a day mixes its hours: even frames against odd ones, held-out blocks between the others. A
+sensor that is knocked at noon is in both sides alike. So each pair is solved from the first and from the last part of
+the day as well (`numerics/change_point`). Two pairs that shift and one that stays tell which sensor it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+import numpy as np
+
+from pipeline.extrinsics.attribution import PairShift, attribute
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.estimates import DayParts, PairEstimate
+from pipeline.geometry.changes import change_jacobian
+
+__all__ = ["MOVED_SIGMAS", "PART_FLOOR_RAD", "constancy_failures"]
+
+# Of a step between two parts of a day that are cut where they differ most.
+MOVED_SIGMAS = 4.0
+# By which parts differ though nothing moved: their scenes and masks do (camera-lidar's bias floor in each of them).
+PART_FLOOR_RAD = float(np.radians(0.03) * np.sqrt(2))
+_ANY_RAD, _ANY_M = (
+    np.radians(20.0),
+    0.05,
+)  # of what the parts are not compared in, when the sensor is looked for
+_AXES = {
+    "camera_lidar": ("pitch", "yaw", "roll"),
+    "camera_radar": ("pitch", "yaw", "roll"),
+    "lidar_radar": ("roll", "pitch", "yaw"),
+}
+
+
+def constancy_failures(estimates: Mapping[str, PairEstimate]) -> dict[str, list[FailedCheck]]:
+    """Pairs whose parts contradict each other, and the other pairs of the sensor that moved where one is to blame.
+
+    Args:
+        estimates: by pair; those without parts say nothing.
+    """
+    parts = {pair: e.parts for pair, e in estimates.items() if e.parts is not None and e.observable.any()}
+    size = {pair: float(np.abs(p.sigmas(PART_FLOOR_RAD)).max()) for pair, p in parts.items()}
+    moved = [pair for pair in parts if size[pair] > MOVED_SIGMAS]
+    if not moved:
+        return {}
+    surest = max(moved, key=size.__getitem__)
+    found = attribute({pair: _shift(p) for pair, p in parts.items()})
+    rivals = [s for s, share in found.probability.items() if share > 0.05] or surest.split("_")
+    sensors = [found.sensor] if found.sensor else [s for s in surest.split("_") if s in rivals]
+    failed = {pair: [_failure(pair, parts[pair], size[pair], sensors)] for pair in moved}
+    for pair in estimates:
+        if found.sensor in pair.split("_") and pair not in failed:
+            sentence = f"the {found.sensor} moved during the day, as {surest.replace('_', '-')} shows"
+            failed[pair] = [FailedCheck(sentence, "moved_in_day")]
+    return failed
+
+
+def _failure(pair: str, parts: DayParts, sigmas: float, sensors: list[str]) -> FailedCheck:
+    axis = int(np.argmax(np.abs(parts.sigmas(PART_FLOOR_RAD))))
+    first, last = (datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S") for ns in parts.cut_ns)
+    size = f"{_AXES[pair][axis]} turned by about {np.degrees(parts.step[axis]):+.2f} deg ({sigmas:.1f} sigma)"
+    who = " or ".join(s for s in pair.split("_") if s in sensors) or " or ".join(pair.split("_"))
+    return FailedCheck(
+        f"{size} within the day, between {first} and {last} UTC: the {who} moved", "moved_in_day"
+    )
+
+
+def _shift(parts: DayParts) -> PairShift:
+    """The step as a twist; positions are open by what a turn in a bracket shifts."""
+    change, covariance = np.zeros(6), np.eye(6) * _ANY_M**2
+    change[:3], covariance[:3, :3] = (
+        parts.step,
+        parts.spread[0] + parts.spread[1] + np.eye(3) * PART_FLOOR_RAD**2,
+    )
+    to_twist = np.linalg.inv(change_jacobian(parts.T[0]))
+    return PairShift(parts.T[0], to_twist @ change, to_twist @ covariance @ to_twist.T)

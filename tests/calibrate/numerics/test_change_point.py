@@ -1,0 +1,76 @@
+"""A day in two parts: where it is cut, how far the parts are apart, and that a quiet day is not cut in earnest."""
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.numerics.change_point import likeliest_cut, parts_of_day
+from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+
+NOISE_RAD = np.radians(0.3)  # of a frame
+
+
+def measured(rng, frames, turn_rad, after):
+    """What each frame says of three rotations."""
+    values = rng.normal(0, NOISE_RAD, (frames, 3))
+    values[after:] += turn_rad
+    return values
+
+
+def parts_of(values):
+    """Parts of a day whose frames each measure the rotation vector."""
+
+    def solve(rows):
+        mean = values[rows].mean(axis=0)
+        T = from_rotation_translation(exp_so3(mean), np.zeros(3))
+        return mean, T, np.eye(3) * NOISE_RAD**2 / len(rows)
+
+    def score(mean):
+        return -0.5 * np.sum((values - mean) ** 2, axis=1) / NOISE_RAD**2
+
+    return parts_of_day(
+        values - values.mean(axis=0), [k * 10**9 for k in range(len(values))], solve, score, (0, 1, 2)
+    )
+
+
+@pytest.mark.parametrize("after", [16, 30, 40, 47])
+def test_a_step_is_found_where_it_is_and_as_large(after):
+    turn = np.radians([0.0, 0.8, -0.4])
+    for seed in range(10):
+        parts = parts_of(measured(np.random.default_rng(seed), 60, turn, after))
+        assert abs(parts.cut_ns[1] / 1e9 - after) <= 2
+        assert parts.cut_ns[1] - parts.cut_ns[0] == 10**9
+        sigma = np.sqrt(np.diag(parts.spread[0] + parts.spread[1]))
+        np.testing.assert_array_less(np.abs(parts.step - turn), 4 * sigma)
+        assert np.abs(parts.sigmas(PART_FLOOR_RAD)).max() > MOVED_SIGMAS
+
+
+def test_the_step_points_from_the_first_part_to_the_last():
+    parts = parts_of(measured(np.random.default_rng(0), 60, np.radians([2.0, 0, 0]), 30))
+    assert parts.step[0] == pytest.approx(np.radians(2.0), abs=np.radians(0.3))
+
+
+def test_quiet_days_are_never_called_moved():
+    """Cut where they differ most, parts of quiet days differ by two or three sigmas; few by more."""
+    found = [
+        np.abs(parts_of(measured(np.random.default_rng(seed), 60, 0.0, 60)).sigmas(0.0)).max()
+        for seed in range(400)
+    ]
+    assert np.mean(np.array(found) > MOVED_SIGMAS) < 0.005
+    assert 1.5 < np.median(found) < 3.0
+
+
+def test_what_is_not_compared_says_nothing():
+    parts = parts_of(measured(np.random.default_rng(0), 60, np.radians([2.0, 0, 0]), 30))
+    only_yaw = type(parts)(parts.T, parts.spread, parts.cut_ns, (2,))
+    assert only_yaw.sigmas(0.0)[0] == 0.0
+
+
+def test_a_cut_leaves_frames_on_either_side():
+    rng = np.random.default_rng(1)
+    for frames in (6, 10, 40):
+        cut = likeliest_cut(rng.normal(size=(frames, 3)))
+        assert cut is not None
+        assert 3 <= cut <= frames - 3
+    assert likeliest_cut(np.zeros((5, 3))) is None
+    assert likeliest_cut(np.zeros((12, 3))) is not None  # nothing differs: any cut will do

@@ -1,0 +1,97 @@
+"""Which sensor moved within the day, by pairs that shift and pairs that stay; and what records keep of it."""
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.half_days import half_days_of
+from pipeline.calibrate.verify.constancy import constancy_failures
+from pipeline.extrinsics.estimates import DayParts, PairEstimate
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
+
+CUT_NS = (1772447400 * 10**9, 1772447700 * 10**9)  # 10:30:00 and 10:35:00 UTC
+SIGMA_RAD = {"camera_lidar": np.radians(0.05), "lidar_radar": np.radians(0.06)}
+
+
+def turned(sensor, turn_deg, share):
+    """Poses of both pairs where a sensor has made a share of its turn about its own axes."""
+    M = from_rotation_translation(exp_so3(np.radians(turn_deg) * share), np.zeros(3))
+    camera, lidar, radar = (M if sensor == s else np.eye(4) for s in ("camera", "lidar", "radar"))
+    return {
+        "camera_lidar": inverse(camera) @ T_CAMERA_LIDAR @ lidar,
+        "lidar_radar": inverse(lidar) @ T_LIDAR_RADAR @ radar,
+    }
+
+
+def estimates(sensor="lidar", turn_deg=(0.0, 0.0, 0.0), *, with_radar=True):
+    """A day whose estimates lie half-way, and whose parts are right."""
+    first, middle, last = (turned(sensor, np.array(turn_deg), share) for share in (0.0, 0.5, 1.0))
+    found = {}
+    for pair, T in middle.items():
+        tested = (0, 1, 2) if pair == "camera_lidar" else (2,)
+        spread = np.eye(3) * SIGMA_RAD[pair] ** 2
+        if pair == "lidar_radar":
+            spread[:2, :2] = np.eye(2) * np.radians(20.0) ** 2
+        parts = DayParts((first[pair], last[pair]), (spread, spread), CUT_NS, tested)
+        found[pair] = PairEstimate(
+            pair, T, np.eye(6) * 1e-6, np.ones(6), np.ones(6, bool), 40,
+            parts=parts if with_radar or pair == "camera_lidar" else None,
+        )  # fmt: skip
+    T = middle["camera_lidar"] @ middle["lidar_radar"]
+    found["camera_radar"] = PairEstimate(
+        "camera_radar", T, np.eye(6) * 1e-6, np.ones(6), np.ones(6, bool), 40
+    )
+    return found
+
+
+def test_a_quiet_day_fails_nothing():
+    assert constancy_failures(estimates()) == {}
+    assert constancy_failures(estimates("camera", (0.1, 0.1, 0.0))) == {}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "turn_deg"),
+    [("camera", (0.0, 1.0, 0.0)), ("lidar", (0.0, 0.0, -1.0)), ("radar", (0.0, 0.0, 1.0))],
+)
+def test_the_sensor_whose_two_pairs_shift_is_named_with_time_and_size(sensor, turn_deg):
+    failed = constancy_failures(estimates(sensor, turn_deg))
+    mine = {pair for pair in ("camera_lidar", "camera_radar", "lidar_radar") if sensor in pair}
+    assert set(failed) == mine
+    assert {c.fault for checks in failed.values() for c in checks} == {"moved_in_day"}
+    sentences = " ".join(c.sentence for checks in failed.values() for c in checks)
+    assert "yaw turned by about" in sentences
+    assert "1.00 deg" in sentences
+    assert "between 10:30:00 and 10:35:00 UTC" in sentences
+    assert f"the {sensor} moved" in sentences
+
+
+def test_the_turn_has_the_sign_of_the_later_part():
+    (check,) = constancy_failures(estimates("radar", (0.0, 0.0, 1.0)))["lidar_radar"]
+    assert "+1.00 deg" in check.sentence
+    (check,) = constancy_failures(estimates("radar", (0.0, 0.0, -1.0)))["lidar_radar"]
+    assert "-1.00 deg" in check.sentence
+
+
+@pytest.mark.parametrize(("sensor", "with_radar"), [("lidar", True), ("camera", False)])
+def test_a_tilt_that_the_radar_does_not_see_leaves_two_sensors(sensor, with_radar):
+    turn = (0.0, 1.0, 0.0) if sensor == "lidar" else (1.0, 0.0, 0.0)  # pitch of either
+    failed = constancy_failures(estimates(sensor, turn, with_radar=with_radar))
+    assert set(failed) == {"camera_lidar"}
+    assert "the camera or lidar moved" in failed["camera_lidar"][0].sentence
+
+
+def test_half_days_lead_from_the_record_to_where_the_sensor_was_and_is():
+    found = estimates("lidar", (0.0, 0.0, 1.0))
+    faults = {pair: ["moved_in_day"] for pair in found}
+    first, last = (turned("lidar", np.array((0.0, 0.0, 1.0)), share) for share in (0.0, 1.0))
+    for poses in (first, last):
+        poses["camera_radar"] = poses["camera_lidar"] @ poses["lidar_radar"]
+    for pair, estimate in found.items():
+        half_days = half_days_of(pair, found, faults)
+        for (change, sigma), poses in zip(half_days, (first, last), strict=True):
+            R = exp_so3(change[:3]) @ estimate.T[:3, :3]
+            np.testing.assert_allclose(R, poses[pair][:3, :3], atol=1e-9)
+            np.testing.assert_allclose(estimate.T[:3, 3] + change[3:], poses[pair][:3, 3], atol=1e-9)
+            assert np.all(sigma >= 0)
+            assert sigma[:3].max() > 0
+    assert half_days_of("camera_lidar", found, {pair: [] for pair in found}) is None
