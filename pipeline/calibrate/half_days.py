@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from pipeline.extrinsics.estimates import PairEstimate
 from pipeline.geometry.changes import change_between
+from schemas.calibrations import PAIRS
 
 __all__ = ["half_days_of"]
 
@@ -25,9 +26,12 @@ def half_days_of(
         estimates: by pair.
         faults: that the verdict of each pair names.
     """
-    parts, own = {p: _parts(e, "moved_in_day" in faults[p]) for p, e in estimates.items()}, estimates[pair]
+    parts, own = (
+        {p: _parts(e, "moved_in_day" in faults.get(p, ())) for p, e in estimates.items()},
+        estimates[pair],
+    )
     poses, sigmas = parts[pair]
-    if pair == "camera_radar" and own.parts is None:
+    if pair == "camera_radar" and own.parts is None and len(parts) == len(PAIRS):
         (T_cl, s_cl), (T_lr, s_lr) = parts["camera_lidar"], parts["lidar_radar"]
         product = estimates["camera_lidar"].T @ estimates["lidar_radar"].T
         if np.abs(product - own.T).max() < _SAME_M:
