@@ -29,6 +29,15 @@ def real_logs() -> Path:
 
 
 @pytest.fixture(scope="session")
+def kitti_logs() -> Path:
+    """Folder with the recording of a street of KITTI."""
+    folder = SHARED / "data" / "kitti"
+    if not folder.is_dir():
+        pytest.skip("the frames of KITTI are not on this machine")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def real_detector() -> Path:
     """A real third-party ONNX detector."""
     path = SHARED / "models" / "yolox_nano.onnx"
