@@ -49,12 +49,15 @@ def read_calibration(
     )
     from pipeline.store.partitions import Lake
     from schemas.versions import CODE_VERSION
+    from schemas.words import day_word
 
     lake = Lake.existing(location)
     if day is None:
         found, source = pairs_of_state(lake, vehicle, method), "state"
     else:
         found, source = pairs_of_day(lake, vehicle, day, method), f"record of {day}"
+    # What has no transform was refused, or of a state is not there.
+    word = day_word("refused" if isinstance(p, str) else p.status for p in found.values())
     pairs, without = choose_pairs(found, force=force)
     pairs = pairs if unchecked else rest_at_prior(lake, vehicle, method, pairs)
     details = [p.details for p in pairs.values()]
@@ -66,7 +69,7 @@ def read_calibration(
         source = f"state of {max((str(d['day']) for d in details), default='no day')}"
     tell_damage(lake)
     return ExportedCalibration(
-        vehicle, source, method, CODE_VERSION, pairs, camera, names, T_base_lidar, without
+        vehicle, source, method, CODE_VERSION, pairs, camera, names, T_base_lidar, without, word
     )
 
 

@@ -132,10 +132,11 @@ def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> i
     doubts, written = not_certified(calibration), _written(calibration)
     for words in warnings_of(calibration):
         logger().warning(words, vehicle=calibration.vehicle, source=calibration.source)
-    status = ("held" if doubts else "done") if written else "refused"
+    status = calibration.word if written or calibration.word != "done" else "refused"
+    status = "uncertified" if status == "done" and doubts else status
     told = {"vehicle": calibration.vehicle, "source": calibration.source, "pairs": written}
     print_summary("export", status, what=what, **told, not_certified=doubts, outputs=outputs)
-    return 3 if doubts or not written else 0
+    return 0 if status == "done" else 3
 
 
 def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:

@@ -103,17 +103,19 @@ def _print_end(
 ) -> None:
     """The night's summary: what became of the vehicle-days and of the vehicles, and where to read about it."""
     from jobs.terminal.summary import left_out, print_summary
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps
+    from schemas.words import DAY_WORDS
 
-    held = any(o.status in ("held", "refused") for o in outcomes)
+    held = any(o.status in ("partly", "held", "refused") for o in outcomes)
     print_summary(
         "nightly",
         {0: "done", 1: "failed", 2: "failed", 3: "held" if held else "incomplete"}[code],
         vehicle_days=len(outcomes),
-        **{s: sum(o.status == s for o in outcomes) for s in ("done", "cached", "held", "refused", "failed")},
+        **{s: sum(o.status == s for o in outcomes) for s in ("cached", *DAY_WORDS) if s != "missing"},
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
+        next_steps=next_steps(findings, str(tables)),
         misconfigured=mend,
         damaged=left_out(tables),
         report=pages[0] if pages else None,

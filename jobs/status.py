@@ -1,4 +1,4 @@
-"""`boresight status`: what of a lake is done, held, refused, failed or missing, and why."""
+"""`boresight status`: what of a lake is done and what is not, and why."""
 
 from __future__ import annotations
 
@@ -39,14 +39,15 @@ def status(
     from dataclasses import asdict
 
     from jobs.terminal.summary import exit_code, left_out, print_summary
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors, status_lines
-    from pipeline.fleet.status import DAY_STATUSES, day_statuses
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
+    from pipeline.fleet.status import day_statuses
     from pipeline.store.data_files import data_files
     from pipeline.store.partitions import Lake
     from pipeline.store.records import last_day, read_last, read_records
     from schemas.calibrations import CALIBRATIONS
     from schemas.drift import DRIFT, DriftFinding
     from schemas.outcomes import OUTCOMES, OutcomeRow
+    from schemas.words import DAY_WORDS
 
     tables = Lake.existing(lake)
     data_files(
@@ -59,7 +60,7 @@ def status(
     found = [s for s in day_statuses(rows, method) if vehicle in (None, s.vehicle)]
     findings = read_last(tables, DRIFT, DriftFinding, method, vehicle=vehicle)
     if not json:
-        _print_table(found, status_lines(findings))
+        _print_table(found, [*status_lines(findings), *next_steps(findings, lake)])
     damaged = left_out(tables)
     ended = "incomplete" if damaged else "done"
     print_summary(
@@ -70,9 +71,10 @@ def status(
         last=last,
         method=method,
         vehicles=len({s.vehicle for s in found}),
-        **{name: sum(s.status == name for s in found) for name in DAY_STATUSES},
+        **{name: sum(s.status == name for s in found) for name in DAY_WORDS},
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
+        next_steps=next_steps(findings, lake),
         damaged=damaged,
         **({"days": [asdict(s) for s in found]} if json else {}),
     )
@@ -106,10 +108,10 @@ def _print_table(days: Sequence[DayStatus], vehicles: Sequence[str]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from pipeline.fleet.status import DAY_STATUSES
     from schemas.faults import in_words
+    from schemas.words import DAY_WORDS
 
-    wanting = sorted((d for d in days if d.status != "done"), key=lambda d: DAY_STATUSES.index(d.status))
+    wanting = sorted((d for d in days if d.status != "done"), key=lambda d: [*DAY_WORDS].index(d.status))
     table = Table("vehicle", "day", "status", "stage", "why")
     for day in wanting[:_ROWS]:
         # Text: names and reasons are not markup.

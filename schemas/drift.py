@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from shlex import quote
 
 from schemas.columns import DEFAULT_TRIO, TableSchema, record_columns, scalar
 
-__all__ = ["DRIFT", "DRIFT_STATUSES", "DriftFinding", "VehicleStatus", "status_of"]
+__all__ = ["DRIFT", "DRIFT_STATUSES", "DriftFinding", "VehicleStatus", "next_step", "status_of"]
 
 # What a person should look at first comes first; lists of vehicles are in this order.
 DRIFT_STATUSES = ("RED", "YELLOW", "UNKNOWN", "GREEN")
@@ -145,3 +146,15 @@ def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
     return VehicleStatus(
         first.vehicle_status, first.vehicle_reason or "", first.vehicle_sensor, first.vehicle_since
     )
+
+
+def next_step(vehicle: str, stored: VehicleStatus, lake: str = "LAKE") -> str:
+    """What a person should do about a vehicle that is RED, with the command; empty where nothing is to be done."""
+    if stored.status != "RED":
+        return ""
+    sensor = stored.sensor or "all"
+    what = f"how the {stored.sensor} is mounted" if stored.sensor else "how all sensors are mounted"
+    command = (
+        f"boresight service --lake {quote(lake)} --vehicle {quote(vehicle)} --day YYYY-MM-DD --kind repair"
+    )
+    return f"{vehicle}: inspect {what}; when it is mended, run `{command} --sensor {sensor}` with that day."

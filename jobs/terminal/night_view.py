@@ -18,6 +18,7 @@ __all__ = ["NightView", "night_view"]
 _MARKS = {
     "done": "[green]ok[/]",
     "cached": "[dim]up to date[/]",
+    "partly": "[yellow]partly[/]",
     "held": "[yellow]held[/]",
     "refused": "[yellow]refused[/]",
     "failed": "[bold red]failed[/]",

@@ -37,12 +37,13 @@ def exit_code(statuses: Iterable[str]) -> int:
     """Exit code of a job from the statuses of what it did.
 
     1 where anything "failed" (a retry may help), else 2 where anything is "misconfigured" (a person must mend it),
-    else 3 where anything was "held", "refused" or "incomplete" (rows that could not be read are left out), else 0.
+    else 3 where anything was "partly" accepted, "held", "refused" or "incomplete" (rows that could not be read are
+    left out), else 0.
     """
     seen = set(statuses)
     if seen & {"failed", "misconfigured"}:
         return 1 if "failed" in seen else 2
-    return 3 if seen & {"held", "refused", "incomplete"} else 0
+    return 3 if seen & {"partly", "held", "refused", "incomplete"} else 0
 
 
 def left_out(lake: Lake) -> list[str]:

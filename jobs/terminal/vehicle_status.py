@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from jobs.terminal.record_tables import STATUS_STYLES
-from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, status_of
+from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
 
-__all__ = ["count_statuses", "moved_sensors", "status_lines"]
+__all__ = ["count_statuses", "moved_sensors", "next_steps", "status_lines"]
 
 
 def status_lines(findings: Sequence[DriftFinding]) -> list[str]:
@@ -34,6 +34,12 @@ def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
         for vehicle, stored in _statuses(findings).items()
         if stored.sensor
     ]
+
+
+def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:
+    """A sentence with the command for each vehicle that something is to be done about."""
+    steps = [next_step(vehicle, stored, lake) for vehicle, stored in _statuses(findings).items()]
+    return [step for step in steps if step]
 
 
 def _statuses(findings: Sequence[DriftFinding]) -> dict[str, VehicleStatus]:

@@ -129,6 +129,7 @@ class ExportedCalibration:
         names: of the frames.
         T_base_lidar: where the lidar sits on the car; None: the lidar is the root of the tree.
         left_out: pair to reason, of those that are not in `pairs`.
+        word: of the record or state as a whole, one of DAY_WORDS.
     """
 
     vehicle: str
@@ -140,6 +141,7 @@ class ExportedCalibration:
     names: FrameNames = field(default_factory=FrameNames)
     T_base_lidar: Float[np.ndarray, "4 4"] | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
+    word: str = "done"
 
     @property
     def root(self) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.fleet.tally import Tally
 from schemas.versions import CODE_VERSION
+from schemas.words import DAY_WORDS
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
@@ -17,7 +18,6 @@ __all__ = ["NightEnd", "write_metrics"]
 
 _SUCCESS = (0, 3)  # what is held or refused is an answer; a night that only has those was a good one
 _LAST_SUCCESS = "boresight_last_success_timestamp_seconds"
-_DAY_STATUSES = ("done", "cached", "held", "refused", "failed")
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def _about_the_night(
         {(): end.exit_code},
     )
     add("boresight_duration_seconds", "Of the last night.", {(): end.ended_s - end.began_s})
-    days = {(s,): tally.vehicle_days[s] for s in _DAY_STATUSES}
+    days = {(s,): tally.vehicle_days[s] for s in ("cached", *DAY_WORDS) if s != "missing"}
     add("boresight_vehicle_days", "Vehicle-days of the last night.", days, ("status",))
     add(
         "boresight_records",

@@ -27,6 +27,7 @@ from pipeline.runner import Stage, try_stage
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.store.partitions import Lake, Partition, last_possible_day
 from pipeline.work import Task
+from schemas.words import day_word
 
 __all__ = ["DayOutcome", "Night", "refused_at_once", "run_night", "run_vehicle_day", "task_of"]
 
@@ -45,9 +46,8 @@ class Night:
 class DayOutcome:
     """What became of a vehicle-day.
 
-    `status`: "done", "cached" (nothing was to do), "held" or "refused" (a pair's record says so, or no record
-    could be made), "failed" (something broke; another try may help). `misconfigured`: it ended so for what fleet.toml
-    says, or a file that it names, and will until that is mended.
+    `status`: a word of DAY_WORDS, or "cached" where all is done already. `misconfigured`: it ended so for what
+    fleet.toml says, or a file that it names, and will until that is mended.
     """
 
     vehicle: str
@@ -210,13 +210,9 @@ def _outcome(finished: Finished[_Job, DayOutcome]) -> DayOutcome:
 def _summarise(partition: Partition, results: Sequence[Outcome]) -> DayOutcome:
     pairs = {r.pair: r.status for r in results[-1].records if results[-1].stage == CALIBRATE.name}
     worst = next((r for r in results if r.status in ("failed", "refused")), None)
-    verdicts = {s for s in ("held", "refused") if s in pairs.values()}
-    if worst is not None:
-        status = worst.status
-    elif verdicts:
-        status = "held" if "held" in verdicts else "refused"
-    else:
-        status = "cached" if all(r.status == "cached" for r in results) else "done"
+    status = worst.status if worst is not None else day_word(pairs.values()) if pairs else "done"
+    if status == "done" and all(r.status == "cached" for r in results):
+        status = "cached"
     return DayOutcome(
         partition.vehicle,
         partition.day,

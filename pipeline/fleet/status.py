@@ -1,4 +1,4 @@
-"""How every vehicle-day of a lake stands: done, held, refused, failed or missing, and why."""
+"""How every vehicle-day of a lake stands, in a word of `schemas.words`, and why."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from schemas.outcomes import OutcomeRow
+from schemas.words import day_word
 
-__all__ = ["DAY_STATUSES", "DayStatus", "day_statuses"]
+__all__ = ["DayStatus", "day_statuses"]
 
-# What a person should look at first comes first.
-DAY_STATUSES = ("failed", "missing", "refused", "held", "done")
 _LAST_STAGE = "calibrate"
 
 
@@ -22,7 +21,7 @@ class DayStatus:
         vehicle: vehicle id.
         day: YYYY-MM-DD.
         method: of the calibration; empty where none came to it.
-        status: one of DAY_STATUSES.
+        status: one of DAY_WORDS.
         stage: where it ended; empty where no stage ran.
         reason: why, in words.
         pairs: how many pairs are accepted, held, refused.
@@ -104,12 +103,8 @@ def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) 
 
 
 def _status(row: OutcomeRow) -> str:
-    if row.status != "done":
-        return row.status
-    for status in ("held", "refused"):
-        if row.kept.get(status):
-            return status
-    return "done"
+    pairs = [status for status, count in row.kept.items() if count]
+    return day_word(pairs) if row.status == "done" and pairs else row.status
 
 
 def _total(values: Sequence[int | None]) -> int | None:

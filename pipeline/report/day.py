@@ -12,7 +12,7 @@ from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.report.words import AXIS_NAMES, PAIR_TITLES, dof_title, motion_in_words, scaled, unit_of
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
-from schemas.drift import DriftFinding, status_of
+from schemas.drift import DriftFinding, next_step, status_of
 from schemas.faults import in_words
 
 __all__ = ["DofRow", "PairView", "answer_for", "clearest_alarm", "pair_view", "sigmas_of", "status_sentence"]
@@ -214,10 +214,11 @@ def status_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
     stored = status_of(findings)
     sentence = f"{stored.reason[:1].upper()}{stored.reason[1:]}."
     moved = clearest_alarm(findings)
-    if moved is None or moved.moved_sensor is None:
-        return stored.status, sentence
-    motion = motion_in_words(moved.moved_sensor, moved.moved_motion or [], moved.moved_motion_sigma or [])
-    return stored.status, f"{sentence} Its motion: {motion}."
+    if moved is not None and moved.moved_sensor is not None:
+        motion = motion_in_words(moved.moved_sensor, moved.moved_motion or [], moved.moved_motion_sigma or [])
+        sentence = f"{sentence} Its motion: {motion}."
+    step = next_step(findings[0].vehicle, stored) if findings else ""
+    return stored.status, f"{sentence} To do for {step}" if step else sentence
 
 
 def clearest_alarm(findings: Sequence[DriftFinding]) -> DriftFinding | None:

@@ -31,6 +31,7 @@ from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import PAIRS, CalibrationRecord, pairs_of
 from schemas.drift import DriftFinding
+from schemas.words import day_word
 
 __all__ = ["DayRead", "write_day_page", "write_day_picture"]
 
@@ -158,10 +159,8 @@ def _as_of(findings: Sequence[DriftFinding]) -> tuple[str, str]:
 
 
 def _after_label(views: Sequence[PairView]) -> str:
-    statuses = {v.status for v in views}
-    if statuses == {"accepted"}:
-        return "calibrated"
-    return "result, partly held" if "accepted" in statuses else "result, held"
+    word = day_word(v.status for v in views)
+    return "calibrated" if word == "done" else f"result, {word}{' accepted' * (word == 'partly')}"
 
 
 def _pictures(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import compress, product
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,10 @@ from pipeline.report.window import FleetWindow
 from pipeline.report.words import PAIR_TITLES, motion_in_words, with_sigma
 from schemas.calibrations import STATUSES
 from schemas.drift import DRIFT_STATUSES, DriftFinding, status_of
+from schemas.words import DAY_WORDS, day_word
 
 __all__ = [
-    "DAY_WORDS",
+    "DAY_LETTERS",
     "FindingView",
     "VehicleRow",
     "finding_views",
@@ -29,12 +31,9 @@ __all__ = [
 ]
 
 # How a vehicle-day is shown: letter of the index, sign and words. Capitals in the index: the day has a page.
-DAY_WORDS = {
-    "a": ("accepted", "✓", "accepted (use it)"),
-    "p": ("partly", "◐", "accepted in part (of some pairs)"),
-    "h": ("held", "○", "held (computed, the prior stays current)"),
-    "r": ("refused", "✕", "refused (nothing computed)"),
-    ".": ("none", "·", "no record"),
+_SIGNS = {"done": "d✓", "partly": "p◐", "held": "h○", "refused": "r✕"}
+DAY_LETTERS = {sign[0]: (word, sign[1], f"{word} ({DAY_WORDS[word]})") for word, sign in _SIGNS.items()} | {
+    ".": ("none", "·", "no record")
 }
 _COLUMNS = 28  # days that the table has: four weeks; a vehicle's older ones are with its charts
 
@@ -49,7 +48,7 @@ class VehicleRow:
         sentence: why.
         sensor: that moved; empty where none did or nobody knows.
         since: first day after the change; empty where there was none.
-        days: a letter of DAY_WORDS per day of the table, capital where the day has a page.
+        days: a letter of DAY_LETTERS per day of the table, capital where the day has a page.
         last_day: the last one with a record; empty where there is none.
         older: days before those of the table, with their letters.
     """
@@ -179,17 +178,17 @@ def _attention(row: VehicleRow | FindingView) -> tuple[int, int, str]:
 
 
 def _letters(window: FleetWindow) -> tuple[Int[np.ndarray, " D"], list[str]]:
-    """Days that any vehicle has a record of, and each vehicle's letters of DAY_WORDS on them."""
+    """Days that any vehicle has a record of, and each vehicle's letters of DAY_LETTERS on them."""
     days, column = np.unique(window.day, return_inverse=True)
     cell = window.owner * len(days) + column
     size = len(window.vehicles) * len(days)
-    of = {name: np.bincount(cell[window.status == s], minlength=size) for s, name in enumerate(STATUSES)}
-    total = sum(of.values())
+    seen = np.zeros((len(STATUSES), size), bool)
+    seen[window.status, cell] = True
     letters = np.full(size, ".")
-    letters[of["refused"] > 0] = "r"
-    letters[of["held"] > 0] = "h"
-    letters[of["accepted"] > 0] = "p"
-    letters[(of["accepted"] == total) & (total > 0)] = "a"
+    for statuses in product((False, True), repeat=len(STATUSES)):
+        if any(statuses):
+            alike = np.all(np.array(statuses) == seen.T, axis=1)
+            letters[alike] = _SIGNS[day_word(compress(STATUSES, statuses))][0]
     return days, ["".join(row) for row in letters.reshape(len(window.vehicles), len(days))]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.config import FleetConfig
 from pipeline.report.charts import fleet_charts
-from pipeline.report.fleet import DAY_WORDS, VehicleRow, finding_views, fleet_rows, headline_for, index_row
+from pipeline.report.fleet import DAY_LETTERS, VehicleRow, finding_views, fleet_rows, headline_for, index_row
 from pipeline.report.names import page_stem
 from pipeline.report.page import render, write_page
 from pipeline.report.reading import fleet_records
@@ -74,7 +74,7 @@ def render_fleet_page(
         rows=rows[:_ROWS],
         total=len(rows),
         days=days,
-        words=DAY_WORDS,
+        words=DAY_LETTERS,
         link=lambda vehicle, day: f"{quote(album.folder.name)}/{day}/{quote(page_stem(vehicle))}.html",
         shown=rows[:_CHARTS],
         index=json.dumps(_index(album, days, rows, {v.vehicle: v for v in views}, charts)),
@@ -105,7 +105,7 @@ def _index(
         "days": list(days),
         "folder": quote(album.folder.name),
         "statuses": DRIFT_STATUSES,
-        "words": DAY_WORDS,
+        "words": DAY_LETTERS,
         "pairs": [PAIR_TITLES[pair] for pair in PAIRS],
         "dofs": [[dof_title(pair, dof) for dof in DOF_NAMES] for pair in PAIRS],
         "rows": told,

@@ -66,7 +66,11 @@ class StagesThatSay:
         return Outcome(name, partition.vehicle, partition.day, answer, "key", rows=7, reason="no frame")
 
     def record(self, partition, answer):
-        statuses = {"held": ["accepted", "held", "accepted"], "refused": ["refused"] * 3}
+        statuses = {
+            "partly": ["accepted", "held", "accepted"],
+            "held": ["held", "held", "refused"],
+            "refused": ["refused"] * 3,
+        }
         rows = [
             CalibrationRecord(
                 partition.vehicle,
@@ -106,7 +110,8 @@ def records(night):
         ({}, "done", "accepted"),
         ({"ingest": "cached", "perceive": "cached", "calibrate": "cached"}, "cached", "accepted"),
         ({"ingest": "cached", "perceive": "cached"}, "done", "accepted"),
-        ({"calibrate": "held"}, "held", "held"),
+        ({"calibrate": "partly"}, "partly", "held"),
+        ({"calibrate": "held"}, "held", "refused"),
         ({"calibrate": "refused"}, "refused", "refused"),
     ],
 )

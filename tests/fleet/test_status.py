@@ -25,12 +25,14 @@ def test_a_day_is_what_its_calibration_says():
         row("c", "d1", "ingest", "refused", reason="no image"),
         row("c", "d1", "calibrate", "refused", reason="ingest: no image"),
         row("d", "d1", "calibrate", kept={"accepted": 2, "refused": 1}),
+        row("e", "d1", "calibrate", kept={"accepted": 0, "held": 1, "refused": 2}),
     )  # fmt: skip
     assert found == {
         ("a", "d1", "joint"): ("done", ""),
-        ("b", "d1", "joint"): ("held", "lidar_radar: too wide"),
+        ("b", "d1", "joint"): ("partly", "lidar_radar: too wide"),
         ("c", "d1", "joint"): ("refused", "no image"),
-        ("d", "d1", "joint"): ("refused", ""),
+        ("d", "d1", "joint"): ("partly", ""),
+        ("e", "d1", "joint"): ("held", ""),
     }
 
 

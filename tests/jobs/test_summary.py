@@ -34,6 +34,7 @@ def test_values_that_json_cannot_carry_are_an_error():
         ([], 0),
         (["done", "cached", "accepted"], 0),
         (["done", "held"], 3),
+        (["done", "partly"], 3),
         (["refused"], 3),
         (["held", "failed", "done"], 1),
     ],

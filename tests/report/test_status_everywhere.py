@@ -2,6 +2,8 @@
 
 import json
 import re
+import shlex
+import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 from types import ModuleType
@@ -10,8 +12,9 @@ import numpy as np
 import pytest
 from rich.text import Text
 
+from jobs.cli import main
 from jobs.show import show
-from jobs.terminal.vehicle_status import count_statuses, moved_sensors, status_lines
+from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
 from pipeline.report.stage import write_day_page, write_fleet_page
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
@@ -97,6 +100,21 @@ def test_the_summary_counts_vehicles_and_names_each_moved_sensor_once(lake: Lake
     assert count_statuses(rows) == {"RED": 1, "YELLOW": 1, "UNKNOWN": 2, "GREEN": 1}
     assert {"vehicle": "red", "sensor": "radar", "since": "2026-03-04"} in moved_sensors(rows)
     assert len({m["vehicle"] for m in moved_sensors(rows)}) == len(moved_sensors(rows))
+
+
+def test_a_red_vehicle_says_what_to_do_with_the_command_and_no_other_does(lake: Lake, tmp_path: Path) -> None:
+    rows = [f for own in stored(lake).values() for f in own]
+    [step] = next_steps(rows, "my lake")
+    assert "how the radar is mounted" in step
+    command = "--vehicle red --day YYYY-MM-DD --kind repair --sensor radar"
+    assert f"boresight service --lake 'my lake' {command}" in step
+    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
+    assert f"boresight service --lake LAKE {command}" in page
+    own = Lake.at(shutil.copytree(lake.root, tmp_path / "lake"))
+    command = next_steps(rows, str(own.root))[0].split("`")[1].replace("YYYY-MM-DD", "2026-03-06")
+    assert main(shlex.split(command)[1:]) == 0
+    audit_fleet(own, _config())
+    assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew
 
 
 def test_records_of_a_release_that_stored_no_status_stay_readable(lake: Lake, tmp_path: Path) -> None:

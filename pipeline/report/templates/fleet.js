@@ -39,13 +39,13 @@ function text(i) {
 }
 
 const names = new Intl.Collator(undefined, { numeric: true });
-const notAccepted = row => row[DAYS].replace(/[aA.]/g, "").length;
+const notDone = row => row[DAYS].replace(/[dD.]/g, "").length;
 const orders = {
   attention: (a, b) => a - b,  // as the rows come
   name: (a, b) => names.compare(fleet.rows[a][NAME], fleet.rows[b][NAME]),
   since: (a, b) => fleet.rows[b][SINCE].localeCompare(fleet.rows[a][SINCE]) || a - b,
   seen: (a, b) => fleet.rows[a][LAST].localeCompare(fleet.rows[b][LAST]) || a - b,
-  bad: (a, b) => notAccepted(fleet.rows[b]) - notAccepted(fleet.rows[a]) || a - b,
+  bad: (a, b) => notDone(fleet.rows[b]) - notDone(fleet.rows[a]) || a - b,
 };
 
 let shown = [], rowHeight = 0, drawn = "";
