@@ -51,7 +51,9 @@ def service(
             "command line", "withdraw", f"no such event of {vehicle} is noted; noted are: {there}"
         )
     key = work_key("service", "", f"{vehicle} {day} {sensor} {kind}", [note, *(["withdrawn"] * withdraw)])
-    event = ServiceEvent(vehicle, day, sensor, kind, note, key, withdrawn=withdraw)
+    event = ServiceEvent(
+        vehicle=vehicle, day=day, sensor=sensor, kind=kind, note=note, work_key=key, withdrawn=withdraw
+    )
     commit_records(tables, SERVICE_EVENTS, [event])
     about = {"vehicle": vehicle, "day": day, "sensor": sensor, "kind": kind, "withdrawn": withdraw}
     print_summary("service", "done", **about, outputs=[tables.table(SERVICE_EVENTS.name)])

@@ -1,18 +1,24 @@
-"""How a table is described once, and what follows from it: Arrow schema and JSON Schema.
+"""How a table is described once, by the dataclass of its rows, and what follows: Arrow schema and JSON Schema.
 
-A table is a tuple of `Column`s. Arrays travel as `binary` blobs, one per attribute, little-endian and C-ordered
+A row's fields are the table's columns (`column`, `array`); `table_of` makes the table of them.
+
+Arrays travel as `binary` blobs, one per attribute, little-endian and C-ordered
 (Parquet reads them 4-10x faster than list columns); the column's Arrow field metadata says dtype and shape, so any
 engine can decode them: `numpy.frombuffer(blob, dtype).reshape(shape)`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Callable
+from dataclasses import Field, dataclass, field, fields
+from types import UnionType
+from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
 
 import pyarrow as pa
 
-__all__ = ["DEFAULT_TRIO", "Column", "TableSchema", "array", "record_columns", "scalar", "transform_columns"]
+__all__ = ["DEFAULT_TRIO", "Column", "Recorded", "TableSchema", "array", "column", "row", "table_of"]
+
+Row = TypeVar("Row")
 
 DEFAULT_TRIO = "default"  # a rig with one camera, one lidar and one radar has one trio of this name
 
@@ -31,6 +37,18 @@ _ARROW: dict[str, pa.DataType] = {
     "list<bool>": pa.list_(pa.bool_()),
     "map<string,float64>": pa.map_(pa.string(), pa.float64()),
     "map<string,int64>": pa.map_(pa.string(), pa.int64()),
+}
+_KINDS: dict[Any, ScalarKind] = {
+    int: "int64",
+    float: "float64",
+    str: "string",
+    bool: "bool",
+    bytes: "binary",
+    list[str]: "list<string>",
+    list[float]: "list<float64>",
+    list[bool]: "list<bool>",
+    dict[str, float]: "map<string,float64>",
+    dict[str, int]: "map<string,int64>",
 }
 _JSON: dict[str, dict[str, Any]] = {
     "int64": {"type": "integer"},
@@ -122,34 +140,65 @@ class TableSchema:
         }
 
 
-def scalar(name: str, kind: ScalarKind, doc: str, *, nullable: bool = False) -> Column:
-    """A plain column."""
-    return Column(name, kind, doc, nullable)
+def column(doc: str, *, kind: str = "", **default: Any) -> Any:
+    """A field that is a plain column.
+
+    Args:
+        doc: what it holds.
+        kind: where the field's type leaves it open (int32); else it follows from that.
+        default: `default` or `default_factory`, as of a dataclass.
+    """
+    return field(**default, metadata={"doc": doc, "kind": kind})
 
 
-def array(name: str, dtype: str, shape: tuple[str | int, ...], doc: str, *, nullable: bool = False) -> Column:
-    """A blob column: little-endian numpy `dtype` (as "<f4"), `shape` with "N" for the free axis."""
-    return Column(name, "binary", doc, nullable, dtype, shape)
+def array(dtype: str, shape: tuple[str | int, ...], doc: str, **default: Any) -> Any:
+    """A field that is a blob: little-endian numpy `dtype` (as "<f4"), `shape` with "N" for the free axis."""
+    return field(**default, metadata={"doc": doc, "kind": "binary", "dtype": dtype, "shape": shape})
 
 
-def transform_columns(prefix: str, doc: str, *, nullable: bool = False) -> tuple[Column, ...]:
-    """Seven columns `<prefix>qw ... <prefix>tz_m` of one `T_parent_child` (scalar-first quaternion, metres)."""
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    return tuple(scalar(f"{prefix}{n}", "float64", doc, nullable=nullable) for n in names)
+@dataclass_transform(
+    kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(field, column, array)
+)
+def row(*, eq: bool = False) -> Callable[[type[Row]], type[Row]]:
+    """A frozen dataclass of named fields only: a row of a table, whose columns its fields are."""
+    return dataclass(frozen=True, eq=eq, kw_only=True)
 
 
-def record_columns() -> tuple[Column, ...]:
-    """The columns of every record table: whose, by which work, and since when it counts."""
-    stamp = "UTC, ISO 8601 with microseconds: "
-    return (
-        scalar(
-            "trio", "string", "camera, lidar and radar of the rig that see the same; default where it has one"
-        ),
-        scalar("work_key", "string", "hash of code version, config, inputs"),
-        scalar("recorded_at", "string", stamp + "when the row was written"),
-        scalar(
-            "asserted_at",
-            "string",
-            stamp + "when a night last made it current: of all rows about the same, the latest is",
-        ),
+@row()
+class Recorded:
+    """Columns of every record table, its last ones: whose, by which work, and since when it counts."""
+
+    trio: str = column(
+        "camera, lidar and radar of the rig that see the same; default where it has one", default=DEFAULT_TRIO
     )
+    work_key: str = column("hash of code version, config, inputs", default="")
+    recorded_at: str = column("UTC, ISO 8601 with microseconds: when the row was written", default="")
+    asserted_at: str = column(
+        "UTC, ISO 8601 with microseconds: when a night last made it current: of all rows about the same, the latest is",
+        default="",
+    )
+
+
+def table_of(
+    of: type,
+    name: str,
+    version: int,
+    doc: str = "",
+    *,
+    made_by: str = "",
+    reads_versions: tuple[int, ...] = (),
+    about: tuple[str, ...] = (),
+) -> TableSchema:
+    """The table whose rows are `of`: a column for each field, in their order, those of every record last."""
+    last = {f.name for f in fields(Recorded)} if issubclass(of, Recorded) else set[str]()
+    types = get_type_hints(of)
+    columns = [_column(f, types[f.name]) for f in sorted(fields(of), key=lambda f: f.name in last)]
+    return TableSchema(name, version, tuple(columns), doc, made_by, reads_versions, about)
+
+
+def _column(of: Field[Any], kind: Any) -> Column:
+    """The column of a field: nullable where None is among its types."""
+    nullable = type(None) in get_args(kind) if isinstance(kind, UnionType) else False
+    plain = next(k for k in get_args(kind) if k is not type(None)) if nullable else kind
+    known = dict(of.metadata)
+    return Column(of.name, known.pop("kind", "") or _KINDS[plain], nullable=nullable, **known)

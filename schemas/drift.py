@@ -7,119 +7,75 @@ shows it reads it from there and decides nothing anew.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from shlex import quote
 
-from schemas.columns import DEFAULT_TRIO, TableSchema, record_columns, scalar
+from schemas.columns import Recorded, column, row, table_of
 
 __all__ = ["DRIFT", "DRIFT_STATUSES", "DriftFinding", "VehicleStatus", "next_step", "status_of"]
 
 # What a person should look at first comes first; lists of vehicles are in this order.
 DRIFT_STATUSES = ("RED", "YELLOW", "UNKNOWN", "GREEN")
 
-DRIFT = TableSchema(
+
+@row(eq=True)
+class DriftFinding(Recorded):
+    """One row of `drift`; fields are the columns of the same name."""
+
+    vehicle: str = column("vehicle id")
+    day: str = column("last day of the audited window, YYYY-MM-DD")
+    method: str = column("method of the audited records")
+    pair: str = column("camera_lidar, camera_radar or lidar_radar")
+    dof: str = column("rx, ry, rz, tx, ty, tz in parent axes")
+    status: str = column(
+        "of this chart: GREEN, YELLOW (a change below the limit that matters, or not yet sure), RED, UNKNOWN "
+        "(too little data); of the vehicle: vehicle_status"
+    )
+    reason: str = column("in words")
+    days_used: int = column("day estimates on the chart")
+    statistic: float | None = column("the chart's alarm statistic at its maximum", default=None)
+    threshold: float | None = column("its alarm threshold under the false-alarm budget", default=None)
+    start_day: str | None = column("first day with the new value", default=None)
+    start_day_earliest: str | None = column("lower end of the start day's interval", default=None)
+    start_day_latest: str | None = column("upper end", default=None)
+    kind: str | None = column("'step' or 'slow drift'", default=None)
+    magnitude: float | None = column("size of the change [rad or m]", default=None)
+    magnitude_sigma: float | None = column("its sigma", default=None)
+    limit: float = column("size that matters for this pair and DoF [rad or m]")
+    moved_sensor: str | None = column(
+        "camera, lidar or radar: the sensor that two shifted pairs share", default=None
+    )
+    moved_probability: float | None = column(
+        "of moved_sensor against the other two, 0..1; null where nothing moved", default=None
+    )
+    moved_motion: list[float] | None = column(
+        "rotation vector [rad] and shift [m] of the moved sensor in its own axes", default=None
+    )
+    moved_motion_sigma: list[float] | None = column("their sigmas", default=None)
+    inputs: list[str] = column("work keys of the records on the chart", default_factory=list)
+    vehicle_status: str | None = column(
+        (
+            "of the vehicle as a whole, the same in all its rows of one audit: RED or YELLOW where a chart is, "
+            "GREEN where a turn of any sensor would have shown, else UNKNOWN; null in rows of releases before 0.4"
+        ),
+        default=None,
+    )
+    vehicle_sensor: str | None = column(
+        "camera, lidar or radar: the sensor that moved; null where none did or it is not clear which",
+        default=None,
+    )
+    vehicle_since: str | None = column("first day after the vehicle's clearest change", default=None)
+    vehicle_reason: str | None = column("why the vehicle has this status, in words", default=None)
+
+
+DRIFT = table_of(
+    DriftFinding,
     "drift",
     2,
-    (
-        scalar("vehicle", "string", "vehicle id"),
-        scalar("day", "string", "last day of the audited window, YYYY-MM-DD"),
-        scalar("method", "string", "method of the audited records"),
-        scalar("pair", "string", "camera_lidar, camera_radar or lidar_radar"),
-        scalar("dof", "string", "rx, ry, rz, tx, ty, tz in parent axes"),
-        scalar(
-            "status",
-            "string",
-            "of this chart: GREEN, YELLOW (a change below the limit that matters, or not yet sure), RED, UNKNOWN (too "
-            "little data); of the vehicle: vehicle_status",
-        ),
-        scalar("reason", "string", "in words"),
-        scalar("days_used", "int64", "day estimates on the chart"),
-        scalar("statistic", "float64", "the chart's alarm statistic at its maximum", nullable=True),
-        scalar("threshold", "float64", "its alarm threshold under the false-alarm budget", nullable=True),
-        scalar("start_day", "string", "first day with the new value", nullable=True),
-        scalar("start_day_earliest", "string", "lower end of the start day's interval", nullable=True),
-        scalar("start_day_latest", "string", "upper end", nullable=True),
-        scalar("kind", "string", "'step' or 'slow drift'", nullable=True),
-        scalar("magnitude", "float64", "size of the change [rad or m]", nullable=True),
-        scalar("magnitude_sigma", "float64", "its sigma", nullable=True),
-        scalar("limit", "float64", "size that matters for this pair and DoF [rad or m]"),
-        scalar(
-            "moved_sensor",
-            "string",
-            "camera, lidar or radar: the sensor that two shifted pairs share",
-            nullable=True,
-        ),
-        scalar(
-            "moved_probability",
-            "float64",
-            "of moved_sensor against the other two, 0..1; null where nothing moved",
-            nullable=True,
-        ),
-        scalar(
-            "moved_motion",
-            "list<float64>",
-            "rotation vector [rad] and shift [m] of the moved sensor in its own axes",
-            nullable=True,
-        ),
-        scalar("moved_motion_sigma", "list<float64>", "their sigmas", nullable=True),
-        scalar("inputs", "list<string>", "work keys of the records on the chart"),
-        scalar(
-            "vehicle_status",
-            "string",
-            "of the vehicle as a whole, the same in all its rows of one audit: RED or YELLOW where a chart is, GREEN "
-            "where a turn of any sensor would have shown, else UNKNOWN; null in rows of releases before 0.4",
-            nullable=True,
-        ),
-        scalar(
-            "vehicle_sensor",
-            "string",
-            "camera, lidar or radar: the sensor that moved; null where none did or it is not clear which",
-            nullable=True,
-        ),
-        scalar("vehicle_since", "string", "first day after the vehicle's clearest change", nullable=True),
-        scalar("vehicle_reason", "string", "why the vehicle has this status, in words", nullable=True),
-        *record_columns(),
-    ),
     made_by="audit",
     reads_versions=(1,),
     about=("vehicle", "day", "trio", "method", "pair", "dof"),
 )
-
-
-@dataclass(frozen=True)
-class DriftFinding:
-    """One row of `drift`; fields are the columns of the same name."""
-
-    vehicle: str
-    day: str
-    method: str
-    pair: str
-    dof: str
-    status: str
-    reason: str
-    days_used: int
-    limit: float
-    work_key: str = ""
-    statistic: float | None = None
-    threshold: float | None = None
-    start_day: str | None = None
-    start_day_earliest: str | None = None
-    start_day_latest: str | None = None
-    kind: str | None = None
-    magnitude: float | None = None
-    magnitude_sigma: float | None = None
-    moved_sensor: str | None = None
-    moved_probability: float | None = None
-    moved_motion: list[float] | None = None
-    moved_motion_sigma: list[float] | None = None
-    inputs: list[str] = field(default_factory=list)
-    vehicle_status: str | None = None
-    vehicle_sensor: str | None = None
-    vehicle_since: str | None = None
-    vehicle_reason: str | None = None
-    trio: str = DEFAULT_TRIO
-    recorded_at: str = ""  # written when the row is
-    asserted_at: str = ""
 
 
 @dataclass(frozen=True)

@@ -2,45 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from schemas.columns import DEFAULT_TRIO, TableSchema, record_columns, scalar
+from schemas.columns import Recorded, column, row, table_of
 
 __all__ = ["EVENT_KINDS", "EVENT_SENSORS", "SERVICE_EVENTS", "ServiceEvent"]
 
 EVENT_KINDS = ("re-mount", "repair", "software release")
 EVENT_SENSORS = ("camera", "lidar", "radar", "all")
 
-SERVICE_EVENTS = TableSchema(
+
+@row(eq=True)
+class ServiceEvent(Recorded):
+    """One row of `service_events`; fields are the columns of the same name."""
+
+    vehicle: str = column("vehicle id")
+    day: str = column("YYYY-MM-DD; its own records count neither to before nor to after")
+    sensor: str = column("camera, lidar, radar or all")
+    kind: str = column("re-mount, repair or software release")
+    note: str = column("for people", default="")
+    withdrawn: bool = column("it was noted by mistake: it counts no more", default=False)
+
+
+SERVICE_EVENTS = table_of(
+    ServiceEvent,
     "service_events",
     2,
-    (
-        scalar("vehicle", "string", "vehicle id"),
-        scalar("day", "string", "YYYY-MM-DD; its own records count neither to before nor to after"),
-        scalar("sensor", "string", "camera, lidar, radar or all"),
-        scalar("kind", "string", "re-mount, repair or software release"),
-        scalar("note", "string", "for people"),
-        scalar("withdrawn", "bool", "it was noted by mistake: it counts no more"),
-        *record_columns(),
-    ),
     "Of events of one vehicle, day, sensor and kind, the last noted counts.",
     made_by="service",
     reads_versions=(1,),
     about=("vehicle", "day", "trio", "sensor", "kind"),
 )
-
-
-@dataclass(frozen=True)
-class ServiceEvent:
-    """One row of `service_events`; fields are the columns of the same name."""
-
-    vehicle: str
-    day: str
-    sensor: str
-    kind: str
-    note: str = ""
-    work_key: str = ""
-    trio: str = DEFAULT_TRIO
-    recorded_at: str = ""  # written when the row is
-    asserted_at: str = ""
-    withdrawn: bool = False

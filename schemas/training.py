@@ -15,11 +15,9 @@ plane fitted to the sweep.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
-from schemas.columns import TableSchema, array, scalar, transform_columns
+from schemas.columns import array, column, row, table_of
 
 __all__ = [
     "CLASS_OF_LABEL",
@@ -66,134 +64,150 @@ DISTANCE_GROUPS: dict[str, tuple[str, ...]] = {
 POINT_IS_EDGE, POINT_IS_GROUND = 1, 2  # bits of lidar_flags
 NO_EDGE = -128  # in edge_offset: no boundary of this direction within reach
 
-TRAINING = TableSchema(
+_PRIOR_CAMERA_LIDAR = "reference T_camera_lidar: the day's prior, never a truth"
+_PRIOR_LIDAR_RADAR = "reference T_lidar_radar: the day's prior, never a truth"
+
+
+@row(eq=False)
+class TrainingRow:
+    """One row of `training`; fields are the columns of the same name, arrays decoded."""
+
+    frame_index: int = column("row of table frames", kind="int32")
+    vehicle: str = column("vehicle id")
+    day: str = column("YYYY-MM-DD")
+    drive: int = column("as in frames", kind="int32")
+    stamp_ns: int = column("as in frames")
+    split: str = column("train, val or test")
+    place: str = column("cell of the map, or stretch of the drive where the log knows no positions")
+    environment: str = column("of the drive: highway, urban, mixed or unknown")
+    rig: str = column("rig of fleet.toml")
+    fingerprint: np.ndarray = array(
+        "|u1", (32,), "256 signs of brightness steps in the small image: near-duplicates"
+    )
+    # the same for all rows of a lake
+    grid_step_deg: float = column("size of a cell")
+    grid_height: int = column("H: rows of the grid", kind="int32")
+    grid_width: int = column("W: columns of the grid", kind="int32")
+    # camera, on the grid
+    image: np.ndarray = array(
+        "|u1", (3, "N"), "red, green, blue; each H W row by row, area-averaged; 0 outside the image"
+    )
+    grid_class: np.ndarray = array("|u1", ("N",), "H W: index into GRID_CLASSES, by majority; UNKNOWN_CLASS")
+    grid_seen: np.ndarray = array("|u1", ("N",), "H W: 1 where the image shows the whole cell")
+    class_distance: np.ndarray = array(
+        "|u1",
+        (6, "N"),
+        (
+            "by DISTANCE_GROUPS, each H W: angle to the nearest pixel of the group [0.1 deg], 255 = 25.5 deg or "
+            "more"
+        ),
+    )
+    edge_offset: np.ndarray = array(
+        "|i1",
+        (4, "N"),
+        (
+            "by EDGE_LEFT/RIGHT/ABOVE/BELOW of observations, each H W: signed way from the cell's centre to the "
+            "nearest mask boundary of that direction, along the row (left, right; positive = to the right) or "
+            "column (above, below; positive = downwards) [0.05 deg]; NO_EDGE = none within 6.35 deg"
+        ),
+    )
+    sky_depth: np.ndarray = array("|u1", ("N",), "H W: depth inside the sky [0.1 deg], 0 outside it")
+    detection_box_rad: np.ndarray = array(
+        "<f4",
+        (24, 4),
+        (
+            "road users: azimuth left, elevation top, azimuth right, elevation bottom of the box (azimuth to the "
+            "left and elevation upwards are positive)"
+        ),
+    )
+    detection_count: int = column("road users among the 24 rows", kind="int32")
+    # lidar
+    lidar_xyz_m: np.ndarray = array(
+        "<f4", ("N", 3), "sweep thinned evenly over directions, lidar frame; input of the network"
+    )
+    lidar_intensity: np.ndarray = array(
+        "|u1", ("N",), "rank of the reflectivity in its sweep, 0..255; 0 where not logged"
+    )
+    lidar_flags: np.ndarray = array("|u1", ("N",), "POINT_IS_EDGE | POINT_IS_GROUND")
+    lidar_count: int = column("points among the rows of lidar_*", kind="int32")
+    cluster_xyz_m: np.ndarray = array(
+        "<f4", ("N", 3), "uniform sample of the object clusters' points, lidar frame; for losses"
+    )
+    cluster_id: np.ndarray = array("<i2", ("N",), "row of cluster_centre_m, -1 = beyond its rows")
+    cluster_point_count: int = column("points among the rows of cluster_xyz_m", kind="int32")
+    cluster_centre_m: np.ndarray = array(
+        "<f4", (48, 3), "centres of the largest object clusters, lidar frame"
+    )
+    cluster_count: int = column("clusters among the 48 rows", kind="int32")
+    edge_xyz_m: np.ndarray = array("<f4", ("N", 3), "depth jumps, lidar frame; for losses")
+    edge_side: np.ndarray = array("|u1", ("N",), "EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies")
+    edge_count: int = column("jumps among the rows of edge_*", kind="int32")
+    drivable_xyz_m: np.ndarray = array(
+        "<f4", (512, 3), "sample of the drivable ground's 1 m cells ahead, lidar frame"
+    )
+    drivable_count: int = column("cells among the 512 rows", kind="int32")
+    drivable_area_m2: float = column("area that they stand for")
+    ground_plane: np.ndarray = array(
+        "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; zeros where none was found"
+    )
+    # radar
+    radar_xyz_m: np.ndarray = array("<f4", (384, 3), "detections, radar frame")
+    radar_residual_mps: np.ndarray = array("<f4", (384,), "Doppler, compensated for the own motion")
+    radar_power_db: np.ndarray = array(
+        "<f4", (384,), "power or RCS, less its median in the scan; 0 where not logged"
+    )
+    radar_motion: np.ndarray = array("|u1", (384,), "0 static, 1 moving, 2 undecided")
+    radar_count: int = column("detections among the 384 rows", kind="int32")
+    radar_has_elevation: bool = column("False where all elevations are 0")
+    track_xyz_m: np.ndarray = array("<f4", (24, 3), "centres of tracked moving clusters, radar frame")
+    track_count: int = column("tracks among the 24 rows", kind="int32")
+    radar_drivable: np.ndarray = array(
+        "|u1",
+        (80, 160),
+        (
+            "drivable by radar, soft, 255 = surely: x ahead by rows, y from right to left by columns, cells of 1 "
+            "m (row r, column c: x = r + 1/2, y = c - 79.5)"
+        ),
+    )
+    # the whole
+    ego_speed_mps: float = column("as in observations; 0 where unknown")
+    way_velocity_mps: np.ndarray = array(
+        "<f8",
+        (3,),
+        "velocity of the radar by Doppler of static detections, radar axes; zeros where unknown",
+        default_factory=lambda: np.zeros(3),
+    )
+    way_sigma_rad: float = column("of its elevation, by the scan alone; 0 where unknown", default=0.0)
+    road_slope: float = column(
+        "of the road under the car along that way, lidar axes; up positive", default=0.0
+    )
+    camera_lag_s: float = column("camera_stamp - stamp")
+    radar_lag_s: float = column("radar_stamp - stamp")
+    camera_model: str = column("as in frames, for reference")
+    camera_K: np.ndarray = array("<f8", (3, 3), "as in frames [px]")
+    camera_D: np.ndarray = array("<f8", ("N",), "as in frames")
+    image_width_px: int = column("as in frames", kind="int32")
+    image_height_px: int = column("as in frames", kind="int32")
+    prior_camera_lidar_qw: float = column(_PRIOR_CAMERA_LIDAR)
+    prior_camera_lidar_qx: float = column(_PRIOR_CAMERA_LIDAR)
+    prior_camera_lidar_qy: float = column(_PRIOR_CAMERA_LIDAR)
+    prior_camera_lidar_qz: float = column(_PRIOR_CAMERA_LIDAR)
+    prior_camera_lidar_tx_m: float = column(_PRIOR_CAMERA_LIDAR)
+    prior_camera_lidar_ty_m: float = column(_PRIOR_CAMERA_LIDAR)
+    prior_camera_lidar_tz_m: float = column(_PRIOR_CAMERA_LIDAR)
+    prior_lidar_radar_qw: float = column(_PRIOR_LIDAR_RADAR)
+    prior_lidar_radar_qx: float = column(_PRIOR_LIDAR_RADAR)
+    prior_lidar_radar_qy: float = column(_PRIOR_LIDAR_RADAR)
+    prior_lidar_radar_qz: float = column(_PRIOR_LIDAR_RADAR)
+    prior_lidar_radar_tx_m: float = column(_PRIOR_LIDAR_RADAR)
+    prior_lidar_radar_ty_m: float = column(_PRIOR_LIDAR_RADAR)
+    prior_lidar_radar_tz_m: float = column(_PRIOR_LIDAR_RADAR)
+
+
+TRAINING = table_of(
+    TrainingRow,
     "training",
     3,
-    (
-        scalar("frame_index", "int32", "row of table frames"),
-        scalar("vehicle", "string", "vehicle id"),
-        scalar("day", "string", "YYYY-MM-DD"),
-        scalar("drive", "int32", "as in frames"),
-        scalar("stamp_ns", "int64", "as in frames"),
-        scalar("split", "string", "train, val or test"),
-        scalar(
-            "place", "string", "cell of the map, or stretch of the drive where the log knows no positions"
-        ),
-        scalar("environment", "string", "of the drive: highway, urban, mixed or unknown"),
-        scalar("rig", "string", "rig of fleet.toml"),
-        array(
-            "fingerprint", "|u1", (32,), "256 signs of brightness steps in the small image: near-duplicates"
-        ),
-        # the same for all rows of a lake
-        scalar("grid_step_deg", "float64", "size of a cell"),
-        scalar("grid_height", "int32", "H: rows of the grid"),
-        scalar("grid_width", "int32", "W: columns of the grid"),
-        # camera, on the grid
-        array(
-            "image",
-            "|u1",
-            (3, "N"),
-            "red, green, blue; each H W row by row, area-averaged; 0 outside the image",
-        ),
-        array("grid_class", "|u1", ("N",), "H W: index into GRID_CLASSES, by majority; UNKNOWN_CLASS"),
-        array("grid_seen", "|u1", ("N",), "H W: 1 where the image shows the whole cell"),
-        array(
-            "class_distance",
-            "|u1",
-            (6, "N"),
-            "by DISTANCE_GROUPS, each H W: angle to the nearest pixel of the group [0.1 deg], 255 = 25.5 deg or more",
-        ),
-        array(
-            "edge_offset",
-            "|i1",
-            (4, "N"),
-            "by EDGE_LEFT/RIGHT/ABOVE/BELOW of observations, each H W: signed way from the cell's centre to the "
-            "nearest mask boundary of that direction, along the row (left, right; positive = to the right) or column "
-            "(above, below; positive = downwards) [0.05 deg]; NO_EDGE = none within 6.35 deg",
-        ),
-        array("sky_depth", "|u1", ("N",), "H W: depth inside the sky [0.1 deg], 0 outside it"),
-        array(
-            "detection_box_rad",
-            "<f4",
-            (24, 4),
-            "road users: azimuth left, elevation top, azimuth right, elevation bottom of the box (azimuth to the left "
-            "and elevation upwards are positive)",
-        ),
-        scalar("detection_count", "int32", "road users among the 24 rows"),
-        # lidar
-        array(
-            "lidar_xyz_m",
-            "<f4",
-            ("N", 3),
-            "sweep thinned evenly over directions, lidar frame; input of the network",
-        ),
-        array(
-            "lidar_intensity",
-            "|u1",
-            ("N",),
-            "rank of the reflectivity in its sweep, 0..255; 0 where not logged",
-        ),
-        array("lidar_flags", "|u1", ("N",), "POINT_IS_EDGE | POINT_IS_GROUND"),
-        scalar("lidar_count", "int32", "points among the rows of lidar_*"),
-        array(
-            "cluster_xyz_m",
-            "<f4",
-            ("N", 3),
-            "uniform sample of the object clusters' points, lidar frame; for losses",
-        ),
-        array("cluster_id", "<i2", ("N",), "row of cluster_centre_m, -1 = beyond its rows"),
-        scalar("cluster_point_count", "int32", "points among the rows of cluster_xyz_m"),
-        array("cluster_centre_m", "<f4", (48, 3), "centres of the largest object clusters, lidar frame"),
-        scalar("cluster_count", "int32", "clusters among the 48 rows"),
-        array("edge_xyz_m", "<f4", ("N", 3), "depth jumps, lidar frame; for losses"),
-        array("edge_side", "|u1", ("N",), "EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies"),
-        scalar("edge_count", "int32", "jumps among the rows of edge_*"),
-        array(
-            "drivable_xyz_m", "<f4", (512, 3), "sample of the drivable ground's 1 m cells ahead, lidar frame"
-        ),
-        scalar("drivable_count", "int32", "cells among the 512 rows"),
-        scalar("drivable_area_m2", "float64", "area that they stand for"),
-        array(
-            "ground_plane", "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; zeros where none was found"
-        ),
-        # radar
-        array("radar_xyz_m", "<f4", (384, 3), "detections, radar frame"),
-        array("radar_residual_mps", "<f4", (384,), "Doppler, compensated for the own motion"),
-        array(
-            "radar_power_db", "<f4", (384,), "power or RCS, less its median in the scan; 0 where not logged"
-        ),
-        array("radar_motion", "|u1", (384,), "0 static, 1 moving, 2 undecided"),
-        scalar("radar_count", "int32", "detections among the 384 rows"),
-        scalar("radar_has_elevation", "bool", "False where all elevations are 0"),
-        array("track_xyz_m", "<f4", (24, 3), "centres of tracked moving clusters, radar frame"),
-        scalar("track_count", "int32", "tracks among the 24 rows"),
-        array(
-            "radar_drivable",
-            "|u1",
-            (80, 160),
-            "drivable by radar, soft, 255 = surely: x ahead by rows, y from right to left by columns, cells of 1 m "
-            "(row r, column c: x = r + 1/2, y = c - 79.5)",
-        ),
-        # the whole
-        scalar("ego_speed_mps", "float64", "as in observations; 0 where unknown"),
-        array(
-            "way_velocity_mps",
-            "<f8",
-            (3,),
-            "velocity of the radar by Doppler of static detections, radar axes; zeros where unknown",
-        ),
-        scalar("way_sigma_rad", "float64", "of its elevation, by the scan alone; 0 where unknown"),
-        scalar("road_slope", "float64", "of the road under the car along that way, lidar axes; up positive"),
-        scalar("camera_lag_s", "float64", "camera_stamp - stamp"),
-        scalar("radar_lag_s", "float64", "radar_stamp - stamp"),
-        scalar("camera_model", "string", "as in frames, for reference"),
-        array("camera_K", "<f8", (3, 3), "as in frames [px]"),
-        array("camera_D", "<f8", ("N",), "as in frames"),
-        scalar("image_width_px", "int32", "as in frames"),
-        scalar("image_height_px", "int32", "as in frames"),
-        *transform_columns("prior_camera_lidar_", "reference T_camera_lidar: the day's prior, never a truth"),
-        *transform_columns("prior_lidar_radar_", "reference T_lidar_radar: the day's prior, never a truth"),
-    ),
     "One frame per row. Padded rows of arrays are 0.",
     made_by="prepare",
     reads_versions=(
@@ -201,80 +215,3 @@ TRAINING = TableSchema(
         2,
     ),  # 1 knew no way_* and no road_slope; both hold six columns more, which nothing read
 )
-
-
-@dataclass(frozen=True, eq=False)
-class TrainingRow:
-    """One row of `training`; fields are the columns of the same name, arrays decoded."""
-
-    frame_index: int
-    vehicle: str
-    day: str
-    drive: int
-    stamp_ns: int
-    split: str
-    place: str
-    environment: str
-    rig: str
-    fingerprint: np.ndarray
-    grid_step_deg: float
-    grid_height: int
-    grid_width: int
-    image: np.ndarray
-    grid_class: np.ndarray
-    grid_seen: np.ndarray
-    class_distance: np.ndarray
-    edge_offset: np.ndarray
-    sky_depth: np.ndarray
-    detection_box_rad: np.ndarray
-    detection_count: int
-    lidar_xyz_m: np.ndarray
-    lidar_intensity: np.ndarray
-    lidar_flags: np.ndarray
-    lidar_count: int
-    cluster_xyz_m: np.ndarray
-    cluster_id: np.ndarray
-    cluster_point_count: int
-    cluster_centre_m: np.ndarray
-    cluster_count: int
-    edge_xyz_m: np.ndarray
-    edge_side: np.ndarray
-    edge_count: int
-    drivable_xyz_m: np.ndarray
-    drivable_count: int
-    drivable_area_m2: float
-    ground_plane: np.ndarray
-    radar_xyz_m: np.ndarray
-    radar_residual_mps: np.ndarray
-    radar_power_db: np.ndarray
-    radar_motion: np.ndarray
-    radar_count: int
-    radar_has_elevation: bool
-    track_xyz_m: np.ndarray
-    track_count: int
-    radar_drivable: np.ndarray
-    ego_speed_mps: float
-    camera_lag_s: float
-    radar_lag_s: float
-    camera_model: str
-    camera_K: np.ndarray
-    camera_D: np.ndarray
-    image_width_px: int
-    image_height_px: int
-    prior_camera_lidar_qw: float
-    prior_camera_lidar_qx: float
-    prior_camera_lidar_qy: float
-    prior_camera_lidar_qz: float
-    prior_camera_lidar_tx_m: float
-    prior_camera_lidar_ty_m: float
-    prior_camera_lidar_tz_m: float
-    prior_lidar_radar_qw: float
-    prior_lidar_radar_qx: float
-    prior_lidar_radar_qy: float
-    prior_lidar_radar_qz: float
-    prior_lidar_radar_tx_m: float
-    prior_lidar_radar_ty_m: float
-    prior_lidar_radar_tz_m: float
-    way_velocity_mps: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    way_sigma_rad: float = 0.0
-    road_slope: float = 0.0

@@ -22,7 +22,7 @@ from pipeline.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_records, read_rows, write_partition
 from pipeline.work import NothingUsable, Records, Run, Task, Told, Window, Work
-from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS, Observation
 from tests.makers.fleet_files import fleet_toml
@@ -275,8 +275,9 @@ def test_row_groups_are_small_and_rows_are_asked_for_as_they_are_written(task, s
 
 def record(work_key):
     return CalibrationRecord(
-        *(DAY.vehicle, DAY.day, "joint", PAIRS[0], *FRAMES_OF_PAIR[PAIRS[0]], "held", "", work_key, "0", 0)
-    )
+        vehicle=DAY.vehicle, day=DAY.day, method="joint", pair=PAIRS[0], parent_frame="camera", child_frame="lidar",
+        status="held", reason="", work_key=work_key, code_version="0", seed=0,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("again", [False, True])

@@ -63,8 +63,10 @@ def vehicle_findings(
             if before is not None:
                 chart = _begun_before(chart, before.get((pair, dof)))
             base = DriftFinding(
-                audit.vehicle, audit.day, audit.method, pair, dof, chart.status, chart.reason, chart.days_used,
-                limit_of(pair, dof, config), audit.work_key, chart.statistic, chart.threshold, inputs=audit.inputs,
+                vehicle=audit.vehicle, day=audit.day, method=audit.method, pair=pair, dof=dof,
+                status=chart.status, reason=chart.reason, days_used=chart.days_used,
+                limit=limit_of(pair, dof, config), work_key=audit.work_key, statistic=chart.statistic,
+                threshold=chart.threshold, inputs=audit.inputs,
             )  # fmt: skip
             findings.append(replace(base, **_change_columns(chart, verdict.attribution)))
     status = decide_status(findings)

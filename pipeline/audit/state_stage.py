@@ -151,7 +151,17 @@ def _states(
         found = fuse(_days(own), scale=scale, autocorrelation=_AUTOCORRELATION)
         parent, child = FRAMES_OF_PAIR[pair]
         words = _words(why, found)
-        base = StateRow(vehicle, last, method, pair, parent, child, "none", words, since=first or None)
+        base = StateRow(
+            vehicle=vehicle,
+            day=last,
+            method=method,
+            pair=pair,
+            parent_frame=parent,
+            child_frame=child,
+            status="none",
+            reason=words,
+            since=first or None,
+        )
         rows.append(base if found is None else _with_state(base, found, own, fleet.verify))
     return Records(rows, Partition(vehicle, last), inputs=inputs)
 

@@ -125,24 +125,24 @@ def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
     """
     effort = outcome.effort
     return OutcomeRow(
-        outcome.vehicle,
-        outcome.day,
-        outcome.stage,
-        method if outcome.stage == CALIBRATIONS.made_by else "",
-        "done" if outcome.status == "cached" else outcome.status,
-        outcome.reason,
+        vehicle=outcome.vehicle,
+        day=outcome.day,
+        stage=outcome.stage,
+        method=method if outcome.stage == CALIBRATIONS.made_by else "",
+        status="done" if outcome.status == "cached" else outcome.status,
+        reason=outcome.reason,
         # What fails has no key: the same failure is the same row, however often it is tried.
-        outcome.work_key or work_key(outcome.stage, CODE_VERSION, outcome.reason, []),
-        outcome.rows,
-        outcome.kept,
-        outcome.rejected,
-        effort.began_at,
-        effort.seconds,
-        effort.bytes_read,
-        effort.bytes_written,
-        CODE_VERSION,
-        list(outcome.inputs),
-        list(outcome.faults),
+        work_key=outcome.work_key or work_key(outcome.stage, CODE_VERSION, outcome.reason, []),
+        rows=outcome.rows,
+        kept=outcome.kept,
+        rejected=outcome.rejected,
+        began_at=effort.began_at,
+        seconds=effort.seconds,
+        bytes_read=effort.bytes_read,
+        bytes_written=effort.bytes_written,
+        code_version=CODE_VERSION,
+        inputs=list(outcome.inputs),
+        faults=list(outcome.faults),
     )
 
 

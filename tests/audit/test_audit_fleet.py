@@ -196,7 +196,14 @@ def _day(k: int) -> str:
 
 
 def _service(lake: Lake, day: int, sensor: str = "radar", vehicle: str = "v") -> None:
-    event = ServiceEvent(vehicle, _day(day), sensor, "repair", "", f"{vehicle}-{day}-{sensor}")
+    event = ServiceEvent(
+        vehicle=vehicle,
+        day=_day(day),
+        sensor=sensor,
+        kind="repair",
+        note="",
+        work_key=f"{vehicle}-{day}-{sensor}",
+    )
     write_records(lake, SERVICE_EVENTS, Partition(vehicle, _day(day)), [event], event.work_key, "0.6.0")
 
 

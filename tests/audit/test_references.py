@@ -101,7 +101,7 @@ def test_states_keep_the_first_accepted_days_and_from_the_tenth_on_what_they_mak
 
 def test_what_is_kept_no_longer_counts_after_a_service_event_another_setting_or_another_record(lake):
     assert kept(lake, count=9) == {}
-    event = ServiceEvent("a", _day(20), "radar", "re-mount")
+    event = ServiceEvent(vehicle="a", day=_day(20), sensor="radar", kind="re-mount")
     assert {p for v, p in kept(lake, [event]) if v == "a"} == {0}  # camera_lidar has nothing to do with it
     old = next(r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="a", day=_day(2)))
     commit_records(lake, CALIBRATIONS, [replace(old, work_key="again", recorded_at="", asserted_at="")])

@@ -126,7 +126,7 @@ def test_a_state_rests_on_the_accepted_days_since_the_last_change(tmp_path: Path
     assert len(states["camera_lidar"].days) == 19
     assert states["camera_lidar"].since is None
     assert states["camera_lidar"].determined == ["azimuth", "elevation"]
-    event = ServiceEvent("v", _day(21), "all", "repair", "", "k")
+    event = ServiceEvent(vehicle="v", day=_day(21), sensor="all", kind="repair", note="", work_key="k")
     write_records(lake, SERVICE_EVENTS, Partition("v", _day(21)), [event], "k", "0.6.0")
     states = _states(lake)
     assert {(s.status, tuple(s.days)) for s in states.values()} == {("none", ())}

@@ -18,7 +18,15 @@ def charts(**changes):
         for dof in DOF_NAMES:
             status = "GREEN" if (pair, dof) in WATCHED else "UNKNOWN"
             rows[pair, dof] = DriftFinding(
-                "v", "2026-03-09", "joint", pair, dof, status, "no change", 9, 0.002
+                vehicle="v",
+                day="2026-03-09",
+                method="joint",
+                pair=pair,
+                dof=dof,
+                status=status,
+                reason="no change",
+                days_used=9,
+                limit=0.002,
             )
     for name, fields in changes.items():
         pair, dof = name.rsplit("_", 1)

@@ -30,7 +30,9 @@ def record(pair, T, environment="urban", day=DAY):
     names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     pose = {prefix + n: float(v) for prefix in ("", "prior_") for n, v in zip(names, values, strict=True)}
     return CalibrationRecord(
-        VEHICLE, day, "joint-optimisation", pair, *FRAMES_OF_PAIR[pair], "accepted", "", "key", "0", 0,
+        vehicle=VEHICLE, day=day, method="joint-optimisation", pair=pair, parent_frame=FRAMES_OF_PAIR[pair][0],
+        child_frame=FRAMES_OF_PAIR[pair][1], status="accepted", reason="", work_key="key", code_version="0",
+        seed=0,
         environment=environment, **pose,
     )  # fmt: skip
 

@@ -56,7 +56,19 @@ def test_reasons_that_more_frames_cannot_clear_ask_for_none(reason):
 
 def record(pair, reason):
     status = "held" if reason else "accepted"
-    return CalibrationRecord("car", DAY, "joint", pair, *FRAMES_OF_PAIR[pair], status, reason, "key", "0", 0)
+    return CalibrationRecord(
+        vehicle="car",
+        day=DAY,
+        method="joint",
+        pair=pair,
+        parent_frame=FRAMES_OF_PAIR[pair][0],
+        child_frame=FRAMES_OF_PAIR[pair][1],
+        status=status,
+        reason=reason,
+        work_key="key",
+        code_version="0",
+        seed=0,
+    )
 
 
 def results(reason, logged=36000, planned=400, ingest="done"):

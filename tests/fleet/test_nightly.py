@@ -73,16 +73,17 @@ class StagesThatSay:
         }
         rows = [
             CalibrationRecord(
-                partition.vehicle,
-                partition.day,
-                "joint",
-                pair,
-                *FRAMES_OF_PAIR[pair],
-                status,
-                "",
-                "key",
-                "0",
-                0,
+                vehicle=partition.vehicle,
+                day=partition.day,
+                method="joint",
+                pair=pair,
+                parent_frame=FRAMES_OF_PAIR[pair][0],
+                child_frame=FRAMES_OF_PAIR[pair][1],
+                status=status,
+                reason="",
+                work_key="key",
+                code_version="0",
+                seed=0,
             )
             for pair, status in zip(PAIRS, statuses.get(answer, ["accepted"] * 3), strict=True)
         ]

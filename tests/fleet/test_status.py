@@ -11,7 +11,17 @@ CLOCK = itertools.count()
 def row(vehicle, day, stage, status="done", method="", reason="", **values):
     stamp = f"2026-04-01T00:00:{next(CLOCK):02d}.000000Z"
     method = "joint" if stage == "calibrate" and not method else method
-    return OutcomeRow(vehicle, day, stage, method, status, reason, "key", asserted_at=stamp, **values)
+    return OutcomeRow(
+        vehicle=vehicle,
+        day=day,
+        stage=stage,
+        method=method,
+        status=status,
+        reason=reason,
+        work_key="key",
+        asserted_at=stamp,
+        **values,
+    )
 
 
 def statuses(*rows):

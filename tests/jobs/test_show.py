@@ -20,10 +20,24 @@ from tests.audit.fleet_records import vehicle_records
 def test_every_record_table_is_shown_for_people_and_for_machines(tmp_path, capsys):
     lake = Lake.at(tmp_path)
     commit_records(
-        lake, OUTCOMES, [OutcomeRow("car", "2026-03-02", "ingest", "", "refused", "no [radar]", "k")]
+        lake,
+        OUTCOMES,
+        [
+            OutcomeRow(
+                vehicle="car",
+                day="2026-03-02",
+                stage="ingest",
+                method="",
+                status="refused",
+                reason="no [radar]",
+                work_key="k",
+            )
+        ],
     )
     commit_records(
-        lake, SERVICE_EVENTS, [ServiceEvent("car", "2026-03-03", "radar", "repair", "new bracket")]
+        lake,
+        SERVICE_EVENTS,
+        [ServiceEvent(vehicle="car", day="2026-03-03", sensor="radar", kind="repair", note="new bracket")],
     )
     for table, column, value in (
         ("outcomes", "reason", "no [radar]"),
@@ -55,7 +69,8 @@ def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, 
     lake = Lake.at(tmp_path)
     commit_records(lake, CALIBRATIONS, held)
     row = OutcomeRow(
-        "car", held[0].day, "calibrate", "joint", "done", "sky beside roofs", "k", kept={"held": 3},
+        vehicle="car", day=held[0].day, stage="calibrate", method="joint", status="done",
+        reason="sky beside roofs", work_key="k", kept={"held": 3},
         faults=["labels_offset"],
     )  # fmt: skip
     commit_records(lake, OUTCOMES, [row])

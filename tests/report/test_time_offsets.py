@@ -89,7 +89,18 @@ def test_edges_meet_their_silhouettes_again_once_the_offset_is_known():
 def test_a_run_gives_the_offsets_that_it_estimated_and_says_them():
     run = {
         pair: CalibrationRecord(
-            "car", "2026-01-01", "joint", pair, parent, child, "accepted", "", "key", "1", 0, time_offset_s=s
+            vehicle="car",
+            day="2026-01-01",
+            method="joint",
+            pair=pair,
+            parent_frame=parent,
+            child_frame=child,
+            status="accepted",
+            reason="",
+            work_key="key",
+            code_version="1",
+            seed=0,
+            time_offset_s=s,
         )
         for (pair, (parent, child)), s in zip(FRAMES_OF_PAIR.items(), (0.0281, None, None), strict=True)
     }

@@ -22,7 +22,8 @@ COVARIANCE = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03]) ** 2
 def record(T, status="accepted", pair="camera_lidar") -> CalibrationRecord:
     q, t = to_quaternion(T), T[:3, 3]
     return CalibrationRecord(
-        "v", "2026-03-02", "joint", pair, "camera", "lidar", status, "", "key", "1", 0,
+        vehicle="v", day="2026-03-02", method="joint", pair=pair, parent_frame="camera", child_frame="lidar",
+        status=status, reason="", work_key="key", code_version="1", seed=0,
         qw=q[0], qx=q[1], qy=q[2], qz=q[3], tx_m=t[0], ty_m=t[1], tz_m=t[2],
         covariance=COVARIANCE, observability=[1.0] * 6, observable=[True] * 5 + [False],
         time_offset_s=0.01, time_offset_sigma_s=0.002, diagnostics={"halves_m": 0.01},

@@ -217,7 +217,8 @@ def status_of_night(verdict: VehicleVerdict, config: AuditConfig) -> VehicleStat
         change, moved = chart.change, verdict.attribution
         rows.append(
             DriftFinding(
-                "v", "", "joint", pair, dof, chart.status, chart.reason, chart.days_used, limit_of(pair, dof, config),
+                vehicle="v", day="", method="joint", pair=pair, dof=dof, status=chart.status,
+                reason=chart.reason, days_used=chart.days_used, limit=limit_of(pair, dof, config),
                 statistic=chart.statistic, threshold=chart.threshold,
                 start_day=None if change is None else str(change.day),
                 kind=None if change is None else change.kind,
