@@ -20,7 +20,7 @@ from pydantic import (
 
 from pipeline.errors import ConfigError
 from pipeline.names import is_vehicle
-from pipeline.rigs import OnnxSemantics, Rig, Section
+from pipeline.rigs import OnnxSemantics, Positive, Rig, Section
 from pipeline.sections import (
     TERMS,
     AuditConfig,
@@ -63,9 +63,11 @@ class Vehicle(Section):
 
 
 class FleetSection(Section):
-    """The fleet's name."""
+    """The fleet's name, and what its workers may take of the machine."""
 
     name: str
+    # Of one stage of one vehicle-day, beside what the worker has. Ordinary days take 1.3, 1 of it reserved and unused.
+    memory_gb: Positive = 4.0
 
 
 class FleetConfig(Section):

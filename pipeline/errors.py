@@ -17,6 +17,7 @@ __all__ = [
     "ModelOutputError",
     "SolveError",
     "StorageError",
+    "TooMuchMemoryError",
 ]
 
 
@@ -116,6 +117,18 @@ class StorageError(BoresightError):
     def __init__(self, place: str, problem: str) -> None:
         self.place, self.problem = place, problem
         super().__init__(f"{place}: {problem}")
+
+
+class TooMuchMemoryError(BoresightError):
+    """Work on a vehicle-day that asked for more memory than a worker may take; the day is refused."""
+
+    faults = ("memory",)
+
+    def __init__(self, gigabytes: float) -> None:
+        self.gigabytes = gigabytes
+        super().__init__(
+            f"needed more than {gigabytes:g} GB of memory (fleet.memory_gb): look for a damaged log, or raise it"
+        )
 
 
 class SolveError(BoresightError):

@@ -13,7 +13,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from pipeline.config import config_hash
-from pipeline.errors import BoresightError, ContractError, DamagedError
+from pipeline.errors import BoresightError, ContractError, DamagedError, TooMuchMemoryError
+from pipeline.memory import at_most
 from pipeline.results import Outcome, Progress, measured
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.records import assert_records, commit_last, commit_records, read_records
@@ -146,7 +147,9 @@ def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
         except (BoresightError, OSError) as err:
             damaged = err.path if isinstance(err, DamagedError) else ""
             told = {
-                "faults": ("configuration",) if getattr(err, "exit_code", 1) == 2 else (),
+                "faults": ("configuration",)
+                if getattr(err, "exit_code", 1) == 2
+                else getattr(err, "faults", ()),
                 "damaged": damaged,
                 "effort": effort(),
             }
@@ -177,6 +180,7 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
         return refused
     try:
         with (
+            at_most(task.fleet.fleet.memory_gb),
             closing(work.rows(run)) as rows,
             write_partition(task.lake, schema, task.partition, run.work_key, CODE_VERSION, run.inputs) as out,
         ):
@@ -184,7 +188,7 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
                 out.append(group)
             counts = {"kept": {"frames": out.rows, **run.kept}, "rejected": dict(run.rejected)}
             out.describe(**counts, remarks=run.remarks, **run.extra)
-    except NothingUsable as refusal:
+    except (NothingUsable, TooMuchMemoryError) as refusal:
         counts = {"kept": {"frames": 0, **run.kept}, "rejected": dict(run.rejected)}
         told = counts | {"reason": str(refusal), "faults": refusal.faults, "inputs": run.inputs}
         return _outcome(stage, task, "refused", run.work_key, **told)
@@ -196,7 +200,10 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
 
 def _refused_before(stage: Stage, task: Task, run: Run) -> Outcome | None:
     """What was said of the same inputs before, if they were refused: nothing would be written now either."""
+    too_much = str(TooMuchMemoryError(task.fleet.fleet.memory_gb))  # with another bound it may be enough
     for row in task.before:
+        if "memory" in row.faults and row.reason != too_much:
+            continue
         if (row.stage, row.status, row.work_key) == (stage.name, "refused", run.work_key):
             counts = {"rows": row.rows, "kept": row.kept, "rejected": row.rejected}
             told = counts | {"reason": row.reason, "faults": tuple(row.faults), "inputs": run.inputs}
@@ -241,7 +248,7 @@ def _add_records(stage: Stage, task: Task, work: Work, run: Run, schema: TableSc
         cached = _record_outcome(stage, task, work, "cached", run.work_key, recorded, where)
         return replace(cached, inputs=run.inputs)
     written: list[Any] = []
-    with closing(work.rows(run)) as batches:
+    with at_most(task.fleet.fleet.memory_gb), closing(work.rows(run)) as batches:
         for records in batches:
             written += records.rows
     if task.commit:

@@ -13,6 +13,7 @@ FAULTS: Final = {
     "doppler": "the sign, the unit or the period of the radar's Doppler is not as configured",
     "few_scenes": "the day shows too few different scenes",
     "labels_offset": "semantic labels lie beside the picture that they belong to",
+    "memory": "the day's logs ask for more memory than a worker may take",
     "model_output": "a perception model returns values that cannot be right",
     "moved_in_day": "a sensor moved during the day",
     "odometry": "the odometry contradicts the other sources of motion",

@@ -18,6 +18,7 @@ LAYERS = ("schemas", "pipeline", "jobs")
 FOUNDATIONS = {
     "config",
     "errors",
+    "memory",
     "names",
     "sections",
     "results",

@@ -8,6 +8,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pipeline.runner
@@ -225,6 +226,27 @@ def test_inputs_that_were_refused_are_not_worked_out_again_and_others_are(task, 
     other, made = stage(rows, {"voxel_m": 0.5})
     assert why_to_run(other, task) == "no observations yet"
     assert (other.run(task).status, made.asked) == ("refused", 1)
+
+
+def test_a_day_that_asks_for_more_memory_than_a_worker_may_take_is_refused_until_it_may_take_more(
+    task, stage
+):
+    def with_bound(gigabytes):
+        section = task.fleet.fleet.model_copy(update={"memory_gb": gigabytes})
+        return replace(task, fleet=task.fleet.model_copy(update={"fleet": section}))
+
+    def rows(_run):
+        keep = [np.ones(1 << 22) for _ in range(16)]  # half a gigabyte
+        yield from make_day(len(keep))
+
+    greedy, made = stage(rows)
+    found = greedy.run(with_bound(0.2))
+    assert (found.status, found.faults) == ("refused", ("memory",))
+    assert "needed more than 0.2 GB of memory (fleet.memory_gb)" in found.reason
+    assert read_manifest(task.lake, OBSERVATIONS, DAY) is None
+    task = replace(task, before=[outcome_row(found, "")])
+    assert (greedy.run(with_bound(0.2)).status, made.asked) == ("refused", 1)
+    assert (greedy.run(with_bound(2.0)).status, made.asked) == ("done", 2)
 
 
 def test_why_a_stage_would_run_names_what_changed(task, stage, monkeypatch):

@@ -5,6 +5,10 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
+
+from pipeline.memory import at_most
+
 
 def behave(item, progress):
     kind, where = item
@@ -17,6 +21,10 @@ def behave(item, progress):
         os.kill(os.getpid(), signal.SIGKILL)
     elif kind.startswith("raise"):
         raise RuntimeError(f"poisoned {kind}")
+    elif kind == "greedy":
+        with at_most(0.25):
+            keep = [np.ones(1 << 22) for _ in range(64)]  # 32 MiB each
+        return len(keep)
     elif kind.startswith("wait"):
         time.sleep(2)
     elif kind.startswith("sleep"):

@@ -1,4 +1,5 @@
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -49,6 +50,18 @@ def test_every_item_ends_once_and_an_error_stays_with_its_own_item(installed, be
     assert all(tries(tmp_path, kind) == 1 for kind in found)
     if installed == "inline":
         assert (0, 1, 2, "a at work") in seen
+
+
+@pytest.mark.parametrize("installed", EXECUTORS, indirect=True)
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_worker_that_asks_for_too_much_memory_is_refused_it_by_name_and_works_on(
+    installed, behave, tmp_path
+):
+    found = run(installed, behave, ["greedy", "a", "b"], tmp_path, workers=1)
+    assert "needed more than 0.25 GB of memory" in found["greedy"].error
+    assert [found[kind].value[0] for kind in "ab"] == ["a done", "b done"]
+    assert tries(tmp_path, "greedy") == 1  # nobody was killed
+    assert resource.getrlimit(resource.RLIMIT_DATA)[0] == resource.RLIM_INFINITY
 
 
 def test_workers_have_one_thread_and_the_parent_keeps_its_setting(behave, tmp_path, monkeypatch):
