@@ -10,6 +10,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 from cyclopts import App, CycloptsError
@@ -17,10 +18,12 @@ from cyclopts import App, CycloptsError
 from jobs.terminal.logging import configure, logger
 from jobs.terminal.summary import print_summary
 from pipeline.errors import BoresightError
+from pipeline.store.atomic_write import NO_SPACE
 
 __all__ = ["COMMANDS", "app", "main"]
 
 FAILED, USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+_OUTPUTS = ("--out", "--page", "--report")
 
 # Command -> where its function is, and what `boresight --help` says of it.
 COMMANDS: dict[str, tuple[str, str]] = {
@@ -113,10 +116,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         code, reason = TERMINATED, "terminated"
     except Exception as err:  # noqa: BLE001 - the last resort: one line for people, the traceback in the log
         logger().error("unexpected error", command=command, exc_info=True)
-        code, reason = FAILED, f"{type(err).__name__}: {err}"
+        code, reason = FAILED, f"{type(err).__name__}: {err}{_output(err, tokens)}"
     else:
         return result if isinstance(result, int) else 0
     return _end(command, reason, code)
+
+
+def _output(err: Exception, tokens: Sequence[str]) -> str:
+    """What the command writes to, for an error for want of space without a path: those of lakes have theirs."""
+    if not isinstance(err, OSError) or err.errno not in NO_SPACE or err.filename is not None:
+        return ""
+    parts = [part for token in tokens for part in token.split("=", 1)]
+    return "".join(f", writing to {path}" for option, path in pairwise(parts) if option in _OUTPUTS)
 
 
 def _stop(signum: int, _frame: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import time
@@ -11,10 +12,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["atomic_write", "remove_abandoned"]
+__all__ = ["NO_SPACE", "atomic_write", "naming", "remove_abandoned"]
 
 # No vehicle-day takes a day: what is older was left by a killed writer on another machine.
 _ABANDONED_S = 24 * 3600.0
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # a disk, a quota or a limit is used up
 
 
 @contextmanager
@@ -28,7 +30,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
     temporary = path.parent / f".writing-{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex}.tmp"
     try:
         # "x" and not mkstemp: the file gets the rights that the umask says, so that others can read the lake.
-        with temporary.open("xb") as stream:
+        with naming(path), temporary.open("xb") as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
@@ -37,6 +39,21 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
         raise
     _flush_folder(path.parent)
+
+
+@contextmanager
+def naming(path: object) -> Iterator[None]:
+    """Let an error for want of space say where: what writes to an open file does not know its name.
+
+    Raises:
+        OSError: with the path.
+    """
+    try:
+        yield
+    except OSError as err:
+        if err.errno not in NO_SPACE or err.filename is not None:
+            raise
+        raise OSError(err.errno, os.strerror(err.errno), str(path)) from err
 
 
 def remove_abandoned(folder: Path) -> None:

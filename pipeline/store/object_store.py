@@ -24,6 +24,8 @@ import obstore
 from obstore.exceptions import BaseError, NotFoundError
 from obstore.store import S3Store
 
+from pipeline.store.atomic_write import naming
+
 __all__ = ["Bucket"]
 
 # A request that takes longer than this is tried anew: a healthy store answers one of 8 MiB within a second.
@@ -118,7 +120,7 @@ class Bucket:
 
         It goes through a local file, so that readers of the store see the whole object or none.
         """
-        with tempfile.TemporaryFile() as stream:
+        with naming(tempfile.gettempdir()), tempfile.TemporaryFile() as stream:
             yield cast("BinaryIO", stream)
             stream.seek(0)
             with self._as_os_errors(key):

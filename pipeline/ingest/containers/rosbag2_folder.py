@@ -15,10 +15,11 @@ from typing import BinaryIO, cast
 
 import zstandard
 
-from pipeline.errors import LogError
+from pipeline.errors import LogError, StorageError
 from pipeline.ingest.containers.bounded import most_bytes
 from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
+from pipeline.store.atomic_write import NO_SPACE
 from pipeline.store.remote_logs import LogPath
 
 __all__ = ["CompressedLog", "FetchedLog", "FolderLog"]
@@ -86,10 +87,13 @@ class _CopiedLog(ABC):
         self.path = path
         _remove_left_behind()
         self._folder = tempfile.TemporaryDirectory(prefix=f"{_UNPACKED}{os.getpid()}-")
+        where = self._folder.name
         try:
-            self._log = open_log(self._copied(Path(self._folder.name)), cache)
+            self._log = open_log(self._copied(Path(where)), cache)
         except (zstandard.ZstdError, OSError, LogError) as err:
             self._folder.cleanup()
+            if isinstance(err, OSError) and err.errno in NO_SPACE:  # this machine's trouble, not the log's
+                raise StorageError(where, f"no space left to unpack {path}") from err
             raise LogError(str(path), f"cannot be unpacked: {err}") from err
         except BaseException:
             self._folder.cleanup()
