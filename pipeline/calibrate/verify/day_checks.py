@@ -15,6 +15,7 @@ from pipeline.calibrate.verify.constancy import constancy_failures
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.motion_sources import MotionFindings
+from pipeline.calibrate.verify.prior_alarms import clock_alarms, edge_alarms, prior_alarms
 from pipeline.calibrate.verify.scene_count import scene_failures
 from pipeline.config import FleetConfig
 from pipeline.extrinsics.checks import FailedCheck
@@ -82,6 +83,18 @@ def _constancy(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
     return constancy_failures(day.solution.pairs)
 
 
+def _alarms(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+    """Mountings and clocks many sigmas from their priors."""
+    pairs = {p: e for p, e in day.solution.pairs.items() if e.frames_used}
+    sigma_s = day.fleet.solve.time_offset_sigma_s
+    found = [
+        prior_alarms(pairs, day.prior, day.limits),
+        clock_alarms(pairs, sigma_s, day.limits),
+        edge_alarms(pairs, day.prior, day.limits),
+    ]
+    return {pair: [check for of in found for check in of.get(pair, ())] for pair in pairs}
+
+
 # In the order in which a record states them.
 DAY_CHECKS: tuple[DayCheck, ...] = (
     _motion,
@@ -91,6 +104,7 @@ DAY_CHECKS: tuple[DayCheck, ...] = (
     _loop,
     _scenes,
     _constancy,
+    _alarms,
 )
 
 

@@ -210,6 +210,9 @@ def analyse_camera_lidar(
         half = replace(scored, terms=problem.terms.of_frames(np.arange(k, problem.terms.frames, 2)))
         halves.append(refine(half, analysis.state, steps=SCHEDULE.half_steps, fixed=fixed))
     diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves)
+    own_tz = analysis.profile.shift_from(float(problem.prior.T_camera_lidar[2, 3]))
+    if analysis.observability[5] < OBSERVABLE and own_tz is not None:
+        diagnostics |= {"own_tz_m": own_tz[0], "own_tz_sigma_m": own_tz[1]}
     witnesses = ask_witnesses(problem.terms, analysis.state, analysis.kernel, problem.blocks, problem.seed)
     found = _conclude(analysis, aligned, problem.config, diagnostics, witnesses)
     return replace(found, parts=_parts(problem, analysis, aligned.frames))

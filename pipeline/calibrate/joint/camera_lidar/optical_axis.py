@@ -29,6 +29,7 @@ __all__ = ["TZ", "TzProfile", "profile_tz", "with_tz"]
 
 TZ = 5  # of the eight unknowns
 _MAX_SIGMA_M = 9.99  # of what a record shows
+_REACH = 2  # spans, within which a parabola's top is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +41,12 @@ class TzProfile:
     bias_m: float
     kinds_apart_m: float  # tz by markings alone less tz by edges alone
     kinds_sigma_m: float
+    is_beyond: bool = False  # the parabola's top is further off than it can tell
+
+    def shift_from(self, tz_m: float) -> tuple[float, float] | None:
+        """How far the day alone puts tz from a prior, and that shift's sigma [m]; None where it does not know."""
+        sigma = float(np.sqrt(self.variance_m2 + self.bias_m**2 + TZ_COMMON_BIAS_M**2))
+        return None if self.is_beyond or not np.isfinite(sigma) else (self.tz_m - tz_m, sigma)
 
     def with_prior(self, tz_m: float, sigma_m: float) -> tuple[float, float, float]:
         """Value [m] and variance [m2] together with a prior, and the share of it that is the same every day."""
@@ -81,7 +88,8 @@ def profile_tz(scored: Scored, state: AlignmentState, follow: Float[np.ndarray, 
         bias = float(np.sqrt(max(apart**2 - sigma**2, 0.0) / 4 + unchecked**2))
     else:
         bias = TZ_UNCHECKED_BIAS_M
-    return TzProfile(centre + top, variance, bias, apart, min(sigma, _MAX_SIGMA_M))
+    is_beyond = abs(top) >= _REACH * SCHEDULE.tz_span_m
+    return TzProfile(centre + top, variance, bias, apart, min(sigma, _MAX_SIGMA_M), is_beyond)
 
 
 def with_tz(prior: Prior, tz_m: float) -> Prior:
@@ -107,7 +115,8 @@ def _maximum(x: Float[np.ndarray, " N"], value: Float[np.ndarray, " N"]) -> tupl
     if curvature <= 0:
         return 0.0, float("inf")
     noise = float(residual[0]) / (len(x) - 3) if len(residual) else 0.0
-    top = float(np.clip(slope / curvature, -2 * SCHEDULE.tz_span_m, 2 * SCHEDULE.tz_span_m))
+    reach = _REACH * SCHEDULE.tz_span_m
+    top = float(np.clip(slope / curvature, -reach, reach))
     spread = noise * np.linalg.inv(A.T @ A)
     J_top = np.array([0.0, 1.0, -top]) / curvature
     return top, float(1 / curvature + J_top @ spread @ J_top)

@@ -16,18 +16,17 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.lidar_radar.conclusions import ObservabilityAnalysis, diagnostics_of, notes_of
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, elevation_spread
+from pipeline.calibrate.joint.lidar_radar.measured_curvature import with_measured_curvature
 from pipeline.calibrate.joint.lidar_radar.normal_equations import (
     AZIMUTH_RANGE_DOF,
     DT,
     ELEVATION_DOF,
-    STEP_LIMIT,
-    UNKNOWNS,
     Linear,
     RadarProblem,
     RadarState,
-    linearise,
     travel_opinion,
 )
+from pipeline.calibrate.joint.lidar_radar.own_position import own_position
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, anneal, finish, last_step, scan
@@ -60,7 +59,6 @@ _CLEARLY = 4.0  # standard errors by which frames reject the end of another star
 _CAMERA_SIGMA_RAD = np.radians(0.5)  # a camera less sure than what its boxes show is left out
 _REMAINING_STEPS = 10.0  # of dt, that count as uncertainty: the valley is flat
 _YAW, _ANY_RAD = 2, np.radians(20.0)
-_MEASURED_SHARE = (0.02, 1.0)  # range of the measured curvature, as a share of the predicted one
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +116,9 @@ def estimate_lidar_radar(
         rival = finish(problem, rival.with_fixed(problem.prior, analysis.fixed), analysis.fixed)[0]
     compared = [analysis.state, analysis.state if rival is best else rival]
     found = _conclude(problem, analysis, compared, halves, rejected)
-    return replace(found, parts=_parts(problem, analysis, config, rng))
+    block = blocks_of(problem.observations, config.bootstrap_blocks)
+    own = own_position(problem, analysis.state, analysis.fixed, block)
+    return replace(found, parts=_parts(problem, analysis, config, rng), diagnostics=found.diagnostics | own)
 
 
 def _problem(
@@ -262,7 +262,7 @@ def _analyse_observability(
         # Once the radar's sigmas are estimated they stay, so that solutions can be compared.
         sharpen = problem.travel is None and not fixed.any()
         state, linear = finish(problem, state, fixed, sharpen=sharpen)
-        information = _with_measured_curvature(problem, state, linear.information)
+        information = with_measured_curvature(problem, state, linear.information)
         curvature = information.sum(0) + linear.prior_information
         variance = 1 / np.diag(linear.prior_information)
         variance[: DT + 1] = np.where(fixed[: DT + 1], before, variance[: DT + 1])
@@ -344,36 +344,6 @@ def _conclude(
         notes,
         common_part(J @ analysis.common[:6, :6] @ J.T, J @ analysis.covariance[:6, :6] @ J.T),
     )
-
-
-def _with_measured_curvature(problem: RadarProblem, state: RadarState, information: np.ndarray) -> np.ndarray:
-    """Information with the cost's own curvature over yaw, x, y, dt and range bias, from differences of its gradient.
-
-    On days of one speed, x, dt and the range bias share a valley that is far flatter than soft assignment predicts.
-    """
-    dof = AZIMUTH_RANGE_DOF
-    total = information.sum(0)[np.ix_(dof, dof)]
-    measured = np.zeros_like(total)
-    for column, k in enumerate(dof):
-        step = np.zeros(UNKNOWNS)
-        step[k] = 0.05 * STEP_LIMIT[k]
-        ahead, behind = (_gradient(problem, state.moved(s)) for s in (step, -step))
-        measured[:, column] = (ahead - behind) / (2 * step[k])
-    # A standing car has no information on dt: what is added is far below any prior.
-    L = np.linalg.cholesky(total + np.diag(1e-3 / STEP_LIMIT[dof] ** 2))
-    W = np.linalg.solve(L, np.linalg.solve(L, 0.5 * (measured + measured.T)).T)
-    values, vectors = np.linalg.eigh(0.5 * (W + W.T))
-    root = L @ vectors
-    out = information.copy()
-    out[np.ix_(np.arange(len(out)), dof, dof)] += (
-        (root * np.clip(values, *_MEASURED_SHARE)) @ root.T - total
-    ) / len(out)
-    return out
-
-
-def _gradient(problem: RadarProblem, state: RadarState) -> np.ndarray:
-    g = linearise(problem, state, 1.0, None).g
-    return g.sum(0)[AZIMUTH_RANGE_DOF]
 
 
 def _remaining_dt(linear: Linear, state: RadarState, fixed: np.ndarray) -> float:

@@ -1,0 +1,141 @@
+"""Alarms: a mounting or a clock that the day puts many sigmas from its prior.
+
+What the day leaves to the prior is as wrong as the prior is, and its sigma says that it is not. So each source that
+knows something of such a prior is asked: the pair's own day with the prior left out, which is too unsure to be a result
+and may still be ten sigmas away, and the other pair of the same sensor. Where the camera finds the lidar .3 m lower
+than tf_static has it, either of the two is mounted elsewhere; if it is the lidar, then the radar's height above it is
+wrong by as much, and nothing in lidar-radar shows that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.estimates import PairEstimate, Prior
+from pipeline.geometry.changes import change_between, change_covariance, change_jacobian
+from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
+from schemas.calibrations import DOF_NAMES
+
+__all__ = ["clock_alarms", "edge_alarms", "prior_alarms"]
+
+# By which the day's own position must differ as well, where frames confirm it; else as many as of the prior.
+_OF_DAY_SIGMAS = 2.0
+_DENIES_SIGMAS = 3.0
+# Normal deviates by which frames align better at the radar's own position than at the prior, and than as far beyond.
+# On 45 good days of ten rigs one of the two was above -0.9: the cost slopes there, and does not dip.
+_CLEARLY_Z = 1.5
+_LIDAR_PAIRS = ("camera_lidar", "lidar_radar")
+
+
+def prior_alarms(
+    pairs: Mapping[str, PairEstimate], prior: Prior, limits: VerdictLimits
+) -> dict[str, list[FailedCheck]]:
+    """Positions left to the prior that the day itself puts elsewhere."""
+    sigma_m = f"{prior.translation_sigma_m:g}"
+    return {
+        pair: [
+            FailedCheck(
+                f"the day itself puts {DOF_NAMES[k]} {shift:+.2f} +- {own:.2f} m from the prior, whose sigma is"
+                f" {sigma_m} m: measure the mounting",
+                "prior",
+            )
+            for k, (shift, own) in _own_positions(estimate).items()
+            if _is_far(estimate, k, prior, limits)
+        ]
+        for pair, estimate in pairs.items()
+    }
+
+
+def _own_positions(estimate: PairEstimate) -> dict[int, tuple[float, float]]:
+    """By index, the day's own shift from a prior that it could not better, and its sigma [m]."""
+    d = estimate.diagnostics
+    keys = {k: f"own_{DOF_NAMES[k]}" for k in range(3, 6)}
+    return {k: (d[f"{name}_m"], d[f"{name}_sigma_m"]) for k, name in keys.items() if f"{name}_m" in d}
+
+
+def _is_far(estimate: PairEstimate, k: int, prior: Prior, limits: VerdictLimits) -> bool:
+    """Whether the day's own position lies many sigmas of prior and day off."""
+    z = [estimate.diagnostics[n] for n in ("own_z_prior", "own_z_beyond") if n in estimate.diagnostics]
+    shift, own = _own_positions(estimate)[k]
+    many = limits.max_move_prior_sigmas
+    least = np.hypot(many * prior.translation_sigma_m, (_OF_DAY_SIGMAS if z else many) * own)
+    return bool(abs(shift) > least) and all(value < -_CLEARLY_Z for value in z)
+
+
+def clock_alarms(
+    pairs: Mapping[str, PairEstimate], sigma_s: float, limits: VerdictLimits
+) -> dict[str, list[FailedCheck]]:
+    """Time offsets beyond what `time_offset_sigma_s` allows, however surely they are estimated."""
+    out = {}
+    for pair, estimate in pairs.items():
+        dt_s, own_s = estimate.time_offset_s, estimate.time_offset_sigma_s or 0.0
+        if dt_s is not None and abs(dt_s) > limits.max_move_prior_sigmas * np.hypot(sigma_s, own_s):
+            shown = f"the stamps are {1e3 * dt_s:+.0f} +- {1e3 * own_s:.0f} ms apart"
+            why = f"{shown}, {1e3 * sigma_s:.0f} ms by time_offset_sigma_s: set the clocks"
+            out[pair] = [FailedCheck(why, "time_offset")]
+    return out
+
+
+def edge_alarms(
+    pairs: Mapping[str, PairEstimate], prior: Prior, limits: VerdictLimits
+) -> dict[str, list[FailedCheck]]:
+    """Camera-lidar or lidar-radar, where the other one contradicts the lidar's mounting and this one rests on it."""
+    out = {}
+    for seen, resting in (_LIDAR_PAIRS, _LIDAR_PAIRS[::-1]):
+        if not {seen, resting} <= pairs.keys() or pairs[seen].disproved:
+            continue
+        step = _contradicted(pairs[seen], prior, limits)
+        # A lidar that is off shows in both pairs, by as much and the other way round.
+        R = prior.T_camera_lidar[:3, :3]
+        into = R.T if seen == "camera_lidar" else R
+        hidden = -np.concatenate([into @ step[:3], into @ step[3:]])
+        if not step.any() or not _rests_on(pairs[resting], prior, hidden, limits):
+            continue
+        axes = ", ".join(DOF_NAMES[k] for k in np.flatnonzero(_kept(pairs[resting], hidden)))
+        why = f"{seen} contradicts the prior: if it is the lidar that is mounted elsewhere, then {axes} is wrong"
+        out[resting] = [FailedCheck(f"{why} here, where the day left it to the prior", "prior")]
+    return out
+
+
+def _contradicted(estimate: PairEstimate, prior: Prior, limits: VerdictLimits) -> Float[np.ndarray, " 6"]:
+    """The change from the prior where it is many sigmas; 0 elsewhere."""
+    step = change_between(prior.of(estimate.pair), estimate.T)
+    far = limits.max_move_prior_sigmas * np.sqrt(np.diag(prior.covariance(estimate.pair)))
+    step = np.where(estimate.observable & (np.abs(step) > far), step, 0.0)
+    for k, (shift, _) in _own_positions(estimate).items():
+        step[k] = shift if _is_far(estimate, k, prior, limits) else step[k]
+    return np.asarray(step)
+
+
+def _kept(resting: PairEstimate, hidden: Float[np.ndarray, " 6"]) -> Bool[np.ndarray, " 6"]:
+    """What the pair left to a prior that would be wrong by a good part of what the other pair found."""
+    size = np.repeat([np.linalg.norm(hidden[:3]), np.linalg.norm(hidden[3:])], 3)
+    return ~resting.observable & (np.abs(hidden) > 0.3 * size)
+
+
+def _rests_on(
+    resting: PairEstimate, prior: Prior, hidden: Float[np.ndarray, " 6"], limits: VerdictLimits
+) -> bool:
+    """Whether the prior's error would move targets by more than their sigma, and nothing in this pair denies it."""
+    far = limits.max_move_prior_sigmas * np.sqrt(np.diag(prior.covariance(resting.pair)))
+    own = change_between(prior.of(resting.pair), resting.T)
+    sigma = np.sqrt(np.diag(change_covariance(resting.T, resting.covariance)))
+    knows = resting.observable.copy()
+    for k, (shift, own_sigma) in _own_positions(resting).items():
+        own[k], sigma[k], knows[k] = shift, own_sigma, True
+    differs = np.abs(own - hidden) > np.maximum(0.5 * np.abs(hidden), _DENIES_SIGMAS * sigma)
+    if np.any(knows & differs & (np.abs(hidden) > far)):
+        return False
+    covariance = change_covariance(resting.T, resting.covariance)
+    J = target_jacobian(resting.pair, resting.T) @ np.linalg.inv(change_jacobian(resting.T))
+    effect = np.zeros(J.shape[:2])
+    for axis in np.flatnonzero(_kept(resting, hidden)):
+        # All others follow what is kept at the prior.
+        effect += J @ (covariance[:, axis] / covariance[axis, axis] * hidden[axis])
+    sigmas = target_sigmas(resting.pair, resting.T, resting.covariance)
+    return bool(np.any(np.sqrt((effect**2).mean(1)) > sigmas))

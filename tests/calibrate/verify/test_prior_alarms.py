@@ -1,0 +1,112 @@
+"""Alarms where a mounting or a clock lies many sigmas from its prior, and none where the day says nothing of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
+from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.calibrate.verify.prior_alarms import clock_alarms, edge_alarms, prior_alarms
+from pipeline.config import SolveConfig
+from pipeline.extrinsics.estimates import PairEstimate, Prior
+from pipeline.geometry.changes import change_jacobian
+from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
+from tests.makers.solve_scenes import T_CAMERA_LIDAR
+
+LIMITS = VerdictLimits()
+SIGMA_M = 0.03
+PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(1.2), SIGMA_M)
+
+
+def estimate_of(pair, shift_m=(0, 0, 0), kept=(), **found):
+    """A pair that moved so far along its parent's axes, with a few positions left to the prior."""
+    T = PRIOR.of(pair).copy()
+    T[:3, 3] += shift_m
+    observable = ~np.isin(np.arange(6), kept)
+    sigma = np.where(observable, [0.0005] * 3 + [0.01] * 3, [0.02] * 3 + [SIGMA_M] * 3)
+    J = np.linalg.inv(change_jacobian(T))
+    return PairEstimate(
+        pair,
+        T,
+        J @ np.diag(sigma**2) @ J.T,
+        observable * 1.0,
+        observable,
+        50,
+        time_offset_s=found.pop("dt_s", 0.0),
+        time_offset_sigma_s=0.005,
+        diagnostics=found,
+    )
+
+
+def in_camera(shift_lidar):
+    return T_CAMERA_LIDAR[:3, :3] @ shift_lidar
+
+
+def alarms_of(camera_lidar, lidar_radar):
+    found = edge_alarms({"camera_lidar": camera_lidar, "lidar_radar": lidar_radar}, PRIOR, LIMITS)
+    return {pair: checks[0].fault for pair, checks in found.items()}
+
+
+def test_a_lidar_that_the_camera_finds_lower_holds_the_radar_whose_height_rests_on_it():
+    lower = estimate_of("camera_lidar", in_camera([0, 0, -0.3]), kept=[5])
+    assert alarms_of(lower, estimate_of("lidar_radar", kept=[3, 5])) == {"lidar_radar": "prior"}
+
+
+@pytest.mark.parametrize("shift_m", [0.0, 0.06, -0.11])
+def test_offsets_that_priors_have_raise_no_alarm(shift_m):
+    shifted = estimate_of("camera_lidar", in_camera([0, 0, shift_m]), kept=[5])
+    assert alarms_of(shifted, estimate_of("lidar_radar", kept=[3, 5])) == {}
+
+
+def test_a_radar_that_knows_its_height_itself_is_not_held_for_the_lidars():
+    lower = estimate_of("camera_lidar", in_camera([0, 0, -0.3]), kept=[5])
+    assert alarms_of(lower, estimate_of("lidar_radar", kept=[3])) == {}
+
+
+def test_a_camera_that_moved_aside_as_well_is_at_fault_itself():
+    """The radar sees where the lidar is along y: where it was. So it is the camera that hangs elsewhere."""
+    aside = estimate_of("camera_lidar", in_camera([0, 0.3, -0.3]), kept=[5])
+    assert alarms_of(aside, estimate_of("lidar_radar", kept=[3, 5])) == {}
+    follows = estimate_of("lidar_radar", [0, -0.3, 0], kept=[3, 5])
+    assert alarms_of(aside, follows) == {"lidar_radar": "prior"}
+
+
+def test_a_basin_that_is_lost_accuses_nobody():
+    lost = replace(estimate_of("camera_lidar", in_camera([0, 0, -0.3]), kept=[5]), disproved="lost")
+    assert alarms_of(lost, estimate_of("lidar_radar", kept=[3, 5])) == {}
+
+
+def test_a_position_left_to_the_prior_is_an_alarm_where_the_day_puts_it_elsewhere():
+    z = {"own_z_prior": -2.0, "own_z_beyond": -2.0}
+    cases = [
+        ({"own_tx_m": 0.5, "own_tx_sigma_m": 0.1} | z, True),
+        ({"own_tx_m": 0.1, "own_tx_sigma_m": 0.01} | z, False),  # a prior may be three sigmas off
+        ({"own_tx_m": 0.5, "own_tx_sigma_m": 0.4} | z, False),  # the day does not know
+        ({"own_tx_m": 0.5, "own_tx_sigma_m": 0.1} | z | {"own_z_beyond": 1.0}, False),  # a slope, no dip
+    ]
+    for found, is_alarm in cases:
+        alarms = prior_alarms({"lidar_radar": estimate_of("lidar_radar", kept=[3], **found)}, PRIOR, LIMITS)
+        assert [c.fault for c in alarms["lidar_radar"]] == ["prior"] * is_alarm
+
+
+def test_a_clock_that_is_further_off_than_stated_is_an_alarm():
+    for dt_s, named in ((0.12, []), (-0.5, ["time_offset"]), (0.5, ["time_offset"])):
+        found = clock_alarms({"lidar_radar": estimate_of("lidar_radar", dt_s=dt_s)}, 0.05, LIMITS)
+        assert [c.fault for c in found.get("lidar_radar", [])] == named
+    assert not clock_alarms({"lidar_radar": estimate_of("lidar_radar", dt_s=0.5)}, 0.2, LIMITS)
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.4])
+def test_a_radar_mounted_further_ahead_than_its_prior_says_is_found_though_x_is_left_to_the_prior(off_m):
+    T = T_LIDAR_RADAR.copy()
+    T[0, 3] += off_m
+    prior = replace(PRIOR, T_lidar_radar=T, translation_sigma_m=0.01)
+    found = estimate_lidar_radar(
+        street_day(24, seed=5), prior, T_CAMERA_LIDAR, SolveConfig(), np.random.default_rng(0)
+    )
+    alarms = prior_alarms({"lidar_radar": found}, prior, LIMITS)["lidar_radar"]
+    own = found.diagnostics
+    assert not found.observable[3]
+    assert abs(own["own_tx_m"] + off_m) < 4 * own["own_tx_sigma_m"]
+    assert [c.fault for c in alarms] == ["prior"] * (off_m > 0)
