@@ -16,6 +16,7 @@ from pipeline.rigs import RoadUser, StreetClass
 
 __all__ = [
     "CITYSCAPES",
+    "DETECTOR_COUNTS",
     "DETECTOR_SETS",
     "LABEL_COUNTS",
     "LABEL_SETS",
@@ -64,6 +65,8 @@ DETECTOR_SETS: dict[str, dict[int, str]] = {
     "coco": {0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 6: "train", 7: "truck"},
     "road_users": dict(enumerate(ROAD_USERS)),
 }
+# Classes of a head; of another number, each would mean another thing than its set says.
+DETECTOR_COUNTS = {"coco": 80, "road_users": len(ROAD_USERS)}
 _ALIASES = {
     "pedestrian": "person", "people": "person", "human": "person",
     "cyclist": "rider", "bicyclist": "rider", "motorcyclist": "rider",

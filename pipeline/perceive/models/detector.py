@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int, UInt8
 
-from pipeline.errors import ModelError
+from pipeline.errors import ModelError, ModelOutputError
 from pipeline.perceive.camera import Detections
-from pipeline.perceive.labels import detector_names
+from pipeline.perceive.labels import DETECTOR_COUNTS, detector_names
 from pipeline.perceive.models.manifest import Manifest
-from pipeline.perceive.models.session import Session, fit_image
+from pipeline.perceive.models.session import AlikeCheck, Session, fit_image
 
 __all__ = ["Candidates", "Detector", "decode_head", "suppress"]
 
@@ -39,12 +39,15 @@ class Detector:
         self._manifest = manifest
         self._session = Session(manifest)
         self._names = detector_names(manifest.output.label_set)
+        self._check_alike = AlikeCheck(manifest.file)
 
     def detect(self, image_bgr: UInt8[np.ndarray, "H W 3"]) -> Detections:
         """Road users in full-image pixels, the best score first.
 
         Raises:
             ModelError: the output has another shape than its layout says.
+            ModelOutputError: it has other classes than its label set says, is no number, or the same for several
+                pictures on end.
         """
         if not self._manifest.input.tile_scales:
             found = [self._of_tile(image_bgr, 1.0, 0, 0, image_bgr.shape)]
@@ -88,8 +91,11 @@ class Detector:
         """Candidates of one tile in full-image pixels, without those that its inner edges cut."""
         spec, output = self._manifest.input, self._manifest.output
         tensor, fit = fit_image(tile_bgr, spec)
+        answer = self._session.run(tensor)
+        self._check_alike(tile_bgr[::4, ::4], answer)
+        classes = DETECTOR_COUNTS[output.label_set]
         head = decode_head(
-            self._session.run(tensor), output.layout, spec.size, output.strides, str(self._manifest.file)
+            answer, output.layout, spec.size, output.strides, str(self._manifest.file), classes
         )
         head = head.take(np.flatnonzero(head.scores >= output.min_score))
         offset = np.array([fit.offset_x, fit.offset_y] * 2, np.float32)
@@ -107,7 +113,12 @@ class Detector:
 
 
 def decode_head(
-    output: np.ndarray, layout: str, input_size: tuple[int, int], strides: tuple[int, ...], manifest: str
+    output: np.ndarray,
+    layout: str,
+    input_size: tuple[int, int],
+    strides: tuple[int, ...],
+    manifest: str,
+    classes: int,
 ) -> Candidates:
     """Boxes in input pixels, with the best class of each.
 
@@ -117,6 +128,7 @@ def decode_head(
 
     Raises:
         ModelError: another shape than the layout has.
+        ModelOutputError: another number of classes.
     """
     if output.ndim != 3 or output.shape[0] != 1:
         raise ModelError(
@@ -124,8 +136,9 @@ def decode_head(
         )
     rows = np.asarray(output[0].T if layout == "yolov8" else output[0], np.float32)
     first_class = 4 if layout == "yolov8" else 5
-    if rows.shape[1] <= first_class:
-        raise ModelError(manifest, f"output.layout: {layout} leaves no classes in {list(output.shape)}")
+    if rows.shape[1] != first_class + classes:
+        found = f"{rows.shape[1] - first_class} classes in {list(output.shape)}"
+        raise ModelOutputError(manifest, f"output.layout: {layout} has {found}, its label set has {classes}")
     centre, size = rows[:, :2], rows[:, 2:4]
     if layout == "yolox":
         grid, stride = _yolox_grid(input_size, strides)

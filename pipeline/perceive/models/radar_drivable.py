@@ -15,11 +15,11 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.config import FleetConfig
-from pipeline.errors import ModelError
+from pipeline.errors import ModelError, ModelOutputError
 from pipeline.geometry.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, grid_layout, sector_of
 from pipeline.perceive.drivable import FreeSector
 from pipeline.perceive.models.manifest import check_hash, read_manifest
-from pipeline.perceive.models.session import open_session
+from pipeline.perceive.models.session import AlikeCheck, open_session
 from pipeline.rigs import OnnxDrivable
 
 __all__ = ["RadarDrivable"]
@@ -57,7 +57,7 @@ class RadarDrivable:
         shapes = [i.shape for i in self._session.get_inputs()]
         if shapes != [[1, len(CHANNELS), *SHAPE]]:
             raise ModelError(self._file, f"path: the model's inputs are {shapes}, not the grid's")
-        self._memory = ScanMemory()
+        self._memory, self._check_alike = ScanMemory(), AlikeCheck(manifest_file)
         self.provenance: dict[str, Any] = {"radar_drivable": manifest.sha256}
 
     @classmethod
@@ -81,9 +81,10 @@ class RadarDrivable:
         except Exception as err:  # onnxruntime's own exceptions share no base but this
             raise ModelError(self._file, f"the model failed to run: {err}") from err
         if answer.shape != (1, *SHAPE) or not np.isfinite(answer).all():
-            raise ModelError(
+            raise ModelOutputError(
                 self._file, f"the model gives {list(answer.shape)}, not {[1, *SHAPE]} finite numbers"
             )
+        self._check_alike(features, answer)
         return np.asarray(answer[0], np.float32)
 
     def free_sector(self, scan: Scan) -> FreeSector:

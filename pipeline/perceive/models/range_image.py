@@ -36,11 +36,11 @@ from jaxtyping import Float32, UInt8
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pipeline.config import FleetConfig
-from pipeline.errors import ModelError
+from pipeline.errors import ModelError, ModelOutputError
 from pipeline.geometry.range_image import EMPTY, channels_of, project, vote_of_neighbours
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.manifest import check_hash, read_manifest
-from pipeline.perceive.models.session import open_session
+from pipeline.perceive.models.session import AlikeCheck, open_session
 from pipeline.rigs import OnnxPointSemantics
 
 __all__ = ["POINT_LABEL_SETS", "RangeImageManifest", "RangeImageSegmenter"]
@@ -146,6 +146,7 @@ class RangeImageSegmenter:
         self._manifest, self._file, self._scale = manifest, str(manifest_file), remission_scale
         self._session = open_session(model, manifest_file)
         self._input = self._checked_input()
+        self._check_alike = AlikeCheck(manifest_file)
         self._kinds = np.array(list(POINT_LABEL_SETS[manifest.output.label_set].values()), np.uint8)
         told = manifest.model_dump(mode="json", exclude={"file", "path"})
         self.provenance: dict[str, Any] = {"lidar_segmenter": told | {"remission_scale": remission_scale}}
@@ -202,13 +203,14 @@ class RangeImageSegmenter:
             raise ModelError(self._file, f"the model failed to run: {err}") from err
         wanted = [1, len(self._kinds), *self._manifest.input.size]
         if list(answer.shape) != wanted:
-            raise ModelError(
+            raise ModelOutputError(
                 self._file,
                 f"output.layout: logits must be {wanted} (1, labels of {self._manifest.output.label_set}, "
                 f"rows, columns), the model gives {list(answer.shape)}",
             )
         if not np.isfinite(answer).all():
-            raise ModelError(self._file, "the model gives logits that are not finite")
+            raise ModelOutputError(self._file, "the model gives logits that are not finite")
+        self._check_alike(tensor[..., ::4, ::4], answer)
         return np.asarray(answer[0], np.float32)
 
     def _checked_input(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from jaxtyping import Float32, UInt8
 from pipeline.errors import ModelError, ModelOutputError
 from pipeline.perceive.models.manifest import InputSpec, Manifest
 
-__all__ = ["Fit", "Session", "fit_image", "open_session"]
+__all__ = ["AlikeCheck", "Fit", "Session", "fit_image", "open_session"]
+
+_MOST_ALIKE = 3  # successive answers that are the same to the last bit though the inputs differ
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,28 @@ class Fit:
     offset_y: int
     width: int
     height: int
+
+
+class AlikeCheck:
+    """Refuses a model that answers several different inputs alike: it looks at none of them."""
+
+    def __init__(self, manifest_file: object) -> None:
+        self._file = str(manifest_file)
+        self._shown, self._before, self._alike = 0, np.zeros(0), 0
+
+    def __call__(self, shown: np.ndarray, answer: np.ndarray) -> None:
+        """Take the next input and its answer.
+
+        Raises:
+            ModelOutputError: the same answer came for several different inputs on end.
+        """
+        own = zlib.crc32(shown.tobytes())
+        if own != self._shown:
+            self._alike = self._alike + 1 if np.array_equal(answer, self._before) else 0
+            self._shown, self._before = own, answer
+        if self._alike >= _MOST_ALIKE:
+            told = f"the model gives the same answer for {_MOST_ALIKE + 1} different inputs on end"
+            raise ModelOutputError(self._file, told)
 
 
 class Session:

@@ -103,10 +103,10 @@ def test_colours_and_normalisation_follow_the_manifest():
     assert fit_image(image, InputSpec(size=(8, 16)))[1] == Fit(1.0, 1.0, 4, 0, 8, 8)
 
 
-def rows_of(boxes, classes, scores, objectness=None):
-    """Rows of a head: centre, size, [objectness], eight classes."""
+def rows_of(boxes, classes, scores, objectness=None, count=8):
+    """Rows of a head: centre, size, [objectness], classes."""
     boxes = np.array(boxes, np.float32)
-    likelihood = np.zeros((len(boxes), 8), np.float32)
+    likelihood = np.zeros((len(boxes), count), np.float32)
     likelihood[np.arange(len(boxes)), classes] = scores
     parts = [(boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2], likelihood]
     if objectness is not None:
@@ -135,7 +135,7 @@ def test_a_yolox_head_is_decoded_on_its_grid():
     output = np.zeros((1, 12 * 20 + 6 * 10, 5 + 8), np.float32)  # strides 8 and 16 on 96 x 160
     cell = 12 * 20 + 3 * 10 + 4  # stride 16, row 3, column 4
     output[0, cell] = [0.5, 0.25, np.log(2.0), np.log(3.0), 0.5, 0, 0, 0.8, 0, 0, 0, 0, 0]
-    found = decode_head(output, "yolox", (96, 160), (8, 16), "m.toml")
+    found = decode_head(output, "yolox", (96, 160), (8, 16), "m.toml", 8)
     best = int(np.argmax(found.scores))
     assert best == cell
     assert found.scores[best] == pytest.approx(0.4)
@@ -152,7 +152,7 @@ def test_suppression_works_within_a_class_only():
 
 
 def test_classes_that_are_no_road_users_are_left_out(tmp_path):
-    answer = rows_of(BOXES[:2], [4, 2], [0.9, 0.8], [1.0, 1.0])  # COCO 4 is an airplane
+    answer = rows_of(BOXES[:2], [4, 2], [0.9, 0.8], [1.0, 1.0], count=80)  # COCO 4 is an airplane
     assert detector(tmp_path, answer, "yolov5", label_set="coco").detect(
         np.zeros((96, 160, 3), np.uint8)
     ).classes == ["car"]
@@ -251,8 +251,28 @@ def test_a_model_that_answers_every_picture_alike_is_refused_and_a_stuck_camera_
     pictures = [np.full((96, 160, 3), shade, np.uint8) for shade in range(4)]
     for picture in [pictures[0]] * 9 + pictures[:3]:
         model.segment(picture, (48, 80))
-    with pytest.raises(ModelOutputError, match="same labels for 4 different pictures"):
+    with pytest.raises(ModelOutputError, match="same answer for 4 different inputs"):
         model.segment(pictures[3], (48, 80))
+
+
+def test_a_detector_of_other_classes_or_of_no_numbers_is_refused(tmp_path):
+    picture, rows = np.zeros((96, 160, 3), np.uint8), rows_of(BOXES, [2, 0, 0], [0.9, 0.8, 0.7], [1.0] * 3)
+    with pytest.raises(ModelOutputError, match=r"8 classes in .* its label set has 80"):
+        detector(tmp_path, rows, "yolov5", label_set="coco").detect(picture)
+    with pytest.raises(ModelOutputError, match=r"80 classes in .* its label set has 8"):
+        detector(tmp_path, np.zeros((1, 84, 9)), "yolov8").detect(picture)
+    rows[0, 0, 0] = np.nan
+    with pytest.raises(ModelOutputError, match="NaN"):
+        detector(tmp_path, rows, "yolov5").detect(picture)
+
+
+def test_a_detector_that_answers_every_picture_alike_is_refused_and_a_stuck_camera_is_not_its_fault(tmp_path):
+    model = detector(tmp_path, rows_of(BOXES, [2, 0, 0], [0.9, 0.8, 0.7], [1.0] * 3), "yolov5")
+    pictures = [np.full((96, 160, 3), shade, np.uint8) for shade in range(4)]
+    for picture in [pictures[0]] * 9 + pictures[:3]:
+        model.detect(picture)
+    with pytest.raises(ModelOutputError, match="same answer for 4 different inputs"):
+        model.detect(pictures[3])
 
 
 def test_a_size_that_the_model_does_not_take_is_refused_on_loading(tmp_path):

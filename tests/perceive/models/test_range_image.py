@@ -1,5 +1,6 @@
 """Lidar semantics by range-image models: their labels, their faults, and whole days."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -253,8 +254,9 @@ def test_a_day_whose_model_is_missing_or_wrong_names_the_manifest(tmp_path, lake
     with pytest.raises(ModelError, match=r"seg\.toml.*no such manifest"):
         perceived(fleet(tmp_path, MODEL), lake)
     manifest(tmp_path, {ROAD: (NONE, NONE, 0.0)}, classes=12)
-    with pytest.raises(ModelError, match=r"seg\.toml.*logits must be"):
-        perceived(fleet(tmp_path, MODEL), lake)
+    refused = perceive_day(DAY, load_fleet(fleet(tmp_path, MODEL)), lake)
+    assert (refused.status, refused.faults) == ("refused", ("model_output",))
+    assert re.search(r"seg\.toml.*logits must be", refused.reason)
 
 
 def test_the_network_that_ships_tells_a_road_from_the_walls_beside_it():
