@@ -242,8 +242,8 @@ def _late(message: tuple[bytes, dict[str, Any]], count: float, place: Place) -> 
     return bytes(old[:4] + data[4:12] + old[12:])
 
 
-def _silent(message: Any, after: float, place: Place) -> Any:
-    return None if place.share >= after else message
+def _silent(message: tuple[bytes, dict[str, Any]], after: float, place: Place) -> bytes | None:
+    return None if place.share >= after else message[0]
 
 
 # Camera
@@ -373,13 +373,13 @@ EDITS: dict[str, Edit] = {
     "k1": Edit(("info",), _info(_distortion)),
     "camera stamps": Edit(_CAMERA, _stamped, raw=True),
     "camera stuck": Edit(("image", "labels", "detections"), _stuck, raw=True),
-    "camera silent": Edit(_CAMERA, _silent),
-    "labels silent": Edit(("labels",), _silent),
+    "camera silent": Edit(_CAMERA, _silent, raw=True),
+    "labels silent": Edit(("labels",), _silent, raw=True),
     "lidar scaled": Edit(("lidar",), _xyz(_scaled)),
     "lidar mirrored": Edit(("lidar",), _xyz(_mirrored)),
     "lidar stuck": Edit(("lidar",), _stuck, raw=True),
     "lidar stamps": Edit(("lidar",), _stamped, raw=True),
-    "lidar silent": Edit(("lidar",), _silent),
+    "lidar silent": Edit(("lidar",), _silent, raw=True),
     "lidar yaw at noon": Edit(("lidar",), _xyz(_turn(2, 0.5))),
     "lidar pitch late": Edit(("lidar",), _xyz(_turn(1, 0.67))),
     "lidar roll at noon": Edit(("lidar",), _xyz(_turn(0, 0.5))),
@@ -391,7 +391,7 @@ EDITS: dict[str, Edit] = {
     "radar mirrored": Edit(("radar",), _xyz(_mirrored)),
     "radar stuck": Edit(("radar",), _stuck, raw=True),
     "radar stamps": Edit(("radar",), _stamped, raw=True),
-    "radar silent": Edit(("radar",), _silent),
+    "radar silent": Edit(("radar",), _silent, raw=True),
     "radar empty": Edit(("radar",), _cloud(_emptied)),
     "radar yaw at noon": Edit(("radar",), _xyz(_turn(2, 0.5))),
     "radar backwards": Edit(("radar",), _xyz(_turn(2, 0.0))),
@@ -403,5 +403,5 @@ EDITS: dict[str, Edit] = {
     "odometry turn rate": Edit(("odometry",), _odometry(angular=-1.0)),
     "odometry reversed": Edit(("odometry",), _odometry(-1.0, -1.0)),
     "odometry late": Edit(("odometry",), _stamped, raw=True),
-    "odometry silent": Edit(("odometry",), _silent),
+    "odometry silent": Edit(("odometry",), _silent, raw=True),
 }

@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.calibrate.joint.camera_lidar.boxes import box_offsets
 from pipeline.calibrate.joint.camera_lidar.estimate import estimate_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.witnesses import Witness, disagreement, widening
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import inverse, log_so3, perturb_exactly
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
 from schemas.observations import EDGE_BELOW
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, make_day
 from tests.makers.traced_scenes import DENSE, GROUND_M, T_TRUE, traced_day
 
 ROOF_M = GROUND_M + 1.6  # of the cars
@@ -84,3 +86,29 @@ def test_what_labels_too_wide_explain_contradicts_nothing():
     asked = [witness("a", 0.2), witness("b", -0.2)]
     assert disagreement(asked) == []
     assert not widening(asked).any()
+
+
+@pytest.mark.parametrize("turn_deg", [(1.5, 0.0), (0.0, -1.5)])
+def test_boxes_show_by_how_much_a_pose_is_turned(turn_deg):
+    day, turn = make_day(12, seed=3), exp_so3(np.radians([*turn_deg, 0.0]))
+    poses = (T_CAMERA_LIDAR, from_rotation_translation(turn, np.zeros(3)) @ T_CAMERA_LIDAR)
+    straight, turned = (box_offsets(day, np.repeat(T[None], len(day), axis=0)) for T in poses)
+    assert set(turned[0].tolist()) == set(range(12))
+    medians = [np.degrees(np.median(offset, axis=0)) for _, offset in (straight, turned)]
+    assert np.abs(medians[0]).max() < 0.2  # faces that look away are in the box, not in the cloud
+    np.testing.assert_allclose(medians[1] - medians[0], -np.array(turn_deg), atol=0.1)
+
+
+def test_boxes_that_pair_with_several_objects_or_none_show_nothing():
+    (o,) = make_day(1, seed=3)
+    twice = replace(o, road_user_boxes_px=np.repeat(o.road_user_boxes_px, 2, axis=0))
+    away = replace(o, road_user_boxes_px=o.road_user_boxes_px[:0])
+    assert len(box_offsets([twice, away], np.repeat(T_CAMERA_LIDAR[None], 2, axis=0))[0]) == 0
+
+
+def test_a_fit_that_all_boxes_contradict_is_held():
+    asked = [witness("the fit", 0.0, 0.04, 0.03), witness("boxes", -0.7, 0.05, 0.15)]
+    (check,) = disagreement(asked)
+    assert check.fault == "witnesses_disagree"
+    unsure = replace(asked[0], scatter_rad=np.radians(0.3))
+    assert disagreement([unsure, asked[1]]) == []

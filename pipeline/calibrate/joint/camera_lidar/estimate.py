@@ -213,7 +213,10 @@ def analyse_camera_lidar(
     own_tz = analysis.profile.shift_from(float(problem.prior.T_camera_lidar[2, 3]))
     if analysis.observability[5] < OBSERVABLE and own_tz is not None:
         diagnostics |= {"own_tz_m": own_tz[0], "own_tz_sigma_m": own_tz[1]}
-    witnesses = ask_witnesses(problem.terms, analysis.state, analysis.kernel, problem.blocks, problem.seed)
+    own = np.sqrt(np.diag(analysis.covariance)[:2]).tolist()
+    witnesses = ask_witnesses(
+        aligned.frames, problem.terms, analysis.state, analysis.kernel, problem.blocks, problem.seed, own
+    )
     found = _conclude(analysis, aligned, problem.config, diagnostics, witnesses)
     return replace(found, parts=_parts(problem, analysis, aligned.frames))
 
