@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from schemas.columns import Recorded, column, row, table_of
 
-__all__ = ["EVENT_KINDS", "EVENT_SENSORS", "SERVICE_EVENTS", "ServiceEvent"]
-
-EVENT_KINDS = ("re-mount", "repair", "software release")
-EVENT_SENSORS = ("camera", "lidar", "radar", "all")
+__all__ = ["SERVICE_EVENTS", "ServiceEvent"]
 
 
 @row(eq=True)

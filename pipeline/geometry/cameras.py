@@ -111,15 +111,6 @@ class Camera:
         rays = self._unproject_equidistant(xd, yd) if equidistant else self._unproject_pinhole(xd, yd)
         return rays.reshape(*uv.shape[:-1], 3)
 
-    def projection_jacobian(
-        self, points_camera: Float[np.ndarray, "*batch 3"]
-    ) -> Float[np.ndarray, "*batch 2 3"]:
-        """d(u, v)/d(x, y, z) [px/m]; meaningful where `project` is valid."""
-        x, y, z = points_camera.astype(np.float64).reshape(-1, 3).T
-        equidistant = self.model == "equidistant"
-        J = self._jacobian_equidistant(x, y, z) if equidistant else self._jacobian_pinhole(x, y, z)
-        return (J * np.array([[self.K[0, 0]], [self.K[1, 1]]])).reshape(*points_camera.shape[:-1], 2, 3)
-
     def fast_polynomial(self, degree: int = 9) -> tuple[Float[np.ndarray, " P"], float]:
         """k(c) with `u = cx + fx k x/|p|`, `v = cy + fy k y/|p|`, c = z/|p|, and the fit's largest error [px].
 
@@ -194,12 +185,6 @@ class Camera:
             -2,
         )
 
-    def _jacobian_pinhole(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-        iz = 1 / np.maximum(z, _MIN_DEPTH_M)
-        o = np.zeros_like(x)
-        J = np.stack([np.stack([iz, o, -x * iz * iz], -1), np.stack([o, iz, -y * iz * iz], -1)], -2)
-        return self._distort_jacobian(x * iz, y * iz) @ J if len(self.D) else J
-
     def _unproject_pinhole(self, xd: np.ndarray, yd: np.ndarray) -> np.ndarray:
         a, b = xd.copy(), yd.copy()
         if len(self.D):
@@ -224,27 +209,6 @@ class Camera:
             h > 1e-9 * norm, self._radius(theta) / np.where(h > 0, h, 1.0), 1 / np.where(norm > 0, norm, 1.0)
         )
         return (theta <= self.max_angle_rad) & (norm > _MIN_DEPTH_M), k * x, k * y
-
-    def _jacobian_equidistant(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-        h2 = x * x + y * y
-        h, r2 = np.sqrt(h2), h2 + z * z
-        theta = np.arctan2(h, z)
-        t2 = theta * theta
-        d = self._coefficients
-        slope = 1 + t2 * (3 * d[0] + t2 * (5 * d[1] + t2 * (7 * d[2] + t2 * 9 * d[3])))
-        axis = h < 1e-6 * np.sqrt(r2)
-        hs = np.where(axis, 1.0, h)
-        k = np.where(axis, 1 / np.sqrt(r2), self._radius(theta) / hs)
-        # d(k)/d(h) and d(k)/d(z), k = radius(theta)/h
-        dk_dh = np.where(axis, 0.0, (slope * z / r2 - k) / hs)
-        dk_dz = np.where(axis, -1 / r2, -slope / r2)
-        rows = []
-        for p, other in ((x, y), (y, x)):
-            own = k + p * dk_dh * p / hs
-            cross = p * dk_dh * other / hs
-            first, second = (own, cross) if p is x else (cross, own)
-            rows.append(np.stack([first, second, p * dk_dz], -1))
-        return np.stack(rows, -2)
 
     def _unproject_equidistant(self, xd: np.ndarray, yd: np.ndarray) -> np.ndarray:
         radius = np.hypot(xd, yd)

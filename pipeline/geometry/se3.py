@@ -21,7 +21,6 @@ __all__ = [
     "from_rotation_translation",
     "hat",
     "inverse",
-    "inverse_covariance",
     "log_se3",
     "log_so3",
     "perturb_exactly",
@@ -133,14 +132,6 @@ def compose_covariance(
     """Covariance of T_a_c = T_a_b T_b_c for independent errors (first order)."""
     A = adjoint(T_a_b)
     return cov_a_b + A @ cov_b_c @ A.T
-
-
-def inverse_covariance(
-    T_a_b: Float[np.ndarray, "4 4"], cov_a_b: Float[np.ndarray, "6 6"]
-) -> Float[np.ndarray, "6 6"]:
-    """Covariance of T_b_a, given that of T_a_b (first order)."""
-    A = adjoint(inverse(T_a_b))
-    return A @ cov_a_b @ A.T
 
 
 def rotation_angle_rad(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch"]:

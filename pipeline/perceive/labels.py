@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import get_args
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import UInt8
 
 from pipeline.rigs import RoadUser, StreetClass
 
@@ -20,13 +20,11 @@ __all__ = [
     "DETECTOR_SETS",
     "LABEL_COUNTS",
     "LABEL_SETS",
-    "REFLECTING_IDS",
     "ROAD_ID",
     "ROAD_USERS",
     "SKY_ID",
     "VOID_ID",
     "detector_names",
-    "is_reflecting",
     "road_user_name",
     "to_cityscapes",
 ]
@@ -34,8 +32,6 @@ __all__ = [
 CITYSCAPES: tuple[str, ...] = get_args(StreetClass)  # the place is the train id
 ROAD_USERS: tuple[str, ...] = get_args(RoadUser)
 ROAD_ID, SKY_ID, VOID_ID = 0, 10, 255
-# Paper, section 4.3: vehicles, pedestrians, signs, poles, buildings, fences and vegetation reflect lidar.
-REFLECTING_IDS = (2, 3, 4, 5, 6, 7, 8, 11, 12, 13, 14, 15, 16, 17, 18)
 
 # Cityscapes name -> ids of the foreign set, outdoor classes only; every other id is void.
 _ADE20K = {
@@ -99,10 +95,3 @@ def road_user_name(logged: str) -> str | None:
     """The road user that a logged class name means, None where it means none (traffic light, dog)."""
     name = logged.strip().lower().replace("_", " ")
     return name if name in ROAD_USERS else _ALIASES.get(name)
-
-
-def is_reflecting(labels: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """True where the label's class is known to reflect lidar (paper, section 4.3)."""
-    table = np.zeros(256, bool)
-    table[list(REFLECTING_IDS)] = True
-    return table[labels]

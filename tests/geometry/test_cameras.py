@@ -79,19 +79,6 @@ def test_projection_agrees_with_opencv(name):
 
 
 @every_camera
-def test_projection_jacobian_agrees_with_central_differences(name):
-    cam = camera(name)
-    points = np.random.default_rng(2).uniform([-6, -3, 4], [6, 3, 40], (40, 3))
-    points = np.concatenate([points, [[0, 0, 10.0], [1e-4, 0, 10]]])  # the axis has a branch of its own
-    found = cam.projection_jacobian(points)
-    step = 1e-5
-    for i in range(3):
-        d = np.eye(3)[i] * step
-        numeric = (cam.project(points + d)[0] - cam.project(points - d)[0]) / (2 * step)
-        np.testing.assert_allclose(found[..., i], numeric, atol=2e-4, rtol=1e-6)
-
-
-@every_camera
 def test_points_behind_the_camera_are_not_seen_or_are_beyond_the_image(name):
     cam = camera(name)
     behind = np.random.default_rng(3).uniform([-20, -20, -40], [20, 20, -0.1], (300, 3))

@@ -146,7 +146,7 @@ def whitened(C, C_expected):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_composed_and_inverted_covariances_agree_with_monte_carlo(seed):
+def test_composed_covariances_agree_with_monte_carlo(seed):
     rng = np.random.default_rng(seed)
     T_a_b, T_b_c = se3.exp_se3(rng.normal(size=6) * [1, 1, 1, 2, 2, 2]), se3.exp_se3(rng.normal(size=6))
     cov_a_b, cov_b_c = covariance(rng, 0.01, 0.02), covariance(rng, 0.02, 0.01)
@@ -154,12 +154,9 @@ def test_composed_and_inverted_covariances_agree_with_monte_carlo(seed):
     A = se3.exp_se3(rng.multivariate_normal(np.zeros(6), cov_a_b, n)) @ T_a_b
     B = se3.exp_se3(rng.multivariate_normal(np.zeros(6), cov_b_c, n)) @ T_b_c
     composed = se3.compose_covariance(T_a_b, cov_a_b, cov_b_c)
-    inverted = se3.inverse_covariance(T_a_b, cov_a_b)
     np.testing.assert_allclose(
         whitened(sample_covariance(T_a_b @ T_b_c, A @ B), composed), np.eye(6), atol=0.05
     )
-    found = sample_covariance(se3.inverse(T_a_b), se3.inverse(A))
-    np.testing.assert_allclose(whitened(found, inverted), np.eye(6), atol=0.05)
 
 
 @settings(max_examples=30)

@@ -11,7 +11,6 @@ from pipeline.perceive.labels import (
     ROAD_USERS,
     SKY_ID,
     VOID_ID,
-    is_reflecting,
     road_user_name,
     to_cityscapes,
 )
@@ -55,11 +54,6 @@ def test_logged_class_names_become_road_users(logged, name):
 def test_detectors_know_only_road_users():
     for names in DETECTOR_SETS.values():
         assert set(names.values()) <= set(ROAD_USERS)
-
-
-def test_sky_road_and_void_reflect_no_lidar():
-    labels = np.array([[0, SKY_ID, VOID_ID, CITYSCAPES.index("car"), CITYSCAPES.index("pole")]], np.uint8)
-    assert is_reflecting(labels).tolist() == [[False, False, False, True, True]]
 
 
 def test_labels_of_a_set_of_ones_own_mean_what_it_says_and_the_others_nothing():

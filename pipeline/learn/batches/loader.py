@@ -85,11 +85,6 @@ class TrainingLoader:
         return sum(len(c.rows) for c in self._chunks)
 
     @property
-    def batches_per_epoch(self) -> int:
-        """Full batches that one epoch gives each rank, on average; at least one."""
-        return max(1, self.frames // (self._batch_size * self._ranks))
-
-    @property
     def epoch(self) -> int:
         """Epoch that the next frame comes from."""
         return self._epoch

@@ -62,10 +62,6 @@ class Grid:
         """Rows."""
         return round(self._rows)
 
-    def coarser(self, factor: int) -> Grid:
-        """The same view in cells `factor` times as large."""
-        return _Level(self.cell_deg * factor, self.left_deg, self.top_deg, self.bottom_deg)
-
     def finer(self, factor: int) -> Grid:
         """The same view in cells 1/`factor` as large."""
         return _Level(self.cell_deg / factor, self.left_deg, self.top_deg, self.bottom_deg)

@@ -18,7 +18,7 @@ from pipeline.learn.sample.grid import Grid
 from pipeline.objective.differentiable.poses import transform_points
 from schemas.training import UNKNOWN_CLASS
 
-__all__ = ["class_of_points", "semantics_accuracy", "semantics_loss"]
+__all__ = ["class_of_points", "semantics_loss"]
 
 _RADAR_WEIGHT = 0.2  # a detection's features hardly determine its class
 
@@ -74,12 +74,6 @@ def semantics_loss(
         target = class_of_points(grid_class, radar_camera, radar_valid, grid)
         loss = loss + _RADAR_WEIGHT * _cross_entropy(predictions.radar_logits.transpose(1, 2), target)
     return loss
-
-
-def semantics_accuracy(logits: Float[Tensor, "B K H W"], target: Int64[Tensor, "B H W"]) -> Float[Tensor, ""]:
-    """Share of the known cells whose most likely class is the target's."""
-    known = target != UNKNOWN_CLASS
-    return ((logits.argmax(1) == target) & known).sum() / known.sum().clamp(min=1)
 
 
 def _lidar_target(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,8 +18,6 @@ from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.materials import TABLE
 
 __all__ = ["View", "encode_jpeg", "render", "view_of"]
-
-_GROUND_LABELS: Final = (0, 1, 9)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,6 @@ __all__ = [
     "LABELS",
     "MATERIALS",
     "TABLE",
-    "VOID",
     "Material",
     "MaterialTable",
     "material",
@@ -25,7 +24,6 @@ LABELS: Final = (
     "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation", "terrain",
     "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle",
 )  # fmt: skip
-VOID: Final = 255
 _PLAIN, _ASPHALT, _GRASS, _FOLIAGE, _FACADE, _PAVING, _SLATS, _CONCRETE, _WORN = range(9)
 
 

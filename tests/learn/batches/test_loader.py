@@ -39,7 +39,7 @@ def taken(loader, batches):
 def test_an_epoch_shows_every_frame_once_in_another_order_each_time(lake):
     loader = TrainingLoader(lake, 4, window_groups=3)
     assert loader.frames == 40
-    epochs = [[n for b in taken(loader, loader.batches_per_epoch) for n in b] for _ in range(3)]
+    epochs = [[n for b in taken(loader, loader.frames // 4) for n in b] for _ in range(3)]
     assert all(sorted(e) == sorted(epochs[0]) and len(set(e)) == 40 for e in epochs)
     assert epochs[0] != epochs[1] != epochs[2]
     neighbours = np.mean([a[0] == b[0] for a, b in zip(epochs[0], epochs[0][1:], strict=False)])
