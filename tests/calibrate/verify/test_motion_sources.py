@@ -178,3 +178,13 @@ def test_the_car_drives_ahead_whatever_sign_its_doppler_has(day):
     as_logged, turned = (lidar_velocities(rows, T_LIDAR_RADAR) for rows in (day, with_doppler(day, -1.0)))
     np.testing.assert_allclose(as_logged, turned, atol=1e-9)
     assert (as_logged[:, 0] > 0).all()
+
+
+def test_a_mirrored_sensor_is_named_and_a_radar_costs_only_its_own_pairs(day):
+    across = np.float32([1, -1, 1])
+    lidar = [replace(o, lidar_map_xyz_m=o.lidar_map_xyz_m * across) for o in day]
+    radar = [replace(o, radar_xyz_m=o.radar_xyz_m * across) for o in day]
+    for rows, pairs in ((lidar, set(PAIRS)), (radar, {"camera_radar", "lidar_radar"})):
+        found = compared_sources(rows, T_LIDAR_RADAR)
+        assert [check.fault for check in found.wrong] == ["orientation"]
+        assert {pair for pair in PAIRS if found.of(pair)} == pairs
