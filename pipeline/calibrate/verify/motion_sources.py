@@ -34,12 +34,9 @@ _LAG_S = 0.1  # radars measure tens of milliseconds beside their stamps
 # Of the scans with detections enough, by how many of them stand still. On good days 24 % at most (a highway's convoys).
 _MOST_SILENT, _EXPLAINED, _DETECTIONS = 0.6, 0.3, 30
 _SAMPLE = 20  # frames in which detections are held against the lidar
-# So many of them meet it, and so many times more, where the radar is turned round: 70 to 93 % did, and 29 % at most as
-# given.
-_LEAST_MET, _TURNED_MORE = 0.3, 1.5
-# On ten days of seven rigs 51 to 93 % met it as given, 12 to 43 % with left and right swapped; where the prior's yaw is
-# 5 deg off, 40 % at most and 1.6 times as many.
-_MIRRORED_MET, _MIRRORED_MORE = 0.45, 2.0
+# So many of them meet it, and so many times more, where a sensor is turned round or mirrored. On ten days of seven rigs
+# 51 to 93 % met it as given, 43 % at most otherwise; where the prior's yaw is 5 deg off, 40 % and 1.6 times as many.
+_LEAST_MET, _MORE = 0.45, 2.0
 _FACTORS = ((3.6, "km/h for m/s"), (1 / 3.6, "m/s for km/h"), (180 / np.pi, "deg/s for rad/s"))
 _NEAR = 0.1
 _SPEEDS = ("odometry_by_lidar", "doppler_by_lidar", "odometry_by_doppler")
@@ -100,22 +97,12 @@ def compared_sources(
         return MotionFindings()
     sources = _sources(observations, T_lidar_radar)
     slopes = _slopes(observations, sources)
-    wrong = _wrong_speeds(slopes, sources.doppler_mps) or _silent_doppler(observations)
-    found = [(_or_turned_round(check, observations, T_lidar_radar), check.fault) for check in wrong]
-    has_odometry = any(
-        o.ego_speed_mps is not None and (o.ego_yaw_rate_radps is not None or o.radar_velocity_mps is None)
-        for o in observations
-    )
-    of_radar = [check for check, fault in found if fault == "doppler" and has_odometry]
-    wrong = [check for check, _ in found]
+    wrong = _wrong_axes(observations, T_lidar_radar) or _wrong_speeds(slopes, sources.doppler_mps)
+    wrong = wrong or _silent_doppler(observations)
+    is_radars = {"doppler": _has_odometry(observations), "orientation": _lidar_agrees(slopes)}
+    of_radar = [check for check in wrong if is_radars.get(check.fault, False)]
     turning, lag = slopes.get("yaw_rate_by_lidar"), slopes.get("odometry_lag_s")
-    mirrored = _mirrored(observations, T_lidar_radar)
-    if mirrored:
-        wrong.append(mirrored)
-        # A mirrored lidar turns the other way than odometry says.
-        if turning is not None and not turning.is_off(1.0, _TURN_SHARE):
-            of_radar.append(mirrored)
-    elif turning is not None and turning.is_off(1.0, _TURN_SHARE):
+    if not wrong and turning is not None and turning.is_off(1.0, _TURN_SHARE):
         shown = f"odometry turns {turning.slope:+.2f} times as fast as the lidar's sweeps"
         wrong.append(FailedCheck(f"{shown}: {_hint(turning.slope)}", "odometry"))
     if lag is not None and not wrong and lag.is_off(0.0, _LAG_S):
@@ -222,34 +209,38 @@ def _silent_doppler(observations: Sequence[Observation]) -> list[FailedCheck]:
     return [FailedCheck(f"{shown}: check doppler_field, its unit, and doppler_period_mps", "doppler")]
 
 
-def _or_turned_round(
-    found: FailedCheck, observations: Sequence[Observation], T_lidar_radar: np.ndarray
-) -> FailedCheck:
-    """A Doppler of the other sign is a radar that looks back, where only then its detections meet the lidar."""
-    if found.fault != "doppler" or "other sign" not in found.sentence:
-        return found
-    turn = from_rotation_translation(exp_so3(np.array([0.0, 0.0, np.pi])), np.zeros(3))
-    as_given, turned = (_met(observations, T) for T in (T_lidar_radar, T_lidar_radar @ turn))
-    if turned < max(_LEAST_MET, _TURNED_MORE * as_given):
-        return found
-    met = (
-        f"{turned:.0%} of its detections meet the lidar where it is turned round, {as_given:.0%} by the prior"
-    )
-    return FailedCheck(f"the radar looks the other way: {met}; mend its transform", "orientation")
-
-
-def _mirrored(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> FailedCheck | None:
-    """Whether detections meet the lidar only where left and right of one of them are swapped."""
+def _wrong_axes(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> list[FailedCheck]:
+    """A sensor that is turned round or mirrored: only so its detections meet the lidar."""
     swap = np.diag([1.0, -1.0, 1.0, 1.0])
+    turn = from_rotation_translation(exp_so3(np.array([0.0, 0.0, np.pi])), np.zeros(3))
+    tried = {
+        "left and right of the lidar are swapped": swap @ T_lidar_radar,
+        "left and right of the radar are swapped": T_lidar_radar @ swap,
+        "the lidar is turned round": turn @ T_lidar_radar,
+        "the radar is turned round": T_lidar_radar @ turn,
+    }
     as_given = _met(observations, T_lidar_radar)
-    met, which = max(
-        (_met(observations, T), n)
-        for T, n in ((swap @ T_lidar_radar, "lidar"), (T_lidar_radar @ swap, "radar"))
+    met, how = max((_met(observations, T), how) for how, T in tried.items())
+    if met < max(_LEAST_MET, _MORE * as_given):
+        return []
+    shown = f"{met:.0%} of the radar's detections meet the lidar where {how}, {as_given:.0%} as given"
+    return [FailedCheck(f"{shown}: mend its axes or its transform", "orientation")]
+
+
+def _lidar_agrees(slopes: dict[str, _Slope]) -> bool:
+    """Whether odometry drives and turns as the lidar's sweeps do."""
+    speed, turning = slopes.get("odometry_by_lidar"), slopes.get("yaw_rate_by_lidar")
+    return (
+        speed is not None and speed.same >= _MET and (turning is None or not turning.is_off(1.0, _TURN_SHARE))
     )
-    if met < max(_MIRRORED_MET, _MIRRORED_MORE * as_given):
-        return None
-    shown = f"{met:.0%} of the detections meet the lidar where left and right of the {which} are swapped"
-    return FailedCheck(f"the lidar or the radar is mirrored: {shown}, {as_given:.0%} as given", "orientation")
+
+
+def _has_odometry(observations: Sequence[Observation]) -> bool:
+    """Whether a speed is logged: one beside a yaw rate, or where the radar's Doppler shows none."""
+    return any(
+        o.ego_speed_mps is not None and (o.ego_yaw_rate_radps is not None or o.radar_velocity_mps is None)
+        for o in observations
+    )
 
 
 def _met(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> float:
