@@ -8,29 +8,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 
 from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.scan_rows import rows_of
-from pipeline.geometry.se3 import from_quaternion
 from pipeline.geometry.spherical import to_spherical
-from pipeline.ingest.doppler_speed import doppler_speed
+from pipeline.ingest.directions_and_units import Motion, motion_of, prior_transform
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected, lacks_prior
 from pipeline.ingest.index import ACCEPTED_TYPES, NEEDED, DayIndex, index_logs, topics_of
 from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
 from pipeline.ingest.stage import pick_trios, read_file_prior
-from pipeline.ingest.sync import constant_gap_ns
+from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns
 from pipeline.results import Progress, silent
-from pipeline.rigs import OnnxSemantics, RadarTopics, Rig
+from pipeline.rigs import OnnxSemantics, Rig
 from schemas.calibrations import SENSORS, pairs_of
+from schemas.faults import FAULTS
 from schemas.frames import Frame
 
 __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
 
 _SAMPLE = 40  # frames looked into; the rest only by their stamps
-_MOVING_MPS = 1.0
-_BACKWARDS = "the car would drive backwards"
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,9 @@ def check_logs(
     usable = round(len(trios) * len(frames) / len(picked)) if trios else 0
     topics = _topics(index, rig)
     missing = [f"{t.topic} ({t.role}): {t.problem}" for t in topics if t.problem and t.role in NEEDED]
-    evidence = replace(_evidence(frames, usable, rig), missing=tuple(missing))
+    missing += _of_another_unit(rejected + builder.counts, rig, index.problems)
+    motion = motion_of(frames, rig)
+    evidence = replace(_evidence(frames, usable, rig, motion), missing=tuple(missing))
     verdicts = judge(evidence)
     return CheckReport(
         answer=overall(verdicts),
@@ -127,17 +127,28 @@ def check_logs(
         has_odometry=any(f.ego_speed_mps is not None for f in frames),
         rejected={str(k): int(v) for k, v in (rejected + index.damage + without).items() if v},
         problems=index.problems,
-        advice=_advice(frames, rig, topics, usable),
+        advice=[*motion.advice, *_advice(frames, rig, topics, usable)],
     )
 
 
-def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:
+def _of_another_unit(counts: Counter[str], rig: Rig, problems: Sequence[str]) -> list[str]:
+    """Sensors whose points are no metres, as topics that are as good as missing, and which unit fits."""
+    named = {"lidar": rig.lidar, "radar": rig.radar}
+    found = []
+    for sensor, reason in WRONG_UNIT.items():
+        topics = named[sensor]
+        if topics is not None and counts[reason] + counts[f"without_{sensor}_{reason}"]:
+            why = next((p for p in problems if p.startswith(reason)), FAULTS["unit"])
+            found.append(f"{topics.points} ({sensor}): {why}")
+    return found
+
+
+def _evidence(frames: list[Frame], usable: int, rig: Rig, motion: Motion) -> Evidence:
     def share(flags: list[bool]) -> float:
         return float(np.mean(flags)) if flags else 0.0
 
     # A rig without a camera lacks no labels, but has no boxes either.
     has_labels = rig.camera is None or isinstance(rig.semantics, OnnxSemantics)
-    moving, problem = _motion(frames, rig)
     rings = max((_rings(f) for f in frames), default=0)
     seen, swept, scanned = ([f for f in frames if sensor in f.sensors] for sensor in SENSORS)
     return Evidence(
@@ -150,9 +161,10 @@ def _evidence(frames: list[Frame], usable: int, rig: Rig) -> Evidence:
         has_intensity=share([f.lidar_intensity is not None for f in swept]) > 0.5,
         rings=rings,
         elevation_share=share([f.radar_has_elevation for f in scanned]),
-        moving_share=moving,
-        doppler_problem=problem,
-        doppler_is_wrong=problem.startswith(_BACKWARDS),
+        moving_share=motion.moving_share,
+        doppler_problem=motion.doppler_problem,
+        doppler_is_wrong=motion.doppler_is_wrong,
+        wrong=motion.wrong,
         frames_of={
             pair: round(usable * share([pair in pairs_of(f.sensors) for f in frames]))
             for pair in pairs_of(rig.sensors)
@@ -168,49 +180,6 @@ def _rings(frame: Frame) -> int:
     finite = np.isfinite(xyz).all(axis=1)
     row = rows_of(to_spherical(xyz[finite]), frame.lidar_ring[finite])
     return 0 if row is None else int(row.max()) + 1
-
-
-def _motion(frames: list[Frame], rig: Rig) -> tuple[float | None, str]:
-    """Share of frames in which the car moves, by odometry or else Doppler, and what is wrong with the Doppler."""
-    period = None if rig.radar is None else rig.radar.doppler_period_mps
-    fits, scanned = [], [f for f in frames if "radar" in f.sensors]
-    for f in scanned:
-        # A radar may look anywhere; a lidar's x axis is taken to point ahead.
-        xyz = f.radar_xyz_m.astype(np.float64) @ _prior_rotation(f, "lidar_radar").T
-        directions = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
-        fits.append(doppler_speed(directions, f.radar_range_rate_mps.astype(np.float64), period))
-    speeds = np.array([s for s, share in fits if share > 1 / 3])
-    odometry = np.array([f.ego_speed_mps for f in frames if f.ego_speed_mps is not None])
-    fitted = speeds if len(speeds) >= len(scanned) / 2 else np.zeros(0)
-    known = odometry if len(odometry) else fitted
-    moving = float(np.mean(np.abs(known) > _MOVING_MPS)) if len(known) else None
-    return moving, "" if rig.radar is None else _doppler_problem(scanned, speeds, rig.radar)
-
-
-def _prior_rotation(frame: Frame, pair: str) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a pair's prior; none where the frame has no prior."""
-    q = [getattr(frame, f"prior_{pair}_{name}") for name in ("qw", "qx", "qy", "qz")]
-    if q[0] is None:
-        return np.eye(3)
-    return from_quaternion(np.array(q, np.float64), np.zeros(3))[:3, :3]
-
-
-def _doppler_problem(frames: list[Frame], speeds: Float[np.ndarray, " N"], radar: RadarTopics) -> str:
-    period = radar.doppler_period_mps
-    spans = [float(np.ptp(f.radar_range_rate_mps)) for f in frames]
-    if period is not None and spans and max(spans) > 1.05 * period:
-        return f"Doppler spans {max(spans):.1f} m/s, more than doppler_period_mps = {period:g} allows"
-    if frames and len(speeds) < len(frames) / 2:
-        return (
-            "most scans fit no static world: check doppler_field, doppler_period_mps and the radar's heading"
-        )
-    moving = speeds[np.abs(speeds) > _MOVING_MPS]
-    if len(moving) >= 3 and np.mean(moving < 0) > 2 / 3:
-        if radar.velocity_fields is not None:
-            return f"{_BACKWARDS}: velocity_fields must be relative to the radar, x ahead"
-        other = "receding" if radar.doppler_positive == "approaching" else "approaching"
-        return f'{_BACKWARDS}: doppler_positive is probably "{other}"'
-    return ""
 
 
 def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
@@ -263,7 +232,7 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
         f"{t.topic}: {t.problem}" for t in topics if t.problem and t.role not in {"tf_static", "odometry"}
     ]
     if frames and frames[0].prior_camera_lidar_qw is not None:
-        R = _prior_rotation(frames[0], "camera_lidar")
+        R = prior_transform(frames[0], "camera_lidar")[:3, :3]
         # Up of the lidar is -y of an optical frame; more than 45 deg off, the frame is no optical one.
         if -R[1, 2] < np.cos(np.pi / 4):
             advice.append(

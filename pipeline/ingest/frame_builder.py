@@ -227,6 +227,8 @@ class FrameBuilder:
             cloud = read_lidar(message, stamp_ns, self._ingest.max_lidar_range_m)
         except (LogError, *DECODE_ERRORS) as err:
             raise Rejected(Rejection.LIDAR_DAMAGED, str(err)) from err
+        if cloud.unit:
+            raise Rejected(Rejection.LIDAR_UNIT, f"{cloud.unit} fit, metres are needed")
         if len(cloud.x_m) < self._ingest.min_lidar_points:
             raise Rejected(Rejection.LIDAR_SPARSE, f"{len(cloud.x_m)} points")
         return cloud, frame_id
@@ -239,6 +241,8 @@ class FrameBuilder:
             cloud = read_radar(message, located.channel.msgtype, self._rig.radar)
         except (LogError, *DECODE_ERRORS) as err:
             raise Rejected(Rejection.RADAR_DAMAGED, str(err)) from err
+        if cloud.unit:
+            raise Rejected(Rejection.RADAR_UNIT, f"{cloud.unit} fit, metres are needed")
         if len(cloud.xyz_m) < self._ingest.min_radar_points:
             raise Rejected(Rejection.RADAR_SPARSE, f"{len(cloud.xyz_m)} points")
         return cloud, frame_id

@@ -31,7 +31,8 @@ class Evidence:
     elevation_share: float
     moving_share: float | None
     doppler_problem: str = ""
-    doppler_is_wrong: bool = False  # its sign or unit surely is, by which calibrate holds every pair
+    doppler_is_wrong: bool = False  # its sign or unit surely is: to be mended before anything else
+    wrong: tuple[str, ...] = ()  # other sources of motion and directions that surely are
     missing: tuple[str, ...] = ()
     frames_of: Mapping[str, int] | None = None
 
@@ -98,6 +99,7 @@ def _without_frames(e: Evidence) -> _Needs:
 
 def _common_needs(e: Evidence) -> _Needs:
     needs: _Needs = [("no", e.doppler_problem)] if e.doppler_is_wrong else []
+    needs += [("no", what) for what in e.wrong]
     if e.frames < _FEW_FRAMES:
         needs.append(("no", f"{e.frames} usable synchronised frames; at least {_FEW_FRAMES} are needed"))
     elif e.frames < _ENOUGH_FRAMES:

@@ -18,6 +18,7 @@ from pipeline.ingest.frame_builder import FrameBuilder, Rejected, Trio
 from pipeline.ingest.index import DayIndex, index_logs, topics_of
 from pipeline.ingest.repetition import REPEATED
 from pipeline.ingest.sync import (
+    WRONG_UNIT,
     Rejection,
     Trios,
     match_by_motion,
@@ -35,7 +36,8 @@ from schemas.frames import SENSORS_ABSENT, SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS
 __all__ = ["find_trios", "pick_trios", "read_file_prior", "work"]
 
 _PROBLEMS_SHOWN = 3
-_STUCK = FAULTS["stuck_sensor"]
+# Reasons that state a fault.
+_STATED = dict.fromkeys(REPEATED.values(), "stuck_sensor") | dict.fromkeys(WRONG_UNIT.values(), "unit")
 _NO_STAMP_NS = -(10**18)  # long before any log
 _SAME_IMAGE_NS = 5_000_000  # labels and detections carry the stamp of the image that they were computed on
 _FAR_FROM_DAY = dt.timedelta(hours=12 + 14 + 12)  # half a day, the earliest time zone, and a night's drive
@@ -47,7 +49,7 @@ _UNUSABLE = (
     Rejection.LIDAR_SPARSE,
     Rejection.RADAR_DAMAGED,
     Rejection.RADAR_SPARSE,
-    *REPEATED.values(),
+    *_STATED,
 )
 
 
@@ -178,8 +180,8 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestCon
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
         what = f"of no moment two sensors were usable, most often {reason} ({rejected[reason]})"
-        if reason in REPEATED.values():
-            what, faults = f"{_STUCK}: {what}", ("stuck_sensor",)
+        if reason in _STATED:
+            what, faults = f"{FAULTS[_STATED[reason]]}: {what}", (_STATED[reason],)
     return _shorten([what, *index.problems]), *faults
 
 
@@ -200,8 +202,9 @@ def absences(index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConf
         elif reason in (Rejection.NO_CAMERA, Rejection.NO_RADAR):
             found[sensor] = f"nothing of {topics[role]} is near enough: not {_near_enough(config)}"
         else:
-            stuck = f"{_STUCK}: " if reason == REPEATED[sensor] else ""
-            found[sensor] = f"{stuck}{topics[role]} was unusable, most often {reason} ({count})"
+            stated = f"{FAULTS[_STATED[reason]]}: " if reason in _STATED else ""
+            why = next((p for p in index.problems if p.startswith(f"{reason}: ")), reason)
+            found[sensor] = f"{stated}{topics[role]} was unusable, most often {why} ({count})"
     return found
 
 

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
@@ -13,6 +14,7 @@ from jaxtyping import Bool, Float, Int, Int64
 from schemas.frames import SAME_SCENE_NS
 
 __all__ = [
+    "WRONG_UNIT",
     "Rejection",
     "Trios",
     "constant_gap_ns",
@@ -49,11 +51,16 @@ class Rejection(StrEnum):
     CAMERA_INFO = "no_usable_camera_info"
     LIDAR_DAMAGED = "lidar_undecodable"
     LIDAR_SPARSE = "too_few_lidar_points"
+    LIDAR_UNIT = "lidar_points_in_another_unit"
     RADAR_DAMAGED = "radar_undecodable"
     RADAR_SPARSE = "too_few_radar_points"
+    RADAR_UNIT = "radar_points_in_another_unit"
     IMAGE_REPEATED = "image_repeats_an_earlier_one"
     LIDAR_REPEATED = "lidar_repeats_an_earlier_sweep"
     RADAR_REPEATED = "radar_repeats_an_earlier_scan"
+
+
+WRONG_UNIT: Final = {"lidar": Rejection.LIDAR_UNIT, "radar": Rejection.RADAR_UNIT}
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,8 @@ from pipeline.errors import ConfigError, ModelError
 from pipeline.ingest.check import check_logs
 from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.ingest.readiness import Evidence, judge, overall
+from pipeline.ingest.units import unit_that_fits
+from pipeline.rigs import RadarTopics
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from tests.makers.fleet_files import fleet_toml
 
@@ -227,3 +229,136 @@ def test_a_model_that_is_not_what_its_manifest_means_stops_the_check(tmp_path):
     (tmp_path / "fleet.toml").write_text(text.replace(line, onnx))
     with pytest.raises(ModelError, match=r"m\.toml.*sha256"):
         check(tmp_path / "fleet.toml", tmp_path / "log.mcap")
+
+
+def with_clouds(kit, frames, topic, columns):
+    """A drive with other clouds on a topic: `columns` makes those of a frame."""
+    drive = kit.Kit(frames=frames).drive()
+    for i in range(frames):
+        stamp, frame_id = kit.START_NS + i * kit.PERIOD_NS, "lidar" if topic == kit.LIDAR else "radar"
+        drive.replaced(topic, i, drive.cloud(stamp, columns(i), frame_id=frame_id))
+    return drive
+
+
+def scaled(columns, factor):
+    return columns | {n: (factor * columns[n]).astype(np.float32) for n in "xyz"}
+
+
+@pytest.mark.parametrize(("role", "sensor"), [("LIDAR", "lidar"), ("RADAR", "radar")])
+@pytest.mark.parametrize(("factor", "unit"), [(1000, "millimetres"), (100, "centimetres")])
+def test_points_in_another_unit_are_named_with_the_unit_that_fits(
+    kit, tmp_path, run_ingest, role, sensor, factor, unit
+):
+    make = kit.lidar if sensor == "lidar" else kit.radar
+    drive = with_clouds(kit, 12, getattr(kit, role), lambda i: scaled(make(i), factor))
+    verdicts = report_on(kit, tmp_path, drive).verdicts
+    for found in (v for v in verdicts if sensor in FRAMES_OF_PAIR[v.pair]):
+        assert found.verdict == "no"
+        assert f"{unit} fit" in found.reasons[0]
+    result, _ = run_ingest(tmp_path / "a.mcap", fleet=kit.fleet(ingest={"min_lidar_points": 500}))
+    assert result.rejected[f"without_{sensor}_{sensor}_points_in_another_unit"] == 12
+
+
+def test_a_log_in_which_both_clouds_are_in_millimetres_is_refused_as_unit(kit, tmp_path, run_ingest):
+    drive = with_clouds(kit, 12, kit.LIDAR, lambda i: scaled(kit.lidar(i), 1000))
+    for i in range(12):
+        stamp = kit.START_NS + i * kit.PERIOD_NS
+        drive.replaced(kit.RADAR, i, drive.cloud(stamp, scaled(kit.radar(i), 1000), frame_id="radar"))
+    result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    assert (result.status, result.faults) == ("refused", ("unit",))
+    assert "millimetres" in result.reason
+
+
+def test_metres_stay_metres_near_and_far():
+    rng = np.random.default_rng(0)
+    for nearest, farthest in ((0.5, 3.0), (2.0, 60.0), (5.0, 250.0), (40.0, 119.0)):
+        assert unit_that_fits(rng.uniform(nearest, farthest, 500), 120.0) == ""
+
+
+def street(i, turn=1.0):
+    """Posts that lidar and radar both see, all of them ahead of the car; `turn` -1: as a sensor that looks back."""
+    rng = np.random.default_rng(i)
+    foot = np.repeat(rng.uniform((6, -15), (50, 15), (25, 2)), 32, axis=0)
+    xyz = np.column_stack([foot, np.tile(np.linspace(-1.5, 2, 32), 25)])
+    return (xyz * [turn, turn, 1]).astype(np.float32)
+
+
+def lidar_street(kit, i, turn=1.0):
+    xyz = street(i, turn)
+    return kit.lidar(i) | dict(zip("xyz", xyz.T, strict=True))
+
+
+def radar_street(i, turn=1.0, factor=1.0):
+    """At 10 m/s ahead, wherever the radar looks; positive is approaching, as the kit's fleet.toml says."""
+    # The kit mounts the radar 2.6 m ahead of the lidar, .1 m to its left and 1.3 m below.
+    xyz = (street(i)[::13] - [2.6, 0.1, -1.3]) * [turn, turn, 1]
+    doppler = factor * turn * 10 * xyz[:, 0] / np.linalg.norm(xyz, axis=1)
+    columns = dict(zip("xyz", xyz.T, strict=True)) | {"doppler": doppler, "power": 0 * doppler + 30}
+    return {n: v.astype(np.float32) for n, v in columns.items()}
+
+
+def street_drive(kit, radar=None, lidar=None):
+    drive = with_clouds(kit, 20, kit.RADAR, radar or radar_street)
+    for i in range(20):
+        columns = lidar(i) if lidar else lidar_street(kit, i)
+        drive.replaced(kit.LIDAR, i, drive.cloud(kit.START_NS + i * kit.PERIOD_NS, columns))
+    return drive
+
+
+def test_a_sensor_that_looks_back_is_told_from_a_sign(kit, tmp_path):
+    good = report_on(kit, tmp_path, street_drive(kit)).evidence
+    assert (good.doppler_problem, good.wrong) == ("", ())
+    turned = street_drive(kit, radar=lambda i: radar_street(i, turn=-1.0))
+    evidence = report_on(kit, tmp_path, turned).evidence
+    assert evidence.doppler_is_wrong
+    assert evidence.doppler_problem.startswith("the radar looks the other way")
+    turned = street_drive(kit, lidar=lambda i: lidar_street(kit, i, -1.0))
+    report = report_on(kit, tmp_path, turned)
+    assert report.answer == "no"
+    assert report.evidence.wrong[0].startswith("the lidar looks the other way")
+    sign = report_on(kit, tmp_path, street_drive(kit, radar=lambda i: radar_street(i, factor=-1.0)))
+    assert 'doppler_positive is probably "receding"' in sign.evidence.doppler_problem
+
+
+@pytest.mark.parametrize(
+    ("odometry", "doppler", "words"),
+    [
+        (10.0, 1.0, ""),
+        (36.0, 1.0, "km/h for m/s fits the odometry"),
+        (-10.0, 1.0, "the other sign fits the odometry"),
+        (10.0, 3.6, "km/h for m/s fits the Doppler"),
+        (20.0, 1.0, "a scale is wrong"),
+    ],
+)
+def test_odometry_and_doppler_that_differ_by_a_unit_or_a_sign_are_named(
+    kit, tmp_path, odometry, doppler, words
+):
+    drive = street_drive(kit, radar=lambda i: radar_street(i, factor=doppler))
+    for i in range(-1, 21):
+        stamp = kit.START_NS + i * kit.PERIOD_NS
+        message = drive.odometry(stamp, 0.0, 0.0, odometry, 0.0)
+        drive.messages.append((kit.ODOMETRY, message.__msgtype__, stamp, message))
+    report = report_on(kit, tmp_path, drive)
+    evidence = report.evidence
+    shown = "; ".join([evidence.doppler_problem, *evidence.wrong])
+    assert words in shown
+    assert bool(shown.strip("; ")) == bool(words)
+    assert (report.answer == "no") == bool(words)
+
+
+def test_a_sign_that_nobody_wrote_down_is_said_with_what_the_log_shows(kit, tmp_path):
+    def advice(factor):
+        drive = street_drive(kit, radar=lambda i: radar_street(i, factor=factor))
+        config = kit.fleet(ingest={"min_lidar_points": 500})
+        rig = config.rigs["default"]
+        radar = RadarTopics(points=rig.radar.points)
+        report = check_logs(
+            [drive.mcap(tmp_path / "a.mcap")], rig.model_copy(update={"radar": radar}), config
+        )
+        return next((a for a in report.advice if "doppler_positive" in a), "")
+
+    assert "the log shows that it is" in advice(-1.0)
+    assert "the log shows the opposite" in advice(1.0)
+    assert "cannot tell" in advice(0.0)
+    written = report_on(kit, tmp_path, street_drive(kit))
+    assert not any("doppler_positive" in a for a in written.advice)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt16
 
+from pipeline.ingest.units import unit_that_fits
+
 __all__ = ["LidarCloud", "cloud_columns", "first_field", "read_lidar"]
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -43,6 +45,7 @@ class LidarCloud:
     ring: UInt16[np.ndarray, " N"] | None
     time_s: Float32[np.ndarray, " N"] | None
     dropped: Counter[str] = field(default_factory=Counter)
+    unit: str = ""  # that fits, where it is not metres
 
 
 def cloud_columns(message: Any) -> np.ndarray:
@@ -118,6 +121,7 @@ def read_lidar(message: Any, stamp_ns: int, max_range_m: float) -> LidarCloud:
         _ring(ring, keep),
         _relative_time_s(first_field(points, _TIME), keep, stamp_ns),
         dropped,
+        unit_that_fits(np.sqrt(range2), max_range_m) if 2 * dropped.total() > len(x) else "",
     )
 
 

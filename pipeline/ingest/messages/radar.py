@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.ingest.messages.point_cloud import cloud_columns, first_field
+from pipeline.ingest.units import unit_that_fits
 from pipeline.rigs import RadarTopics
 
 __all__ = ["RadarCloud", "read_radar"]
 
 _POWER = ("power", "rcs", "amplitude", "intensity", "snr", "snr_db", "power_db")
 _MIN_RANGE_M, _MAX_RANGE_M = 0.05, 1000.0  # no automotive radar sees farther; more is a damaged number
+_REACH_M = 300.0  # of car radars' data sheets
 _FLAT_RAD = 1e-6
 
 
@@ -28,6 +30,7 @@ class RadarCloud:
     power_db: Float32[np.ndarray, " N"] | None
     has_elevation: bool
     dropped: Counter[str] = field(default_factory=Counter)
+    unit: str = ""  # that fits, where it is not metres
 
 
 @np.errstate(all="ignore")  # damaged numbers become inf or nan, and those are dropped
@@ -48,6 +51,7 @@ def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
     xyz, range_rate, power = {"RadarScan": _scan, "RadarTracks": _tracks}.get(kind, _cloud)(message, config)
     range2 = np.einsum("ij,ij->i", xyz, xyz)
     keep, dropped = _within(range2, range_rate)
+    unit = unit_that_fits(np.sqrt(range2), _REACH_M) if 2 * dropped.total() > len(xyz) else ""
     xyz = xyz[keep]
     return RadarCloud(
         xyz.astype(np.float32),
@@ -55,6 +59,7 @@ def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
         None if power is None else power[keep].astype(np.float32),
         bool(np.any(np.abs(xyz[:, 2]) > _FLAT_RAD * np.sqrt(range2[keep]))),
         dropped,
+        unit,
     )
 
 

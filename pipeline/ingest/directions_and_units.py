@@ -1,0 +1,186 @@
+"""Signs, units and directions by a sample of frames: what a log shows of them before anything is calibrated.
+
+Doppler, odometry and the clouds are held against each other. A sign or unit is tried where they disagree, and what fits
+is said. All of it is coarse: a fault moves these numbers by factors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.se3 import from_quaternion
+from pipeline.ingest.doppler_speed import doppler_speed
+from pipeline.rigs import RadarTopics, Rig
+from schemas.frames import Frame
+
+__all__ = ["MOVING_MPS", "Motion", "motion_of", "prior_transform"]
+
+MOVING_MPS = 1.0
+_BACKWARDS = "the car would drive backwards"
+_FEWEST = 3  # moving frames that tell a sign
+_MOST = 2 / 3  # of them that must show the same
+_EXPLAINED = 1 / 3  # share of a scan's detections that a speed must explain
+_KMH = 3.6
+_NEAR = 0.1  # relative: a unit or a plain factor is met
+_OFF = 0.25  # beyond which odometry and Doppler are not the same speed
+# Cells in which something stands, and how much oftener detections must meet them with the radar turned round. Where
+# cells came from the car's own way, 70 to 93 % met, and 29 % at most the other way round.
+_CELL_M, _TALL_M, _LEAST_MET, _TURNED_MORE = 1.0, 0.5, 0.3, 1.5
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the frames show of the car's motion, and what is wrong with whom."""
+
+    moving_share: float | None  # by odometry or else Doppler; None = nobody knows
+    doppler_problem: str = ""
+    doppler_is_wrong: bool = False  # its sign or unit surely is, to be mended before anything else
+    wrong: tuple[str, ...] = ()  # what else is wrong, likewise
+    advice: tuple[str, ...] = ()
+
+
+def motion_of(frames: Sequence[Frame], rig: Rig) -> Motion:
+    """Hold odometry, Doppler and the clouds of some frames against each other."""
+    scanned = [f for f in frames if "radar" in f.sensors]
+    fits = [_fit(f, rig.radar) for f in scanned]
+    speeds = np.array([s for s, share in fits if share > _EXPLAINED])
+    odometry = np.array([f.ego_speed_mps for f in frames if f.ego_speed_mps is not None])
+    fitted = speeds if len(speeds) >= len(scanned) / 2 else np.zeros(0)
+    known = odometry if len(odometry) else fitted
+    moving = float(np.mean(np.abs(known) > MOVING_MPS)) if len(known) else None
+    if rig.radar is None:
+        return Motion(moving)
+    problem = _unfit(scanned, fits, rig.radar)
+    moved = speeds[np.abs(speeds) > MOVING_MPS]
+    sign = _sign(moved) if not problem else 0
+    turned = _turned_round(scanned, sign)
+    wrong: list[str] = []
+    if sign < 0:
+        problem = turned or _other_sign(rig.radar)
+    elif turned:
+        wrong.append(turned)
+    is_wrong = sign < 0
+    both = [
+        (f.ego_speed_mps, s)
+        for f, (s, share) in zip(scanned, fits, strict=True)
+        if f.ego_speed_mps is not None and share > _EXPLAINED and abs(s) > MOVING_MPS
+    ]
+    by_doppler, by_odometry = _ratio_problem(both) if not is_wrong else ("", "")
+    if by_doppler:
+        problem, is_wrong = by_doppler, True
+    wrong += [by_odometry] if by_odometry else []
+    return Motion(moving, problem, is_wrong, tuple(wrong), _assumed_sign(rig.radar, sign))
+
+
+def prior_transform(frame: Frame, pair: str) -> Float[np.ndarray, "4 4"]:
+    """A pair's prior; identity where the frame has none."""
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    values = [getattr(frame, f"prior_{pair}_{name}") for name in names]
+    if values[0] is None:
+        return np.eye(4)
+    return from_quaternion(np.array(values[:4], np.float64), np.array(values[4:], np.float64))
+
+
+def _fit(frame: Frame, radar: RadarTopics | None, factor: float = 1.0) -> tuple[float, float]:
+    """Speed by the Doppler times a factor, and the share of detections that it explains."""
+    # A radar may look anywhere; a lidar's x axis is taken to point ahead.
+    xyz = frame.radar_xyz_m.astype(np.float64) @ prior_transform(frame, "lidar_radar")[:3, :3].T
+    directions = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+    period = None if radar is None else radar.doppler_period_mps
+    return doppler_speed(directions, factor * frame.radar_range_rate_mps.astype(np.float64), period)
+
+
+def _unfit(frames: Sequence[Frame], fits: Sequence[tuple[float, float]], radar: RadarTopics) -> str:
+    """Why the Doppler shows no speed: its period, its unit, or what nobody knows."""
+    period = radar.doppler_period_mps
+    spans = [float(np.ptp(f.radar_range_rate_mps)) for f in frames]
+    if period is not None and spans and max(spans) > 1.05 * period:
+        return f"Doppler spans {max(spans):.1f} m/s, more than doppler_period_mps = {period:g} allows"
+    if not frames or np.mean([share > _EXPLAINED for _, share in fits]) >= 0.5:
+        return ""
+    slower = [_fit(f, radar, 1 / _KMH)[1] > _EXPLAINED for f in frames]
+    if np.mean(slower) >= _MOST:
+        return f"most scans fit no static world, {np.mean(slower):.0%} do as km/h: log the Doppler in m/s"
+    return "most scans fit no static world: check doppler_field, doppler_period_mps and the radar's heading"
+
+
+def _sign(moved_mps: Float[np.ndarray, " N"]) -> int:
+    """1 = the car drives ahead, -1 = it would drive backwards, 0 = the frames do not tell."""
+    if len(moved_mps) < _FEWEST:
+        return 0
+    backwards = float(np.mean(moved_mps < 0))
+    return -1 if backwards > _MOST else 1 if backwards < 1 - _MOST else 0
+
+
+def _other_sign(radar: RadarTopics) -> str:
+    if radar.velocity_fields is not None:
+        return f"{_BACKWARDS}: velocity_fields must be relative to the radar, x ahead"
+    other = "receding" if radar.doppler_positive == "approaching" else "approaching"
+    return f'{_BACKWARDS}: doppler_positive is probably "{other}"'
+
+
+def _assumed_sign(radar: RadarTopics, sign: int) -> tuple[str, ...]:
+    """What the log shows of a sign that fleet.toml leaves out."""
+    if radar.velocity_fields is not None or "doppler_positive" in radar.model_fields_set:
+        return ()
+    absent = f'fleet.toml does not say doppler_positive, so "{radar.doppler_positive}" is assumed'
+    shown = {1: "the log shows that it is", -1: "the log shows the opposite", 0: "this log cannot tell"}[sign]
+    return (f"{absent}; {shown}: write it down" if sign else f"{absent}; {shown}: drive, or look it up",)
+
+
+def _ratio_problem(both: Sequence[tuple[float, float]]) -> tuple[str, str]:
+    """What is wrong with the Doppler, and with the odometry, by their speeds in the same frames."""
+    if len(both) < _FEWEST:
+        return "", ""
+    odometry, doppler = np.array(both).T
+    ratio = float(np.median(odometry / doppler))
+    agreed = np.abs(odometry - ratio * doppler) < _NEAR * np.abs(ratio * doppler) + MOVING_MPS / 2
+    if abs(ratio - 1) < _OFF or agreed.mean() < _MOST:
+        return "", ""
+    shown = f"odometry shows {ratio:+.2f} times the speed that the Doppler does"
+    if abs(ratio * _KMH - 1) < _NEAR:
+        return f"{shown}: km/h for m/s fits the Doppler", ""
+    sign = "the other sign" if ratio < 0 else ""
+    unit = "km/h for m/s" if abs(abs(ratio) / _KMH - 1) < _NEAR else ""
+    fits = " and ".join(word for word in (sign, unit) if word)
+    return "", f"{shown}: {fits} fits the odometry" if fits else f"{shown}: a scale is wrong"
+
+
+def _turned_round(frames: Sequence[Frame], sign: int) -> str:
+    """Says so where detections meet what stands in the sweeps only with one sensor turned round; else empty."""
+    whole = [f for f in frames if "lidar" in f.sensors and len(f.radar_xyz_m)]
+    if not whole:
+        return ""
+    given, radar, lidar = np.mean([_met(f) for f in whole], axis=0)
+    turned = max(radar, lidar)
+    if turned < max(_LEAST_MET, _TURNED_MORE * given):
+        return ""
+    # Where the Doppler shows the radar's own heading right, the sweeps are turned.
+    who = {1: "the lidar", -1: "the radar", 0: "the lidar or the radar"}[sign]
+    met = f"{turned:.0%} of the detections meet what the sweeps show where it is turned round"
+    return f"{who} looks the other way: {met}, {given:.0%} by the prior; mend its transform"
+
+
+def _met(frame: Frame) -> list[float]:
+    """Share of a scan's detections in cells in which the sweep shows something that stands.
+
+    By the prior, with the radar turned round, and with the lidar turned round.
+    """
+    points = frame.lidar_xyz_m.astype(np.float64)
+    points = points[np.isfinite(points).all(1)]
+    cells, index = np.unique(np.floor(points[:, :2] / _CELL_M).astype(np.int64), axis=0, return_inverse=True)
+    low, high = np.full(len(cells), np.inf), np.full(len(cells), -np.inf)
+    np.minimum.at(low, index.ravel(), points[:, 2])
+    np.maximum.at(high, index.ravel(), points[:, 2])
+    standing = {tuple(cell) for cell in cells[high - low > _TALL_M].tolist()}
+    T, turn = prior_transform(frame, "lidar_radar"), np.array([-1.0, -1.0, 1.0])
+    xyz = frame.radar_xyz_m.astype(np.float64)
+    given, radar = (seen @ T[:3, :3].T + T[:3, 3] for seen in (xyz, xyz * turn))
+    places = [
+        np.floor(seen[:, :2] / _CELL_M).astype(np.int64).tolist() for seen in (given, radar, given * turn)
+    ]
+    return [float(np.mean([tuple(place) in standing for place in of])) for of in places]
