@@ -141,13 +141,24 @@ def efficiency(lines: Lines, _row: Row) -> str:
 
 
 def starts(lines: Lines, row: Row) -> str:
-    """Real car: by start, runs whose camera-lidar lies within .15/.20 deg of the given calibration."""
+    """Real car: by start, camera-lidar within .15/.20 deg of the given calibration, and accepted."""
+    mine = [[r["pairs"].get("camera_lidar", {}) for r in lines if r["start"] == s] for s in row["starts"]]
+    near = [sum(p.get("az_deg", 9) <= 0.15 and p.get("el_deg", 9) <= 0.20 for p in pairs) for pairs in mine]
+    accepted = [sum(p.get("status") == "accepted" for p in pairs) for pairs in mine]
+    [runs] = {len(pairs) for pairs in mine}
+    return f"{', '.join(map(str, near))} of {runs}; accepted {', '.join(map(str, accepted))}"
+
+
+def given_inside(lines: Lines, row: Row) -> str:
+    """Real car: by pair, determined degrees of freedom of all runs within 1 and 3 sigma of the given calibration."""
     cells = []
-    for start in row["starts"]:
-        mine = [r["pairs"].get("camera_lidar", {}) for r in lines if r["start"] == start]
-        near = [p.get("az_deg", 9) <= 0.15 and p.get("el_deg", 9) <= 0.20 for p in mine]
-        cells.append(f"{sum(near)} of {len(near)}")
-    return ", ".join(cells)
+    for pair in row["pairs"]:
+        known = [r["pairs"][pair] for r in lines if pair in r["pairs"]]
+        seen = np.concatenate([np.array(p["observable"], bool) for p in known])
+        error, sigma = (np.concatenate([np.array(p[k]) for p in known]) for k in ("error", "error_sigma"))
+        z = np.abs(error / sigma)[seen]
+        cells.append(f"{100 * np.mean(z <= 1):.0f}, {100 * np.mean(z <= 3):.0f} %")
+    return "; ".join(cells)
 
 
 def shown(lines: Lines, row: Row) -> str:
@@ -197,7 +208,7 @@ def last(lines: Lines, row: Row) -> str:
 MEASURES: dict[str, Callable[[Lines, Row], str]] = {
     f.__name__: f
     for f in (
-        accepted_days, by_noise, clocks, efficiency, errors, faulty, found, inside, knocked, last, mounting, named,
-        power, shown, starts, total, value, verified, wrong_days,
+        accepted_days, by_noise, clocks, efficiency, errors, faulty, found, given_inside, inside, knocked, last,
+        mounting, named, power, shown, starts, total, value, verified, wrong_days,
     )
 }  # fmt: skip
