@@ -171,16 +171,6 @@ class TrainingRow:
     )
     # the whole
     ego_speed_mps: float = column("as in observations; 0 where unknown")
-    way_velocity_mps: np.ndarray = array(
-        "<f8",
-        (3,),
-        "velocity of the radar by Doppler of static detections, radar axes; zeros where unknown",
-        default_factory=lambda: np.zeros(3),
-    )
-    way_sigma_rad: float = column("of its elevation, by the scan alone; 0 where unknown", default=0.0)
-    road_slope: float = column(
-        "of the road under the car along that way, lidar axes; up positive", default=0.0
-    )
     camera_lag_s: float = column("camera_stamp - stamp")
     radar_lag_s: float = column("radar_stamp - stamp")
     camera_model: str = column("as in frames, for reference")
@@ -210,8 +200,5 @@ TRAINING = table_of(
     3,
     "One frame per row. Padded rows of arrays are 0.",
     made_by="prepare",
-    reads_versions=(
-        1,
-        2,
-    ),  # 1 knew no way_* and no road_slope; both hold six columns more, which nothing read
+    reads_versions=(1, 2),  # which hold columns more, that nothing reads
 )

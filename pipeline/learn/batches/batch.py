@@ -65,9 +65,6 @@ class TrainingBatch:
     radar_drivable: UInt8[Tensor, "B X Y"]  # soft, cells of 1 m: x = r + 1/2, y = c - Y/2 + 1/2
     # the whole
     ego_speed_mps: Float[Tensor, " B"]
-    way_velocity_mps: Float[Tensor, "B 3"]  # of the radar, by Doppler, in its own axes
-    way_sigma_rad: Float[Tensor, " B"]  # of its elevation; 0 = the way is not known
-    road_slope: Float[Tensor, " B"]  # along the way, lidar axes
     camera_lag_s: Float[Tensor, " B"]
     radar_lag_s: Float[Tensor, " B"]
     T_camera_lidar: Float[Tensor, "B 4 4"]  # the prior

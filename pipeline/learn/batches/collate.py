@@ -40,9 +40,7 @@ _MASKS = {
     "radar_valid": ("radar_count", "radar_motion"),
     "track_valid": ("track_count", "track_xyz_m"),
 }
-_NUMBERS = (
-    "ego_speed_mps", "way_sigma_rad", "road_slope", "camera_lag_s", "radar_lag_s", "drivable_area_m2",
-)  # fmt: skip
+_NUMBERS = ("ego_speed_mps", "camera_lag_s", "radar_lag_s", "drivable_area_m2")
 
 
 def collate(rows: Sequence[TrainingRow]) -> TrainingBatch:
@@ -75,7 +73,6 @@ def collate(rows: Sequence[TrainingRow]) -> TrainingBatch:
         environment=tuple(r.environment for r in rows),
         frame_index=torch.tensor([r.frame_index for r in rows], dtype=torch.int32),
         ground_plane=torch.from_numpy(np.stack([r.ground_plane for r in rows]).astype(np.float32)),
-        way_velocity_mps=torch.from_numpy(np.stack([r.way_velocity_mps for r in rows]).astype(np.float32)),
         radar_has_elevation=torch.tensor([r.radar_has_elevation for r in rows]),
         T_camera_lidar=_transforms(rows, "prior_camera_lidar_"),
         T_lidar_radar=_transforms(rows, "prior_lidar_radar_"),

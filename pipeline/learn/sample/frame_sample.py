@@ -19,7 +19,6 @@ from pipeline.learn.sample.camera_maps import camera_features, stored_grid
 from pipeline.learn.sample.clouds import View, lidar_columns, padded_rows, radar_columns
 from pipeline.learn.sample.grid import Grid, resample_camera
 from pipeline.objective.paper.classes import labels_of
-from pipeline.objective.radar.travel import travel_directions
 from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.training import DISTANCE_GROUPS, TrainingRow
@@ -37,7 +36,6 @@ __all__ = [
 _DETECTIONS = 24
 _MARGIN_RAD = np.radians(6.0)  # beyond the grid: what a guess wrong by so much still brings into view
 _MIN_POINTS = 300  # fewer in view show a network no shape
-_LEAST_WAY_SIGMA_RAD = 1e-4  # made scenes have no noise, and 0 says that the way is unknown
 _MIN_SEEN = 0.2  # of the grid: a camera narrower than that has another grid
 
 
@@ -96,14 +94,13 @@ def make_row(
         edge_offset=features.edge_offset.reshape(4, -1),
         sky_depth=features.sky_depth.ravel(),
         **_detection_columns(observation, camera),
-        **_way_columns(observation, prior),
     )
 
 
 def sensor_row(
     frame: Frame, observation: Observation, prior: Prior, about: About, config: PrepareConfig
 ) -> TrainingRow:
-    """A row whose columns for losses alone (semantics, the way) are 0: what a network needs to be asked, not taught.
+    """A row whose columns for losses alone (semantics) are 0: what a network needs to be asked, not taught.
 
     Args:
         frame: image and sweep.
@@ -197,18 +194,6 @@ def _detection_columns(observation: Observation, camera: Camera) -> dict[str, An
     return {
         "detection_box_rad": padded_rows(angles[rows].astype(np.float32), _DETECTIONS),
         "detection_count": len(rows),
-    }
-
-
-def _way_columns(observation: Observation, prior: Prior) -> dict[str, Any]:
-    """The car's way by Doppler and by the road; none of standing cars, flat radars and empty streets."""
-    way = travel_directions([observation], prior.T_lidar_radar, 0.0)
-    if not way.count:
-        return {}
-    return {
-        "way_velocity_mps": way.velocity_mps[0],
-        "way_sigma_rad": max(float(way.sigma_rad[0]), _LEAST_WAY_SIGMA_RAD),
-        "road_slope": float(way.slope[0]),
     }
 
 

@@ -37,7 +37,6 @@ from pipeline.objective.differentiable.terms import (
     track_cluster_cost,
     track_detection_cost,
 )
-from pipeline.objective.differentiable.way import way_cost
 
 __all__ = ["PAIR_OF_TERM", "FrameObjective", "frame_objective"]
 
@@ -50,7 +49,6 @@ PAIR_OF_TERM = {
     "static": "lidar_radar",
     "tracks_lidar": "lidar_radar",
     "drivable": "lidar_radar",
-    "way": "lidar_radar",
     "loop": "joint",
     "prior_camera_lidar": "camera_lidar",
     "prior_camera_radar": "camera_radar",
@@ -131,7 +129,6 @@ class FrameObjective:
             "static": static_cost(T, frames),
             "tracks_lidar": track_cluster_cost(T, self.tracks, b.cluster_centre_m, b.cluster_valid),
             "drivable": self._drivable(T),
-            "way": way_cost(T, b.way_velocity_mps, b.way_sigma_rad, b.road_slope),
         }
 
     def _drivable(self, T_lidar_radar: Tensor) -> Tensor:

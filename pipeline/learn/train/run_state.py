@@ -24,7 +24,7 @@ from pipeline.learn.train.paper_objective import PaperFrames, with_paper_inputs
 from pipeline.learn.train.processes import Processes
 from pipeline.learn.train.running_mean import DayMeans
 from pipeline.learn.train.schedule import DivergenceGuard
-from pipeline.learn.train.settings import RENAMED, TrainConfig
+from pipeline.learn.train.settings import TrainConfig
 from pipeline.store.partitions import Lake
 
 __all__ = ["RunState", "begin_run", "network_of_run"]
@@ -229,7 +229,7 @@ def _steps(config: TrainConfig, frames: int, processes: int) -> int:
 
 def _same_config(folder: Path, begun: dict[str, Any], config: TrainConfig) -> None:
     now = config.model_dump(mode="json")
-    begun = {RENAMED.get(key, key): value for key, value in begun.items()}
+    begun = TrainConfig.model_validate(begun).model_dump(mode="json")  # as this release names it
     other = sorted(k for k in begun.keys() | now.keys() if begun.get(k) != now.get(k))
     if other:
         problem = (

@@ -17,7 +17,6 @@ from pipeline.learn.sample.grid import Grid
 
 __all__ = [
     "PAIRS_OF",
-    "RENAMED",
     "AugmentConfig",
     "LossConfig",
     "StrangeConfig",
@@ -36,9 +35,8 @@ PAIRS_OF: dict[str, tuple[str, ...]] = {
     "lidar_radar": ("lidar_radar",),
 }
 
-
 # Keys of train.toml and of runs of 0.3.0 that have another name now; both are understood.
-RENAMED = {"doubt_weight": "uncertainty_weight"}
+_RENAMED = {"doubt_weight": "uncertainty_weight"}
 
 
 class _Section(BaseModel):
@@ -59,12 +57,17 @@ class LossConfig(_Section):
     static: NotNegative = 1.0
     tracks_lidar: NotNegative = 0.5
     drivable: NotNegative = 2.0
-    # The radar's velocity along the road (table training of version 2 knows it): detections that point wrong cannot say
-    # so. Off: short runs on a real car did not show what it is worth (README).
-    way: NotNegative = 0.0
     loop: NotNegative = 1.0
     prior: NotNegative = 0.1  # holds what frames do not determine, and is weaker than what they determine
     semantics: NotNegative = 1.0  # the encoders' cross-entropy to the precomputed classes
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_way(cls, values: object) -> object:
+        """Runs before 0.10 name a term `way`, which was off."""
+        if not isinstance(values, Mapping) or values.get("way"):
+            return values
+        return {key: value for key, value in values.items() if key != "way"}
 
 
 class AugmentConfig(_Section):
@@ -146,7 +149,7 @@ class TrainConfig(_Section):
     def _renamed(cls, values: object) -> object:
         if not isinstance(values, Mapping):
             return values
-        return {RENAMED.get(key, key): value for key, value in values.items()}
+        return {_RENAMED.get(key, key): value for key, value in values.items()}
 
     @model_validator(mode="after")
     def _cells_fit(self) -> TrainConfig:

@@ -24,7 +24,7 @@ from pipeline.learn.sample.frame_sample import (
 from pipeline.learn.sample.grid import grid_rays, resample_camera
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, POINT_IS_EDGE, POINT_IS_GROUND
-from tests.makers import doppler_streets, solve_scenes, training_lakes
+from tests.makers import solve_scenes, training_lakes
 
 ABOUT = About("v", "2026-01-01", "default", "train", "p", "urban")
 PRIOR = Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05)
@@ -193,10 +193,9 @@ def test_a_network_is_asked_with_the_same_numbers_that_it_was_taught_with():
     config = training_lakes.fleet_of(["v"]).prepare
     asked = sensor_row(frame, observation, PRIOR, ABOUT, config)
     semantic = {"grid_class", "class_distance", "edge_offset", "sky_depth"}
-    for_losses = semantic | {"way_velocity_mps", "way_sigma_rad", "road_slope"}
     for name in taught.__dataclass_fields__:
         same = np.array_equal(getattr(asked, name), getattr(taught, name))
-        assert same is not (name in for_losses or name.startswith("detection_")), name
+        assert same is not (name in semantic or name.startswith("detection_")), name
         if not same:
             assert not np.any(getattr(asked, name)), name
 
@@ -259,19 +258,3 @@ def test_fingerprints_are_near_for_the_same_view_and_far_for_others():
     others = differing[:8, :8][~np.eye(8, dtype=bool)]
     assert same.max() < 16
     assert others.min() > 60
-
-
-def test_the_row_keeps_the_cars_way_where_the_radar_shows_it_and_zeros_where_not():
-    rng = np.random.default_rng(5)
-    street = doppler_streets.scene(rng)
-    prior = replace(PRIOR, T_lidar_radar=doppler_streets.T_LIDAR_RADAR)
-    config = training_lakes.fleet_of(["v"]).prepare
-    row = make_row(training_lakes.frame_of(street, rng), street, prior, ABOUT, config)
-    ahead = prior.T_lidar_radar[:3, :3] @ row.way_velocity_mps
-    assert np.linalg.norm(ahead) == pytest.approx(doppler_streets.SPEED_MPS, rel=0.02)
-    assert abs(np.arctan2(ahead[2], ahead[0]) - row.road_slope) < 4 * row.way_sigma_rad
-    assert 0 < row.way_sigma_rad < np.radians(3)
-    standing = doppler_streets.scene(rng, speed=1.0)
-    row = make_row(training_lakes.frame_of(standing, rng), standing, prior, ABOUT, config)
-    assert not row.way_velocity_mps.any()
-    assert row.way_sigma_rad == row.road_slope == 0.0
