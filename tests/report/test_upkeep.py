@@ -78,7 +78,7 @@ def test_a_vehicle_that_drives_rarely_has_a_page_for_every_day_of_its_charts(mak
     report(lake, out)
     assert {day for v, day in drawn if v == "weekly"} == {r.day for r in weekly}
     text = out.read_text()
-    assert f'"{weekly[0].day}", "A"' in text  # linked from the vehicle's charts
+    assert f'"{weekly[0].day}", "D"' in text  # linked from the vehicle's charts
     assert 'class="status GREEN"' in text.split(">weekly</a>")[1][:200]
 
 
