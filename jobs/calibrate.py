@@ -74,6 +74,7 @@ def _calibrate_day(task: Task) -> int:
     from pipeline.stages import CALIBRATE
     from pipeline.store.tables import read_manifest
     from schemas.observations import OBSERVATIONS
+    from schemas.words import day_word
 
     vehicle, day = task.partition.vehicle, task.partition.day
     task.fleet.rig_of(vehicle)  # raises, naming the vehicles there are
@@ -85,9 +86,11 @@ def _calibrate_day(task: Task) -> int:
     with progress_reporter(f"calibrate {task.partition.vehicle} {task.partition.day}") as progress:
         outcome = CALIBRATE.run(replace(task, progress=progress))
     record_outcome(task.lake, outcome, task.method or "")
+    word = day_word(status for status, pairs in outcome.kept.items() if pairs)
+    word = outcome.status if word == "done" else word  # or "cached"
     print_summary(
         "calibrate",
-        outcome.status,
+        word,
         vehicle=outcome.vehicle,
         day=outcome.day,
         method=task.method,
@@ -96,7 +99,7 @@ def _calibrate_day(task: Task) -> int:
         work_key=outcome.work_key,
         outputs=outcome.outputs,
     )
-    return exit_code([outcome.status, *(status for status, pairs in outcome.kept.items() if pairs)])
+    return exit_code([word])
 
 
 def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
