@@ -17,7 +17,7 @@ from tests.benchmarks.recovery import changed_radar
 from tests.benchmarks.studies import engine, rigs, table1
 from tests.benchmarks.studies.ablation import _settings, setting_of
 from tests.benchmarks.studies.commits import is_same_code
-from tests.benchmarks.studies.days import SETS, Day, DaySpec
+from tests.benchmarks.studies.days import SETS, Day, DaySpec, label_by_network
 from tests.benchmarks.studies.engine import Run, key_of, prior_of, read_results, run_study, spoiled
 from tests.benchmarks.studies.looks import heading, look, read_looks
 from tests.benchmarks.studies.verdict import _derived, _simulated, fault_of
@@ -317,3 +317,12 @@ def test_a_change_of_the_radars_data_is_a_change_of_its_pose():
     seen = transform_points(T_LIDAR_RADAR, row.radar_xyz_m.astype(float))
     again = transform_points(T_LIDAR_RADAR @ inverse(D), changed.radar_xyz_m.astype(float))
     assert again == pytest.approx(seen, abs=1e-4)
+
+
+def test_a_network_that_labels_a_days_lidar_is_in_its_fleet_file(tmp_path):
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text(fleet_toml("car"))
+    label_by_network(fleet, "shipped:lidar_semantics")
+    [rig] = load_fleet(fleet).rigs.values()
+    assert rig.lidar.semantics is not None
+    assert rig.lidar.semantics.segmenter == "shipped:lidar_semantics"

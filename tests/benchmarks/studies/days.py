@@ -6,13 +6,15 @@
 
 Of a day only its truth, its fleet.toml and its observations stay on the disk; days that are there are not made again.
 `adopt` puts a real day, ingested and perceived, beside them: its logged calibration stands in for the truth that nobody
-knows. `gather` makes one fleet of the days of some sets, each a vehicle, for commands that learn from a lake.
+knows. `gather` makes one fleet of the days of some sets, each a vehicle, for commands that learn from a lake. With
+`--lidar-semantics shipped:lidar_semantics` that network labels the lidar's points, where geometry does otherwise.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 import time
 from collections.abc import Sequence
@@ -35,7 +37,7 @@ from schemas.observations import OBSERVATIONS, Observation
 from tests.benchmarks.studies.commits import commit_now
 from tests.makers.stages import ingest_day, perceive_day
 
-__all__ = ["REAL", "SETS", "Day", "DaySpec", "adopt_day", "generate_day", "load_day"]
+__all__ = ["REAL", "SETS", "Day", "DaySpec", "adopt_day", "generate_day", "label_by_network", "load_day"]
 
 VEHICLE, DATE = "vehicle-1", "2026-03-02"
 _FINISHED = "done.json"
@@ -84,7 +86,7 @@ class Day:
         return T @ from_rotation_translation(down, np.zeros(3))
 
 
-def generate_day(spec: DaySpec, root: Path, *, images: bool = False) -> Path:
+def generate_day(spec: DaySpec, root: Path, *, images: bool = False, lidar_semantics: str = "") -> Path:
     """Simulate, ingest and perceive a day unless it is there; returns its folder. `images` keeps table frames."""
     folder = root / spec.name
     if (folder / _FINISHED).exists():
@@ -100,6 +102,8 @@ def generate_day(spec: DaySpec, root: Path, *, images: bool = False) -> Path:
         folder,
     )  # fmt: skip
     fleet, lake, partition = folder / "fleet.toml", Lake.at(folder / "lake"), Partition(VEHICLE, DATE)
+    if lidar_semantics:
+        label_by_network(fleet, lidar_semantics)
     config = load_fleet(fleet)
     logs = sorted((folder / "logs" / VEHICLE / DATE).iterdir())
     ingest_day(logs, partition, config, lake)
@@ -111,6 +115,13 @@ def generate_day(spec: DaySpec, root: Path, *, images: bool = False) -> Path:
     note |= {"simulated_by": commit, "perceived_by": commit}
     (folder / _FINISHED).write_text(json.dumps(note) + "\n")
     return folder
+
+
+def label_by_network(fleet: Path, network: str) -> None:
+    """Write into a simulated fleet.toml that this network labels the lidar's points."""
+    line = f'semantics = {{ source = "onnx", segmenter = "{network}" }}'
+    text = fleet.read_text()
+    fleet.write_text(re.sub(r"^(\[rigs\.\S+\.lidar\])$", rf"\1\n{line}", text, flags=re.MULTILINE))
 
 
 def adopt_day(fleet_file: Path, lake: str, partition: Partition, root: Path) -> Path:
@@ -295,6 +306,7 @@ def main() -> None:
     parser.add_argument(
         "--shard", default="0/1", help="I/N: every N-th day from the I-th, for N commands at once"
     )
+    parser.add_argument("--lidar-semantics", default="", help="network that labels the lidar's points")
     parser.add_argument("--out", type=Path, help="folder of the gathered fleet")
     parser.add_argument("--fleet", type=Path)
     parser.add_argument("--lake")
@@ -311,7 +323,7 @@ def main() -> None:
     for name in args.sets:
         for spec in SETS[name][shard::shards]:
             began = time.time()
-            generate_day(spec, args.root)
+            generate_day(spec, args.root, lidar_semantics=args.lidar_semantics)
             print(f"{time.strftime('%H:%M:%S')} {name} {spec.name} ({time.time() - began:.0f} s)", flush=True)
 
 
