@@ -16,20 +16,36 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pipeline.errors import ModelError
 from pipeline.perceive.labels import DETECTOR_SETS, LABEL_SETS
 
-__all__ = ["InputSpec", "Manifest", "OutputSpec", "check_hash", "load_manifest", "read_manifest"]
-
-_Kind = TypeVar("_Kind", bound=BaseModel)
+__all__ = ["InputSpec", "Manifest", "ModelFile", "OutputSpec", "Section", "load_manifest", "read_manifest"]
 
 _Unit = Annotated[float, Field(ge=0, le=1)]
 _Size = Annotated[int, Field(gt=0)]
 _Triple = tuple[float, float, float]
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """A section of a manifest: unknown keys, nan and inf are errors."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class InputSpec(_Section):
+class ModelFile(Section):
+    """What every manifest says: which file it means."""
+
+    path: str
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    file: Path = Path()  # of the manifest itself, set on reading
+
+    @property
+    def model_file(self) -> Path:
+        """The ONNX file."""
+        return self.file.parent / self.path
+
+
+_Kind = TypeVar("_Kind", bound=ModelFile)
+
+
+class InputSpec(Section):
     """How an image becomes the model's input, float32 1x3xHxW."""
 
     size: tuple[_Size, _Size]
@@ -49,7 +65,7 @@ class InputSpec(_Section):
         return self
 
 
-class OutputSpec(_Section):
+class OutputSpec(Section):
     """What the model puts out."""
 
     layout: Literal["yolox", "yolov5", "yolov8", "logits", "labels"]
@@ -59,15 +75,12 @@ class OutputSpec(_Section):
     min_score: _Unit = 0.05  # candidates for non-maximum suppression; the config's threshold comes after
 
 
-class Manifest(_Section):
-    """One model, checked: the file exists and is the one that the manifest means."""
+class Manifest(ModelFile):
+    """One model for images."""
 
-    path: str
-    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     task: Literal["detect", "segment"]
     input: InputSpec
     output: OutputSpec
-    file: Path = Path()  # of the manifest itself, set on loading
 
     @model_validator(mode="after")
     def _output_goes_with_task(self) -> Manifest:
@@ -81,11 +94,6 @@ class Manifest(_Section):
             raise ValueError("input.tile_scales is for detectors only")
         return self
 
-    @property
-    def model_file(self) -> Path:
-        """The ONNX file."""
-        return self.file.parent / self.path
-
 
 def load_manifest(file: Path, task: Literal["detect", "segment"]) -> Manifest:
     """Read and check a manifest and the hash of its model.
@@ -98,19 +106,18 @@ def load_manifest(file: Path, task: Literal["detect", "segment"]) -> Manifest:
     manifest = read_manifest(file, Manifest)
     if manifest.task != task:
         raise ModelError(str(file), f'task: is "{manifest.task}", but fleet.toml uses it to {task}')
-    check_hash(file, manifest.model_file, manifest.sha256)
     return manifest
 
 
 def read_manifest(file: Path, kind: type[_Kind]) -> _Kind:
-    """A manifest of this kind; its field `file` becomes the path that it was read from.
+    """A manifest of this kind whose model is there; its field `file` becomes the path that it was read from.
 
     Raises:
-        ModelError: missing file, unknown key or impossible value.
+        ModelError: missing file, unknown key, impossible value, or another model than the manifest means.
     """
     try:
         raw = tomllib.loads(file.read_text())
-        return kind.model_validate({k: v for k, v in raw.items() if k != "file"} | {"file": file})
+        manifest = kind.model_validate({k: v for k, v in raw.items() if k != "file"} | {"file": file})
     except FileNotFoundError as err:
         raise ModelError(str(file), "no such manifest") from err
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as err:
@@ -119,18 +126,12 @@ def read_manifest(file: Path, kind: type[_Kind]) -> _Kind:
         problems = err.errors(include_url=False)
         text = "; ".join(f"{'.'.join(map(str, p['loc'])) or 'manifest'}: {p['msg']}" for p in problems)
         raise ModelError(str(file), text) from err
-
-
-def check_hash(file: Path, model_file: Path, sha256: str) -> None:
-    """Make sure that the model is the one that the manifest `file` means.
-
-    Raises:
-        ModelError: it cannot be read, or is another.
-    """
+    model = manifest.model_file
     try:
-        with model_file.open("rb") as stream:
+        with model.open("rb") as stream:
             found = hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as err:
-        raise ModelError(str(file), f"path: cannot read {model_file}: {err.strerror}") from err
-    if found != sha256:
-        raise ModelError(str(file), f"sha256: {model_file} has {found}, not {sha256}")
+        raise ModelError(str(file), f"path: cannot read {model}: {err.strerror}") from err
+    if found != manifest.sha256:
+        raise ModelError(str(file), f"sha256: {model} has {found}, not {manifest.sha256}")
+    return manifest

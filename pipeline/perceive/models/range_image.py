@@ -33,14 +33,14 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, UInt8
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from pipeline.config import FleetConfig
-from pipeline.errors import ModelError, ModelOutputError
+from pipeline.errors import ModelOutputError
 from pipeline.geometry.range_image import EMPTY, channels_of, project, vote_of_neighbours
 from pipeline.perceive.ground import PointKind
-from pipeline.perceive.models.manifest import check_hash, read_manifest
-from pipeline.perceive.models.session import AlikeCheck, open_session
+from pipeline.perceive.models.manifest import ModelFile, Section, read_manifest
+from pipeline.perceive.models.session import Session
 from pipeline.rigs import OnnxPointSemantics
 
 __all__ = ["POINT_LABEL_SETS", "RangeImageManifest", "RangeImageSegmenter"]
@@ -62,11 +62,7 @@ POINT_LABEL_SETS: dict[str, dict[str, PointKind]] = {
 }  # fmt: skip
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class _Input(_Section):
+class _Input(Section):
     size: tuple[_Size, _Size]
     fov_up_deg: Annotated[float, Field(ge=-90, le=90)]
     fov_down_deg: Annotated[float, Field(ge=-90, le=90)]
@@ -83,7 +79,7 @@ class _Input(_Section):
         return self
 
 
-class _Output(_Section):
+class _Output(Section):
     layout: Literal["logits"]
     label_set: str
 
@@ -94,7 +90,7 @@ class _Output(_Section):
         return self
 
 
-class _Knn(_Section):
+class _Knn(Section):
     neighbours: _Size = 5
     search: _Size = 5
     sigma_px: Annotated[float, Field(gt=0)] = 1.0
@@ -109,16 +105,13 @@ class _Knn(_Section):
         return self
 
 
-class RangeImageManifest(_Section):
+class RangeImageManifest(ModelFile):
     """One model for range images."""
 
-    path: str
-    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     task: Literal["segment_points"]
     input: _Input
     output: _Output
     knn: _Knn = _Knn()
-    file: Path = Path()  # of the manifest itself, set on reading
 
     @model_validator(mode="after")
     def _window_fits(self) -> RangeImageManifest:
@@ -141,12 +134,8 @@ class RangeImageSegmenter:
             ModelError: missing, wrong, or not the model that the hash says.
         """
         manifest = read_manifest(manifest_file, RangeImageManifest)
-        model = manifest_file.parent / manifest.path
-        check_hash(manifest_file, model, manifest.sha256)
         self._manifest, self._file, self._scale = manifest, str(manifest_file), remission_scale
-        self._session = open_session(model, manifest_file)
-        self._input = self._checked_input()
-        self._check_alike = AlikeCheck(manifest_file)
+        self._session = Session(manifest, (5, *manifest.input.size))
         self._kinds = np.array(list(POINT_LABEL_SETS[manifest.output.label_set].values()), np.uint8)
         told = manifest.model_dump(mode="json", exclude={"file", "path"})
         self.provenance: dict[str, Any] = {"lidar_segmenter": told | {"remission_scale": remission_scale}}
@@ -197,10 +186,7 @@ class RangeImageSegmenter:
 
     def _run(self, tensor: np.ndarray) -> np.ndarray:
         """Logits CxHxW."""
-        try:
-            answer = self._session.run(None, {self._input: tensor})[0]
-        except Exception as err:  # onnxruntime's own exceptions share no base but this
-            raise ModelError(self._file, f"the model failed to run: {err}") from err
+        answer = self._session.run(tensor)
         wanted = [1, len(self._kinds), *self._manifest.input.size]
         if list(answer.shape) != wanted:
             raise ModelOutputError(
@@ -208,24 +194,4 @@ class RangeImageSegmenter:
                 f"output.layout: logits must be {wanted} (1, labels of {self._manifest.output.label_set}, "
                 f"rows, columns), the model gives {list(answer.shape)}",
             )
-        if not np.isfinite(answer).all():
-            raise ModelOutputError(self._file, "the model gives logits that are not finite")
-        self._check_alike(tensor[..., ::4, ::4], answer)
         return np.asarray(answer[0], np.float32)
-
-    def _checked_input(self) -> str:
-        inputs = self._session.get_inputs()
-        if len(inputs) != 1 or inputs[0].type != "tensor(float)":
-            found = ", ".join(f"{i.name} {i.type}" for i in inputs)
-            raise ModelError(self._file, f"path: the model must take one float32 image, it takes {found}")
-        wanted, shape = (1, 5, *self._manifest.input.size), inputs[0].shape
-        fits = len(shape) == len(wanted) and all(
-            not isinstance(s, int) or s == w for s, w in zip(shape, wanted, strict=True)
-        )
-        if not fits:
-            raise ModelError(
-                self._file,
-                f"input.size: {list(self._manifest.input.size)} does not go with the model's input {shape} "
-                "(1, 5, rows, columns)",
-            )
-        return str(inputs[0].name)

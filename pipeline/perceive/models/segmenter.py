@@ -19,7 +19,7 @@ class Segmenter:
 
     def __init__(self, manifest: Manifest) -> None:
         self._manifest = manifest
-        self._session = Session(manifest)
+        self._session = Session(manifest, (3, *manifest.input.size))
         self._table = to_cityscapes(manifest.output.label_set)
         self._check_alike = AlikeCheck(manifest.file)
 

@@ -12,7 +12,7 @@ import onnxruntime as ort
 from jaxtyping import Float32, UInt8
 
 from pipeline.errors import ModelError, ModelOutputError
-from pipeline.perceive.models.manifest import InputSpec, Manifest
+from pipeline.perceive.models.manifest import InputSpec, ModelFile
 
 __all__ = ["AlikeCheck", "Fit", "Session", "fit_image", "open_session"]
 
@@ -54,44 +54,49 @@ class AlikeCheck:
 
 
 class Session:
-    """One model, one thread: workers run side by side, and a spinning pool would steal their cores."""
+    """One model, one thread: workers run side by side, and a spinning pool would steal their cores.
 
-    def __init__(self, manifest: Manifest) -> None:
-        self._manifest = manifest
+    Args:
+        manifest: of the model.
+        shape: of one input, without the axis of the batch: channels, rows, columns.
+    """
+
+    def __init__(self, manifest: ModelFile, shape: tuple[int, int, int]) -> None:
+        self._file = str(manifest.file)
         self._session = open_session(manifest.model_file, manifest.file)
-        self._input = self._checked_input()
+        self._input = self._checked_input(shape)
+        self._check_alike = AlikeCheck(manifest.file)
 
-    def run(self, tensor: Float32[np.ndarray, "1 3 H W"]) -> np.ndarray:
+    def run(self, tensor: Float32[np.ndarray, "1 C H W"]) -> np.ndarray:
         """First output of the model.
 
         Raises:
             ModelError: the model does not run on this input.
-            ModelOutputError: it answers with what is no number.
+            ModelOutputError: it answers with what is no number, or with the same for several inputs on end.
         """
         try:
             output: np.ndarray = self._session.run(None, {self._input: tensor})[0]
-        except Exception as err:
-            raise ModelError(str(self._manifest.file), f"the model failed to run: {err}") from err
-        if np.isnan(output).any():
-            raise ModelOutputError(str(self._manifest.file), "the model gives NaN")
+        except Exception as err:  # onnxruntime's own exceptions share no base but this
+            raise ModelError(self._file, f"the model failed to run: {err}") from err
+        if np.isnan(output).any() or np.isposinf(output).any():
+            raise ModelOutputError(self._file, "the model gives NaN or infinity")
+        self._check_alike(tensor[..., ::4, ::4], output)
         return output
 
-    def _checked_input(self) -> str:
-        file, size = str(self._manifest.file), self._manifest.input.size
+    def _checked_input(self, shape: tuple[int, int, int]) -> str:
         inputs = self._session.get_inputs()
         if len(inputs) != 1 or inputs[0].type != "tensor(float)":
             found = ", ".join(f"{i.name} {i.type}" for i in inputs)
-            raise ModelError(file, f"path: the model must take one float32 image, it takes {found}")
-        wanted = (1, 3, *size)
-        shape = inputs[0].shape
-        fits = len(shape) == len(wanted) and all(
-            not isinstance(s, int) or s == w for s, w in zip(shape, wanted, strict=True)
+            raise ModelError(self._file, f"path: the model must take one float32 image, it takes {found}")
+        wanted, taken = (1, *shape), inputs[0].shape
+        fits = len(taken) == len(wanted) and all(
+            not isinstance(s, int) or s == w for s, w in zip(taken, wanted, strict=True)
         )
         if not fits:
-            raise ModelError(
-                file,
-                f"input.size: {list(size)} does not go with the model's input {shape} (1, 3, rows, columns)",
+            told = (
+                f"{list(shape[1:])} does not go with the model's input {taken} (1, {shape[0]}, rows, columns)"
             )
+            raise ModelError(self._file, f"input.size: {told}")
         return str(inputs[0].name)
 
 

@@ -160,7 +160,7 @@ def test_models_of_another_shape_than_their_manifest_are_refused(tmp_path):
     with pytest.raises(ModelError, match=r"output\.layout.*20.*13"):
         few.kinds(points_of([10], [50], [9.0]), None)
     broken = RangeImageSegmenter(manifest(tmp_path, {ROAD: (NONE, NONE, np.nan)}))
-    with pytest.raises(ModelError, match="not finite"):
+    with pytest.raises(ModelError, match="NaN"):
         broken.kinds(points_of([10], [50], [9.0]), None)
 
 
