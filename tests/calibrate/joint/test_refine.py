@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.calibrate.joint.camera_lidar import refine as module
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine, scales
+from pipeline.calibrate.joint.camera_lidar.time_offset import far_time_offset
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.objective.camera_lidar.score import KernelSettings, lidar_velocities, prepare_terms
@@ -53,3 +54,13 @@ def test_what_is_fixed_stays_at_the_prior(scored):
     end = refine(scored, start, steps=3, fixed=fixed)
     assert end.T_camera_lidar[2, 3] == scored.prior.T_camera_lidar[2, 3]
     assert (end.dt_s, end.focal) == (start.dt_s, start.focal)
+
+
+@pytest.mark.parametrize("slid_s", [0.5, -0.5])
+def test_a_camera_whose_clock_is_half_a_second_off_is_seen_from_where_nothing_matches(slid_s):
+    day = traced_day(DENSE, 12, seed=5, dt_s=0.02)
+    terms = prepare_terms(day, T_TRUE, lidar_velocities(day, np.eye(4)), reach_rad=np.radians(8.0))
+    slid = AlignmentState(T_TRUE, dt_s=0.02 + slid_s)
+    found_s, z = far_time_offset(terms, slid, SHARP, np.random.default_rng(0))
+    assert abs(found_s - 0.02) < 0.04
+    assert z > 2

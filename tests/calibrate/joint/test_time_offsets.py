@@ -1,7 +1,5 @@
 """The radar's time offset: dips of the registration's cost beside slopes that have nothing to do with time."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -35,22 +33,38 @@ def test_a_dip_is_deepest_where_it_is_however_steep_the_slope(slope):
     assert (int(np.argmin(cost)) == 37) == (slope == 0.0)  # which its lowest value would not show
 
 
-def test_the_radars_own_sigmas_bring_back_an_offset_that_wider_ones_do_not_see(monkeypatch):
-    prior = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2), 0.05)
+@pytest.fixture(scope="module")
+def problem():
+    """Sixteen frames of streets, at the true pose."""
     rows, rng = street_day(16, seed=5), np.random.default_rng(0)
-    problem = RadarProblem(
+    return RadarProblem(
         rows,
         registration_frames(rows, T_LIDAR_RADAR, rng),
         moving_clusters(rows, with_boxes=False),
         vehicle_boxes(rows),
         None,
-        prior,
+        Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2), 0.05),
         0.05,
         np.radians(0.4),
         ElevationSpread(0.1, 0.5),
     )
-    right = RadarState(T_LIDAR_RADAR, DT_S, 0.0, np.zeros(len(BOX_CLASSES)), SIGMA, 0.0)
-    slid = replace(right, dt_s=DT_S + 0.04)
+
+
+def state_at(dt_s):
+    return RadarState(T_LIDAR_RADAR, dt_s, 0.0, np.zeros(len(BOX_CLASSES)), SIGMA, 0.0)
+
+
+@pytest.mark.parametrize("slid_s", [0.6, -0.6])
+def test_an_offset_far_beyond_what_is_searched_is_seen_from_anywhere(problem, slid_s):
+    far = time_offset.far_time_offset(problem, state_at(DT_S + slid_s))
+    assert abs(far["own_dt_s"] - DT_S) < 0.02
+    assert far["own_dt_z"] < -2
+    right = time_offset.far_time_offset(problem, state_at(DT_S))
+    assert abs(right["own_dt_s"] - DT_S) < 0.02
+
+
+def test_the_radars_own_sigmas_bring_back_an_offset_that_wider_ones_do_not_see(problem, monkeypatch):
+    right, slid = state_at(DT_S), state_at(DT_S + 0.04)
     monkeypatch.setattr(time_offset, "comparison_cost", lambda problem, _: np.zeros(problem.frames.count))
     found = time_offset.better_time_offset(problem, slid)
     assert found is not None

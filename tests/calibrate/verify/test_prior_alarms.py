@@ -97,6 +97,17 @@ def test_a_clock_that_is_further_off_than_stated_is_an_alarm():
     assert not clock_alarms({"lidar_radar": estimate_of("lidar_radar", dt_s=0.5)}, 0.2, LIMITS)
 
 
+@pytest.mark.parametrize(
+    ("own", "is_alarm"), [((0.5, -5.0), True), ((0.5, -0.7), False), ((0.06, -5.0), False)]
+)
+def test_frames_that_align_far_better_at_another_offset_are_an_alarm_though_none_was_solved_for(
+    own, is_alarm
+):
+    estimate = estimate_of("lidar_radar", own_dt_s=own[0], own_dt_z=own[1])
+    found = clock_alarms({"lidar_radar": estimate}, 0.05, LIMITS)
+    assert [c.fault for c in found.get("lidar_radar", [])] == ["time_offset"] * is_alarm
+
+
 @pytest.mark.parametrize("off_m", [0.0, 0.4])
 def test_a_radar_mounted_further_ahead_than_its_prior_says_is_found_though_x_is_left_to_the_prior(off_m):
     T = T_LIDAR_RADAR.copy()

@@ -36,7 +36,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, s_per_metre
+from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, far_time_offset, s_per_metre
 from pipeline.calibrate.joint.camera_lidar.witnesses import (
     Witness,
     ask_witnesses,
@@ -211,6 +211,8 @@ def analyse_camera_lidar(
         halves.append(refine(half, analysis.state, steps=SCHEDULE.half_steps, fixed=fixed))
     diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves)
     own_tz = analysis.profile.shift_from(float(problem.prior.T_camera_lidar[2, 3]))
+    own_dt_s, z = far_time_offset(problem.terms, analysis.state, analysis.kernel, rng)
+    diagnostics |= {"own_dt_s": aligned.expected_dt_s + own_dt_s, "own_dt_z": z}
     if analysis.observability[5] < OBSERVABLE and own_tz is not None:
         diagnostics |= {"own_tz_m": own_tz[0], "own_tz_sigma_m": own_tz[1]}
     own = np.sqrt(np.diag(analysis.covariance)[:2]).tolist()

@@ -19,16 +19,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import median_filter
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine, scales
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.response_surface import DESIGN
-from pipeline.objective.camera_lidar.score import Terms
+from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
 
-__all__ = ["DT", "FOCAL", "TimeOffsetProfile", "profile_time_offset", "s_per_metre"]
+__all__ = ["DT", "FOCAL", "TimeOffsetProfile", "far_time_offset", "profile_time_offset", "s_per_metre"]
 
 DT, FOCAL = 6, 7  # of the eight unknowns
 _SLOW_MPS = 2.0  # below such speeds a shift along the axis is not made up for by the time offset
+# Of an alarm: how far it looks [s], by how many edges, in steps of the way driven, and steps around each.
+_FAR_S, _FAR_EDGES, _FAR_STEP_M, _FAR_LEAST_MPS, _FAR_AROUND, _FAR_KERNEL_PX = 1.0, 5000, 0.25, 4.0, 13, 2.5
 _DT_AND_FOCAL = np.isin(np.arange(8), (DT, FOCAL))
 
 
@@ -91,6 +94,31 @@ def _ends(
             here = refine(scored, moved, steps=SCHEDULE.profile_steps, fixed=fixed)
             ends[sign * k] = here, _frame_scores(scored, here)
     return ends
+
+
+def far_time_offset(
+    terms: Terms, state: AlignmentState, kernel: KernelSettings, rng: np.random.Generator
+) -> tuple[float, float]:
+    """The time offset within a second at which edges match far better than around it, however far from the state's.
+
+    Returns:
+        The state's dt there [s], and by how many standard errors it stands out more than the state's own; 0 where it is
+        the state's own.
+    """
+    some = terms.at_most(_FAR_EDGES, rng).of_kinds(edges=True, markings=False)
+    speed_mps = float(np.sqrt(np.mean(np.sum(terms.velocity_lidar**2, axis=1))))
+    step_s = _FAR_STEP_M / max(speed_mps, _FAR_LEAST_MPS)
+    offsets = np.append(state.dt_s, np.arange(-_FAR_S, _FAR_S + step_s, step_s))
+    order = np.argsort(offsets, kind="stable")
+    T = np.repeat(state.T_camera_lidar[None], len(offsets), 0)
+    at = Alignments(T, offsets[order], np.full(len(offsets), state.focal))
+    score = some.score(at, replace(kernel, sigma_px=_FAR_KERNEL_PX)).astype(np.float64)
+    peaks = np.empty_like(score)
+    # On a slope nothing stands out: rails match wherever on them they are seen.
+    peaks[order] = score - median_filter(score, size=(_FAR_AROUND, 1), mode="nearest")
+    best = int(np.argmax(peaks.mean(1)))
+    more = peaks[best] - peaks[0]
+    return float(offsets[best]), float(more.mean() / (max(float(more.std()), 1e-12) / np.sqrt(len(more))))
 
 
 def _maximum(value: Float[np.ndarray, "S N"]) -> Float[np.ndarray, " S"]:

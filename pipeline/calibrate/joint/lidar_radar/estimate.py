@@ -31,7 +31,11 @@ from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odom
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, anneal, finish, last_step, scan
 from pipeline.calibrate.joint.lidar_radar.tilt_floors import following_tilt, radar_tilt_axes
-from pipeline.calibrate.joint.lidar_radar.time_offset import better_time_offset, comparison_cost
+from pipeline.calibrate.joint.lidar_radar.time_offset import (
+    better_time_offset,
+    comparison_cost,
+    far_time_offset,
+)
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction
 from pipeline.calibrate.numerics.bias_floors import (
     LIDAR_RADAR_BIAS,
@@ -118,6 +122,7 @@ def estimate_lidar_radar(
     found = _conclude(problem, analysis, compared, halves, rejected)
     block = blocks_of(problem.observations, config.bootstrap_blocks)
     own = own_position(problem, analysis.state, analysis.fixed, block)
+    own |= far_time_offset(problem, analysis.state)
     return replace(found, parts=_parts(problem, analysis, config, rng), diagnostics=found.diagnostics | own)
 
 

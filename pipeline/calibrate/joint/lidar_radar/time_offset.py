@@ -19,12 +19,13 @@ from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY, REGISTRATION_COMPARISON_SIGMA
 from pipeline.objective.radar.registration import SIGMA_START, RegistrationFrames, registration_cost
 
-__all__ = ["better_time_offset", "comparison_cost", "dips", "scan_time_offset"]
+__all__ = ["better_time_offset", "comparison_cost", "dips", "far_time_offset", "scan_time_offset"]
 
 _CLEARLY = 4.0  # standard errors by which frames reject the solution's own time offset
 # The same at the radar's own sigmas. A corner radar's dt had slid 39 ms along guard rails that seven fast frames of 23
 # passed: there 3.5, at the other sigmas 2.1; on 13 right days of seeds 40 to 117 no other offset was deeper at all.
 _CLEARLY_BY_OWN, _OWN_STRIDE = 3.0, 3
+_FAR_S, _FAR_STRIDE = 1.0, 3  # of an alarm: how far it looks, in one frame of so many
 
 
 def dips(cost: Float[np.ndarray, "K F"]) -> Float[np.ndarray, "K F"]:
@@ -74,6 +75,29 @@ def better_time_offset(problem: RadarProblem, state: RadarState) -> RadarState |
         ):
             return others[best]
     return None
+
+
+def far_time_offset(problem: RadarProblem, state: RadarState) -> dict[str, float]:
+    """The time offset within a second at which the frames' cost dips deepest, however far from what is expected.
+
+    Returns:
+        `own_dt_s`, as a record counts it, and `own_dt_z`, by how many standard errors the dip is deeper than the
+        solution's: 0 where it is the solution's.
+    """
+    some = problem.of_frames(np.arange(0, problem.frames.count, _FAR_STRIDE))
+    step_s = _step_s(some.frames, SCHEDULE.dt_scan_step_m)
+    offsets = np.append(state.dt_s, np.arange(-_FAR_S, _FAR_S + step_s, step_s))
+    cost = np.array([comparison_cost(some, replace(state, dt_s=float(dt_s))) for dt_s in offsets])
+    order = np.argsort(offsets, kind="stable")
+    depth = np.empty_like(cost)
+    depth[order] = dips(cost[order])
+    best = int(np.argmin(depth.mean(1)))
+    deeper = depth[best] - depth[0]
+    error = max(float(deeper.std()), 1e-12) / np.sqrt(len(deeper))
+    return {
+        "own_dt_s": float(offsets[best]) - problem.constant_gap_s,
+        "own_dt_z": float(deeper.mean() / error),
+    }
 
 
 def _own_cost(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " F"]:
