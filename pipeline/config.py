@@ -51,9 +51,11 @@ __all__ = [
     "VerifyConfig",
     "config_hash",
     "load_fleet",
+    "read_toml",
+    "validated",
 ]
 
-_Kind = TypeVar("_Kind", bound=Section)
+_Kind = TypeVar("_Kind", bound=BaseModel)
 
 
 class Vehicle(Section):
@@ -158,7 +160,7 @@ class FleetConfig(Section):
                 raise ConfigError(str(self._file), name, "no such section")
             # Not through a dump: it would leave out what is no part of a work key (`exclude`).
             kept = {key: getattr(section, key) for key in type(section).model_fields}
-            new[name] = _validated(type(section), kept | values, self._file, name)
+            new[name] = validated(type(section), kept | values, str(self._file), name)
         return self.model_copy(update=new)
 
     def rig_of(self, vehicle: str) -> Rig:
@@ -182,34 +184,48 @@ def load_fleet(path: Path) -> FleetConfig:
     Raises:
         ConfigError: missing file, no TOML, unknown key, impossible value; the message names the key.
     """
+    return validated(FleetConfig, read_toml(path), str(path)).read_from(path)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """What a TOML file says.
+
+    Raises:
+        ConfigError: missing file, no TOML.
+    """
     try:
-        raw = tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_text())
     except FileNotFoundError as err:
         raise ConfigError(str(path), "", "no such file") from err
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as err:
         raise ConfigError(str(path), "", f"not a TOML file: {err}") from err
-    return _validated(FleetConfig, raw, path).read_from(path)
 
 
-def _validated(kind: type[_Kind], values: dict[str, Any], file: Path, *above: str) -> _Kind:
-    """A section of a file; `above` names the sections that it lies in."""
+def validated(kind: type[_Kind], values: dict[str, Any], file: str, *above: str) -> _Kind:
+    """A section of a file; `above` names the sections that it lies in.
+
+    Raises:
+        ConfigError: unknown key, impossible value; the message names the key.
+    """
+    whole = FleetConfig if above else kind
     try:
         return kind.model_validate(values)
     except ValidationError as err:
         problems = [
-            (".".join(map(str, (*above, *p["loc"]))), _unknown_key(p["loc"][-1]) or p["msg"])
-            if p["type"] == "extra_forbidden"
-            else (".".join(map(str, (*above, *p["loc"]))), p["msg"])
+            (
+                ".".join(map(str, (*above, *p["loc"]))),
+                _unknown_key(p["loc"][-1], whole) if p["type"] == "extra_forbidden" else p["msg"],
+            )
             for p in err.errors(include_url=False)
         ]
         (key, first), *others = problems
         text = "; ".join([first, *(f"{other}: {said}" for other, said in others)])
-        raise ConfigError(str(file), key, text) from err
+        raise ConfigError(file, key, text) from err
 
 
-def _unknown_key(key: str | int) -> str:
-    """What to say of a key that no section has: the nearest one that some section has."""
-    known = {name for kind in _kinds(FleetConfig, set()) for name in kind.model_fields}
+def _unknown_key(key: str | int, whole: type[BaseModel]) -> str:
+    """What to say of a key that no section of the whole has: the nearest one that some section has."""
+    known = {name for kind in _kinds(whole, set()) for name in kind.model_fields}
     near = difflib.get_close_matches(str(key), known, n=1)
     return f"unknown key; did you mean {near[0]!r}?" if near else "unknown key"
 

@@ -110,6 +110,12 @@ class PairEstimate:
     parts: DayParts | None = None  # of the day; None where it is too short, or the method does not cut it
     disproved: str = ""  # why it cannot be right, where a check of the solver's shows that
 
+    @classmethod
+    def at_prior(cls, pair: str, prior: Prior) -> PairEstimate:
+        """The prior, where a pair is not estimated."""
+        covariance, none = prior.covariance(pair), np.zeros(6)
+        return cls(pair, prior.of(pair), covariance, none, none > 0, 0, common_covariance=covariance)
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:

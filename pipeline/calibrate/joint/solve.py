@@ -115,7 +115,7 @@ class _Day:
             if len(found) == len(PAIRS):
                 found["camera_radar"], loop_rad = self._composed(found)
             elif "camera_radar" not in self.wanted:
-                found["camera_radar"] = _unchanged("camera_radar", self.prior), []
+                found["camera_radar"] = PairEstimate.at_prior("camera_radar", self.prior), []
         self.progress(3, 3, "done")
         pairs = {pair: found[pair][0] for pair in PAIRS if pair in found}
         checks = {pair: found[pair][1] for pair in pairs if found[pair][1]}
@@ -147,7 +147,7 @@ class _Day:
         if isinstance(self.aligned, Aligned) and not self.aligned.basin.vouched_by:
             # A lost camera contradicts a lidar-radar that is right: the prior, and its sigma, stand in for it. One that
             # is only unsure is compared with its sigma, like any other.
-            camera = _unchanged("camera_lidar", self.prior)
+            camera = PairEstimate.at_prior("camera_lidar", self.prior)
             _, _, contradictions = compose_pairs(camera, lidar_radar, without_lidar, self.prior)
         camera_radar = replace(camera_radar, disproved=camera_lidar.disproved)
         return (camera_radar, [*camera_failed, *radar_failed, *contradictions]), loop_rad
@@ -162,7 +162,7 @@ class _Day:
         """With the camera's boxes where it may help."""
         prior = self.prior
         if "lidar_radar" not in self.wanted:
-            return _unchanged("lidar_radar", prior), []
+            return PairEstimate.at_prior("lidar_radar", prior), []
         # Without an alignment the prior stays current: where that is exact enough, boxes are read through it.
         T = prior.T_camera_lidar if prior.knows("camera_lidar") else None
         covariance = prior.covariance("camera_lidar")
@@ -178,7 +178,7 @@ class _Day:
                 covariance_camera_lidar=covariance,
             )
         except SolveError as err:
-            return _unchanged("lidar_radar", prior), [FailedCheck(err.reason, err.fault)]
+            return PairEstimate.at_prior("lidar_radar", prior), [FailedCheck(err.reason, err.fault)]
         if not helped and "camera_lidar" in self.wanted:
             note = "camera-lidar is not believed: estimated without its help"
             found = replace(found, notes=[*found.notes, note])
@@ -187,7 +187,9 @@ class _Day:
     def _camera_lidar(self, lidar_radar: PairEstimate | None) -> tuple[PairEstimate, list[FailedCheck]]:
         """Along the heading that lidar-radar shows; None = that is disbelieved."""
         if not isinstance(self.aligned, Aligned):
-            return _unchanged("camera_lidar", self.prior), [] if self.aligned is None else [self.aligned]
+            return PairEstimate.at_prior("camera_lidar", self.prior), [] if self.aligned is None else [
+                self.aligned
+            ]
         heading = None if lidar_radar is None else _heading(lidar_radar)
         found = analyse_camera_lidar(self.aligned, np.random.default_rng([self.seed, 3]), heading=heading)
         found = replace(found, disproved=unvouched_basin(self.aligned.basin))
@@ -210,11 +212,3 @@ def _heading(lidar_radar: PairEstimate) -> tuple[np.ndarray, float] | None:
     if not lidar_radar.observable[2]:
         return None
     return lidar_radar.T, float(np.sqrt(lidar_radar.covariance[2, 2]))
-
-
-def _unchanged(pair: str, prior: Prior) -> PairEstimate:
-    """The prior, where a pair is not estimated."""
-    covariance = prior.covariance(pair)
-    return PairEstimate(
-        pair, prior.of(pair), covariance, np.zeros(6), np.zeros(6, bool), 0, common_covariance=covariance
-    )

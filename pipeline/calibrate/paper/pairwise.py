@@ -144,7 +144,7 @@ def estimate_of(
     """A pair's result with its covariance; `minimum` None = not calibrated, the prior stays."""
     base = prior.covariance(problem.pair)
     used = int(problem.informative.sum())
-    blank = PairEstimate(problem.pair, T, base, np.zeros(6), np.zeros(6, bool), used, common_covariance=base)
+    blank = replace(PairEstimate.at_prior(problem.pair, prior), T=T, frames_used=used)
     if minimum is None:
         return replace(blank, notes=["not triggered: keeps the prior"])
     losses = problem.loss(np.stack([problem.T_prior, T]))

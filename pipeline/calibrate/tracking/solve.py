@@ -105,7 +105,7 @@ def solve_tracking(
     failed_checks: dict[str, list[FailedCheck]] = {pair: [] for pair in PAIRS}
     for k, pair in enumerate(("camera_lidar", "lidar_radar")):
         progress(1 + k, 3, pair)
-        pairs[pair] = _unchanged(pair, prior)
+        pairs[pair] = PairEstimate.at_prior(pair, prior)
         if pair not in wanted:
             pairs[pair] = replace(pairs[pair], notes=["not triggered: keeps the prior"])
             continue
@@ -307,12 +307,4 @@ def _too_few(pair: str, tracks: PairTracks, paired: int) -> str:
     return (
         f"too few moving objects: {paired} pairs of tracks, needs {MIN_TRACKS} "
         f"({len(tracks.lidar)} tracks of the lidar, {len(tracks.other)} of the {other})"
-    )
-
-
-def _unchanged(pair: str, prior: Prior) -> PairEstimate:
-    """The prior, where a pair is not calibrated."""
-    covariance = prior.covariance(pair)
-    return PairEstimate(
-        pair, prior.of(pair), covariance, np.zeros(6), np.zeros(6, bool), 0, common_covariance=covariance
     )

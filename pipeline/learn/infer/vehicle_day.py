@@ -72,7 +72,7 @@ def solve_by_networks(
     estimates = {
         pair: replace(_estimate(pair, found[pair], asked, rng), frames_rejected=dict(rejected))
         if pair in triggered
-        else _unchanged(pair, prior)
+        else PairEstimate.at_prior(pair, prior)
         for pair in PAIRS
     }
     failed = {pair: _halves_disagree(pair, found[pair], asked, rng) for pair in triggered}
@@ -110,7 +110,7 @@ def single_frame_solution(
         for pair in PAIRS
     }
     if not estimates["camera_lidar"].observable.any():  # the picture cannot tell: nor can it about the radar
-        estimates["camera_radar"] = _unchanged("camera_radar", prior)
+        estimates["camera_radar"] = PairEstimate.at_prior("camera_radar", prior)
     return Solution(method, estimates)
 
 
@@ -289,13 +289,6 @@ def _blocks(drives: Sequence[int]) -> Int[np.ndarray, " N"]:
 def _estimate(pair: str, answers: Answers, asked: _Asked, rng: np.random.Generator) -> PairEstimate:
     prior = asked.prior
     return day_estimate(pair, answers, prior.of(pair), prior.covariance(pair), rng, asked.unobservable(pair))
-
-
-def _unchanged(pair: str, prior: Prior) -> PairEstimate:
-    nothing, covariance = np.zeros(6), prior.covariance(pair)
-    return PairEstimate(
-        pair, prior.of(pair), covariance, nothing, nothing.astype(bool), 0, common_covariance=covariance
-    )
 
 
 def _halves_disagree(

@@ -5,14 +5,13 @@ The defaults are the paper's recipe where it gives one: Adam (0.9, 0.999), batch
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pipeline.errors import ConfigError
+from pipeline.config import read_toml, validated
 from pipeline.learn.sample.grid import Grid
 
 __all__ = [
@@ -189,18 +188,5 @@ def load_train_config(path: Path | None, overrides: Mapping[str, object]) -> Tra
         ConfigError: missing file, no TOML, unknown key, impossible value; the message names the key.
     """
     name = "train" if path is None else str(path)
-    raw: dict[str, object] = {}
-    if path is not None:
-        try:
-            raw = tomllib.loads(path.read_text())
-        except FileNotFoundError as err:
-            raise ConfigError(name, "", "no such file") from err
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as err:
-            raise ConfigError(name, "", f"not a TOML file: {err}") from err
-    try:
-        return TrainConfig.model_validate(raw | {k: v for k, v in overrides.items() if v is not None})
-    except ValidationError as err:
-        problems = err.errors(include_url=False)
-        key = ".".join(str(part) for part in problems[0]["loc"])
-        text = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems)
-        raise ConfigError(name, key, text) from err
+    raw = {} if path is None else read_toml(path)
+    return validated(TrainConfig, raw | {k: v for k, v in overrides.items() if v is not None}, name)
