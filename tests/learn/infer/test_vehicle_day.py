@@ -234,7 +234,9 @@ def test_untrained_networks_make_records_that_nobody_would_drive_by(lake, capsys
     camera_lidar = next(r for r in records if r.pair == "camera_lidar")
     assert camera_lidar.status == "held"
     assert camera_lidar.diagnostics["answers"] > 0
-    assert run(lake, capsys, "--method", method)[1]["status"] == "cached"
+    assert run(lake, capsys, "--method", method) == (code, told)
+    again = read_records(Lake.at(lake / "lake"), CALIBRATIONS, CalibrationRecord)
+    assert [r.asserted_at for r in again if r.method == method] == [r.asserted_at for r in records]
     assert told["work_key"] == records[0].work_key
 
 
