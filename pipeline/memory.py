@@ -22,14 +22,15 @@ def at_most(gigabytes: float) -> Iterator[None]:
     """Within the block the process gets no more than `gigabytes` of memory beside what it has when the block begins.
 
     RLIMIT_DATA counts what is written to. RLIMIT_AS would count what is mapped: numba, Arrow and ONNX Runtime map
-    gigabytes that they never touch. No effect on systems without /proc.
+    gigabytes that they never touch. No effect where /proc does not say what the process has.
 
     Raises:
         TooMuchMemoryError: more was asked for.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    bounds = [b for b in (_private_bytes() + int(gigabytes * 2**30), soft, hard) if b >= 0]
-    if _STATUS.exists():
+    now = _private_bytes()
+    if now:
+        bounds = [b for b in (now + int(gigabytes * 2**30), soft, hard) if b >= 0]
         resource.setrlimit(resource.RLIMIT_DATA, (min(bounds), hard))
     try:
         yield
@@ -42,7 +43,7 @@ def at_most(gigabytes: float) -> Iterator[None]:
 
 
 def _private_bytes() -> int:
-    """Memory that the process may write to and shares with nobody."""
+    """Memory that the process may write to and shares with nobody; 0 where the system does not say."""
     with suppress(OSError):
         lines = _STATUS.read_text().splitlines()
         return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:")), 0)
