@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int64
 from scipy.special import ndtri, stdtrit
 
 __all__ = [
+    "CLEARLY",
     "OBSERVABLE",
     "Posterior",
     "bootstrap_covariance",
@@ -29,8 +30,10 @@ __all__ = [
     "response",
     "spread_to_covariance",
     "widening",
+    "with_ends",
 ]
 
+CLEARLY = 4.0  # standard errors by which frames reject the end of another start
 OBSERVABLE = 0.5  # the day at least halved the variance
 _WIDENED_AT = 0.975  # where Student's t and the normal are compared: 95 % of what is told by two sigmas
 
@@ -143,6 +146,20 @@ def spread_to_covariance(
     values, vectors = np.linalg.eigh(0.5 * (W + W.T))
     root = L @ vectors
     return (root * np.maximum(values, 1.0)) @ root.T
+
+
+def with_ends(
+    covariance: Float[np.ndarray, "P P"], apart: Float[np.ndarray, " P"]
+) -> Float[np.ndarray, "P P"]:
+    """Covariance of an estimate that two starts see differently: their scatter is added, if it is beyond one sigma.
+
+    Args:
+        covariance: of the estimate.
+        apart: from where one start ended to where the other did; the day rejects neither.
+    """
+    if np.all(np.abs(apart) <= np.sqrt(np.diag(covariance))):
+        return covariance
+    return covariance + np.outer(apart, apart) / 2  # the variance of two values
 
 
 def posterior(

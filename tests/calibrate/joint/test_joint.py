@@ -109,7 +109,7 @@ def test_pairs_that_cannot_be_solved_keep_the_prior_and_fail_a_check():
 
 def solved_with_camera(monkeypatch, day, vouched_by):
     """The solution of a day whose camera-lidar is put in its place: at the truth, sure, and so vouched for."""
-    basin = Basin(AlignmentState(T_CAMERA_LIDAR), "prior", 4, vouched_by, float(np.radians(2.6)), 0.1)
+    basin = Basin(AlignmentState(T_CAMERA_LIDAR), None, "prior", 4, vouched_by, float(np.radians(2.6)), 0.1)
     covariance = np.diag([np.radians(0.02) ** 2] * 3 + [0.01**2] * 3)
     aligned = object.__new__(Aligned)  # without the terms and frames that nothing here looks at
     object.__setattr__(aligned, "basin", basin)

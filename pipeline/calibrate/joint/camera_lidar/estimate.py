@@ -26,13 +26,12 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     analyse_observability,
     day_covariance,
 )
+from pipeline.calibrate.joint.camera_lidar.other_solutions import parts_of_alignment, starts_apart
 from pipeline.calibrate.joint.camera_lidar.refine import (
     NONE_FIXED,
     AlignmentState,
     Scored,
-    derivatives,
     refine,
-    scales,
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
@@ -45,14 +44,13 @@ from pipeline.calibrate.joint.camera_lidar.witnesses import (
     witness_numbers,
 )
 from pipeline.calibrate.numerics.bias_floors import HEADING_SIGMA_RAD, MAX_GAP_PX
-from pipeline.calibrate.numerics.change_point import parts_of_day
-from pipeline.calibrate.numerics.covariance import OBSERVABLE, bootstrap_covariance
+from pipeline.calibrate.numerics.covariance import OBSERVABLE, with_ends
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.common_share import common_part
-from pipeline.extrinsics.estimates import DayParts, PairEstimate, Prior
+from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
@@ -70,7 +68,6 @@ _FEWEST_FRAMES = 5
 _FEWEST_EDGES = 20  # per frame
 _MARGIN_RAD = np.radians(2.0)  # points further out of view than this stay out of it
 _NEAR_PRIOR_M = 0.25
-_IS_TURN = np.arange(8) < 3
 _UNKNOWN_SHARE = 0.7  # of the prior's sigma: from there on the day's speeds did not determine the time offset
 
 
@@ -83,6 +80,7 @@ class Aligned:
     rejected: dict[str, int]
     basin: Basin
     state: AlignmentState
+    second: AlignmentState | None  # where the best start of another origin led
     kernel: KernelSettings
     expected_dt_s: float  # the state's time offset counts from it: the constant part of the stamps' gaps
     intrinsics: DayIntrinsics
@@ -156,15 +154,17 @@ def align_camera_lidar(
     # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
     near = prior.translation_sigma_m <= _NEAR_PRIOR_M
     fixed = IS_TZ if near else NONE_FIXED
-    state = _at_prior_tz(basin.state, prior, terms) if near else basin.state
-    state = refine(thin, state, steps=SCHEDULE.first_steps, fixed=fixed)
+    ends = [end for end in (basin.state, basin.second) if end is not None]
+    ends = [_at_prior_tz(end, prior, terms) if near else end for end in ends]
+    ends = [refine(thin, end, steps=SCHEDULE.first_steps, fixed=fixed) for end in ends]
     kernel = first
     for sigma_px, contrast in SCHEDULE.kernels[1:]:
-        sharp = sharp.exposed_at(state.alone)
-        fitted = sharp.fitted(state.alone, KernelSettings.wide(sigma_px, contrast), rng)
-        kernel = weighted(sharp, state, fitted)
+        sharp = sharp.exposed_at(ends[0].alone)
+        fitted = sharp.fitted(ends[0].alone, KernelSettings.wide(sigma_px, contrast), rng)
+        kernel = weighted(sharp, ends[0], fitted)
         scored = Scored(sharp, kernel, prior, config, limits)
-        state = refine(scored, state, steps=SCHEDULE.sharper_steps, fixed=fixed)
+        ends = [refine(scored, end, steps=SCHEDULE.sharper_steps, fixed=fixed) for end in ends]
+    state, second = ends[0], ends[1] if len(ends) > 1 else None
     problem = CameraLidarProblem(
         sharp,
         prior,
@@ -176,7 +176,7 @@ def align_camera_lidar(
     )
     intrinsics = measure_intrinsics(problem, state, kernel, frames[0].label_scale, rng)
     expected_dt_s = constant_gap_s(camera_gaps_s(frames))
-    return Aligned(problem, frames, rejected, basin, state, kernel, expected_dt_s, intrinsics)
+    return Aligned(problem, frames, rejected, basin, state, second, kernel, expected_dt_s, intrinsics)
 
 
 def analyse_camera_lidar(
@@ -209,7 +209,8 @@ def analyse_camera_lidar(
     for k in (0, 1):
         half = replace(scored, terms=problem.terms.of_frames(np.arange(k, problem.terms.frames, 2)))
         halves.append(refine(half, analysis.state, steps=SCHEDULE.half_steps, fixed=fixed))
-    diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves)
+    starts = starts_apart(scored, analysis, aligned.second)
+    diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves, starts)
     own_tz = analysis.profile.shift_from(float(problem.prior.T_camera_lidar[2, 3]))
     own_dt_s, z = far_time_offset(problem.terms, analysis.state, analysis.kernel, rng)
     diagnostics |= {"own_dt_s": aligned.expected_dt_s + own_dt_s, "own_dt_z": z}
@@ -219,8 +220,10 @@ def analyse_camera_lidar(
     witnesses = ask_witnesses(
         aligned.frames, problem.terms, analysis.state, analysis.kernel, problem.blocks, problem.seed, own
     )
-    found = _conclude(analysis, aligned, problem.config, diagnostics, witnesses)
-    return replace(found, parts=_parts(problem, analysis, aligned.frames))
+    covariance = analysis.covariance[:6, :6] + np.diag([*widening(witnesses) ** 2, 0, 0, 0, 0])
+    covariance = with_ends(covariance, starts[:6])
+    found = _conclude(analysis, covariance, aligned, diagnostics, witnesses)
+    return replace(found, parts=parts_of_alignment(problem, analysis, aligned.frames))
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
@@ -268,41 +271,12 @@ def _at_prior_tz(state: AlignmentState, prior: Prior, terms: Terms) -> Alignment
     return replace(state, dt_s=state.dt_s + s_per_metre(terms, state) * shift_m).with_fixed(prior, IS_TZ)
 
 
-def _parts(
-    problem: CameraLidarProblem, analysis: ObservabilityAnalysis, frames: Sequence[Observation]
-) -> DayParts | None:
-    """First and last part of the day, turned alone, from wide kernels to sharp ones: knocks may be wider than those."""
-    kernels = [replace(analysis.kernel, sigma_px=SCHEDULE.kernels[0][0]), analysis.kernel]
-    start, terms = analysis.state, problem.terms
-    at_start = replace(problem.prior, T_camera_lidar=start.T_camera_lidar)
-    gradients = [derivatives(terms, start, k, scales(terms, k))[0][:, :3] for k in kernels]
-
-    def solve(rows: np.ndarray) -> tuple[AlignmentState, np.ndarray, np.ndarray]:
-        part, state = terms.of_frames(rows), start
-        for kernel in kernels:
-            scored = Scored(part, kernel, at_start, problem.config)
-            state = refine(scored, state, steps=SCHEDULE.part_steps, fixed=~_IS_TURN)
-        # Weighted anew: the scatter of the whole day counts the step itself as noise.
-        kernel, scale = weighted(part, state, analysis.kernel), scales(part, analysis.kernel)
-        g = (derivatives(part, state, kernel, scale)[0] / scale)[:, :3]
-        blocks = np.unique(problem.blocks[rows], return_inverse=True)[1].ravel()
-        prior_information = np.eye(3) / problem.prior.rotation_sigma_rad**2
-        rng = np.random.default_rng(problem.seed)
-        spread = bootstrap_covariance(g[:, :, None] * g[:, None, :], -g, prior_information, blocks, rng)
-        return state, state.T_camera_lidar, spread
-
-    def score(state: AlignmentState) -> Float[np.ndarray, " F"]:
-        return np.sum([terms.score(state.alone, k)[0] for k in kernels], axis=0)
-
-    stamps = [o.stamp_ns for o in frames]
-    return parts_of_day(np.concatenate(gradients, axis=1), stamps, solve, score, (0, 1, 2))
-
-
 def _diagnostics(
     terms: Terms,
     analysis: ObservabilityAnalysis,
     basin: Basin,
     halves: list[AlignmentState],
+    starts: Float[np.ndarray, " 8"],
 ) -> dict[str, float]:
     """Numbers behind the verdict."""
     apart = difference(halves[0], halves[1])
@@ -315,6 +289,10 @@ def _diagnostics(
         **{f"halves_{n}_deg": float(np.degrees(abs(apart[i]))) for i, n in enumerate(("rx", "ry", "rz"))},
         **{f"halves_{n}_m": float(abs(apart[3 + i])) for i, n in enumerate(("tx", "ty", "tz"))},
         "halves_dt_s": float(abs(apart[6])),
+        **{
+            f"starts_{n}": float(starts[i])
+            for i, n in enumerate(("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m"))
+        },
         **{
             f"edge_match_share_{n}": float(terms.mean_match(kernel)[i])
             for i, n in enumerate(("left", "right", "above", "below"))
@@ -333,17 +311,16 @@ def _diagnostics(
 
 def _conclude(
     analysis: ObservabilityAnalysis,
+    covariance: Float[np.ndarray, "6 6"],
     aligned: Aligned,
-    config: SolveConfig,
     diagnostics: dict[str, float],
     witnesses: Sequence[Witness],
 ) -> PairEstimate:
     """The estimate, its covariance by left perturbation, notes."""
-    covariance = analysis.covariance[:6, :6] + np.diag([*widening(witnesses) ** 2, 0, 0, 0, 0])
     dt_sigma = float(np.sqrt(analysis.covariance[6, 6]))
     known = analysis.prior.camera
     notes = aligned.intrinsics.notes(known)
-    if dt_sigma > _UNKNOWN_SHARE * config.time_offset_sigma_s:
+    if dt_sigma > _UNKNOWN_SHARE * aligned.problem.config.time_offset_sigma_s:
         notes.append("camera time offset: the day's speeds do not determine it")
     to_left = np.linalg.inv(change_jacobian(analysis.state.T_camera_lidar))
     return PairEstimate(

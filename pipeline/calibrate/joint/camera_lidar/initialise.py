@@ -45,6 +45,7 @@ class Basin:
     """The best end of all candidates, and how far the nearest end of another origin is from it."""
 
     state: AlignmentState
+    second: AlignmentState | None  # the best one of another origin that agrees with it
     origin: str
     candidates: int
     vouched_by: tuple[str, ...]  # other origins whose ends agree with it
@@ -87,7 +88,9 @@ def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator) -> Basin:
     elsewhere = [e.score for a, e in zip(apart, ends, strict=True) if a >= same_rad]
     lead = 1 - max(elsewhere, default=0.0) / best.score if best.score > 0 else 0.0
     state = refine(scored, best.state, steps=SCHEDULE.finishing_steps)
-    return Basin(state, best.origin, len(ends), vouching, min(others, default=np.pi), float(lead))
+    agreeing = [e for e, a in zip(ends, apart, strict=True) if a < same_rad and e.origin != best.origin]
+    second = max(agreeing, key=lambda e: e.score).state if agreeing else None
+    return Basin(state, second, best.origin, len(ends), vouching, min(others, default=np.pi), float(lead))
 
 
 def difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]:

@@ -42,7 +42,13 @@ from pipeline.calibrate.numerics.bias_floors import (
     LIDAR_RADAR_DT_FLOOR_S,
 )
 from pipeline.calibrate.numerics.change_point import parts_of_day
-from pipeline.calibrate.numerics.covariance import OBSERVABLE, bootstrap_covariance, covariance_with_fixed
+from pipeline.calibrate.numerics.covariance import (
+    CLEARLY,
+    OBSERVABLE,
+    bootstrap_covariance,
+    covariance_with_fixed,
+    with_ends,
+)
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
@@ -59,7 +65,6 @@ from schemas.observations import Observation
 __all__ = ["estimate_lidar_radar"]
 
 _FEWEST_FRAMES = 5
-_CLEARLY = 4.0  # standard errors by which frames reject the end of another start
 _CAMERA_SIGMA_RAD = np.radians(0.5)  # a camera less sure than what its boxes show is left out
 _REMAINING_STEPS = 10.0  # of dt, that count as uncertainty: the valley is flat
 _YAW, _ANY_RAD = 2, np.radians(20.0)
@@ -243,7 +248,7 @@ def _second_best(ends: list[RadarState], costs: list[np.ndarray]) -> RadarState:
     best = int(np.argmin([c.mean() for c in costs]))
     for end, cost in zip(ends, costs, strict=True):
         worse = cost - costs[best]
-        if end is not ends[best] and worse.mean() < _CLEARLY * worse.std() / np.sqrt(len(worse)):
+        if end is not ends[best] and worse.mean() < CLEARLY * worse.std() / np.sqrt(len(worse)):
             return end
     return ends[best]
 
@@ -333,12 +338,16 @@ def _conclude(
 ) -> PairEstimate:
     state, fixed = analysis.state, analysis.fixed
     notes = notes_of(analysis, has_elevation=bool(problem.frames.has_elevation.any()))
+    # Elevation has witnesses of its own.
+    compared = np.isin(np.arange(6), (_YAW, 3, 4)) & ~fixed[:6]
+    apart = change_between(ends[-1].T_lidar_radar, ends[0].T_lidar_radar)
+    covariance = with_ends(analysis.covariance[:6, :6], np.where(compared, apart, 0.0))
     # The record's covariance is of a left perturbation: a turn about the lidar carries the radar along.
     J = np.linalg.inv(change_jacobian(state.T_lidar_radar))
     return PairEstimate(
         "lidar_radar",
         state.T_lidar_radar,
-        J @ analysis.covariance[:6, :6] @ J.T,
+        J @ covariance @ J.T,
         analysis.observability[:6],
         ~fixed[:6],
         problem.frames.count,
@@ -347,7 +356,7 @@ def _conclude(
         float(np.sqrt(analysis.covariance[DT, DT])),
         diagnostics_of(analysis, ends, halves),
         notes,
-        common_part(J @ analysis.common[:6, :6] @ J.T, J @ analysis.covariance[:6, :6] @ J.T),
+        common_part(J @ analysis.common[:6, :6] @ J.T, J @ covariance @ J.T),
     )
 
 
