@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from bisect import bisect_right
-from collections import Counter
 from collections.abc import Collection, Iterator
 from io import BytesIO
 
@@ -18,18 +16,17 @@ from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
 from mcap.records import ChunkIndex, Footer, Schema, Statistics
 
-from pipeline.errors import LogError
 from pipeline.ingest.containers.bounded import MOST_CHUNK_BYTES, OversizedError, unpack_lz4, unpack_zstd
+from pipeline.ingest.containers.chunked_log import ChunkedLog
 from pipeline.ingest.containers.reader import (
     BYTES_AS_TEXT,
     PROTOBUF,
     READ_ERRORS,
     Channel,
     ChunkCache,
-    Position,
     RawMessage,
 )
-from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
+from pipeline.ingest.containers.timeline import Chunk
 from pipeline.store.remote_logs import LogPath
 
 __all__ = ["McapLog"]
@@ -44,39 +41,20 @@ _LAST_OPCODE = max(Opcode)
 _DAMAGED = (*READ_ERRORS, struct.error, zstandard.ZstdError)
 
 
-class McapLog:
+class McapLog(ChunkedLog):
     """LogReader of one .mcap file."""
 
+    _head = _RECORD.size
+
     def __init__(self, path: LogPath, cache: ChunkCache) -> None:
-        self.path, self.damage = path, Counter[str]()
-        self._cache, self._file = cache, path.open("rb")
-        self._size = path.stat().st_size
+        super().__init__(path, cache)
         self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, ChannelRecord] = {}
         self._resolved: dict[int, Channel] = {}
         # True where the summary's checksum is right: its schemas and channels win over the data section's.
         self._trusted = False
-        self._messages: dict[int, int] = {}  # of each channel, by the summary's statistics
         self._chunks = self._read_summary()
         self._chunk_starts = [c.position for c in self._chunks]
         self._lengths = {c.position + _RECORD.size: c.length - _RECORD.size for c in self._chunks}
-
-    def timeline(self) -> Timeline | None:
-        """See LogReader."""
-        if not self._chunks or not self._messages:
-            return None
-        topics = {number: channel.topic for number, channel in self._channels.items()}
-        return timeline_of_chunks(self._chunks, topics, self._messages)
-
-    def scan(
-        self, topics: Collection[str] | None = None, within: Stretches | None = None
-    ) -> Iterator[RawMessage]:
-        """See LogReader."""
-        self.damage.clear()
-        if within is None:
-            return self._scan_all(topics)
-        found = self._scan_in(topics, within) if self._chunks else self._scan_all(topics)
-        return (m for m in found if m.log_time_ns in within)
 
     def _scan_all(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
         for opcode, start, length in self._records():
@@ -99,18 +77,11 @@ class McapLog:
             else:
                 self._learn(opcode, content)
 
-    def _scan_in(self, topics: Collection[str] | None, within: Stretches) -> Iterator[RawMessage]:
-        wanted = {n for n, channel in self._channels.items() if topics is None or channel.topic in topics}
-        for indexed in self._chunks:
-            if not within.touch(indexed.start_ns, indexed.end_ns):
-                continue
-            if indexed.channels is not None and not indexed.channels & wanted:
-                continue
-            start = indexed.position + _RECORD.size
-            chunk = self._cache.get((str(self.path), start)) or self._indexed_chunk(indexed)
-            if chunk is not None:
-                self._cache.offer((str(self.path), start), chunk)
-                yield from self._scan_chunk(chunk, start, topics)
+    def _chunk_again(self, start: int) -> bytes | None:
+        length = self._lengths.get(start)
+        if length is None:
+            length = _RECORD.unpack(self._content(start - _RECORD.size, _RECORD.size))[1]
+        return self._open_chunk(self._content(start, length), check=False)
 
     def _indexed_chunk(self, indexed: Chunk) -> bytes | None:
         """The records of a chunk that the summary names, in one read; None (and counted) where it is damaged."""
@@ -124,31 +95,7 @@ class McapLog:
             return None
         return self._open_chunk(record[_RECORD.size :], check=True)
 
-    def read(self, position: Position) -> memoryview:
-        """See LogReader."""
-        chunk_start, start, end = position
-        if chunk_start < 0:
-            return memoryview(self._content(start, end - start))
-        chunk = self._cache.get((str(self.path), chunk_start))
-        if chunk is None:
-            length = self._lengths.get(chunk_start)
-            if length is None:
-                length = _RECORD.unpack(self._content(chunk_start - _RECORD.size, _RECORD.size))[1]
-            chunk = self._open_chunk(self._content(chunk_start, length), check=False)
-            if chunk is None or len(chunk) < end:
-                raise LogError(str(self.path), "changed while it was read")
-            self._cache.put((str(self.path), chunk_start), chunk)
-        return memoryview(chunk)[start:end]
-
-    def close(self) -> None:
-        """See LogReader."""
-        self._file.close()
-
     # -- records ------------------------------------------------------------
-
-    def _content(self, start: int, length: int) -> bytes:
-        self._file.seek(start)
-        return self._file.read(length)
 
     def _records(self) -> Iterator[tuple[int, int, int]]:
         """(opcode, start of content, length) of records; lost footing is regained at the next known chunk."""
@@ -181,10 +128,6 @@ class McapLog:
                 else:
                     self.damage["oversized_chunks"] += 1
             position = end
-
-    def _next_chunk(self, position: int) -> int | None:
-        i = bisect_right(self._chunk_starts, position)
-        return self._chunk_starts[i] if i < len(self._chunk_starts) else None
 
     def _read_summary(self) -> list[Chunk]:
         """Chunks by the summary, none where it is lost or damaged; learns schemas, channels and counts."""

@@ -6,14 +6,13 @@ Source: http://wiki.ros.org/Bags/Format/2.0
 from __future__ import annotations
 
 import struct
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator
 
-from pipeline.errors import LogError
 from pipeline.ingest.containers.bounded import MOST_CHUNK_BYTES, OversizedError, unpack_bz2, unpack_lz4
-from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, Position, RawMessage
-from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
+from pipeline.ingest.containers.chunked_log import ChunkedLog
+from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, RawMessage
+from pipeline.ingest.containers.timeline import Chunk
 from pipeline.store.remote_logs import LogPath
 
 __all__ = ["BagLog"]
@@ -27,34 +26,14 @@ _MAX_HEADER_BYTES = 1 << 20
 _DAMAGED = (*READ_ERRORS, struct.error)
 
 
-class BagLog:
+class BagLog(ChunkedLog):
     """LogReader of one .bag file."""
 
     def __init__(self, path: LogPath, cache: ChunkCache) -> None:
-        self.path, self.damage = path, Counter[str]()
-        self._cache, self._file = cache, path.open("rb")
-        self._size = path.stat().st_size
-        self._channels: dict[int, Channel] = {}
+        super().__init__(path, cache)
         self._messages: Counter[int] = Counter()  # of each connection, by the index
         self._chunks = self._read_index()
         self._chunk_starts = [c.position for c in self._chunks]
-
-    def timeline(self) -> Timeline | None:
-        """See LogReader."""
-        if not self._chunks:
-            return None
-        topics = {number: channel.topic for number, channel in self._channels.items()}
-        return timeline_of_chunks(self._chunks, topics, self._messages)
-
-    def scan(
-        self, topics: Collection[str] | None = None, within: Stretches | None = None
-    ) -> Iterator[RawMessage]:
-        """See LogReader."""
-        self.damage.clear()
-        if within is None:
-            return self._scan_all(topics)
-        found = self._scan_in(topics, within) if self._chunks else self._scan_all(topics)
-        return (m for m in found if m.log_time_ns in within)
 
     def _scan_all(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
         for position, header, start, length in self._records():
@@ -62,7 +41,7 @@ class BagLog:
                 chunk = self._open_chunk(header, start, length)
                 if chunk is not None:
                     self._cache.offer((str(self.path), position), chunk)
-                    yield from self._scan_records(chunk, position, topics)
+                    yield from self._scan_chunk(chunk, position, topics)
             elif header["op"] == bytes([_MESSAGE]):  # bags of an unchunked writer
                 channel, stamp = self._message(header, topics)
                 if channel is not None:
@@ -72,50 +51,18 @@ class BagLog:
             elif header["op"] == bytes([_CONNECTION]):
                 self._learn(header, self._content(start, length))
 
-    def _scan_in(self, topics: Collection[str] | None, within: Stretches) -> Iterator[RawMessage]:
-        wanted = {n for n, channel in self._channels.items() if topics is None or channel.topic in topics}
-        for indexed in self._chunks:
-            if not within.touch(indexed.start_ns, indexed.end_ns):
-                continue
-            if indexed.channels is not None and not indexed.channels & wanted:
-                continue
-            position = indexed.position
-            chunk = self._cache.get((str(self.path), position)) or self._chunk_at(position)
-            if chunk is not None:
-                self._cache.offer((str(self.path), position), chunk)
-                yield from self._scan_records(chunk, position, topics)
-
-    def _chunk_at(self, position: int) -> bytes | None:
-        """The records of a chunk that the index names; None (and counted) where it is damaged."""
-        record = self._record(position)
+    def _indexed_chunk(self, indexed: Chunk) -> bytes | None:
+        record = self._record(indexed.position)
         if record is None or record[0]["op"] != bytes([_CHUNK]):
             self.damage["damaged_records"] += 1
             return None
         return self._open_chunk(*record)
 
-    def read(self, position: Position) -> memoryview:
-        """See LogReader."""
-        chunk_start, start, end = position
-        if chunk_start < 0:
-            return memoryview(self._content(start, end - start))
-        chunk = self._cache.get((str(self.path), chunk_start))
-        if chunk is None:
-            record = self._record(chunk_start)
-            chunk = self._open_chunk(*record) if record is not None else None
-            if chunk is None or len(chunk) < end:
-                raise LogError(str(self.path), "changed while it was read")
-            self._cache.put((str(self.path), chunk_start), chunk)
-        return memoryview(chunk)[start:end]
-
-    def close(self) -> None:
-        """See LogReader."""
-        self._file.close()
+    def _chunk_again(self, start: int) -> bytes | None:
+        record = self._record(start)
+        return self._open_chunk(*record) if record is not None else None
 
     # -- records ------------------------------------------------------------
-
-    def _content(self, start: int, length: int) -> bytes:
-        self._file.seek(start)
-        return self._file.read(length)
 
     def _record(self, position: int) -> tuple[dict[str, bytes], int, int] | None:
         """(header, start of data, its length) of a record, None where there is no whole one."""
@@ -146,10 +93,6 @@ class BagLog:
                 continue
             yield position, *record
             position = record[1] + record[2]
-
-    def _next_chunk(self, position: int) -> int | None:
-        i = bisect_right(self._chunk_starts, position)
-        return self._chunk_starts[i] if i < len(self._chunk_starts) else None
 
     def _read_index(self) -> list[Chunk]:
         """Chunks by the index at the bag's end, none where it is lost; learns its connections and their counts."""
@@ -217,7 +160,7 @@ class BagLog:
             return None
         return data
 
-    def _scan_records(
+    def _scan_chunk(
         self, chunk: bytes, chunk_start: int, topics: Collection[str] | None
     ) -> Iterator[RawMessage]:
         view, position, size = memoryview(chunk), 0, len(chunk)
