@@ -458,14 +458,14 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
     )
     wrong_all = total["accepted, WRONG"]
     stops = (
-        f"Accepted and wrong: **{rate(wrong_all, records)}**. Stopped by the fault: {stopped}, of which "
+        f"Accepted and wrong: **{_rate(wrong_all, records)}**. Stopped by the fault: {stopped}, of which "
         f"{total['stopped, named rightly']} name it ({_share(total['stopped, named rightly'], stopped)}); of "
         f"{days_stopped} days with one stopped, {days_named} name it ({_share(days_named, days_stopped)})."
     )
     good_days = (
         f"Good days: {len(good)}, {len(of_good)} records, accepted "
         f"{sum(r['pairs'][p]['status'] == 'accepted' for p, r in of_good)}, wrong {len(wrong)}, "
-        f"stopped by a named fault {rate(len(held), len(of_good))}."
+        f"stopped by a named fault {_rate(len(held), len(of_good))}."
     )
     lines = [
         everything,
@@ -479,6 +479,10 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
         f"| {name} | " + " | ".join(str(n or "") for n in row.values()) + " |" for name, row in rows.items()
     ]
     return "\n".join(lines)
+
+
+def _rate(hits: int, trials: int) -> str:
+    return rate(hits, trials) if trials else "none"
 
 
 def _share(part: int, whole: int) -> str:
