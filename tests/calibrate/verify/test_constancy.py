@@ -1,9 +1,12 @@
 """Which sensor moved within the day, by pairs that shift and pairs that stay; and what records keep of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.calibrate.half_days import half_days_of
+from pipeline.calibrate.numerics.change_point import with_parts
 from pipeline.calibrate.verify.constancy import constancy_failures
 from pipeline.extrinsics.estimates import DayParts, PairEstimate
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
@@ -95,3 +98,16 @@ def test_half_days_lead_from_the_record_to_where_the_sensor_was_and_is():
             assert np.all(sigma >= 0)
             assert sigma[:3].max() > 0
     assert half_days_of("camera_lidar", found, {pair: [] for pair in found}) is None
+
+
+def test_a_step_that_few_scenes_cannot_prove_widens_the_sigma_by_half_of_it():
+    found = estimates("lidar", (0.0, 0.0, 0.5))["camera_lidar"]
+    few_scenes = replace(found.parts, spread=(np.eye(3), np.eye(3)))
+    assert constancy_failures({"camera_lidar": replace(found, parts=few_scenes)}) == {}
+    sigma = np.sqrt(np.diag(with_parts(found, few_scenes).covariance)[:3])
+    np.testing.assert_allclose(
+        sigma, np.hypot(0.001, np.where(np.abs(few_scenes.step) > 0.004, few_scenes.step / 2, 0.0))
+    )
+    assert sigma.max() > np.radians(0.2)
+    sure = replace(found, covariance=np.eye(6))
+    np.testing.assert_array_equal(with_parts(sure, few_scenes).covariance, sure.covariance)

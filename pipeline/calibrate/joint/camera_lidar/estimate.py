@@ -44,6 +44,7 @@ from pipeline.calibrate.joint.camera_lidar.witnesses import (
     witness_numbers,
 )
 from pipeline.calibrate.numerics.bias_floors import HEADING_SIGMA_RAD, MAX_GAP_PX
+from pipeline.calibrate.numerics.change_point import with_parts
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, with_ends
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.calibrate.numerics.search_range import search_range
@@ -223,7 +224,7 @@ def analyse_camera_lidar(
     covariance = analysis.covariance[:6, :6] + np.diag([*widening(witnesses) ** 2, 0, 0, 0, 0])
     covariance = with_ends(covariance, starts[:6])
     found = _conclude(analysis, covariance, aligned, diagnostics, witnesses)
-    return replace(found, parts=parts_of_alignment(problem, analysis, aligned.frames))
+    return with_parts(found, parts_of_alignment(problem, analysis, aligned.frames))
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------

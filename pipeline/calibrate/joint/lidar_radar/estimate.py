@@ -41,7 +41,7 @@ from pipeline.calibrate.numerics.bias_floors import (
     LIDAR_RADAR_BIAS,
     LIDAR_RADAR_DT_FLOOR_S,
 )
-from pipeline.calibrate.numerics.change_point import parts_of_day
+from pipeline.calibrate.numerics.change_point import parts_of_day, with_parts
 from pipeline.calibrate.numerics.covariance import (
     CLEARLY,
     OBSERVABLE,
@@ -128,7 +128,8 @@ def estimate_lidar_radar(
     block = blocks_of(problem.observations, config.bootstrap_blocks)
     own = own_position(problem, analysis.state, analysis.fixed, block)
     own |= far_time_offset(problem, analysis.state)
-    return replace(found, parts=_parts(problem, analysis, config, rng), diagnostics=found.diagnostics | own)
+    found = with_parts(found, _parts(problem, analysis, config, rng))
+    return replace(found, diagnostics=found.diagnostics | own)
 
 
 def _problem(
