@@ -25,9 +25,9 @@ __all__ = ["likeliest_cut", "parts_of_day", "with_parts"]
 _LEAST_SHARE = 0.2  # of the frames, on either side of a cut
 _SUSPICIOUS_SIGMAS = 2.0  # of a step: from there on its cut is looked for again
 _MOST_CUTS = 3
-# A step of so many of the whole day's sigmas proves nothing where a part shows few scenes, and yet the pose may be half
-# of it off. On 20 good days of nine rigs pitch and yaw differed by 2.2 at most, a roll once by 5.4; .3 deg of a knock by
-# 6.7.
+# A step of so many of the whole day's sigmas proves nothing where a part shows few scenes, and yet the pose may be
+# half of it off. On 20 good days of nine rigs pitch and yaw differed by 2.2 at most, a roll once by 5.4; a knock of
+# .3 deg by 6.7.
 _WIDENING_SIGMAS = 4.0
 
 State = TypeVar("State")
