@@ -22,7 +22,9 @@ from pipeline.extrinsics.estimates import DayParts, PairEstimate
 
 __all__ = ["likeliest_cut", "parts_of_day", "with_parts"]
 
-_LEAST_SHARE = 0.2  # of the frames, on either side of a cut
+# Of the frames, on either side of a cut. With .2 a radar's turn of 1 deg after .15 of the day was 3.5 to 16 sigmas on
+# three days, with .08 to .12 20 to 22; on 46 good days of eight rigs no parts differed by more than 2.6 with any.
+_LEAST_SHARE = 0.1
 _SUSPICIOUS_SIGMAS = 2.0  # of a step: from there on its cut is looked for again
 _MOST_CUTS = 3
 # A step of so many of the whole day's sigmas proves nothing where a part shows few scenes, and yet the pose may be
