@@ -8,6 +8,7 @@ import pytest
 from pipeline.calibrate.joint import camera_radar
 from pipeline.calibrate.joint.camera_radar import camera_radar_cost, estimate_camera_radar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
+from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
@@ -255,6 +256,31 @@ def test_half_of_a_day_that_was_turned_is_found(day):
     first, second = (solve(part, prior_off_by(1, 0.02)) for part in (day[:20], turned))
     change = log_se3(second.T @ np.linalg.inv(first.T))
     assert abs(change[2] - yaw) < np.radians(0.1)
+
+
+def turned_at_noon(day, axis, turn_deg):
+    """First and last part of a day after whose half the radar is turned about one of its axes."""
+    turn = exp_so3(np.radians(turn_deg) * np.eye(3)[axis])
+    turned = [replace(o, radar_xyz_m=(o.radar_xyz_m @ turn).astype(np.float32)) for o in day[20:]]
+    return solve([*day[:20], *turned], prior_off_by(1, 0.02)).parts
+
+
+def test_a_radar_that_turned_at_noon_shows_in_the_parts_of_the_day_with_time_and_size(day):
+    parts = turned_at_noon(day, 2, 0.5)
+    assert parts.sigmas(PART_FLOOR_RAD)[2] > MOVED_SIGMAS
+    assert np.degrees(parts.step[2]) == pytest.approx(0.5, abs=0.1)
+    assert parts.cut_ns == (day[19].stamp_ns, day[20].stamp_ns)
+    quiet = turned_at_noon(day, 2, 0.0)
+    assert quiet.tested == (0, 1, 2)
+    assert np.abs(quiet.sigmas(PART_FLOOR_RAD)).max() < MOVED_SIGMAS
+
+
+@pytest.mark.parametrize("turn_deg", [2.0, -2.0])
+def test_a_radar_that_tilted_at_noon_tilts_its_parts_and_leaves_yaw(day, turn_deg):
+    """Where nothing but boxes and the registration knows pitch, less than the turn, for sigmas of half a degree."""
+    parts = turned_at_noon(day, 1, turn_deg)
+    assert 0.4 < np.degrees(parts.step[1]) / turn_deg < 1.2
+    assert abs(parts.sigmas(PART_FLOOR_RAD)[2]) < MOVED_SIGMAS
 
 
 def test_the_held_out_cost_of_camera_radar_prefers_the_truth_and_names_frames_that_cannot_tell(day):

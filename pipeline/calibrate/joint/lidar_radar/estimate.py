@@ -175,22 +175,26 @@ def _problem(
 def _parts(
     problem: RadarProblem, analysis: ObservabilityAnalysis, config: SolveConfig, rng: np.random.Generator
 ) -> DayParts | None:
-    """First and last part of the day, turned alone; compared in yaw, for the tilt rests on few detections."""
+    """First and last part of the day, turned alone, compared in the turns that the day determines."""
     frames, start = problem.frames.frame, analysis.state
     about = replace(problem, prior=replace(problem.prior, T_lidar_radar=start.T_lidar_radar))
-    fixed = np.isin(np.arange(len(analysis.fixed)), (0, 1, 3, 4, 5))
+    fixed = analysis.fixed | np.isin(np.arange(len(analysis.fixed)), (3, 4, 5))
+    turns = np.flatnonzero(~fixed[:3])
+    if not len(turns):
+        return None
 
     def solve(rows: np.ndarray) -> tuple[RadarState, np.ndarray, np.ndarray]:
         part = about.of_frames(rows)
         state, linear = finish(part, start, fixed)
         H, g, P = (a[..., ~fixed] for a in (linear.information, linear.g, linear.prior_information))
         block = blocks_of(part.observations, config.bootstrap_blocks)
-        found = bootstrap_covariance(H[:, ~fixed], g, P[~fixed], block, rng)  # yaw comes first
-        return state, state.T_lidar_radar, np.diag([_ANY_RAD**2, _ANY_RAD**2, found[0, 0]])
+        found = bootstrap_covariance(H[:, ~fixed], g, P[~fixed], block, rng)  # turns come first
+        spread = np.eye(3) * _ANY_RAD**2
+        spread[np.ix_(turns, turns)] = found[: len(turns), : len(turns)]
+        return state, state.T_lidar_radar, spread
 
     stamps = [problem.observations[k].stamp_ns for k in frames]
-    gradient = analysis.linear.g[frames][:, [_YAW]]
-    tested = () if analysis.fixed[_YAW] else (_YAW,)
+    gradient, tested = analysis.linear.g[frames][:, turns], tuple(turns.tolist())
     return parts_of_day(gradient, stamps, solve, lambda state: -comparison_cost(problem, state), tested)
 
 
