@@ -47,7 +47,7 @@ results: setup ## write the result tables of both READMEs from what was measured
 	$(BIN)/python -m tests.benchmarks.results_table
 
 accuracy-accept: setup ## measure the fixed days of tests/accuracy and write their baseline
-	$(ONE_THREAD) $(BIN)/python -m tests.accuracy.baseline --accept
+	$(ONE_THREAD) $(BIN)/python -m tests.accuracy.accept --accept
 
 licenses: setup ## write jobs/deploy/THIRD_PARTY_LICENSES.md anew
 	$(BIN)/python -m tests.makers.third_party > jobs/deploy/THIRD_PARTY_LICENSES.md

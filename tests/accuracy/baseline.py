@@ -1,8 +1,8 @@
 """The baseline of the accuracy gate: the numbers of the fixed days, what they may differ by, and how they are accepted.
 
-    python -m tests.accuracy.baseline                    prints what is measured
-    python -m tests.accuracy.baseline --accept           writes it into baseline.json (make accuracy-accept)
-    python -m tests.accuracy.baseline --accept --noise   and measures anew what numbers may differ by
+    python -m tests.accuracy.accept                    prints what is measured
+    python -m tests.accuracy.accept --accept           writes it into baseline.json (make accuracy-accept)
+    python -m tests.accuracy.accept --accept --noise   and measures anew what numbers may differ by
 
 Each day is calibrated from one start; `--noise` does so several times more, each time with another tenth of the frames
 left out and other random draws. The scatter of these is what the gate allows a number to differ by: code that does the
@@ -31,6 +31,7 @@ __all__ = [
     "BASELINE",
     "baseline_of",
     "keep_noise",
+    "main",
     "together",
     "unit_s",
     "worse",
@@ -224,7 +225,3 @@ def keep_noise(known: Mapping[str, Any], content: dict[str, Any]) -> None:
         for pair, verdict in day["verdicts"].items():
             seen = known["days"][name]["verdicts"][pair]
             day["verdicts"][pair] = seen if verdict[0] in seen else verdict
-
-
-if __name__ == "__main__":
-    main()

@@ -80,9 +80,8 @@ def test_a_calibration_costs_no_more_than_the_baseline(measured, fixed):
     made, result = measured(fixed)
     known = KNOWN[fixed.name]["cpu_units"]
     limit = known["value"] + known["noise"]
-    if (
-        result["cpu_s"] / unit_s() > limit
-    ):  # once more: the first of a process compiles, and neighbours come and go
+    # Once more where it was too much: the first of a process compiles, and neighbours come and go.
+    if result["cpu_s"] / unit_s() > limit:
         assert measure_day(made)["cpu_s"] / unit_s() <= limit
 
 
