@@ -79,8 +79,11 @@ def test_the_turn_has_the_sign_of_the_later_part():
 def test_a_tilt_that_the_radar_does_not_see_leaves_two_sensors(sensor, with_radar):
     turn = (0.0, 1.0, 0.0) if sensor == "lidar" else (1.0, 0.0, 0.0)  # pitch of either
     failed = constancy_failures(estimates(sensor, turn, with_radar=with_radar))
-    assert set(failed) == {"camera_lidar"}
     assert "the camera or lidar moved" in failed["camera_lidar"][0].sentence
+    # Did the lidar tilt, then lidar-radar is a mean of two places: 1 deg at noon put its elevation five sigmas off.
+    assert (
+        failed["lidar_radar"][0].sentence == "the camera or lidar moved during the day, as camera-lidar shows"
+    )
 
 
 def test_half_days_lead_from_the_record_to_where_the_sensor_was_and_is():
