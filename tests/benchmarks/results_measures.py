@@ -192,6 +192,12 @@ def named(lines: Lines, _row: Row) -> str:
     return f"{stopped.count('stopped, named rightly')} of {len(stopped)}"
 
 
+def stopped_good(lines: Lines, _row: Row) -> str:
+    """Of the days of study `faults` that have no fault, those of which a record is stopped and names one."""
+    days = [[p["status"] != "accepted" and bool(p["faults"]) for p in r["pairs"].values()] for r in lines]
+    return rate(sum(map(any, days)), len(days))
+
+
 def power(lines: Lines, row: Row) -> str:
     """Study drift_power: RED with the right sensor within `nights`, by whose days; the interval is of the rarer."""
     found = {r["records"]: (r[f"right_within_{row['nights']}"], r["movers"]) for r in lines}
@@ -209,6 +215,6 @@ MEASURES: dict[str, Callable[[Lines, Row], str]] = {
     f.__name__: f
     for f in (
         accepted_days, by_noise, clocks, efficiency, errors, faulty, found, given_inside, inside, knocked, last,
-        mounting, named, power, shown, starts, total, value, verified, wrong_days,
+        mounting, named, power, shown, starts, stopped_good, total, value, verified, wrong_days,
     )
 }  # fmt: skip
