@@ -139,10 +139,14 @@ def disagreement(witnesses: Sequence[Witness]) -> list[FailedCheck]:
 
 
 def widening(witnesses: Sequence[Witness]) -> Float[np.ndarray, " 2"]:
-    """Sigma of pitch and of yaw [rad] to add: half of what two differ by, if more than two sigmas, else 0."""
+    """Sigma of pitch and of yaw [rad] to add: half of what two differ by, if more than two sigmas, else 0.
+
+    Boxes are coarse: they count from three sigmas on.
+    """
     sigma = np.zeros(2)
-    for a, b in _contradictions(witnesses, _WIDENING_SIGMAS):
-        sigma[a.axis] = abs(a.offset_rad - b.offset_rad) / 2
+    fine = [w for w in witnesses if w.name != _BOXES]
+    for a, b in [*_contradictions(fine, _WIDENING_SIGMAS), *_contradictions(witnesses, _SIGMAS)]:
+        sigma[a.axis] = max(sigma[a.axis], abs(a.offset_rad - b.offset_rad) / 2)
     return sigma
 
 
