@@ -23,10 +23,8 @@ __all__ = ["MOVED_SIGMAS", "PART_FLOOR_RAD", "constancy_failures"]
 MOVED_SIGMAS = 4.0
 # By which parts differ though nothing moved: their scenes and masks do (camera-lidar's bias floor in each of them).
 PART_FLOOR_RAD = float(np.radians(0.03) * np.sqrt(2))
-_ANY_RAD, _ANY_M = (
-    np.radians(20.0),
-    0.05,
-)  # of what the parts are not compared in, when the sensor is looked for
+# Of what the parts are not compared in, or do not know, when the sensor is looked for.
+_ANY_RAD, _ANY_M = np.radians(20.0), 0.05
 _AXES = {
     "camera_lidar": ("pitch", "yaw", "roll"),
     "camera_radar": ("pitch", "yaw", "roll"),
@@ -46,7 +44,7 @@ def constancy_failures(estimates: Mapping[str, PairEstimate]) -> dict[str, list[
     if not moved:
         return {}
     surest = max(moved, key=size.__getitem__)
-    found = attribute({pair: _shift(p) for pair, p in parts.items()})
+    found = attribute({pair: _shift(p, pair in moved or pair == "camera_lidar") for pair, p in parts.items()})
     rivals = [s for s, share in found.probability.items() if share > 0.05] or surest.split("_")
     sensors = [found.sensor] if found.sensor else [s for s in surest.split("_") if s in rivals]
     failed = {pair: [_failure(pair, parts[pair], size[pair], sensors)] for pair in moved}
@@ -69,12 +67,17 @@ def _failure(pair: str, parts: DayParts, sigmas: float, sensors: list[str]) -> F
     )
 
 
-def _shift(parts: DayParts) -> PairShift:
-    """The step as a twist; positions are open by what a turn in a bracket shifts."""
+def _shift(parts: DayParts, is_tilt_known: bool) -> PairShift:
+    """The step as a twist; positions are open by what a turn in a bracket shifts.
+
+    Args:
+        parts: of a pair.
+        is_tilt_known: a radar's witnesses of elevation show a part of a tilt only: one that they do not show may be.
+    """
     change, covariance = np.zeros(6), np.eye(6) * _ANY_M**2
-    change[:3], covariance[:3, :3] = (
-        parts.step,
-        parts.spread[0] + parts.spread[1] + np.eye(3) * PART_FLOOR_RAD**2,
-    )
+    change[:3] = parts.step
+    covariance[:3, :3] = parts.spread[0] + parts.spread[1] + np.eye(3) * PART_FLOOR_RAD**2
+    if not is_tilt_known:
+        covariance[:2, :2] += np.eye(2) * _ANY_RAD**2
     to_twist = np.linalg.inv(change_jacobian(parts.T[0]))
     return PairShift(parts.T[0], to_twist @ change, to_twist @ covariance @ to_twist.T)

@@ -86,6 +86,17 @@ def test_a_tilt_that_the_radar_does_not_see_leaves_two_sensors(sensor, with_rada
     )
 
 
+def test_a_tilt_that_the_radar_shows_in_part_does_not_blame_the_camera():
+    """Elevation rests on witnesses with floors of their own, so that parts turn less than the lidar did."""
+    found = estimates("lidar", (0.0, 1.0, 0.0))
+    radar, sure = found["lidar_radar"], np.eye(3) * np.radians(0.2) ** 2
+    first, last = (turned("lidar", np.array((0.0, 1.0, 0.0)), share)["lidar_radar"] for share in (0.4, 0.6))
+    parts = DayParts((first, last), (sure, sure), CUT_NS, (0, 1, 2))
+    failed = constancy_failures(found | {"lidar_radar": replace(radar, parts=parts)})
+    assert "the camera or lidar moved" in failed["camera_lidar"][0].sentence
+    assert failed["lidar_radar"]
+
+
 def test_half_days_lead_from_the_record_to_where_the_sensor_was_and_is():
     found = estimates("lidar", (0.0, 0.0, 1.0))
     faults = {pair: ["moved_in_day"] for pair in found}
