@@ -322,3 +322,9 @@ def test_camera_and_radar_alone_find_their_azimuth(day):
             < 3.5 * np.sqrt(np.diag(found.covariance))[:3][found.observable[:3]]
         )
         assert not found.observable[3:].all()
+
+
+def test_a_knock_wider_than_the_registration_reaches_shows_in_the_parts_too(day):
+    parts = turned_at_noon(day, 2, -5.0)
+    assert abs(parts.sigmas(PART_FLOOR_RAD)[2]) > 10 * MOVED_SIGMAS
+    assert np.degrees(parts.step[2]) == pytest.approx(-5.0, abs=0.2)

@@ -65,6 +65,8 @@ from schemas.observations import Observation
 __all__ = ["estimate_lidar_radar"]
 
 _FEWEST_FRAMES = 5
+# Of a part from the whole day: the registration reaches a degree and a half.
+_KNOCKS_RAD = tuple(np.radians([-5.0, -3.5, -2.0, 2.0, 3.5, 5.0]).tolist())
 _CAMERA_SIGMA_RAD = np.radians(0.5)  # a camera less sure than what its boxes show is left out
 _REMAINING_STEPS = 10.0  # of dt, that count as uncertainty: the valley is flat
 _YAW, _ANY_RAD = 2, np.radians(20.0)
@@ -185,7 +187,7 @@ def _parts(
 
     def solve(rows: np.ndarray) -> tuple[RadarState, np.ndarray, np.ndarray]:
         part = about.of_frames(rows)
-        state, linear = finish(part, start, fixed)
+        state, linear = finish(part, _start_of_part(part, start, len(fixed)), fixed)
         H, g, P = (a[..., ~fixed] for a in (linear.information, linear.g, linear.prior_information))
         block = blocks_of(part.observations, config.bootstrap_blocks)
         found = bootstrap_covariance(H[:, ~fixed], g, P[~fixed], block, rng)  # turns come first
@@ -196,6 +198,12 @@ def _parts(
     stamps = [problem.observations[k].stamp_ns for k in frames]
     gradient, tested = analysis.linear.g[frames][:, turns], tuple(turns.tolist())
     return parts_of_day(gradient, stamps, solve, lambda state: -comparison_cost(problem, state), tested)
+
+
+def _start_of_part(part: RadarProblem, start: RadarState, unknowns: int) -> RadarState:
+    """The day's solution, or one turned in yaw that the part's frames prefer: a knock may be wide."""
+    turned = [start.moved(angle * (np.arange(unknowns) == _YAW)) for angle in (0.0, *_KNOCKS_RAD)]
+    return min(turned, key=lambda state: float(comparison_cost(part, state).sum()))
 
 
 def _with_way(
