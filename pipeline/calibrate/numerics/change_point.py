@@ -43,8 +43,9 @@ def parts_of_day(
     solve: _Solve[State],
     score: Callable[[State], Float[np.ndarray, " F"]],
     tested: tuple[int, ...],
+    scene: Int[np.ndarray, " F"],
 ) -> DayParts | None:
-    """First and last part of a day; None where it is too short to be cut.
+    """First and last part of a day; None where it is too short, or shows too few scenes, to be cut.
 
     Args:
         gradient: of each frame at the solution of all, in order of time, by what may have changed.
@@ -52,8 +53,9 @@ def parts_of_day(
         solve: some frames alone.
         score: of each frame at a solution, higher is better.
         tested: rotations (0, 1, 2) that are compared.
+        scene: of each frame; a part of fewer than three knows nothing of its own spread.
     """
-    cut = likeliest_cut(gradient)
+    cut = likeliest_cut(gradient, scene)
     if cut is None:
         return None
     for _ in range(_MOST_CUTS):
@@ -62,7 +64,7 @@ def parts_of_day(
         parts = DayParts((first[1], last[1]), (first[2], last[2]), cut_ns, tested)
         if np.abs(parts.sigmas(0.0)).max() < _SUSPICIOUS_SIGMAS:
             break
-        allowed = _cuts(len(stamp_ns))
+        allowed = _cuts(scene)
         lost = np.cumsum(score(last[0]) - score(first[0]))[allowed - 1]
         again = int(allowed[np.argmin(lost)])
         if again == cut:
@@ -82,13 +84,14 @@ def with_parts(estimate: PairEstimate, parts: DayParts | None) -> PairEstimate:
     return replace(estimate, parts=parts, covariance=covariance)
 
 
-def likeliest_cut(gradient: Float[np.ndarray, "F P"]) -> int | None:
-    """Number of frames before the likeliest change; None where there are too few frames on either side.
+def likeliest_cut(gradient: Float[np.ndarray, "F P"], scene: Int[np.ndarray, " F"]) -> int | None:
+    """Number of frames before the likeliest change; None where there are too few frames or scenes on either side.
 
     Args:
         gradient: of each frame, in order of time, by what may have changed.
+        scene: of each frame.
     """
-    F, k = len(gradient), _cuts(len(gradient))
+    F, k = len(gradient), _cuts(scene)
     if not len(k):
         return None
     apart = gradient - gradient.mean(axis=0)
@@ -99,7 +102,17 @@ def likeliest_cut(gradient: Float[np.ndarray, "F P"]) -> int | None:
     return int(k[np.argmax(pull)])
 
 
-def _cuts(frames: int) -> Int[np.ndarray, " K"]:
+def _cuts(scene: Int[np.ndarray, " F"]) -> Int[np.ndarray, " K"]:
     """Numbers of frames that may lie before a cut."""
+    frames = len(scene)
     least = max(FEWEST_SCENES, int(np.ceil(_LEAST_SHARE * frames)))
-    return np.arange(least, frames - least + 1)
+    cuts = np.arange(least, frames - least + 1)
+    before, after = _seen(scene), _seen(scene[::-1])[::-1]
+    return cuts[(before[cuts - 1] >= FEWEST_SCENES) & (after[cuts] >= FEWEST_SCENES)]
+
+
+def _seen(scene: Int[np.ndarray, " F"]) -> Int[np.ndarray, " F"]:
+    """How many different scenes were seen up to each frame."""
+    is_new = np.zeros(len(scene), np.int64)
+    is_new[np.unique(scene, return_index=True)[1]] = 1
+    return np.cumsum(is_new)

@@ -17,8 +17,8 @@ def measured(rng, frames, turn_rad, after):
     return values
 
 
-def parts_of(values):
-    """Parts of a day whose frames each measure the rotation vector."""
+def parts_of(values, scene=None):
+    """Parts of a day whose frames each measure the rotation vector, each of its own scene or of a given one."""
 
     def solve(rows):
         mean = values[rows].mean(axis=0)
@@ -28,9 +28,9 @@ def parts_of(values):
     def score(mean):
         return -0.5 * np.sum((values - mean) ** 2, axis=1) / NOISE_RAD**2
 
-    return parts_of_day(
-        values - values.mean(axis=0), [k * 10**9 for k in range(len(values))], solve, score, (0, 1, 2)
-    )
+    scene = np.arange(len(values)) if scene is None else scene
+    stamps = [k * 10**9 for k in range(len(values))]
+    return parts_of_day(values - values.mean(axis=0), stamps, solve, score, (0, 1, 2), scene)
 
 
 @pytest.mark.parametrize("after", [9, 16, 30, 40, 51])
@@ -69,8 +69,18 @@ def test_what_is_not_compared_says_nothing():
 def test_a_cut_leaves_frames_on_either_side():
     rng = np.random.default_rng(1)
     for frames in (6, 10, 40):
-        cut = likeliest_cut(rng.normal(size=(frames, 3)))
+        cut = likeliest_cut(rng.normal(size=(frames, 3)), np.arange(frames))
         assert cut is not None
         assert 3 <= cut <= frames - 3
-    assert likeliest_cut(np.zeros((5, 3))) is None
-    assert likeliest_cut(np.zeros((12, 3))) is not None  # nothing differs: any cut will do
+    assert likeliest_cut(np.zeros((5, 3)), np.arange(5)) is None
+    assert likeliest_cut(np.zeros((12, 3)), np.arange(12)) is not None  # nothing differs: any cut will do
+
+
+def test_a_cut_leaves_three_scenes_on_either_side():
+    """Of the last street two scenes are left: that they agree says nothing of how sure they are."""
+    values = measured(np.random.default_rng(2), 60, np.radians([0.0, 0.0, 2.0]), 50)
+    scene = np.r_[np.arange(50), np.repeat([50, 51], 5)]
+    parts = parts_of(values, scene)
+    assert parts.cut_ns[1] / 1e9 <= 49
+    assert parts_of(values, np.r_[np.zeros(30, int), np.ones(30, int)]) is None
+    assert parts_of(values[:20], np.repeat(np.arange(4), 5)) is None

@@ -73,4 +73,4 @@ def parts_of_alignment(
         return np.sum([terms.score(state.alone, k)[0] for k in kernels], axis=0)
 
     stamps = [o.stamp_ns for o in frames]
-    return parts_of_day(np.concatenate(gradients, axis=1), stamps, solve, score, (0, 1, 2))
+    return parts_of_day(np.concatenate(gradients, axis=1), stamps, solve, score, (0, 1, 2), problem.blocks)

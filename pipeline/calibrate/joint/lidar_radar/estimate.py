@@ -49,7 +49,7 @@ from pipeline.calibrate.numerics.covariance import (
     covariance_with_fixed,
     with_ends,
 )
-from pipeline.calibrate.numerics.frame_blocks import blocks_of
+from pipeline.calibrate.numerics.frame_blocks import blocks_of, scenes_of
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.common_share import common_part, prior_share
@@ -197,7 +197,10 @@ def _parts(
 
     stamps = [problem.observations[k].stamp_ns for k in frames]
     gradient, tested = analysis.linear.g[frames][:, turns], tuple(turns.tolist())
-    return parts_of_day(gradient, stamps, solve, lambda state: -comparison_cost(problem, state), tested)
+    scene = scenes_of([problem.observations[k] for k in frames])
+    return parts_of_day(
+        gradient, stamps, solve, lambda state: -comparison_cost(problem, state), tested, scene
+    )
 
 
 def _start_of_part(part: RadarProblem, start: RadarState, unknowns: int) -> RadarState:
