@@ -26,6 +26,7 @@ FOUNDATIONS = {
     "store",
     "objective",
     "extrinsics",
+    "rig",
     "rigs",
     "ros_messages",
     "shipped_models",
