@@ -183,7 +183,8 @@ def read_columns(
     Args:
         lake: where the table is.
         schema: of the table.
-        columns: names; "diagnostics.disproved" is one value of a column of maps, null where a record has none.
+        columns: names; "diagnostics.disproved" is one value of a column of maps, null where a record has none. A column
+            that no release which wrote to the lake knew yet is null in every row.
         first: only from this day on.
         last: only until this day.
         vehicle: only this vehicle's, or only these'.
@@ -194,7 +195,13 @@ def read_columns(
     """
     asked = dict.fromkeys([*schema.about, "asserted_at", "work_key", *columns])
     wanted = replace(_wanted(vehicle, first, last), asserted_after=asserted_after)
-    return _rows_of(lake, schema, list(asked), wanted)
+    found = _rows_of(lake, schema, list(asked), wanted)
+    if found is None:
+        return None
+    for name in (n for n in asked if n not in found.column_names):
+        field = schema.arrow_schema().field(name).with_nullable(True)
+        found = found.append_column(field, pa.nulls(found.num_rows, field.type))
+    return found
 
 
 class RecordIndex(Generic[Row]):
