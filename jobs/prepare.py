@@ -94,11 +94,11 @@ def _days(
         check_day(name, day)
     for vehicle in vehicles or ():
         config.rig_of(vehicle)
-    wanted = set(vehicles or config.vehicles)
     days = [
         p
         for p in lake.partitions(OBSERVATIONS.name)
-        if p.vehicle in wanted and (from_day or "") <= p.day <= (to_day or "9999")
+        if (p.vehicle in vehicles if vehicles else config.knows(p.vehicle))
+        and (from_day or "") <= p.day <= (to_day or "9999")
     ]
     if not days:
         raise ConfigError(

@@ -95,9 +95,9 @@ def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
     if vehicle is not None:
         config.rig_of(vehicle)  # raises, naming the vehicles there are
         return vehicle
-    if len(config.vehicles) != 1:
+    if len(config.vehicles) != 1 or not config.named_vehicles:
         raise ConfigError("command line", "vehicle", f"name one of {sorted(config.vehicles)} with --vehicle")
-    return next(iter(config.vehicles))
+    return config.named_vehicles[0]
 
 
 def _for_one_look(config: FleetConfig, frames: int) -> FleetConfig:

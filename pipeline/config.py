@@ -6,7 +6,7 @@ import difflib
 import hashlib
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -19,8 +19,9 @@ from pydantic import (
 )
 
 from pipeline.errors import ConfigError
-from pipeline.names import is_vehicle
-from pipeline.rigs import OnnxSemantics, Positive, Rig, Section
+from pipeline.names import is_pattern, is_vehicle, matches
+from pipeline.rig.rig import SECTIONS, Rig
+from pipeline.rigs import Positive, Section
 from pipeline.sections import (
     TERMS,
     AuditConfig,
@@ -56,6 +57,7 @@ __all__ = [
 ]
 
 _Kind = TypeVar("_Kind", bound=BaseModel)
+_SHORT = {(section, kind) for kind, section in SECTIONS.items()}
 
 
 class Vehicle(Section):
@@ -77,6 +79,7 @@ class FleetConfig(Section):
 
     fleet: FleetSection
     rigs: dict[str, Rig]
+    # By name, or by a pattern with * and ? for whichever vehicles the logs are of.
     vehicles: dict[str, Vehicle] = Field(default_factory=dict)
     ingest: IngestConfig = IngestConfig()
     perceive: PerceiveConfig = PerceiveConfig()
@@ -120,13 +123,7 @@ class FleetConfig(Section):
     def _named_files(self) -> Iterator[tuple[str, str]]:
         for name in sorted({v.rig for v in self.vehicles.values()}):
             rig, key = self.rigs[name], f"rigs.{name}"
-            if isinstance(rig.semantics, OnnxSemantics):
-                yield f"{key}.camera.semantics.segmenter", rig.semantics.segmenter
-                yield f"{key}.camera.semantics.detector", rig.semantics.detector
-            if rig.lidar is not None and rig.lidar.semantics is not None:
-                yield f"{key}.lidar.semantics.segmenter", rig.lidar.semantics.segmenter
-            if rig.radar is not None and rig.radar.drivable is not None:
-                yield f"{key}.radar.drivable.model", rig.radar.drivable.model
+            yield from ((f"{key}.{of}", file) for of, file in rig.named_models())
             if rig.prior.file is not None:
                 yield f"{key}.prior.file", rig.prior.file
         if self.learn.model is not None:
@@ -163,16 +160,38 @@ class FleetConfig(Section):
             new[name] = validated(type(section), kept | values, str(self._file), name)
         return self.model_copy(update=new)
 
-    def rig_of(self, vehicle: str) -> Rig:
-        """The rig of a vehicle; ConfigError where the vehicle is not in the file."""
-        if vehicle not in self.vehicles:
+    @property
+    def named_vehicles(self) -> tuple[str, ...]:
+        """Vehicles that the file names; those of its patterns are known by their logs."""
+        return tuple(name for name in self.vehicles if not is_pattern(name))
+
+    def knows(self, vehicle: str) -> bool:
+        """Whether the file names the vehicle, or has a pattern for it."""
+        return bool(self._entries_for(vehicle))
+
+    def vehicle(self, vehicle: str) -> Vehicle:
+        """What the file says of a vehicle: by its name, else by the longest pattern that it matches.
+
+        Raises:
+            ConfigError: nothing.
+        """
+        entries = self._entries_for(vehicle)
+        if not entries:
             problem = f"unknown vehicle; the file has {sorted(self.vehicles)}"
             raise ConfigError(str(self._file), f"vehicles.{vehicle}", problem)
-        return self.rigs[self.vehicles[vehicle].rig]
+        return self.vehicles[vehicle if vehicle in entries else max(entries, key=lambda e: (len(e), e))]
+
+    def _entries_for(self, vehicle: str) -> list[str]:
+        """Keys of [vehicles] that are the vehicle's name or a pattern of it."""
+        return [e for e in self.vehicles if e == vehicle or (is_pattern(e) and matches(e, vehicle))]
+
+    def rig_of(self, vehicle: str) -> Rig:
+        """The rig of a vehicle; ConfigError where the file does not know the vehicle."""
+        return self.rigs[self.vehicle(vehicle).rig]
 
     def with_prior_file(self, vehicle: str, file: Path) -> FleetConfig:
         """The same configuration, with the prior of a vehicle's rig from a file, as far to be trusted as before."""
-        name = self.vehicles[vehicle].rig
+        name = self.vehicle(vehicle).rig
         rig = self.rigs[name]
         prior = rig.prior.model_copy(update={"source": "file", "file": str(file.resolve())})
         return self.model_copy(update={"rigs": self.rigs | {name: rig.model_copy(update={"prior": prior})}})
@@ -213,7 +232,7 @@ def validated(kind: type[_Kind], values: dict[str, Any], file: str, *above: str)
     except ValidationError as err:
         problems = [
             (
-                ".".join(map(str, (*above, *p["loc"]))),
+                ".".join(map(str, (*above, *_written(p["loc"], values)))),
                 _unknown_key(p["loc"][-1], whole) if p["type"] == "extra_forbidden" else p["msg"],
             )
             for p in err.errors(include_url=False)
@@ -221,6 +240,17 @@ def validated(kind: type[_Kind], values: dict[str, Any], file: str, *above: str)
         (key, first), *others = problems
         text = "; ".join([first, *(f"{other}: {said}" for other, said in others)])
         raise ConfigError(file, key, text) from err
+
+
+def _written(loc: Sequence[str | int], values: Any) -> Sequence[str | int]:
+    """A key as the file has it: a sensor of the short form is `camera`, and `cameras.camera` in the model."""
+    for i, key in enumerate(loc):
+        if not isinstance(values, dict):
+            break
+        if key not in values and tuple(loc[i : i + 2]) in _SHORT:
+            return (*loc[:i], *loc[i + 1 :])
+        values = values.get(key)
+    return loc
 
 
 def _unknown_key(key: str | int, whole: type[BaseModel]) -> str:

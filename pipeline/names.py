@@ -6,9 +6,10 @@ import re
 import unicodedata
 from urllib.parse import quote
 
-__all__ = ["is_vehicle"]
+__all__ = ["is_pattern", "is_vehicle", "matches"]
 
 _VEHICLE = re.compile(r"[^/\0=]+")
+_WILD = {"*": ".*", "?": "."}
 _LONGEST_FOLDER = 200  # of the 255 bytes that file systems allow: pages and partitions add to the name
 
 
@@ -19,4 +20,16 @@ def is_vehicle(name: str) -> bool:
         and name not in (".", "..")
         and not any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name)
         and len(quote(name, safe="")) <= _LONGEST_FOLDER
+    )
+
+
+def is_pattern(name: str) -> bool:
+    """Whether a name in fleet.toml stands for whichever vehicles match it."""
+    return any(letter in name for letter in _WILD)
+
+
+def matches(pattern: str, vehicle: str) -> bool:
+    """Whether a vehicle's name is as the pattern says: * for any letters or none, ? for one."""
+    return (
+        re.fullmatch("".join(_WILD.get(letter, re.escape(letter)) for letter in pattern), vehicle) is not None
     )

@@ -1,14 +1,13 @@
-"""What fleet.toml says of a rig: topics of its sensors, what its radar's numbers mean, where its prior comes from."""
+"""What fleet.toml says of sensors: their topics, what a radar's numbers mean, where the prior comes from."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
-
-from schemas.calibrations import SENSORS
 
 __all__ = [
     "CameraPrior",
@@ -21,8 +20,8 @@ __all__ = [
     "Positive",
     "PriorConfig",
     "RadarTopics",
-    "Rig",
     "Section",
+    "SensorPrior",
     "TopicSemantics",
 ]
 
@@ -99,12 +98,27 @@ class CameraPrior:
     )
 
 
-class CameraTopics(Section):
-    """The camera's topics, and what CameraInfo does not say."""
+class SensorPrior(Section):
+    """How far one sensor's prior is to be trusted, where that is not the rig's."""
+
+    rotation_sigma_deg: Positive | None = None
+    translation_sigma_m: Positive | None = None
+
+
+class _Sensor(Section):
+    """What every sensor may be told."""
+
+    # Left out of dumps: it is calibration's, and no reason to ingest a rig's logs again.
+    prior: SensorPrior = Field(default=SensorPrior(), exclude=True)
+
+
+class CameraTopics(_Sensor):
+    """A camera's topics, and what CameraInfo does not say."""
 
     image: Topic
     info: Topic
-    semantics: Annotated[TopicSemantics | OnnxSemantics, Field(discriminator="source")]
+    # Left out: only what needs no labels and no road users can be made of its images.
+    semantics: Annotated[TopicSemantics | OnnxSemantics, Field(discriminator="source")] | None = None
     # Rolling shutter: time from the first image row to the last, which is seen later [s]; 0 = global shutter. The stamp
     # is that of the middle row; where it is another row's, the time offset that is estimated takes that up. Left out of
     # dumps: it is calibration's, and no reason to ingest a rig's logs again.
@@ -117,6 +131,12 @@ class CameraTopics(Section):
         default=CameraPrior.focal_sigma, exclude=True
     )
     centre_sigma_px: Annotated[float, Field(ge=0, le=100)] | None = Field(default=None, exclude=True)
+
+    def named_models(self) -> Iterator[tuple[str, str]]:
+        """Files of models that it names, by key."""
+        if isinstance(self.semantics, OnnxSemantics):
+            yield "semantics.segmenter", self.semantics.segmenter
+            yield "semantics.detector", self.semantics.detector
 
     @property
     def known(self) -> CameraPrior:
@@ -135,12 +155,17 @@ class OnnxPointSemantics(Section):
     remission_scale: Positive = 1.0  # makes logged intensity what the model was trained on
 
 
-class LidarTopics(Section):
-    """The lidar's topic."""
+class LidarTopics(_Sensor):
+    """A lidar's topic."""
 
     points: Topic
     # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
     semantics: OnnxPointSemantics | None = Field(default=None, exclude=True)
+
+    def named_models(self) -> Iterator[tuple[str, str]]:
+        """Files of models that it names, by key."""
+        if self.semantics is not None:
+            yield "semantics.segmenter", self.semantics.segmenter
 
 
 class OnnxDrivable(Section):
@@ -150,8 +175,8 @@ class OnnxDrivable(Section):
     model: str
 
 
-class RadarTopics(Section):
-    """The radar's topic and what its Doppler means."""
+class RadarTopics(_Sensor):
+    """A radar's topic and what its Doppler means."""
 
     points: Topic
     doppler_field: str = "doppler"
@@ -165,6 +190,11 @@ class RadarTopics(Section):
     azimuth_positive: Literal["left", "right"] = "left"  # RadarScan drivers differ; PointCloud2 has x y z
     # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
     drivable: OnnxDrivable | None = Field(default=None, exclude=True)
+
+    def named_models(self) -> Iterator[tuple[str, str]]:
+        """Files of models that it names, by key."""
+        if self.drivable is not None:
+            yield "drivable.model", self.drivable.model
 
     @model_validator(mode="after")
     def _one_way_to_say_velocity(self) -> RadarTopics:
@@ -189,7 +219,9 @@ class PriorConfig(Section):
     # Where static transforms are logged: ROS's name; Foxglove's loggers have no custom. Left out of dumps where it is
     # that: no reason to ingest a rig's logs again.
     topic: Topic = Field(default=TF_STATIC, exclude_if=lambda topic: topic == TF_STATIC)
-    file: str | None = None  # JSON: {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}, relative to fleet.toml
+    # JSON, relative to fleet.toml: {"reference": "top", "T": {"front": 4x4, ...}} with T_reference_sensor of each
+    # sensor; of a short-form rig also {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}.
+    file: str | None = None
     rotation_sigma_deg: Positive = 2.0
     translation_sigma_m: Positive = 0.05
 
@@ -197,44 +229,4 @@ class PriorConfig(Section):
     def _file_goes_with_source(self) -> PriorConfig:
         if (self.source == "file") != (self.file is not None):
             raise ValueError('source = "file" needs file = "...", and file needs source = "file"')
-        return self
-
-
-class Rig(Section):
-    """One rig model; a vehicle names its rig. It has at least two of the three sensors."""
-
-    camera: CameraTopics | None = None
-    lidar: LidarTopics | None = None
-    radar: RadarTopics | None = None
-    ego: EgoTopics | None = None
-    prior: PriorConfig = PriorConfig()
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Those of camera, lidar and radar that it has."""
-        return tuple(sensor for sensor in SENSORS if getattr(self, sensor) is not None)
-
-    @property
-    def semantics(self) -> TopicSemantics | OnnxSemantics | None:
-        """Where the camera's labels and road users come from; None without a camera."""
-        return None if self.camera is None else self.camera.semantics
-
-    @model_validator(mode="after")
-    def _two_sensors(self) -> Rig:
-        if len(self.sensors) < 2:
-            has = f"only a {self.sensors[0]}" if self.sensors else "no sensor"
-            raise ValueError(f"the rig has {has}: a calibration needs two of camera, lidar and radar")
-        return self
-
-    @model_validator(mode="after")
-    def _topics_differ(self) -> Rig:
-        semantics = self.semantics
-        topics = [] if self.camera is None else [self.camera.image, self.camera.info]
-        topics += [sensor.points for sensor in (self.lidar, self.radar) if sensor is not None]
-        topics.append(self.prior.topic)
-        topics += [semantics.labels, semantics.detections] if isinstance(semantics, TopicSemantics) else []
-        topics += [] if self.ego is None else [self.ego.odometry]
-        twice = sorted({topic for topic in topics if topics.count(topic) > 1})
-        if twice:
-            raise ValueError(f"one topic stands for two things: {', '.join(twice)}")
         return self

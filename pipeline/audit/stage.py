@@ -67,9 +67,9 @@ def work(task: Task) -> Work:
     history.read(_after(latest), None)  # days to come are named
     events = events_until(task.lake, last)
     enough = (FEWEST_DAYS, fleet.audit.reference_days)
-    records, references = history.window((first, last), events, enough, fleet.vehicles)
+    records, references = history.window((first, last), events, enough, fleet.named_vehicles)
     said = said_before(task.lake, method)
-    names = sorted({*records.vehicles, *fleet.vehicles, *said})
+    names = sorted({*records.vehicles, *fleet.named_vehicles, *said})
     made: dict[str, dict[str, Reference]] = {}
     for (name, pair), reference in references.items():
         made.setdefault(name, {})[PAIRS[pair]] = reference

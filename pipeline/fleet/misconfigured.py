@@ -14,8 +14,8 @@ def rigs_to_mend(outcomes: Sequence[DayOutcome], fleet: FleetConfig) -> dict[str
     """Rigs of which every day of the night was misconfigured, with the first one's reason."""
     of_rig: dict[str, list[DayOutcome]] = {}
     for outcome in outcomes:
-        if outcome.vehicle in fleet.vehicles:
-            of_rig.setdefault(fleet.vehicles[outcome.vehicle].rig, []).append(outcome)
+        if fleet.knows(outcome.vehicle):
+            of_rig.setdefault(fleet.vehicle(outcome.vehicle).rig, []).append(outcome)
     return {rig: own[0].reason for rig, own in of_rig.items() if all(o.misconfigured for o in own)}
 
 
@@ -28,7 +28,7 @@ def night_statuses(outcomes: Sequence[DayOutcome], fleet: FleetConfig) -> list[s
     mend = rigs_to_mend(outcomes, fleet)
     return [
         "misconfigured"
-        if o.misconfigured and (o.status == "failed" or fleet.vehicles[o.vehicle].rig in mend)
+        if o.misconfigured and (o.status == "failed" or fleet.vehicle(o.vehicle).rig in mend)
         else o.status
         for o in outcomes
     ]

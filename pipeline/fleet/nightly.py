@@ -101,7 +101,7 @@ def run_night(
 
 def refused_at_once(night: Night, of: Partition) -> str:
     """Why logs cannot be of the vehicle and day that their path names; empty where they can."""
-    if of.vehicle not in night.fleet.vehicles:
+    if not night.fleet.knows(of.vehicle):
         return f"{night.fleet.file} has no vehicle {of.vehicle!r}"
     return f"{of.day} has not come yet: mend the logs' path" if of.day > last_possible_day() else ""
 
@@ -177,7 +177,7 @@ class _Jobs(Sequence[_Job]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         day, fleet = self._days[index], self._night.fleet
-        vehicle = fleet.vehicles[day.partition.vehicle]
+        vehicle = fleet.vehicle(day.partition.vehicle)
         own = {"vehicles": {day.partition.vehicle: vehicle}, "rigs": {vehicle.rig: fleet.rigs[vehicle.rig]}}
         # As in `_shared`; what lies in a bucket is there from everywhere.
         logs = tuple(Path(os.path.abspath(g)) if isinstance(g, Path) else g for g in day.logs)

@@ -21,7 +21,8 @@ from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
 from pipeline.ingest.stage import pick_trios, read_file_prior
 from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns
 from pipeline.results import Progress, silent
-from pipeline.rigs import OnnxSemantics, Rig
+from pipeline.rig.rig import Rig
+from pipeline.rigs import OnnxSemantics
 from schemas.calibrations import SENSORS, pairs_of
 from schemas.faults import FAULTS
 from schemas.frames import Frame

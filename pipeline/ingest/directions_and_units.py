@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.ingest.doppler_speed import doppler_speed
-from pipeline.rigs import RadarTopics, Rig
+from pipeline.rig.rig import Rig
+from pipeline.rigs import RadarTopics
 from schemas.frames import Frame
 
 __all__ = ["MOVING_MPS", "Motion", "motion_of", "prior_transform"]

@@ -36,7 +36,8 @@ from pipeline.ingest.messages.radar import RadarCloud, read_radar
 from pipeline.ingest.messages.video import VideoPictures, video_codec
 from pipeline.ingest.repetition import REPEATED, Repetitions
 from pipeline.ingest.sync import Rejection
-from pipeline.rigs import Rig, TopicSemantics
+from pipeline.rig.rig import Rig
+from pipeline.rigs import TopicSemantics
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, pairs_of
 from schemas.frames import SAME_SCENE_NS, Frame
 

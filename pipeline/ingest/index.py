@@ -26,7 +26,8 @@ from pipeline.ingest.messages.generation import encoding_fault
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
-from pipeline.rigs import Rig, TopicSemantics
+from pipeline.rig.rig import Rig
+from pipeline.rigs import TopicSemantics
 from pipeline.store.remote_logs import LogPath
 
 __all__ = ["ACCEPTED_TYPES", "NEEDED", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]

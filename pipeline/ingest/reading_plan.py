@@ -17,7 +17,7 @@ from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stamp_ns
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.messages.radar import read_radar
-from pipeline.rigs import Rig
+from pipeline.rig.rig import Rig
 
 __all__ = ["Reading", "plan_reading", "plan_sweeps", "rare_topics"]
 

@@ -28,7 +28,7 @@ from pipeline.ingest.sync import (
     number_drives,
 )
 from pipeline.results import Progress
-from pipeline.rigs import Rig
+from pipeline.rig.rig import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.faults import FAULTS
 from schemas.frames import SENSORS_ABSENT, SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ, Frame

@@ -139,7 +139,7 @@ def test_without_a_sensors_topic_its_pairs_alone_fail_and_nothing_else_is_said_t
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_a_rig_of_two_sensors_is_judged_by_its_one_pair(kit, tmp_path, sensor):
     config = kit.fleet(ingest={"min_lidar_points": 500})
-    rig = config.rigs["default"].model_copy(update={sensor: None})
+    rig = config.rigs["default"].model_copy(update={f"{sensor}s": {}})
     report = check_logs([kit.Kit(frames=40).drive().mcap(tmp_path / "a.mcap")], rig, config)
     (pair,) = {v.pair for v in report.verdicts}
     assert sensor not in FRAMES_OF_PAIR[pair]
@@ -353,7 +353,7 @@ def test_a_sign_that_nobody_wrote_down_is_said_with_what_the_log_shows(kit, tmp_
         rig = config.rigs["default"]
         radar = RadarTopics(points=rig.radar.points)
         report = check_logs(
-            [drive.mcap(tmp_path / "a.mcap")], rig.model_copy(update={"radar": radar}), config
+            [drive.mcap(tmp_path / "a.mcap")], rig.model_copy(update={"radars": {"radar": radar}}), config
         )
         return next((a for a in report.advice if "doppler_positive" in a), "")
 

@@ -140,7 +140,7 @@ def test_a_day_of_one_sensor_is_refused_by_the_topics_of_the_others(kit, tmp_pat
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_a_rig_without_a_sensor_reads_the_other_two(kit, tmp_path, run_ingest, sensor):
     fleet = kit.fleet()
-    rig = fleet.rigs["default"].model_copy(update={sensor: None})
+    rig = fleet.rigs["default"].model_copy(update={f"{sensor}s": {}})
     fleet = fleet.model_copy(update={"rigs": {"default": rig}})
     result, frames = run_ingest(kit.Kit().drive().mcap(tmp_path / "a.mcap"), fleet=fleet)
     assert (result.status, result.rows) == ("done", 4)

@@ -105,6 +105,10 @@ def test_the_prior_is_the_calibration_that_the_logs_carry(real_logs, lake):
         np.testing.assert_allclose(from_quaternion(q, t), T, atol=1e-6)
 
 
+def _with_radar(rig, **changes):
+    return rig.model_copy(update={"radars": {"radar": rig.radar.model_copy(update=changes)}})
+
+
 def test_check_finds_the_day_fit_and_notices_a_wrong_doppler_sign(logs):
     fleet = load_fleet(CONFIG)
     rig = fleet.rigs["default"]
@@ -114,7 +118,7 @@ def test_check_finds_the_day_fit_and_notices_a_wrong_doppler_sign(logs):
     assert 0.5 < report.evidence.moving_share < 0.95
     assert report.evidence.doppler_problem == ""
     assert {v.verdict for v in report.verdicts if v.pair == "camera_lidar"} == {"yes", "weak"}
-    wrong = rig.model_copy(update={"radar": rig.radar.model_copy(update={"doppler_positive": "receding"})})
+    wrong = _with_radar(rig, doppler_positive="receding")
     assert 'probably "approaching"' in check_logs(logs[:1], wrong, fleet).evidence.doppler_problem
-    short = rig.model_copy(update={"radar": rig.radar.model_copy(update={"doppler_period_mps": 5.0})})
+    short = _with_radar(rig, doppler_period_mps=5.0)
     assert "doppler_period_mps = 5" in check_logs(logs[:1], short, fleet).evidence.doppler_problem

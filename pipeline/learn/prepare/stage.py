@@ -58,7 +58,7 @@ def work(task: Task) -> Work:
     survey = survey_day(task.partition, task.lake, config)
     sides, rejected = frame_sides(survey, plan, config)
     settings = {"prior_file": prior_key(task.fleet, vehicle), "sides": [s or "" for s in sides]}
-    about = _about(survey, task.fleet.vehicles[vehicle].rig, sides)
+    about = _about(survey, task.fleet.vehicle(vehicle).rig, sides)
     extra = {
         "split_rule": _split_rule(config),
         "sides": _sides_given(survey, plan),

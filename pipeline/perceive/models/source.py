@@ -9,7 +9,8 @@ from pipeline.perceive.camera import CameraSemantics, decode_colour, label_size
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import Manifest, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
-from pipeline.rigs import OnnxSemantics, Rig
+from pipeline.rig.rig import Rig
+from pipeline.rigs import OnnxSemantics
 from schemas.frames import Frame
 
 __all__ = ["ModelSource", "check_models"]

@@ -87,7 +87,7 @@ def _is_held_out(day: int) -> bool:
 
 def _days(fleet: FleetConfig, lake: Lake) -> Sequence[_Day]:
     """Each day by its accepted camera-lidar calibration where the lake has one, else by its prior."""
-    partitions = [p for p in lake.partitions(OBSERVATIONS.name) if p.vehicle in fleet.vehicles]
+    partitions = [p for p in lake.partitions(OBSERVATIONS.name) if fleet.knows(p.vehicle)]
     if len(partitions) < 2:
         problem = (
             f"{len(partitions)} vehicle-days with observations of vehicles in fleet.toml: two are needed"

@@ -27,7 +27,7 @@ def drivable_samples(
     Raises:
         ContractError: no observations of a vehicle in fleet.toml.
     """
-    days = [p for p in lake.partitions(OBSERVATIONS.name) if p.vehicle in fleet.vehicles]
+    days = [p for p in lake.partitions(OBSERVATIONS.name) if fleet.knows(p.vehicle)]
     if not days:
         problem = "no observations of a vehicle in fleet.toml: run `boresight perceive`"
         raise ContractError(str(lake.root), problem)

@@ -1,0 +1,246 @@
+"""What fleet.toml says of a rig: its sensors by name, the one that poses refer to, and which edges are wanted."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from itertools import combinations
+from typing import Any, Final, TypeVar
+
+from pydantic import (
+    Field,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
+
+from pipeline.errors import ConfigError
+from pipeline.rig.graph import BASE, EDGE_KINDS, KINDS, Edge, Sensor, edge_between
+from pipeline.rigs import (
+    CameraTopics,
+    EgoTopics,
+    LidarTopics,
+    OnnxSemantics,
+    PriorConfig,
+    RadarTopics,
+    Section,
+    SensorPrior,
+    TopicSemantics,
+)
+
+__all__ = ["SECTIONS", "Rig"]
+
+SECTIONS: Final = {"camera": "cameras", "lidar": "lidars", "radar": "radars"}  # of each kind, in a rig
+# It names files of the lake, columns of maps and ends of edges.
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
+_Topics = TypeVar("_Topics")
+
+
+class Rig(Section):
+    """One rig model; a vehicle names its rig. Between two of its sensors at least there can be an edge.
+
+    `[rigs.X.camera]` is short for `[rigs.X.cameras.camera]`, likewise lidar and radar. A rig that has no other sensors
+    is dumped in the short form.
+    """
+
+    cameras: dict[str, CameraTopics] = Field(default_factory=dict)
+    lidars: dict[str, LidarTopics] = Field(default_factory=dict)
+    radars: dict[str, RadarTopics] = Field(default_factory=dict)
+    ego: EgoTopics | None = None
+    prior: PriorConfig = PriorConfig()
+    reference: str | None = None  # sensor that poses refer to; None = the lidar with most edges
+    base: str | None = None  # the vehicle frame as transforms call it; None = no edges to it
+    # Pairs of sensors; None = found from overlap. Left out of dumps: no reason to ingest a rig's logs again.
+    edges: tuple[tuple[str, str], ...] | None = Field(default=None, exclude=True)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of its cameras, lidars and radars."""
+        return (*self.cameras, *self.lidars, *self.radars)
+
+    @property
+    def nodes(self) -> tuple[Sensor, ...]:
+        """Its sensors, and the vehicle frame where that is configured."""
+        own = tuple(Sensor(name, kind) for kind, of in self._of_kind.items() for name in of)
+        return own if self.base is None else (*own, BASE)
+
+    @property
+    def named_edges(self) -> tuple[Edge, ...] | None:
+        """The edges that the file names; None where they are to be found."""
+        if self.edges is None:
+            return None
+        nodes = {node.name: node for node in self.nodes}
+        return tuple(edge_between(nodes[a], nodes[b]) for a, b in self.edges)
+
+    @property
+    def camera(self) -> CameraTopics | None:
+        """The only camera; None where there is none, ConfigError where there are several."""
+        return _only("cameras", self.cameras)
+
+    @property
+    def lidar(self) -> LidarTopics | None:
+        """The only lidar; None where there is none, ConfigError where there are several."""
+        return _only("lidars", self.lidars)
+
+    @property
+    def radar(self) -> RadarTopics | None:
+        """The only radar; None where there is none, ConfigError where there are several."""
+        return _only("radars", self.radars)
+
+    @property
+    def semantics(self) -> TopicSemantics | OnnxSemantics | None:
+        """Where the only camera's labels and road users come from; None without a camera or semantics."""
+        return None if self.camera is None else self.camera.semantics
+
+    def prior_of(self, name: str) -> SensorPrior:
+        """How far a sensor's prior is to be trusted: what it is told itself, else the rig's."""
+        own = next((of[name].prior for of in self._of_kind.values() if name in of), SensorPrior())
+        rotation, translation = own.rotation_sigma_deg, own.translation_sigma_m
+        return SensorPrior(
+            rotation_sigma_deg=rotation or self.prior.rotation_sigma_deg,
+            translation_sigma_m=translation or self.prior.translation_sigma_m,
+        )
+
+    def named_models(self) -> Iterator[tuple[str, str]]:
+        """Files of models that its sensors name, each with its key in the rig's section."""
+        for kind, of in self._of_kind.items():
+            for name, sensor in of.items():
+                # The short key says the same where it can.
+                key = kind if name == kind else f"{SECTIONS[kind]}.{name}"
+                yield from ((f"{key}.{part}", file) for part, file in sensor.named_models())
+
+    @property
+    def _of_kind(self) -> Mapping[Any, Mapping[str, CameraTopics | LidarTopics | RadarTopics]]:
+        return {"camera": self.cameras, "lidar": self.lidars, "radar": self.radars}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _long_form(cls, values: Any) -> Any:
+        """Of `[rigs.X.camera]`, what it is short for."""
+        if not isinstance(values, dict):
+            return values
+        values = dict(values)
+        for kind, section in SECTIONS.items():
+            one = values.pop(kind, None)
+            if one is not None and section in values:
+                raise ValueError(
+                    f"both {kind} and {section}: {kind} is short for {section}.{kind}, so name all as {section}.NAME"
+                )
+            values |= {} if one is None else {section: {kind: one}}
+        return values
+
+    @model_serializer(mode="wrap")
+    def _short_form(self, dump: Any, info: Any) -> dict[str, Any]:
+        """As before rigs had more than three sensors, where it has no more: work keys stay."""
+        whole = dump(self)
+        if all(set(of) <= {kind} for kind, of in self._of_kind.items()):
+            short = {kind: whole.pop(section).get(kind) for kind, section in SECTIONS.items()}
+            whole = {k: v for k, v in short.items() if v is not None or not info.exclude_none} | whole
+        return {k: v for k, v in whole.items() if v is not None or k not in ("reference", "base")}
+
+    @field_validator("reference", mode="before")
+    @classmethod
+    def _one_reference(cls, value: Any) -> Any:
+        if value is not None and not isinstance(value, str):
+            raise ValueError(f"poses refer to one sensor: name one, not {value}")
+        return value
+
+    @model_validator(mode="after")
+    def _names_are_its_own(self) -> Rig:
+        for name, kind in ((name, kind) for kind, of in self._of_kind.items() for name in of):
+            if not _NAME.fullmatch(name):
+                raise ValueError(f"{SECTIONS[kind]}.{name}: a sensor's name is of letters, digits and _")
+            if name in KINDS and name != kind:
+                raise ValueError(
+                    f"{SECTIONS[kind]}.{name}: {name} stands for something else; rename the {kind}"
+                )
+        twice = sorted({name for name in self.sensors if self.sensors.count(name) > 1})
+        if twice:
+            raise ValueError(
+                f"two sensors are called {', '.join(twice)}: records know them by name, so rename one"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _reference_is_a_sensor(self) -> Rig:
+        if self.reference is not None and self.reference not in self.sensors:
+            raise ValueError(
+                f"reference = {self.reference!r} is no sensor of the rig, which has {_listed(self.sensors)}"
+            )
+        if self.reference is not None:
+            kept = next(of[self.reference] for of in self._of_kind.values() if self.reference in of)
+            if "prior" in kept.model_fields_set:
+                raise ValueError(f"{self.reference} is the reference, which has no prior: leave its out")
+        return self
+
+    @model_validator(mode="after")
+    def _edges_join_its_sensors(self) -> Rig:
+        nodes = {node.name: node for node in self.nodes}
+        if not any(self._can_be_edge(a, b) for a, b in combinations(nodes.values(), 2)):
+            has = (
+                f"only a {next(iter(nodes.values())).kind}"
+                if len(nodes) == 1
+                else _listed(nodes) or "no sensor"
+            )
+            raise ValueError(
+                f"the rig has {has}: a calibration needs two of camera, lidar and radar, two lidars, or base"
+            )
+        for a, b in self.edges or ():
+            unknown = [name for name in (a, b) if name not in nodes]
+            if unknown:
+                why = " (set base = to the vehicle's frame)" if unknown == [BASE.name] else ""
+                raise ValueError(f"edge [{a}, {b}]: the rig has {_listed(nodes)}, but no {unknown[0]}{why}")
+            try:
+                edge_between(nodes[a], nodes[b])
+            except ValueError as err:
+                raise ValueError(f"edge [{a}, {b}]: {err}") from err
+        return self
+
+    @model_validator(mode="after")
+    def _edges_stand_once(self) -> Rig:
+        ends = [frozenset(edge) for edge in self.edges or ()]
+        twice = next((self.edges[i] for i, e in enumerate(ends) if self.edges and e in ends[:i]), None)
+        if twice is not None:
+            raise ValueError(f"edge [{', '.join(twice)}] stands twice")
+        if self.edges == ():
+            raise ValueError("edges names none: leave it out to have them found")
+        return self
+
+    @model_validator(mode="after")
+    def _topics_differ(self) -> Rig:
+        roles: dict[str, list[str]] = {}
+        for role, topic in self._topics():
+            roles.setdefault(topic, []).append(role)
+        twice = [f"{topic} ({' and '.join(of)})" for topic, of in sorted(roles.items()) if len(of) > 1]
+        if twice:
+            raise ValueError(f"one topic stands for two things: {', '.join(twice)}")
+        return self
+
+    def _topics(self) -> Iterator[tuple[str, str]]:
+        """Every topic with what it is of."""
+        for name, camera in self.cameras.items():
+            yield f"image of {name}", camera.image
+            yield f"info of {name}", camera.info
+            if isinstance(camera.semantics, TopicSemantics):
+                yield f"labels of {name}", camera.semantics.labels
+                yield f"detections of {name}", camera.semantics.detections
+        yield from ((f"points of {name}", lidar.points) for name, lidar in self.lidars.items())
+        yield from ((f"points of {name}", radar.points) for name, radar in self.radars.items())
+        yield "prior", self.prior.topic
+        if self.ego is not None:
+            yield "odometry", self.ego.odometry
+
+    @staticmethod
+    def _can_be_edge(a: Sensor, b: Sensor) -> bool:
+        return {f"{a.kind}_{b.kind}", f"{b.kind}_{a.kind}"} & set(EDGE_KINDS) != set()
+
+
+def _listed(names: Any) -> str:
+    return ", ".join(names)
+
+
+def _only(section: str, of: Mapping[str, _Topics]) -> _Topics | None:
+    if len(of) > 1:
+        problem = f"this works on one of {section} so far, and the rig has {_listed(of)}"
+        raise ConfigError("fleet.toml", f"rigs.*.{section}", problem)
+    return next(iter(of.values()), None)

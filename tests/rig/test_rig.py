@@ -1,0 +1,189 @@
+import json
+
+import pytest
+
+from pipeline.config import FleetConfig, config_hash, load_fleet
+from pipeline.errors import ConfigError
+from tests.makers.fleet_files import fleet_toml
+
+VAN = """
+[fleet]
+name = "vans"
+[rigs.van]
+reference = "top"
+base = "base_link"
+[rigs.van.cameras.front]
+image = "/front/image"
+info = "/front/info"
+semantics = { source = "topics", labels = "/front/labels", detections = "/front/detections" }
+[rigs.van.cameras.left]
+image = "/left/image"
+info = "/left/info"
+[rigs.van.lidars.top]
+points = "/top/points"
+[rigs.van.lidars.nose]
+points = "/nose/points"
+[rigs.van.radars.corner_fl]
+points = "/fl/points"
+prior = { rotation_sigma_deg = 4.0 }
+[rigs.van.radars.corner_rr]
+points = "/rr/points"
+[vehicles."*"]
+rig = "van"
+"""
+
+
+def load(tmp_path, text):
+    path = tmp_path / "fleet.toml"
+    path.write_text(text)
+    return load_fleet(path)
+
+
+def test_a_rig_knows_its_sensors_by_name_and_in_the_order_of_the_file(tmp_path):
+    rig = load(tmp_path, VAN).rigs["van"]
+    assert rig.sensors == ("front", "left", "top", "nose", "corner_fl", "corner_rr")
+    assert [(n.name, n.kind) for n in rig.nodes][-3:] == [
+        ("corner_fl", "radar"), ("corner_rr", "radar"), ("base", "base"),
+    ]  # fmt: skip
+    assert (rig.cameras["left"].semantics, rig.lidars["nose"].points) == (None, "/nose/points")
+    assert rig.named_edges is None
+    own, rigs = rig.prior_of("corner_fl"), rig.prior_of("corner_rr")
+    assert (own.rotation_sigma_deg, rigs.rotation_sigma_deg) == (4.0, 2.0)
+    assert own.translation_sigma_m == rigs.translation_sigma_m == 0.05
+
+
+def test_edges_that_the_file_names_have_their_kinds_in_order(tmp_path):
+    text = VAN.replace(
+        'base = "base_link"', 'base = "base_link"\nedges = [["top", "front"], ["base", "nose"]]'
+    )
+    edges = load(tmp_path, text).rigs["van"].named_edges
+    assert [(e.name, e.kind) for e in edges] == [("front-top", "camera_lidar"), ("nose-base", "lidar_base")]
+
+
+def test_the_short_form_is_a_rig_whose_sensors_are_called_by_their_kinds(tmp_path):
+    short = load(tmp_path, fleet_toml("car-1"))
+    long = load(
+        tmp_path,
+        fleet_toml("car-1")
+        .replace("rigs.default.camera", "rigs.default.cameras.camera")
+        .replace("rigs.default.lidar", "rigs.default.lidars.lidar")
+        .replace("rigs.default.radar", "rigs.default.radars.radar"),
+    )
+    assert short.rigs == long.rigs
+    assert short.rigs["default"].sensors == ("camera", "lidar", "radar")
+    assert short.rigs["default"].camera == short.rigs["default"].cameras["camera"]
+
+
+def test_dumps_of_three_sensor_rigs_stay_so_that_no_log_is_ingested_again(tmp_path):
+    rig = load(tmp_path, fleet_toml("car-1")).rigs["default"]
+    assert config_hash(rig) == "6252c4c2fb4a00bc"  # of release 0.10.0
+    assert list(rig.model_dump()) == ["camera", "lidar", "radar", "ego", "prior"]
+    assert "radar" not in rig.model_copy(update={"radars": {}}).model_dump(exclude_none=True)
+
+
+def test_what_only_calibration_asks_for_is_no_reason_to_ingest_again(tmp_path):
+    plain = load(tmp_path, VAN)
+    other = VAN.replace("4.0", "3.0").replace(
+        'base = "base_link"', 'base = "base_link"\nedges = [["front", "top"]]'
+    )
+    assert config_hash(plain.rigs["van"]) == config_hash(load(tmp_path, other).rigs["van"])
+    moved = VAN.replace('reference = "top"', 'reference = "nose"')
+    assert config_hash(plain.rigs["van"]) != config_hash(load(tmp_path, moved).rigs["van"])
+
+
+def test_a_rig_of_many_sensors_comes_back_from_its_dump(tmp_path):
+    fleet = load(tmp_path, VAN)
+    plain = json.loads(json.dumps(fleet.model_dump(mode="json")))
+    assert FleetConfig.model_validate(plain).rigs["van"].nodes == fleet.rigs["van"].nodes
+
+
+def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
+    rig = load(tmp_path, VAN).rigs["van"]
+    with pytest.raises(ConfigError, match=r"cameras: .*front, left"):
+        _ = rig.camera
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("lidars.nose", "lidars.front"), "two sensors are called front"),
+        (("lidars.nose", "lidar"), "both lidar and lidars"),
+        (("lidars.nose", "lidars.base"), "lidars.base: base stands for something else"),
+        (("lidars.nose", "lidars.radar"), "lidars.radar: radar stands for something else"),
+        (("lidars.nose", 'lidars."a/b"'), "letters, digits and _"),
+        (("/nose/points", "/fl/points"), "/fl/points (points of nose and points of corner_fl)"),
+        (("/left/info", "/front/info"), "/front/info (info of front and info of left)"),
+        (('reference = "top"', 'reference = "roof"'), "reference = 'roof' is no sensor"),
+        (('reference = "top"', 'reference = "base"'), "reference = 'base' is no sensor"),
+        (
+            ('reference = "top"', 'reference = ["top", "nose"]'),
+            "van.reference: Value error, poses refer to one",
+        ),
+        (('reference = "top"', 'reference = "corner_fl"'), "corner_fl is the reference"),
+        (
+            ('base = "base_link"', 'edges = [["front", "roof"]]'),
+            "[front, roof]: the rig has front, left, top",
+        ),
+        (('base = "base_link"', 'edges = [["top", "top"]]'), "[top, top]: an edge joins two sensors"),
+        (('base = "base_link"', 'edges = [["front", "left"]]'), "cannot be calibrated against each other"),
+        (('base = "base_link"', 'edges = [["top", "base"]]'), "no base (set base ="),
+        (('base = "base_link"', 'edges = [["top", "left"], ["left", "top"]]'), "[left, top] stands twice"),
+        (('base = "base_link"', "edges = []"), "edges names none"),
+        (('"/nose/points"', '"points"'), "rigs.van.lidars.nose.points"),
+    ],
+)
+def test_a_rig_that_cannot_be_right_is_refused_by_what_is_wrong_with_it(change, said, tmp_path):
+    assert change[0] in VAN
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, VAN.replace(*change, 1))
+    assert said in str(caught.value)
+    assert "fleet.toml: rigs.van" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "is_enough"),
+    [
+        (("cameras", "lidars"), True),
+        (("lidars", "lidars"), True),
+        (("lidars",), False),
+        (("cameras", "cameras"), False),
+        (("radars", "radars"), False),
+        ((), False),
+    ],
+)
+def test_a_rig_that_can_have_no_edge_is_refused(sensors, is_enough, tmp_path):
+    topics = [
+        f"[rigs.a.{kind}.s{i}]\n"
+        + (f'image = "/{i}"\ninfo = "/i{i}"\n' if kind == "cameras" else f'points = "/{i}"\n')
+        for i, kind in enumerate(sensors)
+    ]
+    text = f'[fleet]\nname = "f"\n[rigs.a]\n{"".join(topics)}'
+    if is_enough:
+        assert len(load(tmp_path, text).rigs["a"].nodes) == 2
+    else:
+        with pytest.raises(ConfigError, match="a calibration needs two of camera, lidar and radar"):
+            load(tmp_path, text)
+
+
+def test_a_lidar_alone_is_enough_with_the_vehicle_frame(tmp_path):
+    text = '[fleet]\nname = "f"\n[rigs.a]\nbase = "base_link"\n[rigs.a.lidars.top]\npoints = "/top"\n'
+    assert [n.name for n in load(tmp_path, text).rigs["a"].nodes] == ["top", "base"]
+
+
+def test_a_vehicle_is_known_by_name_then_by_the_longest_pattern(tmp_path):
+    rigs = "".join(
+        f'[rigs.{name}.lidar]\npoints = "/{name}/lidar"\n[rigs.{name}.radar]\npoints = "/radar"\n'
+        for name in ("any", "taxi", "odd")
+    )
+    fleet = load(
+        tmp_path,
+        f'[fleet]\nname = "f"\n{rigs}[vehicles."*"]\nrig = "any"\n[vehicles."taxi-??"]\nrig = "taxi"\n'
+        '[vehicles.taxi-13]\nrig = "odd"\n',
+    )
+    asked = ("van-1", "taxi-12", "taxi-13", "taxi-123")
+    assert [fleet.vehicle(v).rig for v in asked] == ["any", "taxi", "odd", "any"]
+    assert fleet.named_vehicles == ("taxi-13",)
+    narrow = fleet.model_copy(update={"vehicles": {k: v for k, v in fleet.vehicles.items() if k != "*"}})
+    assert [narrow.knows(v) for v in asked] == [False, True, True, False]
+    with pytest.raises(ConfigError, match="unknown vehicle"):
+        narrow.rig_of("van-1")
