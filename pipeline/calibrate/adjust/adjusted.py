@@ -1,0 +1,97 @@
+"""What the adjustment of a rig returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.graph import Edge
+
+__all__ = ["AdjustedEdge", "AdjustedRig", "AdjustedSensor", "AdjustmentLimits"]
+
+
+@dataclass(frozen=True)
+class AdjustmentLimits:
+    """What the adjustment takes for granted.
+
+    Args:
+        clock_sigma_s: of each sensor's clock before the day, about the prior's.
+        innovation_sigmas: beyond which an edge contradicts the others; of a whole rig, however many edges it has.
+    """
+
+    clock_sigma_s: float
+    innovation_sigmas: float = 3.0
+
+    def __post_init__(self) -> None:
+        assert self.clock_sigma_s > 0
+        assert self.innovation_sigmas > 0
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedEdge:
+    """An edge beside the adjusted rig.
+
+    Args:
+        evidence: what its data show.
+        innovation_sigmas: how far it is from what all other edges in use say; None = nothing but the prior checks it.
+        failed: why it is left out; empty = the rig rests on it.
+        doubts: edges one of which is wrong, without a way to tell which: the rig goes on with all but one of them.
+    """
+
+    evidence: EdgeEvidence
+    innovation_sigmas: float | None
+    failed: tuple[FailedCheck, ...] = ()
+    doubts: tuple[Edge, ...] = ()
+
+    @property
+    def used(self) -> bool:
+        """Whether the rig rests on it."""
+        return not self.failed
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedSensor:
+    """How surely a sensor's pose to the reference is known.
+
+    Degrees of freedom: rotation vector about the reference's axes, then the sensor's origin in them.
+
+    Args:
+        observability: 6, share 0..1 of the prior's variance that the day removed.
+        determined: 6, bool; the others keep the prior's sigma.
+        rests_on: edges that its pose rests on: without one of them it is less sure.
+        untied: why the day says nothing of its pose to the reference; empty = it does.
+        doubts: edges that it rests on, one of which is wrong, without a way to tell which.
+        dt_sigma_s: of its clock.
+    """
+
+    observability: np.ndarray
+    determined: np.ndarray
+    rests_on: tuple[Edge, ...]
+    untied: str
+    doubts: tuple[Edge, ...]
+    dt_sigma_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedRig:
+    """Poses and clocks of all sensors, and what each edge and each sensor is worth.
+
+    Args:
+        poses: with the covariance of all at once; a degree of freedom that the day did not halve has the prior's sigma.
+        sensors: by name, less the reference.
+        edges: every edge that had evidence.
+    """
+
+    poses: Extrinsics
+    sensors: Mapping[str, AdjustedSensor]
+    edges: Mapping[Edge, AdjustedEdge]
+
+    @property
+    def left_out(self) -> tuple[Edge, ...]:
+        """Edges that the rig does not rest on though they had evidence."""
+        return tuple(e for e, found in self.edges.items() if not found.used)

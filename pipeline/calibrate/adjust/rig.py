@@ -1,0 +1,221 @@
+"""One solve over a rig: poses and clocks of all sensors, edges that contradict the others left out.
+
+Edges whose own checks failed are left out first: inside a cycle of edges an innovation tells that one of them is wrong,
+hardly ever which. Then the edge that contradicts the others most goes, as long as one does beyond the limit, and the
+rest is solved again. Where several explain the contradiction about as well, the one goes that the poses lose least by,
+and all of them are named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import norm
+
+from pipeline.calibrate.adjust.adjusted import AdjustedEdge, AdjustedRig, AdjustedSensor, AdjustmentLimits
+from pipeline.calibrate.adjust.equations import (
+    Equations,
+    LinearEdge,
+    Rig,
+    equations_at,
+    inverse_of_information,
+)
+from pipeline.calibrate.adjust.innovations import innovation
+from pipeline.calibrate.numerics.covariance import OBSERVABLE
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.common_share import common_part
+from pipeline.geometry.changes import change_jacobian
+from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.graph import Edge, RigGraph, Sensor
+
+__all__ = ["adjust"]
+
+# Gauss-Newton of quadratic costs: four steps from a prior 5 deg away, to 1e-9 rad, m and s.
+_MOST_STEPS, _STILL = 20, 1e-9
+# Two edges are told apart where the better explanation is twenty times as probable: what attribution asks for.
+_CLEAR = 2 * np.log(20.0)
+_MATTERS = 1.01  # a variance that grows by more than this share rests on the edge that was left out
+
+
+def adjust(
+    graph: RigGraph, prior: Extrinsics, evidence: Sequence[EdgeEvidence], limits: AdjustmentLimits
+) -> AdjustedRig:
+    """Solve poses and clocks of all sensors.
+
+    Args:
+        graph: the rig; edges without evidence say nothing.
+        prior: where all sensors are, each once; the part that all days err by alike is its `common`.
+        evidence: of edges of the graph, each once.
+        limits: what is taken for granted.
+
+    Raises:
+        ValueError: evidence of an edge that the graph lacks, or twice; a prior that is not of the graph's sensors.
+    """
+    _check(graph, prior, evidence)
+    failed = {e.edge: e.checks for e in evidence if e.checks}
+    doubts: dict[Edge, tuple[Edge, ...]] = {}
+    while True:
+        used = [e for e in evidence if e.edge not in failed]
+        rig, equations = _solved(Rig(prior, prior, limits.clock_sigma_s), used)
+        found = _innovations(graph, rig, equations, [e for e in evidence if e.edge in failed])
+        worst = _worst(equations, found, limits)
+        if worst is None:
+            break
+        wrong, rivals, sigmas = worst
+        named = (wrong, *rivals) if rivals else ()
+        failed[wrong] = (_contradiction(wrong, rivals, sigmas),)
+        doubts |= {e: named for e in named if e not in doubts}
+    edges = {
+        e.edge: AdjustedEdge(
+            e,
+            found[e.edge][1] if e.edge in found else None,
+            tuple(failed.get(e.edge, ())),
+            doubts.get(e.edge, ()),
+        )
+        for e in evidence
+    }
+    return _concluded(graph, rig, equations, edges)
+
+
+def _check(graph: RigGraph, prior: Extrinsics, evidence: Sequence[EdgeEvidence]) -> None:
+    edges = [e.edge for e in evidence]
+    wrong = [e.name for e in edges if e not in graph.edges or edges.count(e) > 1]
+    if wrong:
+        raise ValueError(f"evidence of edges that the rig lacks, or twice: {', '.join(sorted(set(wrong)))}")
+    if prior.reference != graph.reference or set(prior.T) != {s.name for s in graph.sensors}:
+        raise ValueError(
+            f"a prior of {', '.join(prior.T)} for a rig of {', '.join(s.name for s in graph.sensors)}"
+        )
+
+
+def _solved(rig: Rig, evidence: Sequence[EdgeEvidence]) -> tuple[Rig, Equations]:
+    """The rig that prior and edges agree on, and the equations there."""
+    for _ in range(_MOST_STEPS):
+        equations = equations_at(rig, evidence)
+        step = inverse_of_information(equations.H) @ equations.g
+        rig = rig.moved(step)
+        if np.abs(step).max() < _STILL:
+            break
+    return rig, equations_at(rig, evidence)
+
+
+def _innovations(
+    graph: RigGraph, rig: Rig, equations: Equations, left_out: Sequence[EdgeEvidence]
+) -> dict[Edge, tuple[float, float]]:
+    """Chi-squared and sigmas of each edge against those in use, where these tie its sensors."""
+    found = {}
+    in_use = graph.with_edges([e.evidence.edge for e in equations.edges])
+    apart = [(e, equations) for e in equations_at(rig, left_out).edges]
+    for edge, others in [*((e, equations.without(e)) for e in equations.edges), *apart]:
+        at = edge.evidence.edge
+        value = innovation(edge, others, rig.prior_covariance)
+        if value is not None and in_use.without([at]).path(*at.sensors) is not None:
+            found[at] = value
+    return found
+
+
+def _worst(
+    equations: Equations, found: Mapping[Edge, tuple[float, float]], limits: AdjustmentLimits
+) -> tuple[Edge, tuple[Edge, ...], float] | None:
+    """The edge to leave out, those that it cannot be told from, and its sigmas; None where none contradicts."""
+    tested = {e.evidence.edge: e for e in equations.edges if e.evidence.edge in found}
+    if not tested:
+        return None
+    # One false alarm a rig, not an edge: the limit's probability is shared among all that are tested.
+    limit = float(norm.isf(norm.sf(limits.innovation_sigmas) / len(tested)))
+    beyond = {edge: found[edge][0] for edge in tested if found[edge][1] > limit}
+    if not beyond:
+        return None
+    most = max(beyond.values())
+    rivals = [edge for edge, square in beyond.items() if square > most - _CLEAR]
+    goes = max(rivals, key=lambda edge: _left(equations, tested[edge]))
+    return goes, tuple(e for e in rivals if e != goes), found[goes][1]
+
+
+def _left(equations: Equations, edge: LinearEdge) -> float:
+    """Logarithm of the information that is left without an edge."""
+    return float(np.linalg.slogdet(equations.without(edge).H)[1])
+
+
+def _contradiction(edge: Edge, rivals: Collection[Edge], sigmas: float) -> FailedCheck:
+    others = "" if not rivals else f", or {', '.join(e.name for e in rivals)} is wrong"
+    return FailedCheck(
+        f"{edge.name} contradicts what the other edges say of it by {sigmas:.1f} sigmas{others}",
+        "witnesses_disagree",
+    )
+
+
+def _concluded(
+    graph: RigGraph, rig: Rig, equations: Equations, edges: Mapping[Edge, AdjustedEdge]
+) -> AdjustedRig:
+    """The rig with its covariances, and what each sensor is worth."""
+    n, order = 6 * len(rig.prior.order), rig.prior.order
+    C = inverse_of_information(equations.H)
+    shared = sum((K @ K.T for K in equations.biases(C).values()), np.zeros_like(C))
+    own = sum((K @ K.T for K in equations.biases(C, own=True).values()), np.zeros_like(C))
+    whole = C + shared
+    to_change = _blocks([change_jacobian(rig.poses.T[name]) for name in order])
+    before = np.diag(to_change @ rig.prior.covariance @ to_change.T)
+    after = np.diag(to_change @ whole[:n, :n] @ to_change.T)
+    observability = np.clip(1 - after / before, 0.0, 1.0)
+    determined = observability >= OBSERVABLE
+    # What is not determined keeps the prior's sigma: its row and column are widened, correlations stay.
+    scale = np.where(determined, 1.0, np.sqrt(np.maximum(before / after, 1.0)))
+    wider = np.linalg.solve(to_change, scale[:, None] * to_change)
+    covariance = wider @ whole[:n, :n] @ wider.T
+    follow = C[:n, :n] @ equations.prior_information[:n, :n]
+    alike = follow @ rig.prior.common @ follow.T + (shared + own)[:n, :n]
+    poses = replace(
+        rig.poses,
+        covariance=0.5 * (covariance + covariance.T),
+        common=common_part(wider @ alike @ wider.T, covariance),
+    )
+    rests_on = _rests_on(equations, C, len(order))
+    clock = np.sqrt(np.diag(whole)[n:])
+    sensors = {}
+    for k, name in enumerate(order):
+        at, on = slice(6 * k, 6 * k + 6), rests_on[k]
+        doubts = tuple(dict.fromkeys(d for e in on for d in edges[e].doubts))
+        untied = _untied(graph, graph[name], [e.evidence.edge for e in equations.edges])
+        sensors[name] = AdjustedSensor(
+            observability[at], determined[at] & (not untied), on, untied, doubts, float(clock[k])
+        )
+    return AdjustedRig(poses, sensors, edges)
+
+
+def _rests_on(equations: Equations, C: Float[np.ndarray, "N N"], sensors: int) -> list[tuple[Edge, ...]]:
+    """By sensor, edges without which a variance of its pose is larger."""
+    found: list[tuple[Edge, ...]] = [()] * sensors
+    for edge in equations.edges:
+        without = inverse_of_information(equations.without(edge).H)
+        grown = np.diag(without)[: 6 * sensors] > _MATTERS * np.diag(C)[: 6 * sensors]
+        for k in np.flatnonzero(grown.reshape(sensors, 6).any(axis=1)):
+            found[k] = (*found[k], edge.evidence.edge)
+    return found
+
+
+def _untied(graph: RigGraph, sensor: Sensor, used: Sequence[Edge]) -> str:
+    """Why nothing ties a sensor to the reference; empty where an edge in use does."""
+    in_use = graph.with_edges(used)
+    if in_use.path(graph.reference, sensor) is not None:
+        return ""
+    with_it = [s.name for part in in_use.components() if sensor in part for s in part if s != sensor]
+    if not with_it:
+        lost = ", ".join(e.name for e in graph.edges_of(sensor))
+        return f"no edge of it can be used: {lost}" if lost else "shares nothing with another sensor"
+    return (
+        f"nothing ties it, {', '.join(with_it)} to the reference {graph.reference.name}: "
+        "what joins them is the prior"
+    )
+
+
+def _blocks(parts: Sequence[Float[np.ndarray, "6 6"]]) -> Float[np.ndarray, "P P"]:
+    """Block-diagonal matrix."""
+    out = np.zeros((6 * len(parts),) * 2)
+    for k, part in enumerate(parts):
+        out[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = part
+    return out
