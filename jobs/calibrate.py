@@ -72,13 +72,12 @@ def _calibrate_day(task: Task) -> int:
     from pipeline.errors import ConfigError
     from pipeline.fleet.ledger import record_outcome
     from pipeline.stages import CALIBRATE
-    from pipeline.store.tables import read_manifest
-    from schemas.observations import OBSERVATIONS
+    from pipeline.store.views import perceived
     from schemas.words import day_word
 
     vehicle, day = task.partition.vehicle, task.partition.day
     task.fleet.rig_of(vehicle)  # raises, naming the vehicles there are
-    if read_manifest(task.lake, OBSERVATIONS, task.partition) is None:
+    if perceived(task.lake, task.partition) is None:
         problem = (
             f"the lake has no observations of {vehicle} on {day}: run `boresight ingest` and `perceive` first"
         )

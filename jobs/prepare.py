@@ -88,7 +88,7 @@ def _days(
     """Vehicle-days with observations, as wanted."""
     from pipeline.errors import ConfigError
     from pipeline.fleet.pattern import check_day
-    from schemas.observations import OBSERVATIONS
+    from pipeline.store.views import perceived_days
 
     for name, day in (("--from", from_day), ("--to", to_day)):
         check_day(name, day)
@@ -96,7 +96,7 @@ def _days(
         config.rig_of(vehicle)
     days = [
         p
-        for p in lake.partitions(OBSERVATIONS.name)
+        for p in perceived_days(lake)
         if (p.vehicle in vehicles if vehicles else config.knows(p.vehicle))
         and (from_day or "") <= p.day <= (to_day or "9999")
     ]

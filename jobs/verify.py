@@ -171,14 +171,13 @@ def _spelled_alike(config: FleetConfig, lake: Lake, partition: Partition) -> Fle
     from pipeline.export.texts import to_json
     from pipeline.extrinsics.prior import read_prior
     from pipeline.in_use.spelling import on_grid
-    from pipeline.store.tables import read_manifest, read_rows
+    from pipeline.store.views import observations_of, perceived
     from schemas.calibrations import pairs_of
-    from schemas.observations import OBSERVATIONS, Observation
 
-    if read_manifest(lake, OBSERVATIONS, partition) is None:
+    if perceived(lake, partition) is None:
         return config
     try:
-        prior = read_prior(read_rows(lake, OBSERVATIONS, partition, Observation), config, partition.vehicle)
+        prior = read_prior(list(observations_of(lake, partition)), config, partition.vehicle)
     except SolveError:  # no prior: calibrate refuses the log and says why
         return config
     file = lake.local_root / "on_grid.json"

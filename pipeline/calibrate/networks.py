@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,10 +19,10 @@ from pipeline.learn.infer.way import informed_by_way
 from pipeline.results import Progress
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns
-from pipeline.store.tables import iterate_rows, read_manifest
+from pipeline.store.views import frames_of, ingested, observations_of, perceived
 from pipeline.work import Task
 from schemas.calibrations import PAIRS
-from schemas.frames import FRAMES, Frame
+from schemas.frames import Frame
 from schemas.observations import OBSERVATIONS, Observation
 
 __all__ = ["FrameCalibration", "calibrate_frame", "ssl_settings", "ssl_solver"]
@@ -64,7 +63,7 @@ def ssl_solver(method: str, task: Task) -> Solver:
         triggered: Sequence[str],
         progress: Progress,
     ) -> Solution:
-        if read_manifest(lake, FRAMES, partition) is None:
+        if ingested(lake, partition) is None:
             raise SolveError(
                 f"no frames of this day: {method} looks at images and sweeps, not at observations alone"
             )
@@ -117,14 +116,12 @@ def calibrate_frame(task: Task, frame: int) -> FrameCalibration:
 
 
 def _frames_of(lake: Lake, partition: Partition) -> Callable[[Sequence[int]], Iterator[Frame]]:
-    """Frames by frame_index, which is their row number, a row group at a time."""
-    return lambda indices: itertools.chain.from_iterable(
-        iterate_rows(lake, FRAMES, partition, Frame, rows=list(indices))
-    )
+    """Frames by frame_index, in order of time."""
+    return lambda moments: frames_of(lake, partition, moments)
 
 
 def _one_observation(lake: Lake, partition: Partition, wanted: int) -> tuple[int, Observation]:
-    if read_manifest(lake, OBSERVATIONS, partition) is None or read_manifest(lake, FRAMES, partition) is None:
+    if perceived(lake, partition) is None or ingested(lake, partition) is None:
         raise SolveError(
             "no frames or no observations of this day: run `boresight ingest` and `perceive` first"
         )
@@ -135,9 +132,8 @@ def _one_observation(lake: Lake, partition: Partition, wanted: int) -> tuple[int
         known = f"{index[0]} to {index[-1]}" if len(index) else "none"
         problem = f"no perceived frame has the index or stamp_ns {wanted}; indices are {known}"
         raise ConfigError("command line", "--frame", problem)
-    at = int(found[0])
-    rows = itertools.chain.from_iterable(iterate_rows(lake, OBSERVATIONS, partition, Observation, rows=[at]))
-    return int(index[at]), next(rows)
+    row = int(index[int(found[0])])
+    return row, next(observations_of(lake, partition, [row]))
 
 
 def _polished(

@@ -44,7 +44,7 @@ from pipeline.extrinsics.prior import no_prior, perturbed, prior_key, read_prior
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.results import Outcome, Progress, silent
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_manifest, read_rows
+from pipeline.store.views import ingested, observations_of, perceived
 from pipeline.work import Records, Run, Task, Told, Work
 from schemas.calibrations import (
     FRAMES_OF_PAIR,
@@ -54,8 +54,8 @@ from schemas.calibrations import (
     CalibrationRecord,
     pairs_of,
 )
-from schemas.frames import FRAMES, SENSORS_ABSENT
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.frames import SENSORS_ABSENT
+from schemas.observations import Observation
 
 __all__ = ["calibrate_observations", "work"]
 
@@ -89,8 +89,8 @@ def work(task: Task) -> Work:
         "camera": {} if rig.camera is None else asdict(rig.camera.known),
     }
     prior = rig.prior
-    tables = (FRAMES, OBSERVATIONS) if method.needs_images else (OBSERVATIONS,)
-    manifests = [read_manifest(task.lake, table, task.partition) for table in tables]
+    tables = (ingested, perceived) if method.needs_images else (perceived,)
+    manifests = [manifest_of(task.lake, task.partition) for manifest_of in tables]
 
     def rows(run: Run) -> Generator[Records, None, None]:
         pairs = pairs_of(rig.sensors)
@@ -233,15 +233,15 @@ def _solved(
 
 def _absent(lake: Lake, partition: Partition) -> dict[str, str]:
     """Why frames lack a sensor, by the manifests of perceive and of ingest, which says more."""
-    perceived, ingested = (read_manifest(lake, table, partition) for table in (OBSERVATIONS, FRAMES))
+    told, told_before = perceived(lake, partition), ingested(lake, partition)
     found = {}
     for sensor in SENSORS:
-        counts = {} if perceived is None else perceived.rejected
+        counts = {} if told is None else told.rejected
         own = {name: n for name, n in counts.items() if name.startswith(f"without_{sensor}_")}
         if own:
             most = max(own, key=lambda name: own[name])
             found[sensor] = f"most often {most.removeprefix(f'without_{sensor}_')}, {own[most]} times"
-    return found | ({} if ingested is None else ingested.extra.get(SENSORS_ABSENT, {}))
+    return found | ({} if told_before is None else told_before.extra.get(SENSORS_ABSENT, {}))
 
 
 def _refused(
@@ -301,9 +301,9 @@ def _composed_of(method: Method, pairs: Collection[str]) -> tuple[str, ...]:
 
 
 def _observations(lake: Lake, partition: Partition) -> list[Observation]:
-    if read_manifest(lake, OBSERVATIONS, partition) is None:
+    if perceived(lake, partition) is None:
         raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
-    return read_rows(lake, OBSERVATIONS, partition, Observation)
+    return list(observations_of(lake, partition))
 
 
 def _judge_all(

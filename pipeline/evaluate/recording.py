@@ -8,8 +8,7 @@ from pipeline.errors import ConfigError, ContractError
 from pipeline.evaluate.picks import ReflectorFile, find_again, read_reflectors
 from pipeline.evaluate.reflectors import Echoes
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows
-from schemas.frames import FRAMES, Frame
+from pipeline.store.views import frames_of
 
 __all__ = ["ReflectorFiles", "standing_echoes"]
 
@@ -75,14 +74,13 @@ def standing_echoes(lake: Lake, partition: Partition) -> tuple[list[Echoes] | No
     lidar: list[Echoes] = []
     radar: list[Echoes] = []
     frames = 0
-    for chunk in iterate_rows(lake, FRAMES, partition, Frame):
-        for frame in chunk:
-            if abs(frame.ego_speed_mps or 0.0) > _STANDING_MPS:
-                problem = f"{partition.vehicle} moves on {partition.day}: no standing reflector recording"
-                raise ContractError(str(lake.folder(FRAMES.name, partition)), problem)
-            frames += 1
-            if frame.lidar_intensity is not None:
-                lidar.append((frame.lidar_xyz_m, frame.lidar_intensity))
-            if frame.radar_power_db is not None:
-                radar.append((frame.radar_xyz_m, frame.radar_power_db))
+    for frame in frames_of(lake, partition):
+        if abs(frame.ego_speed_mps or 0.0) > _STANDING_MPS:
+            problem = f"{partition.vehicle} moves on {partition.day}: no standing reflector recording"
+            raise ContractError(str(lake), problem)
+        frames += 1
+        if frame.lidar_intensity is not None:
+            lidar.append((frame.lidar_xyz_m, frame.lidar_intensity))
+        if frame.radar_power_db is not None:
+            radar.append((frame.radar_xyz_m, frame.radar_power_db))
     return (lidar if len(lidar) == frames else None), (radar if len(radar) == frames else None)

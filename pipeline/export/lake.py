@@ -12,10 +12,8 @@ from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.store.current import current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from pipeline.store.tables import iterate_rows, read_manifest
+from pipeline.store.views import ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, CalibrationRecord
-from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS, Observation
 from schemas.states import STATES, StateRow
 
 __all__ = [
@@ -159,19 +157,13 @@ def read_camera(lake: Lake, vehicle: str, days: Iterable[str]) -> Camera | None:
     for day in sorted(days, reverse=True):
         partition = Partition(vehicle, day)
         try:
-            if read_manifest(lake, OBSERVATIONS, partition) is None:
+            if perceived(lake, partition) is None:
                 continue
-            for rows in iterate_rows(lake, OBSERVATIONS, partition, Observation):
-                seen = [row for row in rows if "camera" in row.sensors]
-                if seen:
-                    camera = camera_of(seen[0])
-                    return Camera(
-                        camera.model,
-                        np.array(camera.K),
-                        np.array(camera.D),
-                        camera.width_px,
-                        camera.height_px,
-                    )
+            seen = next((o for o in observations_of(lake, partition) if "camera" in o.sensors), None)
+            if seen is not None:
+                camera = camera_of(seen)
+                K, D = np.array(camera.K), np.array(camera.D)
+                return Camera(camera.model, K, D, camera.width_px, camera.height_px)
         except ContractError as err:  # damaged, or collected after its time
             lake.damage.append(str(err))
     return None
@@ -181,7 +173,7 @@ def read_frame_ids(lake: Lake, vehicle: str, days: Iterable[str]) -> dict[str, s
     """Frame of each sensor as the logs of the latest of these days call it; none of a sensor that has several names."""
     for day in sorted(days, reverse=True):
         try:
-            manifest = read_manifest(lake, FRAMES, Partition(vehicle, day))
+            manifest = ingested(lake, Partition(vehicle, day))
         except ContractError as err:  # damaged
             lake.damage.append(str(err))
             continue

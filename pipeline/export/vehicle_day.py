@@ -8,9 +8,9 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows, read_manifest
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import frames_of, ingested, observations_of, perceived
+from schemas.frames import Frame
+from schemas.observations import Observation
 
 __all__ = ["read_scenes"]
 
@@ -23,24 +23,16 @@ def read_scenes(lake: Lake, partition: Partition, most: int) -> Iterator[tuple[F
         DamagedError: a file of the day cannot be read.
         CollectedError: the day's rows left the lake after their time.
     """
-    manifest = read_manifest(lake, FRAMES, partition)
+    manifest = ingested(lake, partition)
     if manifest is None:
         problem = f"the lake has no frames of {partition.vehicle} {partition.day}: ingest the day's logs"
         raise ConfigError("command line", "day", problem)
     picked = np.unique(np.linspace(0, max(manifest.rows - 1, 0), most).round().astype(int)).tolist()
-    perceived = _perceived(lake, partition)
-    observation = next(perceived, None)
-    for frames in iterate_rows(lake, FRAMES, partition, Frame, rows=picked):
-        for frame in frames:
-            while observation is not None and observation.frame_index < frame.frame_index:
-                observation = next(perceived, None)
-            is_its = observation is not None and observation.frame_index == frame.frame_index
-            yield frame, observation if is_its else None
-
-
-def _perceived(lake: Lake, partition: Partition) -> Iterator[Observation]:
-    """Observations in order of frame; none of a day that was not perceived."""
-    if read_manifest(lake, OBSERVATIONS, partition) is None:
-        return
-    for rows in iterate_rows(lake, OBSERVATIONS, partition, Observation):
-        yield from rows
+    # None of a day that was not perceived.
+    seen = iter(()) if perceived(lake, partition) is None else observations_of(lake, partition)
+    observation = next(seen, None)
+    for frame in frames_of(lake, partition, picked):
+        while observation is not None and observation.frame_index < frame.frame_index:
+            observation = next(seen, None)
+        is_its = observation is not None and observation.frame_index == frame.frame_index
+        yield frame, observation if is_its else None

@@ -27,7 +27,7 @@ from pipeline.perceive.rejections import FrameReason, FrameRejectedError
 from pipeline.perceive.road_markings import lidar_markings, road_contrast
 from pipeline.perceive.tracks import EgoMotion, Tracks, TrackState, advance_tracks, measure_clusters
 from pipeline.rigs import LidarTopics, OnnxSemantics, RadarTopics, TopicSemantics
-from pipeline.store.tables import iterate_rows
+from pipeline.store.views import frames_of
 from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.calibrations import PAIRS
 from schemas.faults import FAULTS
@@ -107,26 +107,24 @@ def work(task: Task) -> Work:
 
 def _rows(task: Task, perceive: Callable[..., Perceived], run: Run) -> Generator[Observation, None, None]:
     """The day's observations, a row group of frames in memory at a time."""
-    total, state, seen = task.inputs[FRAMES.name].rows, TrackState.empty(), 0
+    total, state = task.inputs[FRAMES.name].rows, TrackState.empty()
     whole_ns = -SAME_SCENE_NS
-    for group in iterate_rows(task.lake, FRAMES, task.partition, Frame):
-        for frame in group:
-            found: Perceived | None = None
-            try:
-                found = perceive(frame, tracks=state, alone=frame.stamp_ns - whole_ns > SAME_SCENE_NS)
-            except FrameRejectedError as rejection:
-                run.rejected[rejection.reason.value] += 1
-            except ModelOutputError as err:
-                raise NothingUsable(f"{FAULTS['model_output']}: {err}", "model_output") from err
-            seen += 1
-            run.progress(seen, total, "perceive")
-            if found is not None:
-                state = found.tracks
-                whole_ns = whole_ns if found.unusable else frame.stamp_ns
-                run.kept.update([] if found.lidar_has_rows else [WITHOUT_ROWS])
-                run.kept.update([] if found.deskew is None else [found.deskew])
-                run.rejected.update(f"without_{sensor}_{why.value}" for sensor, why in found.unusable.items())
-                yield found.observation
+    for seen, frame in enumerate(frames_of(task.lake, task.partition), 1):
+        found: Perceived | None = None
+        try:
+            found = perceive(frame, tracks=state, alone=frame.stamp_ns - whole_ns > SAME_SCENE_NS)
+        except FrameRejectedError as rejection:
+            run.rejected[rejection.reason.value] += 1
+        except ModelOutputError as err:
+            raise NothingUsable(f"{FAULTS['model_output']}: {err}", "model_output") from err
+        run.progress(seen, total, "perceive")
+        if found is not None:
+            state = found.tracks
+            whole_ns = whole_ns if found.unusable else frame.stamp_ns
+            run.kept.update([] if found.lidar_has_rows else [WITHOUT_ROWS])
+            run.kept.update([] if found.deskew is None else [found.deskew])
+            run.rejected.update(f"without_{sensor}_{why.value}" for sensor, why in found.unusable.items())
+            yield found.observation
 
 
 class Perceived(NamedTuple):

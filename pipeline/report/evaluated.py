@@ -16,10 +16,8 @@ from pipeline.report.scenes import choose_frames
 from pipeline.report.time_offsets import as_stamped, time_offsets_of
 from pipeline.store.current import prior_of, targets_of, transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows, read_manifest
+from pipeline.store.views import frames_of, ingested, observations_of, perceived
 from schemas.calibrations import PAIRS, CalibrationRecord
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
 
 __all__ = ["Compared", "Comparison", "page_of_runs"]
 
@@ -145,7 +143,7 @@ def _scene(
     """A frame with much to see, and the run's two states, the result with its time offsets; None without frames."""
     first = run["camera_lidar"]
     partition = Partition(first.vehicle, first.day)
-    if any(read_manifest(lake, table, partition) is None for table in (FRAMES, OBSERVATIONS)):
+    if ingested(lake, partition) is None or perceived(lake, partition) is None:
         return None
     states = []
     for of in (prior_of, transform_of):
@@ -155,12 +153,12 @@ def _scene(
         if len(known) < len(PAIRS):
             return None
         states.append(Extrinsics(*known))
-    rows = [o for chunk in iterate_rows(lake, OBSERVATIONS, partition, Observation) for o in chunk]
+    rows = list(observations_of(lake, partition))
     if not rows:
         return None
     picked = [rows[i] for i in choose_frames(rows, states[1].T_camera_lidar, 2)]
     o = picked[-1 if another else 0]
-    frames = [f for chunk in iterate_rows(lake, FRAMES, partition, Frame, [o.frame_index]) for f in chunk]
+    frames = list(frames_of(lake, partition, [o.frame_index]))
     if not frames:
         return None
     return Scene(frames[0], o), states[0], as_stamped(states[1], o, time_offsets_of(run))

@@ -15,11 +15,12 @@ from pipeline.sections import ReportConfig
 from pipeline.store.current import current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import last_day, read_last, read_records
-from pipeline.store.tables import COLLECTED, iterate_rows, read_manifest
+from pipeline.store.tables import COLLECTED
+from pipeline.store.views import frames_of, ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.frames import Frame
+from schemas.observations import Observation
 
 __all__ = [
     "day_records",
@@ -108,13 +109,13 @@ def states_of(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics, Ext
 
 def has_frames(lake: Lake, partition: Partition) -> bool:
     """Whether the lake still holds what pictures are drawn from."""
-    found = [read_manifest(lake, table, partition) for table in (FRAMES, OBSERVATIONS)]
+    found = (ingested(lake, partition), perceived(lake, partition))
     return all(manifest is not None and COLLECTED not in manifest.extra for manifest in found)
 
 
 def spread_observations(lake: Lake, partition: Partition) -> list[Observation]:
     """Up to 60 observations, evenly spread over the day."""
-    found = [o for chunk in iterate_rows(lake, OBSERVATIONS, partition, Observation) for o in chunk]
+    found = list(observations_of(lake, partition))
     if not found:
         return []
     some = np.unique(np.linspace(0, len(found) - 1, _FRAMES_LOOKED_AT).astype(int))
@@ -140,7 +141,7 @@ def scenes_among(
     observations = [o for o in observations if len(o.sensors) == most]
     chosen = [observations[i] for i in choose_frames(observations, T_camera_lidar, count)]
     rows = [o.frame_index for o in chosen]
-    frames = {f.frame_index: f for chunk in iterate_rows(lake, FRAMES, partition, Frame, rows) for f in chunk}
+    frames = {f.frame_index: f for f in frames_of(lake, partition, rows)}
     there = [(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
     return [scene_of(f, o, config) for f, o in there]
 

@@ -22,8 +22,8 @@ from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import from_quaternion, inverse, log_so3, perturb_exactly, transform_points
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import observations_of
+from schemas.observations import Observation
 
 # Targets in the common field of view at 15, 25 and 40 m, lidar frame (the paper's reflectors stood there).
 TARGETS_M = np.array([[15.0, 2.0, -0.5], [25.0, -3.0, -0.5], [40.0, 1.0, 0.0]])
@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--frames", type=int, default=100)
     args = parser.parse_args()
-    rows = read_rows(Lake(args.lake), OBSERVATIONS, Partition(args.vehicle, args.day), Observation)
+    rows = list(observations_of(Lake(args.lake), Partition(args.vehicle, args.day)))
     T_cl, T_lr = reference_of(rows, args.truth)
     for start in STARTS:
         errors = [run(evenly(rows, args.frames), T_cl, T_lr, start, s, "all")[3] for s in range(args.seeds)]

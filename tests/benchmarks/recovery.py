@@ -40,9 +40,9 @@ from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import exp_so3, from_quaternion, inverse, log_se3
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_manifest, read_rows
+from pipeline.store.views import observations_of, perceived
 from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.observations import Observation
 from tests.benchmarks.studies.commits import accept_argument, commit_now, is_accepted
 from tests.benchmarks.studies.engine import read_results, search_range
 from tests.benchmarks.studies.metrics import inside_share
@@ -89,7 +89,7 @@ def run_once(
     """One calibration from one perturbed start on one part of the day."""
     fleet = load_fleet(fleet_file)
     partition = Partition(vehicle, day)
-    rows = read_rows(Lake.at(lake), OBSERVATIONS, partition, Observation)
+    rows = list(observations_of(Lake.at(lake), partition))
     given = read_prior(rows, fleet, vehicle)
     rotation_deg, translation_m = (float(v) for v in start.split(","))
     prior = perturbed(given, (rotation_deg, translation_m), seed)
@@ -116,7 +116,7 @@ def perceived_by(lake: Path, partition: Partition) -> str:
     note = lake.parent / "done.json"
     if note.exists():
         return str(json.loads(note.read_text()).get("perceived_by", "unknown"))
-    manifest = read_manifest(Lake.at(lake), OBSERVATIONS, partition)
+    manifest = perceived(Lake.at(lake), partition)
     return f"version {manifest.code_version}" if manifest else "unknown"
 
 

@@ -31,9 +31,7 @@ from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.frame_objective import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
 from pipeline.learn.train.settings import LossConfig
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import frames_of, observations_of
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
 DOFS = ("roll", "pitch", "yaw", "tx", "ty", "tz")
@@ -60,8 +58,8 @@ def day_batch(
 ) -> TrainingBatch:
     """Rows of a perceived day as one batch, evenly spread over the day."""
     config = load_fleet(fleet)
-    observations = read_rows(lake, OBSERVATIONS, partition, Observation)
-    logged = {f.frame_index: f for f in read_rows(lake, FRAMES, partition, Frame)}
+    observations = list(observations_of(lake, partition))
+    logged = {f.frame_index: f for f in list(frames_of(lake, partition))}
     reference = prior or read_prior(observations, config, partition.vehicle)
     if frames is not None and frames < len(observations):
         observations = [observations[i] for i in np.linspace(0, len(observations) - 1, frames).astype(int)]

@@ -32,9 +32,7 @@ from pipeline.learn.sample.grid import Grid
 from pipeline.learn.train.semantics_loss import class_of_points
 from pipeline.objective.differentiable.poses import transform_points
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import frames_of, observations_of
 from schemas.training import UNKNOWN_CLASS
 
 
@@ -76,8 +74,8 @@ def load(folder: Path, frames: int, cell_deg: float):
     truth_file = next((folder / "truth").glob("*/*.json"))
     vehicle, day = truth_file.parent.name, truth_file.stem
     lake, partition = Lake.at(str(folder / "lake")), Partition(vehicle, day)
-    sensors = {f.frame_index: f for f in read_rows(lake, FRAMES, partition, Frame)}
-    found = read_rows(lake, OBSERVATIONS, partition, Observation)
+    sensors = {f.frame_index: f for f in list(frames_of(lake, partition))}
+    found = list(observations_of(lake, partition))
     prior = read_prior(found, config, vehicle)
     rows = []
     for n in np.linspace(0, len(found) - 1, frames).astype(int):

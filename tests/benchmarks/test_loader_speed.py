@@ -11,9 +11,7 @@ from pipeline.learn.batches.collate import collate
 from pipeline.learn.batches.loader import TrainingLoader
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.store.partitions import Lake
-from pipeline.store.tables import iterate_rows
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import frames_of, observations_of, perceived_days
 from tests.makers import training_lakes
 
 GOAL = 8.0  # issue 4
@@ -39,12 +37,9 @@ def usual_fleet():
 
 def decode_per_sample(lake, fleet):
     """Frames and observations in order (no seeking), each made a sample when its turn comes, then stacked."""
-    for partition in lake.partitions(FRAMES.name):
+    for partition in perceived_days(lake):
         about = About(partition.vehicle, partition.day, "default", "train", "", "")
-        frames, observations = (
-            itertools.chain.from_iterable(iterate_rows(lake, schema, partition, row))
-            for schema, row in ((FRAMES, Frame), (OBSERVATIONS, Observation))
-        )
+        frames, observations = frames_of(lake, partition), observations_of(lake, partition)
         rows = []
         for frame, observation in zip(frames, observations, strict=True):
             prior = read_prior([observation], fleet, partition.vehicle)

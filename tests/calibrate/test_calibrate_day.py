@@ -11,9 +11,9 @@ from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion, rotation_angle_rad
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records, write_partition
+from pipeline.store.tables import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
-from schemas.observations import OBSERVATIONS
+from tests.makers.lakes import write_observations
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day, prior_columns
 from tests.makers.stages import calibrate_day
 
@@ -48,9 +48,7 @@ def fleet_of(prior=None, camera=None, **sections):
 
 def lake_with(tmp_path, observations, key="k1"):
     lake = Lake.at(tmp_path)
-    with write_partition(lake, OBSERVATIONS, DAY, key, "0") as writer:
-        writer.append(observations)
-        writer.describe(kept={}, rejected={})
+    write_observations(lake, DAY, observations, key)
     return lake
 
 

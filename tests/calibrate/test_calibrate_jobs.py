@@ -13,11 +13,10 @@ from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from pipeline.store.tables import write_partition
-from schemas.observations import OBSERVATIONS
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.words import day_word
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.lakes import write_observations
 from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 FLEET = fleet_toml(
@@ -29,11 +28,7 @@ FLEET = fleet_toml(
 def workplace(tmp_path_factory):
     folder = tmp_path_factory.mktemp("work")
     (folder / "fleet.toml").write_text(FLEET)
-    with write_partition(
-        Lake.at(folder / "lake"), OBSERVATIONS, Partition("v", "2024-05-06"), "k", "0"
-    ) as writer:
-        writer.append(make_day(24))
-        writer.describe(kept={}, rejected={})
+    write_observations(Lake.at(folder / "lake"), Partition("v", "2024-05-06"), make_day(24), "k")
     truth = {"T_camera_lidar": T_CAMERA_LIDAR.tolist(), "T_lidar_radar": T_LIDAR_RADAR.tolist()}
     (folder / "truth" / "v").mkdir(parents=True)
     (folder / "truth" / "v" / "2024-05-06.json").write_text(json.dumps(truth))

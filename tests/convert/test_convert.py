@@ -13,8 +13,7 @@ from jobs.cli import main
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows
-from schemas.frames import FRAMES, Frame
+from pipeline.store.views import frames_of
 from tests.makers import data_sets
 from tests.makers.data_sets import (
     SPEED_MPS,
@@ -55,7 +54,7 @@ def converted(request, tmp_path_factory):
         day,
     ]
     assert main(["ingest", *logs, *about]) == 0
-    return name, folder, logs, read_rows(Lake.at(lake), FRAMES, Partition(vehicle, day), Frame)
+    return name, folder, logs, list(frames_of(Lake.at(lake), Partition(vehicle, day)))
 
 
 def test_every_frame_of_the_data_set_becomes_a_trio(converted):
@@ -77,7 +76,7 @@ def test_a_folder_of_kitti_s_own_without_a_radar_becomes_a_rig_of_camera_and_lid
     lake = tmp_path / "lake"
     about = ["--fleet", str(tmp_path / "fleet.toml"), "--lake", str(lake), "--vehicle", "k"]
     assert main(["ingest", *logs, *about, "--day", "2000-01-01"]) == 0
-    frames = read_rows(Lake.at(lake), FRAMES, Partition("k", "2000-01-01"), Frame)
+    frames = list(frames_of(Lake.at(lake), Partition("k", "2000-01-01")))
     assert len(frames) == WHAT["kitti"][2]
     assert all(f.sensors == ["camera", "lidar"] and not len(f.radar_x_m) for f in frames)
     wanted = np.linalg.inv(T_BASE_CAMERA) @ T_BASE_LIDAR
@@ -135,7 +134,7 @@ def test_a_jump_of_the_poses_begins_another_drive(tmp_path):
     about = ["--fleet", str(tmp_path / "fleet.toml"), "--lake", str(tmp_path / "lake"), "--vehicle", "vod"]
     log = next((tmp_path / "logs").rglob("*.mcap"))
     assert main(["ingest", str(log), *about, "--day", "2000-01-01"]) == 0
-    frames = read_rows(Lake.at(tmp_path / "lake"), FRAMES, Partition("vod", "2000-01-01"), Frame)
+    frames = list(frames_of(Lake.at(tmp_path / "lake"), Partition("vod", "2000-01-01")))
     assert [f.drive for f in frames] == [0] * 5 + [1] * 3
     np.testing.assert_allclose([f.ego_speed_mps for f in frames], SPEED_MPS, atol=1e-3)
 

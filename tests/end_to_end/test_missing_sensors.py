@@ -12,10 +12,10 @@ from jobs.cli import main
 from pipeline.geometry.se3 import from_quaternion, log_so3
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records, read_rows
+from pipeline.store.tables import read_records
+from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
-from schemas.observations import OBSERVATIONS, Observation
 from schemas.states import STATES, StateRow
 
 DAY = "2026-03-02"
@@ -75,7 +75,7 @@ def test_a_rig_of_two_sensors_has_records_of_its_one_pair(night, vehicle):
 @pytest.mark.parametrize("vehicle", GONE)
 def test_audit_state_and_observations_are_of_what_the_rig_has(night, vehicle):
     lake = Lake.at(night / "lake")
-    rows = read_rows(lake, OBSERVATIONS, Partition(vehicle, DAY), Observation)
+    rows = list(observations_of(lake, Partition(vehicle, DAY)))
     assert all(set(o.sensors) == set(SENSORS) - {GONE[vehicle]} for o in rows)
     drift = read_records(lake, DRIFT, DriftFinding, vehicle=vehicle)
     assert {(f.pair, f.vehicle_status) for f in drift} == {(PAIR[vehicle], "UNKNOWN")}

@@ -15,10 +15,9 @@ import pytest
 
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_manifest, read_records, read_rows
+from pipeline.store.tables import read_records
+from pipeline.store.views import ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
-from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS, Observation
 from tests.makers.ray_clusters import two_nodes
 
 BORESIGHT = f"{sys.prefix}/bin/boresight"
@@ -102,8 +101,8 @@ def test_the_night_calibrates_what_it_can_and_refuses_the_rest_with_reasons(firs
 def test_every_table_of_the_lake_says_what_it_was_made_from(first_night):
     lake = Lake.at(first_night[0])
     for vehicle, day in WANTED:
-        frames = read_manifest(lake, FRAMES, Partition(vehicle, day))
-        observations = read_manifest(lake, OBSERVATIONS, Partition(vehicle, day))
+        frames = ingested(lake, Partition(vehicle, day))
+        observations = perceived(lake, Partition(vehicle, day))
         assert frames.rows == 12
         assert observations.inputs == [frames.work_key]
         records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day)
@@ -171,7 +170,7 @@ def test_damaged_tables_cost_the_fleet_nothing_and_the_next_night_heals_them(fle
     code, summary, _ = run(*command(fleet, lake, "--executor", "inline"))
     assert (code, summary["failed"]) == (3, 0)
     assert good_days(lake) == WANTED | {("vehicle-3", DAYS[0])}
-    assert len(read_rows(told, OBSERVATIONS, ill, Observation)) == 12
+    assert len(list(observations_of(told, ill))) == 12
     code, summary, _ = run(*command(fleet, lake, "--executor", "inline"))
     assert (summary["damaged"], summary["done"]) == ([], 0)
 

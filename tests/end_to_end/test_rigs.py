@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.ingest.check import check_logs
-from pipeline.store.tables import read_manifest
+from pipeline.store.views import perceived
 from schemas.calibrations import PAIRS
-from schemas.observations import OBSERVATIONS
 from tests.benchmarks.studies.days import Day, DaySpec
 from tests.benchmarks.studies.engine import Run, calibrate_once
 from tests.makers.simulated_days import DATE, simulated_day
@@ -30,9 +29,7 @@ def test_a_rig_unlike_the_paper_s_is_perceived_whole(day):
     for o in made.observations:
         assert len(o.lidar_edge_xyz_m) > 100
         assert o.ground_plane is not None
-    without_rows = read_manifest(made.lake, OBSERVATIONS, made.partition).kept.get(
-        "frames_without_lidar_rows", 0
-    )
+    without_rows = perceived(made.lake, made.partition).kept.get("frames_without_lidar_rows", 0)
     assert without_rows == (len(made.observations) if RINGS[rig] == 0 else 0)
     logs = sorted((folder / "logs" / "vehicle-1" / DATE).iterdir())
     report = check_logs(logs, made.fleet.rig_of("vehicle-1"), made.fleet)

@@ -13,12 +13,11 @@ from pipeline.extrinsics.prior import read_transforms
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records, read_records
-from pipeline.store.tables import write_partition
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from schemas.observations import OBSERVATIONS
 from schemas.states import STATES, StateRow
 from tests.audit.fleet_records import vehicle_records
 from tests.makers.calibrations import CAMERA, T_BASE_LIDAR, calibration
+from tests.makers.lakes import write_observations
 from tests.makers.table_rows import make_row
 
 BOTH = ["azimuth", "elevation"]
@@ -75,9 +74,7 @@ def lake(tmp_path_factory):
         "observations", np.random.default_rng(2), nulls=True, camera_model=CAMERA.model, camera_K=CAMERA.K,
         camera_D=CAMERA.D, image_width_px=CAMERA.width_px, image_height_px=CAMERA.height_px,
     )  # fmt: skip
-    with write_partition(tables, OBSERVATIONS, Partition("v", days[0]), "k", "0.7.0") as writer:
-        writer.append([row])
-        writer.describe(kept={}, rejected={})
+    write_observations(tables, Partition("v", days[0]), [row], "k")
     return folder, days
 
 

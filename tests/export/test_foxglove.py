@@ -14,12 +14,11 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_se3, from_quaternion, inverse, to_quaternion, transform_points
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records
-from pipeline.store.tables import read_rows, write_partition
+from pipeline.store.views import frames_of
 from schemas.calibrations import CALIBRATIONS
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS
 from tests.makers.calibrations import SIGMA, T_CAMERA_LIDAR, T_LIDAR_RADAR
 from tests.makers.foxglove_logs import schema
+from tests.makers.lakes import write_frames, write_observations
 from tests.makers.stages import ingest_day
 from tests.makers.table_rows import make_row
 from tests.makers.written_logs import fleet_config, jpeg
@@ -86,10 +85,8 @@ def exported(tmp_path_factory):
     """A day of four frames, the third of which perception left out, exported."""
     folder = tmp_path_factory.mktemp("drive")
     lake = Lake.at(folder / "lake")
-    with write_partition(lake, FRAMES, DAY, "key", "0.7.0") as writer:
-        writer.append([frame(i) for i in range(COUNT)])
-    with write_partition(lake, OBSERVATIONS, DAY, "key", "0.7.0") as writer:
-        writer.append([observation(i) for i in range(COUNT) if i != 2])
+    write_frames(lake, DAY, [frame(i) for i in range(COUNT)], "key")
+    write_observations(lake, DAY, [observation(i) for i in range(COUNT) if i != 2], "key")
     commit_records(lake, CALIBRATIONS, records())
     out = folder / "drive.mcap"
     call = [
@@ -214,7 +211,7 @@ def test_our_own_ingest_reads_the_drive_back(exported, tmp_path):
     )
     again = Lake.at(tmp_path / "lake")
     assert ingest_day([out], DAY, fleet, again).status == "done"
-    before, after = (read_rows(its, FRAMES, DAY, Frame) for its in (lake, again))
+    before, after = (list(frames_of(its, DAY)) for its in (lake, again))
     for a, b in zip(before, after, strict=True):
         assert (a.image, a.camera_stamp_ns, a.radar_stamp_ns) == (
             b.image,

@@ -15,12 +15,11 @@ from pipeline.geometry.se3 import exp_se3
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records
-from pipeline.store.tables import write_partition
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
-from schemas.frames import FRAMES
 from tests.audit.fleet_records import T_LIDAR_RADAR, vehicle_records
 from tests.makers.calibrations import T_CAMERA_LIDAR
+from tests.makers.lakes import write_frames
 
 FRAME_IDS = {"camera": ["front_optical"], "lidar": ["/top"], "radar": ["radar_front"]}
 ROLLED = {"radar": np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])}  # [rad]
@@ -44,8 +43,7 @@ def lake(tmp_path_factory: pytest.TempPathFactory) -> Path:
     task = Task(FleetConfig.model_validate(fleet), tables, Window())
     AUDIT.run(task)
     STATE.run(task)
-    with write_partition(tables, FRAMES, Partition("v", "2026-03-06"), "k", "0") as writer:
-        writer.describe(kept={}, rejected={}, frame_ids=FRAME_IDS)
+    write_frames(tables, Partition("v", "2026-03-06"), [], frame_ids=FRAME_IDS)
     return folder
 
 

@@ -10,8 +10,7 @@ import pytest
 
 from pipeline.config import FleetConfig
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows
-from schemas.frames import FRAMES, Frame
+from pipeline.store.views import frames_of
 from tests.makers import written_logs
 from tests.makers.stages import ingest_day
 
@@ -45,7 +44,7 @@ def run_ingest(tmp_path):
         lake, day = Lake.at(tmp_path / name), Partition("car", "2023-11-14")
         config = (fleet or written_logs.fleet_config()).read_from(Path(file))
         result = ingest_day(list(logs), day, config, lake)
-        frames = read_rows(lake, FRAMES, day, Frame) if result.rows else []
+        frames = list(frames_of(lake, day)) if result.rows else []
         return result, frames
 
     return run

@@ -10,9 +10,9 @@ from pipeline.errors import ConfigError
 from pipeline.ingest.containers.mcap import McapLog
 from pipeline.ingest.sync import Rejection
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_manifest
+from pipeline.store.views import ingested
 from schemas.calibrations import SENSORS
-from schemas.frames import FRAMES, SENSORS_ABSENT
+from schemas.frames import SENSORS_ABSENT
 from tests.makers.stages import ingest_day
 
 
@@ -122,7 +122,7 @@ def test_a_sensor_that_is_missing_is_named_by_its_topic_and_leaves_the_others(
     assert name in result.reason
     assert all(set(f.sensors) == set(SENSORS) - {sensor} for f in frames)
     assert sum(n for key, n in result.rejected.items() if key.startswith(f"without_{sensor}_")) == 4
-    manifest = read_manifest(Lake.at(tmp_path / "lake"), FRAMES, Partition("car", "2023-11-14"))
+    manifest = ingested(Lake.at(tmp_path / "lake"), Partition("car", "2023-11-14"))
     assert name in manifest.extra[SENSORS_ABSENT][sensor]
     if sensor == "lidar":
         assert all(f.prior_camera_radar_qw is not None for f in frames)
@@ -223,7 +223,7 @@ def test_an_image_that_is_late_by_as_much_as_all_others_costs_nothing_and_one_th
     assert result.rejected["no_camera_in_gate"] == 1
     _, without = run_ingest(log, fleet=kit.fleet(ingest={"sync_gate_s": 0.005}), name="paper")
     assert {tuple(f.sensors) for f in without} == {("lidar", "radar")}
-    manifest = read_manifest(Lake.at(tmp_path / "paper"), FRAMES, Partition("car", "2023-11-14"))
+    manifest = ingested(Lake.at(tmp_path / "paper"), Partition("car", "2023-11-14"))
     assert "leave it out to gate by motion" in manifest.extra[SENSORS_ABSENT]["camera"]
 
 
@@ -235,7 +235,7 @@ def test_intrinsics_that_are_not_calibrated_cost_the_camera_with_what_to_do(kit,
     assert "zero K" in result.reason
     assert result.rejected["camera_info_unusable"] == 4
     assert result.rejected["without_camera_no_usable_camera_info"] == 4
-    manifest = read_manifest(Lake.at(tmp_path / "lake"), FRAMES, Partition("car", "2023-11-14"))
+    manifest = ingested(Lake.at(tmp_path / "lake"), Partition("car", "2023-11-14"))
     assert "CameraInfo with a calibrated K" in manifest.extra[SENSORS_ABSENT]["camera"]
 
 
@@ -297,12 +297,12 @@ def test_a_refused_day_leaves_the_lake_as_it_was(kit, tmp_path, run_ingest):
     assert lake.partitions("frames") == []
     key = run_ingest(log)[0].work_key
     assert run_ingest(refused)[0].status == "refused"
-    assert read_manifest(lake, FRAMES, day).work_key == key
+    assert ingested(lake, day).work_key == key
 
 
 def test_the_manifest_tells_inputs_counts_and_problems(kit, tmp_path, run_ingest):
     result, _ = run_ingest(kit.Kit().drive().without("/tf_static").mcap(tmp_path / "a.mcap"))
-    manifest = read_manifest(Lake.at(tmp_path / "lake"), FRAMES, Partition("car", "2023-11-14"))
+    manifest = ingested(Lake.at(tmp_path / "lake"), Partition("car", "2023-11-14"))
     assert manifest.rejected == result.rejected
     assert manifest.kept == {"frames": 4}
     assert manifest.inputs[0].startswith("a.mcap:")

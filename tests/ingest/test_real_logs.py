@@ -12,8 +12,7 @@ from pipeline.config import load_fleet
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.ingest.check import check_logs
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows
-from schemas.frames import FRAMES, Frame
+from pipeline.store.views import frames_of
 from tests.makers.stages import ingest_day
 
 pytestmark = pytest.mark.real_logs
@@ -36,7 +35,7 @@ def lake(logs, tmp_path_factory):
 
 
 def test_every_frame_of_the_day_is_there_with_the_bytes_and_points_of_the_logs(logs, lake):
-    frames = (f for chunk in iterate_rows(lake, FRAMES, DAY, Frame) for f in chunk)
+    frames = frames_of(lake, DAY)
     seen = Counter()
     for log in logs:  # their names sort by time
         for expected in logged(log):
@@ -92,7 +91,7 @@ def logged(log):
 
 def test_the_prior_is_the_calibration_that_the_logs_carry(real_logs, lake):
     given = json.loads((real_logs / "given_calibration.json").read_text())["astyx-1_2019-01-14_00"]
-    first = next(iterate_rows(lake, FRAMES, DAY, Frame, rows=[0]))[0]
+    first = next(frames_of(lake, DAY, [0]))
     for pair, T in (
         ("camera_lidar", np.array(given["T_camera_lidar"])),
         ("lidar_radar", np.linalg.inv(np.array(given["T_radar_lidar"]))),

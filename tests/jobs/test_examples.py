@@ -12,11 +12,10 @@ from pipeline.geometry.se3 import log_so3, transform_points
 from pipeline.store.current import prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records
-from pipeline.store.tables import write_partition
 from schemas.calibrations import CALIBRATIONS
-from schemas.frames import FRAMES
 from tests.audit.fleet_records import vehicle_records
 from tests.conftest import REPO
+from tests.makers.lakes import write_frames
 from tests.makers.table_rows import make_row
 
 DAYS, HELD = 12, (3, 11)
@@ -47,8 +46,7 @@ def ran(tmp_path_factory):
     commit_records(lake, CALIBRATIONS, earlier)
     commit_records(lake, CALIBRATIONS, records)
     last = max(r.day for r in records if r.status == "accepted")
-    with write_partition(lake, FRAMES, Partition("v", last), "key", "0.7.0") as writer:
-        writer.append([frame(rng), frame(rng)])
+    write_frames(lake, Partition("v", last), [frame(rng), frame(rng)], "key")
     script = REPO / "jobs" / "examples" / "read_a_lake.py"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", [str(script), str(folder / "lake"), "v", str(folder / "pictures")])

@@ -10,8 +10,8 @@ from pipeline.config import FleetConfig, load_fleet
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import observations_of
+from schemas.observations import Observation
 from tests.makers.stages import ingest_day, perceive_day
 
 DATE = "2026-03-02"
@@ -71,5 +71,5 @@ def perceived(
         for p in ("camera_lidar", "camera_radar", "lidar_radar")
         if f"T_{p}" in told
     }
-    rows = read_rows(lake, OBSERVATIONS, partition, Observation)
+    rows = list(observations_of(lake, partition))
     return SimulatedDay(lake, partition, config, fleet_file, rows, truth, told)

@@ -10,10 +10,11 @@ from pipeline.config import FleetConfig
 from pipeline.learn.prepare.stage import decided_sides
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import write_partition
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import perceived_days
+from schemas.frames import Frame
+from schemas.observations import Observation
 from tests.makers import solve_scenes
+from tests.makers.lakes import write_frames, write_observations
 from tests.makers.stages import prepare_day
 
 TOPICS = {
@@ -49,16 +50,13 @@ def fill(lake: Lake, vehicle: str, day: str, frames: int = 6, seed: int | None =
     observations = solve_scenes.make_day(frames, seed=seed)
     rows = [frame_of(o, np.random.default_rng([seed, i]), **changes) for i, o in enumerate(observations)]
     partition = Partition(vehicle, day)
-    for schema, content in ((FRAMES, rows), (OBSERVATIONS, observations)):
-        with write_partition(lake, schema, partition, f"{schema.name}-{seed}-{frames}", "test") as writer:
-            for first in range(0, frames, 4):
-                writer.append(content[first : first + 4])
-            writer.describe(kept={}, rejected={})
+    write_frames(lake, partition, rows, f"frames-{seed}-{frames}")
+    write_observations(lake, partition, observations, f"observations-{seed}-{frames}")
 
 
 def prepare_all(lake, fleet):
     """What `boresight prepare` does, in this process; results by partition."""
-    surveys = [survey_day(p, lake, fleet.prepare) for p in lake.partitions(OBSERVATIONS.name)]
+    surveys = [survey_day(p, lake, fleet.prepare) for p in perceived_days(lake)]
     plan = plan_days(surveys, fleet.prepare, decided_sides(lake, fleet.prepare))
     return {s.partition: prepare_day(s.partition, fleet, lake, plan) for s in surveys}
 

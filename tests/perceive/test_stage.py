@@ -9,10 +9,9 @@ from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, ContractError
 from pipeline.perceive.stage import WITHOUT_ROWS
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_manifest, read_rows, write_partition
+from pipeline.store.views import observations_of, perceived
 from schemas.calibrations import SENSORS
-from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS, Observation
+from tests.makers.lakes import write_frames
 from tests.makers.stages import perceive_day
 
 DAY = Partition("car-1", "2026-03-02")
@@ -38,23 +37,20 @@ def fleet(**perceive):
     )  # fmt: skip
 
 
-def write_frames(lake, frames, key="frames-key", group=3):
-    with write_partition(lake, FRAMES, DAY, key, "test") as writer:
-        for first in range(0, len(frames), group):
-            writer.append(frames[first : first + group])
-        writer.describe(kept={}, rejected={})
+def write(lake, frames, key="frames-key", group=3):
+    write_frames(lake, DAY, frames, key, group)
 
 
 @pytest.fixture
 def lake(tmp_path, made_frame):
     """A lake with one drive of five frames."""
     lake = Lake.at(tmp_path / "lake")
-    write_frames(lake, [made_frame(i) for i in range(5)])
+    write(lake, [made_frame(i) for i in range(5)])
     return lake
 
 
 def rows(lake):
-    return read_rows(lake, OBSERVATIONS, DAY, Observation)
+    return list(observations_of(lake, DAY))
 
 
 def test_a_days_frames_become_observations(lake):
@@ -89,7 +85,7 @@ def test_a_radar_that_looks_back_still_drives_forwards(lake, made_frame):
         frame, radar_x_m=-frame.radar_x_m, radar_y_m=-frame.radar_y_m,
         prior_lidar_radar_qw=0.0, prior_lidar_radar_qx=0.0, prior_lidar_radar_qy=0.0, prior_lidar_radar_qz=1.0,
     )  # fmt: skip
-    write_frames(lake, [turned], key="turned")
+    write(lake, [turned], key="turned")
     perceive_day(DAY, fleet(), lake)
     [row] = rows(lake)
     assert row.radar_velocity_mps[0] == pytest.approx(-8.0, abs=0.1)
@@ -103,14 +99,14 @@ def test_the_same_work_is_cached_and_other_work_is_not(lake, made_frame):
     other = perceive_day(DAY, fleet(voxel_m=0.5), lake)
     assert other.status == "done"
     assert other.work_key != first.work_key
-    write_frames(lake, [made_frame(0)], key="other-key")
+    write(lake, [made_frame(0)], key="other-key")
     assert perceive_day(DAY, fleet(voxel_m=0.5), lake).rows == 1
 
 
 def test_the_same_frames_give_the_same_bytes(lake, tmp_path, made_frame):
     perceive_day(DAY, fleet(), lake)
     twin = Lake.at(tmp_path / "twin")
-    write_frames(twin, [made_frame(i) for i in range(5)], group=1)
+    write(twin, [made_frame(i) for i in range(5)], group=1)
     perceive_day(DAY, fleet(), twin)
     for a, b in zip(rows(lake), rows(twin), strict=True):
         assert a.labels_png == b.labels_png
@@ -127,7 +123,7 @@ def test_bad_frames_are_counted_by_reason_and_do_not_stop_the_day(lake, made_fra
     frames[5] = replace(frames[5], camera_D=np.zeros(3))
     none = np.zeros(0, np.float32)
     frames[6] = replace(frames[6], radar_x_m=none, radar_y_m=none, radar_z_m=none, radar_range_rate_mps=none)
-    write_frames(lake, frames, key="faulty")
+    write(lake, frames, key="faulty")
     result = perceive_day(DAY, fleet(), lake)
     assert result.status == "done"
     assert [o.frame_index for o in rows(lake)] == [0, 7]
@@ -135,14 +131,14 @@ def test_bad_frames_are_counted_by_reason_and_do_not_stop_the_day(lake, made_fra
         "image_undecodable": 1, "labels_missing": 1, "detections_missing": 1, "lidar_points_too_few": 1,
         "camera_model_invalid": 1, "radar_points_too_few": 1,
     }  # fmt: skip
-    assert read_manifest(lake, OBSERVATIONS, DAY).rejected == result.rejected
+    assert perceived(lake, DAY).rejected == result.rejected
 
 
 def test_points_that_are_not_numbers_are_left_out(lake, made_frame):
     frame = made_frame(0)
     x = frame.lidar_x_m.copy()
     x[::7] = np.nan
-    write_frames(lake, [replace(frame, lidar_x_m=x)], key="nan")
+    write(lake, [replace(frame, lidar_x_m=x)], key="nan")
     perceive_day(DAY, fleet(), lake)
     assert np.isfinite(rows(lake)[0].lidar_map_xyz_m).all()
 
@@ -154,7 +150,7 @@ def test_sweeps_without_rows_are_counted_and_still_show_edges(lake, made_frame):
         replace(made_frame(1), lidar_ring=lasers),
         replace(made_frame(2), lidar_ring=lasers),
     ]
-    write_frames(lake, frames, key="rosette")
+    write(lake, frames, key="rosette")
     result = perceive_day(DAY, fleet(), lake)
     assert (result.kept, result.rejected) == ({"frames": 3, WITHOUT_ROWS: 2}, {})
     assert all(len(o.lidar_edge_xyz_m) > 0 for o in rows(lake))
@@ -167,7 +163,7 @@ def test_sensors_that_say_little_are_enough(lake, made_frame):
         frame, lidar_ring=None, lidar_intensity=None, radar_power_db=None,
         radar_z_m=np.zeros_like(frame.radar_z_m), radar_has_elevation=False,
     )  # fmt: skip
-    write_frames(lake, [bare], key="bare")
+    write(lake, [bare], key="bare")
     assert perceive_day(DAY, fleet(), lake).rows == 1
     assert rows(lake)[0].marking_xyz_m.shape == (0, 3)
     assert len(rows(lake)[0].lidar_edge_xyz_m) > 0
@@ -176,7 +172,7 @@ def test_sensors_that_say_little_are_enough(lake, made_frame):
 def test_a_day_without_a_usable_frame_is_refused_and_leaves_no_stale_observations(lake, made_frame):
     perceive_day(DAY, fleet(), lake)
     unlabelled = [replace(made_frame(i), labels_png=None, sensors=["camera", "lidar"]) for i in range(3)]
-    write_frames(lake, unlabelled, key="unlabelled")
+    write(lake, unlabelled, key="unlabelled")
     for _ in range(2):
         result = perceive_day(DAY, fleet(), lake)
         assert result.status == "refused"
@@ -187,7 +183,7 @@ def test_a_day_without_a_usable_frame_is_refused_and_leaves_no_stale_observation
 def test_a_day_without_labels_keeps_lidar_and_radar(lake, made_frame):
     perceive_day(DAY, fleet(), lake)
     whole = rows(lake)
-    write_frames(lake, [replace(made_frame(i), labels_png=None) for i in range(5)], key="unlabelled")
+    write(lake, [replace(made_frame(i), labels_png=None) for i in range(5)], key="unlabelled")
     result = perceive_day(DAY, fleet(), lake)
     assert (result.status, result.rejected) == ("done", {"without_camera_labels_missing": 5})
     for a, b in zip(rows(lake), whole, strict=True):
@@ -208,7 +204,7 @@ def test_what_a_missing_sensor_would_show_is_empty_and_the_others_are_perceived(
         "radar": {f"radar_{axis}_m": none for axis in "xyz"} | {"radar_range_rate_mps": none},
     }[sensor]
     frames = [replace(made_frame(i), sensors=others, **gone) for i in range(5)]
-    write_frames(lake, frames, key=f"no {sensor}")
+    write(lake, frames, key=f"no {sensor}")
     result = perceive_day(DAY, fleet(), lake)
     assert (result.status, result.rows, result.rejected) == ("done", 5, {})
     for a, b in zip(rows(lake), whole, strict=True):

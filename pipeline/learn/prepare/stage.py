@@ -6,7 +6,6 @@ and then has each day written by whichever worker is free (`work`): no row depen
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
 
@@ -21,11 +20,12 @@ from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import Survey, survey_day
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
 from pipeline.store.partitions import Lake
-from pipeline.store.tables import iterate_rows, read_manifest
+from pipeline.store.tables import read_manifest
+from pipeline.store.views import frames_of, observations_of
 from pipeline.work import Run, Task, Work
 from schemas.calibrations import PAIRS, SENSORS
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.frames import Frame
+from schemas.observations import Observation
 from schemas.training import TRAINING, TrainingRow
 
 __all__ = ["decided_sides", "work"]
@@ -93,9 +93,8 @@ def _samples(task: Task, about: Mapping[int, About], rejected: Counter[str]) -> 
     if not about:
         return
     lake, partition, fleet = task.lake, task.partition, task.fleet
-    observations = itertools.chain.from_iterable(iterate_rows(lake, OBSERVATIONS, partition, Observation))
-    frames = itertools.chain.from_iterable(iterate_rows(lake, FRAMES, partition, Frame, rows=sorted(about)))
-    whole = (o for o in observations if len(o.sensors) == len(SENSORS))
+    frames = frames_of(lake, partition, sorted(about))
+    whole = (o for o in observations_of(lake, partition) if len(o.sensors) == len(SENSORS))
     observation = next(whole, None)
     if observation is None:
         rejected[SampleReason.SENSOR_MISSING.value] += len(about)

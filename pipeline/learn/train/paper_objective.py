@@ -36,8 +36,8 @@ from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import observations_of
+from schemas.observations import Observation
 
 __all__ = ["PaperFrame", "PaperFrames", "paper_frame", "with_paper_inputs"]
 
@@ -118,11 +118,9 @@ class PaperFrames:
         if partition not in self._days:
             T_camera_lidar = batch.T_camera_lidar[row].double().cpu().numpy()
             T_camera_radar = batch.T_camera_radar[row].double().cpu().numpy()
-            groups = iterate_rows(self._lake, OBSERVATIONS, partition, Observation)
             self._days[partition] = {
                 o.frame_index: paper_frame(o, T_camera_lidar, T_camera_radar)
-                for group in groups
-                for o in group
+                for o in observations_of(self._lake, partition)
             }
         self._days.move_to_end(partition)
         while len(self._days) > 1 and sum(map(len, self._days.values())) > _KEPT:

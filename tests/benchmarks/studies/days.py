@@ -31,7 +31,7 @@ from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
 from pipeline.simulate.logs.fleet_toml import fleet_toml
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows
+from pipeline.store.views import observations_of
 from schemas.calibrations import PAIRS
 from schemas.observations import OBSERVATIONS, Observation
 from tests.benchmarks.studies.commits import commit_now
@@ -126,7 +126,7 @@ def label_by_network(fleet: Path, network: str) -> None:
 
 def adopt_day(fleet_file: Path, lake: str, partition: Partition, root: Path) -> Path:
     """Put a perceived real day among the generated ones; its logged calibration is the reference."""
-    rows = read_rows(Lake.at(lake), OBSERVATIONS, partition, Observation)
+    rows = list(observations_of(Lake.at(lake), partition))
     given = read_prior(rows, load_fleet(fleet_file), partition.vehicle)
     folder = root / REAL.name
     shutil.rmtree(folder, ignore_errors=True)
@@ -165,7 +165,7 @@ def load_day(spec: DaySpec, root: Path) -> Day:
     partition = Partition(note.get("vehicle", VEHICLE), note.get("day", DATE))
     return Day(
         spec,
-        read_rows(Lake.at(folder / "lake"), OBSERVATIONS, partition, Observation),
+        list(observations_of(Lake.at(folder / "lake"), partition)),
         json.loads((folder / "truth" / partition.vehicle / f"{partition.day}.json").read_text()),
         load_fleet(folder / "fleet.toml"),
         {name: note.get(name, "unknown") for name in ("simulated_by", "perceived_by")},

@@ -33,9 +33,9 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows
+from pipeline.store.views import observations_of
 from schemas.calibrations import PAIRS
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.observations import Observation
 from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.drift_charts import CASES, Case, Vehicle, status_of_night
 from tests.benchmarks.studies.drift_charts import nights as judged_nights
@@ -254,7 +254,7 @@ def gather(args: argparse.Namespace) -> None:
     found = [r for r in known if r["name"] != args.name]
     for folder in sorted((Path(args.lake) / "observations").glob("vehicle=*/day=*")):
         partition = Partition(*(part.partition("=")[2] for part in folder.parts[-2:]))
-        rows = read_rows(lake, OBSERVATIONS, partition, Observation)
+        rows = list(observations_of(lake, partition))
         for part, chosen in _parts(rows, halves=args.parts):
             found += _accepted(chosen, fleet, partition, {"name": args.name, "part": part})
     RECORDS.write_text(json.dumps({"commit": commit_now(), "records": found}) + "\n")

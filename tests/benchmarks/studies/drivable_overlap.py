@@ -25,7 +25,7 @@ from pipeline.learn.perception.radar_drivable.training import area_iou
 from pipeline.perceive.models.session import open_session
 from pipeline.shipped_models import shipped_manifest
 from pipeline.store.partitions import Lake
-from schemas.observations import OBSERVATIONS
+from pipeline.store.views import perceived_days
 from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.engine import RESULTS
 
@@ -45,7 +45,7 @@ def main() -> None:
     found = {}
     for folder in args.days:
         lake = Lake.at(folder / "lake")
-        [day] = lake.partitions(OBSERVATIONS.name)
+        [day] = perceived_days(lake)
         samples = samples_of_day(load_fleet(folder / "fleet.toml"), lake, day, args.frames)
         found[folder.name] = overlaps(samples, args.model)
         print(folder.name, found[folder.name], flush=True)

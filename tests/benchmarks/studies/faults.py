@@ -36,9 +36,10 @@ from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records, read_rows
+from pipeline.store.tables import read_records
+from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.observations import Observation
 from tests.benchmarks.studies.commits import accept_argument, commit_now, is_accepted
 from tests.benchmarks.studies.engine import RESULTS, read_results
 from tests.benchmarks.studies.fault_logs import EDITS, rewrite_logs
@@ -272,7 +273,7 @@ def run_case(run: Run, root: Path, real: Path | None) -> dict[str, Any]:
         given_outcome = {"given": outcome} if outcome.status == "refused" else {}
         calibrate_day(partition, fleet, lake, seed=run.seed, **given_outcome)
         records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle)
-        rows = [] if given_outcome else read_rows(lake, OBSERVATIONS, partition, Observation)
+        rows = [] if given_outcome else list(observations_of(lake, partition))
     T_true = _truth(case, truth)
     pairs = {r.pair: _measured(r, case, T_true, truth, rows) for r in records}
     return {"pairs": pairs, "cpu_s": round(time.process_time() - began, 1)}

@@ -30,9 +30,9 @@ from pipeline.report.above import top_view
 from pipeline.report.encode import jpeg_uri
 from pipeline.report.overlays import Extrinsics, Scene, front_view, whole_view
 from pipeline.store.current import current_records, prior_of, transform_of
-from pipeline.store.tables import iterate_rows, read_records
+from pipeline.store.tables import read_records
+from pipeline.store.views import frames_of
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
-from schemas.frames import FRAMES, Frame
 from tests.benchmarks.studies.days import DATE, VEHICLE
 from tests.benchmarks.studies.ssl_days import SslDay, Where, open_day
 
@@ -217,8 +217,7 @@ def _pictured(picture: Any, caption: str) -> str:
 
 def _scene(day: SslDay, row: int) -> Scene:
     observation = day.rows[row]
-    groups = iterate_rows(day.lake, FRAMES, day.partition, Frame, rows=[observation.frame_index])
-    return Scene(next(iter(next(iter(groups)))), observation)
+    return Scene(next(frames_of(day.lake, day.partition, [observation.frame_index])), observation)
 
 
 def _states(

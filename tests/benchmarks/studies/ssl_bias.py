@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +20,9 @@ from pipeline.learn.infer.aggregate import shared_bias
 from pipeline.learn.infer.onnx_networks import open_networks
 from pipeline.learn.infer.vehicle_day import day_answers
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows
+from pipeline.store.views import frames_of
 from schemas.calibrations import PAIRS
-from schemas.frames import FRAMES, Frame
+from schemas.frames import Frame
 from tests.benchmarks.studies.ssl_days import ModelSet, SslDay, fleet_days, open_day
 from tests.benchmarks.studies.ssl_measures import STARTS
 
@@ -36,9 +35,7 @@ def biases(models: ModelSet, day: SslDay) -> dict[str, np.ndarray]:
     lake = Lake.at(day.where.folder / "lake")
 
     def frames(indices: Sequence[int]) -> Iterator[Frame]:
-        wanted = set(indices)
-        batches = iterate_rows(lake, FRAMES, partition, Frame)
-        return (f for f in chain.from_iterable(batches) if f.frame_index in wanted)
+        return frames_of(lake, partition, indices)
 
     answers = day_answers(
         dict.fromkeys(PAIRS, day.rows),

@@ -7,7 +7,6 @@ that no network learned from: the sides val and test of table training.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,10 +20,10 @@ from pipeline.config import FleetConfig, load_fleet
 from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import perturbed
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows, read_rows
+from pipeline.store.views import frames_of, observations_of
 from schemas.calibrations import PAIRS
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.frames import Frame
+from schemas.observations import Observation
 from tests.benchmarks.studies.days import DATE, SETS, VEHICLE, DaySpec
 from tests.benchmarks.studies.engine import ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M
 
@@ -90,15 +89,12 @@ class SslDay:
         chosen = np.linspace(0, len(self.rows) - 1, min(count, len(self.rows))).round().astype(int)
         rows = [self.rows[i] for i in np.unique(chosen)]
         wanted = [o.frame_index for o in rows]
-        groups = iterate_rows(self.lake, FRAMES, self.partition, Frame, rows=wanted)
-        return rows, list(itertools.chain.from_iterable(groups))
+        return rows, list(frames_of(self.lake, self.partition, wanted))
 
 
 def open_day(where: Where) -> SslDay:
     """Observations, truth and configuration."""
-    rows = read_rows(
-        Lake.at(where.folder / "lake"), OBSERVATIONS, Partition(where.vehicle, where.day), Observation
-    )
+    rows = list(observations_of(Lake.at(where.folder / "lake"), Partition(where.vehicle, where.day)))
     truth = json.loads((where.folder / "truth" / where.vehicle / f"{where.day}.json").read_text())
     return SslDay(where, rows, truth, load_fleet(where.folder / "fleet.toml"))
 

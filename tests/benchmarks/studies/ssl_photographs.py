@@ -24,10 +24,9 @@ from pipeline.config import load_fleet
 from pipeline.extrinsics.prior import read_prior
 from pipeline.store.partitions import Lake
 from pipeline.store.row_groups import read_columns
-from pipeline.store.tables import read_rows
+from pipeline.store.views import observations_of, perceived_days
 from schemas.calibrations import PAIRS
 from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS, Observation
 from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.ssl_days import ModelSet, SslDay, Where
 from tests.benchmarks.studies.ssl_measures import measure_day, measure_frames
@@ -41,8 +40,8 @@ _MODES = ("both", "classes", "image")
 def real_day(folder: Path) -> SslDay:
     """The only vehicle-day of a folder; its logged calibration stands in for the truth that nobody knows."""
     lake, fleet = Lake.at(folder / "lake"), load_fleet(folder / "fleet.toml")
-    [partition] = lake.partitions(OBSERVATIONS.name)
-    rows = read_rows(lake, OBSERVATIONS, partition, Observation)
+    [partition] = perceived_days(lake)
+    rows = list(observations_of(lake, partition))
     given = read_prior(rows, fleet, partition.vehicle)
     truth: dict[str, object] = {f"T_{pair}": given.of(pair).tolist() for pair in PAIRS}
     return SslDay(Where(folder, partition.vehicle, partition.day, 0), rows, truth, fleet)

@@ -11,7 +11,6 @@ measured already is kept.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import time
 from collections.abc import Mapping
@@ -28,9 +27,8 @@ from pipeline.learn.infer.frame_network import FrameNetwork
 from pipeline.learn.infer.onnx_networks import open_networks
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
 from pipeline.learn.infer.way import informed_by_way
-from pipeline.store.tables import iterate_rows
+from pipeline.store.views import frames_of
 from schemas.calibrations import PAIRS
-from schemas.frames import FRAMES, Frame
 from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.days import DATE, VEHICLE
 from tests.benchmarks.studies.ssl_days import ModelSet, SslDay, Where, open_day
@@ -47,9 +45,7 @@ def day_told(networks: list[FrameNetwork], day: SslDay) -> dict[str, Any]:
         dict.fromkeys(PAIRS, day.rows),
         prior,
         networks=networks,
-        frames=lambda wanted: itertools.chain.from_iterable(
-            iterate_rows(day.lake, FRAMES, day.partition, Frame, rows=list(wanted))
-        ),
+        frames=lambda wanted: frames_of(day.lake, day.partition, wanted),
         method="joint-ssl",
         seed=day.where.seed,
     )

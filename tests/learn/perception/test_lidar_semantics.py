@@ -31,8 +31,8 @@ from pipeline.learn.train.checkpoints import load_checkpoint
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows, write_partition
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import observations_of
+from tests.makers.lakes import write_observations
 from tests.makers.solve_scenes import CAMERA, LABEL_SCALE, T_CAMERA_LIDAR, make_observation
 from tests.makers.training_lakes import fill, frame_of
 
@@ -202,10 +202,8 @@ def test_the_job_trains_on_a_lake_holds_days_out_and_leaves_model_manifest_and_c
     fill(lake, "b", "2026-01-02", 4)
     # Perception rejected a frame: it has no observation and teaches nothing.
     day = Partition("a", "2026-01-01")
-    rows = read_rows(lake, OBSERVATIONS, day, Observation)
-    with write_partition(lake, OBSERVATIONS, day, "again", "test") as writer:
-        writer.append(rows[:1] + rows[2:])
-        writer.describe(kept={}, rejected={})
+    rows = list(observations_of(lake, day))
+    write_observations(lake, day, rows[:1] + rows[2:], "again")
     out = tmp_path / "run"
     command = [sys.executable, "-m", "jobs.cli", "train-lidar-semantics", "--fleet", str(fleet), "--lake"]
     command += [

@@ -21,9 +21,8 @@ from pipeline.learn.perception.radar_drivable.training import DrivableTraining, 
 from pipeline.learn.train.checkpoints import load_checkpoint
 from pipeline.perceive.drivable import free_sector
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import write_partition
-from schemas.observations import OBSERVATIONS
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.lakes import write_observations
 from tests.makers.solve_scenes import make_observation, prior_columns
 
 PRIOR = np.eye(4)
@@ -158,9 +157,7 @@ def test_the_job_labels_by_the_logged_prior_trains_and_leaves_model_manifest_and
     for vehicle, prior in (("a", PRIOR), ("b", turned)):
         rng = np.random.default_rng(8)  # the same roads, told otherwise
         rows = [road(rng, **prior_columns("lidar_radar", prior)) for _ in range(4)]
-        with write_partition(lake, OBSERVATIONS, Partition(vehicle, "2026-01-01"), vehicle, "test") as writer:
-            writer.append(rows)
-            writer.describe(kept={}, rejected={})
+        write_observations(lake, Partition(vehicle, "2026-01-01"), rows, vehicle)
         found = samples_of_day(load_fleet(fleet), lake, Partition(vehicle, "2026-01-01"), 9)
         assert np.array_equal(found.label, np.stack([label_grid(o, prior) for o in rows]))
         labels.append(found.label)

@@ -12,11 +12,12 @@ from pipeline.errors import ContractError
 from pipeline.learn.prepare.inventory import alike, read_leaks, take_inventory, write_inventory
 from pipeline.learn.prepare.survey import survey_day
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_manifest, read_rows, write_partition
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.tables import read_manifest, read_rows
+from pipeline.store.views import observations_of
 from schemas.training import SPLITS, TRAINING, TrainingRow
 from tests.makers import training_lakes
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.lakes import write_observations
 
 VEHICLES = ("a", "b", "c", "d", "e")
 
@@ -123,10 +124,9 @@ def test_frames_that_perception_refused_or_that_changed_their_prior_are_counted(
     lake = Lake.at(tmp_path)
     training_lakes.fill(lake, "a", "2026-01-01", 6)
     partition = Partition("a", "2026-01-01")
-    observations = read_rows(lake, OBSERVATIONS, partition, Observation)
+    observations = list(observations_of(lake, partition))
     observations[4] = replace(observations[4], prior_camera_lidar_tx_m=9.0)
-    with write_partition(lake, OBSERVATIONS, partition, "other", "test") as writer:
-        writer.append([o for o in observations if o.frame_index != 2])
+    write_observations(lake, partition, [o for o in observations if o.frame_index != 2], "other")
     result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], split_by=["vehicle"]))[partition]
     assert (result.rows, result.rejected) == (4, {"not_perceived": 1, "prior_changed": 1})
 
@@ -135,11 +135,8 @@ def test_a_day_without_prior_is_refused_with_its_reason(tmp_path):
     lake = Lake.at(tmp_path)
     training_lakes.fill(lake, "a", "2026-01-01", 3)
     partition = Partition("a", "2026-01-01")
-    rows = [
-        replace(o, prior_camera_lidar_qw=None) for o in read_rows(lake, OBSERVATIONS, partition, Observation)
-    ]
-    with write_partition(lake, OBSERVATIONS, partition, "other", "test") as writer:
-        writer.append(rows)
+    rows = [replace(o, prior_camera_lidar_qw=None) for o in list(observations_of(lake, partition))]
+    write_observations(lake, partition, rows, "other")
     result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], split_by=["vehicle"]))[partition]
     assert result.status == "refused"
     assert result.reason == "no sample: 3 no_prior"

@@ -18,9 +18,9 @@ from pipeline.learn.train.run_state import network_of_run
 from pipeline.learn.train.settings import PAIRS_OF, load_train_config
 from pipeline.objective.paper.loop import loop_loss, loop_transform
 from pipeline.store.partitions import Partition
-from pipeline.store.tables import read_rows, write_partition
+from pipeline.store.tables import write_partition
+from pipeline.store.views import frames_of
 from schemas.calibrations import PAIRS
-from schemas.frames import FRAMES, Frame
 from schemas.training import TRAINING
 from tests.makers.simulated_days import simulated_day
 
@@ -43,7 +43,7 @@ view_deg = 0.0
 def day(tmp_path_factory):
     """Three frames with their rows of table training, all of side train."""
     day = simulated_day(tmp_path_factory.mktemp("day"), frames=3)
-    frames = {f.frame_index: f for f in read_rows(day.lake, FRAMES, day.partition, Frame)}
+    frames = {f.frame_index: f for f in list(frames_of(day.lake, day.partition))}
     prior = read_prior(day.observations, day.fleet, "vehicle-1")
     about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
     rows = [make_row(frames[o.frame_index], o, prior, about, day.fleet.prepare) for o in day.observations]

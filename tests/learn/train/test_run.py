@@ -26,8 +26,8 @@ from pipeline.learn.train.run_state import network_of_run
 from pipeline.learn.train.schedule import DivergedError, DivergenceGuard, cosine_rate
 from pipeline.learn.train.settings import TrainConfig, load_train_config
 from pipeline.store.partitions import Partition
-from pipeline.store.tables import read_rows, write_partition
-from schemas.frames import FRAMES, Frame
+from pipeline.store.tables import write_partition
+from pipeline.store.views import frames_of
 from schemas.training import TRAINING
 from tests.makers.simulated_days import simulated_day
 
@@ -48,7 +48,7 @@ def data(tmp_path_factory):
     """Table training of eight frames to train on, in four row groups, and two held out."""
     folder = tmp_path_factory.mktemp("data")
     day = simulated_day(folder, frames=10)
-    frames = {f.frame_index: f for f in read_rows(day.lake, FRAMES, day.partition, Frame)}
+    frames = {f.frame_index: f for f in list(frames_of(day.lake, day.partition))}
     prior = read_prior(day.observations, day.fleet, "vehicle-1")
     about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
     rows = [make_row(frames[o.frame_index], o, prior, about, day.fleet.prepare) for o in day.observations]

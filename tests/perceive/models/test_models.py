@@ -13,7 +13,9 @@ from pipeline.perceive.models.segmenter import Segmenter
 from pipeline.perceive.models.session import Fit, fit_image
 from pipeline.perceive.models.source import ModelSource
 from pipeline.rigs import OnnxSemantics
+from pipeline.store.views import observations_of
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.lakes import write_frames
 from tests.makers.onnx_models import save_constant, save_segmenter, write_manifest
 
 COLOURS = [[0.2, 0.2, 0.2], [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]]  # RGB of ADE20K wall, building, sky
@@ -308,9 +310,6 @@ def test_both_models_together_give_a_frames_semantics(tmp_path, made_frame):
 
 def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, made_frame):
     from pipeline.store.partitions import Lake, Partition
-    from pipeline.store.tables import read_rows, write_partition
-    from schemas.frames import FRAMES
-    from schemas.observations import OBSERVATIONS, Observation
     from tests.makers.stages import perceive_day
 
     segmenter(tmp_path)
@@ -322,19 +321,12 @@ def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, ma
         '[rigs.default.lidar]\npoints = "/p"\n[rigs.default.radar]\npoints = "/r"\n[vehicles.car-1]\n'
     )
     lake, day = Lake.at(tmp_path / "lake"), Partition("car-1", "2026-03-02")
-    with write_partition(lake, FRAMES, day, "frames-key", "test") as writer:
-        # The car logged no semantics: the models give them.
-        bare = {
-            "labels_png": None,
-            "detection_boxes_px": None,
-            "detection_classes": None,
-            "detection_scores": None,
-        }
-        writer.append([replace(made_frame(i), **bare) for i in range(2)])
-        writer.describe(kept={}, rejected={})
+    # The car logged no semantics: the models give them.
+    bare = dict.fromkeys(("labels_png", "detection_boxes_px", "detection_classes", "detection_scores"))
+    write_frames(lake, day, [replace(made_frame(i), **bare) for i in range(2)])
     first = perceive_day(day, load_fleet(toml), lake)
     assert (first.status, first.rows) == ("done", 2)
-    assert [o.road_user_classes for o in read_rows(lake, OBSERVATIONS, day, Observation)] == [
+    assert [o.road_user_classes for o in list(observations_of(lake, day))] == [
         ["car"],
         ["car"],
     ]
@@ -342,7 +334,7 @@ def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, ma
     detector(tmp_path, rows_of(BOXES[:1], [0], [0.9], [1.0]), "yolov5")
     again = perceive_day(day, load_fleet(toml), lake)
     assert again.status == "done"
-    assert [o.road_user_classes for o in read_rows(lake, OBSERVATIONS, day, Observation)] == [
+    assert [o.road_user_classes for o in list(observations_of(lake, day))] == [
         ["person"],
         ["person"],
     ]

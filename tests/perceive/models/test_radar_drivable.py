@@ -16,9 +16,9 @@ from pipeline.learn.perception.radar_drivable.samples import day_samples, scan_o
 from pipeline.learn.perception.radar_drivable.training import DrivableTraining, probabilities, train_drivable
 from pipeline.perceive.models.radar_drivable import RadarDrivable
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows, write_partition
-from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import observations_of
+from schemas.observations import Observation
+from tests.makers.lakes import write_frames
 from tests.makers.stages import perceive_day
 
 DAY = Partition("car-1", "2026-03-02")
@@ -40,14 +40,12 @@ MODEL = {"drivable": {"source": "onnx", "model": "radar_drivable.toml"}}
 def lake(tmp_path_factory, made_frame):
     """A lake with one drive of eight frames."""
     lake = Lake.at(tmp_path_factory.mktemp("drive") / "lake")
-    with write_partition(lake, FRAMES, DAY, "frames-key", "test") as writer:
-        writer.append([made_frame(i) for i in range(8)])
-        writer.describe(kept={}, rejected={})
+    write_frames(lake, DAY, [made_frame(i) for i in range(8)], "frames-key")
     return lake
 
 
 def rows(lake):
-    return read_rows(lake, OBSERVATIONS, DAY, Observation)
+    return list(observations_of(lake, DAY))
 
 
 def test_a_network_taught_by_a_days_lidar_tells_the_days_radar_where_the_road_is(lake, tmp_path):

@@ -14,10 +14,9 @@ from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
 from pipeline.shipped_models import shipped_manifest
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows, write_partition
-from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import observations_of
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.lakes import write_frames
 from tests.makers.onnx_models import write_manifest
 from tests.makers.range_scenes import DOWN, SIZE, UP, points_of
 from tests.makers.stages import perceive_day
@@ -175,15 +174,13 @@ def fleet(folder, semantics=""):
 
 def perceived(toml, lake):
     result = perceive_day(DAY, load_fleet(toml), lake)
-    return result, read_rows(lake, OBSERVATIONS, DAY, Observation)
+    return result, list(observations_of(lake, DAY))
 
 
 @pytest.fixture
 def lake(tmp_path, made_frame):
     lake = Lake.at(tmp_path / "lake")
-    with write_partition(lake, FRAMES, DAY, "frames-key", "test") as writer:
-        writer.append([made_frame(i) for i in range(3)])
-        writer.describe(kept={}, rejected={})
+    write_frames(lake, DAY, [made_frame(i) for i in range(3)], "frames-key")
     return lake
 
 
@@ -230,9 +227,7 @@ def test_a_sweep_without_intensity_and_with_bad_points_is_perceived_too(tmp_path
     lake, frame = Lake.at(tmp_path / "lake"), made_frame()
     x = frame.lidar_x_m.copy()
     x[::50] = np.nan
-    with write_partition(lake, FRAMES, DAY, "frames-key", "test") as writer:
-        writer.append([replace(frame, lidar_x_m=x, lidar_intensity=None)])
-        writer.describe(kept={}, rejected={})
+    write_frames(lake, DAY, [replace(frame, lidar_x_m=x, lidar_intensity=None)], "frames-key")
     manifest(tmp_path)
     result, rows = perceived(fleet(tmp_path, MODEL), lake)
     assert result.status == "done"

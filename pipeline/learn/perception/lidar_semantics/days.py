@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,10 +20,10 @@ from pipeline.learn.perception.lidar_semantics.samples import (
 )
 from pipeline.store.current import current_records, transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import iterate_rows, read_records, read_rows
+from pipeline.store.tables import read_records
+from pipeline.store.views import frames_of, observations_of, perceived_days
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.observations import Observation
 
 __all__ = ["SweepSamples", "labelled_sweeps"]
 
@@ -63,9 +63,9 @@ def labelled_sweeps(
         ContractError: fewer than two vehicle-days of vehicles in fleet.toml.
     """
     days = _days(fleet, lake)
-    layout = layout_of((next(_frames(lake, day.partition)) for day in days), *size)
+    layout = layout_of((next(frames_of(lake, day.partition)) for day in days), *size)
     parts = [
-        day_images(_frames(lake, d.partition), d.observations, d.T_camera_lidar, layout, frames_per_day)
+        day_images(frames_of(lake, d.partition), d.observations, d.T_camera_lidar, layout, frames_per_day)
         for d in days
     ]
     train, held_out = cut(
@@ -87,7 +87,7 @@ def _is_held_out(day: int) -> bool:
 
 def _days(fleet: FleetConfig, lake: Lake) -> Sequence[_Day]:
     """Each day by its accepted camera-lidar calibration where the lake has one, else by its prior."""
-    partitions = [p for p in lake.partitions(OBSERVATIONS.name) if fleet.knows(p.vehicle)]
+    partitions = [p for p in perceived_days(lake) if fleet.knows(p.vehicle)]
     if len(partitions) < 2:
         problem = (
             f"{len(partitions)} vehicle-days with observations of vehicles in fleet.toml: two are needed"
@@ -100,7 +100,7 @@ def _days(fleet: FleetConfig, lake: Lake) -> Sequence[_Day]:
     }
     days = []
     for partition in partitions:
-        rows = read_rows(lake, OBSERVATIONS, partition, Observation)
+        rows = list(observations_of(lake, partition))
         known = accepted.get((partition.vehicle, partition.day))
         if known is None:
             prior = read_prior(rows, fleet, partition.vehicle)
@@ -108,8 +108,3 @@ def _days(fleet: FleetConfig, lake: Lake) -> Sequence[_Day]:
         else:
             days.append(_Day(partition, rows, known, True))
     return days
-
-
-def _frames(lake: Lake, partition: Partition) -> Iterator[Frame]:
-    for group in iterate_rows(lake, FRAMES, partition, Frame):
-        yield from group

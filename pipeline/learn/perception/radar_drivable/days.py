@@ -9,8 +9,7 @@ from pipeline.errors import ContractError
 from pipeline.extrinsics.prior import read_prior
 from pipeline.learn.perception.radar_drivable.samples import DrivableSamples, day_samples, joined
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_rows
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.views import observations_of, perceived_days
 
 __all__ = ["drivable_samples", "samples_of_day"]
 
@@ -27,7 +26,7 @@ def drivable_samples(
     Raises:
         ContractError: no observations of a vehicle in fleet.toml.
     """
-    days = [p for p in lake.partitions(OBSERVATIONS.name) if fleet.knows(p.vehicle)]
+    days = [p for p in perceived_days(lake) if fleet.knows(p.vehicle)]
     if not days:
         problem = "no observations of a vehicle in fleet.toml: run `boresight perceive`"
         raise ContractError(str(lake.root), problem)
@@ -46,5 +45,5 @@ def drivable_samples(
 
 def samples_of_day(fleet: FleetConfig, lake: Lake, day: Partition, frames_per_day: int) -> DrivableSamples:
     """At most `frames_per_day` samples of a vehicle-day, evenly spread, labelled through its prior."""
-    rows = read_rows(lake, OBSERVATIONS, day, Observation)
+    rows = list(observations_of(lake, day))
     return day_samples(rows, read_prior(rows, fleet, day.vehicle).T_lidar_radar, frames_per_day)
