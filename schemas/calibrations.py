@@ -1,4 +1,4 @@
-"""Table `calibrations`: the record of what one method found on one vehicle-day, one row per pair. Append-only."""
+"""Table `calibrations`: the record of what one method found on one vehicle-day, one row per edge. Append-only."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class CalibrationRecord(Recorded):
     vehicle: str = column("vehicle id")
     day: str = column("YYYY-MM-DD")
     method: str = column("one of METHODS")
-    pair: str = column("camera_lidar, camera_radar or lidar_radar")
-    parent_frame: str = column("a of T_a_b")
-    child_frame: str = column("b of T_a_b")
+    pair: str = column("kind of the edge: kinds of its two sensors, as camera_lidar")
+    parent_frame: str = column("a of T_a_b: name of a sensor, or base")
+    child_frame: str = column("b of T_a_b: name of a sensor, or base")
     qw: float | None = column(_POSE, default=None)
     qx: float | None = column(_POSE, default=None)
     qy: float | None = column(_POSE, default=None)
@@ -184,6 +184,15 @@ class CalibrationRecord(Recorded):
         ),
         default=None,
     )
+    innovation_sigmas: float | None = column(
+        "how far the edge's own estimate lies from what the rig's other edges say; null where no other way joins its "
+        "sensors, and in rows before version 5",
+        default=None,
+    )
+    believed: bool | None = column(
+        "whether the adjustment of the whole rig rests on this edge too; null in rows before version 5",
+        default=None,
+    )
     environment: str = column("highway, urban, mixed or unknown", default="unknown")
     time_offset_s: float | None = column(
         "dt: stamp_parent = stamp_child + dt; null where not estimated", default=None
@@ -211,9 +220,9 @@ class CalibrationRecord(Recorded):
 CALIBRATIONS = table_of(
     CalibrationRecord,
     "calibrations",
-    4,
-    "One row per pair and method. boresight show calibrations --json prints these names plus T, 4x4 row-major.",
+    5,
+    "One row per edge and method. boresight show calibrations --json prints these names plus T, 4x4 row-major.",
     made_by="calibrate",
-    reads_versions=(1, 2, 3),
-    about=("vehicle", "day", "trio", "method", "pair"),
+    reads_versions=(1, 2, 3, 4),
+    about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame"),
 )

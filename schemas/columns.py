@@ -9,18 +9,16 @@ engine can decode them: `numpy.frombuffer(blob, dtype).reshape(shape)`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
 from types import UnionType
 from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
 
 import pyarrow as pa
 
-__all__ = ["DEFAULT_TRIO", "Column", "Recorded", "TableSchema", "array", "column", "row", "table_of"]
+__all__ = ["Column", "Recorded", "TableSchema", "array", "column", "row", "table_of"]
 
 Row = TypeVar("Row")
-
-DEFAULT_TRIO = "default"  # a rig with one camera, one lidar and one radar has one trio of this name
 
 ScalarKind = Literal["int64", "int32", "float64", "string", "bool", "binary", "list<string>", "list<float64>",
                      "list<bool>", "map<string,float64>", "map<string,int64>"]  # fmt: skip
@@ -110,6 +108,8 @@ class TableSchema:
     # Of a record table: the columns that say what a row is about. Of all rows about the same, the one that was asserted
     # last is current; work_key tells them apart. Empty: a table of partitions that are replaced as a whole.
     about: tuple[str, ...] = ()
+    # Of a column that older releases did not write: the column that it follows from, and its value by that one's.
+    follows: Mapping[str, tuple[str, Mapping[str, str]]] = field(default_factory=dict)
 
     @property
     def is_record_table(self) -> bool:
@@ -168,9 +168,6 @@ def row(*, eq: bool = False) -> Callable[[type[Row]], type[Row]]:
 class Recorded:
     """Columns of every record table, its last ones: whose, by which work, and since when it counts."""
 
-    trio: str = column(
-        "camera, lidar and radar of the rig that see the same; default where it has one", default=DEFAULT_TRIO
-    )
     work_key: str = column("hash of code version, config, inputs", default="")
     recorded_at: str = column("UTC, ISO 8601 with microseconds: when the row was written", default="")
     asserted_at: str = column(
@@ -188,12 +185,13 @@ def table_of(
     made_by: str = "",
     reads_versions: tuple[int, ...] = (),
     about: tuple[str, ...] = (),
+    follows: Mapping[str, tuple[str, Mapping[str, str]]] | None = None,
 ) -> TableSchema:
     """The table whose rows are `of`: a column for each field, in their order, those of every record last."""
     last = {f.name for f in fields(Recorded)} if issubclass(of, Recorded) else set[str]()
     types = get_type_hints(of)
     columns = [_column(f, types[f.name]) for f in sorted(fields(of), key=lambda f: f.name in last)]
-    return TableSchema(name, version, tuple(columns), doc, made_by, reads_versions, about)
+    return TableSchema(name, version, tuple(columns), doc, made_by, reads_versions, about, follows or {})
 
 
 def _column(of: Field[Any], kind: Any) -> Column:

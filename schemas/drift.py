@@ -1,4 +1,4 @@
-"""Table `drift`: what the control charts say of each vehicle, pair and DoF. Append-only, a row per chart and audit.
+"""Table `drift`: what the control charts say of each vehicle, edge and DoF. Append-only, a row per chart and audit.
 
 The verdict on the vehicle as a whole stands in every one of its rows (`vehicle_*`), as the audit decided it; whoever
 shows it reads it from there and decides nothing anew.
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from shlex import quote
 
+from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.columns import Recorded, column, row, table_of
 
 __all__ = ["DRIFT", "DRIFT_STATUSES", "DriftFinding", "VehicleStatus", "next_step", "status_of"]
@@ -25,7 +26,9 @@ class DriftFinding(Recorded):
     vehicle: str = column("vehicle id")
     day: str = column("last day of the audited window, YYYY-MM-DD")
     method: str = column("method of the audited records")
-    pair: str = column("camera_lidar, camera_radar or lidar_radar")
+    pair: str = column("kind of the edge: kinds of its two sensors, as camera_lidar")
+    parent_frame: str = column("the edge's parent: name of a sensor, or base")
+    child_frame: str = column("the edge's child: name of a sensor, or base")
     dof: str = column("rx, ry, rz, tx, ty, tz in parent axes")
     status: str = column(
         "of this chart: GREEN, YELLOW (a change below the limit that matters, or not yet sure), RED, UNKNOWN "
@@ -41,12 +44,12 @@ class DriftFinding(Recorded):
     kind: str | None = column("'step' or 'slow drift'", default=None)
     magnitude: float | None = column("size of the change [rad or m]", default=None)
     magnitude_sigma: float | None = column("its sigma", default=None)
-    limit: float = column("size that matters for this pair and DoF [rad or m]")
+    limit: float = column("size that matters for this kind of edge and DoF [rad or m]")
     moved_sensor: str | None = column(
-        "camera, lidar or radar: the sensor that two shifted pairs share", default=None
+        "the sensor whose motion explains the shifts of all edges, by name", default=None
     )
     moved_probability: float | None = column(
-        "of moved_sensor against the other two, 0..1; null where nothing moved", default=None
+        "of moved_sensor against the others, 0..1; null where nothing moved", default=None
     )
     moved_motion: list[float] | None = column(
         "rotation vector [rad] and shift [m] of the moved sensor in its own axes", default=None
@@ -61,7 +64,7 @@ class DriftFinding(Recorded):
         default=None,
     )
     vehicle_sensor: str | None = column(
-        "camera, lidar or radar: the sensor that moved; null where none did or it is not clear which",
+        "name of the sensor that moved; null where none did or it is not clear which",
         default=None,
     )
     vehicle_since: str | None = column("first day after the vehicle's clearest change", default=None)
@@ -71,10 +74,14 @@ class DriftFinding(Recorded):
 DRIFT = table_of(
     DriftFinding,
     "drift",
-    2,
+    3,
     made_by="audit",
-    reads_versions=(1,),
-    about=("vehicle", "day", "trio", "method", "pair", "dof"),
+    reads_versions=(1, 2),
+    about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame", "dof"),
+    follows={
+        name: ("pair", {pair: frames[k] for pair, frames in FRAMES_OF_PAIR.items()})
+        for k, name in enumerate(("parent_frame", "child_frame"))
+    },
 )
 
 

@@ -13,7 +13,7 @@ class ServiceEvent(Recorded):
 
     vehicle: str = column("vehicle id")
     day: str = column("YYYY-MM-DD; its own records count neither to before nor to after")
-    sensor: str = column("camera, lidar, radar or all")
+    sensor: str = column("name of the sensor, or all")
     kind: str = column("re-mount, repair or software release")
     note: str = column("for people", default="")
     withdrawn: bool = column("it was noted by mistake: it counts no more", default=False)
@@ -22,9 +22,9 @@ class ServiceEvent(Recorded):
 SERVICE_EVENTS = table_of(
     ServiceEvent,
     "service_events",
-    2,
+    3,
     "Of events of one vehicle, day, sensor and kind, the last noted counts.",
     made_by="service",
-    reads_versions=(1,),
-    about=("vehicle", "day", "trio", "sensor", "kind"),
+    reads_versions=(1, 2),
+    about=("vehicle", "day", "sensor", "kind"),
 )

@@ -1,4 +1,4 @@
-"""Table `states`: what each vehicle should load tonight, per pair: its accepted days since the last change as one."""
+"""Table `states`: what each vehicle should load tonight, per edge: its accepted days since the last change as one."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class StateRow(Recorded):
     vehicle: str = column("vehicle id")
     day: str = column("last day of the audited window, YYYY-MM-DD")
     method: str = column("method of the records")
-    pair: str = column("camera_lidar, camera_radar or lidar_radar")
-    parent_frame: str = column("a of T_a_b")
-    child_frame: str = column("b of T_a_b")
+    pair: str = column("kind of the edge: kinds of its two sensors, as camera_lidar")
+    parent_frame: str = column("a of T_a_b: name of a sensor, or base")
+    child_frame: str = column("b of T_a_b: name of a sensor, or base")
     status: str = column("current (load it) or none (no accepted day since the last change)")
     reason: str = column("in words: since when, and what it does not rest on")
     qw: float | None = column(_POSE, default=None)
@@ -92,9 +92,9 @@ class StateRow(Recorded):
 STATES = table_of(
     StateRow,
     "states",
-    3,
+    4,
     "boresight state prints the latest rows.",
     made_by="state",
-    reads_versions=(1, 2),
-    about=("vehicle", "day", "trio", "method", "pair"),
+    reads_versions=(1, 2, 3),
+    about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame"),
 )

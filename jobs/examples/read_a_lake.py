@@ -23,7 +23,7 @@ from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import from_quaternion, transform_points
 
 LAKE, VEHICLE, PICTURES = sys.argv[1:4] if len(sys.argv) > 3 else ("demo/lake", "vehicle-2", "demo")
-PAIR, TRIO = "camera_lidar", "default"
+PAIR = "camera_lidar"
 Path(PICTURES).mkdir(parents=True, exist_ok=True)
 
 # %% [markdown]
@@ -34,7 +34,7 @@ Path(PICTURES).mkdir(parents=True, exist_ok=True)
 # %%
 records = (
     pl.scan_delta(f"{LAKE}/calibrations")
-    .filter(pl.col("vehicle") == VEHICLE, pl.col("trio") == TRIO, pl.col("method") == "joint")
+    .filter(pl.col("vehicle") == VEHICLE, pl.col("method") == "joint")
     .sort("asserted_at", "work_key")
     .unique(["day", "pair"], keep="last")
     .sort("day", "pair")

@@ -27,12 +27,16 @@ def state_rows(lake: Lake, states: Sequence[StateRow]) -> list[dict[str, Any]]:
             lake, CALIBRATIONS, CalibrationRecord, day=day, vehicle=among, columns=prior_columns
         )
         for record in current_records(rows):
-            priors[record.vehicle, record.method, record.pair, day] = prior_of(record)
+            priors[record.vehicle, record.method, record.parent_frame, record.child_frame, day] = prior_of(
+                record
+            )
     return [
         {c.name: getattr(s, c.name) for c in STATES.columns}
         | {
             "T": transform_of(s),
-            "T_prior": priors.get((s.vehicle, s.method, s.pair, s.days[-1] if s.days else "")),
+            "T_prior": priors.get(
+                (s.vehicle, s.method, s.parent_frame, s.child_frame, s.days[-1] if s.days else "")
+            ),
         }
         for s in states
     ]

@@ -15,7 +15,7 @@ from pipeline.audit.vehicle import VehicleVerdict, limit_of
 from pipeline.audit.verdicts import ChartVerdict
 from pipeline.config import AuditConfig
 from pipeline.extrinsics.attribution import Attribution
-from schemas.calibrations import DOF_NAMES, PAIRS, STATUSES
+from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, STATUSES
 from schemas.drift import DriftFinding
 
 __all__ = ["VehicleAudit", "vehicle_findings"]
@@ -63,7 +63,8 @@ def vehicle_findings(
             if before is not None:
                 chart = _begun_before(chart, before.get((pair, dof)))
             base = DriftFinding(
-                vehicle=audit.vehicle, day=audit.day, method=audit.method, pair=pair, dof=dof,
+                vehicle=audit.vehicle, day=audit.day, method=audit.method, pair=pair,
+                parent_frame=FRAMES_OF_PAIR[pair][0], child_frame=FRAMES_OF_PAIR[pair][1], dof=dof,
                 status=chart.status, reason=chart.reason, days_used=chart.days_used,
                 limit=limit_of(pair, dof, config), work_key=audit.work_key, statistic=chart.statistic,
                 threshold=chart.threshold, inputs=audit.inputs,

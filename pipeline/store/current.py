@@ -1,4 +1,4 @@
-"""The current record of each vehicle, day, method and pair, and the transforms that records carry."""
+"""The current record of each vehicle, day, method and edge, and the transforms that records carry."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _Said = TypeVar("_Said", DriftFinding, StateRow)
 
 
 def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRecord]:
-    """The current record of each (vehicle, day, trio, method, pair), in this order.
+    """The current record of each (vehicle, day, method, edge), in this order.
 
     Args:
         records: as `read_records` returns them, the last asserted last.
     """
-    last = {(r.vehicle, r.day, r.trio, r.method, r.pair): r for r in records}
+    last = {(r.vehicle, r.day, r.method, r.pair, r.parent_frame, r.child_frame): r for r in records}
     return [last[key] for key in sorted(last)]
 
 
@@ -76,7 +76,7 @@ def current_drift(findings: Sequence[DriftFinding]) -> list[DriftFinding]:
     Args:
         findings: as `read_records` returns them.
     """
-    return sorted(_asserted_last(findings), key=lambda f: (f.vehicle, f.method, f.trio, f.pair, f.dof))
+    return sorted(_asserted_last(findings), key=lambda f: (f.vehicle, f.method, *_edge(f), f.dof))
 
 
 def current_states(states: Sequence[StateRow]) -> list[StateRow]:
@@ -85,7 +85,11 @@ def current_states(states: Sequence[StateRow]) -> list[StateRow]:
     Args:
         states: as `read_records` returns them.
     """
-    return sorted(_asserted_last(states), key=lambda s: (s.vehicle, s.method, s.trio, s.pair))
+    return sorted(_asserted_last(states), key=lambda s: (s.vehicle, s.method, *_edge(s)))
+
+
+def _edge(row: DriftFinding | StateRow) -> tuple[str, str, str]:
+    return row.pair, row.parent_frame, row.child_frame
 
 
 def _asserted_last(rows: Sequence[_Said]) -> list[_Said]:
@@ -103,7 +107,7 @@ def current_events(events: Sequence[ServiceEvent]) -> list[ServiceEvent]:
     Args:
         events: as `read_records` returns them, the last asserted last.
     """
-    noted = {(e.vehicle, e.day, e.trio, e.sensor, e.kind): e for e in events}
+    noted = {(e.vehicle, e.day, e.sensor, e.kind): e for e in events}
     return [event for event in noted.values() if not event.withdrawn]
 
 

@@ -23,6 +23,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from pipeline.errors import ContractError, DamagedLogError
 from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake
+from pipeline.store.rows import with_what_follows
 from schemas.columns import TableSchema
 
 __all__ = [
@@ -55,6 +56,8 @@ _KEEP_HOURS = 7 * 24
 # Every writer that comes in between costs one more try; none comes in forty times while others wait for seconds.
 _TRIES = 40
 _PAUSE_S = 0.05
+# Columns that are no more: a table of an older release asks every row for them, and gets what that release wrote.
+_RETIRED = {"trio": "default"}
 DAMAGED = "_damaged"  # a name with an underscore: Delta's own tools leave it alone
 LOG = "_delta_log"
 
@@ -171,7 +174,8 @@ def read_file(
         wanted: row groups without such rows are left out; rows beside them in the others are not.
     """
     path, mapped = lake.record_file(schema.name, name), _mapped(columns)
-    whole = [c for c in columns if "." not in c]
+    asked = [c for c in columns if "." not in c]
+    whole = [*asked, *(schema.follows[c][0] for c in asked if c in schema.follows)]
     # Keys of maps are the same in every row: as places in a dictionary they are a fifth of the memory and time.
     coded = [f"{c}.key_value.key" for c in mapped if c not in whole]
     try:
@@ -196,7 +200,7 @@ def read_file(
         for key in keys:
             maps = table[column] if column in table.column_names else None
             found = found.append_column(f"{column}.{key}", _values_of(maps, key, table.num_rows))
-    return found
+    return with_what_follows(found, schema, asked)
 
 
 def _mapped(columns: Sequence[str]) -> dict[str, list[str]]:
@@ -290,8 +294,15 @@ def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bo
     days, months = (sorted(set(rows.column(n).to_pylist())) for n in ("day", _MONTH))
     # Literals, so that only files of these days are looked at; days and months are digits and hyphens.
     window = f"t.day >= '{days[0]}' and t.day <= '{days[-1]}' and t.{_MONTH} in ({_quoted(months)})"
-    same = " and ".join(f"t.{c} = s.{c}" for c in (*schema.about, "work_key"))
+    same = " and ".join(_same(c, schema) for c in (*schema.about, "work_key"))
     known = {f.name for f in table.schema().fields}
+    later = [f.with_nullable(True) for f in stored_schema(schema) if f.name in set(schema.about) - known]
+    if later:  # a merge looks at them before it would add them
+        table.alter.add_columns(Schema.from_arrow(pa.schema(later)).fields)
+    for name in _RETIRED.keys() & known - set(rows.column_names):
+        rows = rows.append_column(name, pa.array([_RETIRED[name]] * rows.num_rows, pa.string()))
+    # The words of an older release about a column stay: two that differ cannot be merged.
+    rows = rows.cast(pa.schema([f.remove_metadata() if f.name in known else f for f in rows.schema]))
     if table.metadata().configuration.get(_VERSION) != str(schema.version):
         table.alter.set_table_properties({_VERSION: str(schema.version)}, raise_if_not_exists=False)
     merging = table.merge(
@@ -303,6 +314,12 @@ def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bo
         writer_properties=_WRITER,
     ).when_matched_update({"asserted_at": "s.asserted_at"}, predicate="s.asserted_at > t.asserted_at")
     (merging.when_not_matched_insert_all() if insert else merging).execute()
+
+
+def _same(column: str, schema: TableSchema) -> str:
+    """That two rows are about the same; null of an older release's row is what follows from another column."""
+    same = f"t.{column} = s.{column}"
+    return f"({same} or t.{column} is null)" if column in schema.follows else same
 
 
 def _quoted(values: Sequence[str]) -> str:

@@ -17,7 +17,7 @@ from pipeline.errors import ContractError
 from pipeline.results import Progress
 from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records
-from pipeline.store.rows import from_table
+from pipeline.store.rows import from_table, with_what_follows
 from schemas.columns import TableSchema
 
 __all__ = ["Migrated", "migrate_table"]
@@ -72,7 +72,8 @@ def _read(
         try:
             with pq.ParquetFile(path) as file:
                 _check(path, file.metadata.metadata or {}, schema)
-                rows = from_table(file.read(), schema, row_type)
+                whole = with_what_follows(file.read(), schema, list(schema.follows))
+                rows = from_table(whole, schema, row_type)
         except (pa.ArrowException, EOFError) as err:
             aside = folder / "_damaged" / "_".join(path.parts[-3:])
             done.damaged.append(f"{aside}: {str(err).splitlines()[0]}")

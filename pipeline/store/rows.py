@@ -8,11 +8,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from pipeline.errors import ContractError
 from schemas.columns import Column, TableSchema
 
-__all__ = ["from_table", "to_table"]
+__all__ = ["from_table", "to_table", "with_what_follows"]
 
 Row = TypeVar("Row")
 
@@ -50,6 +51,19 @@ def from_table(table: pa.Table, schema: TableSchema, row_type: type[Row]) -> lis
         if c.name in known and c.name not in absent
     }
     return [row_type(**{name: values[name][i] for name in values}) for i in range(table.num_rows)]
+
+
+def with_what_follows(found: pa.Table, schema: TableSchema, asked: Sequence[str]) -> pa.Table:
+    """The table with asked columns of rows that a release wrote before there were such columns."""
+    for column, (source, values) in schema.follows.items():
+        if column in asked and source in found.column_names:
+            place = pc.index_in(found[source], pa.array(values.keys(), pa.string()))
+            made = pa.array(values.values(), pa.string()).take(place.combine_chunks())
+            if column in found.column_names:
+                made = pc.coalesce(found[column], made)
+                found = found.drop_columns(column)
+            found = found.append_column(column, made)
+    return found
 
 
 def _filled(values: list[Any], column: Column, field: Field[Any]) -> list[Any]:

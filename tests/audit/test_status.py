@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from pipeline.audit.status import decide_status
-from schemas.calibrations import DOF_NAMES, PAIRS
+from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS
 from schemas.drift import DriftFinding, status_of
 
 WATCHED = {("camera_lidar", "rx"), ("camera_lidar", "ry"), ("lidar_radar", "rz")}
@@ -22,6 +22,8 @@ def charts(**changes):
                 day="2026-03-09",
                 method="joint",
                 pair=pair,
+                parent_frame=FRAMES_OF_PAIR[pair][0],
+                child_frame=FRAMES_OF_PAIR[pair][1],
                 dof=dof,
                 status=status,
                 reason="no change",

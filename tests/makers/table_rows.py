@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from schemas.calibrations import CALIBRATIONS, SENSORS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, SENSORS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
@@ -27,6 +27,10 @@ def make_row(table, rng, *, nulls=False, free=5, **values):
     """A row of `table` whose fields are random values of the right kind, or null where that is allowed."""
     schema, row_type = ROW_TYPES[table]
     values = {"sensors": list(SENSORS)} | values if "sensors" in [c.name for c in schema.columns] else values
+    if values.get("pair") in FRAMES_OF_PAIR:
+        values = (
+            dict(zip(("parent_frame", "child_frame"), FRAMES_OF_PAIR[values["pair"]], strict=True)) | values
+        )
     filled = {c.name: None if nulls and c.nullable else make_value(c, rng, free) for c in schema.columns}
     return row_type(**filled | values)
 

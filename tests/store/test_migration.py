@@ -18,7 +18,7 @@ from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from tests.makers.table_rows import make_row, same
 
-NEW = {"trio", "recorded_at", "asserted_at"}
+NEW = {"recorded_at", "asserted_at"}
 
 
 def write_old(lake, schema, rows, key, second):
@@ -45,7 +45,7 @@ def write_old(lake, schema, rows, key, second):
 def old(tmp_path):
     """Three vehicle-days, one calibrated by A, then B, then A again (its file written anew); and one audit."""
     lake, rng = Lake.at(tmp_path / "lake"), np.random.default_rng(0)
-    common = {"method": "joint", "trio": "default", "recorded_at": "", "asserted_at": ""}
+    common = {"method": "joint", "recorded_at": "", "asserted_at": ""}
     for vehicle, day, key, second in (
         ("car", "2026-03-02", "B", 20),
         ("car", "2026-03-02", "A", 30),
@@ -86,7 +86,6 @@ def test_one_command_moves_every_record_and_keeps_what_was_current(old, capsys):
         ("bus 7", "2026-03-02"): "A3", ("car", "2026-03-02"): "A", ("car", "2026-04-01"): "A2",
     }  # fmt: skip
     assert current["car", "2026-04-01"].recorded_at == "2023-11-14T22:13:30.000000Z"
-    assert current["car", "2026-04-01"].trio == "default"
     assert len(read_records(old, DRIFT, DriftFinding)) == 1
     assert not list(old.root.glob("*/vehicle=*"))
     assert migrate(lake=str(old)) == 0

@@ -57,7 +57,7 @@ def rng():
 
 
 def record(rng, key, vehicle="car", day="2026-03-02", pair=PAIRS[0]):
-    values = {"recorded_at": "", "asserted_at": "", "method": "joint", "trio": "default"}
+    values = {"recorded_at": "", "asserted_at": "", "method": "joint"}
     return make_row("calibrations", rng, vehicle=vehicle, day=day, pair=pair, work_key=key, **values)
 
 

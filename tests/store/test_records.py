@@ -50,7 +50,7 @@ def rng():
 
 
 def record(rng, key, vehicle="car", day="2026-03-02", pair=PAIRS[0], **values):
-    values = {"recorded_at": "", "asserted_at": "", "method": "joint", "trio": "default"} | values
+    values = {"recorded_at": "", "asserted_at": "", "method": "joint"} | values
     return make_row("calibrations", rng, vehicle=vehicle, day=day, pair=pair, work_key=key, **values)
 
 
@@ -132,9 +132,10 @@ def test_a_clock_that_was_in_the_future_does_not_keep_its_record_current(lake, r
     assert [r.work_key for r in current_records(read(lake))] == ["B"]
 
 
-def test_a_trio_of_its_own_has_a_current_record_of_its_own(lake, rng):
-    commit_records(lake, CALIBRATIONS, [record(rng, "A"), record(rng, "A", trio="rear")])
-    assert [r.trio for r in current_records(read(lake))] == ["default", "rear"]
+def test_an_edge_of_its_own_has_a_current_record_of_its_own(lake, rng):
+    rear = record(rng, "A", parent_frame="rear", child_frame="top")
+    commit_records(lake, CALIBRATIONS, [record(rng, "A"), rear])
+    assert [r.parent_frame for r in current_records(read(lake))] == ["camera", "rear"]
 
 
 def test_a_reader_gets_the_window_the_vehicle_and_the_columns_that_it_asks_for(lake, rng, monkeypatch):
@@ -255,7 +256,9 @@ def test_records_of_a_release_that_knew_fewer_columns_stay_readable_and_more_can
     assert (new.score, new.drive_missing) == (0.5, ["a"])
     np.testing.assert_array_equal(old.covariance, found.covariance)
     assert new.common_covariance.shape == (6, 6)
-    with pytest.raises(ContractError, match=r"holds calibrations/4, this version reads calibrations/2"):
+    with pytest.raises(
+        ContractError, match=rf"holds calibrations/{CALIBRATIONS.version}, this version reads calibrations/2"
+    ):
         read_records(lake, replace(fewer, reads_versions=()), CalibrationRecord)
 
 

@@ -45,7 +45,7 @@ def lake(request, tmp_path, monkeypatch):
 
 
 def row_of(rng, day, key):
-    values = {"recorded_at": "", "asserted_at": "", "method": "joint", "trio": "default", "pair": PAIRS[0]}
+    values = {"recorded_at": "", "asserted_at": "", "method": "joint", "pair": PAIRS[0]}
     return make_row("calibrations", rng, vehicle="car", day=day, work_key=key, **values)
 
 

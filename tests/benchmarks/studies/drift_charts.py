@@ -27,7 +27,7 @@ from pipeline.audit.status import decide_status
 from pipeline.audit.vehicle import VehicleVerdict, judge_fleet, limit_of
 from pipeline.config import AuditConfig
 from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse
-from schemas.calibrations import PAIRS
+from schemas.calibrations import FRAMES_OF_PAIR, PAIRS
 from schemas.drift import DriftFinding, VehicleStatus
 from tests.benchmarks.studies.commits import commit_now
 
@@ -217,7 +217,8 @@ def status_of_night(verdict: VehicleVerdict, config: AuditConfig) -> VehicleStat
         change, moved = chart.change, verdict.attribution
         rows.append(
             DriftFinding(
-                vehicle="v", day="", method="joint", pair=pair, dof=dof, status=chart.status,
+                vehicle="v", day="", method="joint", pair=pair, parent_frame=FRAMES_OF_PAIR[pair][0],
+                child_frame=FRAMES_OF_PAIR[pair][1], dof=dof, status=chart.status,
                 reason=chart.reason, days_used=chart.days_used, limit=limit_of(pair, dof, config),
                 statistic=chart.statistic, threshold=chart.threshold,
                 start_day=None if change is None else str(change.day),
