@@ -96,6 +96,12 @@ class Observation:
     lidar_map_cluster: np.ndarray = array(
         "<i4", ("N",), "DBSCAN object cluster of each point, -1 = none, for lidar_map_xyz_m"
     )
+    lidar_map_time_s: np.ndarray | None = array(
+        "<f4",
+        ("N",),
+        "when each point was measured, against stamp_ns, for lidar_map_xyz_m; null where not de-skewed here",
+        default=None,
+    )
     lidar_cluster_centre_m: np.ndarray = array(
         "<f4", ("N", 3), "centre (of the cluster's points) of each object cluster"
     )
@@ -155,8 +161,9 @@ class Observation:
 OBSERVATIONS = table_of(
     Observation,
     "observations",
-    2,
+    3,
     "Perception of one frame per row; points stay in the frame of the sensor that saw them.",
     made_by="perceive",
-    reads_versions=(1,),  # which knew no label_gradients, and saw with all three sensors
+    # 1 knew no label_gradients, and saw with all three sensors; 2 knew no times of points.
+    reads_versions=(1, 2),
 )

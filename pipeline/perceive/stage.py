@@ -224,6 +224,7 @@ class _Sweep:
     xyz_m: np.ndarray
     intensity: np.ndarray | None
     ring: np.ndarray | None
+    time_s: np.ndarray | None
 
 
 def _source(
@@ -298,6 +299,7 @@ def _perceive_lidar(
         "lidar_map_xyz_m": xyz[sample],
         "lidar_map_is_ground": ground.is_ground[sample].astype(np.uint8),
         "lidar_map_cluster": cluster[sample],
+        "lidar_map_time_s": None if sweep.time_s is None else sweep.time_s[sample],
         "lidar_cluster_centre_m": boxes.centre_m,
         "lidar_cluster_min_m": boxes.min_m,
         "lidar_cluster_max_m": boxes.max_m,
@@ -398,10 +400,12 @@ def _track_columns(tracks: Tracks) -> dict[str, np.ndarray]:
 def _finite_sweep(frame: Frame) -> _Sweep:
     xyz = frame.lidar_xyz_m
     finite = np.isfinite(xyz).all(axis=1)
+    # Of points as logged, nobody can tell whether the driver de-skewed them.
+    times = frame.lidar_time_s if frame.lidar_deskewed else None
+    columns = (frame.lidar_intensity, frame.lidar_ring, times)
     if finite.all():
-        return _Sweep(xyz, frame.lidar_intensity, frame.lidar_ring)
-    intensity = None if frame.lidar_intensity is None else frame.lidar_intensity[finite]
-    return _Sweep(xyz[finite], intensity, None if frame.lidar_ring is None else frame.lidar_ring[finite])
+        return _Sweep(xyz, *columns)
+    return _Sweep(xyz[finite], *(None if column is None else column[finite] for column in columns))
 
 
 def _ego_speed(frame: Frame, motion: RadarMotion) -> float | None:

@@ -143,6 +143,19 @@ def test_points_that_are_not_numbers_are_left_out(lake, made_frame):
     assert np.isfinite(rows(lake)[0].lidar_map_xyz_m).all()
 
 
+def test_points_of_a_deskewed_sweep_keep_their_times_and_those_as_logged_do_not(lake, made_frame):
+    frame = made_frame(0)
+    times = (frame.lidar_x_m * 1e-3).astype(np.float32)  # so that a point tells its own
+    frames = [replace(made_frame(i), lidar_time_s=times, lidar_deskewed=i == 0) for i in range(2)]
+    write(
+        lake, [replace(f, radar_range_rate_mps=f.radar_range_rate_mps * np.nan) for f in frames], key="timed"
+    )
+    perceive_day(DAY, fleet(), lake)
+    kept, as_logged = rows(lake)
+    assert np.array_equal(kept.lidar_map_time_s, (kept.lidar_map_xyz_m[:, 0] * 1e-3).astype(np.float32))
+    assert as_logged.lidar_map_time_s is None
+
+
 def test_sweeps_without_rows_are_counted_and_still_show_edges(lake, made_frame):
     lasers = np.random.default_rng(0).integers(0, 6, len(made_frame(0).lidar_x_m)).astype(np.uint16)
     frames = [
