@@ -13,7 +13,6 @@ from pipeline.objective.camera_lidar.score import Alignments, prepare_terms
 from pipeline.objective.differentiable.edges import edge_residuals_px
 from pipeline.objective.differentiable.lookup import bilinear
 from pipeline.objective.differentiable.paper import (
-    camera_lidar_tensors,
     camera_radar_tensors,
     folded_tensors,
     lidar_radar_tensors,
@@ -31,7 +30,6 @@ from pipeline.objective.differentiable.projection import GridProjection, camera_
 from pipeline.objective.paper import loop
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
-from pipeline.objective.paper.classes import camera_at_label_size, labels_of
 from pipeline.objective.paper.cost_maps import fold_frames, frame_costs
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
 from pipeline.store.partitions import Lake, Partition
@@ -114,11 +112,10 @@ def assert_close(ours, kernel, relative=1e-3):
 
 
 def check_paper_losses(rows, truth):
-    cameras = [camera_at_label_size(o, labels_of(o)) for o in rows]
     T = {pair: near(truth[pair], 4, seed) for seed, pair in enumerate(PAIRS)}
 
     loss = camera_lidar_loss(rows, truth["camera_lidar"], MARGIN_RAD)
-    ours = camera_lidar_tensors(loss, cameras, torch.float64)
+    ours = folded_tensors(loss.frames, torch.float64)
     value, gradient = value_and_gradient(ours.frame_losses, T["camera_lidar"])
     assert_close(value, loss.frame_losses(T["camera_lidar"]))
     assert_slope(ours.frame_losses, T["camera_lidar"], gradient)
@@ -168,7 +165,7 @@ def check_edges(rows, truth):
 def test_folded_maps_agree_with_the_kernel_for_every_camera_model(name):
     camera = CAMERAS[name]
     frames = fold_frames([cloud(1), cloud(2, 700)], [smooth_cost(3), smooth_cost(4)], [camera] * 2, PENALTY)
-    ours = folded_tensors(frames, [camera] * 2, torch.float64)
+    ours = folded_tensors(frames, torch.float64)
     T = poses(4, 3, 0.01, 0.1)
     value, gradient = value_and_gradient(ours.frame_losses, T)
     assert_close(value, frame_costs(frames, T) / frames.counts)

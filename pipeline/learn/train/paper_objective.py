@@ -10,11 +10,11 @@ Source: paper, sections 4.3 (pairs), 4.4 (loop) and "Loss function" (L = L_P + L
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.config import SolveConfig
@@ -24,11 +24,8 @@ from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.concat_network import ConcatCore
 from pipeline.learn.sample.layout import LIDAR_FEATURES, RADAR_FEATURES
 from pipeline.objective.differentiable.paper import (
-    CameraRadarTensors,
-    FoldedTensors,
-    LidarRadarTensors,
-    camera_lidar_tensors,
     camera_radar_tensors,
+    folded_tensors,
     lidar_radar_tensors,
 )
 from pipeline.objective.differentiable.poses import loop_loss
@@ -39,46 +36,21 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import Observation
 
-__all__ = ["PaperFrame", "PaperFrames", "paper_frame", "with_paper_inputs"]
+__all__ = ["PairLoss", "PaperFrames", "paper_frame", "with_paper_inputs"]
 
-_KEPT = (
-    4000  # frames: 2 GB; beyond, the day that was asked for longest ago is prepared anew when it is asked for
-)
+_KEPT = 4000  # frames: 2 GB; beyond, the day that was asked for longest ago is dropped
 # What perception adds to the paper's inputs: a point's range, brightness and velocity stay.
 _DERIVED = {"lidar": ("height", "edge", "ground"), "radar": ("moving",)}
 _RENDERED = 2  # channels before the features: occupied, nearness
 
 
-@dataclass(frozen=True, eq=False)
-class _Folded:
-    """Folded frames of one frame with their map as bytes: a quarter of the memory."""
+@runtime_checkable
+class PairLoss(Protocol):
+    """One pair's loss, ready for any pose."""
 
-    tensors: FoldedTensors  # its maps are empty
-    bytes_: UInt8[Tensor, "1 H W"]
-    step: float
-
-    def unfolded(self) -> FoldedTensors:
-        """The tensors with their map."""
-        return replace(self.tensors, maps=self.bytes_.to(self.tensors.points.dtype) * self.step)
-
-
-@dataclass(frozen=True, eq=False)
-class PaperFrame:
-    """The three pairwise losses of one frame, ready for any pose."""
-
-    camera_lidar: _Folded
-    camera_radar: CameraRadarTensors  # its detections' maps are empty
-    detections: _Folded
-    lidar_radar: LidarRadarTensors
-
-    def loss(self, pair: str, T: Float[Tensor, "1 4 4"]) -> Float[Tensor, ""]:
-        """One pair's loss at a pose."""
-        if pair == "camera_lidar":
-            return self.camera_lidar.unfolded().frame_losses(T)[0]
-        if pair == "camera_radar":
-            whole = replace(self.camera_radar, detections=self.detections.unfolded())
-            return whole.frame_losses(T)[0]
-        return self.lidar_radar.frame_losses(T)[0]
+    def frame_losses(self, T: Float[Tensor, "F 4 4"]) -> Float[Tensor, " F"]:
+        """Of each frame."""
+        ...
 
 
 class PaperFrames:
@@ -87,7 +59,7 @@ class PaperFrames:
     def __init__(self, lake: Lake) -> None:
         """Frames of a lake that has observations beside its table `training`."""
         self._lake = lake
-        self._days: OrderedDict[Partition, dict[int, PaperFrame]] = OrderedDict()
+        self._days: OrderedDict[Partition, dict[int, dict[str, PairLoss]]] = OrderedDict()
 
     def terms(
         self,
@@ -107,13 +79,13 @@ class PaperFrames:
         found = {}
         for pair, T in poses.items():
             if pair in pairs:  # frames are kept by the processor, whatever the network's device
-                losses = [f.loss(pair, T[i : i + 1].cpu()) for i, f in enumerate(frames)]
+                losses = [f[pair].frame_losses(T[i : i + 1].cpu())[0] for i, f in enumerate(frames)]
                 found[pair] = torch.stack(losses).to(T.device)
         if "joint" in pairs:
             found["loop"] = loop_loss(T_camera_lidar, T_lidar_radar, T_camera_radar)
         return found
 
-    def _frame(self, batch: TrainingBatch, row: int) -> PaperFrame:
+    def _frame(self, batch: TrainingBatch, row: int) -> dict[str, PairLoss]:
         partition = Partition(batch.vehicle[row], batch.day[row])
         if partition not in self._days:
             T_camera_lidar = batch.T_camera_lidar[row].double().cpu().numpy()
@@ -136,19 +108,14 @@ def paper_frame(
     observation: Observation,
     T_camera_lidar: Float[np.ndarray, "4 4"],
     T_camera_radar: Float[np.ndarray, "4 4"],
-    dtype: torch.dtype = torch.float32,
-) -> PaperFrame:
-    """Prepare one frame; the poses (the day's prior) only say which points are asked to lie in view, as there."""
+) -> dict[str, PairLoss]:
+    """The losses of one frame by pair; the poses (the day's prior) only say which points are asked to lie in view."""
     margin = np.radians(SolveConfig().search_rotation_deg)
-    lidar = camera_lidar_loss([observation], T_camera_lidar, margin)
-    radar = camera_radar_loss([observation], T_camera_radar, margin)
-    tensors = camera_radar_tensors(radar, dtype)
-    return PaperFrame(
-        _packed(camera_lidar_tensors(lidar, radar.cameras, dtype), float(lidar.frames.camera[0, 5])),
-        replace(tensors, detections=_without_map(tensors.detections)),
-        _packed(tensors.detections, float(radar.detections.camera[0, 5])),
-        lidar_radar_tensors(lidar_radar_loss([observation]), dtype),
-    )
+    return {
+        "camera_lidar": folded_tensors(camera_lidar_loss([observation], T_camera_lidar, margin).frames),
+        "camera_radar": camera_radar_tensors(camera_radar_loss([observation], T_camera_radar, margin)),
+        "lidar_radar": lidar_radar_tensors(lidar_radar_loss([observation])),
+    }
 
 
 def with_paper_inputs(network: CalibrationNetwork) -> None:
@@ -157,21 +124,11 @@ def with_paper_inputs(network: CalibrationNetwork) -> None:
     features = {"lidar": LIDAR_FEATURES, "radar": RADAR_FEATURES}
     for sensor, names in _DERIVED.items():
         if sensor in network.core.encoders:
-            weight = next(
-                network.core.encoders[sensor].parameters()
-            )  # the first convolution's: outputs, channels
+            # The first convolution's: outputs, channels.
+            weight = next(network.core.encoders[sensor].parameters())
             seen = torch.ones_like(weight)
             for name in names:
                 seen[:, _RENDERED + features[sensor].index(name)] = 0
             with torch.no_grad():
                 weight.mul_(seen)
             weight.register_hook(lambda gradient, seen=seen: gradient * seen)  # type: ignore[no-untyped-call]
-
-
-def _packed(tensors: FoldedTensors, step: float) -> _Folded:
-    """Bytes in place of the map, exactly: the map is a whole number of steps."""
-    return _Folded(_without_map(tensors), (tensors.maps / step).round().to(torch.uint8), step)
-
-
-def _without_map(tensors: FoldedTensors) -> FoldedTensors:
-    return replace(tensors, maps=tensors.maps[:, :0, :0])

@@ -1,8 +1,4 @@
-"""Projection inside the compiled loops of the camera-lidar score: one camera model as a flat parameter vector.
-
-The paper's cost maps project in loops of their own (`paper.cost_map_loops`): tangential distortion is folded into their
-maps, and projection and lookup are one loop.
-"""
+"""Projection inside the compiled loops that look up images: one camera model as a flat parameter vector."""
 
 from __future__ import annotations
 

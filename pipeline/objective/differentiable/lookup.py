@@ -10,31 +10,29 @@ __all__ = ["bilinear", "bilinear_groups", "masked_mean", "nearest_pixel"]
 
 
 def bilinear(
-    maps: Float[Tensor, "F H W"],
+    maps: Shaped[Tensor, "F H W"],
     uv: Float[Tensor, "*batch F N 2"],
     valid: Bool[Tensor, "*batch F N"],
     outside: float,
 ) -> Float[Tensor, "*batch F N"]:
     """Map values at pixels; `outside` (without gradient) beyond the image's outermost pixel centres."""
-    height, width = maps.shape[-2:]
-    at, a, b, inside = _cell(height, width, uv, valid)
-    plane = torch.arange(len(maps), device=maps.device)[:, None] * (height * width)
-    return torch.where(
-        inside, _between(maps.reshape(-1), plane + at, width, a, b), torch.full_like(a, outside)
-    )
+    return bilinear_groups(maps[:, None], uv, valid, outside)[..., 0]
 
 
 def bilinear_groups(
-    maps: Shaped[Tensor, "F G H W"], uv: Float[Tensor, "*batch F N 2"], valid: Bool[Tensor, "*batch F N"]
+    maps: Shaped[Tensor, "F G H W"],
+    uv: Float[Tensor, "*batch F N 2"],
+    valid: Bool[Tensor, "*batch F N"],
+    outside: float = 0.0,
 ) -> Float[Tensor, "*batch F N G"]:
-    """Values of G maps of each frame at pixels; 0 where not valid or outside."""
+    """Values of G maps of each frame at pixels; `outside` where not valid or beyond the image."""
     frames, groups, height, width = maps.shape
     at, a, b, inside = _cell(height, width, uv, valid)
     plane = torch.arange(frames, device=maps.device)[:, None] * (groups * height * width)
     # Groups last: the four neighbours are gathered for all of them at once.
     at = (plane + at)[..., None] + torch.arange(groups, device=maps.device) * (height * width)
     value = _between(maps.reshape(-1), at, width, a[..., None], b[..., None])
-    return torch.where(inside[..., None], value, torch.zeros_like(value))
+    return torch.where(inside[..., None], value, outside)
 
 
 def nearest_pixel(

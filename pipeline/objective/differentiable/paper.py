@@ -14,24 +14,21 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from pipeline.geometry.cameras import Camera
 from pipeline.objective.differentiable.lookup import bilinear, masked_mean
 from pipeline.objective.differentiable.poses import inverse, transform_points
 from pipeline.objective.differentiable.projection import CameraProjection, camera_projection
 from pipeline.objective.paper import camera_radar, lidar_radar
-from pipeline.objective.paper.camera_lidar import CameraLidarLoss
 from pipeline.objective.paper.camera_radar import CameraRadarLoss
-from pipeline.objective.paper.cost_maps import FoldedFrames, without_tangential
+from pipeline.objective.paper.cost_maps import FoldedFrames
 from pipeline.objective.paper.lidar_radar import LidarRadarLoss
 
 __all__ = [
     "CameraRadarTensors",
     "FoldedTensors",
     "LidarRadarTensors",
-    "camera_lidar_tensors",
     "camera_radar_tensors",
     "distance_cost",
     "folded_tensors",
@@ -48,18 +45,21 @@ def distance_cost(squared: Float[Tensor, "*shape"], scale: float | Tensor) -> Fl
 
 @dataclass(frozen=True, eq=False)
 class FoldedTensors:
-    """Points and folded cost maps of F frames, as `FoldedFrames` holds them."""
+    """Points and cost maps of F frames, as `FoldedFrames` holds them."""
 
     points: Float[Tensor, "F N 3"]
     present: Bool[Tensor, "F N"]
-    maps: Float[Tensor, "F H W"]
+    maps: UInt8[Tensor, "F H W"]
+    step: Float[Tensor, " F"]  # cost of one step of a byte
     projection: CameraProjection
     penalty: float
 
     def frame_losses(self, T_camera_points: Float[Tensor, "*batch #F 4 4"]) -> Float[Tensor, "*batch F"]:
         """Mean cost of each frame's points."""
         uv, valid = self.projection.project(transform_points(T_camera_points, self.points))
-        return masked_mean(bilinear(self.maps, uv, valid, self.penalty), self.present)
+        value = bilinear(self.maps, uv, valid, -1.0)
+        cost = torch.where(value < 0, self.penalty, value * self.step[:, None])
+        return masked_mean(cost, self.present)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +70,12 @@ class CameraRadarTensors:
     track_present: Bool[Tensor, "F M"]
     centres_px: Float[Tensor, "F B 2"]
     informative: Bool[Tensor, " F"]
-    projection: CameraProjection
     scale_px: float
     detections: FoldedTensors
 
     def frame_losses(self, T_camera_radar: Float[Tensor, "*batch #F 4 4"]) -> Float[Tensor, "*batch F"]:
         """Loss of each frame; 0 where it has no track or no road user."""
-        uv, valid = self.projection.project(transform_points(T_camera_radar, self.tracks))
+        uv, valid = self.detections.projection.project(transform_points(T_camera_radar, self.tracks))
         squared = (uv[..., :, None, :] - self.centres_px[:, None]).square().sum(-1).amin(-1)
         cost = torch.where(valid, distance_cost(squared, self.scale_px), torch.ones_like(squared))
         total = masked_mean(cost, self.track_present) + self.detections.frame_losses(T_camera_radar)
@@ -137,25 +136,15 @@ def smooth_iou(
     return overlap / (lidar_area_m2 + radar_area_m2 - overlap).clamp_min(1e-9)
 
 
-def camera_lidar_tensors(
-    loss: CameraLidarLoss, cameras: Sequence[Camera], dtype: torch.dtype = torch.float32
-) -> FoldedTensors:
-    """The prepared camera-lidar loss as tensors; cameras at label size, as they were when it was prepared."""
-    return folded_tensors(loss.frames, cameras, dtype)
-
-
 def camera_radar_tensors(loss: CameraRadarLoss, dtype: torch.dtype = torch.float32) -> CameraRadarTensors:
     """The prepared camera-radar loss as tensors."""
-    frames = range(len(loss.cameras))
-    tracks, present = padded([loss.tracks_radar[loss.track_frame == f] for f in frames], dtype)
+    frames = range(loss.detections.frames)
     return CameraRadarTensors(
-        tracks,
-        present,
+        *padded([loss.tracks_radar[loss.track_frame == f] for f in frames], dtype),
         torch.tensor(loss.centres_px, dtype=dtype),
         torch.tensor(loss.informative),
-        camera_projection(loss.cameras, dtype),
-        camera_radar.SCALE_RAD * loss.cameras[0].focal_px[0],  # the day's one camera, as there
-        folded_tensors(loss.detections, loss.cameras, dtype),
+        camera_radar.SCALE_RAD * loss.detections.cameras[0].focal_px[0],  # the day's one camera, as there
+        folded_tensors(loss.detections, dtype),
     )
 
 
@@ -182,22 +171,21 @@ def padded(arrays: Sequence[np.ndarray], dtype: torch.dtype) -> tuple[Tensor, Te
     return torch.tensor(points, dtype=dtype), torch.tensor(present)
 
 
-def folded_tensors(frames: FoldedFrames, cameras: Sequence[Camera], dtype: torch.dtype) -> FoldedTensors:
-    """Points and byte maps of the kernel as tensors; cameras as they were given to `fold_frames`, all of one size.
+def folded_tensors(frames: FoldedFrames, dtype: torch.dtype = torch.float32) -> FoldedTensors:
+    """Points and byte maps as tensors.
 
     Raises:
         ValueError: the cameras differ in size or kind of model.
     """
-    xyz = np.stack([frames.x_m, frames.y_m, frames.z_m], -1)
-    sizes = {(c.height_px, c.width_px) for c in cameras}
+    sizes = {(c.height_px, c.width_px) for c in frames.cameras}
     if len(sizes) != 1:
         raise ValueError(f"the maps of a batch must have one size, not {sorted(sizes)}")
     # The lowest byte of a quad is the pixel's own cost.
-    bytes_ = (frames.quads & np.uint32(255)).reshape(len(cameras), *sizes.pop())
-    maps = bytes_.astype(np.float64) * frames.camera[:, 5, None, None].astype(np.float64)
+    bytes_ = (frames.quads & np.uint32(255)).astype(np.uint8).reshape(frames.frames, *sizes.pop())
     return FoldedTensors(
-        *padded(np.split(xyz, frames.first[1:-1]), dtype),
-        torch.tensor(maps, dtype=dtype),
-        camera_projection([without_tangential(c) for c in cameras], dtype),
+        *padded(np.split(frames.xyz_m.T, frames.first[1:-1]), dtype),
+        torch.from_numpy(bytes_),
+        torch.tensor(frames.step, dtype=dtype),
+        camera_projection(frames.cameras, dtype),
         frames.penalty,
     )

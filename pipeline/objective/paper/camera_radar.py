@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.geometry.cameras import Camera
 from pipeline.objective.paper.classes import (
     SKY,
     camera_at_label_size,
@@ -44,7 +43,6 @@ class CameraRadarLoss:
     tracks_radar: np.ndarray  # M 3, of all frames
     track_frame: np.ndarray  # M
     centres_px: np.ndarray  # F B 2, at label size
-    cameras: tuple[Camera, ...]
     detections: FoldedFrames
 
     @property
@@ -54,7 +52,7 @@ class CameraRadarLoss:
 
     @property
     def _tracks_per_frame(self) -> np.ndarray:
-        return np.bincount(self.track_frame, minlength=len(self.cameras))
+        return np.bincount(self.track_frame, minlength=self.detections.frames)
 
     def frame_losses(self, T_camera_radar: Float[np.ndarray, "P 4 4"]) -> Float[np.ndarray, "P F"]:
         """Loss of each frame at each pose."""
@@ -67,7 +65,7 @@ class CameraRadarLoss:
         return losses * self.informative
 
     def _track_costs(self, T: np.ndarray) -> np.ndarray:
-        camera = self.cameras[0]  # one camera a day: checked when the loss was prepared
+        camera = self.detections.cameras[0]  # one camera a day: checked when the loss was prepared
         points = self.tracks_radar @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
         uv, valid = camera.project(points)
         delta = uv[:, :, None, :] - self.centres_px[self.track_frame][None]
@@ -98,7 +96,6 @@ def camera_radar_loss(
         tracks_radar=np.concatenate(tracks) if tracks else np.zeros((0, 3)),
         track_frame=np.concatenate(frame_of).astype(np.int64) if frame_of else np.zeros(0, np.int64),
         centres_px=_padded(centres, _FAR_PX),
-        cameras=tuple(cameras),
         detections=fold_frames(clouds, costs, cameras, PENALTY),
     )
 
