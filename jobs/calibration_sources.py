@@ -145,7 +145,7 @@ def _side_of_files(text: str, form: str, files: str, names: FrameNames) -> Side:
     from pipeline.export.compare import Side, composed
     from pipeline.export.files import read_files
     from pipeline.export.formats import format_named
-    from pipeline.extrinsics.prior import read_transforms
+    from pipeline.extrinsics.prior_file import read_transforms
 
     if form:
         found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names)

@@ -31,7 +31,7 @@ def import_prior(
     from pipeline.export.files import prior_text, read_files, write_files
     from pipeline.export.formats import format_named
     from pipeline.export.tree import ESTIMATED_PAIRS
-    from pipeline.extrinsics.prior import read_transforms
+    from pipeline.extrinsics.prior_file import read_transforms
 
     read = read_files(files)
     pairs = format_named(form).pairs(read, (frames or FrameOptions()).names_in(files))

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.evaluate.comparison import Comparison, compare, current_runs
 from pipeline.evaluate.recording import ReflectorFiles
-from pipeline.extrinsics.prior import read_transforms
+from pipeline.extrinsics.prior_file import read_transforms
 from pipeline.geometry.targets import Picks
 from schemas.calibrations import CalibrationRecord
 

@@ -3,63 +3,110 @@
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import from_quaternion, inverse, log_se3, perturb_exactly
-from pipeline.rigs import CameraPrior, PriorConfig
-from schemas.calibrations import PAIRS, SENSORS, pairs_of
+from pipeline.extrinsics.prior_file import read_star
+from pipeline.geometry.se3 import perturb_exactly
+from pipeline.rig.prior import RigPrior, from_rows, middle_of
+from pipeline.rig.rig import Rig
+from pipeline.rigs import CameraPrior, SensorPrior
+from schemas.calibrations import FRAMES_OF_PAIR, SENSORS, pairs_of
 from schemas.observations import Observation
 
 __all__ = [
-    "logged_prior",
+    "PRIOR",
     "no_prior",
     "perturbed",
     "prior_key",
     "read_prior",
-    "read_transforms",
     "require_named_files",
+    "rig_prior",
+    "rows_of",
+    "trio_prior",
 ]
 
+PRIOR: Final = "prior"  # of the extra of ingest's manifest: transforms that the logs carry
 _QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
-_KEYS = {"T_camera_lidar", "T_lidar_radar", "T_radar_lidar", "T_camera_radar"}
-_SAME = 1e-6  # rad and m: tf_static repeats numbers, it does not measure
 
 
 def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle: str) -> Prior:
-    """The prior of a vehicle as its rig says: logged, or from a file.
+    """The prior of a vehicle with one sensor of each kind as its rig says: logged, or from a file.
 
     Raises:
         SolveError: no frame carries a tf_static prior, or it changes over the day.
         ConfigError: unknown vehicle, or the prior file cannot be read.
     """
     rig = fleet.rig_of(vehicle)
-    config = rig.prior
-    camera = CameraPrior() if rig.camera is None else rig.camera.known
-    if config.file is None:
-        return replace(logged_prior(observations, config), camera=camera)
-    return replace(_prior(read_transforms(fleet.path_of(config.file), rig.sensors), config), camera=camera)
+    names = _only(rig)
+    rows = rows_of(observations, [name or kind for name, kind in zip(names, SENSORS, strict=True)])
+    return trio_prior(rig_prior(rows, fleet, rig), rig, *names)
 
 
-def logged_prior(observations: Sequence[Observation], config: PriorConfig) -> Prior:
-    """The prior that the logs carry (tf_static), as far to be trusted as the configuration says.
+def rig_prior(rows: Iterable[Mapping[str, Any]], fleet: FleetConfig, rig: Rig) -> RigPrior:
+    """The prior of all sensors of a rig: as logged, or from the file that the rig names.
+
+    Args:
+        rows: what ingest says in its manifest under PRIOR (`to_rows`).
+        fleet: which the file's path is relative to.
+        rig: sigmas are its sensors' own, else its own.
 
     Raises:
-        SolveError: no frame carries one, or it changes over the day.
+        SolveError: the logs carry no transform between any two sensors, or one changes over the day.
+        ConfigError: the prior file cannot be read, or is not of this rig.
     """
-    logged = {pair: _logged(observations, pair) for pair in PAIRS}
-    found = {pair: T for pair, T in logged.items() if T is not None}
-    if not found:
+    file = rig.prior.file
+    T = from_rows(rows) if file is None else read_star(fleet.path_of(file), rig)
+    if not T:
         raise SolveError(no_prior("any pair"))
-    return _prior(found, config)
+    nodes = {node.name: node for node in rig.nodes}
+    sigmas = {name: _sigmas(rig.prior_of(name)) for name in nodes}
+    reference = middle_of(rig.nodes) if rig.reference is None else nodes[rig.reference]
+    return RigPrior(rig.nodes, reference, T, sigmas)
+
+
+def trio_prior(prior: RigPrior, rig: Rig, camera: str | None, lidar: str | None, radar: str | None) -> Prior:
+    """The prior of up to one sensor of each kind, for what thinks in a camera, a lidar and a radar; None = without it.
+
+    Its sigmas are those of the transform that is known worst.
+    """
+    names = {"camera": camera, "lidar": lidar, "radar": radar}
+    T, sigmas = dict[str, np.ndarray](), list[tuple[float, float]]()
+    for pair in pairs_of([kind for kind, name in names.items() if name is not None]):
+        a, b = (names[kind] or "" for kind in FRAMES_OF_PAIR[pair])
+        known = prior.between(a, b)
+        if known is not None:
+            T[pair] = known
+            # Camera-radar follows from the other two where the lidar's place is known.
+            sigmas += [prior.sigmas_between(a, b)] if pair != "camera_radar" else []
+    if not sigmas and "camera_radar" in T:
+        sigmas = [prior.sigmas_between(camera or "", radar or "")]
+    unknown = np.full((4, 4), np.nan)
+    return Prior(
+        T.get("camera_lidar", unknown),
+        T.get("lidar_radar", unknown),
+        max((s for s, _ in sigmas), default=np.nan),
+        max((s for _, s in sigmas), default=np.nan),
+        camera=CameraPrior() if camera is None else rig.cameras[camera].known,
+        T_camera_radar_alone=T.get("camera_radar") if len(T) == 1 else None,
+    )
+
+
+def rows_of(observations: Sequence[Observation], names: Sequence[str] = SENSORS) -> list[dict[str, Any]]:
+    """The logged prior that observations of one camera, one lidar and one radar carry, as ingest's manifest says it."""
+    rows = []
+    for pair, kinds in FRAMES_OF_PAIR.items():
+        parent, child = (names[SENSORS.index(kind)] for kind in kinds)
+        columns = [f"prior_{pair}_{part}" for part in (*_QUATERNION, *_TRANSLATION)]
+        known = {tuple(getattr(o, column) for column in columns) for o in observations}
+        rows += [{"parent": parent, "child": child, "q": v[:4], "t_m": v[4:]} for v in known if None not in v]
+    return rows
 
 
 def no_prior(pair: str) -> str:
@@ -111,90 +158,18 @@ def require_named_files(fleet: FleetConfig) -> None:
     for rig in {v.rig for v in fleet.vehicles.values()}:
         file = fleet.rigs[rig].prior.file
         if file is not None:
-            read_transforms(fleet.path_of(file), fleet.rigs[rig].sensors)
+            read_star(fleet.path_of(file), fleet.rigs[rig])
 
 
-def read_transforms(path: Path, sensors: Sequence[str] = SENSORS) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Transforms from a JSON file, by pair: T_camera_lidar and T_lidar_radar (or T_radar_lidar), 4x4 row-major.
-
-    A file of several such objects by name (one per log) must agree with itself. Of a rig with two sensors their
-    transform alone is read; T_camera_radar may be given as the product of the other two.
-
-    Raises:
-        ConfigError: not such a file, or not rigid transforms.
-    """
-    try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError) as err:
-        raise ConfigError(str(path), "", f"no readable JSON: {err}") from err
-    if not isinstance(content, dict):
-        raise ConfigError(str(path), "", "holds no object")
-    if not _KEYS & content.keys():
-        entries = [v for v in content.values() if isinstance(v, dict) and _KEYS & v.keys()]
-        found = [_transforms(path, entry, sensors) for entry in entries]
-        if not found:
-            raise ConfigError(str(path), f"T_{pairs_of(sensors)[0]}", "missing")
-        for other in found[1:]:
-            if any(np.abs(other[pair] - found[0][pair]).max() > _SAME for pair in other):
-                raise ConfigError(str(path), f"T_{pairs_of(sensors)[0]}", "the file's entries disagree")
-        return found[0]
-    return _transforms(path, content, sensors)
-
-
-def _prior(T: Mapping[str, np.ndarray], config: PriorConfig) -> Prior:
-    """The prior with NaN for what is not given."""
-    camera_lidar, lidar_radar = (
-        T.get(pair, np.full((4, 4), np.nan)) for pair in ("camera_lidar", "lidar_radar")
-    )
-    return Prior(camera_lidar, lidar_radar, *_sigmas(config), T_camera_radar_alone=T.get("camera_radar"))
-
-
-def _sigmas(config: PriorConfig) -> tuple[float, float]:
+def _sigmas(prior: SensorPrior) -> tuple[float, float]:
     """Of rotation [rad] and translation [m]."""
-    return float(np.radians(config.rotation_sigma_deg)), config.translation_sigma_m
+    assert prior.rotation_sigma_deg is not None
+    assert prior.translation_sigma_m is not None
+    return float(np.radians(prior.rotation_sigma_deg)), prior.translation_sigma_m
 
 
-def _transforms(path: Path, entry: Mapping[str, object], sensors: Sequence[str]) -> dict[str, np.ndarray]:
-    if "lidar" not in sensors and "T_camera_radar" in entry:
-        return {"camera_radar": _rigid(path, "T_camera_radar", entry["T_camera_radar"])}
-    found = {}
-    if "camera" in sensors:
-        found["camera_lidar"] = _rigid(path, "T_camera_lidar", entry.get("T_camera_lidar"))
-    if "radar" in sensors and "T_lidar_radar" in entry:
-        found["lidar_radar"] = _rigid(path, "T_lidar_radar", entry["T_lidar_radar"])
-    elif "radar" in sensors:
-        found["lidar_radar"] = inverse(_rigid(path, "T_radar_lidar", entry.get("T_radar_lidar")))
-    if len(found) == 2:
-        found["camera_radar"] = found["camera_lidar"] @ found["lidar_radar"]
-    return {pair: found[pair] for pair in pairs_of(sensors)}
-
-
-def _rigid(path: Path, key: str, value: object) -> np.ndarray:
-    try:
-        T = np.array(value, np.float64)
-    except (TypeError, ValueError) as err:
-        raise ConfigError(str(path), key, "is no 4x4 matrix") from err
-    if not np.all(np.isfinite(T)):
-        raise ConfigError(str(path), key, "holds a number that is not finite")
-    if T.shape != (4, 4) or not np.allclose(T[3], [0, 0, 0, 1]):
-        raise ConfigError(str(path), key, "is no 4x4 matrix with the last row 0 0 0 1")
-    R = T[:3, :3]
-    # 1e-3: calibrations shipped with three or four digits are still meant as rotations.
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
-        raise ConfigError(str(path), key, "its upper left 3x3 is no rotation")
-    u, _, vt = np.linalg.svd(R)
-    T[:3, :3] = u @ vt
-    return T
-
-
-def _logged(observations: Sequence[Observation], pair: str) -> np.ndarray | None:
-    names = [f"prior_{pair}_{part}" for part in (*_QUATERNION, *_TRANSLATION)]
-    rows = [[getattr(o, name) for name in names] for o in observations]
-    known = np.array([row for row in rows if None not in row], np.float64)
-    if not len(known):
-        return None
-    values = np.unique(known, axis=0)
-    T = from_quaternion(values[:, :4], values[:, 4:])
-    if np.abs(log_se3(inverse(T[0]) @ T)).max() > _SAME:
-        raise SolveError(f"the logged prior of {pair} changes over the day ({len(values)} values)")
-    return T[0]
+def _only(rig: Rig) -> tuple[str | None, str | None, str | None]:
+    """Names of the only sensor of each kind; ConfigError where there are several."""
+    _ = rig.camera, rig.lidar, rig.radar
+    camera, lidar, radar = (next(iter(of), None) for of in (rig.cameras, rig.lidars, rig.radars))
+    return camera, lidar, radar

@@ -12,7 +12,7 @@ from jaxtyping import Int64
 
 from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError
-from pipeline.extrinsics.prior import read_transforms
+from pipeline.extrinsics.prior_file import read_transforms
 from pipeline.ingest.containers.reader import content_identity
 from pipeline.ingest.frame_builder import FrameBuilder, Rejected, Trio
 from pipeline.ingest.index import DayIndex, index_logs, topics_of
@@ -236,7 +236,7 @@ def read_file_prior(rig: Rig, fleet: FleetConfig) -> dict[str, np.ndarray] | Non
     """
     if rig.prior.file is None:
         return None
-    found = read_transforms(fleet.path_of(rig.prior.file), rig.sensors)
+    found = read_transforms(fleet.path_of(rig.prior.file), [n.kind for n in rig.nodes])
     return {pair: T for pair, T in found.items() if len(found) == 1 or pair != "camera_radar"}
 
 

@@ -1,0 +1,188 @@
+"""What is known of a rig before the day: where each sensor is, and how far that is to be trusted.
+
+Known are transforms of a star: each sensor to one in the middle, mostly the first lidar. Sensors that nothing ties to
+it have a star of their own. Between the ends of a star's edge, numbers stay as they were given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.errors import SolveError
+from pipeline.geometry.se3 import (
+    adjoint,
+    from_quaternion,
+    from_rotation_translation,
+    inverse,
+    log_se3,
+    perturb_exactly,
+    to_quaternion,
+)
+from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.graph import KINDS, Kind, Sensor
+
+__all__ = ["RigPrior", "Star", "from_rows", "middle_of", "moved", "star_of", "to_rows"]
+
+Star = Mapping[tuple[str, str], np.ndarray]  # T_parent_child 4 4 by (parent, child)
+
+_SAME = 1e-6  # rad and m: logs repeat transforms, they do not measure
+_MIDDLES: tuple[Kind, ...] = ("lidar", "radar", "camera")
+# The order in which transforms of a rig with one sensor of each kind are moved, since release 0.1.
+_DRAWN: tuple[tuple[Kind, Kind], ...] = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
+
+
+@dataclass(frozen=True, eq=False)
+class RigPrior:
+    """Transforms between sensors, and each sensor's sigmas.
+
+    Args:
+        nodes: sensors, and `base` where the rig has it.
+        reference: the sensor that poses refer to, and the one without sigmas.
+        T: of a star, by (parent, child).
+        sigmas: rotation [rad] and translation [m] of a node's pose in the reference, isotropic about itself, by name.
+    """
+
+    nodes: tuple[Sensor, ...]
+    reference: Sensor
+    T: Star
+    sigmas: Mapping[str, tuple[float, float]]
+
+    def between(self, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
+        """T_a_b; None where the star does not tie them."""
+        direct = _direct(self.T, a, b)
+        if direct is not None:
+            return direct
+        for node in self.nodes:
+            first, second = _direct(self.T, a, node.name), _direct(self.T, node.name, b)
+            if node.name not in (a, b) and first is not None and second is not None:
+                return first @ second
+        return None
+
+    def sigmas_between(self, a: str, b: str) -> tuple[float, float]:
+        """Rotation [rad] and translation [m] of T_a_b, without lever arms: of a given transform as of one sensor."""
+        rotation, translation = zip(
+            *(self.sigmas[n] for n in (a, b) if n != self.reference.name), strict=True
+        )
+        if _direct(self.T, a, b) is not None:
+            return max(rotation), max(translation)
+        return float(np.hypot.reduce(rotation)), float(np.hypot.reduce(translation))
+
+    @property
+    def untied(self) -> tuple[Sensor, ...]:
+        """Nodes whose pose in the reference nobody knows."""
+        return tuple(n for n in self.nodes if self.between(self.reference.name, n.name) is None)
+
+    def extrinsics(self) -> Extrinsics:
+        """Poses of all nodes that are tied to the reference.
+
+        A sensor's rotation is wrong about itself, as whoever mounts it turns it where it stands. No day differs from
+        another by its prior: the whole covariance is common.
+        """
+        T = {n.name: self.between(self.reference.name, n.name) for n in self.nodes}
+        poses = {name: pose for name, pose in T.items() if pose is not None}
+        order = tuple(name for name in poses if name != self.reference.name)
+        covariance = np.zeros((6 * len(order), 6 * len(order)))
+        for k, name in enumerate(order):
+            rotation, translation = self.sigmas[name]
+            A = adjoint(from_rotation_translation(np.eye(3), poses[name][:3, 3]))
+            own = np.diag([rotation**2] * 3 + [translation**2] * 3)
+            covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = A @ own @ A.T
+        return Extrinsics(self.reference, poses, order, covariance, covariance.copy())
+
+
+def middle_of(nodes: Iterable[Sensor]) -> Sensor:
+    """The sensor that a star is about where none is named: the first lidar, else radar, else camera."""
+    return min((n for n in nodes if n.kind in _MIDDLES), key=lambda n: _MIDDLES.index(n.kind))
+
+
+def star_of(
+    nodes: Sequence[Sensor], transform: Callable[[str, str], Float[np.ndarray, "4 4"] | None]
+) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
+    """A star about the middle, and one about the middle of those that it does not reach, and so on.
+
+    Args:
+        nodes: of which something is known, as the frames of their data.
+        transform: T_a_b of two names, None where there is no chain between them.
+    """
+    found, left = dict[tuple[str, str], np.ndarray](), list(nodes)
+    while any(n.kind in _MIDDLES for n in left):
+        middle = middle_of(left)
+        left.remove(middle)
+        for node in tuple(left):
+            parent, child = sorted((middle, node), key=lambda n: KINDS.index(n.kind))
+            T = transform(parent.name, child.name)
+            if T is not None:
+                found[parent.name, child.name] = T
+                left.remove(node)
+    return found
+
+
+def to_rows(stars: Iterable[Star]) -> list[dict[str, Any]]:
+    """As JSON: each transform once, as quaternion (w x y z) and translation [m]; stars of several logs may differ."""
+    rows = [
+        {"parent": a, "child": b, "q": to_quaternion(T).tolist(), "t_m": T[:3, 3].tolist()}
+        for star in stars
+        for (a, b), T in star.items()
+    ]
+    return [row for i, row in enumerate(rows) if row not in rows[:i]]
+
+
+def from_rows(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
+    """The star that all of the day's logs agree on.
+
+    Raises:
+        SolveError: a transform changes over the day.
+    """
+    found: dict[tuple[str, str], list[np.ndarray]] = {}
+    for row in sorted(rows, key=lambda row: (*row["q"], *row["t_m"])):
+        T = from_quaternion(np.array(row["q"], np.float64), np.array(row["t_m"], np.float64))
+        found.setdefault((row["parent"], row["child"]), []).append(T)
+    for (a, b), values in found.items():
+        if max(np.abs(log_se3(inverse(values[0]) @ T)).max() for T in values) > _SAME:
+            raise SolveError(f"the logged prior of {a}_{b} changes over the day ({len(values)} values)")
+    return {ends: values[0] for ends, values in found.items()}
+
+
+def moved(prior: RigPrior, angle_rad: float, shift_m: float, seed: int) -> RigPrior:
+    """The prior with each sensor but the reference turned and shifted by so much, with sigmas that allow for it.
+
+    A rig with one sensor of each kind has its transforms moved as since release 0.1: camera to lidar, lidar to radar.
+    """
+    rng = np.random.default_rng(seed)
+    kinds = [n.kind for n in prior.nodes]
+    if len(set(kinds)) == len(kinds) and "base" not in kinds:
+        T = _moved_as_pairs(prior, angle_rad, shift_m, rng)
+    else:
+        others = [n.name for n in prior.nodes if n not in (prior.reference, *prior.untied)]
+        pose = prior.extrinsics().T
+        T = {
+            (prior.reference.name, n): perturb_exactly(pose[n], angle_rad, shift_m, rng) for n in others
+        } | {
+            ends: T for ends, T in prior.T.items() if not {*others, prior.reference.name} & set(ends)
+        }  # fmt: skip
+    sigmas = {n: (max(r, angle_rad), max(t, shift_m)) for n, (r, t) in prior.sigmas.items()}
+    return replace(prior, T=T, sigmas=sigmas)
+
+
+def _moved_as_pairs(
+    prior: RigPrior, angle_rad: float, shift_m: float, rng: np.random.Generator
+) -> dict[tuple[str, str], np.ndarray]:
+    name = {n.kind: n.name for n in prior.nodes}
+    T = dict(prior.T)
+    for a, b in _DRAWN:
+        ends = (name.get(a, ""), name.get(b, ""))
+        # Drawn for a pair that the rig lacks as well: the others' draws stay.
+        drawn = perturb_exactly(T.get(ends, np.eye(4)), angle_rad, shift_m, rng)
+        T |= {ends: drawn} if ends in T else {}
+    return T
+
+
+def _direct(T: Star, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
+    if a == b:
+        return np.eye(4)
+    return T[a, b] if (a, b) in T else inverse(T[b, a]) if (b, a) in T else None

@@ -1,0 +1,170 @@
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.config import load_fleet
+from pipeline.errors import ConfigError, SolveError
+from pipeline.extrinsics.prior import perturbed, rig_prior, trio_prior
+from pipeline.geometry.se3 import exp_se3, inverse, log_so3
+from pipeline.rig.prior import RigPrior, from_rows, moved, star_of, to_rows
+from schemas.calibrations import pairs_of
+from tests.makers.fleet_files import fleet_toml
+from tests.rig.test_rig import VAN
+
+NAMES = ("front", "left", "top", "nose", "corner_fl", "corner_rr", "base")
+
+
+def poses(seed=0):
+    """T_base_sensor of the van's sensors."""
+    rng = np.random.default_rng(seed)
+    return {name: exp_se3(rng.normal(0, 1, 6)) for name in NAMES}
+
+
+def prior_of(tmp_path, text=VAN, lost=()):
+    path = tmp_path / "fleet.toml"
+    path.write_text(text)
+    fleet = load_fleet(path)
+    rig, T = next(iter(fleet.rigs.values())), poses()
+
+    def chain(a, b):
+        return None if (a in lost) != (b in lost) else inverse(T[a]) @ T[b]
+
+    rows = json.loads(json.dumps(to_rows([star_of(rig.nodes, chain)])))
+    return rig, rig_prior(rows, fleet, rig), T
+
+
+def three_sensors(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text(fleet_toml("car"))
+    fleet = load_fleet(path)
+    rig, T = fleet.rigs["default"], poses()
+    as_sensor = dict(zip(("camera", "lidar", "radar"), ("front", "top", "corner_fl"), strict=True))
+    star = star_of(rig.nodes, lambda a, b: inverse(T[as_sensor[a]]) @ T[as_sensor[b]])
+    return rig, rig_prior(to_rows([star]), fleet, rig), star
+
+
+def test_poses_of_all_sensors_come_back_through_the_manifest(tmp_path):
+    _, prior, T = prior_of(tmp_path)
+    known = prior.extrinsics()
+    assert (known.reference.name, known.order) == (
+        "top",
+        ("front", "left", "nose", "corner_fl", "corner_rr", "base"),
+    )
+    for a in NAMES:
+        for b in NAMES:
+            np.testing.assert_allclose(known.between(a, b), inverse(T[a]) @ T[b], atol=1e-9)
+            np.testing.assert_allclose(prior.between(a, b), inverse(T[a]) @ T[b], atol=1e-9)
+
+
+def test_a_sensor_is_unsure_about_itself_by_its_own_sigmas(tmp_path):
+    _, prior, _ = prior_of(tmp_path)
+    known = prior.extrinsics()
+    for name, degrees in (("left", 2.0), ("corner_fl", 4.0)):
+        # In its own axes nothing of the lever arm is left.
+        expected = np.diag([np.radians(degrees) ** 2] * 3 + [0.05**2] * 3)
+        np.testing.assert_allclose(known.covariance_between(name, "top"), expected, atol=1e-12)
+    assert np.array_equal(known.covariance, known.common)
+
+
+def test_sensors_that_no_chain_reaches_are_named_and_know_each_other(tmp_path):
+    _, prior, T = prior_of(tmp_path, lost=("corner_rr", "nose"))
+    assert [n.name for n in prior.untied] == ["nose", "corner_rr"]
+    assert prior.between("top", "nose") is None
+    np.testing.assert_allclose(
+        prior.between("nose", "corner_rr"), inverse(T["nose"]) @ T["corner_rr"], atol=1e-9
+    )
+    assert set(prior.extrinsics().T) == set(NAMES) - {"nose", "corner_rr"}
+    shaken = moved(prior, 0.03, 0.1, seed=1)
+    assert np.array_equal(shaken.between("nose", "corner_rr"), prior.between("nose", "corner_rr"))
+
+
+def test_a_prior_that_changes_over_the_day_is_refused():
+    T = {("top", "nose"): np.eye(4)}
+    other = {("top", "nose"): exp_se3(np.array([0, 0, 1e-3, 0, 0, 0]))}
+    assert len(to_rows([T, T])) == 1
+    with pytest.raises(SolveError, match="top_nose changes over the day"):
+        from_rows(to_rows([T, other]))
+
+
+def test_no_sensor_but_the_reference_stays_where_it_was_and_all_move_by_as_much(tmp_path):
+    _, prior, _ = prior_of(tmp_path)
+    before, after = prior.extrinsics().T, moved(prior, np.radians(3), 0.1, seed=4)
+    for name, T in after.extrinsics().T.items():
+        turn = np.degrees(np.linalg.norm(log_so3(T[:3, :3] @ before[name][:3, :3].T)))
+        shift = np.linalg.norm(T[:3, 3] - before[name][:3, 3])
+        assert (turn, shift) == pytest.approx((0, 0) if name == "top" else (3, 0.1), abs=1e-9)
+    assert after.sigmas["front"] == (np.radians(3), 0.1)
+    assert after.sigmas["corner_fl"] == (np.radians(4), 0.1)
+
+
+@pytest.mark.parametrize("missing", [None, "camera", "lidar", "radar"])
+def test_a_three_sensor_rig_is_moved_by_the_draws_that_it_always_had(missing, tmp_path):
+    rig, prior, star = three_sensors(tmp_path)
+    if missing is not None:
+        rig = rig.model_copy(update={f"{missing}s": {}})
+        nodes = tuple(n for n in prior.nodes if n.name != missing)
+        star = {("camera", "radar"): prior.between("camera", "radar")} if missing == "lidar" else star
+        star = {ends: T for ends, T in star.items() if missing not in ends}
+        prior = RigPrior(nodes, nodes[-1] if missing == "lidar" else prior.reference, star, prior.sigmas)
+    names = [None if name == missing else name for name in ("camera", "lidar", "radar")]
+    then = perturbed(trio_prior(prior, rig, *names), (2.0, 0.1), 7)
+    now = trio_prior(moved(prior, np.radians(2.0), 0.1, 7), rig, *names)
+    for pair in pairs_of([name for name in names if name is not None]):
+        assert then.knows(pair)
+        np.testing.assert_array_equal(now.of(pair), then.of(pair))
+    assert (now.rotation_sigma_rad, now.translation_sigma_m) == (
+        then.rotation_sigma_rad,
+        then.translation_sigma_m,
+    )
+
+
+def test_any_three_sensors_have_the_prior_of_a_three_sensor_rig(tmp_path):
+    rig, prior, T = prior_of(tmp_path, VAN.replace('/left/info"', '/left/info"\nreadout_s = 0.02'))
+    found = trio_prior(prior, rig, "left", "nose", "corner_rr")
+    np.testing.assert_allclose(found.T_camera_lidar, inverse(T["left"]) @ T["nose"], atol=1e-9)
+    np.testing.assert_allclose(found.T_lidar_radar, inverse(T["nose"]) @ T["corner_rr"], atol=1e-9)
+    assert found.camera.readout_s == 0.02
+    # Neither is the reference: both may be off.
+    assert found.rotation_sigma_rad == pytest.approx(np.radians(2) * np.sqrt(2))
+    pair = trio_prior(prior, rig, None, "top", "corner_fl")
+    assert pair.knows("lidar_radar")
+    assert not pair.knows("camera_lidar")
+    assert pair.rotation_sigma_rad == np.radians(4)
+
+
+def test_a_prior_file_says_where_every_sensor_is(tmp_path):
+    path = tmp_path / "prior.json"
+    text = VAN + '[rigs.van.prior]\nsource = "file"\nfile = "prior.json"\n'
+    T = poses()
+    given = {"reference": "top", "T": {n: (inverse(T["top"]) @ T[n]).tolist() for n in NAMES if n != "top"}}
+    path.write_text(json.dumps(given))
+    _, prior, _ = prior_of(tmp_path, text)
+    np.testing.assert_allclose(prior.between("left", "base"), inverse(T["left"]) @ T["base"], atol=1e-9)
+    wrong = [
+        (given | {"reference": "roof"}, "reference: 'roof' is none of front"),
+        (given | {"T": {k: v for k, v in given["T"].items() if k != "nose"}}, "lacks nose"),
+        (given | {"T": given["T"] | {"roof": np.eye(4).tolist()}}, "has roof, not in the rig"),
+        (given | {"T": given["T"] | {"top": (2 * np.eye(4)).tolist()}}, "T.top"),
+        (given | {"T": given["T"] | {"top": T["top"].tolist()}}, "the reference's own pose"),
+        (given | {"T": given["T"] | {"nose": [[1]]}}, "T.nose: is no 4x4 matrix"),
+        ({"T_camera_lidar": np.eye(4).tolist()}, '{"reference": "top", "T": {...}}'),
+    ]
+    for content, said in wrong:
+        path.write_text(json.dumps(content))
+        with pytest.raises(ConfigError) as caught:
+            prior_of(tmp_path, text)
+        assert said in str(caught.value)
+        assert "prior.json" in str(caught.value)
+
+
+def test_a_prior_file_of_poses_is_read_for_three_sensors_too(tmp_path):
+    rig, prior, star = three_sensors(tmp_path)
+    pose = {n: prior.between("lidar", n).tolist() for n in ("camera", "radar")}
+    (tmp_path / "prior.json").write_text(json.dumps({"reference": "lidar", "T": pose}))
+    rig = rig.model_copy(
+        update={"prior": rig.prior.model_copy(update={"source": "file", "file": "prior.json"})}
+    )
+    found = rig_prior([], load_fleet(tmp_path / "fleet.toml"), rig)
+    for ends, T in star.items():
+        np.testing.assert_allclose(found.between(*ends), T, atol=1e-9)
