@@ -88,7 +88,7 @@ def _plan(vehicles: int, days: int, frames: int, seed: int) -> tuple[FleetSpec, 
     base = FleetSpec(vehicles=vehicles, days=days, frames=frames, seed=seed, container="mixed")
     dates = day_names(base.first_day, days)
     knocks = _KNOCK if vehicles > 1 and days > 2 else ""
-    return FleetSpec(**(vars(base) | {"faults": parse_faults(knocks, dates)})), dates
+    return replace(base, faults=parse_faults(knocks, dates)), dates
 
 
 def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int | None) -> list[DayOutcome]:

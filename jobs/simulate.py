@@ -38,16 +38,16 @@ def simulate(
         vehicles: number of vehicles, vehicle-1 and so on.
         days: number of consecutive days.
         first_day: first of them, YYYY-MM-DD.
-        frames: camera-lidar-radar trios per vehicle-day, in three drives.
-        rate_hz: trios per second within a drive.
+        frames: moments per vehicle-day at which every sensor is logged, in three drives.
+        rate_hz: moments per second within a drive.
         rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128, rosette,
-            fisheye, pinhole, rolling, truck, bumper or tilted; each with `-flat` behind it for a radar without
-            elevation. pipeline/simulate/README.md says what they are.
+            fisheye, pinhole, rolling, truck, bumper, tilted, or van (6 cameras, 2 lidars, 5 radars); each with `-flat`
+            behind it for radars without elevation. pipeline/simulate/README.md says what they are.
         environments: what the drives lead through.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
         faults: vehicle:day:sensor:kind:amount, several with commas; kinds: yaw pitch roll [deg], x y z [m],
             drift-... per day, warm-... over the day, time and stamp [s] (0.5@0.6: after .6 of the day's frames),
-            missing, swap, intrinsics, centre, centre-v [px], labels, night, dusk, few.
+            missing, stuck, swap, intrinsics, centre, centre-v [px], labels, night, dusk, few.
         remount_deg: sd per axis by which every day's mounting differs from the day before, as when a rig is taken off
             every evening; fixed sensors move by hundredths of a degree, which is the default.
         reflectors: also record three corner reflectors on every vehicle's last day, under OUT/reflectors.
@@ -56,8 +56,9 @@ def simulate(
     """
     from pipeline.simulate.faults import parse_faults
     from pipeline.simulate.fleet import FleetSpec, day_names
+    from pipeline.simulate.sensors.rigs import rig_named
 
-    named = parse_faults(faults, day_names(first_day, days))
+    named = parse_faults(faults, day_names(first_day, days), rig_named(rig))
     spec = FleetSpec(
         vehicles=vehicles,
         days=days,

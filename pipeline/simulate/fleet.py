@@ -21,7 +21,10 @@ from pipeline.simulate.faults import DayFaults, Fault, faults_on, misread, shake
 from pipeline.simulate.logs.fleet_toml import fleet_toml
 from pipeline.simulate.logs.recording import FIRST_FRAME_S, Setup, record_drive
 from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log
-from pipeline.simulate.sensors.rigs import Mounting, mounting_of, rig_named
+from pipeline.simulate.sensors.data_sheets import CameraSpec
+from pipeline.simulate.sensors.mounting import Mounting, mounting_of
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
+from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.semantics import SemanticsSpec
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
@@ -161,10 +164,8 @@ def simulate_vehicle_day(
 ) -> int:
     """Write one vehicle-day, a log per drive; returns the number of logs."""
     name, day_name = vehicle_names(spec)[vehicle], day_names(spec.first_day, spec.days)[day]
-    today, mounting = faults_on(spec.faults, name, day), mounting_on(spec, vehicle, day)
-    folder, drives, done = out / "logs" / name / day_name, [], 0
-    setup = Setup(rig_named(spec.rig), mounting, spec.semantics, today)
-    shares = _shares(today.frames or spec.frames, spec.drives)
+    rig, folder, drives, done = rig_named(spec.rig), out / "logs" / name / day_name, [], 0
+    shares = _shares(_frames(spec, name, day), spec.drives)
     for i, frames in enumerate(shares):
         drive = drive_of(spec, vehicle, day, i, frames)
         container = CONTAINERS[(i + day) % 3] if spec.container == "mixed" else spec.container
@@ -175,9 +176,9 @@ def simulate_vehicle_day(
             progress(base + n, spec.frames, f"{name} {day_name}")
 
         last = max(sum(shares) - 1, 1)
-        mountings = [mounting_on(spec, vehicle, day, (done + k) / last) for k in range(frames)]
+        setups = [_setup(spec, vehicle, day, (done + k) / last) for k in range(frames)]
         with open_log(path, container) as log:
-            record_drive(log, World(drive), setup, mountings, spec.rate_hz, rng, tick)
+            record_drive(log, World(drive, rig.behind_m), setups, spec.rate_hz, rng, tick)
         done += frames
         drives.append(
             {"log": path.name, "frames": frames}
@@ -185,7 +186,7 @@ def simulate_vehicle_day(
         )
     truth = out / "truth" / name / f"{day_name}.json"
     truth.parent.mkdir(parents=True, exist_ok=True)
-    truth.write_text(json.dumps(_truth(spec, vehicle, day, mounting) | {"drives": drives}, indent=1))
+    truth.write_text(json.dumps(_truth(spec, vehicle, day) | {"drives": drives}, indent=1))
     return len(shares)
 
 
@@ -197,6 +198,16 @@ def mounting_on(spec: FleetSpec, vehicle: int, day: int, share: float = 0.0) -> 
         rig = replace(rig, remount_rotation_deg=spec.remount_deg, remount_translation_m=shift_m)
     mounting = mounting_of(rig, spec.seed, vehicle, day)
     return shaken(mounting, spec.faults, vehicle_names(spec)[vehicle], day, share)
+
+
+def _setup(spec: FleetSpec, vehicle: int, day: int, share: float) -> Setup:
+    """The vehicle after a share of a day's frames."""
+    today = faults_on(spec.faults, vehicle_names(spec)[vehicle], day, share)
+    return Setup(rig_named(spec.rig), mounting_on(spec, vehicle, day, share), spec.semantics, today)
+
+
+def _frames(spec: FleetSpec, vehicle: str, day: int) -> int:
+    return int(faults_on(spec.faults, vehicle, day).amount("few")) or spec.frames
 
 
 def _shares(frames: int, drives: int) -> list[int]:
@@ -213,31 +224,66 @@ def drive_of(spec: FleetSpec, vehicle: int, day: int, number: int, frames: int) 
         hours=8 + 3 * number, minutes=7 * vehicle
     )
     seed = int(np.random.default_rng([spec.seed, vehicle, day, number, 52]).integers(1 << 31))
-    today: DayFaults = faults_on(spec.faults, vehicle_names(spec)[vehicle], day)
+    today = faults_on(spec.faults, vehicle_names(spec)[vehicle], day)
     duration = FIRST_FRAME_S + frames / spec.rate_hz + 1.0
-    return Drive(seed, environment, duration, int(start.timestamp()) * 10**9, today.night or today.dusk)
+    return Drive(
+        seed, environment, duration, int(start.timestamp()) * 10**9, today.has("night") or today.has("dusk")
+    )
 
 
-def _truth(spec: FleetSpec, vehicle: int, day: int, m: Mounting) -> dict[str, Any]:
+def _truth(spec: FleetSpec, vehicle: int, day: int) -> dict[str, Any]:
     """What a judge needs to know; stamp_a = stamp_b + dt_a_b_s, as in the calibration records."""
-    name = vehicle_names(spec)[vehicle]
+    name, rig = vehicle_names(spec)[vehicle], rig_named(spec.rig)
+    morning, evening = (mounting_on(spec, vehicle, day, share) for share in (0.0, 1.0))
+    today = faults_on(spec.faults, name, day)
+    ends = _poses(evening) | (_pairs(evening) if rig.is_short else {})
     return {
         "vehicle": name,
         "day": day_names(spec.first_day, spec.days)[day],
         "rig": spec.rig,
         "seed": spec.seed,
-        **{key: T.tolist() for key, T in m.truth().items()},
-        "T_vehicle_camera": m.T_vehicle_camera.tolist(),
-        "T_vehicle_lidar": m.T_vehicle_lidar.tolist(),
-        "T_vehicle_radar": m.T_vehicle_radar.tolist(),
-        "dt_camera_lidar_s": m.camera_delay_s,
-        "dt_lidar_radar_s": -m.radar_delay_s,
-        "dt_camera_radar_s": m.camera_delay_s - m.radar_delay_s,
-        "radar_range_bias_m": m.radar_range_bias_m,
-        "radar_elevation_bias_rad": m.radar_elevation_bias_rad,
-        "camera_K": m.camera.K.tolist(),
-        "camera_K_logged": misread(m.nominal_camera, faults_on(spec.faults, name, day)).K.tolist(),
-        "camera_readout_s": rig_named(spec.rig).camera.readout_s,
+        "reference": rig.reference.name,
+        **_poses(morning),
+        "dt_s": {n: m.delay_s for n, m in morning.sensors.items()},  # after the reference's stamps
+        "cameras": {s.name: _camera(s, morning, today) for s in rig.of_kind("camera")},
+        "radars": {n: asdict(m.errors) for n, m in morning.sensors.items() if m.errors is not None},
+        **(_of_three(morning, rig, today) if rig.is_short else {}),
         "faults": [asdict(f) | {"active": f.day <= day} for f in spec.faults if f.vehicle == name],
-        "at_end_of_day": {k: T.tolist() for k, T in mounting_on(spec, vehicle, day, 1.0).truth().items()},
+        "at_end_of_day": ends,
+    }
+
+
+def _poses(mounting: Mounting) -> dict[str, Any]:
+    return {"T_base_sensor": {n: m.T_vehicle.tolist() for n, m in mounting.sensors.items()}}
+
+
+def _camera(sensor: SensorSpec, mounting: Mounting, today: DayFaults) -> dict[str, Any]:
+    assert isinstance(sensor.sheet, CameraSpec)
+    true, logged = mounting.camera(sensor.name)
+    stated = misread(logged, today, sensor.name)
+    return {"K": true.K.tolist(), "K_logged": stated.K.tolist(), "readout_s": sensor.sheet.readout_s}
+
+
+def _pairs(m: Mounting) -> dict[str, Any]:
+    """T_parent_child of the pairs of a rig of three."""
+    pairs = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
+    return {f"T_{a}_{b}": m.between(a, b).tolist() for a, b in pairs}
+
+
+def _of_three(m: Mounting, rig: RigSpec, today: DayFaults) -> dict[str, Any]:
+    """The same by the names that readers of rigs of three know."""
+    camera, radar, errors = m["camera"], m["radar"], m["radar"].errors
+    assert errors is not None
+    about = _camera(rig["camera"], m, today)
+    return {
+        **_pairs(m),
+        **{f"T_vehicle_{n}": mounted.T_vehicle.tolist() for n, mounted in m.sensors.items()},
+        "dt_camera_lidar_s": camera.delay_s,
+        "dt_lidar_radar_s": -radar.delay_s,
+        "dt_camera_radar_s": camera.delay_s - radar.delay_s,
+        "radar_range_bias_m": errors.range_bias_m,
+        "radar_elevation_bias_rad": errors.elevation_bias_rad,
+        "camera_K": about["K"],
+        "camera_K_logged": about["K_logged"],
+        "camera_readout_s": about["readout_s"],
     }

@@ -9,7 +9,6 @@ Source: paper, section 2.1 (150 frames, positions picked by hand in each sensor'
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
@@ -20,10 +19,13 @@ from jaxtyping import Float
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.results import Progress, silent
 from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, vehicle_names
-from pipeline.simulate.logs.recording import Setup, nominal_poses, trio
-from pipeline.simulate.logs.writers import TOPICS, open_log
-from pipeline.simulate.sensors.rigs import Mounting, rig_named
-from pipeline.simulate.sensors.simulated_frame import Scene, SimulatedFrame, frame_of
+from pipeline.simulate.logs.recording import Setup, messages_of, nominal_poses
+from pipeline.simulate.logs.topics import TOPICS
+from pipeline.simulate.logs.writers import open_log
+from pipeline.simulate.sensors.mounting import Mounting
+from pipeline.simulate.sensors.radar import Scan
+from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.simulate.sensors.simulated_frame import Scene, Seat, frame_of, triggered_stamps
 from pipeline.simulate.world.casting import Moment, standing_of
 from pipeline.simulate.world.drives import Parked
 from pipeline.simulate.world.meshes import Mesh, MeshBuilder, Number
@@ -63,11 +65,12 @@ def simulate_reflectors(
     with open_log(folder / f"{day_name}.mcap", "mcap") as log:
         log.put(TOPICS["tf"], at(0.0), log.messages.transforms(at(0.0), nominal_poses(mounting)))
         for k in range(frames):
-            frame = frame_of(moment, scene, rig, mounting, 1.0 + k / _RATE_HZ, rng, spec.semantics)
-            items = trio(log.messages, frame, setup, at, rng)
+            stamps = triggered_stamps(rig, mounting, 1.0 + k / _RATE_HZ, rng)
+            frame = frame_of(Seat(moment, scene, rig, mounting), stamps, rng, spec.semantics)
+            items = messages_of(log.messages, frame, setup, at, rng)
             for time_ns, topic, message in sorted(items, key=lambda p: p[0]):
                 log.put(topic, time_ns, message)
-            seen.append(replace(frame, jpeg=b"", labels_png=b"", true_labels=np.zeros((0, 0), np.uint8)))
+            seen.append(frame.scans["radar"])
             progress(k + 1, frames, f"{name} {day_name} reflectors")
     path = folder / f"{day_name}.json"
     path.write_text(json.dumps(_picks(name, day_name, mounting, seen, rng), indent=1))
@@ -119,40 +122,42 @@ def _trihedral(b: MeshBuilder, apex: np.ndarray) -> None:
 
 
 def _picks(
-    vehicle: str, day: str, m: Mounting, frames: list[SimulatedFrame], rng: np.random.Generator
+    vehicle: str, day: str, m: Mounting, scans: list[Scan], rng: np.random.Generator
 ) -> dict[str, Any]:
     """What a patient person marks in each sensor's data, and what is true."""
-    T_camera_vehicle, T_lidar_vehicle = inverse(m.T_vehicle_camera), inverse(m.T_vehicle_lidar)
-    pixels, _ = m.camera.project(transform_points(T_camera_vehicle, REFLECTORS_VEHICLE))
-    lidar = transform_points(T_lidar_vehicle, REFLECTORS_VEHICLE)
-    radar = transform_points(inverse(m.T_vehicle_radar), REFLECTORS_VEHICLE)
+    seen, lidar, radar = (
+        transform_points(inverse(m[n].T_vehicle), REFLECTORS_VEHICLE) for n in ("camera", "lidar", "radar")
+    )
+    camera, logged = m.camera("camera")
+    pixels, _ = camera.project(seen)
     positions = zip(pixels, lidar, radar, strict=True)
-    targets = [_target(frames, *position, m.camera.width_px, rng) for position in positions]
+    targets = [_target(scans, *position, camera.width_px, rng) for position in positions]
+    pairs = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
     return {
         "vehicle": vehicle,
         "day": day,
-        "frames": len(frames),
+        "frames": len(scans),
         "reflector": {"edge_m": _EDGE_M},
         "targets": targets,
         "camera": {
-            "model": m.nominal_camera.model,
-            "K": m.nominal_camera.K.tolist(),
-            "D": m.nominal_camera.D.tolist(),
-            "width_px": m.nominal_camera.width_px,
-            "height_px": m.nominal_camera.height_px,
+            "model": logged.model,
+            "K": logged.K.tolist(),
+            "D": logged.D.tolist(),
+            "width_px": logged.width_px,
+            "height_px": logged.height_px,
         },
         "truth": {
             "pixels": pixels.tolist(),
             "lidar_m": lidar.tolist(),
             "radar_m": radar.tolist(),
-            "camera_K": m.camera.K.tolist(),
-            **{key: T.tolist() for key, T in m.truth().items()},
+            "camera_K": camera.K.tolist(),
+            **{f"T_{a}_{b}": m.between(a, b).tolist() for a, b in pairs},
         },
     }
 
 
 def _target(
-    frames: list[SimulatedFrame],
+    scans: list[Scan],
     pixel: Float[np.ndarray, " 2"],
     lidar_m: Float[np.ndarray, " 3"],
     radar_m: Float[np.ndarray, " 3"],
@@ -163,7 +168,7 @@ def _target(
     step = width_px / 1824  # half a pixel of the full camera
     pixel_sd, lidar_sd = 0.5 * max(step, 0.5), _LIDAR_PICK_SIGMA_M
     picked_pixel, picked_lidar = pixel + rng.normal(0, pixel_sd, 2), lidar_m + rng.normal(0, lidar_sd, 3)
-    detections = _radar_picks(frames, radar_m)
+    detections = _radar_picks(scans, radar_m)
     return {
         "pixel": picked_pixel.tolist(),
         "lidar_m": picked_lidar.tolist(),
@@ -178,12 +183,12 @@ def _target(
     }
 
 
-def _radar_picks(frames: list[SimulatedFrame], near_m: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "N 3"]:
-    """The strongest detection around a reflector in every frame that has one."""
+def _radar_picks(scans: list[Scan], near_m: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "N 3"]:
+    """The strongest detection around a reflector in every scan that has one."""
     found = []
-    for frame in frames:
-        offset = np.linalg.norm(frame.scan.xyz_m[:, :2] - near_m[:2], axis=1)
+    for scan in scans:
+        offset = np.linalg.norm(scan.xyz_m[:, :2] - near_m[:2], axis=1)
         close = np.flatnonzero(offset < 1.5)
         if close.size:
-            found.append(frame.scan.xyz_m[close[np.argmax(frame.scan.power_db[close])]])
+            found.append(scan.xyz_m[close[np.argmax(scan.power_db[close])]])
     return np.array(found, np.float64) if found else np.full((1, 3), np.nan)

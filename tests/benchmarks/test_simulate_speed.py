@@ -7,7 +7,8 @@ import pytest
 
 from pipeline.simulate.fleet import FleetSpec, simulate_vehicle_day
 from pipeline.simulate.sensors.camera import _rays_of
-from pipeline.simulate.sensors.rigs import mounting_of, rig_named
+from pipeline.simulate.sensors.mounting import mounting_of
+from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
@@ -25,8 +26,8 @@ def seconds_per_bare_image(rig):
     drive = Drive(3, "urban", 10.0, 0)
     mounting = mounting_of(rig_named(rig), 1, 0, 0)
     moment = World(drive).moment(2.0)
-    T = drive.ego.poses(np.array([2.0]))[0] @ mounting.T_vehicle_camera
-    rays = (_rays_of(mounting.camera) @ T[:3, :3].T.astype(np.float32)).reshape(-1, 3)
+    T = drive.ego.poses(np.array([2.0]))[0] @ mounting["camera"].T_vehicle
+    rays = (_rays_of(mounting["camera"].camera) @ T[:3, :3].T.astype(np.float32)).reshape(-1, 3)
     origins = np.tile((T[:3, 3] - moment.standing.origin).astype(np.float32), (len(rays), 1))
     rounds = []
     for _ in range(2):

@@ -10,23 +10,40 @@ from rosbags.rosbag1 import Reader as Bag1
 from rosbags.rosbag2 import Reader as Bag2
 
 from pipeline.simulate.logs.messages import Messages
-from pipeline.simulate.sensors.rigs import Mounting, RigSpec, mounting_of, rig_named
-from pipeline.simulate.sensors.semantics import SemanticsSpec
-from pipeline.simulate.sensors.simulated_frame import Scene, SimulatedFrame, frame_of, scene_of
+from pipeline.simulate.sensors.lidar import Sweep
+from pipeline.simulate.sensors.mounting import Mounting, mounting_of
+from pipeline.simulate.sensors.radar import Scan
+from pipeline.simulate.sensors.rig_spec import RigSpec
+from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.simulate.sensors.semantics import Box, SemanticsSpec
+from pipeline.simulate.sensors.simulated_frame import Scene, Seat, frame_of, scene_of, triggered_stamps
 from pipeline.simulate.world.casting import Moment, World
 from pipeline.simulate.world.drives import Drive
 
 
 @dataclass(frozen=True, eq=False)
+class Trio:
+    """What camera, lidar and radar of a rig of three deliver for one moment."""
+
+    lidar_stamp_s: float
+    camera_stamp_s: float
+    jpeg: bytes
+    boxes: list[Box]
+    sweep: Sweep
+    scan: Scan
+    true_labels: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Shot:
-    """One simulated trio and everything that is known about it."""
+    """One simulated moment and everything that is known about it."""
 
     drive: Drive
     scene: Scene
     moment: Moment
     rig: RigSpec
     mounting: Mounting
-    frame: SimulatedFrame
+    frame: Trio
 
 
 def shots_of(environment, *, rig=None, times=(1.0, 4.0), seed=5, night=False):
@@ -35,9 +52,19 @@ def shots_of(environment, *, rig=None, times=(1.0, 4.0), seed=5, night=False):
     drive = Drive(seed, environment, 8.0, 0, night)
     world, scene, shots = World(drive), scene_of(drive), []
     for t in times:
-        moment = world.moment(t - rig.lidar.sweep_s / 2)
-        frame = frame_of(
-            moment, scene, rig, mounting, t, np.random.default_rng([7, int(10 * t)]), SemanticsSpec()
+        moment = world.moment(t - rig["lidar"].sheet.sweep_s / 2)
+        rng = np.random.default_rng([7, int(10 * t)])
+        stamps = triggered_stamps(rig, mounting, t, rng)
+        seen = frame_of(Seat(moment, scene, rig, mounting), stamps, rng, SemanticsSpec())
+        image = seen.images["camera"]
+        frame = Trio(
+            t,
+            stamps["camera"],
+            image.jpeg,
+            image.boxes,
+            seen.sweeps["lidar"],
+            seen.scans["radar"],
+            image.true_labels,
         )
         shots.append(Shot(drive, scene, moment, rig, mounting, frame))
     return shots
@@ -61,7 +88,7 @@ def shots(urban, highway):
 @pytest.fixture(scope="session")
 def flat_shot():
     rig = rig_named("ring16-flat")
-    small = replace(rig, lidar=replace(rig.lidar, columns=450))
+    small = rig.with_sheet("lidar", replace(rig["lidar"].sheet, columns=450))
     return shots_of("urban", rig=small, times=(2.0,))[0]
 
 
@@ -71,9 +98,9 @@ def shots_of_rig():
 
     def make(name, environment):
         rig = rig_named(name)
-        around = rig.lidar.azimuth_deg[1] == 180
-        lidar = replace(rig.lidar, columns=450) if around else rig.lidar
-        return shots_of(environment, rig=replace(rig, lidar=lidar), times=(2.0,))[0]
+        around = rig["lidar"].sheet.azimuth_deg[1] == 180
+        lidar = replace(rig["lidar"].sheet, columns=450) if around else rig["lidar"].sheet
+        return shots_of(environment, rig=rig.with_sheet("lidar", lidar), times=(2.0,))[0]
 
     return make
 

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.simulate.faults import Fault
 from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day
-from pipeline.simulate.logs.writers import TOPICS
+from pipeline.simulate.logs.topics import TOPICS
 from pipeline.simulate.sensors.clocks import Ticks, free_clocks
 from pipeline.simulate.sensors.rigs import rig_named
 
@@ -27,11 +27,12 @@ def test_the_two_ticks_nearest_to_a_time_enclose_it(t_s):
 
 
 def test_free_clocks_drift_through_all_gaps_even_where_rates_are_multiples():
-    clocks = free_clocks((30.0, 10.0, 13.0), np.random.default_rng(0))
-    sweeps = [clocks.lidar.nearest(t)[0] for t in np.arange(0, 60, 0.5)]
-    gaps = np.array([clocks.camera.nearest(t)[0] - t for t in sweeps])
-    assert np.abs(gaps).max() <= clocks.camera.period_s / 2 + 1e-12
-    assert np.ptp(gaps) > 0.9 * clocks.camera.period_s
+    clocks = free_clocks(rig_named("paper-free"), np.random.default_rng(0))
+    camera = clocks["camera"]
+    sweeps = [clocks["lidar"].nearest(t)[0] for t in np.arange(0, 60, 0.5)]
+    gaps = np.array([camera.nearest(t)[0] - t for t in sweeps])
+    assert np.abs(gaps).max() <= camera.period_s / 2 + 1e-12
+    assert np.ptp(gaps) > 0.9 * camera.period_s
 
 
 def stamps_of(read, log, topic):
@@ -41,7 +42,8 @@ def stamps_of(read, log, topic):
 def test_a_free_running_log_holds_the_nearest_image_and_scan_and_some_that_are_not(
     tmp_path, read, the_log, monkeypatch
 ):
-    free = replace(rig_named("demo"), free_hz=rig_named("paper-free").free_hz)
+    rates = {s.name: s.rate_hz for s in rig_named("paper-free").sensors}
+    free = rig_named("demo").changed(lambda s: replace(s, rate_hz=rates[s.name]))
     monkeypatch.setattr("pipeline.simulate.fleet.rig_named", lambda _: free)
     simulate_vehicle_day(FleetSpec(**SHORT, frames=5), 0, 0, tmp_path)
     log = the_log(tmp_path)
@@ -73,4 +75,4 @@ def test_a_stamp_fault_shifts_stamps_and_nothing_else(tmp_path, read, the_log):
 def test_a_late_clock_shifts_what_a_sensor_sees_and_not_its_stamps():
     fault = Fault("vehicle-1", 0, "radar", "time", 0.03)
     mounting = mounting_on(FleetSpec(**SHORT, frames=1, faults=(fault,)), 0, 0)
-    assert mounting.radar_phase_s == 0.0
+    assert mounting["radar"].phase_s == 0.0

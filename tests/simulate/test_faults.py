@@ -8,7 +8,7 @@ from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import inverse, log_so3
 from pipeline.simulate.faults import Fault, faults_on, parse_faults
 from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day
-from pipeline.simulate.logs.writers import TOPICS
+from pipeline.simulate.logs.topics import TOPICS
 
 DAYS = ["2026-03-02", "2026-03-03", "2026-03-04"]
 QUIET = {"vehicles": 2, "days": 3, "frames": 1, "drives": 1, "environments": "urban"}
@@ -20,24 +20,24 @@ def spec_with(*faults):
 
 def moved_deg(spec, day, pair):
     """Turn of a pair's true transform against the same day without faults."""
-    T, T0 = (mounting_on(s, 0, day).truth()[pair] for s in (spec, FleetSpec(**QUIET)))
+    T, T0 = (mounting_on(s, 0, day).between(*pair) for s in (spec, FleetSpec(**QUIET)))
     return np.degrees(np.linalg.norm(log_so3((T @ inverse(T0))[:3, :3])))
 
 
 def test_a_knocked_radar_moves_its_two_pairs_from_that_day_on_and_no_other():
     spec = spec_with(Fault("vehicle-1", 1, "radar", "yaw", 1.2))
-    for pair in ("T_lidar_radar", "T_camera_radar"):
+    for pair in (("lidar", "radar"), ("camera", "radar")):
         assert moved_deg(spec, 0, pair) == pytest.approx(0, abs=1e-9)
         assert moved_deg(spec, 1, pair) == pytest.approx(1.2, abs=1e-6)
         assert moved_deg(spec, 2, pair) == pytest.approx(1.2, abs=1e-6)
-    assert moved_deg(spec, 2, "T_camera_lidar") == pytest.approx(0, abs=1e-9)
-    other = mounting_on(spec, 1, 2).truth()["T_lidar_radar"]
-    np.testing.assert_array_equal(other, mounting_on(FleetSpec(**QUIET), 1, 2).truth()["T_lidar_radar"])
+    assert moved_deg(spec, 2, ("camera", "lidar")) == pytest.approx(0, abs=1e-9)
+    other = mounting_on(spec, 1, 2).between("lidar", "radar")
+    np.testing.assert_array_equal(other, mounting_on(FleetSpec(**QUIET), 1, 2).between("lidar", "radar"))
 
 
 def test_a_slow_drift_grows_day_by_day():
     spec = spec_with(Fault("vehicle-1", 1, "lidar", "drift-pitch", 0.2))
-    turned = [moved_deg(spec, day, "T_camera_lidar") for day in range(3)]
+    turned = [moved_deg(spec, day, ("camera", "lidar")) for day in range(3)]
     np.testing.assert_allclose(turned, [0.0, 0.2, 0.4], atol=1e-6)
 
 
@@ -45,8 +45,8 @@ def test_a_knock_within_a_day_spares_its_first_frames_and_stays_for_good():
     spec = spec_with(*parse_faults("vehicle-1:1:camera:yaw:0.5@0.6", DAYS))
 
     def turned_deg(day, share):
-        T = mounting_on(spec, 0, day, share).truth()["T_camera_lidar"]
-        T0 = mounting_on(FleetSpec(**QUIET), 0, day).truth()["T_camera_lidar"]
+        T = mounting_on(spec, 0, day, share).between("camera", "lidar")
+        T0 = mounting_on(FleetSpec(**QUIET), 0, day).between("camera", "lidar")
         return np.degrees(np.linalg.norm(log_so3((T @ inverse(T0))[:3, :3])))
 
     turned = [
@@ -61,8 +61,10 @@ def test_a_knock_within_a_day_spares_its_first_frames_and_stays_for_good():
 
 def test_a_sensor_that_warms_up_moves_over_the_day_and_is_back_the_next():
     spec = spec_with(*parse_faults("vehicle-1:1:lidar:warm-pitch:0.3", DAYS))
-    pitch = [mounting_on(spec, 0, d, s).T_vehicle_lidar for d, s in ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.5))]
-    still = [mounting_on(FleetSpec(**QUIET), 0, d).T_vehicle_lidar for d in (1, 1, 1, 2)]
+    pitch = [
+        mounting_on(spec, 0, d, s)["lidar"].T_vehicle for d, s in ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.5))
+    ]
+    still = [mounting_on(FleetSpec(**QUIET), 0, d)["lidar"].T_vehicle for d in (1, 1, 1, 2)]
     turns = [log_so3(T[:3, :3] @ T0[:3, :3].T) for T, T0 in zip(pitch, still, strict=True)]
     np.testing.assert_allclose(np.degrees(turns), [[0, a, 0] for a in (0, 0.15, 0.3, 0)], atol=1e-9)
 
@@ -89,18 +91,18 @@ def test_a_shift_moves_the_sensor_and_a_late_clock_the_stamps():
     spec = spec_with(Fault("vehicle-1", 1, "camera", "z", 0.05), Fault("vehicle-1", 1, "radar", "time", 0.03))
     before, after = (mounting_on(s, 0, 1) for s in (FleetSpec(**QUIET), spec))
     np.testing.assert_allclose(
-        after.T_vehicle_camera[:3, 3] - before.T_vehicle_camera[:3, 3], [0, 0, 0.05], atol=1e-12
+        after["camera"].T_vehicle[:3, 3] - before["camera"].T_vehicle[:3, 3], [0, 0, 0.05], atol=1e-12
     )
-    assert after.radar_delay_s - before.radar_delay_s == pytest.approx(0.03)
+    assert after["radar"].delay_s - before["radar"].delay_s == pytest.approx(0.03)
 
 
 def test_the_daily_remount_is_small_beside_a_knock():
     spec = FleetSpec(**QUIET | {"days": 20})
-    first = mounting_on(spec, 0, 0).truth()["T_lidar_radar"]
+    first = mounting_on(spec, 0, 0).between("lidar", "radar")
     turns = [
         np.degrees(
             np.linalg.norm(
-                log_so3((mounting_on(spec, 0, d).truth()["T_lidar_radar"] @ inverse(first))[:3, :3])
+                log_so3((mounting_on(spec, 0, d).between("lidar", "radar") @ inverse(first))[:3, :3])
             )
         )
         for d in range(1, 20)
@@ -110,7 +112,7 @@ def test_the_daily_remount_is_small_beside_a_knock():
 
 def test_a_rig_that_is_taken_off_every_evening_comes_back_otherwise():
     spec = FleetSpec(**QUIET, remount_deg=0.5)
-    first, second = (mounting_on(spec, 0, day).truth()["T_lidar_radar"] for day in (0, 1))
+    first, second = (mounting_on(spec, 0, day).between("lidar", "radar") for day in (0, 1))
     assert 0.2 < np.degrees(np.linalg.norm(log_so3((first @ inverse(second))[:3, :3]))) < 4.0
 
 
@@ -197,9 +199,10 @@ def test_night_is_dark_and_confuses_the_networks(tmp_path, logged):
 
 def test_faults_on_another_day_leave_this_one_alone():
     faults = (Fault("vehicle-1", 2, "lidar", "missing", 1.0), Fault("vehicle-1", 2, "camera", "few", 3.0))
-    assert faults_on(faults, "vehicle-1", 1).missing == ()
-    assert faults_on(faults, "vehicle-1", 2).missing == ("lidar",)
-    assert faults_on(faults, "vehicle-1", 2).frames == 3
+    assert not faults_on(faults, "vehicle-1", 1).faults
+    assert faults_on(faults, "vehicle-1", 2).has("missing", "lidar")
+    assert not faults_on(faults, "vehicle-1", 2).has("missing", "camera")
+    assert faults_on(faults, "vehicle-1", 2).amount("few") == 3
 
 
 def test_faults_are_read_from_text_by_day_or_number():

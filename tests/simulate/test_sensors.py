@@ -11,20 +11,23 @@ from pipeline.simulate.world.materials import LABELS
 
 def test_the_paper_rig_has_the_data_sheet_of_the_paper():
     rig = rig_named("paper")
-    camera = rig.camera.nominal()
+    camera = rig["camera"].sheet.nominal()
     assert (camera.width_px, camera.height_px, camera.model) == (1824, 940, "equidistant")
     edges = camera.unproject(np.array([[-0.5, 469.5], [1823.5, 469.5], [911.5, -0.5], [911.5, 939.5]]))
     np.testing.assert_allclose(np.degrees(np.arccos(edges[0] @ edges[1])), 116.0, atol=0.1)
     np.testing.assert_allclose(np.degrees(np.arccos(edges[2] @ edges[3])), 58.5, atol=0.1)
-    assert rig.lidar.columns == 240
-    assert rig.lidar.rows == 96
-    assert (rig.radar.azimuth_resolution_deg, rig.radar.elevation_resolution_deg) == (1.6, 6.0)
+    assert rig["lidar"].sheet.columns == 240
+    assert rig["lidar"].sheet.rows == 96
+    assert (rig["radar"].sheet.azimuth_resolution_deg, rig["radar"].sheet.elevation_resolution_deg) == (
+        1.6,
+        6.0,
+    )
 
 
 def test_doppler_is_quantised_and_folded_into_one_period(highway):
     shot = highway[0]
-    spec = replace(shot.rig.radar, doppler_period_mps=10.394, doppler_step_mps=0.0812)
-    args = (shot.moment, shot.scene.ego, shot.mounting.T_vehicle_radar)
+    spec = replace(shot.rig["radar"].sheet, doppler_period_mps=10.394, doppler_step_mps=0.0812)
+    args = (shot.moment, shot.scene.ego, shot.mounting["radar"].T_vehicle)
     folded = scan_radar(*args, spec, RadarErrors(), np.random.default_rng(3))
     free = scan_radar(*args, replace(spec, doppler_period_mps=None), RadarErrors(), np.random.default_rng(3))
     assert np.abs(folded.range_rate_mps).max() <= 10.394 / 2 + 0.05
@@ -35,7 +38,7 @@ def test_doppler_is_quantised_and_folded_into_one_period(highway):
 
 def test_range_and_elevation_errors_are_what_was_asked_for(urban):
     shot = urban[0]
-    args = (shot.moment, shot.scene.ego, shot.mounting.T_vehicle_radar, shot.rig.radar)
+    args = (shot.moment, shot.scene.ego, shot.mounting["radar"].T_vehicle, shot.rig["radar"].sheet)
     plain = scan_radar(*args, RadarErrors(), np.random.default_rng(3))
     off = scan_radar(*args, RadarErrors(range_bias_m=0.3), np.random.default_rng(3))
     n = min(len(plain.xyz_m), len(off.xyz_m))
@@ -65,10 +68,10 @@ def test_paint_is_brighter_than_asphalt_to_camera_and_lidar(highway):
         intensity = shot.frame.sweep.intensity[near]
         bright = intensity > 25
         assert 0.01 < bright.mean() < 0.3
-        T_camera_lidar = shot.mounting.truth()["T_camera_lidar"]
+        T_camera_lidar = shot.mounting.between("camera", "lidar")
         p = shot.frame.sweep.xyz_m[near] @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-        uv, ok = shot.mounting.camera.project(p)
-        ok &= shot.mounting.camera.contains(uv)
+        uv, ok = shot.mounting["camera"].camera.project(p)
+        ok &= shot.mounting["camera"].camera.contains(uv)
         image = cv2.imdecode(np.frombuffer(shot.frame.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
         u, v = np.round(uv[ok]).astype(int).T
         grey = image[v, u].astype(float)
@@ -77,11 +80,11 @@ def test_paint_is_brighter_than_asphalt_to_camera_and_lidar(highway):
 
 def test_edges_of_objects_give_mixed_points(urban):
     """Some returns lie between two surfaces, so an estimator may not trust each depth jump."""
-    spec = urban[0].rig.lidar
+    spec = urban[0].rig["lidar"].sheet
     sharp = replace(spec, divergence_deg=1e-6)
     from pipeline.simulate.sensors.lidar import sweep_lidar
 
-    args = (urban[0].moment, urban[0].scene.ego, urban[0].mounting.T_vehicle_lidar)
+    args = (urban[0].moment, urban[0].scene.ego, urban[0].mounting["lidar"].T_vehicle)
     end = urban[0].frame.lidar_stamp_s
     wide = sweep_lidar(*args, spec, end, np.random.default_rng(0))
     fine = sweep_lidar(*args, sharp, end, np.random.default_rng(0))
@@ -101,7 +104,7 @@ def test_edges_of_objects_give_mixed_points(urban):
 
 
 def test_some_beams_never_come_back(urban):
-    spec = urban[0].rig.lidar
+    spec = urban[0].rig["lidar"].sheet
     assert 0.3 < len(urban[0].frame.sweep.ring) / (spec.rows * spec.columns) < 0.99
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pipeline.simulate.logs.writers import TOPICS
-from pipeline.simulate.sensors.rig_spec import RigSpec
+from pipeline.simulate.logs.topics import TOPICS, topics_of
+from pipeline.simulate.sensors.data_sheets import CameraSpec, RadarSpec
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
 
 __all__ = ["fleet_toml", "mixed_fleet_toml"]
 
@@ -30,26 +31,16 @@ def _text(fleet: str, rigs: Mapping[str, RigSpec], vehicles: Mapping[str, str]) 
 
 
 def _sections(rig_name: str, rig: RigSpec) -> list[str]:
-    period = rig.radar.doppler_period_mps
+    lines = (
+        []
+        if rig.is_short
+        else [f"[rigs.{rig_name}]", f'reference = "{rig.reference.name}"', 'base = "base_link"', ""]
+    )
+    for sensor in rig.sensors:
+        lines += [f"[rigs.{rig_name}.{sensor.kind}{'' if rig.is_short else f's.{sensor.name}'}]"]
+        lines += [*_sensor(sensor), ""]
     return [
-        f"[rigs.{rig_name}.camera]",
-        f'image = "{TOPICS["image"]}"',
-        f'info = "{TOPICS["info"]}"',
-        (
-            f'semantics = {{ source = "topics", labels = "{TOPICS["labels"]}", '
-            f'detections = "{TOPICS["detections"]}", label_set = "cityscapes" }}'
-        ),
-        *([f"readout_s = {rig.camera.readout_s}"] if rig.camera.readout_s else []),
-        "",
-        f"[rigs.{rig_name}.lidar]",
-        f'points = "{TOPICS["lidar"]}"',
-        "",
-        f"[rigs.{rig_name}.radar]",
-        f'points = "{TOPICS["radar"]}"',
-        'doppler_field = "doppler"',
-        f'doppler_positive = "{rig.radar.doppler_positive}"',
-        *([f"doppler_period_mps = {period}"] if period is not None else []),
-        "",
+        *lines,
         f"[rigs.{rig_name}.ego]",
         f'odometry = "{TOPICS["odometry"]}"',
         "",
@@ -57,4 +48,28 @@ def _sections(rig_name: str, rig: RigSpec) -> list[str]:
         'source = "tf_static"',
         "rotation_sigma_deg = 1.2",
         "translation_sigma_m = 0.03",
+    ]
+
+
+def _sensor(sensor: SensorSpec) -> list[str]:
+    topics, sheet = topics_of(sensor.name, sensor.kind), sensor.sheet
+    if isinstance(sheet, CameraSpec):
+        return [
+            f'image = "{topics["image"]}"',
+            f'info = "{topics["info"]}"',
+            (
+                f'semantics = {{ source = "topics", labels = "{topics["labels"]}", '
+                f'detections = "{topics["detections"]}", label_set = "cityscapes" }}'
+            ),
+            *([f"readout_s = {sheet.readout_s}"] if sheet.readout_s else []),
+        ]
+    points = [f'points = "{topics["points"]}"']
+    if not isinstance(sheet, RadarSpec):
+        return points
+    period = sheet.doppler_period_mps
+    return [
+        *points,
+        'doppler_field = "doppler"',
+        f'doppler_positive = "{sheet.doppler_positive}"',
+        *([f"doppler_period_mps = {period}"] if period is not None else []),
     ]

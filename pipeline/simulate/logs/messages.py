@@ -15,6 +15,7 @@ from pipeline.simulate.sensors.semantics import Box
 
 __all__ = ["FRAMES", "Messages"]
 
+# Frames of a rig whose sensors are called camera, lidar and radar; elsewhere a sensor's frame has its name.
 FRAMES: Final = {
     "camera": "camera_front_optical",
     "lidar": "lidar_top",
@@ -50,7 +51,7 @@ def _typestore(ros_version: int) -> Any:
 
 
 class Messages:
-    """Makes messages of ROS version 1 or 2, in the frames of the simulated car."""
+    """Makes messages of ROS version 1 or 2, in the frames of the simulated car; sensors go by their names."""
 
     def __init__(self, ros_version: int) -> None:
         self.typestore = _typestore(ros_version)
@@ -61,21 +62,21 @@ class Messages:
         return self.ros.serialised(message)
 
     def _at(self, stamp_ns: int, frame: str) -> Any:
-        return self.ros.header(stamp_ns, FRAMES[frame])
+        return self.ros.header(stamp_ns, FRAMES.get(frame, frame))
 
-    def image(self, stamp_ns: int, data: bytes, encoding: str) -> Any:
+    def image(self, stamp_ns: int, camera: str, data: bytes, encoding: str) -> Any:
         """CompressedImage."""
-        return self.ros.image(self._at(stamp_ns, "camera"), data, encoding)
+        return self.ros.image(self._at(stamp_ns, camera), data, encoding)
 
-    def camera_info(self, stamp_ns: int, camera: Camera) -> Any:
+    def camera_info(self, stamp_ns: int, camera: str, intrinsics: Camera) -> Any:
         """CameraInfo."""
-        return self.ros.camera_info(self._at(stamp_ns, "camera"), camera)
+        return self.ros.camera_info(self._at(stamp_ns, camera), intrinsics)
 
-    def cloud(self, stamp_ns: int, frame: str, columns: dict[str, np.ndarray]) -> Any:
+    def cloud(self, stamp_ns: int, sensor: str, columns: dict[str, np.ndarray]) -> Any:
         """PointCloud2 of float32 and uint16 columns, packed in their order."""
-        return self.ros.cloud(self._at(stamp_ns, frame), columns)
+        return self.ros.cloud(self._at(stamp_ns, sensor), columns)
 
-    def detections(self, stamp_ns: int, boxes: list[Box]) -> Any:
+    def detections(self, stamp_ns: int, camera: str, boxes: list[Box]) -> Any:
         """Detection2DArray; boxes in full-image pixels."""
         items = []
         for i, box in enumerate(boxes):
@@ -87,20 +88,20 @@ class Messages:
             bbox = self.ros.make(
                 "vision_msgs/BoundingBox2D", center=centre, size_x=box.x1 - box.x0, size_y=box.y1 - box.y0
             )
-            header = self._at(stamp_ns, "camera")
+            header = self._at(stamp_ns, camera)
             items.append(
                 self.ros.make(
                     "vision_msgs/Detection2D", header=header, results=[result], bbox=bbox, id=str(i)
                 )
             )
         return self.ros.make(
-            "vision_msgs/Detection2DArray", header=self._at(stamp_ns, "camera"), detections=items
+            "vision_msgs/Detection2DArray", header=self._at(stamp_ns, camera), detections=items
         )
 
     def transforms(self, stamp_ns: int, T_vehicle_sensor: dict[str, Float[np.ndarray, "4 4"]]) -> Any:
         """TFMessage with the vehicle as parent of every sensor."""
         poses = T_vehicle_sensor.items()
-        return self.ros.transforms((self._at(stamp_ns, "vehicle"), FRAMES[s], T) for s, T in poses)
+        return self.ros.transforms((self._at(stamp_ns, "vehicle"), FRAMES.get(s, s), T) for s, T in poses)
 
     def odometry(
         self, stamp_ns: int, T_odom_vehicle: Float[np.ndarray, "4 4"], speed_mps: float, yaw_rate_radps: float

@@ -2,44 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import cv2
 import numpy as np
 
 from pipeline.geometry.se3 import from_rotation_translation
-from pipeline.simulate.faults import DayFaults, misread
+from pipeline.simulate.faults import DayFaults, misread, swapped_with
 from pipeline.simulate.logs.messages import Messages
-from pipeline.simulate.logs.writers import TOPICS, OpenLog
-from pipeline.simulate.sensors.clocks import Clocks, free_clocks
+from pipeline.simulate.logs.topics import TOPICS, topics_of
+from pipeline.simulate.logs.writers import OpenLog
+from pipeline.simulate.sensors.clocks import Ticks, free_clocks
+from pipeline.simulate.sensors.data_sheets import LidarSpec, RadarSpec
+from pipeline.simulate.sensors.lidar import Sweep
+from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan
-from pipeline.simulate.sensors.rigs import Mounting, RigSpec
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
 from pipeline.simulate.sensors.semantics import SemanticsSpec, encode_png
 from pipeline.simulate.sensors.simulated_frame import (
     Image,
+    Seat,
     SimulatedFrame,
     frame_of,
-    image_of,
-    scan_of,
     scene_of,
+    triggered_stamps,
 )
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
-__all__ = ["FIRST_FRAME_S", "Setup", "nominal_poses", "record_drive", "trio"]
+__all__ = ["FIRST_FRAME_S", "Setup", "messages_of", "nominal_poses", "record_drive"]
 
+T = TypeVar("T")
 _ODOMETRY_HZ: Final = 20.0
 FIRST_FRAME_S: Final = 1.0  # a drive's log begins this long before its first frame
-# Of free-running sensors the log holds the image and the scan next to each sweep, for rendering costs most of a day;
-# with every so many sweeps also the second next ones, so that pairing has to choose.
+# Of free-running sensors the log holds what each measured next to the reference's sweep, for rendering costs most of a
+# day; with every so many sweeps also the second next, so that pairing has to choose.
 _NEIGHBOURS_EVERY: Final = 4
+
+
+At = Callable[[float], int]  # stamp [ns] of a time of the drive [s]
+Sent = tuple[int, str, Any]  # log time [ns], topic, message
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A vehicle on one day: its rig, where its sensors are in the morning, how well networks label, what is wrong."""
+    """A vehicle at one moment: its rig, where its sensors are, how well networks label, what is wrong with it."""
 
     rig: RigSpec
     mounting: Mounting
@@ -50,8 +59,7 @@ class Setup:
 def record_drive(
     log: OpenLog,
     world: World,
-    setup: Setup,
-    mountings: Sequence[Mounting],
+    setups: Sequence[Setup],
     rate_hz: float,
     rng: np.random.Generator,
     tick: Callable[[int], None],
@@ -61,34 +69,36 @@ def record_drive(
     Args:
         log: open for writing.
         world: of the drive.
-        setup: the vehicle that drives through it.
-        mountings: where the sensors are at each trio to write.
-        rate_hz: trios per second.
+        setups: the vehicle at each moment to write.
+        rate_hz: moments per second.
         rng: noise.
-        tick: told the number of frames written, after each.
+        tick: told the number of moments written, after each.
     """
-    drive, messages = world.drive, log.messages
+    drive, messages, rig = world.drive, log.messages, setups[0].rig
 
     def at(t_s: float) -> int:
         return drive.start_ns + round(t_s * 1e9)
 
     odometry = _odometry(drive, rng)
-    log.put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), nominal_poses(setup.mounting)))
+    log.put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), nominal_poses(setups[0].mounting)))
     scene = scene_of(drive)
-    semantics = _labelled_in_the_dark(setup.semantics, setup.faults)
-    free_hz = setup.rig.free_hz
-    clocks = None if free_hz is None else free_clocks(free_hz, np.random.default_rng([drive.seed, 53]))
-    for k, mounting in enumerate(mountings):
+    clocks = free_clocks(rig, np.random.default_rng([drive.seed, 53]))
+    first: dict[str, SimulatedFrame] = {}
+    for k, setup in enumerate(setups):
         stamp = FIRST_FRAME_S + k / rate_hz + rng.uniform(0, 0.02)
-        stamp, near = (stamp, None) if clocks is None else _free_stamps(clocks, stamp)
-        moment = world.moment(stamp - setup.rig.lidar.sweep_s / 2)
-        view = moment, scene, setup.rig, mounting
-        frame = frame_of(*view, stamp, rng, semantics, near and near[0])
-        pending = trio(messages, frame, setup, at, rng)
-        if near is not None and k % _NEIGHBOURS_EVERY == 0:
-            image, scan = image_of(*view, near[1][0], rng, semantics), scan_of(*view, near[1][1], rng)
-            pending += _of_camera(messages, image, setup, at, rng)
-            pending += _of_radar(messages, scan, near[1][1], setup, at)
+        if rig.reference.name in clocks:
+            stamp = clocks[rig.reference.name].nearest(stamp)[0]
+        seat = Seat(world.moment(stamp - _sweep_s(rig) / 2), scene, rig, setup.mounting)
+        semantics = _labelled_in_the_dark(setup.semantics, setup.faults)
+        near, next_near = _stamps(setup, clocks, stamp, rng)
+        alone = [{n: t} for n, t in next_near.items()] if k % _NEIGHBOURS_EVERY == 0 else []
+        pending: list[Sent] = []
+        for group in ([near], alone):
+            frames = [frame_of(seat, stamps, rng, semantics) for stamps in group]
+            for frame in frames:
+                first |= {name: frame for name in frame.stamps_s if name not in first}
+                shown = _resent(frame, first, setup.faults)
+                pending += messages_of(messages, shown, setup, at, rng)
         while odometry and odometry[0][0] <= stamp + 0.1:
             t, T, speed, yaw_rate = odometry.pop(0)
             pending.append((at(t), TOPICS["odometry"], messages.odometry(at(t), T, speed, yaw_rate)))
@@ -97,94 +107,124 @@ def record_drive(
         tick(k + 1)
 
 
-def _free_stamps(
-    clocks: Clocks, about_s: float
-) -> tuple[float, tuple[tuple[float, float], tuple[float, float]]]:
-    """The sweep nearest to a time, the (image, scan) nearest to it, and the next nearest."""
-    stamp = clocks.lidar.nearest(about_s)[0]
-    camera, radar = clocks.camera.nearest(stamp), clocks.radar.nearest(stamp)
-    return stamp, ((camera[0], radar[0]), (camera[1], radar[1]))
+def _sweep_s(rig: RigSpec) -> float:
+    sheet = rig.reference.sheet
+    assert isinstance(sheet, LidarSpec)
+    return sheet.sweep_s
 
 
-def trio(
-    messages: Messages,
-    frame: SimulatedFrame,
-    setup: Setup,
-    at: Callable[[float], int],
-    rng: np.random.Generator,
-) -> list[tuple[int, str, Any]]:
-    """The messages of one frame: (log time [ns], topic, message).
+def _stamps(
+    setup: Setup, clocks: Mapping[str, Ticks], sweep_s: float, rng: np.random.Generator
+) -> tuple[dict[str, float], dict[str, float]]:
+    """By sensor the stamp nearest to the reference's, and of others that run freely the next nearest."""
+    rig, mounting = setup.rig, setup.mounting
+    if not clocks:
+        return triggered_stamps(rig, mounting, sweep_s, rng), {}
+    phase = {n: mounting[n].phase_s for n in clocks}
+    near = {n: ticks.nearest(sweep_s) for n, ticks in clocks.items()}
+    others = {n: second + phase[n] for n, (_, second) in near.items() if n != rig.reference.name}
+    return {n: first + phase[n] for n, (first, _) in near.items()}, others
+
+
+def _resent(frame: SimulatedFrame, first: Mapping[str, SimulatedFrame], today: DayFaults) -> SimulatedFrame:
+    """A frame in which stuck sensors deliver what they did first."""
+
+    def held(by_name: Mapping[str, T], of: Callable[[SimulatedFrame], Mapping[str, T]]) -> dict[str, T]:
+        return {n: of(first[n])[n] if today.has("stuck", n) else value for n, value in by_name.items()}
+
+    return SimulatedFrame(
+        frame.stamps_s,
+        held(frame.images, lambda f: f.images),
+        held(frame.sweeps, lambda f: f.sweeps),
+        held(frame.scans, lambda f: f.scans),
+    )
+
+
+def messages_of(
+    messages: Messages, frame: SimulatedFrame, setup: Setup, at: At, rng: np.random.Generator
+) -> list[Sent]:
+    """The messages of one frame; none of a sensor that is missing.
 
     Args:
         messages: makes them.
         frame: what the sensors deliver.
         setup: rig and faults of the day.
-        at: stamp [ns] of a time of the drive [s].
+        at: stamp of a time of the drive.
         rng: exchanges classes where the day's labels are permuted.
     """
-    image = Image(frame.camera_stamp_s, frame.jpeg, frame.labels_png, frame.boxes, frame.true_labels)
-    return [
-        *_of_camera(messages, image, setup, at, rng),
-        *_of_lidar(messages, frame, setup, at),
-        *_of_radar(messages, frame.scan, frame.radar_stamp_s, setup, at),
-    ]
+    sent: list[Sent] = []
+    for sensor in setup.rig.sensors:
+        name = sensor.name
+        if name not in frame.stamps_s or setup.faults.has("missing", name):
+            continue
+        stamp = at(frame.stamps_s[name])
+        if name in frame.images:
+            sent += _of_camera(messages, frame.images[name], setup, sensor, stamp, rng)
+        else:
+            columns = (
+                _of_lidar(frame.sweeps[name], sensor)
+                if name in frame.sweeps
+                else _of_radar(frame.scans[name], sensor)
+            )
+            plug = _plugged(sensor, setup)
+            # A reader takes the frame of a mistaken cable from the driver behind it.
+            owner = plug if plug.kind == sensor.kind else sensor
+            topic = topics_of(plug.name, plug.kind)["points"]
+            sent.append((stamp, topic, messages.cloud(stamp, owner.name, columns)))
+    return sent
+
+
+def _plugged(sensor: SensorSpec, setup: Setup) -> SensorSpec:
+    """The sensor on whose topic this one's points are sent."""
+    for fault in setup.faults.faults:
+        if fault.kind == "swap":
+            one = setup.rig[fault.sensor]
+            other = swapped_with(one, setup.rig)
+            if other is not None and sensor in (one, other):
+                return other if sensor == one else one
+    return sensor
 
 
 def _of_camera(
     messages: Messages,
     image: Image,
     setup: Setup,
-    at: Callable[[float], int],
+    sensor: SensorSpec,
+    stamp: int,
     rng: np.random.Generator,
-) -> list[tuple[int, str, Any]]:
-    """An image with its intrinsics, labels and detections; none where the camera is missing."""
-    today, stamp = setup.faults, at(image.stamp_s)
-    if "camera" in today.missing:
-        return []
-    info = misread(setup.mounting.nominal_camera, today)
-    labels = _permuted(image.labels_png, rng) if today.labels_permuted else image.labels_png
-    return [
-        (stamp, TOPICS["info"], messages.camera_info(stamp, info)),
-        (stamp, TOPICS["image"], messages.image(stamp, image.jpeg, "jpeg")),
-        (stamp, TOPICS["labels"], messages.image(stamp, labels, "mono8; png compressed")),
-        (stamp, TOPICS["detections"], messages.detections(stamp, image.boxes)),
-    ]
+) -> list[Sent]:
+    """An image with its intrinsics, labels and detections."""
+    today, name = setup.faults, sensor.name
+    info = misread(setup.mounting.camera(name)[1], today, name)
+    labels = _permuted(image.labels_png, rng) if today.has("labels", name) else image.labels_png
+    made = {
+        "info": messages.camera_info(stamp, name, info),
+        "image": messages.image(stamp, name, image.jpeg, "jpeg"),
+        "labels": messages.image(stamp, name, labels, "mono8; png compressed"),
+        "detections": messages.detections(stamp, name, image.boxes),
+    }
+    topics = topics_of(name, "camera")
+    return [(stamp, topics[what], message) for what, message in made.items()]
 
 
-def _of_lidar(
-    messages: Messages, frame: SimulatedFrame, setup: Setup, at: Callable[[float], int]
-) -> list[tuple[int, str, Any]]:
-    stamp, sweep = at(frame.lidar_stamp_s), frame.sweep
-    if "lidar" in setup.faults.missing:
-        return []
+def _of_lidar(sweep: Sweep, sensor: SensorSpec) -> dict[str, np.ndarray]:
+    assert isinstance(sensor.sheet, LidarSpec)
     points = dict(zip("xyz", sweep.xyz_m.T, strict=True))
     # Drivers of solid-state lidars call their lasers lines, and readers take them for rings.
-    laser = "ring" if setup.rig.lidar.pattern == "rows" else "line"
-    points |= {"intensity": sweep.intensity, laser: sweep.ring, "time": sweep.time_s}
-    topic = TOPICS["radar" if setup.faults.swapped else "lidar"]
-    return [(stamp, topic, messages.cloud(stamp, "lidar", points))]
+    laser = "ring" if sensor.sheet.pattern == "rows" else "line"
+    return points | {"intensity": sweep.intensity, laser: sweep.ring, "time": sweep.time_s}
 
 
-def _of_radar(
-    messages: Messages, scan: Scan, stamp_s: float, setup: Setup, at: Callable[[float], int]
-) -> list[tuple[int, str, Any]]:
-    stamp = at(stamp_s)
-    if "radar" in setup.faults.missing:
-        return []
-    sign = np.float32(-1.0 if setup.rig.radar.doppler_positive == "approaching" else 1.0)
+def _of_radar(scan: Scan, sensor: SensorSpec) -> dict[str, np.ndarray]:
+    assert isinstance(sensor.sheet, RadarSpec)
+    sign = np.float32(-1.0 if sensor.sheet.doppler_positive == "approaching" else 1.0)
     detections = dict(zip("xyz", scan.xyz_m.T, strict=True))
-    detections |= {"doppler": sign * scan.range_rate_mps, "power": scan.power_db}
-    topic = TOPICS["lidar" if setup.faults.swapped else "radar"]
-    return [(stamp, topic, messages.cloud(stamp, "radar", detections))]
+    return detections | {"doppler": sign * scan.range_rate_mps, "power": scan.power_db}
 
 
 def nominal_poses(mounting: Mounting) -> dict[str, np.ndarray]:
     """T_vehicle_sensor as /tf_static says."""
-    return {
-        "camera": mounting.T_vehicle_nominal_camera,
-        "lidar": mounting.T_vehicle_nominal_lidar,
-        "radar": mounting.T_vehicle_nominal_radar,
-    }
+    return {name: mounted.T_vehicle_nominal for name, mounted in mounting.sensors.items()}
 
 
 def _permuted(png: bytes, rng: np.random.Generator) -> bytes:
@@ -198,9 +238,9 @@ def _labelled_in_the_dark(spec: SemanticsSpec, today: DayFaults) -> SemanticsSpe
 
     Or of dusk: outlines 2 label pixels looser, half of the boxes missed, and what is seen is told as by day.
     """
-    if today.dusk:
+    if today.has("dusk"):
         return replace(spec, boundary_px=spec.boundary_px + 2.0, miss=0.5)
-    if not today.night:
+    if not today.has("night"):
         return spec
     return replace(
         spec,

@@ -14,19 +14,10 @@ from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as Bag2Writer
 
 from pipeline.simulate.logs.messages import Messages
+from pipeline.simulate.logs.topics import TOPICS
 
-__all__ = ["CONTAINERS", "TOPICS", "OpenLog", "log_name", "open_log"]
+__all__ = ["CONTAINERS", "OpenLog", "log_name", "open_log"]
 
-TOPICS: Final = {
-    "tf": "/tf_static",
-    "info": "/camera/front/camera_info",
-    "image": "/camera/front/image/compressed",
-    "lidar": "/lidar/top/points",
-    "radar": "/radar/front/points",
-    "labels": "/perception/camera/labels",
-    "detections": "/perception/camera/detections",
-    "odometry": "/vehicle/odometry",
-}
 CONTAINERS: Final = ("mcap", "ros1", "db3")
 
 

@@ -34,7 +34,7 @@ class View:
     shutter: RollingShutter | None = None
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)  # six cameras at two sizes, and another vehicle's
 def _rays(model: str, K: tuple[float, ...], D: tuple[float, ...], width: int, height: int) -> np.ndarray:
     camera = Camera(model, np.array(K).reshape(3, 3), np.array(D), width, height)
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))

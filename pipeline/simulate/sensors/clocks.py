@@ -7,11 +7,13 @@ from typing import Final
 
 import numpy as np
 
-__all__ = ["Clocks", "Ticks", "free_clocks"]
+from pipeline.simulate.sensors.rig_spec import RigSpec
+
+__all__ = ["Ticks", "free_clocks"]
 
 # Of a rate against its nominal value: mechanical lidars hold theirs to some parts in a thousand, quartzes to a hundred
 # in a million. Without it 30 and 10 Hz would keep one gap for a whole drive, as if they were triggered.
-_RATE_SD: Final = (1e-4, 3e-3, 1e-4)
+_RATE_SD: Final = {"camera": 1e-4, "lidar": 3e-3, "radar": 1e-4}
 
 
 @dataclass(frozen=True)
@@ -28,22 +30,15 @@ class Ticks:
         return first, first + float(np.copysign(self.period_s, t_s - first))
 
 
-@dataclass(frozen=True)
-class Clocks:
-    """Stamps of the three sensors during one drive."""
-
-    camera: Ticks
-    lidar: Ticks
-    radar: Ticks
-
-
-def free_clocks(rates_hz: tuple[float, float, float], rng: np.random.Generator) -> Clocks:
-    """Clocks of camera, lidar and radar that know nothing of each other.
+def free_clocks(rig: RigSpec, rng: np.random.Generator) -> dict[str, Ticks]:
+    """Clocks, for one drive, of the sensors that run freely: none knows of another.
 
     Args:
-        rates_hz: nominal rates of the three.
+        rig: what is mounted.
         rng: draws phases and what the rates are off by.
     """
-    periods = 1 / (np.array(rates_hz) * (1 + rng.normal(0, _RATE_SD)))
+    free = {s.name: (s.rate_hz, _RATE_SD[s.kind]) for s in rig.sensors if s.rate_hz is not None}
+    rates, sd = np.array([*free.values()]).reshape(-1, 2).T
+    periods = 1 / (rates * (1 + rng.normal(0, sd)))
     phases = rng.uniform(0, periods)
-    return Clocks(*(Ticks(float(p), float(a)) for p, a in zip(periods, phases, strict=True)))
+    return {n: Ticks(float(p), float(a)) for n, p, a in zip(free, periods, phases, strict=True)}

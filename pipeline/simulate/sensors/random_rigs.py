@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
-from pipeline.simulate.sensors.rig_spec import RigSpec
+from pipeline.simulate.sensors.rig_spec import RigSpec, short_rig
 
 __all__ = ["random_rig"]
 
@@ -39,19 +39,18 @@ def random_rig(seed: int) -> RigSpec:
     radar_xyz = (float(even(3.2, 3.8)), float(even(-0.4, 0.4)), float(even(0.4, 0.8)))
     if not in_grille:
         radar_xyz = (float(even(1.3, 1.8)), float(even(-0.3, 0.3)), high + float(even(-0.1, 0.3)))
-    return RigSpec(
+    return short_rig(
         f"random-{seed}",
-        camera=_camera(rng),
-        lidar=_lidar(rng),
-        radar=_radar(rng),
-        camera_xyz_m=(float(even(1.2, 2.1)), float(even(-0.15, 0.15)), high),
-        lidar_xyz_m=(float(even(0.9, 1.9)), float(even(-0.15, 0.15)), high + above),
-        radar_xyz_m=radar_xyz,
-        camera_rpy_deg=turned(1.0, 3.0, 1.5),
-        lidar_rpy_deg=turned(1.0, 2.0, 1.5),
-        radar_rpy_deg=turned(1.0, 1.5, 2.0),
-        camera_delay_s=float(even(-0.02, 0.03)),
-        radar_delay_s=float(even(-0.03, 0.03)),
+        _camera(rng),
+        _lidar(rng),
+        _radar(rng),
+        xyz_m=(
+            (float(even(1.2, 2.1)), float(even(-0.15, 0.15)), high),
+            (float(even(0.9, 1.9)), float(even(-0.15, 0.15)), high + above),
+            radar_xyz,
+        ),
+        rpy_deg=(turned(1.0, 3.0, 1.5), turned(1.0, 2.0, 1.5), turned(1.0, 1.5, 2.0)),
+        delay_s=(float(even(-0.02, 0.03)), float(even(-0.03, 0.03))),
         sync_jitter_s=float(even(0.0005, 0.003)),
         prior_rotation_deg=float(even(0.5, 1.5)),
         prior_translation_m=float(even(0.01, 0.05)),

@@ -1,25 +1,20 @@
-"""What is mounted on a vehicle: rigs of sensors, nominal (CAD) poses, and how true poses differ from them."""
+"""What is mounted on vehicles: rigs by name."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
 
 from pipeline.errors import ConfigError
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
 from pipeline.simulate.sensors.random_rigs import random_rig
-from pipeline.simulate.sensors.rig_spec import RigSpec
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, short_rig
+from pipeline.simulate.sensors.van import VAN
 
-__all__ = ["RIGS", "Mounting", "RigSpec", "mounting_of", "rig_named"]
+__all__ = ["RIGS", "rig_named"]
 
-# Optical axes (x right, y down, z forward) in a frame with x forward, y left, z up.
-_R_BODY_OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-SENSORS: Final = ("camera", "lidar", "radar")
 RANDOM: Final = "random-"  # begins the names of rigs that a seed draws
 
 
@@ -36,64 +31,77 @@ _ROWS_128: Final = (
     *np.arange(13.0, 15.5, 1.0).tolist(),
 )
 _CORNER: Final = RadarSpec(azimuth_deg=60.0, azimuth_resolution_deg=3.2, rays=9000)
-_BASE: Final = RigSpec("demo", camera=_CAMERA, lidar=_LIDAR, radar=_RADAR)
+_CAMERA_M, _LIDAR_M, _LEVEL = (1.62, 0.02, 1.62), (1.50, 0.00, 1.80), (0.0, 0.0, 0.0)
+_PAPER: Final = (CameraSpec(), LidarSpec(), RadarSpec())
+
+
+def _demo(
+    name: str,
+    camera: CameraSpec = _CAMERA,
+    lidar: LidarSpec = _LIDAR,
+    radar: RadarSpec = _RADAR,
+    **where: Any,
+) -> RigSpec:
+    """The demo's rig with other sensors, or in other places."""
+    return short_rig(name, camera, lidar, radar, **where)
+
 
 _ALL: Final = (
-    RigSpec("paper"),
+    short_rig("paper", *_PAPER),
     # One clock without delays, as the paper's car has it: what methods without time offsets are owed.
-    RigSpec("paper-one-clock", camera_delay_s=0.0, radar_delay_s=0.0, delay_sd_s=0.0),
+    short_rig("paper-one-clock", *_PAPER, delay_s=(0.0, 0.0), delay_sd_s=0.0),
     # No common trigger: every sensor at its own rate and phase, as on most cars.
-    RigSpec("paper-free", free_hz=(30.0, 10.0, 13.0)),
-    _BASE,
-    RigSpec(
+    short_rig("paper-free", *_PAPER, free_hz=(30.0, 10.0, 13.0)),
+    _demo("demo"),
+    _demo(
         "ring16",
-        camera=_CAMERA,
         lidar=LidarSpec((-180.0, 180.0), (-15.0, 15.0), 1800, 16, 0.1, 0.8, 100.0),
         radar=RadarSpec(rays=6000, doppler_period_mps=10.394, doppler_positive="approaching"),
     ),
     # Radars of the bumper's corners look past what a forward lidar sees.
-    replace(
-        _BASE, name="corner-left", lidar=_SPINNING, radar=_CORNER,
-        radar_xyz_m=(3.60, 0.80, 0.60), radar_rpy_deg=(0.0, 0.0, 45.0),
+    _demo(
+        "corner-left", lidar=_SPINNING, radar=_CORNER,
+        xyz_m=(_CAMERA_M, _LIDAR_M, (3.60, 0.80, 0.60)), rpy_deg=(_LEVEL, _LEVEL, (0.0, 0.0, 45.0)),
     ),
-    replace(
-        _BASE, name="corner-right", lidar=_SPINNING, radar=_CORNER,
-        radar_xyz_m=(3.60, -0.80, 0.60), radar_rpy_deg=(0.0, 0.0, -45.0),
+    _demo(
+        "corner-right", lidar=_SPINNING, radar=_CORNER,
+        xyz_m=(_CAMERA_M, _LIDAR_M, (3.60, -0.80, 0.60)), rpy_deg=(_LEVEL, _LEVEL, (0.0, 0.0, -45.0)),
     ),
-    replace(
-        _BASE, name="spin128",
+    _demo(
+        "spin128",
         lidar=LidarSpec(
             (-180.0, 180.0), (-25.0, 15.0), 1200, 128, 0.1, 0.8, 120.0, row_elevation_deg=_ROWS_128
         ),
     ),
     # 240,000 beams a second over 82 x 25 deg, as Livox' Horizon has them; six lasers behind the same prisms.
-    replace(
-        _BASE, name="rosette",
+    _demo(
+        "rosette",
         lidar=LidarSpec((-41.0, 41.0), (-14.5, 10.5), 4000, 6, 0.1, 1.0, 100.0, pattern="rosette"),
     ),
-    replace(_BASE, name="fisheye", camera=CameraSpec(1280, 960, 190.0, 142.5), lidar=_SPINNING),
-    replace(
-        _BASE, name="pinhole",
+    _demo("fisheye", camera=CameraSpec(1280, 960, 190.0, 142.5), lidar=_SPINNING),
+    _demo(
+        "pinhole",
         camera=CameraSpec(
             1280, 720, 72.0, 44.5, model="plumb_bob", distortion=(-0.32, 0.11, 5e-4, -4e-4, -0.015)
         ),
     ),
-    replace(_BASE, name="rolling", camera=replace(_CAMERA, readout_s=0.03)),
+    _demo("rolling", camera=replace(_CAMERA, readout_s=0.03)),
     # A cab: everything high up but the radar, and looking down.
-    replace(
-        _BASE, name="truck", lidar=replace(_LIDAR, elevation_deg=(-21.0, 3.0)),
-        camera_xyz_m=(2.10, 0.10, 2.55), camera_rpy_deg=(0.0, 6.0, 0.0), lidar_xyz_m=(1.90, 0.0, 3.00),
-        radar_xyz_m=(2.60, -0.15, 0.65),
+    _demo(
+        "truck", lidar=replace(_LIDAR, elevation_deg=(-21.0, 3.0)),
+        xyz_m=((2.10, 0.10, 2.55), (1.90, 0.0, 3.00), (2.60, -0.15, 0.65)),
+        rpy_deg=((0.0, 6.0, 0.0), _LEVEL, _LEVEL),
     ),
-    replace(_BASE, name="bumper", radar_xyz_m=(3.70, 0.05, 0.50)),
+    _demo("bumper", xyz_m=(_CAMERA_M, _LIDAR_M, (3.70, 0.05, 0.50))),
     # Nose down, and twice as fast.
-    replace(_BASE, name="tilted", lidar=replace(_LIDAR, sweep_s=0.04), lidar_rpy_deg=(0.0, 5.0, 0.0)),
+    _demo("tilted", lidar=replace(_LIDAR, sweep_s=0.04), rpy_deg=(_LEVEL, (0.0, 5.0, 0.0), _LEVEL)),
+    VAN,
 )  # fmt: skip
 RIGS: Final = {rig.name: rig for rig in _ALL}
 
 
 def rig_named(name: str) -> RigSpec:
-    """One of RIGS, or `random-SEED`; `-flat` behind the name takes the radar's elevation away.
+    """One of RIGS, or `random-SEED`; `-flat` behind the name takes the radars' elevation away.
 
     Raises:
         ConfigError: no such rig.
@@ -104,95 +112,11 @@ def rig_named(name: str) -> RigSpec:
     if base is None:
         known = f"{', '.join(RIGS)}, {RANDOM}SEED, each with or without -flat"
         raise ConfigError("simulate", "rig", f"{name!r} is not one of {known}")
+    return replace(base.changed(_flat), name=name) if name.endswith("-flat") else base
+
+
+def _flat(sensor: SensorSpec) -> SensorSpec:
+    sheet = sensor.sheet
     return (
-        replace(base, name=name, radar=replace(base.radar, has_elevation=False))
-        if name.endswith("-flat")
-        else base
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Mounting:
-    """Where the sensors of one vehicle are on one day (true), where its log says (nominal), and the true camera."""
-
-    T_vehicle_camera: np.ndarray
-    T_vehicle_lidar: np.ndarray
-    T_vehicle_radar: np.ndarray
-    T_vehicle_nominal_camera: np.ndarray
-    T_vehicle_nominal_lidar: np.ndarray
-    T_vehicle_nominal_radar: np.ndarray
-    camera: Camera
-    nominal_camera: Camera
-    camera_delay_s: float
-    radar_delay_s: float
-    radar_range_bias_m: float
-    radar_elevation_bias_rad: float
-    camera_phase_s: float = 0.0  # of a triggered sensor's stamps after the sweep's, beside jitter
-    radar_phase_s: float = 0.0
-
-    def truth(self) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """T_camera_lidar, T_lidar_radar, T_camera_radar."""
-        T_camera_vehicle = inverse(self.T_vehicle_camera)
-        return {
-            "T_camera_lidar": T_camera_vehicle @ self.T_vehicle_lidar,
-            "T_lidar_radar": inverse(self.T_vehicle_lidar) @ self.T_vehicle_radar,
-            "T_camera_radar": T_camera_vehicle @ self.T_vehicle_radar,
-        }
-
-
-def _nominal(rig: RigSpec) -> dict[str, np.ndarray]:
-    return {
-        "camera": from_rotation_translation(
-            _turned(rig.camera_rpy_deg) @ _R_BODY_OPTICAL, np.array(rig.camera_xyz_m)
-        ),
-        "lidar": from_rotation_translation(_turned(rig.lidar_rpy_deg), np.array(rig.lidar_xyz_m)),
-        "radar": from_rotation_translation(_turned(rig.radar_rpy_deg), np.array(rig.radar_xyz_m)),
-    }
-
-
-def _turned(rpy_deg: tuple[float, float, float]) -> np.ndarray:
-    R = np.eye(3)
-    for axis, angle in zip(np.eye(3), np.radians(rpy_deg), strict=True):
-        R = exp_so3(angle * axis) @ R
-    return R
-
-
-def _disturbed(T: np.ndarray, rotation_rad: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
-    """Turned about the vehicle's axes at the sensor's own place, and shifted along them."""
-    return from_rotation_translation(exp_so3(rotation_rad) @ T[:3, :3], T[:3, 3] + translation_m)
-
-
-def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int) -> Mounting:
-    """Mounting of a vehicle on a day: CAD, then how this vehicle was built, then how the day's remount left it."""
-    built = np.random.default_rng([seed, vehicle, 41])
-    remount = np.random.default_rng([seed, vehicle, day, 42])
-    nominal, true = _nominal(rig), {}
-    for sensor in SENSORS:
-        axis = built.normal(size=3)
-        angle = (
-            np.radians(rig.prior_rotation_deg) * np.clip(abs(built.normal(1.0, 0.3)), 0.3, 1.7) / np.sqrt(2)
-        )
-        T = _disturbed(
-            nominal[sensor], angle * axis / np.linalg.norm(axis), built.normal(0, rig.prior_translation_m, 3)
-        )
-        rotation = np.radians(rig.remount_rotation_deg) * remount.normal(size=3)
-        true[sensor] = _disturbed(T, rotation, rig.remount_translation_m * remount.normal(size=3))
-    logged = rig.camera.nominal()
-    K = logged.K.copy()
-    K[0, 0] *= 1 + built.normal(0, rig.camera.focal_error)
-    K[1, 1] *= K[0, 0] / logged.K[0, 0]
-    K[:2, 2] += built.normal(0, rig.camera.centre_error_px * rig.camera.width_px / 1824, 2)
-    return Mounting(
-        true["camera"],
-        true["lidar"],
-        true["radar"],
-        nominal["camera"],
-        nominal["lidar"],
-        nominal["radar"],
-        Camera(logged.model, K, logged.D, logged.width_px, logged.height_px),
-        logged,
-        rig.camera_delay_s + built.normal(0, rig.delay_sd_s),
-        rig.radar_delay_s + built.normal(0, rig.delay_sd_s),
-        built.normal(0, 0.03),
-        np.radians(built.normal(0, 0.15)),
+        replace(sensor, sheet=replace(sheet, has_elevation=False)) if isinstance(sheet, RadarSpec) else sensor
     )

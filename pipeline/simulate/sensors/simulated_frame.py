@@ -1,15 +1,19 @@
-"""One trio, from the world to what the sensors deliver."""
+"""One moment, from the world to what the sensors deliver."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from pipeline.rig.graph import Kind
 from pipeline.simulate.sensors.camera import encode_jpeg, render, view_of
+from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
 from pipeline.simulate.sensors.lidar import Sweep, sweep_lidar
-from pipeline.simulate.sensors.radar import RadarErrors, Scan, scan_radar
-from pipeline.simulate.sensors.rigs import Mounting, RigSpec
+from pipeline.simulate.sensors.mounting import Mounting
+from pipeline.simulate.sensors.radar import Scan, scan_radar
+from pipeline.simulate.sensors.rig_spec import RigSpec
 from pipeline.simulate.sensors.rolling_shutter import RollingShutter
 from pipeline.simulate.sensors.semantics import (
     Box,
@@ -23,14 +27,13 @@ from pipeline.simulate.sensors.semantics import (
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Drive, Motion
 
-__all__ = ["Image", "Scene", "SimulatedFrame", "frame_of", "image_of", "scan_of", "scene_of"]
+__all__ = ["Image", "Scene", "Seat", "SimulatedFrame", "frame_of", "scene_of", "triggered_stamps"]
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
     """An image and what networks make of it; `true_labels` goes into no log."""
 
-    stamp_s: float
     jpeg: bytes
     labels_png: bytes
     boxes: list[Box]
@@ -39,17 +42,12 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFrame:
-    """What the sensors deliver for one trio, stamps in seconds of the drive; `true_labels` goes into no log."""
+    """What sensors deliver for one moment, by name; stamps in seconds of the drive."""
 
-    lidar_stamp_s: float
-    camera_stamp_s: float
-    radar_stamp_s: float
-    jpeg: bytes
-    labels_png: bytes
-    boxes: list[Box]
-    sweep: Sweep
-    scan: Scan
-    true_labels: np.ndarray = field(repr=False)
+    stamps_s: Mapping[str, float]
+    images: Mapping[str, Image]
+    sweeps: Mapping[str, Sweep]
+    scans: Mapping[str, Scan]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,84 +69,79 @@ def scene_of(drive: Drive) -> Scene:
     return Scene(drive.ego, drive.sun, drive.night, mirrors)
 
 
+@dataclass(frozen=True, eq=False)
+class Seat:
+    """From where a moment is looked at: the world at that time, what is around, and what the vehicle carries."""
+
+    moment: Moment
+    scene: Scene
+    rig: RigSpec
+    mounting: Mounting
+
+
 def frame_of(
-    moment: Moment,
-    scene: Scene,
-    rig: RigSpec,
-    mounting: Mounting,
-    stamp_s: float,
-    rng: np.random.Generator,
-    semantics: SemanticsSpec,
-    stamps_s: tuple[float, float] | None = None,
+    seat: Seat, stamps_s: Mapping[str, float], rng: np.random.Generator, semantics: SemanticsSpec
 ) -> SimulatedFrame:
-    """The trio whose lidar sweep ends at `stamp_s`; `moment` should be near the middle of the sweep.
+    """What the named sensors deliver with these stamps, each measured its delay before its stamp.
 
-    `stamps_s` are those of image and scan; None = the sweep triggers both.
+    The moment should be near the middle of the reference lidar's sweep. Days are their random draws: lidars come first,
+    then what cameras see, radars, and last what networks make of the images.
     """
-    camera_stamp, radar_stamp = stamps_s or _triggered(rig, mounting, stamp_s, rng)
-    sweep = sweep_lidar(moment, scene.ego, mounting.T_vehicle_lidar, rig.lidar, stamp_s, rng)
-    jpeg, true, boxes = _exposed(moment, scene, rig, mounting, camera_stamp, rng, semantics)
-    scan = scan_of(moment, scene, rig, mounting, radar_stamp, rng)
-    labels = encode_png(noisy_labels(true, semantics, rng))
-    return SimulatedFrame(stamp_s, camera_stamp, radar_stamp, jpeg, labels, boxes, sweep, scan, true)
+
+    def at(kind: Kind) -> dict[str, float]:
+        return {s.name: stamps_s[s.name] for s in seat.rig.of_kind(kind) if s.name in stamps_s}
+
+    sweeps = {n: _sweep(seat, n, t, rng) for n, t in at("lidar").items()}
+    exposed = {n: _exposed(seat, n, t, rng, semantics) for n, t in at("camera").items()}
+    scans = {n: _scan(seat, n, t, rng) for n, t in at("radar").items()}
+    images = {
+        n: Image(jpeg, encode_png(noisy_labels(true, semantics, rng)), boxes, true)
+        for n, (jpeg, true, boxes) in exposed.items()
+    }
+    return SimulatedFrame(dict(stamps_s), images, sweeps, scans)
 
 
-def image_of(
-    moment: Moment,
-    scene: Scene,
-    rig: RigSpec,
-    mounting: Mounting,
-    stamp_s: float,
-    rng: np.random.Generator,
-    semantics: SemanticsSpec,
-) -> Image:
-    """The image with a stamp, taken the camera's delay before it."""
-    jpeg, true, boxes = _exposed(moment, scene, rig, mounting, stamp_s, rng, semantics)
-    return Image(stamp_s, jpeg, encode_png(noisy_labels(true, semantics, rng)), boxes, true)
+def triggered_stamps(
+    rig: RigSpec, mounting: Mounting, stamp_s: float, rng: np.random.Generator
+) -> dict[str, float]:
+    """Stamps of all sensors that the reference lidar's sweep triggers, its own among them."""
+    others = [s for s in rig.sensors if s != rig.reference]
+    jitter = np.clip(rng.normal(0, rig.sync_jitter_s, len(others)), -0.0045, 0.0045)
+    stamps = stamp_s + jitter
+    found = {s.name: float(t) + mounting[s.name].phase_s for s, t in zip(others, stamps, strict=True)}
+    return found | {rig.reference.name: stamp_s}
 
 
-def scan_of(
-    moment: Moment, scene: Scene, rig: RigSpec, mounting: Mounting, stamp_s: float, rng: np.random.Generator
-) -> Scan:
-    """The radar scan with a stamp, taken the radar's delay before it."""
-    errors = RadarErrors(mounting.radar_range_bias_m, mounting.radar_elevation_bias_rad)
+def _sweep(seat: Seat, name: str, stamp_s: float, rng: np.random.Generator) -> Sweep:
+    sheet, mounted = seat.rig[name].sheet, seat.mounting[name]
+    assert isinstance(sheet, LidarSpec)
+    end_s = stamp_s - mounted.delay_s
+    return sweep_lidar(seat.moment, seat.scene.ego, mounted.T_vehicle, sheet, end_s, rng)
+
+
+def _scan(seat: Seat, name: str, stamp_s: float, rng: np.random.Generator) -> Scan:
+    sheet, mounted, scene = seat.rig[name].sheet, seat.mounting[name], seat.scene
+    assert isinstance(sheet, RadarSpec)
+    assert mounted.errors is not None
+    moment = seat.moment.advanced(stamp_s - mounted.delay_s)
     return scan_radar(
-        moment.advanced(stamp_s - mounting.radar_delay_s),
-        scene.ego,
-        mounting.T_vehicle_radar,
-        rig.radar,
-        errors,
-        rng,
-        scene.mirrors_m,
-        scene.beacons_map,
+        moment, scene.ego, mounted.T_vehicle, sheet, mounted.errors, rng, scene.mirrors_m, scene.beacons_map
     )
 
 
-def _triggered(
-    rig: RigSpec, mounting: Mounting, stamp_s: float, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Stamps of image and scan that a sweep triggers."""
-    camera, radar = stamp_s + np.clip(rng.normal(0, rig.sync_jitter_s, 2), -0.0045, 0.0045)
-    return float(camera) + mounting.camera_phase_s, float(radar) + mounting.radar_phase_s
-
-
 def _exposed(
-    moment: Moment,
-    scene: Scene,
-    rig: RigSpec,
-    mounting: Mounting,
-    stamp_s: float,
-    rng: np.random.Generator,
-    semantics: SemanticsSpec,
+    seat: Seat, name: str, stamp_s: float, rng: np.random.Generator, semantics: SemanticsSpec
 ) -> tuple[bytes, np.ndarray, list[Box]]:
     """JPEG, true labels and noisy boxes of the image with a stamp."""
-    exposure = moment.advanced(stamp_s - mounting.camera_delay_s)
-    T_map_camera = scene.ego.poses(np.array([exposure.t_s]))[0] @ mounting.T_vehicle_camera
-    readout_s = rig.camera.readout_s
-    shutter = RollingShutter(scene.ego, mounting.T_vehicle_camera, readout_s) if readout_s else None
-    view = view_of(exposure, mounting.camera, T_map_camera, shutter)
+    sheet, mounted, scene = seat.rig[name].sheet, seat.mounting[name], seat.scene
+    assert isinstance(sheet, CameraSpec)
+    camera, _ = seat.mounting.camera(name)
+    exposure = seat.moment.advanced(stamp_s - mounted.delay_s)
+    T_map_camera = scene.ego.poses(np.array([exposure.t_s]))[0] @ mounted.T_vehicle
+    shutter = RollingShutter(scene.ego, mounted.T_vehicle, sheet.readout_s) if sheet.readout_s else None
+    view = view_of(exposure, camera, T_map_camera, shutter)
     image = render(exposure, view, scene.sun, rng, night=scene.night)
     true = label_image(exposure, view.coarse)
-    size_px = (mounting.camera.width_px, mounting.camera.height_px)
+    size_px = (camera.width_px, camera.height_px)
     boxes = noisy_boxes(boxes_of(exposure, view.coarse), size_px, semantics, rng)
-    return encode_jpeg(image, rig.camera.jpeg_quality), true, boxes
+    return encode_jpeg(image, sheet.jpeg_quality), true, boxes

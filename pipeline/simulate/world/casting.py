@@ -28,6 +28,8 @@ __all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "shadow_map", "st
 
 _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 60.0
+_SHADOWS_BEHIND_M: Final = 8.0  # of an ordinary window: who looks ahead sees no others
+_POPULATED_M, _UNPOPULATED_M = 150.0, 15.0  # road users ahead; the last stretch behind that is empty
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,30 +63,33 @@ class Standing:
 
 
 class World:
-    """The world of one drive; holds one window of it at a time."""
+    """The world of one drive, so far behind the vehicle; holds one window of it at a time."""
 
-    def __init__(self, drive: Drive) -> None:
-        self.drive = drive
+    def __init__(self, drive: Drive, behind_m: float = _BEHIND_M) -> None:
+        self.drive, self._behind_m = drive, behind_m
         self._chunks: dict[int, Mesh] = {}
         self._window: tuple[int, int] | None = None
         self._standing: Standing | None = None
 
     def around(self, s_m: float) -> Standing:
-        """The standing world from 60 m behind to 170 m ahead of an arc length."""
-        window = int((s_m - _BEHIND_M) // CHUNK_M), int((s_m + _AHEAD_M) // CHUNK_M)
+        """The standing world to 170 m ahead of an arc length."""
+        window = int((s_m - self._behind_m) // CHUNK_M), int((s_m + _AHEAD_M) // CHUNK_M)
         if self._standing is None or window != self._window:
             self._chunks = {
                 i: self._chunks.get(i) or chunk_mesh(self.drive, i) for i in range(window[0], window[1] + 1)
             }
             origin = np.round(self.drive.road.to_map(np.array([[s_m, 0.0, 0.0]]))[0])
             mesh, road = join(list(self._chunks.values())), self.drive.road
-            self._window, self._standing = window, standing_of(mesh, origin, self.drive.sun, road.to_map, s_m)
+            shadows_behind_m = _SHADOWS_BEHIND_M + self._behind_m - _BEHIND_M
+            self._window = window
+            self._standing = standing_of(mesh, origin, self.drive.sun, road.to_map, s_m, shadows_behind_m)
         return self._standing
 
     def moment(self, t_s: float) -> Moment:
         """The world at a time of the drive."""
         standing = self.around(self.drive.ego.arc(t_s))
-        return Moment(standing, actors_at(self.drive, t_s), t_s)
+        within_m = self._behind_m - _UNPOPULATED_M, _POPULATED_M
+        return Moment(standing, actors_at(self.drive, t_s, within_m), t_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,10 +236,11 @@ def shadow_map(
     sun: np.ndarray,
     to_map: Callable[[np.ndarray], np.ndarray],
     s_m: float,
+    behind_m: float,
 ) -> ShadowMap:
     """Cast the ground around an arc length towards the sun; once per window, not per image."""
     cell, half = 0.4, 22.0
-    s0 = s_m - 8.0
+    s0 = s_m - behind_m
     s, d = np.meshgrid(np.arange(s0, s_m + 95.0, cell), np.arange(-half, half, cell), indexing="ij")
     ground = to_map(np.stack([s.ravel(), d.ravel(), np.full(s.size, 0.2)], 1)) - origin
     hit = (
@@ -244,10 +250,17 @@ def shadow_map(
 
 
 def standing_of(
-    mesh: Mesh, origin: np.ndarray, sun: np.ndarray, to_map: Callable[[np.ndarray], np.ndarray], s_m: float
+    mesh: Mesh,
+    origin: np.ndarray,
+    sun: np.ndarray,
+    to_map: Callable[[np.ndarray], np.ndarray],
+    s_m: float,
+    shadows_behind_m: float = _SHADOWS_BEHIND_M,
 ) -> Standing:
     """A standing world of a mesh given in the map."""
     corners = (mesh.corners - origin.astype(np.float32)).astype(np.float32)
     local = Mesh(corners, mesh.material, mesh.tint, mesh.uv, mesh.instance)
     scene = _scene(local)
-    return Standing(origin, local, scene, shadow_map(scene, origin, sun, to_map, s_m), _normals(corners))
+    return Standing(
+        origin, local, scene, shadow_map(scene, origin, sun, to_map, s_m, shadows_behind_m), _normals(corners)
+    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 from jaxtyping import Float
@@ -12,9 +11,6 @@ from pipeline.simulate.world.actors import VARIANTS
 from pipeline.simulate.world.drives import Drive, RoadLayout
 
 __all__ = ["Actor", "actors_at"]
-
-_AHEAD_M: Final = 150.0
-_BEHIND_M: Final = 45.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +54,7 @@ class _Place:
     yaw_rad: float = 0.0
 
 
-def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (_BEHIND_M, _AHEAD_M)) -> list[Actor]:
+def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (45.0, 150.0)) -> list[Actor]:
     """Road users from `within_m[0]` behind us to `within_m[1]` ahead."""
     here = drive.ego.arc(t_s)
     actors = _leaders(drive, t_s, here, within_m)

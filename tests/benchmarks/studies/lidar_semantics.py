@@ -93,8 +93,8 @@ def sweeps(seed: int, vehicle: int, frames: int) -> list[tuple[np.ndarray, np.nd
     mounting, rng, made = mounting_on(spec, vehicle, 0), np.random.default_rng([seed, vehicle]), []
     for k in range(frames):
         stamp = FIRST_FRAME_S + k / spec.rate_hz
-        moment = world.moment(stamp - rig.lidar.sweep_s / 2)
-        sweep = sweep_lidar(moment, scene.ego, mounting.T_vehicle_lidar, rig.lidar, stamp, rng)
+        moment = world.moment(stamp - rig["lidar"].sheet.sweep_s / 2)
+        sweep = sweep_lidar(moment, scene.ego, mounting["lidar"].T_vehicle, rig["lidar"].sheet, stamp, rng)
         made.append((sweep.xyz_m, sweep.intensity, sweep.label))
     return made
 

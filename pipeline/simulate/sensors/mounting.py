@@ -1,0 +1,129 @@
+"""Where a vehicle's sensors are on one day, what is true of each, and what its log says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.simulate.sensors.data_sheets import CameraSpec
+from pipeline.simulate.sensors.radar import RadarErrors
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Triple
+
+__all__ = ["Mounted", "Mounting", "mounting_of"]
+
+# Optical axes (x right, y down, z forward) in a frame with x forward, y left, z up.
+_R_BODY_OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Mounted:
+    """One sensor of one vehicle on one day.
+
+    Args:
+        T_vehicle: true pose, T_vehicle_sensor.
+        T_vehicle_nominal: as /tf_static has it.
+        delay_s: its stamp of an event less the reference lidar's.
+        phase_s: of its stamps after the moment that they belong to, beside jitter.
+        camera: true intrinsics of a camera.
+        nominal_camera: those that the log states.
+        errors: constant errors of a radar.
+    """
+
+    T_vehicle: np.ndarray
+    T_vehicle_nominal: np.ndarray
+    delay_s: float = 0.0
+    phase_s: float = 0.0
+    camera: Camera | None = None
+    nominal_camera: Camera | None = None
+    errors: RadarErrors | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Mounting:
+    """All sensors of one vehicle on one day, by name."""
+
+    sensors: Mapping[str, Mounted]
+
+    def __getitem__(self, name: str) -> Mounted:
+        """The sensor of that name."""
+        return self.sensors[name]
+
+    def between(self, parent: str, child: str) -> Float[np.ndarray, "4 4"]:
+        """True T_parent_child of two sensors."""
+        return inverse(self[parent].T_vehicle) @ self[child].T_vehicle
+
+    def camera(self, name: str) -> tuple[Camera, Camera]:
+        """Intrinsics of a camera: true, and as its log states them."""
+        mounted = self[name]
+        assert mounted.camera is not None
+        assert mounted.nominal_camera is not None
+        return mounted.camera, mounted.nominal_camera
+
+
+def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int) -> Mounting:
+    """Mounting of a vehicle on a day: CAD, then how this vehicle was built, then how the day's remount left it."""
+    built = np.random.default_rng([seed, vehicle, 41])
+    remount = np.random.default_rng([seed, vehicle, day, 42])
+    poses = {s.name: _poses(rig, s, built, remount) for s in rig.sensors}
+    lenses = {s.name: _lens(s.sheet, built) for s in rig.sensors if isinstance(s.sheet, CameraSpec)}
+    delays = {s.name: s.delay_s + built.normal(0, rig.delay_sd_s) for s in rig.sensors if s != rig.reference}
+    # Range bias [m], elevation bias [deg].
+    errors = {
+        s.name: RadarErrors(built.normal(0, 0.03), np.radians(built.normal(0, 0.15)))
+        for s in rig.of_kind("radar")
+    }
+    return Mounting(
+        {n: _mounted(pose, delays.get(n, 0.0), lenses.get(n), errors.get(n)) for n, pose in poses.items()}
+    )
+
+
+def _mounted(
+    pose: tuple[np.ndarray, np.ndarray],
+    delay_s: float,
+    lens: tuple[Camera, Camera] | None,
+    errors: RadarErrors | None,
+) -> Mounted:
+    true, nominal = lens or (None, None)
+    return Mounted(*pose, delay_s, camera=true, nominal_camera=nominal, errors=errors)
+
+
+def _poses(
+    rig: RigSpec, sensor: SensorSpec, built: np.random.Generator, remount: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """True and nominal T_vehicle_sensor."""
+    R = _turned(sensor.rpy_deg) @ (_R_BODY_OPTICAL if sensor.kind == "camera" else np.eye(3))
+    nominal = from_rotation_translation(R, np.array(sensor.xyz_m))
+    axis = built.normal(size=3)
+    angle = np.radians(rig.prior_rotation_deg) * np.clip(abs(built.normal(1.0, 0.3)), 0.3, 1.7) / np.sqrt(2)
+    shift = built.normal(0, rig.prior_translation_m, 3)
+    T = _disturbed(nominal, angle * axis / np.linalg.norm(axis), shift)
+    rotation = np.radians(rig.remount_rotation_deg) * remount.normal(size=3)
+    return _disturbed(T, rotation, rig.remount_translation_m * remount.normal(size=3)), nominal
+
+
+def _lens(sheet: CameraSpec, built: np.random.Generator) -> tuple[Camera, Camera]:
+    """True and logged intrinsics."""
+    logged = sheet.nominal()
+    K = logged.K.copy()
+    K[0, 0] *= 1 + built.normal(0, sheet.focal_error)
+    K[1, 1] *= K[0, 0] / logged.K[0, 0]
+    K[:2, 2] += built.normal(0, sheet.centre_error_px * sheet.width_px / 1824, 2)
+    return Camera(logged.model, K, logged.D, logged.width_px, logged.height_px), logged
+
+
+def _turned(rpy_deg: Triple) -> np.ndarray:
+    R = np.eye(3)
+    for axis, angle in zip(np.eye(3), np.radians(rpy_deg), strict=True):
+        R = exp_so3(angle * axis) @ R
+    return R
+
+
+def _disturbed(T: np.ndarray, rotation_rad: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
+    """Turned about the vehicle's axes at the sensor's own place, and shifted along them."""
+    return from_rotation_translation(exp_so3(rotation_rad) @ T[:3, :3], T[:3, 3] + translation_m)

@@ -1,0 +1,159 @@
+"""A rig of thirteen named sensors: what its log, its fleet.toml and its truth hold, and faults of one of them."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.config import load_fleet
+from pipeline.errors import ConfigError
+from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.simulate.faults import parse_faults
+from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
+from pipeline.simulate.sensors.mounting import mounting_of
+from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.simulate.world.casting import World
+from pipeline.simulate.world.drives import Drive
+
+DAY = "2026-03-02"
+VAN = rig_named("van")
+CAMERAS, LIDARS, RADARS = ([s.name for s in VAN.of_kind(kind)] for kind in ("camera", "lidar", "radar"))
+FAULTS = (
+    "vehicle-1:0:corner_rr:missing:1@0.5,vehicle-1:0:rear:stuck:1,vehicle-1:0:left:intrinsics:0.02,"
+    "vehicle-1:0:grille:stamp:0.03,vehicle-1:0:corner_fl:yaw:0.5@0.5,vehicle-1:0:nose:swap:1"
+)
+
+
+def small(sensor):
+    """The sensor with an eighth of its pixels or beams, for time."""
+    sheet = sensor.sheet
+    if isinstance(sheet, CameraSpec):
+        sheet = replace(sheet, width_px=sheet.width_px // 4, height_px=sheet.height_px // 4)
+    elif isinstance(sheet, LidarSpec):
+        sheet = replace(sheet, columns=sheet.columns // 4)
+    return replace(sensor, sheet=sheet)
+
+
+@pytest.fixture(scope="module")
+def days(tmp_path_factory, read, the_log):
+    """A good and a faulty day of two moments: folder, (topic, stamp, message) and truth of each."""
+    found = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.simulate.fleet.rig_named", lambda _: VAN.changed(small))
+        for name, faults in (("good", ""), ("bad", FAULTS)):
+            out = tmp_path_factory.mktemp(name)
+            spec = FleetSpec(
+                vehicles=1, days=1, frames=2, drives=1, rig="van", environments="urban",
+                faults=parse_faults(faults, [DAY], VAN),
+            )  # fmt: skip
+            simulate_fleet(spec, out)
+            truth = json.loads((out / "truth" / "vehicle-1" / f"{DAY}.json").read_text())
+            found[name] = out, read(the_log(out)), truth
+    return found
+
+
+def sent(messages, topic):
+    return [(stamp, message) for name, stamp, message in messages if name == topic]
+
+
+def test_every_sensor_has_topics_of_its_own_in_the_log_and_in_fleet_toml(days):
+    out, messages, _ = days["good"]
+    rig = load_fleet(out / "fleet.toml").rig_of("vehicle-1")
+    assert [*rig.cameras, *rig.lidars, *rig.radars] == [s.name for s in VAN.sensors]
+    assert (rig.reference, rig.base) == ("top", "base_link")
+    named = [c.image for c in rig.cameras.values()] + [c.info for c in rig.cameras.values()]
+    named += [getattr(c.semantics, what) for c in rig.cameras.values() for what in ("labels", "detections")]
+    named += [s.points for s in (*rig.lidars.values(), *rig.radars.values())]
+    assert {topic for topic, _, _ in messages} == {*named, "/tf_static", rig.ego.odometry}
+    frames = {m.header.frame_id for _, m in sent(messages, "/radar/corner_rl/points")}
+    assert frames == {"corner_rl"}
+
+
+def test_static_transforms_are_near_the_truth_of_every_sensor_but_not_the_truth(days):
+    _, messages, truth = days["good"]
+    ((_, tf),) = sent(messages, "/tf_static")
+    assert {t.child_frame_id for t in tf.transforms} == {s.name for s in VAN.sensors}
+    assert {t.header.frame_id for t in tf.transforms} == {"base_link"}
+    for item in tf.transforms:
+        at = item.transform.translation
+        off = np.array([at.x, at.y, at.z]) - np.array(truth["T_base_sensor"][item.child_frame_id])[:3, 3]
+        assert 1e-4 < np.linalg.norm(off) < 0.15
+
+
+def test_every_sensor_but_the_reference_has_a_clock_of_its_own(days):
+    _, messages, truth = days["good"]
+    stamps = {n: [t for t, _ in sent(messages, f"/radar/{n}/points")] for n in RADARS}
+    assert len({t for own in stamps.values() for t in own}) == sum(map(len, stamps.values()))
+    assert all(len(own) == 3 for own in stamps.values())  # two moments, and one next nearest
+    assert truth["dt_s"].pop("top") == 0
+    assert len(set(truth["dt_s"].values())) == len(VAN.sensors) - 1
+
+
+def test_sensors_point_where_their_names_say():
+    mounting = mounting_of(VAN, 1, 0, 0)
+    for name, yaw_deg in {"left": 70, "right": -70, "rear": 180, "corner_rl": 135, "corner_fr": -50}.items():
+        T = mounting[name].T_vehicle
+        ahead = T[:3, 2] if name in CAMERAS else T[:3, 0]
+        off = np.degrees(np.arctan2(ahead[1], ahead[0])) - yaw_deg
+        assert abs((off + 180) % 360 - 180) < 4
+
+
+def test_the_world_behind_the_van_is_as_full_as_the_one_ahead():
+    drive = Drive(5, "urban", 8.0, 0)
+    ahead, behind = [], []
+    for t in (1.0, 3.0, 5.0):
+        moment = World(drive, VAN.behind_m).moment(t)
+        x = [(inverse(drive.ego.poses(np.array([t]))[0]) @ a.T_map_actor[:, 3])[0] for a in moment.actors]
+        ahead.append(np.sum(np.array(x) > 20))
+        behind.append(np.sum(np.array(x) < -20))
+    assert np.mean(behind) > 0.5 * np.mean(ahead) > 3
+
+
+def test_a_camera_that_looks_back_sees_the_road_it_came_along(days):
+    _, messages, _ = days["good"]
+    _, message = sent(messages, "/perception/rear/labels")[0]
+    labels = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_UNCHANGED)
+    middle = labels[:, labels.shape[1] // 2]
+    assert middle[-1] == 0  # road before the bumper
+    assert np.mean(labels == 0) > 0.1
+    assert len(np.unique(labels)) > 5
+
+
+def test_a_fault_of_one_sensor_is_its_alone(days):
+    _, good, truth = days["good"]
+    _, bad, spoiled = days["bad"]
+    assert len(sent(bad, "/radar/corner_rr/points")) < len(sent(good, "/radar/corner_rr/points"))
+    assert sent(bad, "/radar/corner_rr/points")  # silent from half of the day on
+    images = [bytes(m.data) for _, m in sent(bad, "/camera/rear/image/compressed")]
+    assert len(images) > 1
+    assert len(set(images)) == 1
+    focal = [days[n][2]["cameras"]["left"]["K_logged"][0][0] for n in ("bad", "good")]
+    assert focal[0] / focal[1] == pytest.approx(1.02)
+    late = sent(bad, "/lidar/grille/points")[0][0] - sent(good, "/lidar/grille/points")[0][0]
+    assert late * 1e-9 == pytest.approx(0.03, abs=2e-9)
+    for topic in ("/camera/front/image/compressed", "/lidar/top/points"):
+        for (t0, a), (t1, b) in zip(sent(good, topic), sent(bad, topic), strict=True):
+            assert t0 == t1
+            assert bytes(a.data) == bytes(b.data)
+    for name in (s.name for s in VAN.sensors):
+        T, T0 = (np.array(t["at_end_of_day"]["T_base_sensor"][name]) for t in (spoiled, truth))
+        turn_deg = np.degrees(np.linalg.norm(log_so3(T[:3, :3] @ T0[:3, :3].T)))
+        assert turn_deg == pytest.approx(0.5 if name == "corner_fl" else 0.0, abs=1e-6)
+
+
+def test_a_mistaken_cable_sends_a_radar_s_points_under_its_neighbour_s_name(days):
+    _, good, _ = days["good"]
+    _, bad, _ = days["bad"]
+    nose = sent(good, "/radar/nose/points")[0][1]
+    elsewhere = sent(bad, "/radar/corner_fl/points")[0][1]
+    assert bytes(nose.data) == bytes(elsewhere.data)
+    assert elsewhere.header.frame_id == "corner_fl"
+
+
+@pytest.mark.parametrize("item", ["top:time:0.1", "radar:yaw:1", "top:intrinsics:0.1", "front:swap:1"])
+def test_faults_name_sensors_of_the_rig_that_they_can_happen_to(item):
+    with pytest.raises(ConfigError, match="happens to"):
+        parse_faults(f"vehicle-1:0:{item}", [DAY], VAN)
