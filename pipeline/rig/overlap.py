@@ -14,7 +14,7 @@ from pipeline.rig.graph import EDGE_KINDS, KINDS, Edge, RigGraph, Sensor, edge_b
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.views import View
 
-__all__ = ["Overlap", "best_trio", "find_edges", "overlaps_of"]
+__all__ = ["Overlap", "best_three", "find_edges", "overlaps_of"]
 
 _RANGES_M = (15.0, 25.0, 40.0)  # of the targets that pairs are certified at
 _LEAST = 0.05  # of the directions of the sensor that sees fewer
@@ -90,17 +90,17 @@ def find_edges(
     return RigGraph(prior.nodes, edges, reference or _most_tied(prior.nodes, edges))
 
 
-def best_trio(overlaps: Sequence[Overlap]) -> tuple[Sensor, Sensor, Sensor] | None:
+def best_three(overlaps: Sequence[Overlap]) -> tuple[Sensor, Sensor, Sensor] | None:
     """Camera, lidar and radar of which all three pairs share a view, the most by the pair that shares least."""
     shared = {o.edge: o.shared_sr for o in overlaps if o.is_enough}
     sensors = dict.fromkeys(s for edge in shared for s in edge.sensors)
     by_kind = [[s for s in sensors if s.kind == kind] for kind in ("camera", "lidar", "radar")]
-    trios = {
+    triples = {
         (c, l, r): min(shared.get(edge_between(*pair), 0.0) for pair in ((c, l), (l, r), (c, r)))
         for c, l, r in product(*by_kind)
     }
-    best = max(trios, key=lambda trio: trios[trio], default=None)
-    return best if best is not None and trios[best] > 0 else None
+    best = max(triples, key=lambda triple: triples[triple], default=None)
+    return best if best is not None and triples[best] > 0 else None
 
 
 def _of_overlaps(nodes: Sequence[Sensor], overlaps: Sequence[Overlap]) -> list[Edge]:

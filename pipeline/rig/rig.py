@@ -52,6 +52,8 @@ class Rig(Section):
     base: str | None = None  # the vehicle frame as transforms call it; None = no edges to it
     # Pairs of sensors; None = found from overlap. Left out of dumps: no reason to ingest a rig's logs again.
     edges: tuple[tuple[str, str], ...] | None = Field(default=None, exclude=True)
+    # Camera, lidar and radar for methods that work on three; None = those that share most. Likewise.
+    three: tuple[str, str, str] | None = Field(default=None, exclude=True)
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -199,11 +201,21 @@ class Rig(Section):
     @model_validator(mode="after")
     def _edges_stand_once(self) -> Rig:
         ends = [frozenset(edge) for edge in self.edges or ()]
-        twice = next((self.edges[i] for i, e in enumerate(ends) if self.edges and e in ends[:i]), None)
+        twice = next((end for end in ends if ends.count(end) > 1), None)
         if twice is not None:
-            raise ValueError(f"edge [{', '.join(twice)}] stands twice")
+            raise ValueError(f"edge [{_listed(sorted(twice))}] stands twice")
         if self.edges == ():
             raise ValueError("edges names none: leave it out to have them found")
+        return self
+
+    @model_validator(mode="after")
+    def _three_are_one_of_each_kind(self) -> Rig:
+        if self.three is not None and any(
+            name not in of for name, of in zip(self.three, self._of_kind.values(), strict=True)
+        ):
+            raise ValueError(
+                f"three = [{_listed(self.three)}]: name a camera, a lidar and a radar of the rig"
+            )
         return self
 
     @model_validator(mode="after")

@@ -8,7 +8,7 @@ import pytest
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.geometry.spherical import to_spherical
 from pipeline.rig.graph import BASE, RigGraph, Sensor, edge_between
-from pipeline.rig.overlap import best_trio, find_edges, overlaps_of
+from pipeline.rig.overlap import best_three, find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, star_of
 
 # Name, kind, azimuth that it looks to, half-width and half-height of its view [deg].
@@ -161,6 +161,6 @@ def test_a_rig_with_one_sensor_of_each_kind_has_all_its_pairs_as_before():
 
 
 def test_the_best_three_sensors_all_share_a_view():
-    assert [s.name for s in best_trio(overlaps_of(*rig()))] == ["front", "top", "ahead"]
+    assert [s.name for s in best_three(overlaps_of(*rig()))] == ["front", "top", "ahead"]
     apart = [("c", "camera", 0, 20, 10), ("l", "lidar", 0, 180, 15), ("r", "radar", 180, 50, 90)]
-    assert best_trio(overlaps_of(*rig(apart))) is None
+    assert best_three(overlaps_of(*rig(apart))) is None

@@ -129,6 +129,11 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
         (('base = "base_link"', 'edges = [["top", "base"]]'), "no base (set base ="),
         (('base = "base_link"', 'edges = [["top", "left"], ["left", "top"]]'), "[left, top] stands twice"),
         (('base = "base_link"', "edges = []"), "edges names none"),
+        (
+            ('base = "base_link"', 'three = ["front", "top", "nose"]'),
+            "three = [front, top, nose]: name a camera",
+        ),
+        (('base = "base_link"', 'three = ["front", "top"]'), "van.three"),
         (('"/nose/points"', '"points"'), "rigs.van.lidars.nose.points"),
     ],
 )

@@ -1,0 +1,31 @@
+"""Which camera, lidar and radar a method works on that knows one of each: the paper's, tracks and networks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pipeline.errors import SolveError
+from pipeline.rig.graph import Kind
+from pipeline.rig.overlap import Overlap, best_three
+from pipeline.rig.rig import Rig
+
+__all__ = ["three_sensors"]
+
+
+def three_sensors(method: str, rig: Rig, overlaps: Sequence[Overlap]) -> Mapping[Kind, str]:
+    """Names by kind: those that the rig names, else the three that share most; of a rig with one of each, these.
+
+    Raises:
+        SolveError: no three of the rig share a view.
+    """
+    sensors = [node for node in rig.nodes if node.kind != "base"]
+    only = {sensor.kind: sensor.name for sensor in sensors}
+    if len(only) == len(sensors):
+        return only
+    named = rig.three or ()
+    among = [o for o in overlaps if not named or {s.name for s in o.edge.sensors} <= set(named)]
+    best = best_three(among)
+    if best is None:
+        which = f"{', '.join(named[:2])} and {named[2]} share none" if named else "no three of the rig do"
+        raise SolveError(f"method {method} works on a camera, a lidar and a radar that share a view: {which}")
+    return {sensor.kind: sensor.name for sensor in best}
