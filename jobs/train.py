@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Literal
 from jobs.extras import needs
 
 if TYPE_CHECKING:
+    from pipeline.learn.train.loop import TrainResult
     from pipeline.learn.train.run import TrainRequest
     from pipeline.learn.train.settings import TrainConfig
 
-__all__ = ["parse_duration", "train"]
+__all__ = ["parse_duration", "report_training", "train"]
 
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -77,9 +78,8 @@ def train(  # options of the command: as many as a user may set
 def _run(request: TrainRequest, settings: TrainConfig, ray_workers: int | None) -> int:
     """Train here, as one of torchrun's processes, or on Ray; the summary is printed once."""
     import os
-    from dataclasses import asdict
 
-    from jobs.terminal.summary import print_summary, progress_reporter
+    from jobs.terminal.summary import progress_reporter
     from pipeline.learn.train.run import train as run
 
     if ray_workers is not None:
@@ -92,8 +92,20 @@ def _run(request: TrainRequest, settings: TrainConfig, ray_workers: int | None) 
     else:
         with progress_reporter(f"train {request.out.name}") as progress:
             result = run(request, settings, progress)
-    fields = asdict(result)
-    print_summary("train", fields.pop("status"), out=request.out, **fields)
+    return report_training("train", result, request.out)
+
+
+def report_training(
+    command: str, result: TrainResult, out: Path, report: str = "report", **more: object
+) -> int:
+    """Print how a call ended, its last report under that name, and `more`; the exit code."""
+    from dataclasses import asdict
+
+    from jobs.terminal.summary import print_summary
+
+    fields = asdict(result) | more
+    fields[report] = fields.pop("report")
+    print_summary(command, fields.pop("status"), out=out, **fields)
     return 128 + result.signal if result.signal else 0
 
 

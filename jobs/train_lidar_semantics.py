@@ -3,15 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from jobs.extras import needs
-
-if TYPE_CHECKING:
-    from pipeline.learn.perception.lidar_semantics.days import SweepSamples
-    from pipeline.learn.perception.lidar_semantics.network import SweepNetwork
-    from pipeline.learn.perception.lidar_semantics.training import SweepTraining
-    from pipeline.learn.perception.trainer import TrainingResult
 
 __all__ = ["train_lidar_semantics"]
 
@@ -52,41 +45,25 @@ def train_lidar_semantics(  # options of the command: as many as a user may set
         time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
         threads: of the processor.
     """
-    from dataclasses import asdict
-
     import torch
 
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from jobs.train import parse_duration
+    from jobs.terminal.summary import progress_reporter
+    from jobs.train import parse_duration, report_training
     from pipeline.config import load_fleet
     from pipeline.learn.perception.lidar_semantics.days import labelled_sweeps
-    from pipeline.learn.perception.lidar_semantics.training import SweepTraining, train_sweeps
+    from pipeline.learn.perception.lidar_semantics.export import export_sweeps
+    from pipeline.learn.perception.lidar_semantics.training import SweepTraining, normal_of, train_sweeps
     from pipeline.store.partitions import Lake
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
-    config = SweepTraining(steps, batch_size, learning_rate, seed=seed)
+    config = SweepTraining(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
     samples = labelled_sweeps(load_fleet(fleet), Lake.at(lake), (rows, columns), frames_per_day)
     torch.set_num_threads(threads)
     with progress_reporter(f"train {out.name}") as progress:
         network, result = train_sweeps(samples.train, samples.held_out, out, config, limit, progress)
-    outputs = [_export(network, samples, result, config, out)] if result.status == "done" else []
-    fields = samples.numbers | asdict(result)
-    print_summary("train-lidar-semantics", fields.pop("status"), out=out, outputs=outputs, **fields)
-    return 128 + result.signal if result.signal else 0
-
-
-def _export(
-    network: SweepNetwork, samples: SweepSamples, result: TrainingResult, config: SweepTraining, out: Path
-) -> Path:
-    """The finished network as a model with a card that says what it was trained on and how well it does."""
-    from dataclasses import asdict
-
-    from pipeline.learn.perception.lidar_semantics.export import export_sweeps
-    from pipeline.learn.perception.lidar_semantics.training import normal_of
-
-    card = {
-        "data": samples.numbers,
-        "training": asdict(config),
-        "held_out_against_projected_labels": result.scores,
-    }
-    return export_sweeps(network, samples.layout, normal_of(samples.train), out, card)
+    outputs: list[Path] = []
+    if result.status == "done":
+        scores = {"held_out_against_projected_labels": result.report}
+        card = {"data": samples.numbers, "training": config.model_dump(), **scores}
+        outputs = [export_sweeps(network, samples.layout, normal_of(samples.train), out, card)]
+    return report_training("train-lidar-semantics", result, out, "scores", outputs=outputs, **samples.numbers)

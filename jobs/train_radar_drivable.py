@@ -40,12 +40,10 @@ def train_radar_drivable(  # options of the command: as many as a user may set
         time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
         threads: of the processor.
     """
-    from dataclasses import asdict
-
     import torch
 
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from jobs.train import parse_duration
+    from jobs.terminal.summary import progress_reporter
+    from jobs.train import parse_duration, report_training
     from pipeline.config import load_fleet
     from pipeline.learn.perception.radar_drivable.days import drivable_samples
     from pipeline.learn.perception.radar_drivable.export import export_drivable
@@ -53,16 +51,13 @@ def train_radar_drivable(  # options of the command: as many as a user may set
     from pipeline.store.partitions import Lake
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
-    config = DrivableTraining(steps, batch_size, learning_rate, seed=seed)
+    config = DrivableTraining(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
     train, held_out, data = drivable_samples(load_fleet(fleet), Lake.at(lake), frames_per_day)
     torch.set_num_threads(threads)
     with progress_reporter(f"train {out.name}") as progress:
         network, result = train_drivable(train, held_out, out, config, limit, progress)
     outputs: list[Path] = []
     if result.status == "done":
-        card = {"data": data, "training": asdict(config), "iou_held_out": result.scores}
+        card = {"data": data, "training": config.model_dump(), "iou_held_out": result.report}
         outputs = [export_drivable(network, out, card)]
-    fields = data | asdict(result)
-    fields["iou"] = fields.pop("scores")
-    print_summary("train-radar-drivable", fields.pop("status"), out=out, outputs=outputs, **fields)
-    return 128 + result.signal if result.signal else 0
+    return report_training("train-radar-drivable", result, out, "iou", outputs=outputs, **data)

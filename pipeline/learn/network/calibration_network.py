@@ -19,7 +19,7 @@ from pipeline.learn.network.outputs import CoreOutputs, Predictions
 from pipeline.learn.network.views import RenderedView, render
 from pipeline.learn.sample.layout import NetworkConfig
 
-__all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "refine", "turns_only"]
+__all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "turns_only"]
 
 
 class CalibrationNetwork(nn.Module):
@@ -129,14 +129,6 @@ def compose(
 
 def build_network(config: NetworkConfig, seed: int = 0) -> CalibrationNetwork:
     """A fresh network; the same seed gives the same weights, whatever else used torch's generator."""
-    state = torch.random.get_rng_state()
-    torch.manual_seed(seed)
-    try:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
         return CalibrationNetwork(config)
-    finally:
-        torch.random.set_rng_state(state)
-
-
-def refine(network: CalibrationNetwork, inputs: NetworkInputs, iterations: int = 3) -> list[Predictions]:
-    """`network.refine`, for callers that hold the network as a value."""
-    return network.refine(inputs, iterations)

@@ -13,7 +13,7 @@ from torch import distributed
 
 from pipeline.errors import ConfigError
 
-__all__ = ["Processes", "joined"]
+__all__ = ["ALONE", "Processes", "joined"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,9 @@ class Processes:
             distributed.all_reduce(values)
             values = values / self.count
         return values
+
+
+ALONE = Processes(0, 1, torch.device("cpu"))
 
 
 @contextmanager

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 
 from pipeline.errors import BoresightError, ConfigError, ContractError, MissingExtraError
-from pipeline.learn.train.run import TrainRequest, TrainResult, train
+from pipeline.learn.train.loop import TrainResult
+from pipeline.learn.train.run import TrainRequest, train
 from pipeline.learn.train.settings import TrainConfig
 
 __all__ = ["train_on_ray"]

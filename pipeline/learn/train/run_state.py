@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,100 +12,122 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from pipeline.errors import ConfigError, ContractError
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.batches.loader import load_split
 from pipeline.learn.network.calibration_network import CalibrationNetwork, build_network
 from pipeline.learn.network.exported_weights import network_of_file
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.acceleration import accelerate
-from pipeline.learn.train.batch_loss import Passes
+from pipeline.learn.train.batch_loss import Passes, batch_loss
 from pipeline.learn.train.batch_stream import BatchStream, batch_stream
 from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
+from pipeline.learn.train.loop import Run
+from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.paper_objective import PaperFrames, with_paper_inputs
 from pipeline.learn.train.processes import Processes
 from pipeline.learn.train.running_mean import DayMeans
-from pipeline.learn.train.schedule import DivergenceGuard
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.store.partitions import Lake
 
 __all__ = ["RunState", "begin_run", "network_of_run"]
 
 _ENDLESS = 10**9  # steps, where time is what ends a run
+_VALIDATION_SEED = 977  # the guesses of validation are the same every time
 
 
-@dataclass
-class RunState:
+class RunState(Run):
     """One process's part of a run."""
 
-    config: TrainConfig
-    grid: Grid
     network: CalibrationNetwork
-    passes: nn.Module
-    optimiser: torch.optim.Adam
-    stream: BatchStream
-    day_means: DayMeans
-    guard: DivergenceGuard
-    steps: int
-    step: int = 0
-    trained_s: float = 0.0
-    best: float = math.inf
-    paper: PaperFrames | None = None
+
+    def __init__(
+        self, data: str, config: TrainConfig, processes: Processes, stream: BatchStream, *, compiled: bool
+    ) -> None:
+        self.config, self.grid, self.stream = config, Grid(config.cell_deg), stream
+        network = build_network(_network_config(config, self.grid), config.seed).to(processes.device)
+        self.paper: PaperFrames | None = None
+        if config.loss.definition == "paper":
+            with_paper_inputs(network)
+            self.paper = PaperFrames(Lake.at(data))
+        accelerate(network, half=processes.device.type == "cuda", compiled=compiled)
+        self.passes: nn.Module = Passes(network, config.iterations)
+        if processes.count > 1:
+            # A pair's network uses a part of the encoders only.
+            self.passes = DistributedDataParallel(self.passes, find_unused_parameters=True)
+        self.day_means, self.best = DayMeans(), math.inf
+        self.held_out = _held_out(data, config) if processes.leads else None
+        super().__init__(network, config, _steps(config, stream.frames, processes.count), processes)
 
     @property
     def progress(self) -> float:
-        """Share of the run that is done, by what its learning rate goes by."""
+        """Share of the run that is done, by time where time is what ends it."""
         if self.config.budget_minutes is not None:
             return self.trained_s / (60 * self.config.budget_minutes)
-        return self.step / self.steps
+        return super().progress
 
-    @property
-    def finished(self) -> bool:
-        """True when there is nothing left to train."""
-        return self.step >= self.steps or self.progress >= 1
+    def comparable(self) -> bool:
+        """Losses of the encoders alone are of another size."""
+        return (self.step + 1) % self.config.matched_every == 0
 
-    def save(self, folder: Path, processes: Processes) -> None:
-        """Write the last checkpoint; every process must call."""
+    def losses(self) -> dict[str, Tensor]:
+        """Of the step's batch, from random guesses."""
+        found = batch_loss(
+            self.passes, self.stream.batch(self.step), self.config, self.day_means,
+            _generator(self.config.seed, self.step, self.processes.rank), self.network,
+            matched=self.comparable(), paper=self.paper,
+        )  # fmt: skip
+        return found.report | {"loss": found.loss}
+
+    def validate(self, folder: Path, log: MetricsLog | None) -> None:
+        """Every so often report the losses of held-out frames from the same guesses; keep the best weights."""
+        frames, sums = self.held_out, dict[str, float]()
+        if frames is None or not (self.step % self.config.validate_every == 0 or self.finished):
+            return
+        passes, generator = Passes(self.network, self.config.iterations), torch.Generator()
+        generator.manual_seed(_VALIDATION_SEED)
+        day_means = DayMeans()
+        self.network.eval()
+        with torch.no_grad():
+            for first in range(0, len(frames), 16):
+                part = frames[first : first + 16].to(self.processes.device)
+                found = batch_loss(
+                    passes, part, self.config, day_means, generator, self.network, paper=self.paper
+                )
+                for name, value in found.report.items():
+                    sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
+        self.network.train()
+        if log is not None:
+            log.report(self.step, {f"validation/{name}": value for name, value in sums.items()})
+        if sums["alignment"] < self.best:
+            self.best = sums["alignment"]
+            content = {"network": self.network.state_dict(), "step": self.step, "alignment": self.best}
+            save_checkpoint(folder / BEST, self._about() | content)
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds; every process must call."""
         # "consensus": name of the running day means in checkpoints of format 1.
         own = {"stream": self.stream.state_dict(), "consensus": self.day_means.state_dict()}
-        everyone = processes.gather(own)
-        if processes.leads:
-            state = self.weights() | {
-                "optimiser": self.optimiser.state_dict(),
-                "processes": everyone,
-                "guard": self.guard.state_dict(),
-                "step": self.step,
-                "trained_s": self.trained_s,
-                "best": self.best,
-            }
-            save_checkpoint(folder / LAST, state)
+        everyone = {"processes": self.processes.gather(own), "best": self.best}
+        return super().state() | self._about() | everyone
 
-    def weights(self) -> dict[str, Any]:
-        """What inference needs."""
-        return {
-            "config": self.config.model_dump(mode="json"),
-            "grid": asdict(self.grid),
-            "network": self.network.state_dict(),
-        }
-
-    def load(self, state: dict[str, Any], processes: Processes) -> None:
+    def load(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint.
 
         Raises:
             ConfigError: it was written by another number of processes.
         """
-        if len(state["processes"]) != processes.count:
-            problem = f"begun by {len(state['processes'])}, now {processes.count}"
+        if len(state["processes"]) != self.processes.count:
+            problem = f"begun by {len(state['processes'])}, now {self.processes.count}"
             raise ConfigError("train", "processes", f"a run goes on with as many as it was {problem}")
-        self.network.load_state_dict(state["network"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        own = state["processes"][processes.rank]
+        super().load(state)
+        own = state["processes"][self.processes.rank]
         self.stream.load_state_dict(own["stream"])
         self.day_means.load_state_dict(own["consensus"])
-        self.guard.load_state_dict(state["guard"])
-        self.step, self.trained_s, self.best = (
-            int(state["step"]),
-            float(state["trained_s"]),
-            float(state["best"]),
-        )
+        self.best = float(state["best"])
+
+    def _about(self) -> dict[str, Any]:
+        return {"config": self.config.model_dump(mode="json"), "grid": asdict(self.grid)}
 
 
 def begin_run(
@@ -118,51 +140,16 @@ def begin_run(
     resident: bool,
     start: Path | None = None,
 ) -> RunState:
-    """A fresh run, or the one in the folder where its last checkpoint left it.
-
-    Args:
-        data: see `TrainRequest`.
-        folder: of the run.
-        config: a run goes on only with the same.
-        processes: this process among those that train together.
-        compiled: see `TrainRequest`.
-        resident: see `TrainRequest`.
-        start: run or exported file whose weights a fresh run begins with; a run that goes on has its own.
-
-    Raises:
-        ConfigError: the folder's run has another configuration; `start` has another kind of network.
-        ContractError: no training data, or other data than the run began with; nothing trained in `start`.
-    """
+    """A fresh run, or the one in the folder where its last checkpoint left it; arguments and errors as of `train`."""
     stream = batch_stream(data, config, processes, resident=resident)
     try:
-        grid = Grid(config.cell_deg)
-        network = build_network(_network_config(config, grid), config.seed).to(processes.device)
-        by_paper = config.loss.definition == "paper"
-        if by_paper:
-            with_paper_inputs(network)
-        accelerate(network, half=processes.device.type == "cuda", compiled=compiled)
-        passes: nn.Module = Passes(network, config.iterations)
-        if processes.count > 1:
-            # A pair's network uses a part of the encoders only.
-            passes = DistributedDataParallel(passes, find_unused_parameters=True)
-        run = RunState(
-            config,
-            grid,
-            network,
-            passes,
-            torch.optim.Adam(network.parameters(), lr=config.learning_rate, betas=config.adam_betas),
-            stream,
-            DayMeans(),
-            DivergenceGuard(config.diverged_factor),
-            _steps(config, stream.frames, processes.count),
-            paper=PaperFrames(Lake.at(data)) if by_paper else None,
-        )
+        run = RunState(data, config, processes, stream, compiled=compiled)
         if (folder / LAST).exists():
             state = load_checkpoint(folder / LAST, processes.device)
             _same_config(folder, state["config"], config)
-            run.load(state, processes)
+            run.load(state)
         elif start is not None:
-            _take_weights(network, start)
+            _take_weights(run.network, start)
     except BaseException:
         stream.close()
         raise
@@ -225,6 +212,20 @@ def _steps(config: TrainConfig, frames: int, processes: int) -> int:
     if config.budget_minutes is not None:
         return _ENDLESS
     return max(1, math.ceil(config.epochs * frames / (config.batch_size * processes)))
+
+
+def _held_out(data: str, config: TrainConfig) -> TrainingBatch | None:
+    """Frames to validate on; None where the data has none."""
+    try:
+        return load_split(Lake.at(data), "val", limit=config.validation_frames)
+    except ContractError:
+        return None
+
+
+def _generator(seed: int, step: int, rank: int) -> torch.Generator:
+    """Random numbers of one step: they depend on (seed, step, rank) only, so a checkpoint need not hold a state."""
+    # Odd multipliers keep neighbouring steps and ranks apart.
+    return torch.Generator().manual_seed((seed * 1_000_003 + step * 8_191 + rank * 131) % 2**63)
 
 
 def _same_config(folder: Path, begun: dict[str, Any], config: TrainConfig) -> None:

@@ -17,6 +17,7 @@ from pipeline.learn.sample.grid import Grid
 __all__ = [
     "PAIRS_OF",
     "AugmentConfig",
+    "DescentConfig",
     "LossConfig",
     "StrangeConfig",
     "TrainConfig",
@@ -105,7 +106,28 @@ class StrangeConfig(_Section):
     )
 
 
-class TrainConfig(_Section):
+class DescentConfig(_Section):
+    """How any network descends: what the training loop reads."""
+
+    batch_size: Count = 4  # frames per process
+    steps: Count | None = None
+    learning_rate: Positive = 3e-4
+    final_learning_rate: Positive = 3e-7
+    adam_betas: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]] = (0.9, 0.999)
+    gradient_norm: Positive = 10.0  # longer gradients are cut: single frames can be wild
+    log_every: Count = 10  # steps
+    checkpoint_minutes: Positive = 5.0
+    diverged_factor: Annotated[float, Field(gt=1)] = 10.0  # times the smallest smoothed loss so far
+    seed: int = 0
+
+    @model_validator(mode="after")
+    def _rates_fall(self) -> DescentConfig:
+        if self.final_learning_rate > self.learning_rate:
+            raise ValueError("final_learning_rate must not exceed learning_rate")
+        return self
+
+
+class TrainConfig(DescentConfig):
     """The whole of train.toml."""
 
     architecture: Literal["matching", "concat"] = "matching"
@@ -122,23 +144,13 @@ class TrainConfig(_Section):
     # Encoders learn from classes alone, at every step; matchers have few weights and cost half of a step: they join at
     # every n-th.
     matched_every: Count = 1
-    batch_size: Count = 4  # frames per process
-    epochs: Positive = 20.0
-    steps: Count | None = None  # in place of epochs
-    learning_rate: Positive = 3e-4
-    final_learning_rate: Positive = 3e-7
-    adam_betas: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]] = (0.9, 0.999)
-    gradient_norm: Positive = 10.0  # longer gradients are cut: single frames can be wild
+    epochs: Positive = 20.0  # where steps are not given
     # In place of epochs: the run ends, and the cosine, after so much time.
     budget_minutes: Positive | None = None
     # Of the likelihood of each frame's scatter about its day's mean, which teaches the log variances.
     uncertainty_weight: NotNegative = 0.01
     validate_every: Count = 500  # steps
     validation_frames: Count = 128
-    log_every: Count = 10  # steps
-    checkpoint_minutes: Positive = 5.0
-    diverged_factor: Annotated[float, Field(gt=1)] = 10.0  # times the smallest smoothed loss so far
-    seed: int = 0
     loss: LossConfig = LossConfig()
     augment: AugmentConfig = AugmentConfig()
     strange: StrangeConfig = StrangeConfig()
@@ -172,12 +184,6 @@ class TrainConfig(_Section):
         if self.loss.definition == "paper" and own != ("concat", 0.0, False, StrangeConfig()):
             problem = 'architecture = "concat", augment.view_deg = 0, and neither takes_classes nor [strange]'
             raise ValueError(f'loss.definition = "paper" needs {problem}')
-        return self
-
-    @model_validator(mode="after")
-    def _rates_fall(self) -> TrainConfig:
-        if self.final_learning_rate > self.learning_rate:
-            raise ValueError("final_learning_rate must not exceed learning_rate")
         return self
 
 

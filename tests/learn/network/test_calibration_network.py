@@ -10,7 +10,7 @@ import torch
 from pipeline.extrinsics.estimates import Prior
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.collate import collate
-from pipeline.learn.network.calibration_network import build_network, refine
+from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
 from pipeline.learn.network.views import render
 from pipeline.learn.sample.frame_sample import About, make_row
@@ -98,7 +98,7 @@ def test_refinement_hands_turns_on_but_no_shifts_and_encodes_the_camera_once():
     calls = []
     network.core.camera_encoder.register_forward_hook(lambda *_: calls.append(1))
     with torch.no_grad():
-        answers = refine(network, inputs, 3)
+        answers = network.refine(inputs, 3)
         by_hand = inputs
         for answer in answers:
             again = network(by_hand)

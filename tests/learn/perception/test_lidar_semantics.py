@@ -38,7 +38,7 @@ from tests.makers.training_lakes import fill, frame_of
 
 LAYOUT = SweepLayout(24, 720, 8.0, -24.0)
 ROAD, CAR = LABELS.index("road"), LABELS.index("car")
-QUICK = SweepTraining(steps=6, batch_size=2, width=4, report_every=2)
+QUICK = SweepTraining(steps=6, batch_size=2, width=4, log_every=2)
 
 
 def hits(origin, rays, wall_m, angle):
@@ -133,8 +133,8 @@ def test_the_network_learns_and_perception_gets_its_answers_from_the_exported_mo
     network, result = train_sweeps(train, held_out, tmp_path, config)
     assert result.status == "done"
     # Whoever calls everything by one name has half of it; seconds of training are not the end.
-    assert result.scores["iou_ground"] > 0.8
-    assert result.scores["iou_road_user"] > 0.8
+    assert result.report["iou_ground"] > 0.8
+    assert result.report["iou_road_user"] > 0.8
     manifest = export_sweeps(network, LAYOUT, normal_of(train), tmp_path, {})
     segmenter = RangeImageSegmenter(manifest)
     for frame, _, road in street(4, 3):

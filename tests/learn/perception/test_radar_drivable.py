@@ -26,7 +26,7 @@ from tests.makers.lakes import write_observations
 from tests.makers.solve_scenes import make_observation, prior_columns
 
 PRIOR = np.eye(4)
-QUICK = DrivableTraining(steps=40, batch_size=4, width=12, report_every=10)
+QUICK = DrivableTraining(steps=40, batch_size=4, width=12, log_every=10)
 
 
 def road(rng, **changes):
@@ -102,8 +102,8 @@ def test_the_network_beats_geometry_and_the_best_guess_on_roads_that_it_has_not_
     train, held_out = samples
     _, result = train_drivable(train, held_out, tmp_path, DrivableTraining(steps=160, batch_size=4, width=12))
     assert result.status == "done"
-    assert result.scores["network"] > result.scores["geometric"] + 0.2
-    assert result.scores["network"] > result.scores["constant"] + 0.2
+    assert result.report["network"] > result.report["geometric"] + 0.2
+    assert result.report["network"] > result.report["constant"] + 0.2
 
 
 def test_a_stopped_run_goes_on_to_the_same_weights(samples, tmp_path):

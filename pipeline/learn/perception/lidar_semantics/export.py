@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from pipeline.learn.perception.exporter import ExportedGraph, export_model
+from pipeline.learn.perception.exporter import export_model
 from pipeline.learn.perception.lidar_semantics.network import SweepNetwork
 from pipeline.learn.perception.lidar_semantics.samples import SweepLayout
 from pipeline.learn.perception.lidar_semantics.training import Normal
@@ -32,9 +32,9 @@ def export_sweeps(
     Returns:
         The manifest.
     """
-    graph = ExportedGraph(network.eval(), torch.zeros(1, 5, *layout.size), "points", "logits")
-    told = {"purpose": PURPOSE, "command": "boresight train-lidar-semantics", **card}
-    return export_model(graph, folder, NAME, _manifest(layout, normal), told, LIMITS)
+    about = {"purpose": PURPOSE, "command": "boresight train-lidar-semantics", **card, "limits": LIMITS}
+    example, names = torch.zeros(1, 5, *layout.size), ("points", "logits")
+    return export_model(network.eval(), example, names, folder, NAME, _manifest(layout, normal), about)
 
 
 def _manifest(layout: SweepLayout, normal: Normal) -> str:

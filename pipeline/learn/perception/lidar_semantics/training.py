@@ -19,10 +19,10 @@ from pipeline.learn.perception.lidar_semantics.samples import SweepImages
 from pipeline.learn.perception.trainer import (
     Task,
     TrainingConfig,
-    TrainingResult,
     hash_of_arrays,
     run_training,
 )
+from pipeline.learn.train.loop import TrainResult
 from pipeline.results import Progress, silent
 
 __all__ = ["Normal", "SweepTraining", "held_out_scores", "kind_scores", "normal_of", "train_sweeps"]
@@ -30,7 +30,6 @@ __all__ = ["Normal", "SweepTraining", "held_out_scores", "kind_scores", "normal_
 _BRIGHTNESS = 0.2  # remission of lidars of one make differs by as much
 
 
-@dataclass(frozen=True)
 class SweepTraining(TrainingConfig):
     """Defaults that suit some hundred sweeps."""
 
@@ -61,7 +60,7 @@ def train_sweeps(
     config: SweepTraining,
     time_limit_s: float | None = None,
     progress: Progress = silent,
-) -> tuple[SweepNetwork, TrainingResult]:
+) -> tuple[SweepNetwork, TrainResult]:
     """Train, or go on with the run in `out`, until it is finished, the time is up or a signal asks to stop.
 
     Raises:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.geometry.radar_grid import CHANNELS, SHAPE, grid_layout
-from pipeline.learn.perception.exporter import ExportedGraph, export_model
+from pipeline.learn.perception.exporter import export_model
 from pipeline.learn.perception.radar_drivable.network import DrivableNetwork
 
 __all__ = ["LIMITS", "NAME", "export_drivable"]
@@ -41,8 +41,8 @@ def export_drivable(network: DrivableNetwork, folder: Path, card: dict[str, Any]
     Returns:
         The manifest.
     """
-    network.eval()
-    graph = ExportedGraph(_Graph(network), torch.zeros(1, len(CHANNELS), *SHAPE), "features", "drivable")
+    about = {"purpose": PURPOSE, "command": "boresight train-radar-drivable", **card, "limits": LIMITS}
+    example, names = torch.zeros(1, len(CHANNELS), *SHAPE), ("features", "drivable")
     layout = "".join(f"{key} = {json.dumps(value)}\n" for key, value in grid_layout().items())
-    told = {"purpose": PURPOSE, "command": "boresight train-radar-drivable", **card}
-    return export_model(graph, folder, NAME, f'task = "{NAME}"\n\n[grid]\n{layout}', told, LIMITS)
+    manifest = f'task = "{NAME}"\n\n[grid]\n{layout}'
+    return export_model(_Graph(network.eval()), example, names, folder, NAME, manifest, about)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +17,15 @@ from pipeline.learn.perception.radar_drivable.samples import FREE, UNKNOWN, Driv
 from pipeline.learn.perception.trainer import (
     Task,
     TrainingConfig,
-    TrainingResult,
     hash_of_arrays,
     run_training,
 )
+from pipeline.learn.train.loop import TrainResult
 from pipeline.results import Progress, silent
 
 __all__ = ["DrivableTraining", "area_iou", "held_out_iou", "probabilities", "train_drivable"]
 
 
-@dataclass(frozen=True)
 class DrivableTraining(TrainingConfig):
     """Defaults that suit some hundred scans."""
 
@@ -44,7 +42,7 @@ def train_drivable(
     config: DrivableTraining,
     time_limit_s: float | None = None,
     progress: Progress = silent,
-) -> tuple[DrivableNetwork, TrainingResult]:
+) -> tuple[DrivableNetwork, TrainResult]:
     """Train, or go on with the run in `out`, until it is finished, the time is up or a signal asks to stop.
 
     The result's scores are those of `held_out_iou`.

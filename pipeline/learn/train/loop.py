@@ -1,0 +1,175 @@
+"""The training loop of every network: resumable, within a time limit, stopped by a signal between two steps.
+
+A run can be stopped at any moment and goes on where its last checkpoint was. On one CPU thread it then gives the same
+weights, bit for bit, as one that was never stopped: everything random in a step comes from (seed, step, rank).
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.learn.train.checkpoints import LAST, save_checkpoint
+from pipeline.learn.train.metrics import MetricsLog
+from pipeline.learn.train.processes import ALONE, Processes
+from pipeline.learn.train.schedule import DivergenceGuard, cosine_rate
+from pipeline.learn.train.settings import DescentConfig
+from pipeline.results import Progress
+
+__all__ = ["Run", "TrainResult", "run_loop"]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """How a call ended (`done`, `time_limit`, or `stopped` by `signal`), where, and the last report."""
+
+    status: str
+    step: int
+    steps: int
+    samples: int
+    seconds: float
+    report: dict[str, float] = field(default_factory=dict)
+    signal: int = 0
+
+
+class Run(ABC):
+    """What a step changes.
+
+    Args:
+        network: in training mode.
+        config: rates and limits.
+        steps: in all.
+        processes: this process among those that train together.
+    """
+
+    def __init__(
+        self, network: nn.Module, config: DescentConfig, steps: int, processes: Processes = ALONE
+    ) -> None:
+        self.network, self.descent, self.steps, self.processes = network, config, steps, processes
+        self.optimiser = torch.optim.Adam(
+            network.parameters(), lr=config.learning_rate, betas=config.adam_betas
+        )
+        self.guard = DivergenceGuard(config.diverged_factor)
+        self.step, self.trained_s = 0, 0.0
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, which the learning rate follows."""
+        return self.step / self.steps
+
+    @property
+    def finished(self) -> bool:
+        """True when there is nothing left to train."""
+        return self.step >= self.steps or self.progress >= 1
+
+    @abstractmethod
+    def losses(self) -> dict[str, Tensor]:
+        """The next step's `loss`, differentiable, and what else is reported."""
+
+    def comparable(self) -> bool:
+        """Whether the next step's loss may be compared with earlier ones, to see a run diverge."""
+        return True
+
+    def validate(self, folder: Path, log: MetricsLog | None) -> None:  # noqa: B027 - not every run validates
+        """Called after every step."""
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds; every process must call."""
+        return {
+            "network": self.network.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "guard": self.guard.state_dict(),
+            "step": self.step,
+            "trained_s": self.trained_s,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.guard.load_state_dict(state["guard"])
+        self.step, self.trained_s = int(state["step"]), float(state.get("trained_s", 0.0))
+
+    def save(self, folder: Path) -> None:
+        """Write the last checkpoint; every process must call."""
+        state = self.state()
+        if self.processes.leads:
+            save_checkpoint(folder / LAST, state)
+
+    def descend(self) -> dict[str, Tensor]:
+        """One step of Adam; returns what to report."""
+        config, comparable = self.descent, self.comparable()
+        rate = cosine_rate(self.progress, config.learning_rate, config.final_learning_rate)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        found = self.losses()
+        self.optimiser.zero_grad(set_to_none=True)
+        found["loss"].backward()  # type: ignore[no-untyped-call]
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm)
+        means = self.processes.mean(torch.stack([found["loss"].detach().float(), norm.detach().float()]))
+        if comparable:
+            self.guard.check(self.step, *means.tolist())
+        self.optimiser.step()
+        self.step += 1
+        return found | {"loss": means[0], "gradient_norm": means[1], "learning_rate": torch.tensor(rate)}
+
+
+def run_loop(
+    run: Run,
+    folder: Path,
+    log: MetricsLog | None,
+    stops: list[int],
+    time_limit_s: float | None,
+    progress: Progress,
+) -> TrainResult:
+    """Train until the run is finished, the time is up or a signal asks to stop; leaves last.pt in the folder.
+
+    Args:
+        run: fresh or resumed.
+        folder: of the run.
+        log: of the process that leads; None in the others.
+        stops: signals received, see `stop_signals`.
+        time_limit_s: of this call; None = no limit.
+        progress: called at every report.
+
+    Raises:
+        DivergedError: the loss is no number or has grown too far; the last checkpoint is from before.
+    """
+    config, processes, began = run.descent, run.processes, time.monotonic()
+    saved = reported = tick = began
+    first_step = reported_step = run.step
+    report: dict[str, float] = {}
+
+    def samples_since(step: int) -> int:
+        return (run.step - step) * config.batch_size * processes.count
+
+    while not run.finished:
+        now = time.monotonic()
+        run.trained_s, tick = run.trained_s + now - tick, now
+        late = time_limit_s is not None and now - began >= time_limit_s
+        stop, save = processes.any([bool(stops) or late, now - saved >= 60 * config.checkpoint_minutes])
+        if stop:
+            break
+        if save:
+            run.save(folder)
+            saved = time.monotonic()
+        values = run.descend()
+        if run.step % config.log_every == 0 or run.finished:
+            now = time.monotonic()
+            report = {name: float(value) for name, value in values.items()}
+            report["samples_per_s"] = samples_since(reported_step) / max(now - reported, 1e-9)
+            reported, reported_step = now, run.step
+            if log is not None:
+                log.report(run.step, report)
+            progress(run.step, min(run.steps, run.step + 10**6), f"loss {report['loss']:.3f}")
+        run.validate(folder, log)
+    run.save(folder)
+    status = "done" if run.finished else ("stopped" if stops else "time_limit")
+    seconds, signal = time.monotonic() - began, stops[0] if stops else 0
+    return TrainResult(status, run.step, run.steps, samples_since(first_step), seconds, report, signal)
