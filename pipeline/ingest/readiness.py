@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-__all__ = ["DofVerdict", "Evidence", "judge", "overall"]
+__all__ = ["DofVerdict", "Evidence", "judge", "judge_edge", "overall"]
 
 # 30 frames give camera-lidar within 0.1 deg and lidar-radar yaw within 0.15 deg on real logs, 10 twice that.
 _ENOUGH_FRAMES, _FEW_FRAMES = 30, 10
 _MOVING_SHARE = 0.2  # time offsets show only where the car moves
-_ORDER = ("camera_lidar", "lidar_radar", "camera_radar")  # in which they are shown: the composed one last
+_ORDER = ("camera_lidar", "lidar_radar", "camera_radar")  # in which three are shown: the composed one last
 _DENSE_RINGS = 32  # below, reflectivity on the road has to carry pitch
 
 
@@ -50,13 +50,19 @@ class DofVerdict:
 def judge(evidence: Evidence) -> list[DofVerdict]:
     """One verdict per pair and class of DoF, the weakest of what it needs."""
     of_pair = dict.fromkeys(_ORDER, evidence.frames) if evidence.frames_of is None else evidence.frames_of
-    found = []
-    for pair in sorted(of_pair, key=_ORDER.index):
-        count = of_pair[pair]
-        own = replace(evidence, frames=count)
-        needs = [(dof, needs) for of, dof, needs in _needs(own) if of == pair]
-        found += [_verdict(pair, dof, needs if count else _without_frames(own)) for dof, needs in needs]
-    return found
+    return [
+        verdict
+        for pair in sorted(of_pair, key=_ORDER.index)
+        for verdict in judge_edge(pair, pair, replace(evidence, frames=of_pair[pair]))
+    ]
+
+
+def judge_edge(name: str, kind: str, evidence: Evidence) -> list[DofVerdict]:
+    """One verdict per class of DoF of an edge, by what is known of its two sensors."""
+    needs = [(dof, needs) for of, dof, needs in _needs(evidence) if of == kind]
+    return [
+        _verdict(name, dof, needs if evidence.frames else _without_frames(evidence)) for dof, needs in needs
+    ]
 
 
 def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
@@ -77,6 +83,15 @@ def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
         ("camera_radar", "yaw", ground + camera + radar),
         ("camera_radar", "roll and pitch", tilt + camera),
         ("camera_radar", "translation", ground + camera + radar + shift),
+        ("lidar_lidar", "roll, pitch and yaw", ground),
+        ("lidar_lidar", "translation", ground),
+        ("lidar_lidar", "time offset", moving),
+        ("lidar_base", "roll, pitch and z", ground),
+        ("lidar_base", "yaw", moving),
+        ("lidar_base", "x and y", ground + [("weak", "only turns say where the vehicle's x and y are")]),
+        ("radar_base", "yaw", moving + radar),
+        ("radar_base", "pitch", moving + radar + _elevation_needs(evidence)),
+        ("radar_base", "roll and translation", [("no", "Doppler does not show it: the prior stays")]),
     ]
 
 

@@ -8,9 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Final, Literal, get_args
 
-__all__ = ["BASE", "EDGE_KINDS", "KINDS", "Edge", "Kind", "RigGraph", "Sensor", "edge_between"]
+__all__ = [
+    "BASE",
+    "EDGE_KINDS",
+    "KINDS",
+    "Edge",
+    "Kind",
+    "RigGraph",
+    "Sensor",
+    "edge_between",
+    "possible_edges",
+]
 
 Kind = Literal["camera", "lidar", "radar", "base"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -78,6 +89,12 @@ class Edge:
     def other(self, name: str) -> Sensor:
         """The sensor at the other end of the named one."""
         return self.child if name == self.parent.name else self.parent
+
+
+def possible_edges(nodes: Sequence[Sensor]) -> tuple[Edge, ...]:
+    """All edges that the nodes' kinds allow."""
+    pairs = (sorted(two, key=lambda s: KINDS.index(s.kind)) for two in combinations(nodes, 2))
+    return tuple(edge_between(a, b) for a, b in pairs if f"{a.kind}_{b.kind}" in EDGE_KINDS)
 
 
 def edge_between(a: Sensor, b: Sensor) -> Edge:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.geometry.se3 import exp_so3, inverse, transform_points
-from pipeline.rig.graph import EDGE_KINDS, KINDS, Edge, RigGraph, Sensor, edge_between
+from pipeline.rig.graph import Edge, RigGraph, Sensor, edge_between, possible_edges
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.views import View
 
@@ -49,14 +49,15 @@ def overlaps_of(prior: RigPrior, views: Mapping[str, View]) -> tuple[Overlap, ..
     """
     own = {s: _sphere()[views[s.name](_sphere())] for s in prior.nodes if s.name in views}
     found = []
-    for a, b in combinations(own, 2):
+    for edge in possible_edges([s for s, seen in own.items() if len(seen)]):
+        a, b = edge.sensors
         T_a_b = prior.between(a.name, b.name)
-        if _kind(a, b) in EDGE_KINDS and T_a_b is not None and len(own[a]) and len(own[b]):
+        if T_a_b is not None:
             few, many, T = (b, a, T_a_b) if len(own[b]) <= len(own[a]) else (a, b, inverse(T_a_b))
             sigmas = prior.sigmas_between(a.name, b.name)
             seen = [_seen(r * own[few], T, views[many.name], sigmas, r).mean() for r in _RANGES_M]
             share = float(np.mean(seen))
-            found.append(Overlap(edge_between(a, b), share, share * len(own[few]) / _DIRECTIONS * 4 * np.pi))
+            found.append(Overlap(edge, share, share * len(own[few]) / _DIRECTIONS * 4 * np.pi))
     return tuple(found)
 
 
@@ -125,10 +126,6 @@ def _most_tied(nodes: Sequence[Sensor], edges: Sequence[Edge]) -> Sensor:
     """Of lidars, else radars, else cameras, the first of those with most edges."""
     kind = next(k for k in ("lidar", "radar", "camera") if any(n.kind == k for n in nodes))
     return max((n for n in nodes if n.kind == kind), key=lambda n: sum(n in e.sensors for e in edges))
-
-
-def _kind(a: Sensor, b: Sensor) -> str:
-    return "_".join(sorted((a.kind, b.kind), key=KINDS.index))
 
 
 def _seen(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from itertools import combinations
 from typing import Any, Final, TypeVar
 
 from pydantic import (
@@ -15,7 +14,7 @@ from pydantic import (
 )
 
 from pipeline.errors import ConfigError
-from pipeline.rig.graph import BASE, EDGE_KINDS, KINDS, Edge, Sensor, edge_between
+from pipeline.rig.graph import BASE, KINDS, Edge, Sensor, edge_between, possible_edges
 from pipeline.rigs import (
     CameraTopics,
     EgoTopics,
@@ -178,7 +177,7 @@ class Rig(Section):
     @model_validator(mode="after")
     def _edges_join_its_sensors(self) -> Rig:
         nodes = {node.name: node for node in self.nodes}
-        if not any(self._can_be_edge(a, b) for a, b in combinations(nodes.values(), 2)):
+        if not possible_edges(self.nodes):
             has = (
                 f"only a {next(iter(nodes.values())).kind}"
                 if len(nodes) == 1
@@ -241,10 +240,6 @@ class Rig(Section):
         yield "prior", self.prior.topic
         if self.ego is not None:
             yield "odometry", self.ego.odometry
-
-    @staticmethod
-    def _can_be_edge(a: Sensor, b: Sensor) -> bool:
-        return {f"{a.kind}_{b.kind}", f"{b.kind}_{a.kind}"} & set(EDGE_KINDS) != set()
 
 
 def _listed(names: Any) -> str:

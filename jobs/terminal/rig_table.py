@@ -1,0 +1,66 @@
+"""A rig as a matrix on the terminal, with what its edges lack below."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pipeline.ingest.rig_matrix import PairFinding, RigFinding
+
+__all__ = ["print_rig"]
+
+_NAMED = 4  # edges that are named of those that lack the same
+_COLOUR = {"yes": "green", "weak": "yellow", "no": "red"}
+
+
+def print_rig(console: Console, rig: RigFinding) -> None:
+    """The matrix: a row for each sensor, a column for each that it could have an edge to."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    pairs = {(p.parent, p.child): p for p in rig.pairs}
+    columns = [s for s in rig.sensors if any(child == s for _, child in pairs)]
+    rows = [s for s in rig.sensors if any(parent == s for parent, _ in pairs)]
+    table = Table(title="Who sees the same", title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for row in rows:
+        name = f"{row} *" if row == rig.reference else row
+        table.add_row(name, *(_cell(pairs.get((row, column))) for column in columns))
+    console.print(table)
+    console.print(
+        "share of the smaller view, moments with both; below, of edges, DoF that they give + in part"
+    )
+    console.print(f"poses refer to {rig.reference} (*); what has no second line is not calibrated")
+    for (dof, verdict, reason), edges in _reasons(rig).items():
+        named = ", ".join(edges[:_NAMED]) + (
+            f" and {len(edges) - _NAMED} more" if len(edges) > _NAMED else ""
+        )
+        console.print(f"  - {dof} of {named}: [{_COLOUR[verdict]}]{verdict}[/], {escape(reason)}")
+    if rig.loose:
+        console.print(f"  - nothing ties {', '.join(rig.loose)} to {rig.reference}", markup=False)
+
+
+def _cell(pair: PairFinding | None) -> str:
+    from pipeline.ingest.rig_matrix import dof_counts
+
+    if pair is None:
+        return ""
+    share = "" if pair.share is None else f"{pair.share:.0%} "
+    if not pair.is_edge:
+        return f"[bright_black]{share or '- '}{pair.moments}[/]"
+    given, weak = dof_counts(pair.verdicts)
+    colour = "green" if given else "yellow" if weak else "red"
+    return f"{share}{pair.moments}\n[{colour}]{given}+{weak}[/]"
+
+
+def _reasons(rig: RigFinding) -> dict[tuple[str, str, str], list[str]]:
+    """What edges lack: class of DoF, verdict and reason, with the edges that they are of."""
+    found: dict[tuple[str, str, str], list[str]] = {}
+    for verdict in (v for pair in rig.pairs for v in pair.verdicts):
+        for reason in verdict.reasons:
+            found.setdefault((verdict.dof, verdict.verdict, reason), []).append(verdict.pair)
+    return found
