@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from pipeline.convert.recording import Recording
+    from pipeline.rig.graph import Kind
 
 __all__ = ["convert"]
 
@@ -21,9 +22,9 @@ def convert(
     out: Path,
     vehicle: str | None = None,
     day: str = "2000-01-01",
-    camera: str = "CAM_FRONT",
-    lidar: str = "LIDAR_TOP",
-    radar: str = "RADAR_FRONT",
+    camera: str | None = None,
+    lidar: str | None = None,
+    radar: str | None = None,
     radar_columns: str = "x,y,z,power,doppler",
     segmenter: str | None = None,
     detector: str | None = None,
@@ -31,15 +32,15 @@ def convert(
     """Write OUT/logs/VEHICLE/DAY/*.mcap and OUT/fleet.toml from a folder of a data set.
 
     Args:
-        data_set: nuscenes; vod (View-of-Delft); kitti: image_2, velodyne and calib, and
-            radar (with Tr_radar_to_velo in calib) where there is one.
+        data_set: nuscenes; vod (View-of-Delft); kitti: image_2, velodyne and calib, and image_3 and
+            radar (with Tr_radar_to_velo in calib) where there are such.
         folder: of the data set.
         out: folder to write into.
         vehicle: of vod and kitti; default: the data set's name. nuScenes names its own, and its days.
         day: of vod and kitti, which have no stamps, YYYY-MM-DD.
-        camera: channel of nuScenes.
-        lidar: channel of nuScenes.
-        radar: channel of nuScenes.
+        camera: channels of nuScenes, several with commas; default: all.
+        lidar: likewise.
+        radar: likewise.
         radar_columns: of kitti's radar/*.bin (float32); doppler is the range rate, positive = receding.
         segmenter: manifest of a model for fleet.toml, relative to it; without one, semantics must come from elsewhere.
         detector: manifest of a model for fleet.toml.
@@ -47,7 +48,7 @@ def convert(
     from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
     from pipeline.convert.log_file import fleet_text, write_log
-    from pipeline.convert.nuscenes import Channels, read_nuscenes
+    from pipeline.convert.nuscenes import read_nuscenes
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import Partition
 
@@ -56,7 +57,8 @@ def convert(
     owner = vehicle or str(data_set)
     Partition(owner, day)  # refuses what is no vehicle or day
     if data_set == "nuscenes":
-        recordings = read_nuscenes(folder, Channels(camera, lidar, radar))
+        named: dict[Kind, str | None] = {"camera": camera, "lidar": lidar, "radar": radar}
+        recordings = read_nuscenes(folder, {k: c.split(",") for k, c in named.items() if c is not None})
     elif data_set == "vod":
         recordings = read_view_of_delft(folder, owner, day)
     else:
@@ -68,11 +70,12 @@ def convert(
             progress(done, len(paths), recording.name)
             messages += write_log(path, recording)
     models = None if segmenter is None or detector is None else (segmenter, detector)
-    has_ego = all(any(e.kind == "ego" for e in r.events) for r in recordings)
+    has_ego = all(any(e.sensor == "ego" for e in r.events) for r in recordings)
     vehicles = sorted({r.vehicle for r in recordings})
     fleet = out / "fleet.toml"
-    has_radar = any("radar" in r.T_base for r in recordings)
-    fleet.write_text(fleet_text(data_set, vehicles, models, ego=has_ego, radar=has_radar))
+    kinds = {name: kind for r in recordings for name, kind in r.kinds.items()}
+    base = data_set == "nuscenes"  # the others give poses in a sensor's frame
+    fleet.write_text(fleet_text(data_set, vehicles, kinds, models, ego=has_ego, base=base))
     print_summary("convert", "done", fleet=fleet, logs=paths, messages=messages)
     return 0
 

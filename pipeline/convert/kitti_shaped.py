@@ -1,4 +1,4 @@
-"""KITTI-shaped folders: View-of-Delft's two trees, and one tree, with a folder `radar` or without.
+"""KITTI-shaped folders: View-of-Delft's two trees, and one tree, with folders `image_3` and `radar` or without.
 
 The data sets give no stamps: frames count at 10 Hz from noon of the day that the caller names, and all sensors of a
 frame have the same stamp. Where poses jump farther than a car drives between frames, another drive begins a minute
@@ -26,6 +26,7 @@ from pipeline.convert.recording import Event, Recording, ego_events
 from pipeline.errors import ConfigError
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import inverse
+from pipeline.rig.graph import Kind
 
 __all__ = ["Layout", "read_kitti", "read_view_of_delft"]
 
@@ -41,7 +42,7 @@ class Layout:
     """Where things are in the folder.
 
     Args:
-        images: folder of images, named by frame.
+        images: folders of images, named by frame, by the camera's name; P2 in calib is of image_2, P3 of image_3.
         lidar: folder of .bin.
         radar: folder of .bin; empty: there is none.
         calib: folder of .txt.
@@ -50,7 +51,7 @@ class Layout:
         radar_columns: of a row; empty names are left out.
     """
 
-    images: str
+    images: Mapping[str, str]
     lidar: str
     radar: str
     calib: str
@@ -67,7 +68,7 @@ def read_view_of_delft(folder: Path, vehicle: str, day: str) -> list[Recording]:
     """
     lidar, radar = "lidar/training", "radar/training"
     layout = Layout(
-        f"{lidar}/image_2",
+        {"camera": f"{lidar}/image_2"},
         f"{lidar}/velodyne",
         f"{radar}/velodyne",
         f"{lidar}/calib",
@@ -79,7 +80,9 @@ def read_view_of_delft(folder: Path, vehicle: str, day: str) -> list[Recording]:
 
 
 def read_kitti(folder: Path, vehicle: str, day: str, radar_columns: Sequence[str]) -> list[Recording]:
-    """The one recording of a folder with image_2, velodyne and calib; radar, with Tr_radar_to_velo, where there is one.
+    """The one recording of a folder with image_2, velodyne and calib; image_3 and radar where there are such.
+
+    The radar needs Tr_radar_to_velo. Of two cameras that of image_2 is called left, the other right.
 
     Raises:
         ConfigError: as `read_view_of_delft`, or the radar's columns lack x, y, z or doppler.
@@ -88,63 +91,78 @@ def read_kitti(folder: Path, vehicle: str, day: str, radar_columns: Sequence[str
     if missing:
         raise ConfigError("command line", "radar-columns", f"lacks {', '.join(missing)}")
     radar = "radar" if (folder / "radar").is_dir() else ""
-    layout = Layout("image_2", "velodyne", radar, "calib", "", "pose", tuple(radar_columns))
+    pair = {"left": "image_2", "right": "image_3"}
+    images = pair if (folder / "image_3").is_dir() else {"camera": "image_2"}
+    layout = Layout(images, "velodyne", radar, "calib", "", "pose", tuple(radar_columns))
     return [_read(folder, layout, vehicle, day)]
 
 
 def _read(folder: Path, layout: Layout, vehicle: str, day: str) -> Recording:
-    images = {p.stem: p for p in sorted((folder / layout.images).glob("*")) if p.suffix in (".jpg", ".png")}
-    points = [f for f in (layout.lidar, layout.radar) if f]
-    frames = [n for n in images if all((folder / f / f"{n}.bin").is_file() for f in points)]
+    images = {name: _images(folder / held) for name, held in layout.images.items()}
+    clouds = {"lidar": layout.lidar} | ({"radar": layout.radar} if layout.radar else {})
+    columns = {"lidar": _LIDAR_COLUMNS, "radar": layout.radar_columns}
+    common = sorted(set.intersection(*(set(of) for of in images.values())))
+    frames = [n for n in common if all((folder / f / f"{n}.bin").is_file() for f in clouds.values())]
     if not frames:
-        raise ConfigError(str(folder), "", f"no frame is in all of {', '.join([layout.images, *points])}")
-    camera, T_camera_lidar, T_lidar_radar = _calibration(folder, layout, frames[0], images[frames[0]])
-    # The lidar is the base: nothing says where it sits on the car.
-    T_base = {"camera": inverse(T_camera_lidar), "lidar": np.eye(4)}
-    T_base |= {} if T_lidar_radar is None else {"radar": T_lidar_radar}
+        wanted = [*layout.images.values(), *clouds.values()]
+        raise ConfigError(str(folder), "", f"no frame is in all of {', '.join(wanted)}")
+    cameras, T_lidar = _calibration(folder, layout, frames[0], {n: of[frames[0]] for n, of in images.items()})
     poses = {n: T for n in frames if (T := _pose(folder / layout.poses / f"{n}.json")) is not None}
-    T_odom_base = {n: T @ T_camera_lidar for n, T in poses.items()}
+    T_odom_base = {n: T @ inverse(T_lidar[next(iter(cameras))]) for n, T in poses.items()}
     stamps = _stamps(frames, T_odom_base, day)
     events = []
     for n, stamp in stamps.items():
+        events += [Event(stamp, name, partial(read_bytes, of[n])) for name, of in images.items()]
         events += [
-            Event(stamp, "image", partial(read_bytes, images[n])),
-            Event(stamp, "lidar", partial(_points, folder / layout.lidar / f"{n}.bin", _LIDAR_COLUMNS)),
+            Event(stamp, name, partial(_points, folder / held / f"{n}.bin", columns[name]))
+            for name, held in clouds.items()
         ]
-        if layout.radar:
-            scan = folder / layout.radar / f"{n}.bin"
-            events.append(Event(stamp, "radar", partial(_points, scan, layout.radar_columns)))
     for drive in _drives(stamps, T_odom_base):
         events += ego_events([stamps[n] for n in drive], [T_odom_base[n] for n in drive])
     events.sort(key=lambda event: event.stamp_ns)
-    return Recording(vehicle, day, folder.resolve().name, camera, T_base, events)
+    kinds: dict[str, Kind] = {**dict.fromkeys(cameras, "camera"), "lidar": "lidar"}
+    kinds |= {"radar": "radar"} if layout.radar else {}
+    return Recording(vehicle, day, folder.resolve().name, kinds, cameras, T_lidar, events)
+
+
+def _images(folder: Path) -> dict[str, Path]:
+    """Images by frame, in their order."""
+    return {p.stem: p for p in sorted(folder.glob("*")) if p.suffix in (".jpg", ".png")}
 
 
 def _calibration(
-    folder: Path, layout: Layout, frame: str, image: Path
-) -> tuple[Camera, Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"] | None]:
-    """The camera, T_camera_lidar and T_lidar_radar, None without a radar."""
+    folder: Path, layout: Layout, frame: str, images: Mapping[str, Path]
+) -> tuple[dict[str, Camera], dict[str, Float[np.ndarray, "4 4"]]]:
+    """Cameras by name, and T_lidar_sensor of all: the lidar is the base, for nothing says where it sits on the car."""
     path = folder / layout.calib / f"{frame}.txt"
     lines = _lines(path)
+    cameras, T_lidar = {}, {}
+    for name, image in images.items():
+        P = _matrix(path, lines, f"P{layout.images[name][-1]}")
+        cameras[name] = _camera(image, P)
+        T_lidar[name] = inverse(_rectified(path, lines, P) @ _matrix(path, lines, "Tr_velo_to_cam"))
+    T_lidar["lidar"] = np.eye(4)
+    if layout.radar and not layout.radar_calib:
+        T_lidar["radar"] = _matrix(path, lines, "Tr_radar_to_velo")
+    elif layout.radar:
+        path, first = folder / layout.radar_calib / f"{frame}.txt", next(iter(images))
+        own, P = _lines(path), _matrix(path, lines, f"P{layout.images[first][-1]}")
+        T_camera_radar = _rectified(path, own, P) @ _matrix(path, own, "Tr_velo_to_cam")
+        T_lidar["radar"] = T_lidar[first] @ T_camera_radar
+    return cameras, T_lidar
+
+
+def _camera(image: Path, P: Float[np.ndarray, "4 4"]) -> Camera:
+    """Intrinsics of a rectified camera, and the size of its image."""
     data = np.frombuffer(read_bytes(image), np.uint8)
     pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
     if pixels is None:
         raise ConfigError(str(image), "", "is no readable image")
-    P = _matrix(path, lines, "P2")
-    camera = Camera("plumb_bob", P[:3, :3].copy(), np.zeros(5), pixels.shape[1], pixels.shape[0])
-    T_camera_lidar = _rectified(path, lines, P) @ _matrix(path, lines, "Tr_velo_to_cam")
-    if not layout.radar:
-        return camera, T_camera_lidar, None
-    if not layout.radar_calib:
-        return camera, T_camera_lidar, _matrix(path, lines, "Tr_radar_to_velo")
-    path = folder / layout.radar_calib / f"{frame}.txt"
-    own = _lines(path)
-    T_camera_radar = _rectified(path, own, P) @ _matrix(path, own, "Tr_velo_to_cam")
-    return camera, T_camera_lidar, inverse(T_camera_lidar) @ T_camera_radar
+    return Camera("plumb_bob", P[:3, :3].copy(), np.zeros(5), pixels.shape[1], pixels.shape[0])
 
 
 def _rectified(path: Path, lines: Mapping[str, Sequence[float]], P: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """From the reference camera to the camera of P2: rectified, and shifted by its baseline (K^-1 P's last column)."""
+    """From the reference camera to the camera of P: rectified, and shifted by its baseline (K^-1 P's last column)."""
     T = np.eye(4)
     T[:3, 3] = np.linalg.solve(P[:3, :3], P[:3, 3])
     R = np.eye(4)

@@ -1,4 +1,4 @@
-"""nuScenes-shaped folders: a recording per scene, samples and sweeps of a camera, the lidar and a radar.
+"""nuScenes-shaped folders: a recording per scene, samples and sweeps of all its cameras, lidars and radars.
 
 nuScenes' lidar looks along y, with x to the right: its points are turned to x forward, y left. Its radar gives a
 velocity vector, whose part along the ray is what was measured; points that the devkit hides by default (ambiguous,
@@ -10,8 +10,7 @@ Source: nuscenes-devkit, docs/schema_nuscenes.md and utils/data_classes.py (Rada
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,67 +23,70 @@ from pipeline.convert.recording import Event, Recording, ego_events
 from pipeline.errors import ConfigError
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import from_quaternion, from_rotation_translation
+from pipeline.rig.graph import Kind
 
-__all__ = ["Channels", "read_nuscenes"]
+__all__ = ["read_nuscenes"]
 
 # Coordinates in x forward, y left, z up to those of nuScenes' lidar (x right, y forward, z up).
 _T_NUSCENES_LIDAR = from_rotation_translation(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
-_KINDS = {"camera": "image", "lidar": "lidar", "radar": "radar"}
 _OfScene = defaultdict[str, defaultdict[str, list[dict[str, Any]]]]
 _UNAMBIGUOUS, _VALID = 3, 0  # ambig_state and invalid_state that the devkit shows by default
 
 
-@dataclass(frozen=True)
-class Channels:
-    """Which sensors make the trio."""
-
-    camera: str = "CAM_FRONT"
-    lidar: str = "LIDAR_TOP"
-    radar: str = "RADAR_FRONT"
-
-
-def read_nuscenes(folder: Path, channels: Channels) -> list[Recording]:
+def read_nuscenes(folder: Path, channels: Mapping[Kind, Sequence[str]]) -> list[Recording]:
     """Recordings of all scenes, their points not loaded yet.
+
+    Sensors go by their channels in small letters, as cam_front; where no kind has two, by their kinds.
 
     Args:
         folder: holds one folder of tables (as v1.0-mini), samples and sweeps.
-        channels: which sensors make the trio.
+        channels: which ones to take of a kind; all of kinds that it leaves out.
 
     Raises:
         ConfigError: a table, row or channel is missing; it names the file.
     """
     tables = _Tables(folder)
     calibrated = {row["token"]: row for row in tables.rows("calibrated_sensor")}
-    of_scene = _by_scene(tables, channels, calibrated)
+    sensors = _sensors(tables, channels)
+    of_scene = _by_scene(tables, {token: name for token, (name, _) in sensors.items()}, calibrated)
+    kinds = dict(sensors.values())
     poses = {row["token"]: row for row in tables.rows("ego_pose")}
     logs = {row["token"]: row for row in tables.rows("log")}
     recordings = []
     for scene in tables.rows("scene"):
         rows = of_scene[scene["token"]]
-        if all(rows[role] for role in _KINDS):
+        there = {name: kind for name, kind in kinds.items() if rows[name]}
+        if len(there) > 1:
             log = tables.found("log", logs, scene["log_token"])
             about = (str(log["vehicle"]), str(log["date_captured"]), str(scene["name"]))
-            recordings.append(_recording(folder, about, rows, calibrated, poses))
+            recordings.append(_recording(folder, about, there, rows, calibrated, poses))
     if not recordings:
-        raise ConfigError(str(tables.path("scene")), "", "no scene has all three sensors")
+        raise ConfigError(str(tables.path("scene")), "", "no scene has two sensors")
     return recordings
 
 
-def _by_scene(tables: _Tables, channels: Channels, calibrated: Mapping[str, Any]) -> _OfScene:
-    """Rows of sample_data by scene and role, of the trio's channels."""
-    sensors = {row["channel"]: row["token"] for row in tables.rows("sensor")}
-    role_of = {}
-    for role, channel in vars(channels).items():
-        if channel not in sensors:
-            there = ", ".join(sorted(sensors))
-            raise ConfigError(str(tables.path("sensor")), channel, f"no such channel; there are {there}")
-        role_of[sensors[channel]] = role
+def _sensors(tables: _Tables, channels: Mapping[Kind, Sequence[str]]) -> dict[str, tuple[str, Kind]]:
+    """Name and kind of the sensors to take, cameras first, by their tokens."""
+    rows = {str(row["channel"]): row for row in tables.rows("sensor")}
+    for kind, channel in ((kind, c) for kind, of in channels.items() for c in of):
+        there = sorted(c for c, row in rows.items() if row["modality"] == kind)
+        if channel not in there:
+            words = f"no such {kind}; there are {', '.join(there) or 'none'}"
+            raise ConfigError(str(tables.path("sensor")), channel, words)
+    kinds: tuple[Kind, ...] = ("camera", "lidar", "radar")
+    taken = {k: [c for c in channels.get(k, rows) if rows[c]["modality"] == k] for k in kinds}
+    is_short = all(len(of) <= 1 for of in taken.values())
+    return {str(rows[c]["token"]): (k if is_short else c.lower(), k) for k, of in taken.items() for c in of}
+
+
+def _by_scene(tables: _Tables, name_of: Mapping[str, str], calibrated: Mapping[str, Any]) -> _OfScene:
+    """Rows of sample_data by scene and the sensor's name."""
     scene_of = {row["token"]: row["scene_token"] for row in tables.rows("sample")}
     of_scene: _OfScene = defaultdict(lambda: defaultdict(list))
     for row in tables.rows("sample_data"):
         sensor = tables.found("calibrated_sensor", calibrated, row["calibrated_sensor_token"])["sensor_token"]
-        if sensor in role_of:
-            of_scene[tables.found("sample", scene_of, row["sample_token"])][role_of[sensor]].append(row)
+        if sensor in name_of:
+            of_scene[tables.found("sample", scene_of, row["sample_token"])][name_of[sensor]].append(row)
     return of_scene
 
 
@@ -127,26 +129,35 @@ class _Row(dict[str, Any]):
 def _recording(
     folder: Path,
     about: tuple[str, str, str],
+    kinds: Mapping[str, Kind],
     rows: Mapping[str, list[dict[str, Any]]],
     calibrated: Mapping[str, dict[str, Any]],
     poses: Mapping[str, dict[str, Any]],
 ) -> Recording:
-    first = {role: calibrated[rows[role][0]["calibrated_sensor_token"]] for role in _KINDS}
-    T_base = {role: _pose(row) for role, row in first.items()}
-    T_base["lidar"] = T_base["lidar"] @ _T_NUSCENES_LIDAR
-    K = np.array(first["camera"]["camera_intrinsic"], np.float64)
-    if K.shape != (3, 3):
-        raise ConfigError(str(folder), "calibrated_sensor.camera_intrinsic", "is no 3x3 matrix")
-    image = rows["camera"][0]
-    camera = Camera("plumb_bob", K, np.zeros(5), int(image["width"]), int(image["height"]))
+    first = {name: calibrated[rows[name][0]["calibrated_sensor_token"]] for name in kinds}
+    T_base = {
+        n: _pose(row) @ (_T_NUSCENES_LIDAR if kinds[n] == "lidar" else np.eye(4)) for n, row in first.items()
+    }
+    cameras = {
+        name: _camera(folder, first[name], rows[name][0]) for name, kind in kinds.items() if kind == "camera"
+    }
     loaders = {"camera": read_bytes, "lidar": _lidar, "radar": _radar}
     events = [
-        Event(_stamp_ns(row), kind, partial(loaders[role], folder / row["filename"]))
-        for role, kind in _KINDS.items()
-        for row in rows[role]
+        Event(_stamp_ns(row), name, partial(loaders[kind], folder / row["filename"]))
+        for name, kind in kinds.items()
+        for row in rows[name]
     ]
-    events += _ego(rows["lidar"], poses)
-    return Recording(*about, camera, T_base, sorted(events, key=lambda event: event.stamp_ns))
+    # Every row has the pose of its own time; the lidar's are the densest.
+    ego = next((n for n, kind in kinds.items() if kind == "lidar"), next(iter(kinds)))
+    events += _ego(rows[ego], poses)
+    return Recording(*about, kinds, cameras, T_base, sorted(events, key=lambda event: event.stamp_ns))
+
+
+def _camera(folder: Path, calibrated: Mapping[str, Any], image: Mapping[str, Any]) -> Camera:
+    K = np.array(calibrated["camera_intrinsic"], np.float64)
+    if K.shape != (3, 3):
+        raise ConfigError(str(folder), "calibrated_sensor.camera_intrinsic", "is no 3x3 matrix")
+    return Camera("plumb_bob", K, np.zeros(5), int(image["width"]), int(image["height"]))
 
 
 def _stamp_ns(row: Mapping[str, Any]) -> int:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.rig.graph import Kind
 
 __all__ = ["EgoMotion", "Event", "Recording", "ego_events", "image_format"]
 
@@ -28,7 +29,7 @@ class Event(NamedTuple):
     """What one sensor saw: `load` gives JPEG or PNG bytes, columns of points by name, or an EgoMotion."""
 
     stamp_ns: int
-    kind: str  # image, lidar, radar or ego
+    sensor: str  # its name, or ego
     load: Callable[[], Any]
 
 
@@ -40,15 +41,17 @@ class Recording:
         vehicle: its id.
         day: YYYY-MM-DD.
         name: of the log.
-        camera: intrinsics.
-        T_base: T_base_sensor of camera (optical), lidar and, where there is one, radar (both x forward, y left, z up).
+        kinds: of its sensors, by name.
+        cameras: intrinsics, by name.
+        T_base: T_base_sensor of cameras (optical), lidars and radars (both x forward, y left, z up), by name.
         events: in order of their stamps; radar columns hold x, y, z, doppler (range rate, positive = receding).
     """
 
     vehicle: str
     day: str
     name: str
-    camera: Camera
+    kinds: Mapping[str, Kind]
+    cameras: Mapping[str, Camera]
     T_base: Mapping[str, Float[np.ndarray, "4 4"]]
     events: Sequence[Event]
 

@@ -18,9 +18,9 @@ from jaxtyping import Float
 
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.results import Progress, silent
+from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, vehicle_names
 from pipeline.simulate.logs.recording import Setup, messages_of, nominal_poses
-from pipeline.simulate.logs.topics import TOPICS
 from pipeline.simulate.logs.writers import open_log
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan

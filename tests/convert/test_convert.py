@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from jobs.cli import main
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import from_quaternion
+from pipeline.simulate.logs.messages import Messages
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of
 from tests.makers import data_sets
@@ -39,6 +41,7 @@ def converted(request, tmp_path_factory):
     name, folder = request.param, tmp_path_factory.mktemp(request.param)
     MAKERS[name](folder / "data")
     call = ["convert", name, str(folder / "data"), "--out", str(folder / "out"), "--day", "2021-05-04"]
+    call += ["--camera", "CAM_FRONT"] if name == "nuscenes" else []
     assert main(call) == 0
     vehicle, day, _ = WHAT[name]
     logs = sorted(map(str, (folder / "out" / "logs" / vehicle / day).iterdir()))
@@ -142,7 +145,7 @@ def test_a_jump_of_the_poses_begins_another_drive(tmp_path):
 @pytest.mark.parametrize(
     ("name", "file", "content", "words"),
     [
-        ("nuscenes", "v1.0-mini/sensor.json", b"[]", "CAM_FRONT: no such channel"),
+        ("nuscenes", "v1.0-mini/sensor.json", b"[]", "scene.json: no scene has two sensors"),
         ("nuscenes", "v1.0-mini/sample.json", b"{", "sample.json: no readable JSON"),
         (
             "nuscenes",
@@ -164,6 +167,49 @@ def test_a_broken_file_is_named_and_leaves_no_log(name, file, content, words, tm
     assert main(["convert", name, str(tmp_path / "data"), "--out", str(tmp_path / "out")]) == 2
     assert words in json.loads(capsys.readouterr().out.splitlines()[-1])["reason"]
     assert list(tmp_path.rglob("*.mcap")) == []
+
+
+def topics_and_frames(path):
+    """Of a log, by another reader than the pipeline's: messages by topic, child frames of /tf_static."""
+    store, found = Messages(2).typestore, {}
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            found.setdefault(channel.topic, []).append(store.deserialize_cdr(message.data, schema.name))
+    return found, {t.child_frame_id: t.transform for t in found["/tf_static"][0].transforms}
+
+
+def test_nuscenes_brings_all_its_sensors_under_their_own_names(tmp_path):
+    data_sets.nuscenes(tmp_path / "data")
+    assert main(["convert", "nuscenes", str(tmp_path / "data"), "--out", str(tmp_path)]) == 0
+    rig = load_fleet(tmp_path / "fleet.toml").rigs["default"]
+    assert set(rig.cameras) == {"cam_front", "cam_back"}
+    assert (set(rig.lidars), set(rig.radars), rig.base) == ({"lidar_top"}, {"radar_front"}, "base_link")
+    found, frames = topics_and_frames(next((tmp_path / "logs").rglob("*.mcap")))
+    assert set(frames) == set(rig.sensors)
+    assert frames["cam_back"].translation.x == -1
+    of_cameras = [topic for c in rig.cameras.values() for topic in (c.image, c.info)]
+    for topic in (*of_cameras, rig.lidars["lidar_top"].points, rig.radars["radar_front"].points):
+        assert len(found[topic]) == WHAT["nuscenes"][2], topic
+    assert found[rig.cameras["cam_back"].image][0].header.frame_id == "cam_back"
+
+
+@pytest.mark.parametrize("wrong", ["CAM_SIDE", "LIDAR_TOP"])
+def test_a_channel_that_is_no_camera_is_refused_with_those_that_are(wrong, tmp_path, capsys):
+    data_sets.nuscenes(tmp_path / "data", frames=1)
+    call = ["convert", "nuscenes", str(tmp_path / "data"), "--out", str(tmp_path), "--camera", wrong]
+    assert main(call) == 2
+    assert f"{wrong}: no such camera; there are CAM_BACK, CAM_FRONT" in capsys.readouterr().out
+
+
+def test_both_colour_cameras_of_kitti_are_taken_a_baseline_apart(tmp_path):
+    data_sets.kitti(tmp_path / "data", second_camera=True)
+    assert main(["convert", "kitti", str(tmp_path / "data"), "--out", str(tmp_path)]) == 0
+    assert set(load_fleet(tmp_path / "fleet.toml").rigs["default"].cameras) == {"left", "right"}
+    found, frames = topics_and_frames(next((tmp_path / "logs").rglob("*.mcap")))
+    assert len(found["/camera/right/image/compressed"]) == WHAT["kitti"][2]
+    # Frames of lidar axes: y to the left; the right camera's P3 has half a metre more of baseline.
+    apart = frames["left"].translation.y - frames["right"].translation.y
+    assert apart == pytest.approx(data_sets.BASELINE_M)
 
 
 @pytest.mark.parametrize("name", MAKERS)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 SPEED_MPS = 10.0
+BASELINE_M = 0.54
 WIDTH, HEIGHT = 160, 96
 K = np.array([[120.0, 0, 80], [0, 120.0, 48], [0, 0, 1]])
 R_BODY_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -88,20 +89,27 @@ def view_of_delft(folder, frames=12, jump_at=None):
     return folder
 
 
-def kitti(folder, frames=6):
-    """image_2, velodyne, radar and calib of one folder; the camera of P2 lies 6 cm beside the reference camera."""
-    for path in ("image_2", "velodyne", "radar", "calib"):
+def kitti(folder, frames=6, *, second_camera=False):
+    """image_2, velodyne, radar and calib of one folder; the camera of P2 lies 6 cm beside the reference camera.
+
+    That of P3 lies a baseline to the right of it, where it is wanted.
+    """
+    for path in ("image_2", *(["image_3"] if second_camera else []), "velodyne", "radar", "calib"):
         (folder / path).mkdir(parents=True)
     P = np.hstack([K, np.array([[-120.0 * 0.06], [0], [0]])])
+    P3 = np.hstack([K, np.array([[-120.0 * (0.06 + BASELINE_M)], [0], [0]])])
     T_ref_lidar = pose([0.06, 0, 0]) @ np.linalg.inv(T_BASE_CAMERA) @ T_BASE_LIDAR
     T_lidar_radar = np.linalg.inv(T_BASE_LIDAR) @ T_BASE_RADAR
     for n in range(frames):
         name = f"{n:06d}"
         (folder / "image_2" / f"{name}.png").write_bytes(image_bytes(".png", n))
+        if second_camera:
+            (folder / "image_3" / f"{name}.png").write_bytes(image_bytes(".png", n + frames))
         (folder / "velodyne" / f"{name}.bin").write_bytes(lidar_points(n).tobytes())
         (folder / "radar" / f"{name}.bin").write_bytes(radar_points(n).astype(np.float32).tobytes())
         lines = {
             "P2": P,
+            "P3": P3,
             "R0_rect": np.eye(3),
             "Tr_velo_to_cam": T_ref_lidar[:3],
             "Tr_radar_to_velo": T_lidar_radar[:3],

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.rig.topics import TOPICS
 from pipeline.simulate.faults import Fault
 from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day
-from pipeline.simulate.logs.topics import TOPICS
 from pipeline.simulate.sensors.clocks import Ticks, free_clocks
 from pipeline.simulate.sensors.rigs import rig_named
 

@@ -6,9 +6,9 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.rig.topics import TOPICS
 from pipeline.simulate.faults import Fault, faults_on, parse_faults
 from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day
-from pipeline.simulate.logs.topics import TOPICS
 
 DAYS = ["2026-03-02", "2026-03-03", "2026-03-04"]
 QUIET = {"vehicles": 2, "days": 3, "frames": 1, "drives": 1, "environments": "urban"}

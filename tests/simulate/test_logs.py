@@ -5,8 +5,8 @@ import pytest
 
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
+from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet, simulate_vehicle_day
-from pipeline.simulate.logs.topics import TOPICS
 from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log
 from pipeline.simulate.reflectors import simulate_reflectors
 

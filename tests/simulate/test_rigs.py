@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
+from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, drive_of, simulate_vehicle_day
 from pipeline.simulate.logs.fleet_toml import fleet_toml, mixed_fleet_toml
-from pipeline.simulate.logs.topics import TOPICS
 from pipeline.simulate.sensors.beams import beams_of
 from pipeline.simulate.sensors.camera import render, view_of
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec

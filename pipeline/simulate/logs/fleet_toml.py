@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pipeline.simulate.logs.topics import TOPICS, topics_of
+from pipeline.rig.topics import TOPICS, topics_of
 from pipeline.simulate.sensors.data_sheets import CameraSpec, RadarSpec
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
 

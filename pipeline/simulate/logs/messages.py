@@ -10,18 +10,12 @@ from jaxtyping import Float
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.geometry.cameras import Camera
+from pipeline.rig.topics import frame_of
 from pipeline.ros_messages import RosMessages
 from pipeline.simulate.sensors.semantics import Box
 
-__all__ = ["FRAMES", "Messages"]
+__all__ = ["Messages"]
 
-# Frames of a rig whose sensors are called camera, lidar and radar; elsewhere a sensor's frame has its name.
-FRAMES: Final = {
-    "camera": "camera_front_optical",
-    "lidar": "lidar_top",
-    "radar": "radar_front",
-    "vehicle": "base_link",
-}
 # vision_msgs 4 (ROS 2 Humble), as the real logs carry it; rosbags ships no vision_msgs.
 _VISION: Final = {
     "vision_msgs/msg/Point2D": "float64 x\nfloat64 y",
@@ -62,7 +56,7 @@ class Messages:
         return self.ros.serialised(message)
 
     def _at(self, stamp_ns: int, frame: str) -> Any:
-        return self.ros.header(stamp_ns, FRAMES.get(frame, frame))
+        return self.ros.header(stamp_ns, frame_of(frame))
 
     def image(self, stamp_ns: int, camera: str, data: bytes, encoding: str) -> Any:
         """CompressedImage."""
@@ -101,11 +95,11 @@ class Messages:
     def transforms(self, stamp_ns: int, T_vehicle_sensor: dict[str, Float[np.ndarray, "4 4"]]) -> Any:
         """TFMessage with the vehicle as parent of every sensor."""
         poses = T_vehicle_sensor.items()
-        return self.ros.transforms((self._at(stamp_ns, "vehicle"), FRAMES.get(s, s), T) for s, T in poses)
+        return self.ros.transforms((self._at(stamp_ns, "base"), frame_of(s), T) for s, T in poses)
 
     def odometry(
         self, stamp_ns: int, T_odom_vehicle: Float[np.ndarray, "4 4"], speed_mps: float, yaw_rate_radps: float
     ) -> Any:
         """Odometry: pose in odom, twist in the vehicle frame."""
         header = self.ros.header(stamp_ns, "odom")
-        return self.ros.odometry(header, FRAMES["vehicle"], T_odom_vehicle, speed_mps, yaw_rate_radps)
+        return self.ros.odometry(header, frame_of("base"), T_odom_vehicle, speed_mps, yaw_rate_radps)

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from pipeline.geometry.se3 import from_rotation_translation
+from pipeline.rig.topics import TOPICS, topics_of
 from pipeline.simulate.faults import DayFaults, misread, swapped_with
 from pipeline.simulate.logs.messages import Messages
-from pipeline.simulate.logs.topics import TOPICS, topics_of
 from pipeline.simulate.logs.writers import OpenLog
 from pipeline.simulate.sensors.clocks import Ticks, free_clocks
 from pipeline.simulate.sensors.data_sheets import LidarSpec, RadarSpec

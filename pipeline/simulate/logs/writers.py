@@ -13,8 +13,8 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as Bag2Writer
 
+from pipeline.rig.topics import TOPICS
 from pipeline.simulate.logs.messages import Messages
-from pipeline.simulate.logs.topics import TOPICS
 
 __all__ = ["CONTAINERS", "OpenLog", "log_name", "open_log"]
 

@@ -1,4 +1,4 @@
-"""Topics of a simulated log."""
+"""Topics and frames of the logs that are written here: simulated ones, and those of converted data sets."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Final
 
 from pipeline.rig.graph import Kind
 
-__all__ = ["TOPICS", "topics_of"]
+__all__ = ["TOPICS", "frame_of", "topics_of"]
 
 # Of a rig whose sensors are called camera, lidar and radar, and of the vehicle.
 TOPICS: Final = {
@@ -18,6 +18,12 @@ TOPICS: Final = {
     "labels": "/perception/camera/labels",
     "detections": "/perception/camera/detections",
     "odometry": "/vehicle/odometry",
+}
+_FRAMES: Final = {
+    "camera": "camera_front_optical",
+    "lidar": "lidar_top",
+    "radar": "radar_front",
+    "base": "base_link",
 }
 
 
@@ -34,3 +40,8 @@ def topics_of(name: str, kind: Kind) -> dict[str, str]:
         "labels": f"/perception/{name}/labels",
         "detections": f"/perception/{name}/detections",
     }
+
+
+def frame_of(node: str) -> str:
+    """The frame of a sensor, which has its name but for camera, lidar and radar, or of the base."""
+    return _FRAMES.get(node, node)
