@@ -1,4 +1,4 @@
-"""A pair's day estimates as numbers to chart, its fixed reference, and the charts of a whole fleet side by side."""
+"""An edge's day estimates as numbers to chart, its fixed reference, and the charts of a whole fleet side by side."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.charts import Charts, clipped, scan
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, hat, log_so3
-from schemas.calibrations import DOF_NAMES, PAIRS
+from pipeline.rig.edges import edge_order
+from pipeline.rig.graph import Edge
+from schemas.calibrations import DOF_NAMES
 
 __all__ = [
     "DOFS",
@@ -20,6 +22,7 @@ __all__ = [
     "charted",
     "charts_of_fleet",
     "clipped_days",
+    "edges_of_fleet",
     "pair_days",
     "reference_of",
     "with_reference",
@@ -37,7 +40,7 @@ FEWEST_DAYS = 14  # of a window, however far back they lie
 
 @dataclass(frozen=True, eq=False)
 class PairDays:
-    """Day estimates of one pair. Held days are among them: a large knock is just what the verdict holds.
+    """Day estimates of one edge. Held days are among them: a large knock is just what the verdict holds.
 
     Args:
         day: ordinals of the calendar, rising.
@@ -87,7 +90,7 @@ class PairDays:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Where a pair was when it was last known to be right: the mean of its first accepted days.
+    """Where an edge was when it was last known to be right: the mean of its first accepted days.
 
     Args:
         days: ordinals of the days that it rests on.
@@ -110,7 +113,7 @@ def pair_days(
     observable: Bool[np.ndarray, "N 6"],
     accepted: Bool[np.ndarray, " N"],
 ) -> PairDays:
-    """Day estimates of a pair, changes from the first.
+    """Day estimates of an edge, changes from the first.
 
     Args:
         day: ordinals, rising.
@@ -187,10 +190,10 @@ def charted(days: PairDays, first: int, last: int, reference: Reference | None) 
     as tell something. Where it reaches into the reference, that is not one day but those that it rests on.
 
     Args:
-        days: of one pair, since commissioning or the last service event; what the window and the reference take.
+        days: of one edge, since commissioning or the last service event; what the window and the reference take.
         first: first day of the window, an ordinal.
         last: its last day.
-        reference: of the pair; None where too few days were accepted.
+        reference: of the edge; None where too few days were accepted.
     """
     until = days.between(0, last)
     if len(until.day) <= FEWEST_DAYS:
@@ -219,16 +222,26 @@ def with_reference(days: PairDays, reference: Reference) -> PairDays:
     )
 
 
-def charts_of_fleet(fleet: Sequence[Mapping[str, PairDays]]) -> Charts:
-    """Charts of all vehicles, in order of vehicle, pair and DoF; one without days is empty."""
-    longest = max((len(d.day) for pairs in fleet for d in pairs.values()), default=0)
-    shape = (len(fleet), len(PAIRS), DOFS, max(longest, 1))
+def edges_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]]) -> tuple[Edge, ...]:
+    """Edges that any vehicle has days of, in order."""
+    return tuple(sorted({edge for edges in fleet for edge in edges}, key=edge_order))
+
+
+def charts_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]], edges: Sequence[Edge]) -> Charts:
+    """Charts of all vehicles, in order of vehicle, edge and DoF; one without days is empty.
+
+    Args:
+        fleet: by vehicle, day estimates by edge.
+        edges: `edges_of_fleet`.
+    """
+    longest = max((len(d.day) for own in fleet for d in own.values()), default=0)
+    shape = (len(fleet), len(edges), DOFS, max(longest, 1))
     day, value = np.zeros(shape, np.int64), np.zeros(shape)
     sigma, accepted = np.full(shape, np.inf), np.ones(shape, bool)
     count, reference_days = np.zeros(shape[:3], np.int64), np.zeros(shape[:3], np.int64)
-    for v, pairs in enumerate(fleet):
-        for p, pair in enumerate(PAIRS):
-            days = pairs.get(pair)
+    for v, own in enumerate(fleet):
+        for p, edge in enumerate(edges):
+            days = own.get(edge)
             if days is None or not len(days.day):
                 continue
             n = len(days.day)

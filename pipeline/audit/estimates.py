@@ -16,9 +16,11 @@ from jaxtyping import Bool, Float, Int
 from pipeline.audit.days import PairDays, pair_days
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation
+from pipeline.rig.edges import edge_order, edges_of_rows
+from pipeline.rig.graph import Edge
 from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
-from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, STATUSES
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES, STATUSES
 
 __all__ = ["COLUMNS", "Estimates", "day_name", "days_of", "estimates_of", "faults_of", "joined"]
 
@@ -44,7 +46,7 @@ _ACCEPTED, _HELD, _REFUSED = (STATUSES.index(name) for name in ("accepted", "hel
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """Current records of one method in order of vehicle, day and pair; what a record lacks is not finite.
+    """Current records of one method in order of vehicle, day and edge; what a record lacks is not finite.
 
     A year of a fleet as rows would be gigabytes; a record is 700 bytes here.
 
@@ -52,7 +54,8 @@ class Estimates:
         vehicles: names, in order.
         owner: which of them a record is of.
         day: ordinals of the calendar.
-        pair: places in PAIRS; -1: none of them.
+        edges: that any record is of, in order.
+        edge: which of them a record is of; -1: none.
         status: places in STATUSES; -1: none of them.
         pose: of T_parent_child: quaternion (scalar first), translation [m].
         has_estimate: neither pose nor covariance is null.
@@ -68,9 +71,10 @@ class Estimates:
     """
 
     vehicles: list[str]
+    edges: tuple[Edge, ...]
     owner: Int[np.ndarray, " N"]
     day: Int[np.ndarray, " N"]
-    pair: Int[np.ndarray, " N"]
+    edge: Int[np.ndarray, " N"]
     status: Int[np.ndarray, " N"]
     pose: Float[np.ndarray, "N 7"]
     has_estimate: Bool[np.ndarray, " N"]
@@ -88,8 +92,8 @@ class Estimates:
         """Some of the records, in their order."""
         keys = self.work_key[rows] if isinstance(rows, slice) else self.work_key.take(pa.array(rows))
         return Estimates(
-            self.vehicles, self.owner[rows], self.day[rows], self.pair[rows], self.status[rows], self.pose[rows],
-            self.has_estimate[rows], self.covariance[rows], self.common[rows], self.has_common[rows],
+            self.vehicles, self.edges, self.owner[rows], self.day[rows], self.edge[rows], self.status[rows],
+            self.pose[rows], self.has_estimate[rows], self.covariance[rows], self.common[rows], self.has_common[rows],
             self.observable[rows], self.disproved[rows], self.shown_wrong_rad[rows],
             self.unchecked_sigmas[rows], self.half_days[rows], keys,
         )  # fmt: skip
@@ -100,6 +104,14 @@ class Estimates:
         if begin == len(self.vehicles) or self.vehicles[begin] != vehicle:
             return self.at(slice(0, 0))
         return self.at(slice(*np.searchsorted(self.owner, [begin, begin + 1])))
+
+    def is_of(self, edge: Edge) -> Bool[np.ndarray, " N"]:
+        """Records of an edge."""
+        return self.edge == self.edges.index(edge) if edge in self.edges else np.zeros(len(self.edge), bool)
+
+    def own_edges(self) -> list[Edge]:
+        """Edges of these records, in order."""
+        return [self.edges[e] for e in np.unique(self.edge).tolist() if e >= 0]
 
     @property
     def accepted(self) -> Bool[np.ndarray, " N"]:
@@ -138,8 +150,8 @@ def estimates_of(table: pa.Table | None) -> Estimates:
     found = current_rows(table, CALIBRATIONS)
     names = found["vehicle"].combine_chunks().dictionary_encode()
     owner, day = np.asarray(names.indices).astype(np.int64), ordinals(found["day"])
-    pair = places(found["pair"], PAIRS)
-    order = np.lexsort((pair, day, owner))  # trios of a day side by side
+    edges, edge = edges_of_rows(found)
+    order = np.lexsort((edge, day, owner))  # edges of a day side by side
     found = found.take(pa.array(order))
     pose = np.stack([found[name].to_numpy() for name in _POSE], axis=1)
     is_there = np.all([there(found[name]) for name in (*_POSE, "covariance")], axis=0)
@@ -148,7 +160,7 @@ def estimates_of(table: pa.Table | None) -> Estimates:
     unchecked = np.stack([pc.fill_null(found[name], 0.0).to_numpy() for name in _UNCHECKED], axis=1)
     return Estimates(
         names.dictionary.to_pylist(),  # rows are in order of vehicle, and so is what they are first met in
-        owner[order], day[order], pair[order], places(found["status"], STATUSES), pose,
+        edges, owner[order], day[order], edge[order], places(found["status"], STATUSES), pose,
         is_there, matrices(found["covariance"]), matrices(found["common_covariance"]),
         there(found["common_covariance"]), observable_dofs(found["observable"]),
         pc.fill_null(found[_DISPROVED], 0.0).to_numpy() != 0.0, np.where(np.isfinite(worst), worst, 0.0),
@@ -167,26 +179,30 @@ def joined(parts: Sequence[Estimates]) -> Estimates:
     owner = np.concatenate(
         [np.array([place.get(v, -1) for v in part.vehicles], np.int64)[part.owner] for part in parts]
     )
+    edges = tuple(sorted({e for part in parts for e in part.edges}, key=edge_order))
+    edge = np.concatenate(
+        [np.array([*(edges.index(e) for e in part.edges), -1], np.int64)[part.edge] for part in parts]
+    )
     whole = {
         f.name: np.concatenate([getattr(part, f.name) for part in parts])
         for f in fields(Estimates)
-        if f.name not in ("vehicles", "owner", "work_key")
+        if f.name not in ("vehicles", "edges", "owner", "edge", "work_key")
     }
     keys = pa.concat_arrays([part.work_key for part in parts])
-    found = Estimates(vehicles, owner, work_key=keys, **whole)
-    return found.at(np.lexsort((found.pair, found.day, owner)))
+    found = Estimates(vehicles, edges, owner, edge=edge, work_key=keys, **whole)
+    return found.at(np.lexsort((edge, found.day, owner)))
 
 
-def days_of(records: Estimates, held_sigma_factor: float) -> dict[str, PairDays]:
-    """Estimates by pair; refused and disproved days are gaps, held ones are less sure.
+def days_of(records: Estimates, held_sigma_factor: float) -> dict[Edge, PairDays]:
+    """Estimates by edge; refused and disproved days are gaps, held ones are less sure.
 
     Args:
         records: of one vehicle, none with a fault.
         held_sigma_factor: by which a held day is less sure at least.
     """
-    pairs = {}
-    for place, pair in enumerate(PAIRS):
-        rows = np.flatnonzero(records.usable & (records.pair == place))
+    days, usable = {}, records.usable
+    for edge in records.own_edges():
+        rows = np.flatnonzero(usable & records.is_of(edge))
         if not len(rows):
             continue
         own = records.at(rows)
@@ -199,8 +215,8 @@ def days_of(records: Estimates, held_sigma_factor: float) -> dict[str, PairDays]
         covariance[off, :3, :3] += np.eye(3) * own.shown_wrong_rad[off, None, None] ** 2
         if cut.any():
             T[cut], covariance[cut] = _since_it_moved(T[cut], covariance[cut], own.half_days[cut, 1])
-        pairs[pair] = pair_days(own.day, T, covariance, common, own.observable, own.accepted)
-    return pairs
+        days[edge] = pair_days(own.day, T, covariance, common, own.observable, own.accepted)
+    return days
 
 
 def _since_it_moved(
@@ -224,7 +240,7 @@ def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:
         latest_day: the last day that a drive can be of.
     """
     future = records.day > dt.date.fromisoformat(latest_day).toordinal()
-    unknown = (records.pair < 0) | (records.status < 0)
+    unknown = (records.edge < 0) | (records.status < 0)
     looked_at = ~future & ~unknown & ~records.refused
     estimated, C = looked_at & records.has_estimate, records.covariance
     pose = np.where(np.isfinite(records.pose), records.pose, np.inf)

@@ -1,9 +1,9 @@
-"""Verdicts to rows of table drift: one per pair and DoF, the status of the vehicle in each."""
+"""Verdicts to rows of table drift: one per edge and DoF, the status of the vehicle in each."""
 
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,9 @@ from pipeline.audit.vehicle import VehicleVerdict, limit_of
 from pipeline.audit.verdicts import ChartVerdict
 from pipeline.config import AuditConfig
 from pipeline.extrinsics.attribution import Attribution
-from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, STATUSES
+from pipeline.rig.edges import edge_order
+from pipeline.rig.graph import Edge
+from schemas.calibrations import DOF_NAMES, STATUSES
 from schemas.drift import DriftFinding
 
 __all__ = ["VehicleAudit", "vehicle_findings"]
@@ -37,39 +39,41 @@ def vehicle_findings(
     records: Estimates,
     verdict: VehicleVerdict,
     config: AuditConfig,
-    remarks: Mapping[tuple[str, str], str],
-    before: Mapping[tuple[str, str], DriftFinding] | None = None,
+    remarks: Mapping[tuple[Edge, str], str],
+    before: Mapping[tuple[Edge, str], DriftFinding] | None = None,
+    edges: Sequence[Edge] = (),
 ) -> list[DriftFinding]:
-    """Rows in order of pair and DoF; a DoF without a chart says why. A pair that the vehicle has not has none.
+    """Rows in order of edge and DoF; a DoF without a chart says why. An edge that the vehicle has not has none.
 
     Args:
         audit: what all rows have in common.
         records: the vehicle's current records of the window, in order of day.
         verdict: on its charts.
         config: limits.
-        remarks: by pair and DoF, what a chart's reason says besides.
-        before: by pair and DoF, the latest earlier audit's rows: they knew days that have left the window since.
+        remarks: by edge and DoF, what a chart's reason says besides.
+        before: by edge and DoF, the latest earlier audit's rows: they knew days that have left the window since.
+        edges: those that its rig can have, of a vehicle of which nothing is known yet.
     """
     findings = []
-    known = {PAIRS[p] for p in records.pair.tolist() if p >= 0} | {pair for pair, _ in before or ()}
-    for pair in (p for p in PAIRS if p in known or not known):
-        without_data, last_estimate = _without_data(records, pair), _last_estimate(records, pair)
+    known = {*records.own_edges(), *(edge for edge, _ in before or ())} or {*edges}
+    for edge in sorted(known, key=edge_order):
+        without_data, last_estimate = _without_data(records, edge), _last_estimate(records, edge)
         for dof in DOF_NAMES:
-            chart = verdict.charts.get((pair, dof)) or without_data
+            chart = verdict.charts.get((edge, dof)) or without_data
             if last_estimate:
                 chart = replace(chart, reason=f"{chart.reason}; no estimate after {last_estimate}")
-            if (pair, dof) in remarks:
-                chart = replace(chart, reason=f"{chart.reason}; {remarks[pair, dof]}")
+            if (edge, dof) in remarks:
+                chart = replace(chart, reason=f"{chart.reason}; {remarks[edge, dof]}")
             if before is not None:
-                chart = _begun_before(chart, before.get((pair, dof)))
+                chart = _begun_before(chart, before.get((edge, dof)))
             base = DriftFinding(
-                vehicle=audit.vehicle, day=audit.day, method=audit.method, pair=pair,
-                parent_frame=FRAMES_OF_PAIR[pair][0], child_frame=FRAMES_OF_PAIR[pair][1], dof=dof,
+                vehicle=audit.vehicle, day=audit.day, method=audit.method, pair=edge.kind,
+                parent_frame=edge.parent.name, child_frame=edge.child.name, dof=dof,
                 status=chart.status, reason=chart.reason, days_used=chart.days_used,
-                limit=limit_of(pair, dof, config), work_key=audit.work_key, statistic=chart.statistic,
+                limit=limit_of(edge, dof, config), work_key=audit.work_key, statistic=chart.statistic,
                 threshold=chart.threshold, inputs=audit.inputs,
             )  # fmt: skip
-            findings.append(replace(base, **_change_columns(chart, verdict.attribution)))
+            findings.append(replace(base, **_change_columns(chart, edge, verdict.attribution)))
     status = decide_status(findings)
     return [
         replace(
@@ -83,7 +87,7 @@ def vehicle_findings(
     ]
 
 
-def _change_columns(chart: ChartVerdict, moved: Attribution | None) -> dict[str, Any]:
+def _change_columns(chart: ChartVerdict, edge: Edge, found: Attribution | None) -> dict[str, Any]:
     """Columns of a chart with an alarm; none for another."""
     change = chart.change
     if change is None:
@@ -96,13 +100,15 @@ def _change_columns(chart: ChartVerdict, moved: Attribution | None) -> dict[str,
         "magnitude": change.size,
         "magnitude_sigma": change.size_sigma,
     }
-    if moved is None:
+    name = None if found is None else found.on(edge)
+    if found is not None and len(found.moved) != 1:
+        columns |= {"reason": f"{chart.reason}; {found.explanation}"}
+    if found is None or name is None:
         return columns
-    if moved.sensor is None:
-        return columns | {"reason": f"{chart.reason}; {moved.explanation}"}
+    moved = found.moved[name]
     return columns | {
-        "moved_sensor": moved.sensor,
-        "moved_probability": moved.probability[moved.sensor],
+        "moved_sensor": name,
+        "moved_probability": moved.probability,
         "moved_motion": moved.motion.tolist(),
         "moved_motion_sigma": np.sqrt(np.diag(moved.covariance)).tolist(),
     }
@@ -122,14 +128,14 @@ def _begun_before(chart: ChartVerdict, before: DriftFinding | None) -> ChartVerd
     return replace(chart, change=replace(change, day=day, earliest=earliest, latest=latest))
 
 
-def _last_estimate(records: Estimates, pair: str) -> str:
-    """The day of a pair's last estimate, where the vehicle drove on after it; else empty."""
-    days = records.day[(records.pair == PAIRS.index(pair)) & ~records.refused]
+def _last_estimate(records: Estimates, edge: Edge) -> str:
+    """The day of an edge's last estimate, where the vehicle drove on after it; else empty."""
+    days = records.day[records.is_of(edge) & ~records.refused]
     return day_name(int(days.max())) if len(days) and days.max() < records.day.max() else ""
 
 
-def _without_data(records: Estimates, pair: str) -> ChartVerdict:
-    found = records.status[records.pair == PAIRS.index(pair)].tolist()
+def _without_data(records: Estimates, edge: Edge) -> ChartVerdict:
+    found = records.status[records.is_of(edge)].tolist()
     kinds = [(name, found.count(STATUSES.index(name))) for name in ("held", "refused")]
     counts = ", ".join(f"{count} {name}" for name, count in kinds if count)
     reason = f"no estimate in the window ({counts})" if counts else "no record in the window"

@@ -21,7 +21,9 @@ from pipeline.audit.references import first_accepted, read_kept
 from pipeline.audit.service import restart_of
 from pipeline.store.partitions import Lake
 from pipeline.store.records import first_day, last_day, read_columns
-from schemas.calibrations import CALIBRATIONS, PAIRS
+from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.rig.graph import Edge
+from schemas.calibrations import CALIBRATIONS
 from schemas.service_events import ServiceEvent
 
 __all__ = ["History", "last_audited_day"]
@@ -62,8 +64,8 @@ class History:
         events: Mapping[str, Sequence[ServiceEvent]],
         enough: tuple[int, int],
         asked: Collection[str] = (),
-    ) -> tuple[Estimates, dict[tuple[str, int], Reference]]:
-        """The records that charts need, and the references that need none: by vehicle and place in PAIRS.
+    ) -> tuple[Estimates, dict[tuple[str, Edge], Reference]]:
+        """The records that charts need, and the references that need none: by vehicle and edge.
 
         Args:
             window: first and last day.
@@ -86,13 +88,13 @@ class History:
         known = joined(parts)
         usable = known.at(np.flatnonzero(known.usable))
         # A chart of few days shows the reference's own days among them.
-        often = {key for key, days in Counter(_pairs(usable)).items() if days > fewest}
+        often = {key for key, days in Counter(_edges(usable)).items() if days > fewest}
         made = {
             key: kept[key].reference
             for key in often & kept.keys()
             if (own := kept[key].reference) is not None and day_name(own.days[-1]) < begin[key[0]]
         }
-        lacking = {key: first_accepted(kept.get(key)) for key in set(_pairs(known)) - made.keys()}
+        lacking = {key: first_accepted(kept.get(key)) for key in set(_edges(known)) - made.keys()}
         found = joined([known, *self.references(begin, window, events, count, lacking)])
         return found, {key: own for key, own in made.items() if own is not None}
 
@@ -102,33 +104,33 @@ class History:
         window: tuple[str, str],
         events: Mapping[str, Sequence[ServiceEvent]],
         count: int,
-        asked: Mapping[tuple[str, int], str | None],
+        asked: Mapping[tuple[str, Edge], str | None],
     ) -> Iterator[Estimates]:
-        """Records of the first accepted days of pairs since they were last serviced.
+        """Records of the first accepted days of edges since they were last serviced.
 
         Args:
             begin: day from which each vehicle's records are known already.
             window: see `window`.
             events: likewise.
             count: accepted days.
-            asked: pairs that are asked for, with the day before which none was accepted; None = there is none yet.
+            asked: edges that are asked for, with the day before which none was accepted; None = there is none yet.
         """
         until, last = window
-        restart = {key: restart_of(events.get(key[0], ()), PAIRS[key[1]], last) for key in asked}
+        restart = {key: restart_of(events.get(key[0], ()), key[1], last) for key in asked}
         since = {
             key: max(start, "" if (event := restart[key]) is None else _day_after(event.day))
             for key, start in asked.items()
             if start is not None
         }
         lacking = {key for key, start in since.items() if start < until}
-        accepted: Counter[tuple[str, int]] = Counter()
+        accepted: Counter[tuple[str, Edge]] = Counter()
         for month, end in _months_until(self.lake, until):
             vehicles = {key[0] for key in lacking if since[key] <= end}
             if not vehicles:
                 continue
             part = self.read(month, end, vehicles)
             rows = []
-            of_row = zip(_pairs(part), part.day.tolist(), part.accepted.tolist(), strict=True)
+            of_row = zip(_edges(part), part.day.tolist(), part.accepted.tolist(), strict=True)
             for row, (key, ordinal, is_accepted) in enumerate(of_row):
                 if key not in lacking or day_name(ordinal) < since[key]:
                     continue
@@ -153,8 +155,9 @@ class History:
         faults = faults_of(records, self.latest)
         for row, why in faults.items():
             owner, day = records.vehicles[records.owner[row]], day_name(int(records.day[row]))
-            pair = int(records.pair[row])
-            self.left_out[f"{owner} {day} {PAIRS[pair] if pair >= 0 else 'record'} {why}"] = None
+            edge = int(records.edge[row])
+            what = _words(records.edges[edge]) if edge >= 0 else "record"
+            self.left_out[f"{owner} {day} {what} {why}"] = None
         kept = np.delete(np.arange(len(records.day)), list(faults))
         return joined([records.at(kept)]) if faults else records
 
@@ -163,10 +166,15 @@ def _day_after(day: str) -> str:
     return (dt.date.fromisoformat(day) + dt.timedelta(days=1)).isoformat()
 
 
-def _pairs(records: Estimates) -> list[tuple[str, int]]:
-    """Vehicle and pair of each record."""
-    names = records.vehicles
-    return [(names[v], p) for v, p in zip(records.owner.tolist(), records.pair.tolist(), strict=True)]
+def _words(edge: Edge) -> str:
+    """As records call it: by its kind where its sensors are called so, else by their names."""
+    return edge.kind if edge == EDGE_OF_PAIR.get(edge.kind) else edge.name
+
+
+def _edges(records: Estimates) -> list[tuple[str, Edge]]:
+    """Vehicle and edge of each record."""
+    names, edges = records.vehicles, records.edges
+    return [(names[v], edges[e]) for v, e in zip(records.owner.tolist(), records.edge.tolist(), strict=True)]
 
 
 def _days_driven(records: Estimates) -> Counter[str]:

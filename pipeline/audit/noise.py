@@ -40,26 +40,26 @@ class Noise:
     autocorrelation: Float[np.ndarray, " M"]
 
 
-def estimate_noise(charts: Charts, dofs: int, pairs: int) -> Noise:
+def estimate_noise(charts: Charts, dofs: int, edges: int) -> Noise:
     """Noise of all charts of a fleet.
 
     Args:
-        charts: rows in order of vehicle, pair and degree of freedom; a chart without days has count 0.
-        dofs: degrees of freedom of a pair.
-        pairs: pairs of a vehicle.
+        charts: rows in order of vehicle, edge and degree of freedom; a chart without days has count 0.
+        dofs: degrees of freedom of an edge.
+        edges: that any vehicle has; those of the same name are of one kind of place on every vehicle.
     """
-    shape = (len(charts.count) // (pairs * dofs), pairs, dofs)
+    shape = (len(charts.count) // (edges * dofs), edges, dofs)
     phi = np.repeat(_autocorrelation(charts, shape, _PRIOR_AUTOCORRELATION).ravel(), dofs)
     # Days that err alike differ less from each other than they scatter; that counts only as far as it was seen.
     alike = np.repeat(_autocorrelation(charts, shape, 0.0).ravel(), dofs)[:, None]
     size, gap, spread = _differences(charts, 1)
     expected = np.sqrt(np.maximum(spread[0] - 2 * alike**gap * spread[1], 1e-12 * spread[0]))
     sizes = (np.abs(size) / expected / norm.ppf(0.75)).reshape(*shape, -1)
-    found, seen = _median(np.moveaxis(sizes, 0, 2).reshape(pairs, dofs, -1))
+    found, seen = _median(np.moveaxis(sizes, 0, 2).reshape(edges, dofs, -1))
     of_fleet = np.maximum(np.sqrt(_shrunk(found, seen, np.ones_like(found), _PRIOR_FREEDOM)[0]), 1.0)
     relative = sizes / of_fleet[None, :, :, None]
-    vehicle, seen = _median(relative.reshape(len(relative), pairs, -1))
-    # Degrees of freedom of one pair share scenes: their differences count as those of one.
+    vehicle, seen = _median(relative.reshape(len(relative), edges, -1))
+    # Degrees of freedom of one edge share scenes: their differences count as those of one.
     variance, freedom = _shrunk(vehicle, seen / dofs, np.ones_like(vehicle), _PRIOR_FREEDOM)
     own, own_seen = _median(relative)
     prior = np.broadcast_to(variance[:, :, None], own.shape)
@@ -70,7 +70,7 @@ def estimate_noise(charts: Charts, dofs: int, pairs: int) -> Noise:
 
 
 def _autocorrelation(charts: Charts, shape: tuple[int, ...], prior: float) -> Float[np.ndarray, "V P"]:
-    """By vehicle and pair, from how much more two days differ that lie two days apart: by 1 + phi in variance."""
+    """By vehicle and edge, from how much more two days differ that lie two days apart: by 1 + phi in variance."""
     logs, counts = [], []
     V, P = shape[:2]
     for lag in (1, 2):

@@ -19,7 +19,9 @@ from pipeline.audit.service import restart_of
 from pipeline.geometry.se3 import from_quaternion, to_quaternion
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_columns, read_latest
-from schemas.calibrations import CALIBRATIONS, PAIRS
+from pipeline.rig.edges import edge_named
+from pipeline.rig.graph import Edge
+from schemas.calibrations import CALIBRATIONS
 from schemas.service_events import ServiceEvent
 from schemas.states import STATES, StateRow
 
@@ -33,7 +35,7 @@ _MARGIN = dt.timedelta(days=1)
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What is known of a pair's reference.
+    """What is known of an edge's reference.
 
     Args:
         since: day of the service event before it; empty where there was none.
@@ -52,8 +54,8 @@ def read_kept(
     window: tuple[str, str],
     events: Mapping[str, Sequence[ServiceEvent]],
     count: int,
-) -> dict[tuple[str, int], Kept]:
-    """What the last states keep, by vehicle and place in PAIRS, as far as it still counts.
+) -> dict[tuple[str, Edge], Kept]:
+    """What the last states keep, by vehicle and edge, as far as it still counts.
 
     Args:
         lake: where they are.
@@ -66,19 +68,23 @@ def read_kept(
     eve = (dt.date.fromisoformat(first) - dt.timedelta(days=1)).isoformat()
     rows = read_latest(lake, STATES, StateRow, first=eve, last=last, columns=_COLUMNS)
     # Of a night that was run again the last one counts.
-    last_said = {(s.vehicle, s.pair): s for s in rows if s.method == method}
-    states = [s for s in last_said.values() if s.reference_days is not None]
-    changed = _changed_since(lake, last, {s.vehicle: s.recorded_at for s in states})
+    last_said = {(s.vehicle, _edge(s)): s for s in rows if s.method == method}
+    states = {key: s for key, s in last_said.items() if s.reference_days is not None}
+    changed = _changed_since(lake, last, {s.vehicle: s.recorded_at for s in states.values()})
     kept = {}
-    for state in states:
-        event = restart_of(events.get(state.vehicle, ()), state.pair, last)
+    for (vehicle, edge), state in states.items():
+        event = restart_of(events.get(vehicle, ()), edge, last)
         same = (state.reference_since or "") == ("" if event is None else event.day)
-        own, since = _kept(state), changed.get(state.vehicle, last)
+        own, since = _kept(state), changed.get(vehicle, last)
         if same and state.reference_count == count and since >= first:
             # Among the days that are read anyway, its own may be others now.
             is_whole = not own.days or since > own.days[-1]
-            kept[state.vehicle, PAIRS.index(state.pair)] = own if is_whole else replace(own, reference=None)
+            kept[vehicle, edge] = own if is_whole else replace(own, reference=None)
     return kept
+
+
+def _edge(state: StateRow) -> Edge:
+    return edge_named(state.pair, state.parent_frame, state.child_frame)
 
 
 def first_accepted(kept: Kept | None) -> str | None:
@@ -89,7 +95,7 @@ def first_accepted(kept: Kept | None) -> str | None:
 
 
 def kept_of(days: PairDays | None, since: str, count: int) -> Kept:
-    """What a pair's days make.
+    """What an edge's days make.
 
     Args:
         days: all from the service event to tonight, or those from the first accepted one on.

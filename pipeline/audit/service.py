@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from pipeline.rig.graph import Edge
 from pipeline.store.current import current_events
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 
 __all__ = ["events_until", "restart_of", "what_was_done"]
@@ -26,17 +26,18 @@ def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
     return events
 
 
-def restart_of(events: Sequence[ServiceEvent], pair: str, last_day: str) -> ServiceEvent | None:
-    """The last event that moved a pair, or may have; None where there was none.
+def restart_of(events: Sequence[ServiceEvent], edge: Edge, last_day: str) -> ServiceEvent | None:
+    """The last event that moved an edge, or may have; None where there was none.
 
     The day of the event itself belongs to neither side: nobody knows whether it drove before or after.
 
     Args:
         events: of one vehicle.
-        pair: of sensors.
+        edge: of two sensors.
         last_day: later events are not known yet.
     """
-    touching = [e for e in events if e.day <= last_day and e.sensor in ("all", *FRAMES_OF_PAIR[pair])]
+    names = {"all", *(sensor.name for sensor in edge.sensors)}
+    touching = [e for e in events if e.day <= last_day and e.sensor in names]
     return max(touching, key=lambda e: e.day, default=None)
 
 

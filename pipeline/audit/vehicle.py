@@ -9,58 +9,60 @@ import numpy as np
 from jaxtyping import Int
 
 from pipeline.audit.changes import Change, start_interval
-from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, clipped_days
+from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, clipped_days, edges_of_fleet
 from pipeline.audit.noise import Noise, estimate_noise
 from pipeline.audit.verdicts import ChartVerdict, judge_charts
 from pipeline.config import AuditConfig
 from pipeline.extrinsics.attribution import Attribution, PairShift, attribute, pair_shift
-from schemas.calibrations import DOF_NAMES, PAIRS
+from pipeline.rig.graph import Edge
+from schemas.calibrations import DOF_NAMES
 
-__all__ = ["VehicleVerdict", "independent_pairs", "judge_fleet", "limit_of"]
+__all__ = ["VehicleVerdict", "independent_edges", "judge_fleet", "limit_of"]
 
 # The thresholds' bound is loose: it takes splits and charts as unrelated and days at face value, where single days are
 # clipped and RED needs a size that matters. Set for 50 per 1,000 vehicle-nights, RED came 1.2, 0.1 and 0.1 times
 # (Student's t with 4 degrees of freedom, AR(1) 0.6, wrong sigmas; 20,700 nights each, seed 101 of study drift_charts).
 # So they are set for this many times the budget, and the study proves it on other seeds.
 _BOUND_IS_LOOSE = 15.0
-# Camera_radar is composed of the other two where it is nearer to them than this [rad, m].
+# A camera-radar edge is composed of two others where it is nearer to them than this [rad, m].
 _COMPOSED_WITHIN = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class VehicleVerdict:
-    """Verdicts by (pair, dof), and what moved; `attribution` is None where no chart alarms."""
+    """Verdicts by (edge, dof), and what moved; `attribution` is None where no chart alarms."""
 
-    charts: dict[tuple[str, str], ChartVerdict]
+    charts: dict[tuple[Edge, str], ChartVerdict]
     attribution: Attribution | None
 
 
-def limit_of(pair: str, dof: str, config: AuditConfig) -> float:
+def limit_of(edge: Edge, dof: str, config: AuditConfig) -> float:
     """Size of a change that matters [rad or m]."""
     if dof.startswith("t"):
         return config.translation_limit_m
-    degrees = config.camera_lidar_limit_deg if pair == "camera_lidar" else config.radar_limit_deg
-    return float(np.radians(degrees))
+    has_radar = "radar" in (sensor.kind for sensor in edge.sensors)
+    return float(np.radians(config.radar_limit_deg if has_radar else config.camera_lidar_limit_deg))
 
 
-def judge_fleet(fleet: Sequence[Mapping[str, PairDays]], config: AuditConfig) -> list[VehicleVerdict]:
+def judge_fleet(fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig) -> list[VehicleVerdict]:
     """Judge all charts of all vehicles.
 
     Args:
-        fleet: by vehicle, day estimates by pair; a pair may be missing.
+        fleet: by vehicle, day estimates by edge; vehicles may have other edges than each other.
         config: limits and the false-alarm budget.
     """
-    if not fleet:
-        return []
-    charts = charts_of_fleet(fleet)
-    noise = estimate_noise(charts, DOFS, len(PAIRS))
-    per_vehicle = len(PAIRS) * DOFS
+    edges = edges_of_fleet(fleet)
+    if not edges:
+        return [VehicleVerdict({}, None) for _ in fleet]
+    charts = charts_of_fleet(fleet, edges)
+    noise = estimate_noise(charts, DOFS, len(edges))
+    per_vehicle = len(edges) * DOFS
     live = (charts.count > 1).reshape(len(fleet), per_vehicle).sum(axis=1)
     # An audit is one vehicle-night: its expected number of alarms stays within the budget whatever the nights
     # share, because expectations add; Bonferroni over the charts, because those share errors too.
     budget = np.minimum(_BOUND_IS_LOOSE * config.false_alarms_per_1000_vehicle_days / 1000, 0.5)
     probability = budget / np.maximum(live, 1)
-    limit = np.array([limit_of(pair, dof, config) for pair in PAIRS for dof in DOF_NAMES])
+    limit = np.array([limit_of(edge, dof, config) for edge in edges for dof in DOF_NAMES])
     verdicts = judge_charts(
         charts,
         noise,
@@ -69,35 +71,41 @@ def judge_fleet(fleet: Sequence[Mapping[str, PairDays]], config: AuditConfig) ->
         config.baseline_days,
     )
     return [
-        _judged(pairs, verdicts[v * per_vehicle : (v + 1) * per_vehicle], _part(noise, v, per_vehicle))
-        for v, pairs in enumerate(fleet)
+        _judged(own, verdicts[v * per_vehicle : (v + 1) * per_vehicle], _noise_of(noise, v, edges))
+        for v, own in enumerate(fleet)
     ]
 
 
-def _part(noise: Noise, v: int, size: int) -> Noise:
-    at = slice(v * size, (v + 1) * size)
-    return Noise(noise.scale[at], noise.freedom[at], noise.autocorrelation[at])
+def _noise_of(noise: Noise, v: int, edges: Sequence[Edge]) -> dict[Edge, Noise]:
+    """Of one vehicle, by edge: six charts each."""
+    first = v * len(edges) * DOFS
+    parts = [slice(first + k * DOFS, first + (k + 1) * DOFS) for k in range(len(edges))]
+    return {
+        edge: Noise(noise.scale[at], noise.freedom[at], noise.autocorrelation[at])
+        for edge, at in zip(edges, parts, strict=True)
+    }
 
 
-def _judged(pairs: Mapping[str, PairDays], verdicts: Sequence[ChartVerdict], noise: Noise) -> VehicleVerdict:
+def _judged(
+    own: Mapping[Edge, PairDays], verdicts: Sequence[ChartVerdict], noise: Mapping[Edge, Noise]
+) -> VehicleVerdict:
     """One vehicle: what its charts say, with the start that they share, and the sensor that moved."""
-    keys = [(pair, dof) for pair in PAIRS for dof in DOF_NAMES]
+    keys = [(edge, dof) for edge in noise for dof in DOF_NAMES]
     charts = {
-        key: _name_undetermined_days(verdict, len(pairs[key[0]].day))
+        key: _name_undetermined_days(verdict, len(own[key[0]].day))
         for key, verdict in zip(keys, verdicts, strict=True)
-        if key[0] in pairs
+        if key[0] in own
     }
     if not any(v.change for v in charts.values()):
         return VehicleVerdict(charts, None)
     strongest = _strongest(list(charts.values()))
-    days = _common_days(pairs)
+    seen = {edge: found for edge, found in own.items() if len(found.day)}
+    seen, days = _with_common_days(seen, strongest.day)
     if strongest.kind == "step":
         days = days[(days < strongest.day) | (days >= strongest.settled)]
-    seen = {pair: found for pair, found in pairs.items() if len(found.day)}
     if len(days) and strongest.day < days[-1]:  # a last day that stands alone is what it is
-        scale = noise.scale.reshape(len(PAIRS), DOFS)
-        seen = {pair: clipped_days(found, scale[PAIRS.index(pair)]) for pair, found in seen.items()}
-    seen = independent_pairs(seen, days)
+        seen = {edge: clipped_days(found, noise[edge].scale) for edge, found in seen.items()}
+    seen = independent_edges(seen, days)
     charts = _share_start(charts, _joint_start(seen, days))
     return VehicleVerdict(charts, _attribute(_strongest(list(charts.values())), seen, noise, days))
 
@@ -109,18 +117,31 @@ def _name_undetermined_days(verdict: ChartVerdict, days: int) -> ChartVerdict:
     return replace(verdict, reason=reason)
 
 
-def independent_pairs(pairs: Mapping[str, PairDays], days: Int[np.ndarray, " N"]) -> dict[str, PairDays]:
-    """Pairs whose errors are their own: camera_radar is left out where it is composed of the other two."""
-    if len(pairs) < len(PAIRS) or not len(days):
-        return dict(pairs)
-    T = {pair: p.T[np.searchsorted(p.day, days[-1])] for pair, p in pairs.items()}
-    gap = np.abs(T["camera_lidar"] @ T["lidar_radar"] - T["camera_radar"]).max()
-    return {p: d for p, d in pairs.items() if p != "camera_radar" or gap > _COMPOSED_WITHIN}
+def independent_edges(own: Mapping[Edge, PairDays], days: Int[np.ndarray, " N"]) -> dict[Edge, PairDays]:
+    """Edges whose errors are their own: one of camera and radar is left out where it is composed of two others.
+
+    Args:
+        own: days by edge of one vehicle.
+        days: that all of them have.
+    """
+    if not len(days):
+        return dict(own)
+    T = {edge: found.T[np.searchsorted(found.day, days[-1])] for edge, found in own.items()}
+    composed = {
+        edge
+        for edge in own
+        for first in own
+        for second in own
+        if edge.kind == "camera_radar"
+        and (first.parent, first.child, second.child) == (edge.parent, second.parent, edge.child)
+        and np.abs(T[first] @ T[second] - T[edge]).max() <= _COMPOSED_WITHIN
+    }
+    return {edge: found for edge, found in own.items() if edge not in composed}
 
 
 def _share_start(
-    verdicts: dict[tuple[str, str], ChartVerdict], joint: tuple[int, int, int] | None
-) -> dict[tuple[str, str], ChartVerdict]:
+    verdicts: dict[tuple[Edge, str], ChartVerdict], joint: tuple[int, int, int] | None
+) -> dict[tuple[Edge, str], ChartVerdict]:
     """Give all steps that may be one event the start day that all DoFs together find."""
     if joint is None:
         return verdicts
@@ -134,12 +155,12 @@ def _share_start(
     return shared
 
 
-def _joint_start(pairs: Mapping[str, PairDays], days: Int[np.ndarray, " N"]) -> tuple[int, int, int] | None:
-    """Start day and interval from the full 6x6 covariances of all pairs on the days that all of them have."""
+def _joint_start(own: Mapping[Edge, PairDays], days: Int[np.ndarray, " N"]) -> tuple[int, int, int] | None:
+    """Start day and interval from the full 6x6 covariances of all edges on the days that all of them have."""
     if len(days) < 2:
         return None
     gain = np.zeros(len(days) - 1)
-    for found in pairs.values():
+    for found in own.values():
         rows = np.searchsorted(found.day, days)
         information = np.linalg.inv(found.spread[rows])
         moment = np.einsum("nij,nj->ni", information, found.change[rows])
@@ -153,7 +174,10 @@ def _joint_start(pairs: Mapping[str, PairDays], days: Int[np.ndarray, " N"]) -> 
 
 
 def _attribute(
-    change: Change, pairs: Mapping[str, PairDays], noise: Noise, days: Int[np.ndarray, " N"]
+    change: Change,
+    own: Mapping[Edge, PairDays],
+    noise: Mapping[Edge, Noise],
+    days: Int[np.ndarray, " N"],
 ) -> Attribution:
     # A slow drift is compared between its later half and the days before it set in, and the half between is
     # left out.
@@ -162,10 +186,13 @@ def _attribute(
         days = days[(days < change.day) | (days >= middle)]
     is_after = days >= change.day
     if not is_after.any() or is_after.all():
-        return Attribution(None, "the pairs have no common days before and after", {}, np.zeros(6), np.eye(6))
-    freedom = noise.freedom.reshape(len(PAIRS), DOFS)
-    known_by = min(float(freedom[PAIRS.index(pair)].min()) for pair in pairs)
-    return attribute(_shifts(pairs, noise, days, is_after), known_by)
+        return Attribution("the pairs have no common days before and after")
+    known_by = min(float(noise[edge].freedom.min()) for edge in own)
+    shifts = {}
+    for edge, found in own.items():
+        rows, phi = np.searchsorted(found.day, days), float(noise[edge].autocorrelation[0])
+        shifts[edge] = pair_shift(found.origin, found.change[rows], found.spread[rows], is_after, phi)
+    return attribute(shifts, known_by)
 
 
 def _strongest(verdicts: Sequence[ChartVerdict]) -> Change:
@@ -175,19 +202,31 @@ def _strongest(verdicts: Sequence[ChartVerdict]) -> Change:
     return best.change
 
 
-def _common_days(pairs: Mapping[str, PairDays]) -> Int[np.ndarray, " N"]:
-    days = [set(p.day.tolist()) for p in pairs.values() if len(p.day)]
+def _with_common_days(
+    own: Mapping[Edge, PairDays], start: int
+) -> tuple[dict[Edge, PairDays], Int[np.ndarray, " N"]]:
+    """Edges, and the days that all of them have: those without which there are days on both sides of a start.
+
+    An edge that fell silent before the change, or was added after it, says nothing of it, and must not hide what the
+    others say.
+    """
+    left = dict(own)
+    days = _common_days(left)
+    while len(left) > 1 and not (len(days) and days[0] < start <= days[-1]):
+        fewest = min(left, key=lambda edge: min(_sides(left[edge].day, start)))
+        if min(_sides(left[fewest].day, start)):
+            return dict(own), _common_days(own)
+        del left[fewest]
+        days = _common_days(left)
+    return left, days
+
+
+def _sides(day: Int[np.ndarray, " N"], start: int) -> tuple[int, int]:
+    """How many days lie before a start and from it on."""
+    before = int(np.searchsorted(day, start))
+    return before, len(day) - before
+
+
+def _common_days(own: Mapping[Edge, PairDays]) -> Int[np.ndarray, " N"]:
+    days = [set(found.day.tolist()) for found in own.values() if len(found.day)]
     return np.array(sorted(set.intersection(*days)) if days else [], dtype=np.int64)
-
-
-def _shifts(
-    pairs: Mapping[str, PairDays], noise: Noise, days: Int[np.ndarray, " N"], is_after: np.ndarray
-) -> dict[str, PairShift]:
-    shifts = {}
-    for p, pair in enumerate(PAIRS):
-        if pair in pairs:
-            found = pairs[pair]
-            rows = np.searchsorted(found.day, days)
-            phi = float(noise.autocorrelation[p * DOFS])
-            shifts[pair] = pair_shift(found.origin, found.change[rows], found.spread[rows], is_after, phi)
-    return shifts

@@ -1,20 +1,21 @@
-"""Which sensor moved: the one whose motion explains the shifts of all pairs.
+"""Which sensor moved: the one whose motion explains the shifts of all edges.
 
-A sensor that moves by xi in its own axes shifts the two pairs it belongs to, consistently, and leaves the
-third alone:
+A sensor that moves by xi in its own axes shifts the edges that it is an end of, consistently, and leaves all others
+alone:
 
-    camera:  T_camera_lidar' = exp(-xi) T_camera_lidar    T_camera_radar' = exp(-xi) T_camera_radar
-    lidar:   T_camera_lidar' = T_camera_lidar exp(xi)     T_lidar_radar'  = exp(-xi) T_lidar_radar
-    radar:   T_camera_radar' = T_camera_radar exp(xi)     T_lidar_radar'  = T_lidar_radar exp(xi)
+    its edges as parent:  T_sensor_other' = exp(-xi) T_sensor_other
+    its edges as child:   T_other_sensor' = T_other_sensor exp(xi)
 
-With `T exp(xi) = exp(Ad_T xi) T` each is linear in xi, so each sensor's best motion is one generalised
-least squares fit.
+With `T exp(xi) = exp(Ad_T xi) T` each is linear in xi, so each sensor's best motion is one generalised least squares
+fit. A leaf of one edge is told from the sensor that it hangs on by that one's other edges, which stay. The vehicle
+frame is a node like the others: that `base` moved means that all sensors moved against the road.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,20 +23,22 @@ from scipy.stats import f as f_distribution
 
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import adjoint
+from pipeline.rig.graph import KINDS, Edge
 
-__all__ = ["SENSORS", "Attribution", "PairShift", "attribute", "pair_shift"]
+__all__ = ["Attribution", "Moved", "PairShift", "attribute", "pair_shift"]
 
-SENSORS = ("camera", "lidar", "radar")
 _CLEAR_PROBABILITY = 0.95
 # A best motion that explains the shifts worse than this is not the whole story ...
 _MISFIT_PROBABILITY = 1e-3
 _KNOWN = 1e9  # degrees of freedom: as good as infinitely many, for which SciPy's F has no value
 _WHOLE_STORY = 0.99  # ... unless it explains this share of them (of chi-squared): sigmas are estimates
+# Of three sensors, any two that move against the third explain all: two are looked for among more.
+_FEWEST_FOR_TWO = 4
 
 
 @dataclass(frozen=True, eq=False)
 class PairShift:
-    """Twist (left perturbation, parent axes [rad, m]) by which a pair changed, its 6x6 covariance, at `T`."""
+    """Twist (left perturbation, parent axes [rad, m]) by which an edge changed, its 6x6 covariance, at `T`."""
 
     T: np.ndarray
     xi: np.ndarray
@@ -43,18 +46,37 @@ class PairShift:
 
 
 @dataclass(frozen=True, eq=False)
-class Attribution:
-    """The sensor that moved and its motion (rotation vector [rad], shift [m]) in its own axes.
+class Moved:
+    """How a sensor moved: motion (rotation vector [rad], shift [m]) in its own axes, and how surely it was this one."""
 
-    `sensor` is None where the days cannot tell; `explanation` says why in words. `probability` holds each
-    sensor's share against the other two, given that exactly one of them moved.
-    """
-
-    sensor: str | None
-    explanation: str
-    probability: dict[str, float]
+    probability: float
     motion: np.ndarray
     covariance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Attribution:
+    """What moved, and why that is said.
+
+    Args:
+        explanation: in words.
+        moved: by name the sensors that moved, one or two; none where the days cannot tell.
+        probability: of each sensor against the others, given that exactly one of them moved.
+    """
+
+    explanation: str
+    moved: Mapping[str, Moved] = field(default_factory=dict)
+    probability: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def sensor(self) -> str | None:
+        """The sensor that moved, of two the first; None where the days cannot tell."""
+        return next(iter(self.moved), None)
+
+    def on(self, edge: Edge) -> str | None:
+        """The sensor that an edge shows: the one of two that is an end of it, else the first."""
+        ends = [sensor.name for sensor in edge.sensors]
+        return next((name for name in self.moved if name in ends), self.sensor)
 
 
 def pair_shift(
@@ -64,7 +86,7 @@ def pair_shift(
     is_after: Bool[np.ndarray, " N"],
     autocorrelation: float = 0.0,
 ) -> PairShift:
-    """Shift of one pair between the days before and after a change, each side averaged by full covariances.
+    """Shift of one edge between the days before and after a change, each side averaged by full covariances.
 
     Args:
         origin: T_parent_child that changes count from.
@@ -90,55 +112,94 @@ def _less_sure(days: int, autocorrelation: float) -> float:
     return float(1 + 2 * np.sum((1 - lag / days) * autocorrelation**lag))
 
 
-def attribute(shifts: Mapping[str, PairShift], known_by: float = np.inf) -> Attribution:
-    """Decide between the three sensors.
+def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Attribution:
+    """Decide between the sensors of a rig.
 
     Args:
-        shifts: by pair, of pairs whose errors are their own; at least two, else nothing can be told apart.
+        shifts: by edge, of edges whose errors are their own; at least two, else nothing can be told apart.
         known_by: degrees of freedom that the scale of the covariances is known to; inf = it is known.
     """
-    pairs = tuple(shifts)
-    if len(pairs) < 2:
-        which = " or ".join(pairs[0].split("_")) if pairs else "any sensor"
-        told = f"{which}: one pair alone has data, which both share"
-        return Attribution(None, told, {}, np.zeros(6), np.eye(6))
+    if len(shifts) < 2:
+        names = [sensor.name for edge in shifts for sensor in edge.sensors]
+        return Attribution(f"{' or '.join(names) or 'any sensor'}: one pair alone has data, which both share")
     total = sum(float(s.xi @ np.linalg.solve(s.covariance, s.xi)) for s in shifts.values())
-    fits = {sensor: _fit(sensor, {p: shifts[p] for p in pairs}) for sensor in SENSORS}
-    cost = {sensor: fit[0] for sensor, fit in fits.items()}
-    best = min(cost, key=cost.__getitem__)
-    share = {s: float(np.exp(-0.5 * (c - cost[best]))) for s, c in cost.items()}
-    probability = {s: v / sum(share.values()) for s, v in share.items()}
-    motion, covariance = fits[best][1:]
-    freedom = 6 * len(pairs) - 6
+    sensors = sorted({s for edge in shifts for s in edge.sensors}, key=lambda s: (KINDS.index(s.kind), s.name))
+    names = [sensor.name for sensor in sensors]
+    fits = {name: _fit([name], shifts) for name in names}
+    probability = _shares({name: fit[0] for name, fit in fits.items()})
+    best = max(names, key=probability.__getitem__)
+    cost, motion, covariance = fits[best]
+    explains = _explains(cost, total, 6 * len(shifts) - 6, known_by)
+    if probability[best] >= _CLEAR_PROBABILITY and explains:
+        moved = {best: Moved(probability[best], motion, covariance)}
+        return Attribution(f"the {best} moved", moved, probability)
+    if not explains and (two := _two(names, shifts, total, known_by)):
+        return Attribution(f"the {' and the '.join(two)} moved, each for itself", two, probability)
     if probability[best] < _CLEAR_PROBABILITY:
-        rivals = [s for s in SENSORS if probability[s] > 1 - _CLEAR_PROBABILITY]
-        return Attribution(None, f"cannot tell {' from '.join(rivals)}", probability, motion, covariance)
-    # What is left, over a scale that the vehicle's own few days told: F, not chi-squared (Hotelling 1931).
-    if (
-        f_distribution.sf(cost[best] / freedom, freedom, min(known_by, _KNOWN)) < _MISFIT_PROBABILITY
-        and cost[best] > (1 - _WHOLE_STORY) * total
-    ):
-        text = f"no single sensor explains it ({best} comes nearest): several moved, or sigmas are too small"
-        return Attribution(None, text, probability, motion, covariance)
-    return Attribution(best, f"the {best} moved", probability, motion, covariance)
+        rivals = [name for name in names if probability[name] > 1 - _CLEAR_PROBABILITY]
+        return Attribution(f"cannot tell {' from '.join(rivals)}", {}, probability)
+    text = f"no single sensor explains it ({best} comes nearest): several moved, or sigmas are too small"
+    return Attribution(text, {}, probability)
 
 
-def _fit(sensor: str, shifts: Mapping[str, PairShift]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Chi-squared, motion and covariance of one sensor's best motion."""
-    information, moment, total = np.zeros((6, 6)), np.zeros(6), 0.0
-    for pair, shift in shifts.items():
-        H, W = _design(sensor, pair, shift.T), np.linalg.inv(shift.covariance)
+def _two(
+    names: Sequence[str], shifts: Mapping[Edge, PairShift], total: float, known_by: float
+) -> dict[str, Moved]:
+    """The two sensors that explain what none does alone; empty where no two do, or not clearly these."""
+    freedom = 6 * len(shifts) - 12
+    if len(names) < _FEWEST_FOR_TWO or freedom <= 0:
+        return {}
+    fits = {two: _fit(two, shifts) for two in combinations(names, 2)}
+    share = _shares({two: fit[0] for two, fit in fits.items()})
+    best = max(share, key=share.__getitem__)
+    cost, motion, covariance = fits[best]
+    if share[best] < _CLEAR_PROBABILITY or not _explains(cost, total, freedom, known_by):
+        return {}
+    parts = (slice(0, 6), slice(6, 12))
+    return {
+        name: Moved(share[best], motion[at], covariance[at, at]) for name, at in zip(best, parts, strict=True)
+    }
+
+
+def _shares[Who: (str, tuple[str, str])](cost: Mapping[Who, float]) -> dict[Who, float]:
+    """Probabilities of explanations by their chi-squared, none likelier than another before."""
+    least = min(cost.values())
+    share = {who: float(np.exp(-0.5 * (c - least))) for who, c in cost.items()}
+    return {who: value / sum(share.values()) for who, value in share.items()}
+
+
+def _explains(cost: float, total: float, freedom: int, known_by: float) -> bool:
+    """Whether what an explanation leaves is noise, or next to nothing.
+
+    What is left, over a scale that the vehicle's own few days gave: F, not chi-squared (Hotelling 1931).
+    """
+    chance = f_distribution.sf(cost / freedom, freedom, min(known_by, _KNOWN))
+    return bool(chance >= _MISFIT_PROBABILITY or cost <= (1 - _WHOLE_STORY) * total)
+
+
+def _fit(
+    moving: Sequence[str], shifts: Mapping[Edge, PairShift]
+) -> tuple[float, Float[np.ndarray, " P"], Float[np.ndarray, "P P"]]:
+    """Chi-squared, motions and covariance of the best motions of some sensors, six numbers each."""
+    size = 6 * len(moving)
+    information, moment, total = np.zeros((size, size)), np.zeros(size), 0.0
+    for edge, shift in shifts.items():
+        H, W = _design(moving, edge, shift.T), np.linalg.inv(shift.covariance)
         information += H.T @ W @ H
         moment += H.T @ W @ shift.xi
         total += float(shift.xi @ W @ shift.xi)
-    covariance = np.linalg.inv(information)
+    # Two sensors that share their only edge cannot be told apart: the least motion of both.
+    covariance = np.linalg.inv(information) if len(moving) == 1 else np.linalg.pinv(information, hermitian=True)
     motion = covariance @ moment
     return total - float(moment @ motion), motion, covariance
 
 
-def _design(sensor: str, pair: str, T: np.ndarray) -> np.ndarray:
-    """d(xi of the pair)/d(motion of the sensor in its own axes)."""
-    parent, child = pair.split("_")
-    if sensor == child:
-        return adjoint(T)
-    return -np.eye(6) if sensor == parent else np.zeros((6, 6))
+def _design(moving: Sequence[str], edge: Edge, T: np.ndarray) -> Float[np.ndarray, "6 P"]:
+    """d(xi of the edge)/d(motions of sensors in their own axes)."""
+    H = np.zeros((6, 6 * len(moving)))
+    for k, name in enumerate(moving):
+        if name == edge.child.name:
+            H[:, 6 * k : 6 * k + 6] = adjoint(T)
+        elif name == edge.parent.name:
+            H[:, 6 * k : 6 * k + 6] = -np.eye(6)
+    return H

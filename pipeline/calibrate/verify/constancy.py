@@ -16,6 +16,7 @@ from pipeline.extrinsics.attribution import PairShift, attribute
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import DayParts, PairEstimate
 from pipeline.geometry.changes import change_jacobian
+from pipeline.rig.edges import EDGE_OF_PAIR
 
 __all__ = ["MOVED_SIGMAS", "PART_FLOOR_RAD", "constancy_failures"]
 
@@ -44,7 +45,9 @@ def constancy_failures(estimates: Mapping[str, PairEstimate]) -> dict[str, list[
     if not moved:
         return {}
     surest = max(moved, key=size.__getitem__)
-    found = attribute({pair: _shift(p, pair in moved or pair == "camera_lidar") for pair, p in parts.items()})
+    found = attribute(
+        {EDGE_OF_PAIR[pair]: _shift(p, pair in moved or pair == "camera_lidar") for pair, p in parts.items()}
+    )
     rivals = [s for s, share in found.probability.items() if share > 0.05] or surest.split("_")
     sensors = [found.sensor] if found.sensor else [s for s in surest.split("_") if s in rivals]
     failed = {pair: [_failure(pair, parts[pair], size[pair], sensors)] for pair in moved}

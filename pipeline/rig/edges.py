@@ -1,0 +1,67 @@
+"""Edges as tables name them: a pair, which is the edge's kind, and the names of its two sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, cast
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Int
+
+from pipeline.rig.graph import EDGE_KINDS, Edge, Kind, Sensor
+from schemas.calibrations import FRAMES_OF_PAIR
+
+__all__ = ["EDGE_OF_PAIR", "edge_named", "edge_order", "edges_of_rows"]
+
+_COLUMNS: Final = ("pair", "parent_frame", "child_frame")
+
+
+def edge_named(pair: str, parent: str, child: str) -> Edge:
+    """The edge of a kind between two sensors.
+
+    Args:
+        pair: its kind, as camera_lidar.
+        parent: name of a sensor.
+        child: name of another.
+
+    Raises:
+        ValueError: no edge is of that kind, or both are one sensor.
+    """
+    if pair not in EDGE_KINDS:
+        raise ValueError(f"no edge is of the kind {pair!r}: there are {', '.join(EDGE_KINDS)}")
+    kinds = [cast("Kind", kind) for kind in pair.split("_")]
+    return Edge(Sensor(parent, kinds[0]), Sensor(child, kinds[1]))
+
+
+# Edges of a rig whose sensors are called by their kinds, as a short fleet.toml does and all records until 0.10 did.
+EDGE_OF_PAIR: Final[Mapping[str, Edge]] = {
+    pair: edge_named(pair, *frames) for pair, frames in FRAMES_OF_PAIR.items()
+}
+
+
+def edge_order(edge: Edge) -> tuple[int, str, str]:
+    """Key to sort edges by: kinds in the order of EDGE_KINDS, then names."""
+    return EDGE_KINDS.index(edge.kind), edge.parent.name, edge.child.name
+
+
+def edges_of_rows(rows: pa.Table) -> tuple[tuple[Edge, ...], Int[np.ndarray, " N"]]:
+    """The edges that rows are about, in order, and the place among them of each row's; -1 where it is no edge.
+
+    Args:
+        rows: with columns pair, parent_frame and child_frame.
+    """
+    names = [pc.fill_null(rows[name], "").combine_chunks() for name in _COLUMNS]
+    coded = pc.binary_join_element_wise(*names, "\0").dictionary_encode()
+    found = [_edge_or_none(*text.split("\0")) for text in coded.dictionary.to_pylist()]
+    edges = tuple(sorted({edge for edge in found if edge is not None}, key=edge_order))
+    place = np.array([-1 if edge is None else edges.index(edge) for edge in found], np.int64)
+    return edges, place[np.asarray(coded.indices)]
+
+
+def _edge_or_none(pair: str, parent: str, child: str) -> Edge | None:
+    try:
+        return edge_named(pair, parent, child)
+    except ValueError:
+        return None
