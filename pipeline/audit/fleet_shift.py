@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.audit.days import PairDays
 from pipeline.audit.vehicle import VehicleVerdict, judge_fleet
 from pipeline.config import AuditConfig
+from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["FleetShift", "judge_without_fleet_shifts"]
@@ -36,12 +37,12 @@ class FleetShift:
 
 
 def judge_without_fleet_shifts(
-    fleet: Sequence[Mapping[str, PairDays]], config: AuditConfig
-) -> tuple[list[VehicleVerdict], dict[tuple[str, str], FleetShift]]:
-    """Verdicts on all vehicles, and by (pair, dof) what was taken out of all of them before.
+    fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig
+) -> tuple[list[VehicleVerdict], dict[tuple[Edge, str], FleetShift]]:
+    """Verdicts on all vehicles, and by (edge, dof) what was taken out of all of them before.
 
     Args:
-        fleet: by vehicle, day estimates by pair.
+        fleet: by vehicle, day estimates by edge.
         config: limits and the false-alarm budget.
     """
     verdicts = judge_fleet(fleet, config)
@@ -52,10 +53,10 @@ def judge_without_fleet_shifts(
 
 
 def _shifts(
-    fleet: Sequence[Mapping[str, PairDays]], verdicts: Sequence[VehicleVerdict]
-) -> dict[tuple[str, str], FleetShift]:
+    fleet: Sequence[Mapping[Edge, PairDays]], verdicts: Sequence[VehicleVerdict]
+) -> dict[tuple[Edge, str], FleetShift]:
     found = {}
-    for key in sorted({k for v in verdicts for k, chart in v.charts.items() if chart.change is not None}):
+    for key in {k: None for v in verdicts for k, chart in v.charts.items() if chart.change is not None}:
         changes = [v.charts[key].change for v in verdicts if key in v.charts]
         starts = Counter((c.day, c.size > 0) for c in changes if c is not None and c.kind == "step")
         if not starts:
@@ -68,7 +69,7 @@ def _shifts(
     return found
 
 
-def _size(pairs: Mapping[str, PairDays], key: tuple[str, str], day: int) -> float | None:
+def _size(pairs: Mapping[Edge, PairDays], key: tuple[Edge, str], day: int) -> float | None:
     """Median after less median before of one vehicle; None where it has no two days on either side."""
     days = pairs.get(key[0])
     if days is None:
@@ -83,14 +84,14 @@ def _size(pairs: Mapping[str, PairDays], key: tuple[str, str], day: int) -> floa
 
 
 def _without(
-    pairs: Mapping[str, PairDays], shifts: Mapping[tuple[str, str], FleetShift]
-) -> dict[str, PairDays]:
+    own: Mapping[Edge, PairDays], shifts: Mapping[tuple[Edge, str], FleetShift]
+) -> dict[Edge, PairDays]:
     out = {}
-    for pair, days in pairs.items():
+    for edge, days in own.items():
         change = days.change.copy()
         for k, dof in enumerate(DOF_NAMES):
-            shift = shifts.get((pair, dof))
+            shift = shifts.get((edge, dof))
             if shift is not None:
                 change[days.day >= shift.day, k] -= shift.size
-        out[pair] = replace(days, change=change)
+        out[edge] = replace(days, change=change)
     return out

@@ -19,10 +19,10 @@ from pipeline.audit.days import Reference
 from pipeline.audit.estimates import COLUMNS, Estimates, day_name, estimates_of, faults_of, joined
 from pipeline.audit.references import first_accepted, read_kept
 from pipeline.audit.service import restart_of
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Lake
 from pipeline.store.records import first_day, last_day, read_columns
-from pipeline.rig.edges import EDGE_OF_PAIR
-from pipeline.rig.graph import Edge
 from schemas.calibrations import CALIBRATIONS
 from schemas.service_events import ServiceEvent
 
@@ -156,7 +156,7 @@ class History:
         for row, why in faults.items():
             owner, day = records.vehicles[records.owner[row]], day_name(int(records.day[row]))
             edge = int(records.edge[row])
-            what = _words(records.edges[edge]) if edge >= 0 else "record"
+            what = words_of(records.edges[edge]) if edge >= 0 else "record"
             self.left_out[f"{owner} {day} {what} {why}"] = None
         kept = np.delete(np.arange(len(records.day)), list(faults))
         return joined([records.at(kept)]) if faults else records
@@ -164,11 +164,6 @@ class History:
 
 def _day_after(day: str) -> str:
     return (dt.date.fromisoformat(day) + dt.timedelta(days=1)).isoformat()
-
-
-def _words(edge: Edge) -> str:
-    """As records call it: by its kind where its sensors are called so, else by their names."""
-    return edge.kind if edge == EDGE_OF_PAIR.get(edge.kind) else edge.name
 
 
 def _edges(records: Estimates) -> list[tuple[str, Edge]]:

@@ -17,10 +17,10 @@ from pipeline.audit.days import PairDays, Reference, reference_of
 from pipeline.audit.estimates import day_name
 from pipeline.audit.service import restart_of
 from pipeline.geometry.se3 import from_quaternion, to_quaternion
-from pipeline.store.partitions import Lake
-from pipeline.store.records import read_columns, read_latest
 from pipeline.rig.edges import edge_named
 from pipeline.rig.graph import Edge
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_columns, read_latest
 from schemas.calibrations import CALIBRATIONS
 from schemas.service_events import ServiceEvent
 from schemas.states import STATES, StateRow

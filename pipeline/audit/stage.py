@@ -6,6 +6,7 @@ import datetime as dt
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -20,10 +21,12 @@ from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.errors import ConfigError
 from pipeline.results import Progress
+from pipeline.rig.edges import edge_named
+from pipeline.rig.graph import EDGE_KINDS, KINDS, Edge, edge_between
 from pipeline.store.partitions import Lake, Partition, content_hash, last_possible_day, work_key
 from pipeline.store.records import read_last
 from pipeline.work import Records, Task, Told, Window, Work
-from schemas.calibrations import DOF_NAMES, PAIRS
+from schemas.calibrations import DOF_NAMES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import ServiceEvent
 from schemas.versions import CODE_VERSION
@@ -41,9 +44,7 @@ class _Vehicle:
 
     records: Estimates
     events: Sequence[ServiceEvent]
-    references: Mapping[
-        str, Reference
-    ]  # by pair, that an earlier night made of records that are not among these
+    references: Mapping[Edge, Reference]  # that an earlier night made of records that are not among these
     said: Sequence[DriftFinding]  # by the last audit, where some of the vehicle's records cannot be read
 
 
@@ -52,7 +53,7 @@ def work(task: Task) -> Work:
 
     The window ends with its last day (None = the last day that any vehicle has a record for) and begins with its first
     (None = `audit.window_days` before its end). The configuration's vehicles are audited even where they have no
-    record. One finding per vehicle, pair and DoF, in that order; none where the lake has no record in the window.
+    record. One finding per vehicle, edge and DoF, in that order; none where the lake has no record in the window.
     Records that nothing can be made of, and those of days to come, are named in the outcome and left out.
 
     Raises:
@@ -70,9 +71,9 @@ def work(task: Task) -> Work:
     records, references = history.window((first, last), events, enough, fleet.named_vehicles)
     said = said_before(task.lake, method)
     names = sorted({*records.vehicles, *fleet.named_vehicles, *said})
-    made: dict[str, dict[str, Reference]] = {}
-    for (name, pair), reference in references.items():
-        made.setdefault(name, {})[PAIRS[pair]] = reference
+    made: dict[str, dict[Edge, Reference]] = {}
+    for (name, edge), reference in references.items():
+        made.setdefault(name, {})[edge] = reference
     vehicles = {
         v: _Vehicle(records.of(v), events.get(v, ()), made.get(v, {}), said.get(v, ())) for v in names
     }
@@ -104,16 +105,16 @@ def _judged(
     progress(len(vehicles), len(vehicles), "")
 
 
-def _charted(vehicle: _Vehicle, window: tuple[str, str, str], config: AuditConfig) -> dict[str, PairDays]:
-    """The window's days of each pair beside its reference, none from before what was last done to it."""
+def _charted(vehicle: _Vehicle, window: tuple[str, str, str], config: AuditConfig) -> dict[Edge, PairDays]:
+    """The window's days of each edge beside its reference, none from before what was last done to it."""
     first, last = (dt.date.fromisoformat(day).toordinal() for day in window[:2])
     charts = {}
-    for pair, days in days_of(vehicle.records, config.held_sigma_factor).items():
-        restart = restart_of(vehicle.events, pair, window[1])
+    for edge, days in days_of(vehicle.records, config.held_sigma_factor).items():
+        restart = restart_of(vehicle.events, edge, window[1])
         since = 0 if restart is None else dt.date.fromisoformat(restart.day).toordinal() + 1
         own = days.between(since, last)
-        reference = vehicle.references.get(pair) or reference_of(own, config.reference_days)
-        charts[pair] = charted(own, first, last, reference)
+        reference = vehicle.references.get(edge) or reference_of(own, config.reference_days)
+        charts[edge] = charted(own, first, last, reference)
     return charts
 
 
@@ -154,7 +155,7 @@ def _findings(
     vehicle: _Vehicle,
     verdict: VehicleVerdict,
     window: tuple[str, str, str],
-    known: tuple[Mapping[tuple[str, str], FleetShift], Mapping[tuple[str, str], DriftFinding]],
+    known: tuple[Mapping[tuple[Edge, str], FleetShift], Mapping[tuple[Edge, str], DriftFinding]],
 ) -> Records:
     (first, last, method), (shifts, before) = window, known
     records = vehicle.records.at(
@@ -163,16 +164,31 @@ def _findings(
     inputs = records.keys()
     config = config_hash(fleet.audit, {"from": first, "to": last, "method": method})
     audit = VehicleAudit(name, last, method, "", inputs)
-    rows = vehicle_findings(audit, records, verdict, fleet.audit, _remarks(vehicle, last, shifts), before)
+    remarks = _remarks(vehicle, last, shifts)
+    possible = () if len(records.edge) else _possible_edges(fleet, name)
+    rows = vehicle_findings(audit, records, verdict, fleet.audit, remarks, before, possible)
     rows = standing(rows, vehicle.said, vehicle.events, last)
     # All vehicles are judged side by side, so a verdict rests on more than this vehicle's records: the key has it too.
     key = work_key("audit", CODE_VERSION, config, [*inputs, content_hash(rows)])
     return Records([replace(row, work_key=key) for row in rows], Partition(name, last), key, inputs)
 
 
+def _possible_edges(fleet: FleetConfig, name: str) -> list[Edge]:
+    """Edges that a vehicle without any record is UNKNOWN on: its rig's, of a large one those at its reference."""
+    rig = fleet.rig_of(name)
+    if rig.named_edges is not None:
+        return list(rig.named_edges)
+    nodes = sorted(rig.nodes, key=lambda n: KINDS.index(n.kind))
+    pairs = [(a, b) for a, b in combinations(nodes, 2) if f"{a.kind}_{b.kind}" in EDGE_KINDS]
+    if len(nodes) > len(KINDS) - 1:
+        middle = rig.reference or next(iter((*rig.lidars, *rig.sensors)))
+        pairs = [(a, b) for a, b in pairs if middle in (a.name, b.name)]
+    return [edge_between(a, b) for a, b in pairs]
+
+
 def _found_before(
     lake: Lake, method: str, verdicts: Mapping[str, VehicleVerdict], first: str
-) -> dict[str, dict[tuple[str, str], DriftFinding]]:
+) -> dict[str, dict[tuple[Edge, str], DriftFinding]]:
     """By vehicle, the last audit's rows, where a change may have begun before the window did."""
     window = dt.date.fromisoformat(first).toordinal()
     asked = {
@@ -180,22 +196,23 @@ def _found_before(
         for name, verdict in verdicts.items()
         if any(c.change is not None and c.change.earliest < window for c in verdict.charts.values())
     }
-    before: dict[str, dict[tuple[str, str], DriftFinding]] = {}
+    before: dict[str, dict[tuple[Edge, str], DriftFinding]] = {}
     if asked:
         for finding in read_last(lake, DRIFT, DriftFinding, method, vehicle=asked, columns=_OF_BEFORE):
-            before.setdefault(finding.vehicle, {})[finding.pair, finding.dof] = finding
+            edge = edge_named(finding.pair, finding.parent_frame, finding.child_frame)
+            before.setdefault(finding.vehicle, {})[edge, finding.dof] = finding
     return before
 
 
 def _remarks(
-    vehicle: _Vehicle, last: str, shifts: Mapping[tuple[str, str], FleetShift]
-) -> dict[tuple[str, str], str]:
+    vehicle: _Vehicle, last: str, shifts: Mapping[tuple[Edge, str], FleetShift]
+) -> dict[tuple[Edge, str], str]:
     """What a reader of a chart should know besides: where it begins, and what was taken out of it."""
-    remarks: dict[tuple[str, str], str] = {}
-    for pair in (PAIRS[p] for p in np.unique(vehicle.records.pair)):
-        restart = restart_of(vehicle.events, pair, last)
+    remarks: dict[tuple[Edge, str], str] = {}
+    for edge in vehicle.records.own_edges():
+        restart = restart_of(vehicle.events, edge, last)
         if restart is not None:
-            remarks |= {(pair, dof): f"since the {what_was_done(restart)}" for dof in DOF_NAMES}
+            remarks |= {(edge, dof): f"since the {what_was_done(restart)}" for dof in DOF_NAMES}
     for key, shift in shifts.items():
         day = dt.date.fromordinal(shift.day).isoformat()
         text = f"without what {shift.vehicles} of {shift.of} vehicles show since {day}"

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtri
 
-from pipeline.audit.days import DOFS, charts_of_fleet
+from pipeline.audit.days import DOFS, charts_of_fleet, edges_of_fleet
 from pipeline.audit.estimates import Estimates, day_name, days_of, estimates_of, joined
 from pipeline.audit.history import History
 from pipeline.audit.noise import estimate_noise
@@ -20,10 +20,11 @@ from pipeline.audit.state import DayEstimate, State, fuse
 from pipeline.config import AuditConfig, FleetConfig, VerifyConfig, config_hash
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.target_sigmas import target_sigmas
+from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Partition, content_hash, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
 from pipeline.work import Records, Run, Task, Told, Window, Work
-from schemas.calibrations import CALIBRATIONS, DOF_NAMES, FRAMES_OF_PAIR, PAIRS
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
@@ -42,7 +43,7 @@ _CHANGE = ("start_day", "start_day_latest")  # what is asked of the audit's rows
 
 
 def work(task: Task) -> Work:
-    """The state of every vehicle that has a record in the window, one row per pair.
+    """The state of every vehicle that has a record in the window, one row per edge.
 
     A state rests on the accepted days since the last of: the vehicle's first day, a service event, a change that the
     latest audit found. The window ends as the audit's does.
@@ -63,15 +64,18 @@ def work(task: Task) -> Work:
     references = _references(history, records, (first, last), events, fleet.audit) if last else {}
 
     def rows(run: Run) -> Generator[Records, None, None]:
-        scales = _scales(records, fleet.audit) if records.vehicles else np.ones((0, 0, 0))
+        scales = _scales(records, fleet.audit)
         for done, vehicle in enumerate(records.vehicles):
             run.progress(done, len(records.vehicles), vehicle)
-            since = {p: _since(p, events.get(vehicle, ()), changes.get(vehicle, ()), last) for p in PAIRS}
-            own = _states(fleet, (vehicle, last, method), records.of(vehicle), since, scales[done])
-            kept = [references[vehicle, PAIRS.index(row.pair)] for row in own.rows]
+            of_vehicle = records.of(vehicle)
+            edges = of_vehicle.own_edges()
+            since = {e: _since(e, events.get(vehicle, ()), changes.get(vehicle, ()), last) for e in edges}
+            own = _states(fleet, (vehicle, last, method), of_vehicle, since, scales[done])
+            kept = [references[vehicle, edge] for edge in edges]
             count = fleet.audit.reference_days
             whole = [replace(r, **kept_columns(k, count)) for r, k in zip(own.rows, kept, strict=True)]
-            config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method, "since": since})
+            begun = {edge.name: first for edge, first in since.items()}
+            config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method, "since": begun})
             key = work_key("state", CODE_VERSION, config, [*(own.inputs or ()), content_hash(whole)])
             yield replace(own, rows=[replace(r, work_key=key) for r in whole], work_key=key)
 
@@ -85,46 +89,48 @@ def _references(
     window: tuple[str, str],
     events: Mapping[str, Sequence[ServiceEvent]],
     config: AuditConfig,
-) -> dict[tuple[str, int], Kept]:
-    """The fixed reference of every vehicle and pair, as far as there is one: kept, or made of its first days."""
+) -> dict[tuple[str, Edge], Kept]:
+    """The fixed reference of every vehicle and edge, as far as there is one: kept, or made of its first days."""
     first, last = window
     count = config.reference_days
     kept = read_kept(history.lake, history.method, window, events, count)
     found = {key: own for key, own in kept.items() if own.reference is not None}
-    asked = {(v, p) for v in records.vehicles for p in range(len(PAIRS))} - found.keys()
+    asked = {(v, e) for v in records.vehicles for e in records.of(v).own_edges()} - found.keys()
     begin = dict.fromkeys(records.vehicles, first)
     lacking = {key: first_accepted(kept.get(key)) for key in asked}
     known = joined([records, *history.references(begin, window, events, count, lacking)])
     for vehicle in sorted({v for v, _ in asked}):
         days = days_of(known.of(vehicle), config.held_sigma_factor)
-        for place, pair in enumerate(PAIRS):
-            if (vehicle, place) in asked:
-                event = restart_of(events.get(vehicle, ()), pair, last)
-                since = "" if event is None else event.day
-                begun = dt.date.fromisoformat(since).toordinal() + 1 if since else 0
-                own = days[pair].between(begun, _END) if pair in days else None
-                found[vehicle, place] = kept_of(own, since, count)
+        for edge in (e for v, e in asked if v == vehicle):
+            event = restart_of(events.get(vehicle, ()), edge, last)
+            since = "" if event is None else event.day
+            begun = dt.date.fromisoformat(since).toordinal() + 1 if since else 0
+            own = days[edge].between(begun, _END) if edge in days else None
+            found[vehicle, edge] = kept_of(own, since, count)
     return found
 
 
-def _scales(records: Estimates, config: AuditConfig) -> Float[np.ndarray, "V P 6"]:
-    """By vehicle, pair and DoF of a change, how much more its days scatter than they say, as the charts see it."""
+def _scales(records: Estimates, config: AuditConfig) -> list[dict[Edge, Float[np.ndarray, " 6"]]]:
+    """By vehicle, edge and DoF of a change, how much more its days scatter than they say, as the charts see it."""
     days = [days_of(records.of(vehicle), config.held_sigma_factor) for vehicle in records.vehicles]
-    charts = charts_of_fleet([{pair: own.at(own.accepted) for pair, own in of.items()} for of in days])
-    return estimate_noise(charts, DOFS, len(PAIRS)).scale.reshape(len(days), len(PAIRS), DOFS)
+    edges = edges_of_fleet(days)
+    charts = charts_of_fleet([{e: own.at(own.accepted) for e, own in of.items()} for of in days], edges)
+    scale = estimate_noise(charts, DOFS, len(edges)).scale if edges else np.ones(0)
+    return [dict(zip(edges, s, strict=True)) for s in scale.reshape(len(days), len(edges), DOFS)]
 
 
 def _since(
-    pair: str, events: Sequence[ServiceEvent], findings: Sequence[DriftFinding], last: str
+    edge: Edge, events: Sequence[ServiceEvent], findings: Sequence[DriftFinding], last: str
 ) -> tuple[str, str]:
-    """First day that may count for a pair, and why; empty where all days may."""
+    """First day that may count for an edge, and why; empty where all days may."""
     first, why = "", ""
-    event = restart_of(events, pair, last)
+    event = restart_of(events, edge, last)
     if event is not None:
         first = (dt.date.fromisoformat(event.day) + dt.timedelta(days=1)).isoformat()
         why = f"after the {what_was_done(event)}"
     for finding in findings:
-        changed = finding.pair == pair and finding.status in ("RED", "YELLOW") and finding.start_day
+        is_own = (finding.parent_frame, finding.child_frame) == (edge.parent.name, edge.child.name)
+        changed = is_own and finding.status in ("RED", "YELLOW") and finding.start_day
         if changed and (finding.start_day_latest or "") > first:
             first = finding.start_day_latest or ""
             why = f"after a change that the audit found since {finding.start_day}"
@@ -135,29 +141,25 @@ def _states(
     fleet: FleetConfig,
     about: tuple[str, str, str],
     records: Estimates,
-    since: Mapping[str, tuple[str, str]],
-    scales: Float[np.ndarray, "P 6"],
+    since: Mapping[Edge, tuple[str, str]],
+    scales: Mapping[Edge, Float[np.ndarray, " 6"]],
 ) -> Records:
     vehicle, last, method = about
     inputs = records.keys()
     rows = []
-    for pair, scale in zip(PAIRS, scales, strict=True):
-        if not np.any(records.pair == PAIRS.index(pair)):
-            continue  # the rig has it not
-        first, why = since[pair]
+    for edge, (first, why) in since.items():
         begin = dt.date.fromisoformat(first).toordinal() if first else 0
         usable = records.accepted & records.has_estimate & (records.day >= begin)
-        own = records.at(np.flatnonzero(usable & (records.pair == PAIRS.index(pair))))
-        found = fuse(_days(own), scale=scale, autocorrelation=_AUTOCORRELATION)
-        parent, child = FRAMES_OF_PAIR[pair]
+        own = records.at(np.flatnonzero(usable & records.is_of(edge)))
+        found = fuse(_days(own), scale=scales.get(edge), autocorrelation=_AUTOCORRELATION)
         words = _words(why, found)
         base = StateRow(
             vehicle=vehicle,
             day=last,
             method=method,
-            pair=pair,
-            parent_frame=parent,
-            child_frame=child,
+            pair=edge.kind,
+            parent_frame=edge.parent.name,
+            child_frame=edge.child.name,
             status="none",
             reason=words,
             since=first or None,
@@ -175,7 +177,7 @@ def _words(why: str, found: State | None) -> str:
 
 
 def _days(records: Estimates) -> list[DayEstimate]:
-    """Accepted records of a pair as days to fuse."""
+    """Accepted records of an edge as days to fuse."""
     return [
         DayEstimate(day_name(day), T, covariance, common if has_common else None, observable)
         for day, T, covariance, common, has_common, observable in zip(
@@ -189,7 +191,7 @@ def _with_state(base: StateRow, found: State, records: Estimates, verify: Verify
     sigma = target_sigmas(base.pair, found.T, found.covariance)
     azimuth, elevation = (
         (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
-        if base.pair == "camera_lidar"
+        if "radar" not in base.pair
         else (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
     )
     reach = float(ndtri(0.5 + verify.confidence / 2)) * np.degrees(sigma)

@@ -2,29 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
-from schemas.calibrations import PAIRS
+from pipeline.rig.edges import EDGE_OF_PAIR, edge_named, edge_order, words_of
+from pipeline.rig.graph import KINDS, Edge
 from schemas.drift import DriftFinding, VehicleStatus
 
 __all__ = ["decide_status"]
 
-# Turns that every night determines; a turn of any sensor shows in one of these groups. A group is watched where all
-# charts of one of its alternatives are GREEN.
-# Pitch and yaw: the image's two axes.
-_CAMERA_AGAINST_LIDAR = ((("camera_lidar", "rx"), ("camera_lidar", "ry")),)
-# Yaw alone: radars measure azimuth ten times better than elevation, and many measure no elevation at all.
-_RADAR_AGAINST_THE_OTHERS = ((("lidar_radar", "rz"),), (("camera_radar", "ry"),))
-_Groups = dict[str, tuple[tuple[tuple[str, str], ...], ...]]
+# Turns that every night determines, by kind of edge: what a GREEN chart of them excludes. Of cameras pitch and yaw, the
+# image's two axes; of radars yaw alone: they measure azimuth ten times better than elevation, and many measure none.
+_WATCHED: Mapping[str, tuple[str, ...]] = {
+    "camera_lidar": ("rx", "ry"),
+    "camera_radar": ("ry",),
+    "lidar_radar": ("rz",),
+    "lidar_lidar": ("rx", "ry", "rz"),
+    "lidar_base": ("rx", "ry"),
+    "radar_base": ("rz",),
+}
+# By kind of sensor, the edges whose charts watch it; the later ones only where it has none of the earlier.
+_WATCHING: Mapping[str, tuple[tuple[str, ...], ...]] = {
+    "camera": (("camera_lidar",), ("camera_radar",)),
+    "lidar": (("camera_lidar", "lidar_lidar"), ("lidar_radar",), ("lidar_base",)),
+    "radar": (("lidar_radar", "camera_radar"), ("radar_base",)),
+}
 
 
-def _watched(pairs: Collection[str]) -> _Groups:
-    """Groups of charts by the sensors whose turn shows in them, of a vehicle with these pairs."""
-    watched: _Groups = {"camera or lidar": _CAMERA_AGAINST_LIDAR} if "camera_lidar" in pairs else {}
-    radar = tuple(charts for charts in _RADAR_AGAINST_THE_OTHERS if charts[0][0] in pairs)
-    if radar:
-        watched["radar" if watched else radar[0][0][0].replace("_", " or ")] = radar
-    return watched
+def _watched(edges: Collection[Edge]) -> dict[str, tuple[Edge, ...]]:
+    """Edges of which one that is GREEN excludes a turn of the sensors named, as `front or top`."""
+    ordered = sorted(edges, key=lambda e: ("base" in e.kind, e.kind == "camera_radar", edge_order(e)))
+    by_edges: dict[tuple[Edge, ...], list[str]] = {}
+    sensors = sorted({s for e in edges for s in e.sensors}, key=lambda s: (KINDS.index(s.kind), s.name))
+    for sensor in sensors:
+        own = [edge for edge in ordered if sensor in edge.sensors]
+        tiers = [tuple(e for e in own if e.kind in kinds) for kinds in _WATCHING.get(sensor.kind, ())]
+        watching = next((tier for tier in tiers if tier), None)
+        if watching is not None:
+            by_edges.setdefault(watching, []).append(sensor.name)
+    return {" or ".join(names): watching for watching, names in by_edges.items()}
 
 
 def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
@@ -32,9 +47,9 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
 
     RED: at least one chart is RED, a lasting change of a size that matters.
     YELLOW: none is RED, at least one is YELLOW: a smaller change, or one that rests on a single day.
-    GREEN: no chart alarms, and a turn of any sensor by the size that matters would have shown: of the pairs that the
-        vehicle has, the charts of camera-lidar pitch and yaw are GREEN, and so is radar yaw against the lidar or
-        against the camera. Charts that say UNKNOWN beside these do not take GREEN away: they belong to what the days
+    GREEN: no chart alarms, and a turn of any sensor by the size that matters would have shown: of the edges that the
+        vehicle has, each camera's pitch and yaw against a lidar are GREEN, and so is each radar's yaw against a lidar
+        or a camera. Charts that say UNKNOWN beside these do not take GREEN away: they belong to what the days
         cannot determine (radar roll, heights, on most roads), and would say UNKNOWN for ever. The reason says how many
         charts are GREEN.
     UNKNOWN: no chart alarms, but on one of those charts a change that matters could hide: too few days, sigmas too
@@ -44,19 +59,19 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     before one without, then the largest statistic in units of its threshold.
 
     Args:
-        findings: one row per pair and DoF of one vehicle, in any order; `vehicle_*` are not read.
+        findings: one row per edge and DoF of one vehicle, in any order; `vehicle_*` are not read.
     """
     alarms = [f for f in findings if f.status in ("RED", "YELLOW")]
     if alarms:
         clearest = max(alarms, key=_clarity)
         reason = f"{_what_happened(clearest)}: {clearest.reason}"
         return VehicleStatus(clearest.status, reason, clearest.moved_sensor, clearest.start_day)
-    status = {(f.pair, f.dof): f.status for f in findings}
-    watched = _watched({f.pair for f in findings} or PAIRS)
+    status = {(_edge(f), f.dof): f.status for f in findings}
+    watched = _watched({edge for edge, _ in status} or EDGE_OF_PAIR.values())
     unwatched = [
-        sensor
-        for sensor, alternatives in watched.items()
-        if not any(all(status.get(chart) == "GREEN" for chart in charts) for charts in alternatives)
+        sensors
+        for sensors, edges in watched.items()
+        if not any(all(status.get((e, dof)) == "GREEN" for dof in _WATCHED[e.kind]) for e in edges)
     ]
     green = sum(s == "GREEN" for s in status.values())
     count = f"{green} of {len(findings)} charts would show a change that matters"
@@ -65,10 +80,15 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     if max((f.days_used for f in findings), default=0) > 1:
         hidden = " and of the ".join(unwatched)
         first = watched[unwatched[0]][0]  # where there is a choice
-        blind = [f for f in findings if (f.pair, f.dof) in first and f.status != "GREEN"]
-        why = "".join(f"; {f.pair} {f.dof}: {f.reason}" for f in blind[:1])
+        own = [f for f in findings if _edge(f) == first and f.dof in _WATCHED[first.kind]]
+        blind = [f for f in own if f.status != "GREEN"]
+        why = "".join(f"; {words_of(first)} {f.dof}: {f.reason}" for f in blind[:1])
         return VehicleStatus("UNKNOWN", f"a turn of the {hidden} could hide ({count}){why}")
     return VehicleStatus("UNKNOWN", "too little data to say whether a sensor moved")
+
+
+def _edge(finding: DriftFinding) -> Edge:
+    return edge_named(finding.pair, finding.parent_frame, finding.child_frame)
 
 
 def _clarity(alarm: DriftFinding) -> tuple[bool, bool, float]:

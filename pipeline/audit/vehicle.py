@@ -13,7 +13,7 @@ from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, clipped_days, e
 from pipeline.audit.noise import Noise, estimate_noise
 from pipeline.audit.verdicts import ChartVerdict, judge_charts
 from pipeline.config import AuditConfig
-from pipeline.extrinsics.attribution import Attribution, PairShift, attribute, pair_shift
+from pipeline.extrinsics.attribution import Attribution, attribute, pair_shift
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -27,6 +28,7 @@ from pipeline.rig.graph import KINDS, Edge
 
 __all__ = ["Attribution", "Moved", "PairShift", "attribute", "pair_shift"]
 
+_Who = TypeVar("_Who", str, tuple[str, str])
 _CLEAR_PROBABILITY = 0.95
 # A best motion that explains the shifts worse than this is not the whole story ...
 _MISFIT_PROBABILITY = 1e-3
@@ -43,6 +45,21 @@ class PairShift:
     T: np.ndarray
     xi: np.ndarray
     covariance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighed:
+    """A shift with what every fit needs of it: its weight, what it weighs, and the adjoint of T."""
+
+    xi: np.ndarray
+    W: np.ndarray
+    square: float
+    adjoint: np.ndarray
+
+    @classmethod
+    def of(cls, shift: PairShift) -> _Weighed:
+        W = np.linalg.inv(shift.covariance)
+        return cls(shift.xi, W, float(shift.xi @ W @ shift.xi), adjoint(shift.T))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +140,12 @@ def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Att
         names = [sensor.name for edge in shifts for sensor in edge.sensors]
         return Attribution(f"{' or '.join(names) or 'any sensor'}: one pair alone has data, which both share")
     total = sum(float(s.xi @ np.linalg.solve(s.covariance, s.xi)) for s in shifts.values())
-    sensors = sorted({s for edge in shifts for s in edge.sensors}, key=lambda s: (KINDS.index(s.kind), s.name))
+    sensors = sorted(
+        {s for edge in shifts for s in edge.sensors}, key=lambda s: (KINDS.index(s.kind), s.name)
+    )
     names = [sensor.name for sensor in sensors]
-    fits = {name: _fit([name], shifts) for name in names}
+    weighed = {edge: _Weighed.of(shift) for edge, shift in shifts.items()}
+    fits = {name: _fit([name], weighed) for name in names}
     probability = _shares({name: fit[0] for name, fit in fits.items()})
     best = max(names, key=probability.__getitem__)
     cost, motion, covariance = fits[best]
@@ -133,7 +153,7 @@ def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Att
     if probability[best] >= _CLEAR_PROBABILITY and explains:
         moved = {best: Moved(probability[best], motion, covariance)}
         return Attribution(f"the {best} moved", moved, probability)
-    if not explains and (two := _two(names, shifts, total, known_by)):
+    if not explains and (two := _two(names, weighed, total, known_by)):
         return Attribution(f"the {' and the '.join(two)} moved, each for itself", two, probability)
     if probability[best] < _CLEAR_PROBABILITY:
         rivals = [name for name in names if probability[name] > 1 - _CLEAR_PROBABILITY]
@@ -143,7 +163,7 @@ def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Att
 
 
 def _two(
-    names: Sequence[str], shifts: Mapping[Edge, PairShift], total: float, known_by: float
+    names: Sequence[str], shifts: Mapping[Edge, _Weighed], total: float, known_by: float
 ) -> dict[str, Moved]:
     """The two sensors that explain what none does alone; empty where no two do, or not clearly these."""
     freedom = 6 * len(shifts) - 12
@@ -161,7 +181,7 @@ def _two(
     }
 
 
-def _shares[Who: (str, tuple[str, str])](cost: Mapping[Who, float]) -> dict[Who, float]:
+def _shares(cost: Mapping[_Who, float]) -> dict[_Who, float]:
     """Probabilities of explanations by their chi-squared, none likelier than another before."""
     least = min(cost.values())
     share = {who: float(np.exp(-0.5 * (c - least))) for who, c in cost.items()}
@@ -178,28 +198,31 @@ def _explains(cost: float, total: float, freedom: int, known_by: float) -> bool:
 
 
 def _fit(
-    moving: Sequence[str], shifts: Mapping[Edge, PairShift]
+    moving: Sequence[str], shifts: Mapping[Edge, _Weighed]
 ) -> tuple[float, Float[np.ndarray, " P"], Float[np.ndarray, "P P"]]:
     """Chi-squared, motions and covariance of the best motions of some sensors, six numbers each."""
     size = 6 * len(moving)
     information, moment, total = np.zeros((size, size)), np.zeros(size), 0.0
     for edge, shift in shifts.items():
-        H, W = _design(moving, edge, shift.T), np.linalg.inv(shift.covariance)
-        information += H.T @ W @ H
-        moment += H.T @ W @ shift.xi
-        total += float(shift.xi @ W @ shift.xi)
+        total += shift.square
+        if edge.parent.name in moving or edge.child.name in moving:
+            H = _design(moving, edge, shift)
+            information += H.T @ shift.W @ H
+            moment += H.T @ shift.W @ shift.xi
     # Two sensors that share their only edge cannot be told apart: the least motion of both.
-    covariance = np.linalg.inv(information) if len(moving) == 1 else np.linalg.pinv(information, hermitian=True)
+    covariance = (
+        np.linalg.inv(information) if len(moving) == 1 else np.linalg.pinv(information, hermitian=True)
+    )
     motion = covariance @ moment
     return total - float(moment @ motion), motion, covariance
 
 
-def _design(moving: Sequence[str], edge: Edge, T: np.ndarray) -> Float[np.ndarray, "6 P"]:
+def _design(moving: Sequence[str], edge: Edge, shift: _Weighed) -> Float[np.ndarray, "6 P"]:
     """d(xi of the edge)/d(motions of sensors in their own axes)."""
     H = np.zeros((6, 6 * len(moving)))
     for k, name in enumerate(moving):
         if name == edge.child.name:
-            H[:, 6 * k : 6 * k + 6] = adjoint(T)
+            H[:, 6 * k : 6 * k + 6] = shift.adjoint
         elif name == edge.parent.name:
             H[:, 6 * k : 6 * k + 6] = -np.eye(6)
     return H

@@ -20,7 +20,7 @@ def target_jacobian(
     pair: str, T: Float[np.ndarray, "4 4"], targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS
 ) -> Float[np.ndarray, "2 N 6"]:
     """d(azimuth, elevation of each target) / d(left perturbation of T) [rad per rad and m]."""
-    angles = to_spherical if pair == "lidar_radar" else camera_direction_angles
+    angles = camera_direction_angles if pair.startswith("camera") else to_spherical
     points = transform_points(T, targets)
     columns = []
     for steps in _nudges():

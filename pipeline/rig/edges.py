@@ -13,7 +13,7 @@ from jaxtyping import Int
 from pipeline.rig.graph import EDGE_KINDS, Edge, Kind, Sensor
 from schemas.calibrations import FRAMES_OF_PAIR
 
-__all__ = ["EDGE_OF_PAIR", "edge_named", "edge_order", "edges_of_rows"]
+__all__ = ["EDGE_OF_PAIR", "edge_named", "edge_order", "edges_of_rows", "words_of"]
 
 _COLUMNS: Final = ("pair", "parent_frame", "child_frame")
 
@@ -44,6 +44,11 @@ EDGE_OF_PAIR: Final[Mapping[str, Edge]] = {
 def edge_order(edge: Edge) -> tuple[int, str, str]:
     """Key to sort edges by: kinds in the order of EDGE_KINDS, then names."""
     return EDGE_KINDS.index(edge.kind), edge.parent.name, edge.child.name
+
+
+def words_of(edge: Edge) -> str:
+    """An edge in sentences: its kind where its sensors are called by their kinds, else their names."""
+    return edge.kind if edge == EDGE_OF_PAIR.get(edge.kind) else edge.name
 
 
 def edges_of_rows(rows: pa.Table) -> tuple[tuple[Edge, ...], Int[np.ndarray, " N"]]:

@@ -12,6 +12,7 @@ from pipeline.audit import estimates
 from pipeline.audit.days import PairDays
 from pipeline.audit.estimates import COLUMNS, estimates_of
 from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse, to_quaternion
+from pipeline.rig.graph import Edge
 from pipeline.store.rows import to_table
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 
@@ -69,7 +70,7 @@ def vehicle_records(
     return records
 
 
-def days_of(records: list[CalibrationRecord], held_sigma_factor: float) -> dict[str, PairDays]:
+def days_of(records: list[CalibrationRecord], held_sigma_factor: float) -> dict[Edge, PairDays]:
     """Records of one vehicle as the audit charts them."""
     table = to_table(records, CALIBRATIONS)
     for name in COLUMNS:

@@ -1,5 +1,6 @@
 """Which sensor moved: motions of one sensor, built by SE(3) algebra, with noise."""
 
+import contextlib
 from dataclasses import replace
 from types import ModuleType
 
@@ -7,21 +8,26 @@ import numpy as np
 import pytest
 
 from pipeline.audit.days import PairDays
-from pipeline.audit.vehicle import independent_pairs
+from pipeline.audit.vehicle import independent_edges
 from pipeline.extrinsics.attribution import PairShift, attribute, pair_shift
-from pipeline.geometry.se3 import adjoint, exp_se3, inverse, log_se3
+from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse, log_se3
+from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.rig.graph import BASE, Edge, Sensor, edge_between
 
+CAMERA_LIDAR, CAMERA_RADAR, LIDAR_RADAR = (
+    EDGE_OF_PAIR[p] for p in ("camera_lidar", "camera_radar", "lidar_radar")
+)
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])  # a turned bracket: yaw and a little sideways
 
 
-def _days(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[str, PairDays]:
+def _days(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[Edge, PairDays]:
     rng = np.random.default_rng(seed)
     return maker.days_of(maker.vehicle_records("v", 4, rng, motion=lambda day: moved if day > 1 else {}), 2.0)
 
 
-def _shifts(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[str, PairShift]:
+def _shifts(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[Edge, PairShift]:
     days, is_after = _days(maker, moved, seed), np.array([0, 0, 1, 1], bool)
-    own = independent_pairs(days, days["camera_lidar"].day)
+    own = independent_edges(days, days[CAMERA_LIDAR].day)
     return {pair: pair_shift(d.origin, d.change, d.spread, is_after) for pair, d in own.items()}
 
 
@@ -39,8 +45,9 @@ def test_the_moved_sensor_is_named_with_its_motion_in_its_own_axes(
         assert found.sensor in (sensor, None)
         if found.sensor == sensor:
             named += 1
-            error = found.motion - twist
-            normalised.append(error @ np.linalg.solve(found.covariance, error))
+            moved = found.moved[sensor]
+            error = moved.motion - twist
+            normalised.append(error @ np.linalg.solve(moved.covariance, error))
     assert named >= 57
     assert 4.5 < np.mean(normalised) < 7.5  # chi-squared with 6 degrees of freedom
 
@@ -74,15 +81,15 @@ def test_a_scale_that_few_days_told_does_not_hide_who_moved(maker: ModuleType) -
 
 def test_one_pair_alone_cannot_tell(maker: ModuleType) -> None:
     shifts = _shifts(maker, {"radar": KNOCK}, 0)
-    assert attribute({"lidar_radar": shifts["lidar_radar"]}).sensor is None
+    assert attribute({LIDAR_RADAR: shifts[LIDAR_RADAR]}).sensor is None
 
 
 def test_a_composed_pair_is_not_counted_as_a_third_witness(maker: ModuleType) -> None:
     days = _days(maker, {"radar": KNOCK}, 0)
-    last = days["camera_lidar"].day
-    assert set(independent_pairs(days, last)) == {"camera_lidar", "lidar_radar"}
-    own = replace(days["camera_radar"], T=exp_se3(np.full(6, 1e-3)) @ days["camera_radar"].T)
-    assert len(independent_pairs(days | {"camera_radar": own}, last)) == 3
+    last = days[CAMERA_LIDAR].day
+    assert set(independent_edges(days, last)) == {CAMERA_LIDAR, LIDAR_RADAR}
+    own = replace(days[CAMERA_RADAR], T=exp_se3(np.full(6, 1e-3)) @ days[CAMERA_RADAR].T)
+    assert len(independent_edges(days | {CAMERA_RADAR: own}, last)) == 3
 
 
 def test_a_mean_of_days_that_err_alike_is_as_unsure_as_it_is() -> None:
@@ -101,7 +108,7 @@ def test_a_mean_of_days_that_err_alike_is_as_unsure_as_it_is() -> None:
     assert 0.8 < scatter / predicted < 1.0
 
 
-def test_three_independent_pairs_agree_on_the_sensor() -> None:
+def test_three_independent_edges_agree_on_the_sensor() -> None:
     rng = np.random.default_rng(1)
     T_cl, T_lr = exp_se3(rng.normal(size=6)), exp_se3(rng.normal(size=6))
     T = {"camera_lidar": T_cl, "lidar_radar": T_lr, "camera_radar": exp_se3(np.full(6, 1e-3)) @ T_cl @ T_lr}
@@ -110,6 +117,142 @@ def test_three_independent_pairs_agree_on_the_sensor() -> None:
     for pair in ("lidar_radar", "camera_radar"):
         xi[pair] = log_se3(T[pair] @ exp_se3(KNOCK) @ inverse(T[pair]))
         np.testing.assert_allclose(xi[pair], adjoint(T[pair]) @ KNOCK, atol=1e-9)
-    found = attribute({p: PairShift(T[p], xi[p], cov) for p in T})
+    found = attribute({EDGE_OF_PAIR[p]: PairShift(T[p], xi[p], cov) for p in T})
     assert found.sensor == "radar"
-    np.testing.assert_allclose(found.motion, KNOCK, atol=1e-9)
+    np.testing.assert_allclose(found.moved["radar"].motion, KNOCK, atol=1e-9)
+
+
+# -- rigs of many sensors ----------------------------------------------------------------------------
+
+# Sigmas of an edge's shift between the days before a change and those after it, in its parent's axes [deg, m]: what
+# some days of each kind of edge give. What a kind does not show is as unsure as a prior.
+UNSURE_DEG, UNSURE_M = 2.0, 0.1
+SHIFT_SIGMAS = {
+    "camera_lidar": ([0.03, 0.03, 0.05], [0.03, 0.03, 0.05]),
+    "camera_radar": ([0.3, 0.08, UNSURE_DEG], [UNSURE_M] * 3),
+    "lidar_radar": ([UNSURE_DEG, 0.4, 0.05], [UNSURE_M] * 3),
+    "lidar_lidar": ([0.03, 0.03, 0.03], [0.02, 0.02, 0.02]),
+    "lidar_base": ([0.05, 0.05, 0.1], [UNSURE_M, UNSURE_M, 0.02]),
+    "radar_base": ([UNSURE_DEG, 0.4, 0.1], [UNSURE_M] * 3),
+}
+# Axes as cameras have them, seen from bodies' axes.
+R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+class Rig:
+    """A random rig of eight sensors, and what its edges show of motions."""
+
+    def __init__(self, rng, *, edges=16, with_base=False):
+        kinds = ["lidar", "lidar", *rng.choice(["camera", "radar"], 6)]
+        self.sensors = [Sensor(f"s{i}", str(kind)) for i, kind in enumerate(kinds)]
+        self.sensors += [BASE] if with_base else []
+        self.T = {s.name: self._pose(s, rng) for s in self.sensors}
+        possible = []
+        for i, b in enumerate(self.sensors):
+            for a in self.sensors[:i]:
+                with contextlib.suppress(ValueError):  # two cameras, two radars, a camera and base
+                    possible.append(edge_between(a, b))
+        # Each sensor on the first lidar, then others.
+        tree = [e for e in possible if "s0" in (e.parent.name, e.child.name)]
+        rest = [e for e in possible if e not in tree]
+        chosen = rng.permutation(len(rest))[: max(edges - len(tree), 0)]
+        self.edges = [*tree, *(rest[i] for i in chosen)]
+
+    def _pose(self, sensor, rng):
+        """Upright, looking anywhere, within two metres."""
+        yaw = exp_se3(np.r_[0, 0, rng.uniform(-3, 3), rng.uniform(-2, 2, 3)])
+        R = R_BODY_CAMERA if sensor.kind == "camera" else np.eye(3)
+        return yaw @ from_rotation_translation(R, np.zeros(3))
+
+    def degree(self, name):
+        return sum(name in (e.parent.name, e.child.name) for e in self.edges)
+
+    def shifts(self, moved, rng):
+        found = {}
+        for edge in self.edges:
+            T = inverse(self.T[edge.parent.name]) @ self.T[edge.child.name]
+            rotation, shift = SHIFT_SIGMAS[edge.kind]
+            covariance = np.diag(np.r_[np.radians(rotation), shift] ** 2)
+            xi = rng.multivariate_normal(np.zeros(6), covariance)
+            xi += adjoint(T) @ moved.get(edge.child.name, np.zeros(6))
+            xi -= moved.get(edge.parent.name, np.zeros(6))
+            found[edge] = PairShift(T, xi, covariance)
+        return found
+
+
+def knock(rng, sensor):
+    """Half a degree about any axis; of a radar, which measures azimuth alone well, yaw."""
+    axis = np.array([0.0, 0.0, 1.0]) if sensor.kind == "radar" else rng.normal(size=3)
+    return np.r_[np.radians(0.5) * axis / np.linalg.norm(axis), np.zeros(3)]
+
+
+def test_of_eight_sensors_the_one_that_was_knocked_is_named_and_no_other():
+    rng, right, wrong, asked = np.random.default_rng(31), 0, [], 0
+    for _ in range(60):
+        rig = Rig(rng)
+        for sensor in (s for s in rig.sensors if rig.degree(s.name) >= 3):
+            found = attribute(rig.shifts({sensor.name: knock(rng, sensor)}, rng))
+            asked += 1
+            right += found.sensor == sensor.name
+            wrong += [found.sensor] if found.sensor not in (sensor.name, None) else []
+    assert asked > 200
+    assert right / asked >= 0.95
+    assert not wrong
+
+
+@pytest.mark.parametrize("is_hub", [True, False])
+def test_a_hub_and_a_leaf_of_one_edge_are_never_taken_for_each_other(is_hub):
+    rng = np.random.default_rng(32)
+    for _ in range(200):
+        rig = Rig(rng, edges=7)  # a star: all but s0 are leaves
+        hub, leaf = rig.sensors[0], rig.sensors[int(rng.integers(1, 8))]
+        moved, other = (hub, leaf) if is_hub else (leaf, hub)
+        found = attribute(rig.shifts({moved.name: knock(rng, moved)}, rng))
+        assert found.probability[other.name] < 0.01
+
+
+def test_a_leaf_and_the_only_sensor_that_it_meets_are_not_told_apart():
+    rng = np.random.default_rng(33)
+    shifts = Rig(rng, edges=7).shifts({}, rng)
+    alone = Edge(Sensor("rear", "camera"), Sensor("tail", "lidar"))
+    shifts[alone] = PairShift(exp_se3(rng.normal(size=6)), np.r_[0.01, np.zeros(5)], np.eye(6) * 1e-7)
+    found = attribute(shifts)
+    assert found.sensor is None
+    assert found.explanation == "cannot tell rear from tail"
+
+
+def test_a_vehicle_frame_that_moved_against_all_sensors_is_told_from_a_reference_that_moved():
+    rng, named = np.random.default_rng(34), []
+    for _ in range(100):
+        rig = Rig(rng, edges=14, with_base=True)
+        for name in ("base", "s0"):
+            found = attribute(rig.shifts({name: np.array([0, np.radians(0.5), 0, 0, 0, 0])}, rng))
+            assert found.sensor in (name, None)
+            named.append(found.sensor == name)
+    assert np.mean(named) >= 0.95
+
+
+def test_two_sensors_that_moved_at_once_are_both_named_with_their_motions():
+    rng, right, normalised = np.random.default_rng(35), 0, []
+    for _ in range(100):
+        rig = Rig(rng)
+        able = [s for s in rig.sensors if s.kind != "radar" and rig.degree(s.name) >= 2]
+        moved = {able[i].name: knock(rng, able[i]) for i in rng.permutation(len(able))[:2]}
+        found = attribute(rig.shifts(moved, rng))
+        right += set(found.moved) == {*moved}
+        for name in {*found.moved} & {*moved}:
+            error = found.moved[name].motion - moved[name]
+            normalised.append(error @ np.linalg.solve(found.moved[name].covariance, error))
+    assert right >= 95
+    assert 4.5 < np.mean(normalised) < 7.5
+
+
+def test_an_edge_shows_the_one_of_two_moved_sensors_that_is_its_end():
+    rng = np.random.default_rng(36)
+    rig = Rig(rng)
+    names = {"s0", "s1"}
+    found = attribute(rig.shifts({name: knock(rng, rig.sensors[0]) for name in names}, rng))
+    assert set(found.moved) == names
+    for edge in rig.edges:
+        ends = {edge.parent.name, edge.child.name}
+        assert found.on(edge) in (names & ends or names)

@@ -8,15 +8,17 @@ import pytest
 from pipeline.audit import history
 from pipeline.audit.estimates import day_name
 from pipeline.audit.references import read_kept
+from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records, read_records
 from pipeline.work import Task, Window
-from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.service_events import ServiceEvent
 from schemas.states import STATES, StateRow
 from tests.audit.test_audit_fleet import KNOCK, _day, _fleet
 
+CAMERA_LIDAR = EDGE_OF_PAIR["camera_lidar"]
 DAYS = 60
 LAST = DAYS - 1
 
@@ -92,8 +94,8 @@ def without_states(bare, tmp_path):
 
 def test_states_keep_the_first_accepted_days_and_from_the_tenth_on_what_they_make(lake):
     found = kept(lake)
-    assert set(found) == {(v, p) for v in "abc" for p in range(len(PAIRS))}
-    a, c = found["a", 0], found["c", 0]
+    assert set(found) == {(v, edge) for v in "abc" for edge in EDGE_OF_PAIR.values()}
+    a, c = (found[v, CAMERA_LIDAR] for v in "ac")
     assert a.days == tuple(_day(d) for d in range(12) if d % 7 != 3)
     assert [day_name(d) for d in a.reference.days] == list(a.days)
     assert (c.days, c.reference) == (tuple(_day(d) for d in range(54, LAST)), None)
@@ -102,7 +104,9 @@ def test_states_keep_the_first_accepted_days_and_from_the_tenth_on_what_they_mak
 def test_what_is_kept_no_longer_counts_after_a_service_event_another_setting_or_another_record(lake):
     assert kept(lake, count=9) == {}
     event = ServiceEvent(vehicle="a", day=_day(20), sensor="radar", kind="re-mount")
-    assert {p for v, p in kept(lake, [event]) if v == "a"} == {0}  # camera_lidar has nothing to do with it
+    assert {p for v, p in kept(lake, [event]) if v == "a"} == {
+        CAMERA_LIDAR
+    }  # which has nothing to do with it
     old = next(r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="a", day=_day(2)))
     commit_records(lake, CALIBRATIONS, [replace(old, work_key="again", recorded_at="", asserted_at="")])
     assert {v for v, _ in kept(lake)} == {"b", "c"}
@@ -117,4 +121,4 @@ def test_the_states_of_every_night_keep_the_same_reference(lake):
         if own.reference is not None:
             np.testing.assert_array_equal(after[key].reference.spread, own.reference.spread)
             np.testing.assert_allclose(after[key].reference.T, own.reference.T, atol=1e-15)
-    assert len(after["c", 0].days) == len(before["c", 0].days) + 1
+    assert len(after["c", CAMERA_LIDAR].days) == len(before["c", CAMERA_LIDAR].days) + 1

@@ -27,7 +27,9 @@ from pipeline.audit.status import decide_status
 from pipeline.audit.vehicle import VehicleVerdict, judge_fleet, limit_of
 from pipeline.config import AuditConfig
 from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse
-from schemas.calibrations import FRAMES_OF_PAIR, PAIRS
+from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.rig.graph import Edge
+from schemas.calibrations import PAIRS
 from schemas.drift import DriftFinding, VehicleStatus
 from tests.benchmarks.studies.commits import commit_now
 
@@ -106,10 +108,10 @@ class Vehicle:
     served: int = 0
     frozen: dict[str, Reference] = field(default_factory=dict)
 
-    def tonight(self, night: int, config: AuditConfig) -> dict[str, PairDays]:
+    def tonight(self, night: int, config: AuditConfig) -> dict[Edge, PairDays]:
         """What the audit looks at on a night."""
         first = night - config.window_days + 1
-        return {pair: self._charted(pair, first, night, config) for pair in self.pairs}
+        return {EDGE_OF_PAIR[pair]: self._charted(pair, first, night, config) for pair in self.pairs}
 
     def _charted(self, pair: str, first: int, night: int, config: AuditConfig) -> PairDays:
         days = self.pairs[pair]
@@ -213,13 +215,13 @@ def _held(covariance: np.ndarray, common: np.ndarray, accepted: np.ndarray) -> n
 def status_of_night(verdict: VehicleVerdict, config: AuditConfig) -> VehicleStatus:
     """The vehicle's status as the audit decides it from its rows."""
     rows = []
-    for (pair, dof), chart in verdict.charts.items():
+    for (edge, dof), chart in verdict.charts.items():
         change, moved = chart.change, verdict.attribution
         rows.append(
             DriftFinding(
-                vehicle="v", day="", method="joint", pair=pair, parent_frame=FRAMES_OF_PAIR[pair][0],
-                child_frame=FRAMES_OF_PAIR[pair][1], dof=dof, status=chart.status,
-                reason=chart.reason, days_used=chart.days_used, limit=limit_of(pair, dof, config),
+                vehicle="v", day="", method="joint", pair=edge.kind, parent_frame=edge.parent.name,
+                child_frame=edge.child.name, dof=dof, status=chart.status,
+                reason=chart.reason, days_used=chart.days_used, limit=limit_of(edge, dof, config),
                 statistic=chart.statistic, threshold=chart.threshold,
                 start_day=None if change is None else str(change.day),
                 kind=None if change is None else change.kind,

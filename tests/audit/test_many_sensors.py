@@ -1,0 +1,118 @@
+"""Audit and state of rigs of many sensors: charts by edge, sensors by name."""
+
+import numpy as np
+import pytest
+
+from pipeline.config import load_fleet
+from pipeline.stages import AUDIT, STATE
+from pipeline.store.partitions import Lake
+from pipeline.store.records import commit_records, read_records
+from pipeline.work import Task, Window
+from schemas.calibrations import CALIBRATIONS
+from schemas.drift import DriftFinding
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.states import STATES, StateRow
+from tests.audit.fleet_records import vehicle_records
+from tests.makers.rig_records import EDGES, T_of, rig_records
+
+RIGS = """
+[fleet]
+name = "vans"
+[rigs.van.prior]
+source = "tf_static"
+[rigs.van.cameras.front]
+image = "/front"
+info = "/front_info"
+[rigs.van.cameras.left]
+image = "/left"
+info = "/left_info"
+[rigs.van.lidars.top]
+points = "/top"
+[rigs.van.radars.bumper]
+points = "/bumper"
+[rigs.van.radars.corner]
+points = "/corner"
+[vehicles."*"]
+rig = "van"
+[vehicles.new]
+rig = "van"
+"""
+TURN = np.array([0.0, np.radians(0.5), 0.0, 0.0, 0.0, 0.0])
+EDGE_NAMES = {(e.parent.name, e.child.name) for e in EDGES}
+
+
+@pytest.fixture
+def fleet(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text(RIGS)
+    return load_fleet(path)
+
+
+def audited(fleet, lake, rows):
+    commit_records(lake, CALIBRATIONS, rows)
+    found = AUDIT.run(Task(fleet, lake, Window())).records
+    by_vehicle: dict[str, list[DriftFinding]] = {}
+    for finding in found:
+        by_vehicle.setdefault(finding.vehicle, []).append(finding)
+    return by_vehicle
+
+
+@pytest.fixture
+def lake(tmp_path):
+    return Lake.at(tmp_path / "lake")
+
+
+def edge(finding):
+    return finding.parent_frame, finding.child_frame
+
+
+@pytest.mark.parametrize("sensor", ["left", "front", "corner", "top"])
+def test_the_sensor_that_moved_is_named_among_five_and_its_edges_alone_alarm(fleet, lake, sensor):
+    turn = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.0, 0.0]) if sensor == "corner" else TURN
+    rng = np.random.default_rng(4)
+    moved = rig_records("a", 12, rng, motion=lambda day: {sensor: turn} if day > 6 else {})
+    found = audited(fleet, lake, moved + rig_records("b", 12, rng))
+    alarms = [f for f in found["a"] if f.status == "RED"]
+    assert {f.moved_sensor for f in alarms} == {f.vehicle_sensor for f in found["a"]} == {sensor}
+    assert {f.vehicle_since for f in found["a"]} == {"2026-03-08"}
+    assert all(sensor in edge(f) for f in alarms)
+    assert {f.vehicle_status for f in found["b"]} == {"GREEN"}
+    assert {edge(f) for f in found["b"]} == EDGE_NAMES
+
+
+def test_two_cameras_that_moved_are_each_named_on_their_own_edges(fleet, lake):
+    rng = np.random.default_rng(5)
+    both = {"left": TURN, "front": -1.5 * TURN}
+    found = audited(fleet, lake, rig_records("a", 12, rng, motion=lambda day: both if day > 6 else {}))
+    alarms = [f for f in found["a"] if f.status == "RED"]
+    assert {(f.parent_frame, f.moved_sensor) for f in alarms} == {("left", "left"), ("front", "front")}
+    assert all("the front and the left moved, each for itself" in f.reason for f in alarms)
+
+
+def test_a_service_of_one_sensor_begins_the_charts_of_its_edges_anew(fleet, lake):
+    event = ServiceEvent(vehicle="a", day="2026-03-06", sensor="left", kind="re-mount")
+    commit_records(lake, SERVICE_EVENTS, [event])
+    found = audited(fleet, lake, rig_records("a", 12, np.random.default_rng(6)))
+    days = {edge(f): f.days_used for f in found["a"]}
+    assert days == {e: 6 if "left" in e else 12 for e in EDGE_NAMES}
+
+
+def test_vehicles_of_different_rigs_are_charted_side_by_side(fleet, lake):
+    rng = np.random.default_rng(7)
+    rows = rig_records("a", 8, rng) + vehicle_records("old", 8, rng)
+    found = audited(fleet, lake, rows)
+    assert {edge(f) for f in found["a"]} == EDGE_NAMES
+    assert {edge(f) for f in found["old"]} == {("camera", "lidar"), ("camera", "radar"), ("lidar", "radar")}
+    assert {f.vehicle_status for f in found["new"]} == {"UNKNOWN"}  # it has no record
+
+
+def test_a_state_is_written_for_every_edge(fleet, lake):
+    commit_records(lake, CALIBRATIONS, rig_records("a", 6, np.random.default_rng(8)))
+    STATE.run(Task(fleet, lake, Window()))
+    states = {(s.parent_frame, s.child_frame): s for s in read_records(lake, STATES, StateRow)}
+    assert states.keys() == EDGE_NAMES
+    for own in EDGES:
+        state = states[own.parent.name, own.child.name]
+        sigma = np.sqrt(np.diag(state.covariance)[3:])
+        assert np.all(np.abs([state.tx_m, state.ty_m, state.tz_m] - T_of(own)[:3, 3]) < 4 * sigma)
+        assert (state.pair, len(state.days)) == (own.kind, 6)

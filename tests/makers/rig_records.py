@@ -1,0 +1,74 @@
+"""Calibration records of a rig of five sensors, made by SE(3) algebra with noise of known covariance."""
+
+import datetime as dt
+
+import numpy as np
+
+from pipeline.geometry.se3 import exp_se3, from_rotation_translation, inverse, to_quaternion
+from pipeline.rig.edges import edge_named
+from schemas.calibrations import CalibrationRecord
+
+FIRST_DAY = dt.date(2026, 3, 1)
+EDGES = (
+    edge_named("camera_lidar", "front", "top"),
+    edge_named("camera_lidar", "left", "top"),
+    edge_named("camera_radar", "front", "bumper"),
+    edge_named("lidar_radar", "top", "bumper"),
+    edge_named("lidar_radar", "top", "corner"),
+)
+_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_body_camera
+_LEFTWARDS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+T_TOP = {
+    "top": np.eye(4),
+    "front": from_rotation_translation(_OPTICAL, np.array([0.4, 0.1, -0.3])),
+    "left": from_rotation_translation(_LEFTWARDS @ _OPTICAL, np.array([0.1, 0.6, -0.4])),
+    "bumper": from_rotation_translation(np.eye(3), np.array([2.1, 0.0, -1.2])),
+    "corner": from_rotation_translation(_LEFTWARDS, np.array([1.8, 0.8, -1.1])),
+}
+# One day's sigmas [deg, m] along the parent's axes.
+_SIGMAS = {
+    "camera_lidar": np.array([0.02, 0.02, 0.03, 0.02, 0.02, 0.02]),
+    "camera_radar": np.array([0.15, 0.06, 0.5, 0.05, 0.1, 0.05]),
+    "lidar_radar": np.array([0.5, 0.15, 0.04, 0.05, 0.05, 0.1]),
+}
+
+
+def covariance_of(edge):
+    """One day's."""
+    sigmas = _SIGMAS[edge.kind].copy()
+    sigmas[:3] = np.radians(sigmas[:3])
+    return np.diag(sigmas**2)
+
+
+def T_of(edge, moved=None):
+    """T_parent_child, each sensor moved in its own axes."""
+    a, b = (T_TOP[s.name] @ exp_se3((moved or {}).get(s.name, np.zeros(6))) for s in edge.sensors)
+    return inverse(a) @ b
+
+
+def rig_records(vehicle, days, rng, *, motion=lambda _day: {}, edges=EDGES):
+    """Accepted records of every edge and day; `motion(day)`: each sensor's motion so far, own axes."""
+    return [
+        record_of(vehicle, day, edge, exp_se3(_noise(edge, rng)) @ T_of(edge, motion(day)))
+        for day in range(days)
+        for edge in edges
+    ]
+
+
+def record_of(vehicle, day, edge, T):
+    q, q_prior, T_prior = to_quaternion(T), to_quaternion(T_of(edge)), T_of(edge)
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    return CalibrationRecord(
+        vehicle=vehicle, day=(FIRST_DAY + dt.timedelta(days=day)).isoformat(), method="joint", pair=edge.kind,
+        parent_frame=edge.parent.name, child_frame=edge.child.name, status="accepted", reason="", seed=0,
+        code_version="0.11.0", work_key=f"{vehicle}-{day}", frames_total=120, frames_used=80, environment="urban",
+        **dict(zip(names, (*q.tolist(), *T[:3, 3].tolist()), strict=True)),
+        **{f"prior_{n}": v for n, v in zip(names, (*q_prior.tolist(), *T_prior[:3, 3].tolist()), strict=True)},
+        prior_covariance=np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3), covariance=covariance_of(edge),
+        common_covariance=0.1 * covariance_of(edge), observability=[0.97] * 6, observable=[True] * 6,
+        determined=["azimuth", "elevation"],
+    )  # fmt: skip
+
+
+def _noise(edge, rng):
+    return rng.multivariate_normal(np.zeros(6), covariance_of(edge))
