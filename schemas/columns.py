@@ -109,7 +109,7 @@ class TableSchema:
     # last is current; work_key tells them apart. Empty: a table of partitions that are replaced as a whole.
     about: tuple[str, ...] = ()
     # Of a column that older releases did not write: the column that it follows from, and its value by that one's.
-    follows: Mapping[str, tuple[str, Mapping[str, str]]] = field(default_factory=dict)
+    follows: Mapping[str, tuple[str, Mapping[str, str]]] = field(default_factory=dict, hash=False)
 
     @property
     def is_record_table(self) -> bool:
