@@ -133,7 +133,7 @@ def _propagated(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, sd
 
 
 def _mean_error(pair: str, points: np.ndarray, true: np.ndarray) -> np.ndarray:
-    if pair == "lidar_radar":
+    if not pair.startswith("camera"):
         difference = to_spherical(points) - to_spherical(true)
         angles, distance = difference[:, :2], difference[:, 2]
     else:

@@ -40,6 +40,9 @@ NEEDED_AXES: Mapping[str, tuple[str, ...]] = {
     "camera_lidar": ("azimuth", "elevation"),
     "camera_radar": ("azimuth",),
     "lidar_radar": ("azimuth",),
+    "lidar_lidar": ("azimuth", "elevation"),
+    "lidar_base": ("azimuth", "elevation"),
+    "radar_base": ("azimuth",),
 }
 
 
@@ -57,9 +60,13 @@ class AxisLimits:
 
 @dataclass(frozen=True)
 class AxisCheck:
-    """One axis of one pair; angles [rad] are nan where the log gives no estimate."""
+    """One axis of one pair; angles [rad] are nan where the log gives no estimate.
+
+    `pair` is the pair's kind, or names of its sensors where they are called otherwise.
+    """
 
     pair: str
+    kind: str
     axis: str
     status: str  # pass, warn, fail or inconclusive
     reason: str
@@ -75,14 +82,16 @@ def limits_of(pair: str, verify: VerifyConfig, asked_deg: tuple[float, float]) -
     """What is judged of a pair: azimuth and elevation, and the camera's roll beside the lidar.
 
     Args:
-        pair: which one.
+        pair: kind of it.
         verify: from where on an error matters, and the confidence.
         asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go unseen.
     """
-    has_radar = pair.endswith("radar")
+    has_radar = "radar" in pair
     azimuth = verify.radar_limit_deg if has_radar else verify.camera_lidar_limit_deg
     elevation = verify.radar_elevation_limit_deg if has_radar else verify.camera_lidar_limit_deg
-    limits = {"azimuth": azimuth, "elevation": elevation} | ({} if has_radar else {"roll": azimuth})
+    limits = {"azimuth": azimuth, "elevation": elevation} | (
+        {"roll": azimuth} if pair == "camera_lidar" else {}
+    )
     asked_rad = float(np.radians(asked_deg[has_radar]))
     return {
         axis: AxisLimits(float(np.radians(deg)), asked_rad, verify.confidence) for axis, deg in limits.items()
@@ -94,16 +103,16 @@ def check_axes(record: CalibrationRecord, limits: Mapping[str, AxisLimits]) -> l
     in_use, found = prior_of(record), transform_of(record)
     blocked = _why_not(record)
     if in_use is None or found is None or record.covariance is None:
-        return [_silent(record.pair, axis, of, blocked or record.reason) for axis, of in limits.items()]
+        return [_silent(record, axis, of, blocked or record.reason) for axis, of in limits.items()]
     off = _off(record.pair, in_use, found, np.asarray(record.covariance), targets_of(record))
-    return [_checked(record.pair, axis, limits[axis], *off[axis], blocked) for axis in limits if axis in off]
+    return [_checked(record, axis, limits[axis], *off[axis], blocked) for axis in limits if axis in off]
 
 
 def answer_of(checks: Sequence[AxisCheck]) -> str:
     """Of all pairs: "wrong" where an axis fails, "right" where all that the pairs are good for passes or warns."""
     if any(c.status == "fail" for c in checks):
         return "wrong"
-    needed = [c for c in checks if c.axis in NEEDED_AXES[c.pair]]
+    needed = [c for c in checks if c.axis in NEEDED_AXES[c.kind]]
     return "right" if needed and all(c.status in {"pass", "warn"} for c in needed) else "inconclusive"
 
 
@@ -126,14 +135,16 @@ def _off(
 
 
 def _checked(
-    pair: str, axis: str, limits: AxisLimits, off_rad: float, sigma_rad: float, blocked: str
+    record: CalibrationRecord, axis: str, limits: AxisLimits, off_rad: float, sigma_rad: float, blocked: str
 ) -> AxisCheck:
     threshold = max(limits.limit_rad, CONTRADICTION_SIGMAS * sigma_rad)
     power = float(ndtr((limits.asked_rad - threshold) / sigma_rad))
     shown = threshold + _SHOWN_SIGMAS * sigma_rad
     status, reason = _status(off_rad, sigma_rad, limits, power, blocked)
     numbers = (off_rad, sigma_rad, limits.limit_rad, limits.asked_rad)
-    return AxisCheck(pair, axis, status, reason, *numbers, 0.0 if blocked else power, shown)
+    return AxisCheck(
+        _pair(record), record.pair, axis, status, reason, *numbers, 0.0 if blocked else power, shown
+    )
 
 
 def _status(
@@ -154,11 +165,17 @@ def _status(
     return "pass", distance
 
 
-def _silent(pair: str, axis: str, limits: AxisLimits, reason: str) -> AxisCheck:
+def _silent(record: CalibrationRecord, axis: str, limits: AxisLimits, reason: str) -> AxisCheck:
     nan = float("nan")
     return AxisCheck(
-        pair, axis, "inconclusive", reason, nan, nan, limits.limit_rad, limits.asked_rad, 0.0, nan
-    )
+        _pair(record), record.pair, axis, "inconclusive", reason, nan, nan, limits.limit_rad, limits.asked_rad,
+        0.0, nan,
+    )  # fmt: skip
+
+
+def _pair(record: CalibrationRecord) -> str:
+    kinds = record.pair == f"{record.parent_frame}_{record.child_frame}"
+    return record.pair if kinds else f"{record.parent_frame}-{record.child_frame}"
 
 
 def _why_not(record: CalibrationRecord) -> str:

@@ -63,7 +63,7 @@ def in_use_view(answer: str, checks: Sequence[Mapping[str, object]]) -> InUseVie
 def _row(check: Mapping[str, object]) -> AxisRow:
     status = str(check["status"])
     return AxisRow(
-        pair=str(check["pair"]).replace("_", "-"),
+        pair=_spoken(str(check["pair"]), str(check["kind"])),
         axis=str(check["axis"]),
         status=status,
         mood=_MOODS[status],
@@ -79,3 +79,8 @@ def _deg(angle_rad: object) -> str:
     if not isinstance(angle_rad, float) or not math.isfinite(angle_rad):
         return "unknown"
     return f"{np.degrees(angle_rad):.{_UNITS_SHOWN}f} deg"
+
+
+def _spoken(pair: str, kind: str) -> str:
+    """Kinds of sensors with a dash between them; names stay as they are."""
+    return pair.replace("_", "-") if pair == kind else pair

@@ -54,6 +54,19 @@ def test_an_error_beyond_chance_and_limit_fails_on_its_own_axis_alone():
     assert "0.50 deg off" in of_yaw["azimuth"].reason
 
 
+def test_sensors_that_have_names_are_told_apart_and_judged_by_their_kinds():
+    front = replace(record(0.5), parent_frame="front", child_frame="top")
+    assert {c.pair for c in check_axes(front, limits_of("camera_lidar", VerifyConfig(), ASKED_DEG))} == {
+        "front-top"
+    }
+    assert axes(front)["azimuth"].status == "fail"
+    level = replace(record(0.5, axis=2), pair="lidar_lidar", parent_frame="top", child_frame="nose")
+    level = replace(level, **columns(np.eye(4)), **columns(exp_se3(np.eye(6)[2] * 0.5 * DEG), "prior_"))
+    of_yaw = axes(level)
+    assert {axis: c.status for axis, c in of_yaw.items()} == {"azimuth": "fail", "elevation": "pass"}
+    assert answer_of(list(of_yaw.values())) == "wrong"
+
+
 def test_an_error_that_is_measured_but_does_not_matter_is_a_warning():
     assert axes(record(0.15, 0.03))["azimuth"].status == "warn"
 
