@@ -139,7 +139,7 @@ def test_vector_projection_agrees_with_the_point_by_point_one_and_marks_what_can
 
 
 def test_a_fisheye_is_projected_where_its_model_says_behind_the_camera_too():
-    camera = rig_named("fisheye").camera.nominal().scaled(0.5)
+    camera = rig_named("fisheye")["camera"].sheet.nominal().scaled(0.5)
     u, v = np.meshgrid(np.linspace(0, camera.width_px - 1, 33), np.linspace(0, camera.height_px - 1, 25))
     pixels = np.stack([u.ravel(), v.ravel()], -1)
     rays = camera.unproject(pixels)
