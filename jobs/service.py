@@ -17,7 +17,7 @@ def service(
     vehicle: str,
     day: str,
     kind: Literal["re-mount", "repair", "software release"],
-    sensor: Literal["camera", "lidar", "radar", "all"] = "all",
+    sensor: str = "all",
     note: str = "",
     withdraw: bool = False,
 ) -> int:
@@ -31,7 +31,7 @@ def service(
         vehicle: id of the vehicle; call it once for each.
         day: on which it was done, YYYY-MM-DD.
         kind: what was done.
-        sensor: which sensor; all = the whole vehicle.
+        sensor: name of the sensor, or base; all = the whole vehicle.
         note: for people.
         withdraw: this was noted by mistake: from the next audit on it counts no more.
     """
@@ -44,6 +44,7 @@ def service(
 
     tables, of = Lake.existing(lake), Partition(vehicle, day)
     _require_known(tables, of)
+    _require_sensor(tables, vehicle, sensor)
     noted = events_until(tables, None).get(vehicle, [])
     if withdraw and (day, sensor, kind) not in [(e.day, e.sensor, e.kind) for e in noted]:
         there = "; ".join(f"{e.kind} of {e.sensor} on {e.day}" for e in noted) or "none"
@@ -80,3 +81,16 @@ def _require_known(lake: Lake, of: Partition) -> None:
         like = get_close_matches(of.vehicle, sorted(known)) or sorted(known)[:5]
         problem = f"the lake has no day of {of.vehicle!r}; it has {', '.join(like) or 'no vehicle'}"
         raise ConfigError("command line", "vehicle", problem)
+
+
+def _require_sensor(lake: Lake, vehicle: str, sensor: str) -> None:
+    """Raise ConfigError for a sensor that no record of the vehicle is about."""
+    from pipeline.errors import ConfigError
+    from pipeline.store.records import read_columns
+    from schemas.calibrations import CALIBRATIONS
+
+    rows = read_columns(lake, CALIBRATIONS, (), first=None, last=None, vehicle=vehicle)
+    known = {n for c in ("parent_frame", "child_frame") for n in (rows[c].to_pylist() if rows else ())}
+    if known and sensor not in {"all", *known}:
+        problem = f"{vehicle} has no {sensor!r}; its records are about {', '.join(sorted(known))}"
+        raise ConfigError("command line", "sensor", problem)

@@ -11,7 +11,9 @@ if TYPE_CHECKING:
 
 __all__ = ["show"]
 
-Table = Literal["calibrations", "drift", "states", "outcomes", "service_events", "frames", "observations"]
+Table = Literal[
+    "calibrations", "poses", "drift", "states", "outcomes", "service_events", "frames", "observations"
+]
 
 
 def show(
@@ -24,7 +26,7 @@ def show(
     current: bool = False,
     json: bool = False,
 ) -> int:
-    """Show records (calibrations, drift, states, ...) or partitions (frames, observations).
+    """Show records (calibrations, poses, drift, states, ...) or partitions (frames, observations).
 
     Args:
         table: what to show.
@@ -32,10 +34,10 @@ def show(
         vehicle: only this vehicle.
         day: only this day, YYYY-MM-DD.
         method: only records of this method.
-        current: only the current record of each vehicle, day, method and pair; of drift, what the last audit said; of
-            events, those not withdrawn; of outcomes, all are.
+        current: only the current record of each vehicle, day, method and edge or sensor; of drift, what the
+            last audit said; of events, those not withdrawn; of outcomes, all are.
         json: print a JSON list and nothing else: oldest record first, names as the columns, and for
-            calibrations "T", the 4x4 row-major T_parent_child (null where the day was refused).
+            calibrations "T", the 4x4 row-major T_parent_child, for poses T_reference_sensor (null where refused).
     """
     from jobs.terminal.summary import left_out
     from pipeline.store.partitions import Lake
@@ -65,6 +67,7 @@ def _records(
     from pipeline.store.current import (
         current_drift,
         current_events,
+        current_poses,
         current_records,
         current_states,
         transform_of,
@@ -73,12 +76,14 @@ def _records(
     from schemas.calibrations import CalibrationRecord
     from schemas.drift import DriftFinding
     from schemas.outcomes import OutcomeRow
+    from schemas.poses import PoseRow
     from schemas.service_events import ServiceEvent
     from schemas.states import StateRow
     from schemas.versions import TABLES
 
     kinds: dict[str, tuple[type[Any], Callable[[list[Any]], list[Any]]]] = {
         "calibrations": (CalibrationRecord, current_records),
+        "poses": (PoseRow, current_poses),
         "drift": (DriftFinding, current_drift),
         "states": (StateRow, current_states),
         "outcomes": (OutcomeRow, list),
@@ -95,7 +100,7 @@ def _records(
     if table == "states":
         return state_rows(lake, chosen)
     shown = [{n: getattr(r, n) for n in names} for r in chosen]
-    if table == "calibrations":
+    if table in ("calibrations", "poses"):
         return [row | {"T": transform_of(r)} for row, r in zip(shown, chosen, strict=True)]
     return shown
 

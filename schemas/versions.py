@@ -11,6 +11,7 @@ from schemas.drift import DRIFT
 from schemas.frames import FRAMES
 from schemas.observations import OBSERVATIONS
 from schemas.outcomes import OUTCOMES
+from schemas.poses import POSES
 from schemas.service_events import SERVICE_EVENTS
 from schemas.states import STATES
 from schemas.training import TRAINING
@@ -21,7 +22,8 @@ __all__ = ["CODE_VERSION", "TABLES", "write_json_schemas"]
 CODE_VERSION = "0.10.0"
 
 TABLES: dict[str, TableSchema] = {
-    t.name: t for t in (FRAMES, OBSERVATIONS, TRAINING, CALIBRATIONS, DRIFT, STATES, OUTCOMES, SERVICE_EVENTS)
+    t.name: t
+    for t in (FRAMES, OBSERVATIONS, TRAINING, CALIBRATIONS, POSES, DRIFT, STATES, OUTCOMES, SERVICE_EVENTS)
 }
 
 

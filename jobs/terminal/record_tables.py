@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Any
 
@@ -29,6 +30,7 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
 
     cells = {
         "calibrations": _calibration_cells,
+        "poses": _pose_row_cells,
         "drift": _drift_cells,
         "states": _state_cells,
         "outcomes": _outcome_cells,
@@ -67,6 +69,21 @@ def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
     }
 
 
+def _pose_row_cells(row: dict[str, Any]) -> dict[str, str]:
+    def degrees(sigma_rad: float | None) -> str:
+        return "" if sigma_rad is None else f"{sigma_rad * 180 / math.pi:.3f}"
+
+    return {
+        **{name: row[name] for name in ("vehicle", "day", "method", "sensor", "reference", "status")},
+        **_pose_cells(row["T"], None, with_change=False),
+        "sigma azimuth [deg]": degrees(row["azimuth_sigma_rad"]),
+        "elevation [deg]": degrees(row["elevation_sigma_rad"]),
+        "certified": ", ".join(row["determined"]),
+        "edges": ", ".join(row["edges"]),
+        "reason": "; ".join(text for text in (in_words(row["faults"] or ()), row["reason"]) if text),
+    }
+
+
 def _prior_of(row: dict[str, Any]) -> Any:
     import numpy as np
 
@@ -76,7 +93,7 @@ def _prior_of(row: dict[str, Any]) -> Any:
     return None if None in values else from_quaternion(np.array(values[:4]), np.array(values[4:]))
 
 
-def _pose_cells(T: Any, T_prior: Any) -> dict[str, str]:
+def _pose_cells(T: Any, T_prior: Any, *, with_change: bool = True) -> dict[str, str]:
     """Pose of the child in the parent, and how far that lies from the prior, along the parent's axes."""
     import numpy as np
 
@@ -92,7 +109,7 @@ def _pose_cells(T: Any, T_prior: Any) -> dict[str, str]:
         change = None if T_prior is None else change_between(T_prior, T)
         if change is not None:
             moved = f"{words(np.degrees(change[:3]), '+.3f')} deg\n{words(change[3:], '+.3f')} m"
-    return {"qw qx qy qz, x y z": pose, "change from prior": moved}
+    return {"qw qx qy qz, x y z": pose} | ({"change from prior": moved} if with_change else {})
 
 
 def _sigma(sigma: float, observable: bool, digits: int) -> str:
@@ -100,8 +117,6 @@ def _sigma(sigma: float, observable: bool, digits: int) -> str:
 
 
 def _drift_cells(row: dict[str, Any]) -> dict[str, str]:
-    import math
-
     is_rotation = row["dof"].startswith("r")
     scale, unit = (180 / math.pi, "deg") if is_rotation else (1.0, "m")
     size = ""

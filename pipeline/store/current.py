@@ -15,12 +15,14 @@ from pipeline.geometry.targets import DEFAULT_TARGETS
 from schemas.calibrations import CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DriftFinding
+from schemas.poses import PoseRow
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
 
 __all__ = [
     "current_drift",
     "current_events",
+    "current_poses",
     "current_records",
     "current_rows",
     "current_states",
@@ -40,6 +42,16 @@ def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRec
         records: as `read_records` returns them, the last asserted last.
     """
     last = {(r.vehicle, r.day, r.method, r.pair, r.parent_frame, r.child_frame): r for r in records}
+    return [last[key] for key in sorted(last)]
+
+
+def current_poses(poses: Sequence[PoseRow]) -> list[PoseRow]:
+    """The current pose of each (vehicle, day, method, sensor), in this order.
+
+    Args:
+        poses: as `read_records` returns them, the last asserted last.
+    """
+    last = {(p.vehicle, p.day, p.method, p.sensor): p for p in poses}
     return [last[key] for key in sorted(last)]
 
 
@@ -111,8 +123,8 @@ def current_events(events: Sequence[ServiceEvent]) -> list[ServiceEvent]:
     return [event for event in noted.values() if not event.withdrawn]
 
 
-def transform_of(record: CalibrationRecord | StateRow) -> Float[np.ndarray, "4 4"] | None:
-    """T_parent_child of a record or state; None where the day was refused, or no day was accepted."""
+def transform_of(record: CalibrationRecord | StateRow | PoseRow) -> Float[np.ndarray, "4 4"] | None:
+    """T_parent_child of a record or state, T_reference_sensor of a pose; None where there is no estimate."""
     return _transform(record.qw, record.qx, record.qy, record.qz, record.tx_m, record.ty_m, record.tz_m)
 
 

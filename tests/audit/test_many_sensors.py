@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from jobs.service import service
 from pipeline.config import load_fleet
+from pipeline.errors import ConfigError
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records, read_records
@@ -95,6 +97,14 @@ def test_a_service_of_one_sensor_begins_the_charts_of_its_edges_anew(fleet, lake
     found = audited(fleet, lake, rig_records("a", 12, np.random.default_rng(6)))
     days = {edge(f): f.days_used for f in found["a"]}
     assert days == {e: 6 if "left" in e else 12 for e in EDGE_NAMES}
+
+
+def test_a_service_is_noted_of_a_sensor_that_records_are_about_and_of_no_other(lake):
+    commit_records(lake, CALIBRATIONS, rig_records("a", 1, np.random.default_rng(6)))
+    event = {"lake": str(lake.root), "vehicle": "a", "day": "2026-03-06", "kind": "re-mount"}
+    assert service(**event, sensor="left") == 0
+    with pytest.raises(ConfigError, match="a has no 'camera'; its records are about bumper, corner, front,"):
+        service(**event, sensor="camera")
 
 
 def test_vehicles_of_different_rigs_are_charted_side_by_side(fleet, lake):

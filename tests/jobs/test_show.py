@@ -13,8 +13,10 @@ from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.outcomes import OUTCOMES, OutcomeRow
+from schemas.poses import POSES
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from tests.audit.fleet_records import vehicle_records
+from tests.makers.table_rows import make_row
 
 
 def test_every_record_table_is_shown_for_people_and_for_machines(tmp_path, capsys):
@@ -50,6 +52,23 @@ def test_every_record_table_is_shown_for_people_and_for_machines(tmp_path, capsy
         assert row[column] == value
         assert show(table, lake=str(tmp_path), vehicle="bus", json=True) == 0
         assert json.loads(capsys.readouterr().out) == []
+
+
+def test_poses_are_shown_with_their_transform_and_the_current_one_alone_where_asked(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    quaternion = {"qw": 0.0, "qx": 0.0, "qy": 0.0, "qz": 1.0, "tx_m": 1.0, "ty_m": 2.0, "tz_m": 3.0}
+    common = {"vehicle": "car", "day": "2026-03-02", "reference": "top", "recorded_at": "", "asserted_at": ""}
+    for key, sensor in (("A", "front"), ("B", "front"), ("A", "left")):
+        row = make_row("poses", rng, **common, sensor=sensor, work_key=key, method="joint", **quaternion)
+        commit_records(Lake.at(tmp_path), POSES, [row])
+    assert show("poses", lake=str(tmp_path), vehicle="car", day="2026-03-02", current=True, json=True) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [(r["sensor"], r["work_key"]) for r in rows] == [("front", "B"), ("left", "A")]
+    assert rows[0]["T"] == [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    asked = {"sensor", "reference", "covariance", "status", "reason", "determined", "dt_s", "edges"}
+    assert asked | {"azimuth_sigma_rad", "elevation_sigma_rad"} <= rows[0].keys()
+    assert show("poses", lake=str(tmp_path)) == 0
+    assert "front" in capsys.readouterr().out
 
 
 def test_status_names_the_command_that_moves_records_of_older_releases(tmp_path):

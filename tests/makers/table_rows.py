@@ -7,6 +7,7 @@ from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.outcomes import OUTCOMES, OutcomeRow
+from schemas.poses import POSES, PoseRow
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import STATES, StateRow
 from schemas.training import TRAINING, TrainingRow
@@ -18,6 +19,7 @@ ROW_TYPES = {
     CALIBRATIONS.name: (CALIBRATIONS, CalibrationRecord),
     DRIFT.name: (DRIFT, DriftFinding),
     OUTCOMES.name: (OUTCOMES, OutcomeRow),
+    POSES.name: (POSES, PoseRow),
     STATES.name: (STATES, StateRow),
     SERVICE_EVENTS.name: (SERVICE_EVENTS, ServiceEvent),
 }

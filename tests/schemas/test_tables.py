@@ -12,6 +12,7 @@ from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import FRAMES, Frame
 from schemas.observations import OBSERVATIONS, Observation
 from schemas.outcomes import OUTCOMES, OutcomeRow
+from schemas.poses import POSES, PoseRow
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import STATES, StateRow
 from schemas.training import TRAINING, TrainingRow
@@ -24,6 +25,7 @@ ROW_TYPES = {
     CALIBRATIONS.name: CalibrationRecord,
     DRIFT.name: DriftFinding,
     OUTCOMES.name: OutcomeRow,
+    POSES.name: PoseRow,
     STATES.name: StateRow,
     SERVICE_EVENTS.name: ServiceEvent,
 }
