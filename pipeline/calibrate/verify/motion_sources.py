@@ -16,6 +16,7 @@ from jaxtyping import Float
 from pipeline.calibrate.verify.sweep_motion import occupied_share, sweep_motion
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.objective.ego_motion import is_same, motion_of
 from schemas.observations import Observation
 
 __all__ = ["MotionFindings", "compared_sources"]
@@ -24,10 +25,7 @@ _FEWEST = 6  # frames, or pairs of them
 _SIGMAS = 4.0
 _MOVING_MPS, _TURNING_RADPS, _ACCELERATING_MPS2 = 3.0, 0.03, 0.3
 _ADJACENT_S = 1.5  # across three frames: the acceleration between them
-# Speeds are the same within these. On 10 good days of seven rigs, the real car's too, odometry and lidar agreed in 89 %
-# of what moves and more, Doppler and lidar in 88 % (without odometry 69, and 48 for a 16-row rig whose Doppler is
-# ambiguous), odometry and Doppler in 97 %; where one was wrong, in 17, 17 and 40 % at most.
-_SAME_MPS, _SAME_SHARE = 0.5, 0.2
+# Shares of moments in which two speeds are the same (`objective/ego_motion`).
 _MET, _AGREED, _FEWEST_PAIRS = 0.4, 0.5, 8
 _TURN_SHARE = 0.5
 _LAG_S = 0.1  # radars measure tens of milliseconds beside their stamps
@@ -115,15 +113,8 @@ def compared_sources(
 
 
 def _sources(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> _Sources:
-    v = [np.full(3, np.nan) if o.radar_velocity_mps is None else o.radar_velocity_mps for o in observations]
-    # Where no yaw rate was logged there is no odometry, and the column's speed is the Doppler's.
-    odometry = [
-        (np.nan, np.nan) if o.ego_yaw_rate_radps is None or o.ego_speed_mps is None
-        else (o.ego_speed_mps, o.ego_yaw_rate_radps)
-        for o in observations
-    ]  # fmt: skip
-    speed, turn = np.array(odometry, np.float64).reshape(-1, 2).T
-    return _Sources(speed, turn, np.array(v, np.float64).reshape(-1, 3) @ T_lidar_radar[0, :3])
+    doppler, odometry = motion_of(observations, T_lidar_radar, np.inf)
+    return _Sources(odometry.speed_mps, odometry.yaw_rate_radps, doppler.velocity_mps @ T_lidar_radar[0, :3])
 
 
 def _slopes(observations: Sequence[Observation], sources: _Sources) -> dict[str, _Slope]:
@@ -290,4 +281,4 @@ def _slope(y: np.ndarray, x: np.ndarray, least: float) -> _Slope | None:
 
 
 def _share(y: np.ndarray, expected: np.ndarray) -> float:
-    return float(np.mean(np.abs(y - expected) < _SAME_MPS + _SAME_SHARE * np.abs(expected)))
+    return float(np.mean(is_same(y, expected)))

@@ -1,0 +1,255 @@
+"""Edge lidar-base: how a lidar stands on the car, by the road under it and the way that it drives.
+
+The road shows roll, pitch and height; the direction of travel shows yaw, and pitch a second time, sharper: the rear
+axle follows the road. Both are means over scenes: slopes, bends and bumps come and go, and what the car nods and leans
+under acceleration is fitted along with its acceleration. x and y are shown by neither; they have no information.
+
+So base is the frame that the road and the wheels define: z up from the road, x along the way of straight driving. One
+that is fixed to the body differs by how the car stands (load, springs) and rolls (toe); `STANCE` says by how much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.calibrate.edges.road import RoadUnder, road_under
+from pipeline.calibrate.edges.robust_regression import Regression, regress
+from pipeline.calibrate.edges.sweep_travel import SweepTravel, sweep_travel
+from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.geometry.changes import change_jacobian
+from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
+from pipeline.objective.ego_motion import EgoMotion
+from pipeline.rig.evidence import EDGE, EdgeEvidence
+from pipeline.rig.graph import BASE, Edge
+
+__all__ = ["Scenes", "estimate_lidar_base"]
+
+# What all days of a car err by alike, as one sigma of roll, pitch, yaw and height of the base. Roads fall by about 2 %
+# to the side that is driven on, so bodies that lean by some 5 deg/g and rear axles that slip by some 3 deg/g (Gillespie
+# 1992, Fundamentals of vehicle dynamics) stand 0.1 deg off, on part of the roads. Tyres settle by a centimetre.
+STANCE = np.array([*np.radians([0.05, 0.05, 0.05]), 0.01])
+# A lidar's own: ranges are good to 3 cm by data sheets, at 8 m and 1.8 m above the road that is 7 mm of height.
+_RANGES_M = 0.007
+# Beyond what scenes scatter by, errors of 8 tuning days: roll 0.017 deg RMS, pitch 0.012, yaw 0.016, height 2 mm.
+_MATCHING = np.array([*np.radians([0.01, 0.01, 0.01]), 0.001])
+_AXLE_SIGMA_M = 1.5  # how far from the base the point may lie that follows the car's way: a wheelbase's half
+_NODS_SIGMA = np.radians(0.3)  # per m/s2, along and across: 3 deg/g
+_LONGEST_WAY_M = 20.0  # beyond, scatter is the road's and no longer the registration's
+_AGAIN_RAD = np.radians(2.0)  # so far from the start the sweeps are looked at again
+_HALVES_SIGMAS = 4.0
+_AXES = ("roll", "pitch", "yaw", "height")
+
+
+@dataclass(frozen=True, eq=False)
+class Scenes:
+    """Which frames show the same (`numerics/frame_blocks`): a standing car counts once, and blocks err apart."""
+
+    scene: np.ndarray  # F
+    block: np.ndarray  # F
+
+    @property
+    def weight(self) -> Float[np.ndarray, " F"]:
+        """Of each frame, so that scenes weigh alike."""
+        return np.asarray(1 / np.bincount(self.scene)[self.scene])
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """What the day shows of the pose of a lidar in its base, each None where it shows nothing."""
+
+    roll: Regression | None
+    pitch_by_road: Regression | None
+    pitch_by_way: Regression | None
+    yaw: Regression | None
+    height: Regression | None
+
+    def axis(self, name: str) -> tuple[float, float] | None:
+        """Change of an axis that the data ask for, and its variance."""
+        if name != "pitch":
+            one = getattr(self, name)
+            return None if one is None else (one.value[0], one.covariance[0, 0])
+        both = [p for p in (self.pitch_by_road, self.pitch_by_way) if p is not None]
+        if not both:
+            return None
+        weight = np.array([1 / p.covariance[0, 0] for p in both])
+        value = np.array([p.value[0] for p in both])
+        mean = float(weight @ value / weight.sum())
+        apart = float(weight @ (value - mean) ** 2) / max(len(both) - 1, 1)
+        return mean, max(1.0, apart) / float(
+            weight.sum()
+        )  # two that differ by more than both sigmas widen it
+
+
+def estimate_lidar_base(
+    edge: Edge,
+    sweeps: Sequence[Sweep],
+    ego: EgoMotion,
+    T_base_lidar: Float[np.ndarray, "4 4"],
+    scenes: Scenes,
+    *,
+    T_base_lidar_deskewed: Float[np.ndarray, "4 4"] | None = None,
+    road_z_m: float = 0.0,
+    height_m: tuple[float, float] | None = None,
+) -> EdgeEvidence:
+    """What a day shows of T_lidar_base.
+
+    Args:
+        edge: lidar, base.
+        sweeps: one per moment.
+        ego: motion of the base at these moments.
+        T_base_lidar: the start; nothing of it enters the information.
+        scenes: of the moments.
+        T_base_lidar_deskewed: pose by which sweeps were de-skewed; None = the start.
+        road_z_m: where the road lies in axes of the base: 0 for one on the ground.
+        height_m: the lidar's height over the road as somebody measured it, and the sigma of that.
+    """
+    assumed = T_base_lidar if T_base_lidar_deskewed is None else T_base_lidar_deskewed
+    T, travel, roads, shown = _solved(sweeps, ego, T_base_lidar, assumed, scenes, road_z_m)
+    change, variance = np.zeros(4), np.full(4, np.inf)
+    for k, name in enumerate(_AXES):
+        found = shown.axis(name)
+        if found is not None:
+            change[k], variance[k] = found
+    checks = _halves(shown)
+    if height_m is not None:
+        off_m = height_m[0] + road_z_m - T[2, 3]
+        change[3], variance[3], contradicts = _with_measured(change[3], variance[3], off_m, height_m[1])
+        checks += contradicts
+    information, gradient = _by_left_perturbation(T, change, variance)
+    return EdgeEvidence(
+        edge, inverse(T), 0.0, information, gradient, _biases(edge, T),
+        frames_used=len(set(roads.moment) | set(travel.moment)),
+        checks=tuple(checks), diagnostics=_numbers(travel, roads, shown), notes=_notes(variance),
+    )  # fmt: skip
+
+
+def _solved(
+    sweeps: Sequence[Sweep],
+    ego: EgoMotion,
+    T: np.ndarray,
+    assumed: np.ndarray,
+    scenes: Scenes,
+    road_z_m: float,
+) -> tuple[np.ndarray, SweepTravel, RoadUnder, _Shown]:
+    """The pose to which road and way lead, and what they show there."""
+    start = T
+    skewed = ego.at_sensor(assumed)
+    travel = sweep_travel(deskewed_again(sweeps, skewed, ego.at_sensor(T)), ego, T)
+    for again in range(3):
+        # The road is asked again once sweeps are de-skewed along the way; the way hardly depends on that.
+        now = deskewed_again(sweeps, skewed, ego.at_sensor(T))
+        if again and _angle(start, T) > _AGAIN_RAD:
+            start, travel = T, sweep_travel(now, ego, T)
+        roads = road_under(now, T, road_z_m)
+        shown = _shown(travel.seen_from(T @ inverse(start)), roads, ego, scenes, road_z_m)
+        if again < 2:
+            T = _moved(T, [0.0 if (found := shown.axis(name)) is None else found[0] for name in _AXES])
+    return T, travel, roads, shown
+
+
+def _shown(travel: SweepTravel, roads: RoadUnder, ego: EgoMotion, scenes: Scenes, road_z_m: float) -> _Shown:
+    """Regressions on what the car nods, leans and turns by; signs are those of the pose's change."""
+    azimuth, elevation = travel.angles_rad.T
+    one, free = np.ones(len(azimuth)), np.inf
+    block, sigma = travel.bend, 1 / np.minimum(travel.way_m, _LONGEST_WAY_M)
+    turning = np.stack([one, travel.curvature_radpm], 1)
+    nodding = np.stack([one, travel.acceleration_mps2], 1)
+    yaw = regress(turning, -azimuth, sigma, block, np.array([free, _AXLE_SIGMA_M]))
+    by_way = regress(nodding, elevation, sigma, block, np.array([free, _NODS_SIGMA]))
+    block, share = scenes.block[roads.moment], scenes.weight[roads.moment]
+    one, sigma = np.ones((len(block), 1)), np.ones(len(block))
+    across = (ego.velocity_mps[:, 0] * ego.yaw_rate_radps)[roads.moment]
+    known = np.isfinite(across)
+    leaning = np.stack([one[:, 0], np.where(known, across, 0.0)], 1)
+    roll = regress(leaning, -roads.cross_slope, sigma, block, np.array([free, _NODS_SIGMA]), share)
+    by_road = regress(one, roads.slope, sigma, block, np.array([free]), share)
+    height = regress(one, road_z_m - roads.height_m, sigma, block, np.array([free]), share)
+    return _Shown(roll, by_road, by_way, yaw, height)
+
+
+def _moved(T: np.ndarray, change: Sequence[float]) -> np.ndarray:
+    """Turned at the lidar's own place, and lifted."""
+    return from_rotation_translation(
+        exp_so3(np.array(change[:3])) @ T[:3, :3], T[:3, 3] + [0.0, 0.0, change[3]]
+    )
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1.0, 1.0)))
+
+
+def _with_measured(
+    change: float, variance: float, off_m: float, sigma_m: float
+) -> tuple[float, float, list[FailedCheck]]:
+    """The height by the road and a measured one together."""
+    if not np.isfinite(variance):
+        return off_m, sigma_m**2, []
+    apart = abs(off_m - change) / np.sqrt(variance + sigma_m**2 + STANCE[3] ** 2 + _RANGES_M**2)
+    told = f"the road shows a height {100 * (change - off_m):+.0f} cm beside the measured one"
+    checks = [FailedCheck(told, "witnesses_disagree")] if apart > _HALVES_SIGMAS else []
+    total = 1 / (1 / variance + 1 / sigma_m**2)
+    return total * (change / variance + off_m / sigma_m**2), total, checks
+
+
+def _halves(shown: _Shown) -> list[FailedCheck]:
+    """Axes in which one half of the scenes contradicts the other, beyond what a car's stance leaves."""
+    of = {"roll": shown.roll, "pitch": shown.pitch_by_way, "yaw": shown.yaw, "height": shown.height}
+    checks = []
+    for (name, fit), stance in zip(of.items(), STANCE, strict=True):
+        sigmas = 0.0 if fit is None else fit.halves / float(np.hypot(np.sqrt(fit.covariance[0, 0]), stance))
+        if sigmas > _HALVES_SIGMAS:
+            told = f"{name} to the base differs by {sigmas:.0f} sigmas between halves of the scenes"
+            checks.append(FailedCheck(told, "witnesses_disagree"))
+    return checks
+
+
+def _by_left_perturbation(
+    T: np.ndarray, change: np.ndarray, variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information and gradient of T_lidar_base, from changes of T_base_lidar: roll, pitch, yaw, height."""
+    J = np.zeros((4, 7))
+    # exp(xi) T_lidar_base is the inverse of exp(-Ad(T_base_lidar) xi) T_base_lidar.
+    J[:, :6] = -(change_jacobian(T) @ adjoint(T))[[0, 1, 2, 5]]
+    weight = 1 / variance
+    return (J.T * weight) @ J, J.T @ (weight * change)
+
+
+def _biases(edge: Edge, T: np.ndarray) -> dict[str, np.ndarray]:
+    """What all days err by alike: the car's stance, the lidar's ranges, the matching."""
+    up = inverse(T)[:3, :3] @ [0.0, 0.0, 1.0]
+    of_lidar = np.zeros((6, 6))
+    of_lidar[3:, 3:] = _RANGES_M**2 * np.outer(up, up)
+    axes = np.zeros((4, 6))
+    axes[[0, 1, 2, 3], [0, 1, 2, 5]] = 1.0
+    to_lidar = adjoint(inverse(T)) @ np.linalg.inv(change_jacobian(T)) @ axes.T
+    return {
+        BASE.name: axes.T @ np.diag(STANCE**2) @ axes,
+        edge.parent.name: of_lidar,
+        EDGE: to_lidar @ np.diag(_MATCHING**2) @ to_lidar.T,
+    }
+
+
+def _numbers(travel: SweepTravel, roads: RoadUnder, shown: _Shown) -> dict[str, float]:
+    numbers = {
+        "way_m": float(travel.way_m.sum()),
+        "sweep_pairs": len(travel.moment),
+        "roads": len(roads.moment),
+    }
+    if shown.yaw is not None:
+        numbers |= {"axle_behind_base_m": float(shown.yaw.value[1])}
+    if shown.pitch_by_road is not None and shown.pitch_by_way is not None:
+        apart = shown.pitch_by_road.value[0] - shown.pitch_by_way.value[0]
+        numbers |= {"pitch_road_less_way_deg": float(np.degrees(apart))}
+    return {name: float(value) for name, value in numbers.items()}
+
+
+def _notes(variance: np.ndarray) -> tuple[str, ...]:
+    missing = [name for name, v in zip(_AXES, variance, strict=True) if not np.isfinite(v)]
+    why = {"yaw": "no pair of sweeps shows the way driven"}
+    notes = [f"{name} to the base: {why.get(name, 'too little road is seen')}" for name in missing]
+    return (*notes, "x, y to the base: neither road nor way shows them")

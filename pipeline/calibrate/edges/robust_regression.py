@@ -1,0 +1,99 @@
+"""Robust linear regression whose covariance is what blocks of frames differ by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+__all__ = ["Regression", "regress"]
+
+_PASSES = 20
+_SCALES = 2.0  # of the Cauchy weight, in robust standard deviations
+_LEAST = 1e-6
+_FEW = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Coefficients, their covariance, and what single rows scatter by (in units of their sigmas)."""
+
+    value: np.ndarray  # P
+    covariance: np.ndarray  # P P
+    scatter: float
+    halves: float  # half of what the first coefficient differs by between even and odd blocks; NaN of too few
+
+
+def regress(
+    A: Float[np.ndarray, "N P"],
+    y: Float[np.ndarray, " N"],
+    sigma: Float[np.ndarray, " N"],
+    blocks: Int[np.ndarray, " N"],
+    prior_sigmas: Float[np.ndarray, " P"],
+    share: Float[np.ndarray, " N"] | None = None,
+) -> Regression | None:
+    """Fit y = A x.
+
+    The covariance is the larger one, by coefficient, of what blocks show (sandwich) and what independent rows would.
+
+    Args:
+        A: rows of the design.
+        y: values.
+        sigma: of the rows against each other; their common scale is estimated.
+        blocks: rows of one block may err alike.
+        prior_sigmas: of coefficients about 0; infinite ones are free.
+        share: by which a row counts: rows of one scene together for one.
+
+    Returns:
+        None of fewer than three blocks, or no more rows than free coefficients.
+    """
+    names = np.unique(blocks)
+    if len(names) < 3 or len(y) <= A.shape[1]:
+        return None
+    held = np.diag(1 / prior_sigmas**2)
+    share = np.ones(len(y)) if share is None else share
+    A_, y_ = A / sigma[:, None], y / sigma
+    x, scale, weight = _fitted(A_, y_, held, share)
+    H = (A_.T * weight) @ A_ / scale**2 + held
+    scores = (A_ * (weight * (y_ - A_ @ x) / scale**2)[:, None]).astype(np.float64)
+    of_blocks = np.stack([scores[blocks == b].sum(0) for b in names])
+    spread = of_blocks.T @ of_blocks * _small_sample(len(names))
+    H_inverse = np.linalg.inv(H)
+    sandwich = H_inverse @ (spread + held) @ H_inverse
+    widen = np.sqrt(np.maximum(np.diag(H_inverse) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
+    return Regression(x, sandwich * np.outer(widen, widen), scale, _halves(A_, y_, blocks, held, share))
+
+
+def _small_sample(blocks: int) -> float:
+    """By how much few blocks understate a variance: what Student's t has over the normal, and the mean taken off."""
+    return blocks / (blocks - 1) * ((blocks - 1) / (blocks - 3) if blocks > _FEW else _FEW)
+
+
+def _fitted(
+    A: np.ndarray, y: np.ndarray, held: np.ndarray, share: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Coefficients, robust scale and Cauchy weights of rows of unit sigma, from the least absolute deviations on."""
+    weight, scale, x = share, 1.0, np.zeros(A.shape[1])
+    for k in range(_PASSES):
+        x = np.linalg.solve((A.T * weight) @ A / scale**2 + held, (A.T * weight) @ y / scale**2)
+        r = np.abs(y - A @ x)
+        scale = max(1.4826 * _median(r, share), _LEAST)
+        far = r / scale
+        weight = share / (1 + (far / _SCALES) ** 2) if k > _PASSES // 3 else share / np.maximum(far, 0.1)
+    return x, scale, weight
+
+
+def _median(values: np.ndarray, share: np.ndarray) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(share[order])
+    return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
+
+
+def _halves(A: np.ndarray, y: np.ndarray, blocks: np.ndarray, held: np.ndarray, share: np.ndarray) -> float:
+    """How far the first coefficient of even blocks lies from the mean of even and odd ones; NaN of too few."""
+    even = np.unique(blocks, return_inverse=True)[1] % 2 == 0
+    if min(even.sum(), (~even).sum()) <= 2 * A.shape[1]:
+        return float("nan")
+    one, other = (_fitted(A[half], y[half], held, share[half])[0][0] for half in (even, ~even))
+    return float(abs(one - other) / 2)

@@ -1,0 +1,123 @@
+"""The way a lidar travels, in its own axes, from pairs of its sweeps: no radar, and no heading of anyone's.
+
+What stands is registered from one sweep to the next. The transform between them is a screw, and a car's rear axle
+does not slip sideways or hop: the direction in which it travels is the vehicle's x axis. Odometry says only where to
+look, and how far the way was where walls do not tell (a tunnel).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.calibrate.edges.point_to_plane import Surfaces, register
+from pipeline.calibrate.edges.sweeps import Sweep
+from pipeline.geometry.se3 import exp_se3, log_se3, transform_points
+from pipeline.objective.ego_motion import EgoMotion
+
+__all__ = ["SweepTravel", "sweep_travel"]
+
+_LONGEST_S = 1.2  # between sweeps: then too little is seen twice
+_LEAST_WAY_M = 3.0  # a centimetre aside is 0.2 deg
+_MOST_PAIRS, _MOST_POINTS, _MOST_SURFACES = 60, 1800, 6000
+# Of the start: turns [rad]; the way ahead [m] (odometry's scale, and a mean of two speeds); aside and up loose, for
+# there the data are asked.
+_LOOSE_M = 1.0
+_START_SIGMAS = np.array([0.02, 0.02, 0.02, 0.3, _LOOSE_M, _LOOSE_M])
+_HELD_SHARE = 0.1  # of the loose sigma: what is not known so much better rests on the start
+_NO_SHARE = 1e-6  # for asking what the data alone know
+_LEAST_SHARE = 0.05
+_BEND_M = 50.0  # simulated cars slip by up to 0.1 deg for so long, and so do real ones in a bend
+
+
+@dataclass(frozen=True, eq=False)
+class SweepTravel:
+    """Motion of the base between pairs of sweeps, in axes of the base by the pose that was given."""
+
+    moment: np.ndarray  # M, of the earlier sweep
+    velocity_mps: np.ndarray  # M 3
+    turn_radps: np.ndarray  # M 3
+    way_m: np.ndarray  # M
+    acceleration_mps2: np.ndarray  # M
+    sigma_rad: np.ndarray  # M 2, of the way's azimuth and elevation, by the registration alone
+
+    @property
+    def angles_rad(self) -> Float[np.ndarray, "M 2"]:
+        """Azimuth and elevation of the way, or of its opposite where the car reverses: zero where the pose is right."""
+        x, y, z = (self.velocity_mps * np.copysign(1.0, self.velocity_mps[:, :1])).T
+        return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], -1)
+
+    @property
+    def bend(self) -> Int64[np.ndarray, " M"]:
+        """Block of each pair: in one bend a car slips the same way."""
+        return np.asarray(np.cumsum(self.way_m) // _BEND_M, np.int64)
+
+    @property
+    def curvature_radpm(self) -> Float[np.ndarray, " M"]:
+        """Turn per way, positive to the left."""
+        return np.asarray(self.turn_radps[:, 2] / self.velocity_mps[:, 0])
+
+    def seen_from(self, T_new_old: Float[np.ndarray, "4 4"]) -> SweepTravel:
+        """The same ways in axes of the base by another pose, which is turned; a lever arm's change is left out."""
+        R = T_new_old[:3, :3]
+        return replace(self, velocity_mps=self.velocity_mps @ R.T, turn_radps=self.turn_radps @ R.T)
+
+
+def sweep_travel(
+    sweeps: Sequence[Sweep], ego: EgoMotion, T_base_lidar: Float[np.ndarray, "4 4"]
+) -> SweepTravel:
+    """Register pairs of successive sweeps of moving frames, at most 60 over the day."""
+    tried = (_between(sweeps, ego, T_base_lidar, i, j) for i, j in _pairs(sweeps, ego).tolist())
+    rows = [row for row in tried if row is not None]
+    table = np.array(rows, np.float64).reshape(-1, 11)
+    return SweepTravel(
+        table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:7], table[:, 7], table[:, 8], table[:, 9:]
+    )
+
+
+def _pairs(sweeps: Sequence[Sweep], ego: EgoMotion) -> Int64[np.ndarray, "P 2"]:
+    """Successive sweeps of one drive between which the car drove some metres."""
+    found: list[tuple[int, int]] = []
+    for i, (a, b) in enumerate(pairwise(sweeps)):
+        gap_s = (b.stamp_ns - a.stamp_ns) * 1e-9
+        way_m = gap_s * ego.velocity_mps[i : i + 2, 0].mean()
+        if a.drive == b.drive and 0 < gap_s < _LONGEST_S and abs(way_m) > _LEAST_WAY_M:
+            found.append((i, i + 1))
+    pairs = np.array(found, np.int64).reshape(-1, 2)
+    return pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MOST_PAIRS)).astype(int))]
+
+
+def _between(
+    sweeps: Sequence[Sweep], ego: EgoMotion, T_base_lidar: np.ndarray, i: int, j: int
+) -> tuple[float, ...] | None:
+    """A row of SweepTravel; None where the sweeps do not tell."""
+    gap_s = (sweeps[j].stamp_ns - sweeps[i].stamp_ns) * 1e-9
+    before, after = (transform_points(T_base_lidar, sweeps[k].xyz_m) for k in (i, j))
+    surfaces = Surfaces.of(before[:: max(1, len(before) // _MOST_SURFACES)])
+    if surfaces is None:
+        return None
+    (vx, vy), turn = ego.velocity_mps[[i, j]].mean(0), ego.yaw_rate_radps[[i, j]].mean()
+    start = exp_se3(np.array([0.0, 0.0, turn, vx, vy, 0.0]) * gap_s)
+    found = register(after[:: max(1, len(after) // _MOST_POINTS)], surfaces, start, _START_SIGMAS)
+    if found is None or found.share < _LEAST_SHARE:
+        return None
+    xi = log_se3(found.T) / gap_s
+    way_m = float(np.linalg.norm(xi[3:])) * gap_s
+    aside_m, up_m = _sigmas_m(found.information, way_m)
+    if max(aside_m, up_m) > _HELD_SHARE * _LOOSE_M or way_m < _LEAST_WAY_M / 2:
+        return None
+    faster = (ego.velocity_mps[j, 0] - ego.velocity_mps[i, 0]) / gap_s
+    return (float(i), *xi[3:], *xi[:3], way_m, faster, aside_m / way_m, up_m / way_m)
+
+
+def _sigmas_m(information: np.ndarray, way_m: float) -> tuple[float, float]:
+    """Of the way's end aside and up, as the way's direction has it: half of a turn on the way goes with it."""
+    held = np.diag(_START_SIGMAS**-2.0) * np.diag([1, 1, 1, 1, _NO_SHARE, _NO_SHARE])
+    C = np.linalg.inv(information + held)
+    aside = np.array([0.0, 0.0, way_m / 2, 0.0, 1.0, 0.0])
+    up = np.array([0.0, -way_m / 2, 0.0, 0.0, 0.0, 1.0])
+    return float(np.sqrt(aside @ C @ aside)), float(np.sqrt(up @ C @ up))
