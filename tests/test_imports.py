@@ -29,6 +29,7 @@ FOUNDATIONS = {
     "rig",
     "rigs",
     "ros_messages",
+    "rows",
     "shipped_models",
     "work",
 }

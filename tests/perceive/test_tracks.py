@@ -151,4 +151,4 @@ def test_no_cluster_gives_no_track():
     )
     state, tracks = advance_tracks(TrackState.empty(), 0, 0, EgoMotion((0.0, 0.0), None), none, PERIOD_MPS)
     assert tracks.xyz_m.shape == (0, 3)
-    assert state.state.shape == (0, 4)
+    assert state.filters.state.shape == (0, 4)

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int64
 from pipeline.calibrate.tracking.kalman import Track
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import to_spherical, wrap_angle
+from pipeline.rows import join_rows, take_rows
 
 __all__ = ["Association", "Shared", "associate", "bearing_sigma_rad", "shared_rows", "shared_sightings"]
 
@@ -180,18 +181,8 @@ def _along(velocity: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 def _gathered(tracks: Sequence[Track], track: np.ndarray, row: np.ndarray) -> Track:
     """The named sightings of many tracks in one, in the order named."""
-    if not len(track):
+    if not tracks:
         none, nothing = np.zeros(0, np.int64), np.zeros(0)
-        return Track(-1, none, none, nothing, np.zeros((0, 3)), np.zeros((0, 3)), nothing, nothing)
-    start = np.concatenate([[0], np.cumsum([t.sightings for t in tracks])[:-1]])
-    rows = start[track] + row
-    return Track(
-        -1,
-        np.concatenate([t.frame for t in tracks])[rows],
-        np.concatenate([t.detection for t in tracks])[rows],
-        np.concatenate([t.stamp_s for t in tracks])[rows],
-        np.concatenate([t.position_m for t in tracks])[rows],
-        np.concatenate([t.velocity_mps for t in tracks])[rows],
-        np.concatenate([t.rate_sigma_mps for t in tracks])[rows],
-        np.concatenate([t.range_sigma_m for t in tracks])[rows],
-    )
+        return Track(-1, none, none, np.zeros((0, 3)), np.zeros((0, 3)), nothing, nothing)
+    start = np.concatenate([[0], np.cumsum([t.sightings for t in tracks])[:-1]]).astype(np.int64)
+    return take_rows(join_rows(tracks), start[track] + row)

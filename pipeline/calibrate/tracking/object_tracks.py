@@ -12,15 +12,17 @@ stand for these here.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 from scipy.spatial import cKDTree
 
-from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow, take_sightings
+from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical
+from pipeline.rows import take_rows
 from schemas.observations import Observation
 
 __all__ = [
@@ -124,7 +126,6 @@ def radar_tracks(observations: Sequence[Observation]) -> list[Track]:
                 drive,
                 np.array([i for i, _ in seen]),
                 np.array([k for _, k in seen]),
-                np.array([observations[i].radar_stamp_ns * 1e-9 for i, _ in seen]),
                 np.array([observations[i].radar_track_xyz_m[k] for i, k in seen], np.float64),
                 velocity,
                 np.full(len(seen), _RADAR_RATE_SIGMA_MPS),
@@ -142,13 +143,13 @@ def lidar_tracks(observations: Sequence[Observation], motion: Sequence[Motion]) 
         kept.append(rows)
         centres = o.lidar_cluster_centre_m[rows].astype(np.float64)
         covariance = np.tile(_CLUSTER_SIGMA_M**2 * np.eye(2), (len(centres), 1, 1))
-        scans.append(Scan(i, o.drive, o.stamp_ns * 1e-9, motion[i], centres, covariance))
+        scans.append(Scan(i, o.drive, o.stamp_ns, motion[i], centres, covariance))
     return [_renumbered(t, kept) for t in follow(scans)]
 
 
 def moves_over_ground(track: Track) -> bool:
     """Faster over ground than 2 m/s and than its sigma explains, over the later half of its sightings."""
-    later = take_sightings(track, np.arange(track.sightings // 2, track.sightings))
+    later = take_rows(track, np.arange(track.sightings // 2, track.sightings))
     speed = np.median(np.linalg.norm(later.velocity_mps[:, :2], axis=1))
     return bool(speed > max(_LEAST_SPEED_MPS, _SPEED_SIGMAS * float(np.median(later.rate_sigma_mps))))
 
@@ -172,7 +173,7 @@ def camera_tracks(observations: Sequence[Observation], motion: Sequence[Motion])
         u = np.stack([np.cos(angles[:, 0]), np.sin(angles[:, 0])], axis=-1)
         outer = u[:, :, None] * u[:, None, :]
         covariance = along[:, None, None] * outer + across[:, None, None] * (np.eye(2) - outer)
-        scans.append(Scan(i, o.drive, o.camera_stamp_ns * 1e-9, motion[i], centres, covariance))
+        scans.append(Scan(i, o.drive, o.camera_stamp_ns, motion[i], centres, covariance))
     return follow(scans)
 
 
@@ -233,10 +234,7 @@ def _road_users(o: Observation) -> Int64[np.ndarray, " K"]:
 def _renumbered(track: Track, kept: Sequence[np.ndarray]) -> Track:
     """Detections numbered as the observation's clusters, not as the ones that were followed."""
     rows = np.array([kept[i][k] for i, k in zip(track.frame, track.detection, strict=True)])
-    return Track(
-        track.drive, track.frame, rows, track.stamp_s, track.position_m, track.velocity_mps,
-        track.rate_sigma_mps, track.range_sigma_m,
-    )  # fmt: skip
+    return replace(track, detection=rows)
 
 
 def _boxes(o: Observation) -> tuple[np.ndarray, np.ndarray]:

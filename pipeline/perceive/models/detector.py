@@ -13,6 +13,7 @@ from pipeline.perceive.camera import Detections
 from pipeline.perceive.labels import DETECTOR_COUNTS, detector_names
 from pipeline.perceive.models.manifest import Manifest
 from pipeline.perceive.models.session import Session, fit_image
+from pipeline.rows import join_rows, take_rows
 
 __all__ = ["Candidates", "Detector", "decode_head", "suppress"]
 
@@ -26,10 +27,6 @@ class Candidates:
     boxes: Float32[np.ndarray, "N 4"]
     scores: Float32[np.ndarray, " N"]
     classes: Int[np.ndarray, " N"]
-
-    def take(self, rows: np.ndarray) -> Candidates:
-        """Some of them."""
-        return Candidates(self.boxes[rows], self.scores[rows], self.classes[rows])
 
 
 class Detector:
@@ -54,13 +51,9 @@ class Detector:
             found = [
                 c for scale in self._manifest.input.tile_scales for c in self._of_scale(image_bgr, scale)
             ]
-        joined = Candidates(
-            np.concatenate([c.boxes for c in found]),
-            np.concatenate([c.scores for c in found]),
-            np.concatenate([c.classes for c in found]),
-        )
-        joined = joined.take(np.flatnonzero(np.isin(joined.classes, list(self._names))))
-        kept = joined.take(suppress(joined, self._manifest.output.nms_iou))
+        joined = join_rows(found)
+        joined = take_rows(joined, np.isin(joined.classes, list(self._names)))
+        kept = take_rows(joined, suppress(joined, self._manifest.output.nms_iou))
         height, width = image_bgr.shape[:2]
         limit = np.array([width, height, width, height], np.float32)
         return Detections(
@@ -95,7 +88,7 @@ class Detector:
         head = decode_head(
             answer, output.layout, spec.size, output.strides, str(self._manifest.file), classes
         )
-        head = head.take(np.flatnonzero(head.scores >= output.min_score))
+        head = take_rows(head, head.scores >= output.min_score)
         offset = np.array([fit.offset_x, fit.offset_y] * 2, np.float32)
         ratio = np.array([fit.scale_x, fit.scale_y] * 2, np.float32)
         boxes = (head.boxes - offset) / ratio
@@ -107,7 +100,7 @@ class Detector:
             | ((y + height < whole[0]) & (boxes[:, 3] > height - _EDGE_PX))
         )
         full = (boxes + np.array([x, y, x, y], np.float32)) / np.float32(scale)
-        return Candidates(full, head.scores, head.classes).take(np.flatnonzero(~cut))
+        return take_rows(Candidates(full, head.scores, head.classes), ~cut)
 
 
 def decode_head(

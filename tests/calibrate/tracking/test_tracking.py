@@ -36,7 +36,7 @@ def make_track(position_m, velocity_mps, first_frame=0, drive=0):
     n = len(position_m)
     return Track(
         drive, np.arange(first_frame, first_frame + n), np.zeros(n, int),
-        np.arange(n) * STEP_S, position_m, np.tile(velocity_mps, (n, 1)), np.full(n, 0.5), np.full(n, 0.7),
+        position_m, np.tile(velocity_mps, (n, 1)), np.full(n, 0.5), np.full(n, 0.7),
     )  # fmt: skip
 
 
@@ -230,7 +230,7 @@ def test_the_filter_follows_an_object_past_a_moving_car_and_finds_its_velocity_o
             Scan(
                 i,
                 0,
-                i * STEP_S,
+                round(i * STEP_S * 1e9),
                 motion,
                 np.column_stack([seen, np.zeros(3)]),
                 np.tile(0.05 * np.eye(2), (3, 1, 1)),
@@ -250,7 +250,9 @@ def test_the_filter_follows_an_object_past_a_moving_car_and_finds_its_velocity_o
 
 def test_no_track_goes_from_one_drive_to_the_next():
     one = np.array([[20.0, 0, 0]])
-    scans = [Scan(i, i // 2, i * STEP_S, Motion((0.0, 0.0)), one, np.eye(2)[None]) for i in range(4)]
+    scans = [
+        Scan(i, i // 2, round(i * STEP_S * 1e9), Motion((0.0, 0.0)), one, np.eye(2)[None]) for i in range(4)
+    ]
     assert [t.frame.tolist() for t in follow(scans)] == [[0, 1], [2, 3]]
 
 

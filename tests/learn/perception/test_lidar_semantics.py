@@ -30,6 +30,7 @@ from pipeline.learn.perception.lidar_semantics.training import (
 from pipeline.learn.train.checkpoints import load_checkpoint
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
+from pipeline.rows import take_rows
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from tests.makers.lakes import write_observations
@@ -169,7 +170,7 @@ def test_a_stopped_run_goes_on_to_the_same_weights_and_with_its_own_configuratio
     with pytest.raises(ContractError, match="other samples"):
         train_sweeps(held_out, train, tmp_path / "whole", QUICK)
     with pytest.raises(ContractError, match="both are needed"):
-        train_sweeps(train, train.at(np.arange(0)), tmp_path / "new", QUICK)
+        train_sweeps(train, take_rows(train, np.arange(0)), tmp_path / "new", QUICK)
 
 
 def test_scores_are_those_of_the_definition():

@@ -20,6 +20,7 @@ from pipeline.learn.perception.radar_drivable.samples import BLOCKED, FREE, UNKN
 from pipeline.learn.perception.radar_drivable.training import DrivableTraining, area_iou, train_drivable
 from pipeline.learn.train.checkpoints import load_checkpoint
 from pipeline.perceive.drivable import free_sector
+from pipeline.rows import take_rows
 from pipeline.store.partitions import Lake, Partition
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.lakes import write_observations
@@ -135,7 +136,7 @@ def test_a_run_goes_on_with_its_own_configuration_and_samples_only(samples, tmp_
     with pytest.raises(ContractError, match="other samples"):
         train_drivable(held_out, train, tmp_path, few)
     with pytest.raises(ContractError, match="both are needed"):
-        train_drivable(train, train.at(np.arange(0)), tmp_path / "new", few)
+        train_drivable(train, take_rows(train, np.arange(0)), tmp_path / "new", few)
 
 
 def test_the_network_is_small_and_cells_without_label_do_not_count():

@@ -44,10 +44,6 @@ class SweepImages:
     def __len__(self) -> int:
         return len(self.label)
 
-    def at(self, rows: np.ndarray) -> SweepImages:
-        """Some of them."""
-        return SweepImages(self.channels[rows], self.label[rows])
-
 
 def sweep_of(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Finite points and their remission as logged; a log without intensity has none, 0 everywhere."""

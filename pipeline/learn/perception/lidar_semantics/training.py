@@ -24,6 +24,7 @@ from pipeline.learn.perception.trainer import (
 )
 from pipeline.learn.train.loop import TrainResult
 from pipeline.results import Progress, silent
+from pipeline.rows import take_rows
 
 __all__ = ["Normal", "SweepTraining", "held_out_scores", "kind_scores", "normal_of", "train_sweeps"]
 
@@ -78,7 +79,7 @@ def train_sweeps(
         network,
         hash_of_arrays(train.channels, train.label),
         lambda rng: _loss(
-            network, train.at(rng.integers(0, len(train), config.batch_size)), rng, normal, weight
+            network, take_rows(train, rng.integers(0, len(train), config.batch_size)), rng, normal, weight
         ),
         lambda: held_out_scores(network, held_out, normal),
     )

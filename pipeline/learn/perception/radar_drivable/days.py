@@ -7,7 +7,8 @@ import numpy as np
 from pipeline.config import FleetConfig
 from pipeline.errors import ContractError
 from pipeline.extrinsics.prior import read_prior
-from pipeline.learn.perception.radar_drivable.samples import DrivableSamples, day_samples, joined
+from pipeline.learn.perception.radar_drivable.samples import DrivableSamples, day_samples
+from pipeline.rows import join_rows, take_rows
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of, perceived_days
 
@@ -34,11 +35,13 @@ def drivable_samples(
     if len(parts) == 1:
         # Neighbouring scans are alike: a tenth between the two sides belongs to neither.
         rows, total = np.arange(len(parts[0])), len(parts[0])
-        train, held_out = parts[0].at(rows[: int(0.7 * total)]), parts[0].at(rows[int(0.8 * total) :])
+        train, held_out = (
+            take_rows(parts[0], r) for r in (rows[: int(0.7 * total)], rows[int(0.8 * total) :])
+        )
     else:
         # The second day is held out already: two days are enough.
-        train = joined([p for i, p in enumerate(parts) if i % _HELD_OUT_EVERY != 1])
-        held_out = joined([p for i, p in enumerate(parts) if i % _HELD_OUT_EVERY == 1])
+        train = join_rows([p for i, p in enumerate(parts) if i % _HELD_OUT_EVERY != 1])
+        held_out = join_rows([p for i, p in enumerate(parts) if i % _HELD_OUT_EVERY == 1])
     numbers = {"vehicle_days": len(days), "samples": len(train), "held_out_samples": len(held_out)}
     return train, held_out, numbers
 

@@ -19,7 +19,7 @@ from pipeline.geometry.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, cell
 from pipeline.geometry.se3 import transform_points
 from schemas.observations import Observation
 
-__all__ = ["BLOCKED", "FREE", "UNKNOWN", "DrivableSamples", "day_samples", "joined", "label_grid", "scan_of"]
+__all__ = ["BLOCKED", "FREE", "UNKNOWN", "DrivableSamples", "day_samples", "label_grid", "scan_of"]
 
 BLOCKED, FREE, UNKNOWN = 0, 1, 255
 _HALF_M = 64  # the lidar's grid of 1 m cells covers the radar's reach around it
@@ -35,10 +35,6 @@ class DrivableSamples:
 
     def __len__(self) -> int:
         return len(self.label)
-
-    def at(self, rows: np.ndarray) -> DrivableSamples:
-        """Some of them."""
-        return DrivableSamples(self.features[rows], self.label[rows], self.geometric[rows])
 
 
 def day_samples(
@@ -62,15 +58,6 @@ def day_samples(
         )
     features, labels, geometric = zip(*rows, strict=True)
     return DrivableSamples(np.stack(features), np.stack(labels), np.stack(geometric))
-
-
-def joined(parts: Sequence[DrivableSamples]) -> DrivableSamples:
-    """All samples of these days."""
-    return DrivableSamples(
-        np.concatenate([p.features for p in parts]),
-        np.concatenate([p.label for p in parts]),
-        np.concatenate([p.geometric for p in parts]),
-    )
 
 
 def scan_of(observation: Observation) -> Scan:

@@ -22,6 +22,7 @@ from pipeline.learn.perception.trainer import (
 )
 from pipeline.learn.train.loop import TrainResult
 from pipeline.results import Progress, silent
+from pipeline.rows import take_rows
 
 __all__ = ["DrivableTraining", "area_iou", "held_out_iou", "probabilities", "train_drivable"]
 
@@ -59,7 +60,7 @@ def train_drivable(
     task = Task(
         network,
         hash_of_arrays(train.features, train.label),
-        lambda rng: _loss(network, train.at(rng.integers(0, len(train), config.batch_size)), rng),
+        lambda rng: _loss(network, take_rows(train, rng.integers(0, len(train), config.batch_size)), rng),
         lambda: held_out_iou(network, train, held_out),
         "held_out/iou_{}",
     )

@@ -1,0 +1,33 @@
+"""Dataclasses all of whose arrays have one row per thing; other fields belong to all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+__all__ = ["join_rows", "take_rows"]
+
+_Table = TypeVar("_Table")
+
+
+def take_rows(table: _Table, rows: np.ndarray) -> _Table:
+    """Some of the rows, by number or mask."""
+    return _changed(table, {name: values[rows] for name, values in _arrays(table).items()})
+
+
+def join_rows(parts: Sequence[_Table]) -> _Table:
+    """The rows of all parts, one after another; what is no array is the first one's."""
+    columns = [_arrays(part) for part in parts]
+    return _changed(parts[0], {name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
+
+
+def _arrays(table: Any) -> dict[str, np.ndarray]:
+    values = {f.name: getattr(table, f.name) for f in fields(table)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def _changed(table: Any, arrays: dict[str, np.ndarray]) -> Any:
+    return replace(table, **arrays)
