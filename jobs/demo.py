@@ -24,6 +24,8 @@ __all__ = ["demo"]
 _NETWORK = "joint-ssl"
 # The radar of the second vehicle is knocked before the third day: 1.2 deg is what a kerb or a car wash does.
 _KNOCK = "vehicle-2:2:radar:yaw:1.2"
+# Vehicles that carry other sensors than the first: the rig `duo` has two cameras and two radars.
+_OWN_RIGS: tuple[tuple[str, str], ...] = ()
 
 
 @needs("simulate")
@@ -85,7 +87,9 @@ def _plan(vehicles: int, days: int, frames: int, seed: int) -> tuple[FleetSpec, 
     from pipeline.simulate.faults import parse_faults
     from pipeline.simulate.fleet import FleetSpec, day_names
 
-    base = FleetSpec(vehicles=vehicles, days=days, frames=frames, seed=seed, container="mixed")
+    base = FleetSpec(
+        vehicles=vehicles, days=days, frames=frames, seed=seed, container="mixed", own_rigs=_OWN_RIGS
+    )
     dates = day_names(base.first_day, days)
     knocks = _KNOCK if vehicles > 1 and days > 2 else ""
     return replace(base, faults=parse_faults(knocks, dates)), dates
@@ -97,8 +101,9 @@ def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int | No
     from pipeline.fleet.pattern import find_vehicle_days
 
     work = find_vehicle_days(str(logs / "{vehicle}" / "{day}" / "*"), dates[0], dates[-1])
-    # The network looks at single frames, without semantics.
-    last_day = [w for w in work if w.partition.day == dates[-1]]
+    # The network looks at single frames, without semantics, of rigs of three.
+    others = dict(_OWN_RIGS)
+    last_day = [w for w in work if w.partition.day == dates[-1] and w.partition.vehicle not in others]
     by_network = replace(night, method=_NETWORK)
     return [
         *watch_night(night, work, "process", workers),
@@ -128,9 +133,8 @@ def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
     from pipeline.config import config_hash
     from pipeline.errors import LogError
     from pipeline.fleet.executor import EXECUTORS
-    from pipeline.simulate.fleet import day_names, vehicle_names
-    from pipeline.simulate.logs.fleet_toml import fleet_toml
-    from pipeline.simulate.sensors.rigs import rig_named
+    from pipeline.simulate.fleet import day_names, rigs_of, vehicle_names
+    from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
     from schemas.versions import CODE_VERSION
 
     stamp, key = out / ".simulated", config_hash({"spec": repr(spec), "code": CODE_VERSION})
@@ -141,7 +145,7 @@ def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
         shutil.rmtree(out / folder, ignore_errors=True)
     out.mkdir(parents=True, exist_ok=True)
     vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
-    (out / "fleet.toml").write_text(fleet_toml("demo", spec.rig, rig_named(spec.rig), vehicles))
+    (out / "fleet.toml").write_text(mixed_fleet_toml("demo", rigs_of(spec)))
     work = [(spec, v, d, out) for d in range(len(days)) for v in range(len(vehicles))]
     names = [f"{vehicles[v]} {days[d]}" for _, v, d, _ in work]
     with (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from pipeline.report.truth import Truth
     from pipeline.store.partitions import Lake
     from schemas.calibrations import CalibrationRecord
     from schemas.drift import DriftFinding
@@ -26,7 +27,7 @@ _WIDTH = 124  # of the table; a narrower terminal wraps lines, which reads bette
 def print_comparison(
     lake: Lake,
     method: str,
-    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    truth: Truth,
     day: str,
     findings: Sequence[DriftFinding],
 ) -> list[dict[str, Any]]:
@@ -42,13 +43,13 @@ def print_comparison(
     found, console = _current(lake, method, day), _console()
     table, errors = _table(day), []
     for record in found:
-        T_true = truth[record.vehicle, record.day][record.pair]
+        T_true = _true(truth, record)
         errors.append(_errors(record, T_true))
         for row in _rows(record, T_true):
             table.add_row(*row)
     console.print(table)
     for record in (r for r in found if r.status == "refused"):
-        console.print(f"{_styled(record.status)}  {record.vehicle} {record.pair}: {record.reason}")
+        console.print(f"{_styled(record.status)}  {record.vehicle} {_name(record)}: {record.reason}")
     for line in status_lines(findings):
         console.print(line)
     return errors
@@ -57,7 +58,7 @@ def print_comparison(
 def print_methods(
     lake: Lake,
     methods: Sequence[str],
-    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    truth: Truth,
     day: str,
 ) -> dict[str, list[dict[str, Any]]]:
     """Print a row per method: what its records of one day are off by, on average over vehicles.
@@ -87,14 +88,12 @@ def print_methods(
         cells = [_mean_error(own, truth, pair, before=False) for pair in PAIRS]
         table.add_row(method, *cells, f"{accepted} of {len(own)}")
     _console().print(table)
-    return {
-        method: [_errors(r, truth[r.vehicle, r.day][r.pair]) for r in own] for method, own in records.items()
-    }
+    return {method: [_errors(r, _true(truth, r)) for r in own] for method, own in records.items()}
 
 
 def _mean_error(
     records: Sequence[CalibrationRecord],
-    truth: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    truth: Truth,
     pair: str,
     *,
     before: bool,
@@ -107,11 +106,19 @@ def _mean_error(
     for record in (r for r in records if r.pair == pair):
         T = prior_of(record) if before else transform_of(record)
         if T is not None:
-            found.append(errors_at_targets(pair, T, truth[record.vehicle, record.day][pair]))
+            found.append(errors_at_targets(pair, T, _true(truth, record)))
     if not found:
         return "refused"
     azimuth, elevation, range_m = np.mean(found, axis=0)
     return f"{np.degrees(azimuth):.3f} / {np.degrees(elevation):.3f} / {range_m:.3f}"
+
+
+def _true(truth: Truth, record: CalibrationRecord) -> np.ndarray:
+    from pipeline.report.truth import true_transform
+
+    T = true_transform(truth, record)
+    assert T is not None, "the demo knows the truth of all its sensors"
+    return T
 
 
 def _current(lake: Lake, method: str, day: str) -> list[CalibrationRecord]:
@@ -157,13 +164,13 @@ def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
 
     T, T_prior = transform_of(record), prior_of(record)
     if T is None or T_prior is None or record.covariance is None:
-        return [[record.vehicle, record.pair, _styled(record.status)]]
+        return [[record.vehicle, _name(record), _styled(record.status)]]
     true, estimate = change_between(T_prior, T_true), change_between(T_prior, T)
     sigma = np.sqrt(np.diag(change_covariance(T, record.covariance)))
     seen = record.observable or [True] * 6
     rows = []
     for first, unit, scale, digits in ((0, "deg", np.degrees(1), 2), (3, "cm", 100.0, 1)):
-        head = [record.vehicle, record.pair, _styled(record.status)] if first == 0 else [""] * 3
+        head = [record.vehicle, _name(record), _styled(record.status)] if first == 0 else [""] * 3
         cells = [f"turn {unit}" if first == 0 else f"shift {unit}"]
         for i in range(first, first + 3):
             shown = f"{estimate[i] * scale:+.{digits}f} ± {sigma[i] * scale:.{digits}f}"
@@ -171,6 +178,11 @@ def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
             cells.append(f"{shown} " if seen[i] else f"[dim]({shown})[/]")
         rows.append(head + cells)
     return rows
+
+
+def _name(record: CalibrationRecord) -> str:
+    """Both sensors, as camera_lidar where they go by their kinds."""
+    return f"{record.parent_frame}_{record.child_frame}"
 
 
 def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
@@ -189,6 +201,8 @@ def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
         "day": record.day,
         "method": record.method,
         "pair": record.pair,
+        "parent_frame": record.parent_frame,
+        "child_frame": record.child_frame,
         "status": record.status,
         "rotation_error_prior_deg": before[0],
         "rotation_error_deg": after[0],

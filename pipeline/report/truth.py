@@ -6,18 +6,21 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.errors import ConfigError
 from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.geometry.se3 import inverse
 from pipeline.report.words import PAIR_TITLES, scaled
 from pipeline.store.current import prior_of, transform_of
-from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.calibrations import DOF_NAMES, CalibrationRecord
 
-__all__ = ["TruthRow", "read_truth", "truth_rows", "truth_summary"]
+__all__ = ["TruthRow", "read_truth", "true_transform", "truth_rows", "truth_summary"]
 
-# (vehicle, day) -> pair -> T_parent_child
+# (vehicle, day) -> sensor, or base -> T_base_sensor
 Truth = Mapping[tuple[str, str], Mapping[str, np.ndarray]]
 
 
@@ -35,8 +38,10 @@ class TruthRow:
     determined: list[bool]
 
 
-def read_truth(folder: Path) -> dict[tuple[str, str], dict[str, np.ndarray]]:
-    """Read `<folder>/<vehicle>/<day>.json`, each with T_camera_lidar, T_camera_radar and T_lidar_radar as 4x4 lists.
+def read_truth(folder: Path) -> Truth:
+    """Read `<folder>/<vehicle>/<day>.json`: T_base_sensor, by sensor, as 4x4 lists.
+
+    Of releases before 0.11.0: T_camera_lidar and T_camera_radar.
 
     Raises:
         ConfigError: the folder holds no such file, or one lacks a transform.
@@ -44,22 +49,36 @@ def read_truth(folder: Path) -> dict[tuple[str, str], dict[str, np.ndarray]]:
     truth = {}
     for path in sorted(folder.glob("*/*.json")):
         try:
-            content = json.loads(path.read_text())
-            truth[(path.parent.name, path.stem)] = {
-                p: np.array(content[f"T_{p}"], dtype=float) for p in PAIRS
-            }
-        except (KeyError, ValueError, TypeError) as err:
+            truth[(path.parent.name, path.stem)] = _poses(json.loads(path.read_text()))
+        except (KeyError, ValueError, TypeError, AttributeError) as err:
             raise ConfigError(str(path), "", f"holds no true extrinsics: {err}") from err
     if not truth:
         raise ConfigError(str(folder), "truth", "holds no <vehicle>/<day>.json")
     return truth
 
 
+def _poses(content: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    if "T_base_sensor" in content:
+        of = content["T_base_sensor"]
+        return {name: np.array(T, dtype=float) for name, T in of.items()} | {"base": np.eye(4)}
+    # Nothing else is asked of the base, so the camera can stand for it.
+    seen = {n: np.array(content[f"T_camera_{n}"], dtype=float) for n in ("lidar", "radar")}
+    return {"camera": np.eye(4)} | seen
+
+
+def true_transform(truth: Truth, record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
+    """T_parent_child of a record's day; None where it is not known."""
+    poses = truth.get((record.vehicle, record.day), {})
+    if record.parent_frame not in poses or record.child_frame not in poses:
+        return None
+    return inverse(poses[record.parent_frame]) @ poses[record.child_frame]
+
+
 def truth_rows(records: Sequence[CalibrationRecord], truth: Truth) -> list[TruthRow]:
     """Rows for all records whose truth is known."""
     rows = []
     for record in records:
-        T_true = truth.get((record.vehicle, record.day), {}).get(record.pair)
+        T_true = true_transform(truth, record)
         if T_true is not None:
             rows.append(_row(record, T_true))
     return rows

@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.errors import ConfigError
 from pipeline.results import Progress, silent
 from pipeline.simulate.faults import DayFaults, Fault, faults_on, misread, shaken
-from pipeline.simulate.logs.fleet_toml import fleet_toml
+from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
 from pipeline.simulate.logs.recording import FIRST_FRAME_S, Setup, record_drive
 from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log
 from pipeline.simulate.sensors.data_sheets import CameraSpec
@@ -34,6 +34,8 @@ __all__ = [
     "day_names",
     "drive_of",
     "mounting_on",
+    "rig_of",
+    "rigs_of",
     "simulate_fleet",
     "simulate_vehicle_day",
     "vehicle_names",
@@ -51,6 +53,7 @@ class FleetSpec:
     drives: int = 3
     rate_hz: float = 2.0
     rig: str = "demo"
+    own_rigs: tuple[tuple[str, str], ...] = ()  # vehicles that have another rig, and which
     environments: str = "mixed"  # urban, highway, mixed
     container: str = "mcap"  # mcap, ros1, db3, mixed
     faults: tuple[Fault, ...] = ()
@@ -69,11 +72,24 @@ class FleetSpec:
         for name, value in counts.items():
             if value <= 0:
                 raise ConfigError("simulate", name, f"{value} is not positive")
+        names = vehicle_names(self)
         for fault in self.faults:
-            if fault.vehicle not in vehicle_names(self):
-                raise ConfigError(
-                    "--faults", fault.vehicle, f"no such vehicle among {', '.join(vehicle_names(self))}"
-                )
+            if fault.vehicle not in names:
+                raise ConfigError("--faults", fault.vehicle, f"no such vehicle among {', '.join(names)}")
+            sensors = [s.name for s in rig_of(self, names.index(fault.vehicle)).sensors]
+            if fault.sensor not in sensors:
+                words = f"{fault.vehicle} has no such sensor among {', '.join(sensors)}"
+                raise ConfigError("--faults", fault.sensor, words)
+
+
+def rig_of(spec: FleetSpec, vehicle: int) -> RigSpec:
+    """What is mounted on a vehicle."""
+    return rig_named(dict(spec.own_rigs).get(vehicle_names(spec)[vehicle], spec.rig))
+
+
+def rigs_of(spec: FleetSpec) -> dict[str, RigSpec]:
+    """What is mounted on each vehicle, by name."""
+    return {name: rig_of(spec, i) for i, name in enumerate(vehicle_names(spec))}
 
 
 def vehicle_names(spec: FleetSpec) -> list[str]:
@@ -104,7 +120,7 @@ def simulate_fleet(
     """
     vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "fleet.toml").write_text(fleet_toml("synthetic", spec.rig, rig_named(spec.rig), vehicles))
+    (out / "fleet.toml").write_text(mixed_fleet_toml("synthetic", rigs_of(spec)))
     work = [(v, d) for d in range(len(days)) for v in range(len(vehicles))]
     total, done, logs = len(work) * spec.frames, 0, 0
     if workers <= 1:
@@ -164,7 +180,7 @@ def simulate_vehicle_day(
 ) -> int:
     """Write one vehicle-day, a log per drive; returns the number of logs."""
     name, day_name = vehicle_names(spec)[vehicle], day_names(spec.first_day, spec.days)[day]
-    rig, folder, drives, done = rig_named(spec.rig), out / "logs" / name / day_name, [], 0
+    rig, folder, drives, done = rig_of(spec, vehicle), out / "logs" / name / day_name, [], 0
     shares = _shares(_frames(spec, name, day), spec.drives)
     for i, frames in enumerate(shares):
         drive = drive_of(spec, vehicle, day, i, frames)
@@ -192,7 +208,7 @@ def simulate_vehicle_day(
 
 def mounting_on(spec: FleetSpec, vehicle: int, day: int, share: float = 0.0) -> Mounting:
     """Where the sensors of a vehicle are after a share of a day's frames, faults included."""
-    rig = rig_named(spec.rig)
+    rig = rig_of(spec, vehicle)
     if spec.remount_deg is not None:  # the paper takes its rig off every evening: lever arms move along
         shift_m = rig.remount_translation_m * max(spec.remount_deg / rig.remount_rotation_deg, 1.0) / 4
         rig = replace(rig, remount_rotation_deg=spec.remount_deg, remount_translation_m=shift_m)
@@ -203,7 +219,7 @@ def mounting_on(spec: FleetSpec, vehicle: int, day: int, share: float = 0.0) -> 
 def _setup(spec: FleetSpec, vehicle: int, day: int, share: float) -> Setup:
     """The vehicle after a share of a day's frames."""
     today = faults_on(spec.faults, vehicle_names(spec)[vehicle], day, share)
-    return Setup(rig_named(spec.rig), mounting_on(spec, vehicle, day, share), spec.semantics, today)
+    return Setup(rig_of(spec, vehicle), mounting_on(spec, vehicle, day, share), spec.semantics, today)
 
 
 def _frames(spec: FleetSpec, vehicle: str, day: int) -> int:
@@ -233,14 +249,14 @@ def drive_of(spec: FleetSpec, vehicle: int, day: int, number: int, frames: int) 
 
 def _truth(spec: FleetSpec, vehicle: int, day: int) -> dict[str, Any]:
     """What a judge needs to know; stamp_a = stamp_b + dt_a_b_s, as in the calibration records."""
-    name, rig = vehicle_names(spec)[vehicle], rig_named(spec.rig)
+    name, rig = vehicle_names(spec)[vehicle], rig_of(spec, vehicle)
     morning, evening = (mounting_on(spec, vehicle, day, share) for share in (0.0, 1.0))
     today = faults_on(spec.faults, name, day)
     ends = _poses(evening) | (_pairs(evening) if rig.is_short else {})
     return {
         "vehicle": name,
         "day": day_names(spec.first_day, spec.days)[day],
-        "rig": spec.rig,
+        "rig": rig.name,
         "seed": spec.seed,
         "reference": rig.reference.name,
         **_poses(morning),

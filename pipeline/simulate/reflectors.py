@@ -19,12 +19,11 @@ from jaxtyping import Float
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.results import Progress, silent
 from pipeline.rig.topics import TOPICS
-from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, vehicle_names
+from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, rig_of, vehicle_names
 from pipeline.simulate.logs.recording import Setup, messages_of, nominal_poses
 from pipeline.simulate.logs.writers import open_log
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan
-from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.simulated_frame import Scene, Seat, frame_of, triggered_stamps
 from pipeline.simulate.world.casting import Moment, standing_of
 from pipeline.simulate.world.drives import Parked
@@ -49,7 +48,7 @@ def simulate_reflectors(
         Path of the JSON file.
     """
     name, day_name = vehicle_names(spec)[vehicle], day_names(spec.first_day, spec.days)[day]
-    rig, mounting = rig_named(spec.rig), mounting_on(spec, vehicle, day)
+    rig, mounting = rig_of(spec, vehicle), mounting_on(spec, vehicle, day)
     rng = np.random.default_rng([spec.seed, vehicle, day, 71])
     scene = Scene(Parked(), _SUN, beacons_map=REFLECTORS_VEHICLE)
     moment = Moment(standing_of(_lot(), np.zeros(3), _SUN, lambda p: p, 8.0), [], 0.0)

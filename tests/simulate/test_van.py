@@ -10,6 +10,7 @@ import pytest
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.report.truth import read_truth
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
@@ -157,3 +158,23 @@ def test_a_mistaken_cable_sends_a_radar_s_points_under_its_neighbour_s_name(days
 def test_faults_name_sensors_of_the_rig_that_they_can_happen_to(item):
     with pytest.raises(ConfigError, match="happens to"):
         parse_faults(f"vehicle-1:0:{item}", [DAY], VAN)
+
+
+def test_vehicles_of_one_fleet_can_carry_other_sensors_than_the_rest(tmp_path):
+    spec = FleetSpec(vehicles=2, days=1, frames=1, drives=1, own_rigs=(("vehicle-2", "duo"),))
+    simulate_fleet(spec, tmp_path)
+    fleet = load_fleet(tmp_path / "fleet.toml")
+    assert fleet.rig_of("vehicle-1").sensors == ("camera", "lidar", "radar")
+    assert fleet.rig_of("vehicle-2").sensors == ("front", "left", "top", "nose", "corner_fl")
+    truth = read_truth(tmp_path / "truth")
+    assert set(truth["vehicle-2", DAY]) == {"front", "left", "top", "nose", "corner_fl", "base"}
+    of_three = json.loads((tmp_path / "truth" / "vehicle-1" / f"{DAY}.json").read_text())
+    poses = truth["vehicle-1", DAY]
+    T = inverse(poses["camera"]) @ poses["radar"]
+    np.testing.assert_allclose(T, of_three["T_camera_radar"], atol=1e-12)
+
+
+def test_a_fault_of_a_vehicle_that_lacks_the_sensor_is_refused_before_anything_is_written():
+    faults = parse_faults("vehicle-1:0:corner_fl:yaw:1", [DAY], VAN)
+    with pytest.raises(ConfigError, match="corner_fl"):
+        FleetSpec(vehicles=2, days=1, rig="van", own_rigs=(("vehicle-1", "demo"),), faults=faults)

@@ -11,7 +11,7 @@ from pipeline.errors import ConfigError
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
 from pipeline.simulate.sensors.random_rigs import random_rig
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, short_rig
-from pipeline.simulate.sensors.van import VAN
+from pipeline.simulate.sensors.van import DUO, VAN
 
 __all__ = ["RIGS", "rig_named"]
 
@@ -96,6 +96,7 @@ _ALL: Final = (
     # Nose down, and twice as fast.
     _demo("tilted", lidar=replace(_LIDAR, sweep_s=0.04), rpy_deg=(_LEVEL, (0.0, 5.0, 0.0), _LEVEL)),
     VAN,
+    DUO,
 )  # fmt: skip
 RIGS: Final = {rig.name: rig for rig in _ALL}
 

@@ -1,4 +1,4 @@
-"""A delivery van with six cameras, two lidars and five radars, each on a clock of its own.
+"""A delivery van with six cameras, two lidars and five radars, each on a clock of its own, and a part of it.
 
 Everything around the car is seen: the roof lidar shares its view with every camera, the cameras overlap their
 neighbours, and the rear corner radars share theirs with the cameras that look back.
@@ -6,12 +6,13 @@ neighbours, and the rear corner radars share theirs with the cameras that look b
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Sheet
 
-__all__ = ["VAN"]
+__all__ = ["DUO", "VAN"]
 
 # Lens and pixels of surround cameras at about a third of their resolution; the lens maker's distortion is logged.
 _SIDE: Final = CameraSpec(
@@ -52,3 +53,13 @@ VAN: Final = RigSpec(
     ),
     behind_m=150.0,
 )
+
+# What the demo can afford: as quick as a rig of three.
+_SMALL: Final[dict[str, Sheet]] = {
+    "front": CameraSpec(608, 312),
+    "left": CameraSpec(480, 300, 84.0, 58.7, model="plumb_bob", distortion=_SIDE.distortion),
+    "top": replace(_ROOF, columns=450),
+    "nose": replace(_LONG, rays=4000),
+    "corner_fl": replace(_CORNER, rays=4000),
+}
+DUO: Final = RigSpec("duo", tuple(replace(VAN[name], sheet=sheet) for name, sheet in _SMALL.items()))

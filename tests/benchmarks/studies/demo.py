@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.targets import errors_at_targets
-from pipeline.report.truth import read_truth
+from pipeline.report.truth import Truth, read_truth, true_transform
 from pipeline.store.current import current_drift, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake
 from pipeline.store.tables import read_records
@@ -32,8 +32,6 @@ from tests.benchmarks.studies.engine import RESULTS
 from tests.benchmarks.studies.metrics import inside_share, measure
 
 __all__ = ["measure_demo"]
-
-Truth = dict[tuple[str, str], dict[str, np.ndarray]]
 
 
 def measure_demo(folder: Path) -> dict[str, Any]:
@@ -53,7 +51,7 @@ def _errors(records: Sequence[CalibrationRecord], truth: Truth) -> dict[str, Any
     """Azimuth [deg], elevation [deg], range [m] of the records of one pair, and of their priors."""
     out: dict[str, Any] = {"records": 0}
     for name, of in (("prior", prior_of), ("found", transform_of)):
-        known = [(r.pair, T, truth[r.vehicle, r.day][r.pair]) for r in records if (T := of(r)) is not None]
+        known = [(r.pair, T, true_transform(truth, r)) for r in records if (T := of(r)) is not None]
         if known:
             errors = np.mean([errors_at_targets(*k) for k in known], axis=0) * [*np.degrees([1, 1]), 1]
             out |= {f"{name}_az_el_deg_range_m": [round(float(v), 4) for v in errors]}
@@ -65,7 +63,7 @@ def _coverage(records: Sequence[CalibrationRecord], truth: Truth) -> dict[str, A
     """Share of the determined degrees of freedom within one and three of their sigmas."""
     z = []
     for record in records:
-        T_true = truth[record.vehicle, record.day][record.pair]
+        T_true = true_transform(truth, record)
         measured = measure(record, T_true, Prior(T_true, T_true, 1.0, 1.0), None)
         if "error" in measured:
             determined = np.array(measured["observable"], bool)
