@@ -109,6 +109,13 @@ class PairEstimate:
     failed_checks: list[FailedCheck] = field(default_factory=list)  # of the solver's, on this pair alone
     parts: DayParts | None = None  # of the day; None where it is too short, or the method does not cut it
     disproved: str = ""  # why it cannot be right, where a check of the solver's shows that
+    # Covariances 6 6 (left perturbation) of what all frames err by alike, parts of `covariance`: by "camera", "lidar"
+    # or "radar" where every pair of that sensor errs by it, by "edge" where this pair alone does ...
+    bias: dict[str, np.ndarray] = field(default_factory=dict)
+    bias_in_weights: np.ndarray | None = (
+        None  # ... and this pair's that the weight of its data has in it already
+    )
+    time_offset_prior_s: float | None = None  # what was expected of the time offset before the day
 
     @classmethod
     def at_prior(cls, pair: str, prior: Prior) -> PairEstimate:

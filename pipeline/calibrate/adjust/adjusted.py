@@ -61,8 +61,8 @@ class AdjustedSensor:
     Degrees of freedom: rotation vector about the reference's axes, then the sensor's origin in them.
 
     Args:
-        observability: 6, share 0..1 of the prior's variance that the day removed.
-        determined: 6, bool; the others keep the prior's sigma.
+        observability: 6, share 0..1 of its variance that is not the prior's error.
+        determined: 6, bool; the others rest on the prior.
         rests_on: edges that its pose rests on: without one of them it is less sure.
         untied: why the day says nothing of its pose to the reference; empty = it does.
         doubts: edges that it rests on, one of which is wrong, without a way to tell which.
@@ -82,7 +82,7 @@ class AdjustedRig:
     """Poses and clocks of all sensors, and what each edge and each sensor is worth.
 
     Args:
-        poses: with the covariance of all at once; a degree of freedom that the day did not halve has the prior's sigma.
+        poses: with the covariance of all at once.
         sensors: by name, less the reference.
         edges: every edge that had evidence.
     """

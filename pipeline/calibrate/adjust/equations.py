@@ -1,13 +1,15 @@
 """Normal equations of a rig: evidence of edges and the prior of each sensor once, by poses and clocks of all sensors.
 
 Unknowns are the left perturbations of T_reference_sensor [rad, m], six a sensor, then a clock [s] a sensor, both in the
-prior's order. A bias that all edges of a sensor share is considered, not solved for (Schmidt 1966): it has no equation,
-and what the solution errs by because of it is added to the covariance. A bias of an edge alone is part of its noise.
+prior's order, then six for every sensor whose edges share a bias, in sigmas of it. Were it only added to the
+covariance, it would not lower the weight of the edges that have it: an edge of .05 deg with a bias
+of .25 deg then made a yaw of .037 deg, which another edge knew, one of .046. A bias of an edge alone is part of its
+noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,24 +37,34 @@ class Rig:
         poses: T of each sensor, and its clock; its covariances are those of `prior`.
         prior: before the day.
         clock_sigma_s: of each sensor's clock before the day, about the prior's dt.
+        biased: sensors whose edges share a bias.
+        biases: of all of them, in sigmas.
     """
 
     poses: Extrinsics
     prior: Extrinsics
     clock_sigma_s: float
+    biased: tuple[str, ...]
+    biases: np.ndarray
+
+    @classmethod
+    def at(cls, prior: Extrinsics, clock_sigma_s: float, evidence: Sequence[EdgeEvidence]) -> Rig:
+        """The prior, and room for the biases that this evidence states."""
+        biased = tuple(sorted({owner for e in evidence for owner in e.bias} - {EDGE}))
+        return cls(prior, prior, clock_sigma_s, biased, np.zeros(6 * len(biased)))
 
     @property
     def unknowns(self) -> int:
-        """Six a sensor and its clock, less the reference's."""
-        return 7 * len(self.prior.order)
+        """Six a sensor and its clock, less the reference's; six a bias."""
+        return 7 * len(self.prior.order) + len(self.biases)
 
     @property
     def prior_covariance(self) -> Float[np.ndarray, "N N"]:
         """Of all unknowns, around the prior."""
-        P = np.zeros((self.unknowns, self.unknowns))
-        poses = 6 * len(self.prior.order)
+        P = np.eye(self.unknowns)
+        poses, moving = 6 * len(self.prior.order), 7 * len(self.prior.order)
         P[:poses, :poses] = self.prior.covariance
-        P[poses:, poses:] = np.eye(len(self.prior.order)) * self.clock_sigma_s**2
+        P[poses:moving, poses:moving] *= self.clock_sigma_s**2
         return P
 
     def clock(self, name: str) -> int | None:
@@ -64,10 +76,11 @@ class Rig:
         """The rig after a step of all unknowns."""
         poses, order = self.poses, self.prior.order
         T = {n: exp_se3(x[6 * k : 6 * k + 6]) @ poses.T[n] for k, n in enumerate(order)}
-        clocks = x[6 * len(order) :]
+        clocks = x[6 * len(order) : 7 * len(order)]
         dt_s = {n: poses.dt_s.get(n, 0.0) + float(clocks[k]) for k, n in enumerate(order)}
         kept = {poses.reference.name: poses.T[poses.reference.name]}
-        return replace(self, poses=replace(poses, T=kept | T, dt_s=dt_s))
+        biases = self.biases + x[7 * len(order) :]
+        return replace(self, poses=replace(poses, T=kept | T, dt_s=dt_s), biases=biases)
 
     def from_prior(self) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N N"]]:
         """Where the rig is, as perturbation of the prior, and its derivative by the unknowns."""
@@ -78,6 +91,7 @@ class Rig:
             x[at] = log_se3(self.poses.T[name] @ inverse(self.prior.T[name]))
             J[at, at] = left_jacobian_inverse(x[at])
             x[6 * len(order) + k] = self.poses.dt_s.get(name, 0.0) - self.prior.dt_s.get(name, 0.0)
+        x[7 * len(order) :] = self.biases
         return x, J
 
 
@@ -86,12 +100,11 @@ class LinearEdge:
     """An edge's cost at a rig: 1/2 (x + J d)' W (x + J d) - g' (x + J d), d being a step of all unknowns."""
 
     evidence: EdgeEvidence
-    x: np.ndarray  # 7, where the rig has the edge, from where its evidence is linearised
+    x: np.ndarray  # 7, where rig and biases have the edge, from where its evidence is linearised
     J: np.ndarray  # 7 N
     W: np.ndarray  # 7 7, of the edge with its own bias
     g: np.ndarray  # 7
     own: np.ndarray  # 7 6, one sigma of the edge's own bias, which W has in it
-    shared: Mapping[str, np.ndarray]  # by sensor: 7 6, one sigma of its bias, as x errs by it
 
     @property
     def descent(self) -> Float[np.ndarray, " 7"]:
@@ -113,21 +126,19 @@ class Equations:
         J, edges = left_out.J, tuple(e for e in self.edges if e is not left_out)
         return replace(self, H=self.H - J.T @ left_out.W @ J, g=self.g - J.T @ left_out.descent, edges=edges)
 
-    def biases(
-        self, C: Float[np.ndarray, "N N"], *, own: bool = False
-    ) -> dict[str, Float[np.ndarray, "N 6"]]:
-        """By owner, what the solution errs by because of one sigma of a bias; those of edges by the edge's name.
+    def common(self, C: Float[np.ndarray, "N N"], rig: Rig) -> Float[np.ndarray, "N N"]:
+        """Part of the solution's covariance that all days err by alike: the prior's and that of biases.
 
         Args:
             C: inverse of H.
-            own: those that edges have for themselves, which are in H already; else those that sensors share.
+            rig: whose prior says which part of it that is.
         """
-        found: dict[str, np.ndarray] = {}
-        for edge in self.edges:
-            owned = {edge.evidence.edge.name: edge.own} if own else edge.shared
-            for owner, error in owned.items():
-                found[owner] = found.get(owner, 0.0) + C @ (edge.J.T @ (edge.W @ error))
-        return found
+        alike = rig.prior_covariance
+        poses = len(rig.prior.covariance)
+        alike[:poses, :poses] = rig.prior.common
+        follow = C @ self.prior_information
+        of_edges = [C @ (e.J.T @ (e.W @ e.own)) for e in self.edges]
+        return sum((K @ K.T for K in of_edges), follow @ alike @ follow.T)
 
 
 def equations_at(rig: Rig, evidence: Sequence[EdgeEvidence]) -> Equations:
@@ -171,8 +182,12 @@ def _linear_edge(rig: Rig, evidence: EdgeEvidence) -> LinearEdge:
         at = rig.clock(name)
         if at is not None:
             J[6, at] = sign
-    W, g, own = _with_own_bias(evidence)
-    return LinearEdge(evidence, np.append(xi, dt_s - evidence.dt_s), J, W, g, own, _shared(evidence))
+    x = np.append(xi, dt_s - evidence.dt_s)
+    for owner, error in _shared(evidence).items():
+        k = 6 * rig.biased.index(owner)
+        J[:, 7 * len(poses.order) + k :][:, :6] = error
+        x += error @ rig.biases[k : k + 6]
+    return LinearEdge(evidence, x, J, *_with_own_bias(evidence))
 
 
 def _with_own_bias(evidence: EdgeEvidence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -185,7 +200,7 @@ def _with_own_bias(evidence: EdgeEvidence) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _shared(evidence: EdgeEvidence) -> dict[str, np.ndarray]:
-    """How the edge errs by one sigma of its sensors' biases: a sensor turned in its own axes, as it seems."""
+    """How the edge errs (7 6) by one sigma of a sensor's bias: it seems to be turned in its own axes."""
     parent, child = evidence.edge.sensors
     seen = {parent.name: -np.eye(6), child.name: adjoint(evidence.T)}
     return {n: _rows_of_seven(seen[n] @ _root(B)) for n, B in evidence.bias.items() if n != EDGE}

@@ -38,12 +38,6 @@ def innovation(
     of_edge = inverse_of_information(edge.W + _NONE * inverse_of_information(before))
     residual = of_edge @ edge.g - edge.x - edge.J @ (C @ others.g)
     covariance = of_edge + edge.J @ C @ edge.J.T
-    biases = others.biases(C)
-    for owner in biases.keys() | edge.shared.keys():
-        error = edge.shared.get(owner, np.zeros((7, 6))) - edge.J @ biases.get(
-            owner, np.zeros((C.shape[0], 6))
-        )
-        covariance = covariance + error @ error.T
     values, vectors = eigh(covariance, before)
     known = values < 1.0
     if not known.any():

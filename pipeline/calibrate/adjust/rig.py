@@ -60,7 +60,7 @@ def adjust(
     doubts: dict[Edge, tuple[Edge, ...]] = {}
     while True:
         used = [e for e in evidence if e.edge not in failed]
-        rig, equations = _solved(Rig(prior, prior, limits.clock_sigma_s), used)
+        rig, equations = _solved(Rig.at(prior, limits.clock_sigma_s, evidence), used)
         found = _innovations(graph, rig, equations, [e for e in evidence if e.edge in failed])
         worst = _worst(equations, found, limits)
         if worst is None:
@@ -155,36 +155,40 @@ def _concluded(
     """The rig with its covariances, and what each sensor is worth."""
     n, order = 6 * len(rig.prior.order), rig.prior.order
     C = inverse_of_information(equations.H)
-    shared = sum((K @ K.T for K in equations.biases(C).values()), np.zeros_like(C))
-    own = sum((K @ K.T for K in equations.biases(C, own=True).values()), np.zeros_like(C))
-    whole = C + shared
-    to_change = _blocks([change_jacobian(rig.poses.T[name]) for name in order])
-    before = np.diag(to_change @ rig.prior.covariance @ to_change.T)
-    after = np.diag(to_change @ whole[:n, :n] @ to_change.T)
-    observability = np.clip(1 - after / before, 0.0, 1.0)
-    determined = observability >= OBSERVABLE
-    # What is not determined keeps the prior's sigma: its row and column are widened, correlations stay.
-    scale = np.where(determined, 1.0, np.sqrt(np.maximum(before / after, 1.0)))
-    wider = np.linalg.solve(to_change, scale[:, None] * to_change)
-    covariance = wider @ whole[:n, :n] @ wider.T
-    follow = C[:n, :n] @ equations.prior_information[:n, :n]
-    alike = follow @ rig.prior.common @ follow.T + (shared + own)[:n, :n]
+    observability = _observability(rig, equations, C[:n, :n])
     poses = replace(
         rig.poses,
-        covariance=0.5 * (covariance + covariance.T),
-        common=common_part(wider @ alike @ wider.T, covariance),
+        covariance=C[:n, :n],
+        common=common_part(equations.common(C, rig)[:n, :n], C[:n, :n]),
     )
     rests_on = _rests_on(equations, C, len(order))
-    clock = np.sqrt(np.diag(whole)[n:])
+    clock = np.sqrt(np.diag(C)[n : n + len(order)])
     sensors = {}
     for k, name in enumerate(order):
         at, on = slice(6 * k, 6 * k + 6), rests_on[k]
         doubts = tuple(dict.fromkeys(d for e in on for d in edges[e].doubts))
         untied = _untied(graph, graph[name], [e.evidence.edge for e in equations.edges])
         sensors[name] = AdjustedSensor(
-            observability[at], determined[at] & (not untied), on, untied, doubts, float(clock[k])
+            observability[at],
+            (observability[at] >= OBSERVABLE) & (not untied),
+            on,
+            untied,
+            doubts,
+            float(clock[k]),
         )
     return AdjustedRig(poses, sensors, edges)
+
+
+def _observability(rig: Rig, equations: Equations, C: Float[np.ndarray, "P P"]) -> Float[np.ndarray, " P"]:
+    """Share of each variance that is not the prior's error: 1 - posterior/prior where a sensor has one unknown.
+
+    Counted so, a position that the prior knows given its turn is not called determined because the day found the turn.
+    """
+    n = len(C)
+    to_change = _blocks([change_jacobian(rig.poses.T[name]) for name in rig.prior.order])
+    follow = to_change @ C @ equations.prior_information[:n, :n]
+    of_prior = np.diag(follow @ rig.prior.covariance @ follow.T)
+    return np.clip(1 - of_prior / np.diag(to_change @ C @ to_change.T), 0.0, 1.0)
 
 
 def _rests_on(equations: Equations, C: Float[np.ndarray, "N N"], sensors: int) -> list[tuple[Edge, ...]]:

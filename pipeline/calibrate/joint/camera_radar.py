@@ -141,6 +141,8 @@ def estimate_camera_radar(
         common_covariance=J
         @ common_of(after.covariance, prior_covariance, np.diag(CAMERA_RADAR_BIAS**2))
         @ J.T,
+        # How a radar sees cars, whichever camera has their boxes.
+        bias={"radar": J @ np.diag(np.where(after.observable, CAMERA_RADAR_BIAS, 0.0) ** 2) @ J.T},
     )
 
 

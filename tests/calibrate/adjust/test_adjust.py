@@ -87,8 +87,6 @@ def test_chi_squared_of_all_unknowns_is_what_it_should_be_over_150_rigs():
         found = scene.adjusted([scene.edge(*e) for e in CLOSED], innovation_sigmas=8.0)
         e = np.concatenate([log_se3(scene.true[n] @ inverse(found.poses.T[n])) for n in EIGHT])
         squares.append(e @ np.linalg.solve(found.poses.covariance, e) / len(e))
-        # What a day does not halve is widened to the prior, which lowers chi-squared: here it is little.
-        assert np.mean([found.sensors[n].determined.mean() for n in EIGHT]) > 0.8
     assert 0.9 < np.mean(squares) < 1.1
 
 
@@ -131,8 +129,6 @@ def test_a_tree_has_the_covariance_that_composition_has():
     edges = [scene.edge("cam0", "top"), scene.edge("top", "rad0", sigmas=fine)]
     edges = [replace(e, T=scene.between(e.edge.parent.name, e.edge.child.name)) for e in edges]
     found = scene.adjusted(edges)
-    # What a day does not halve is widened to the prior: here everything is halved.
-    assert all(s.determined.all() for s in found.sensors.values())
     alone = []
     for e, pair in zip(edges, (("cam0", "top"), ("top", "rad0")), strict=True):
         before = scene.prior.covariance_between(*pair)
@@ -278,8 +274,10 @@ def test_the_equations_are_the_derivatives_of_the_cost():
     scene = Scene(rng, "cam0", "rad0", prior_sigma=3 * PRIOR_SIGMA)
     scene.draw_clocks()
     edges = [scene.edge("cam0", "top"), scene.edge("top", "rad0"), scene.edge("cam0", "rad0")]
-    edges = [replace(e, gradient=rng.normal(size=7), bias={}) for e in edges]
-    rig = Rig(scene.prior, scene.prior, 0.02).moved(rng.normal(0, 0.03, 14))
+    B = {"cam0": np.diag([np.radians(0.5) ** 2] * 3 + [1e-4] * 3)}
+    edges = [replace(e, gradient=rng.normal(size=7), bias=B if "cam0" in e.edge.name else {}) for e in edges]
+    rig = Rig.at(scene.prior, 0.02, edges)
+    rig = rig.moved(rng.normal(0, 0.03, 20))
 
     def cost(at):
         x, _ = at.from_prior()
@@ -289,14 +287,14 @@ def test_the_equations_are_the_derivatives_of_the_cost():
         return total
 
     equations, step = equations_at(rig, edges), 1e-6
-    numeric = [(cost(rig.moved(x)) - cost(rig.moved(-x))) / (2 * step) for x in step * np.eye(14)]
+    numeric = [(cost(rig.moved(x)) - cost(rig.moved(-x))) / (2 * step) for x in step * np.eye(20)]
     np.testing.assert_allclose(-np.array(numeric), equations.g, rtol=1e-5, atol=1e-2)
     for e in equations.edges:
         k = edges.index(e.evidence)
         J = [
             (equations_at(rig.moved(x), edges).edges[k].x - equations_at(rig.moved(-x), edges).edges[k].x)
             / (2 * step)
-            for x in step * np.eye(14)
+            for x in step * np.eye(20)
         ]
         np.testing.assert_allclose(np.array(J).T, e.J, atol=1e-6)
 

@@ -26,6 +26,7 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     analyse_observability,
     day_covariance,
 )
+from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ
 from pipeline.calibrate.joint.camera_lidar.other_solutions import parts_of_alignment, starts_apart
 from pipeline.calibrate.joint.camera_lidar.refine import (
     NONE_FIXED,
@@ -43,7 +44,12 @@ from pipeline.calibrate.joint.camera_lidar.witnesses import (
     widening,
     witness_numbers,
 )
-from pipeline.calibrate.numerics.bias_floors import HEADING_SIGMA_RAD, MAX_GAP_PX
+from pipeline.calibrate.numerics.bias_floors import (
+    CAMERA_LIDAR_BIAS,
+    HEADING_SIGMA_RAD,
+    MAX_GAP_PX,
+    TZ_COMMON_BIAS_M,
+)
 from pipeline.calibrate.numerics.change_point import with_parts
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, with_ends
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
@@ -55,6 +61,7 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
+from pipeline.rig.evidence import EDGE
 from schemas.observations import Observation
 
 __all__ = [
@@ -340,4 +347,21 @@ def _conclude(
             to_left @ analysis.common[:6, :6] @ to_left.T, to_left @ covariance @ to_left.T
         ),
         failed_checks=disagreement(witnesses),
+        bias={owner: to_left @ B @ to_left.T for owner, B in _biases(analysis).items()},
+        bias_in_weights=to_left @ np.diag(_tz_bias(analysis)) @ to_left.T,
+        time_offset_prior_s=aligned.expected_dt_s,
     )
+
+
+def _biases(analysis: ObservabilityAnalysis) -> dict[str, Float[np.ndarray, "6 6"]]:
+    """What all frames err by alike, by owner: masks and intrinsics turn the camera, whatever it is paired with."""
+    turns = np.diag(np.where(analysis.fixed[:6] | (np.arange(6) > 2), 0.0, CAMERA_LIDAR_BIAS) ** 2)
+    return {"camera": turns, EDGE: analysis.floors[:6, :6] - turns}
+
+
+def _tz_bias(analysis: ObservabilityAnalysis) -> Float[np.ndarray, " 6"]:
+    """Variance of tz by what edges and markings err by alike, as its profile weighs it against the prior."""
+    weight = max(float(analysis.observability[TZ]), 0.0)
+    known = weight >= OBSERVABLE
+    variance = weight**2 * (analysis.profile.bias_m**2 + TZ_COMMON_BIAS_M**2) if known else 0.0
+    return np.where(np.arange(6) == TZ, variance, 0.0)

@@ -86,6 +86,7 @@ class ObservabilityAnalysis:
     fixed: np.ndarray  # 8, bool: at the prior
     covariance: np.ndarray  # 8 8
     common: np.ndarray  # 8 8, of the covariance what all days of a vehicle err by alike
+    floors: np.ndarray  # 8 8, of the common part what is no prior's
     observability: np.ndarray  # 6
     profile: TzProfile
 
@@ -153,7 +154,7 @@ def _fix_unobservable(
             break
         fixed = more_fixed
     return ObservabilityAnalysis(
-        problem.prior, state, kernel, fixed, day.covariance, day.common, observability, profile
+        problem.prior, state, kernel, fixed, day.covariance, day.common, day.floors, observability, profile
     )
 
 
@@ -189,6 +190,7 @@ class DayCovariance:
 
     covariance: np.ndarray  # 8 8
     common: np.ndarray  # 8 8, of the covariance what all days of a vehicle err by alike
+    floors: np.ndarray  # 8 8, of the common part what is no prior's
     observability: np.ndarray  # 6
 
 
@@ -219,7 +221,7 @@ def day_covariance(
     common = floors + prior_share(covariance, prior_information)
     covariance = covariance + floors
     observability = np.clip(1 - np.diag(covariance) / prior_variance, 0.0, 1.0)[:6]
-    return DayCovariance(covariance, common, observability)
+    return DayCovariance(covariance, common, floors, observability)
 
 
 def _prior_variance(problem: CameraLidarProblem) -> Float[np.ndarray, " 8"]:

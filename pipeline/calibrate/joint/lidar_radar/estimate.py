@@ -60,6 +60,7 @@ from pipeline.objective.radar.registration import registration_frames
 from pipeline.objective.radar.travel import travel_directions
 from pipeline.objective.radar.vehicle_boxes import vehicle_boxes
 from pipeline.objective.stamp_gaps import constant_gap_s, radar_gaps_s
+from pipeline.rig.evidence import EDGE
 from schemas.observations import Observation
 
 __all__ = ["estimate_lidar_radar"]
@@ -308,10 +309,13 @@ def _analyse_observability(
         # fixed, they contradict the scene by metres, and yaw follows.
         unknown[DT] &= not np.any(unknown[:DT] & ~fixed[:DT])
         fixed[: DT + 1] |= unknown
-    common = follow @ _floors(linear, curvature, fixed) @ follow.T + prior_share(full, np.diag(1 / variance))
+    floors = follow @ _floors(linear, curvature, fixed) @ follow.T
+    common = floors + prior_share(full, np.diag(1 / variance))
     for covariance in (full, common):
         covariance[np.arange(DT + 1), np.arange(DT + 1)] += bias
-    return ObservabilityAnalysis(state, linear, full, common, fixed, observability, linear.witnesses)
+    return ObservabilityAnalysis(
+        state, linear, full, common, np.diag(bias), floors, fixed, observability, linear.witnesses
+    )
 
 
 def _following_tilt(linear: Linear, fixed: Bool[np.ndarray, " P"]) -> Float[np.ndarray, "P P"]:
@@ -373,6 +377,9 @@ def _conclude(
         diagnostics_of(analysis, ends, halves),
         notes,
         common_part(J @ analysis.common[:6, :6] @ J.T, J @ covariance @ J.T),
+        bias={EDGE: J @ analysis.bias[:6, :6] @ J.T},
+        bias_in_weights=J @ analysis.floors[:6, :6] @ J.T,
+        time_offset_prior_s=-problem.constant_gap_s,
     )
 
 
