@@ -13,7 +13,15 @@ from shlex import quote
 from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.columns import Recorded, column, row, table_of
 
-__all__ = ["DRIFT", "DRIFT_STATUSES", "DriftFinding", "VehicleStatus", "next_step", "status_of"]
+__all__ = [
+    "DRIFT",
+    "DRIFT_STATUSES",
+    "DriftFinding",
+    "VehicleStatus",
+    "kind_of_sensor",
+    "next_step",
+    "status_of",
+]
 
 # What a person should look at first comes first; lists of vehicles are in this order.
 DRIFT_STATUSES = ("RED", "YELLOW", "UNKNOWN", "GREEN")
@@ -109,6 +117,21 @@ def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
     return VehicleStatus(
         first.vehicle_status, first.vehicle_reason or "", first.vehicle_sensor, first.vehicle_since
     )
+
+
+def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
+    """camera, lidar, radar or base: what the sensor of a name is on the edges that findings are about.
+
+    Args:
+        name: of a sensor.
+        findings: of its vehicle.
+    """
+    known = {
+        frame: kind
+        for f in findings
+        for frame, kind in zip((f.parent_frame, f.child_frame), f.pair.split("_"), strict=True)
+    }
+    return known.get(name, name)
 
 
 def next_step(vehicle: str, stored: VehicleStatus, lake: str = "LAKE") -> str:

@@ -15,9 +15,11 @@ from jaxtyping import Bool, Float, Int
 from pipeline.geometry.changes import change_between
 from pipeline.report.verdicts import ChartVerdicts, FleetVerdicts
 from pipeline.report.window import FleetWindow
-from schemas.calibrations import DOF_NAMES, PAIRS
+from pipeline.rig.edges import edge_order
+from pipeline.rig.graph import Edge
+from schemas.calibrations import DOF_NAMES
 
-__all__ = ["fleet_charts"]
+__all__ = ["charted_edges", "fleet_charts"]
 
 # Of a value as the page gets it: 1e-4 deg and 0.1 mm are a hundredth of the smallest sigma of a day.
 _PER_UNIT = 1e4
@@ -25,42 +27,68 @@ _STATUS_LETTERS = "ahr"  # of schemas.calibrations.STATUSES
 _DOFS = len(DOF_NAMES)
 
 
+def charted_edges(window: FleetWindow, verdicts: FleetVerdicts) -> tuple[Edge, ...]:
+    """Edges that any record or chart is of, in order."""
+    return tuple(sorted({*window.edges, *verdicts.charts.edges}, key=edge_order))
+
+
 def fleet_charts(window: FleetWindow, verdicts: FleetVerdicts) -> Iterator[tuple[str, dict[str, Any]]]:
     """Every audited vehicle with its charts, for `templates/fleet.js`.
 
-    A chart is [pair, dof, status, limit, start, values, sigmas]: places in PAIRS, DOF_NAMES and DRIFT_STATUSES; the
-    limit, and per day value and sigma, in 1e-4 deg or 1e-4 m, null where the day does not say; the start as days of the
-    calendar (first, earliest, latest), null where nothing changed. Values are relative to the level before the change.
-    `days` are ordinals of the calendar; `pairs` has a letter per pair and day: accepted, held, refused, "." none.
+    A chart is [edge, dof, status, limit, start, values, sigmas]: places in `charted_edges`, DOF_NAMES and
+    DRIFT_STATUSES; the limit, and per day value and sigma, in 1e-4 deg or 1e-4 m, null where the day does not say; the
+    start as days of the calendar (first, earliest, latest), null where nothing changed. Values are relative to the
+    level before the change.
+    `days` are ordinals of the calendar; `pairs` has a letter per edge and day: accepted, held, refused, "." none.
     """
     first = _spans(window.owner, len(window.vehicles))
     of_chart = _spans(verdicts.charts.owner, len(verdicts.vehicles))
     place = {vehicle: v for v, vehicle in enumerate(window.vehicles)}
     values = _values(window, verdicts)
+    edges = charted_edges(window, verdicts)
+    place_of = [
+        np.array([edges.index(e) for e in own], np.int64) for own in (window.edges, verdicts.charts.edges)
+    ]
     for c, vehicle in enumerate(verdicts.vehicles):
         v = place.get(vehicle)
         if v is not None:
             rows, charts = slice(*first[v : v + 2]), slice(*of_chart[c : c + 2])
-            yield vehicle, _vehicle(window, verdicts.charts, values, rows, charts)
+            shown = place_of[0][window.edge[rows]], place_of[1][verdicts.charts.edge[charts]]
+            yield vehicle, _vehicle(window, verdicts.charts, values, (rows, charts), shown, len(edges))
 
 
 def _vehicle(
-    window: FleetWindow, verdicts: ChartVerdicts, values: Float[np.ndarray, "N 6"], rows: slice, charts: slice
+    window: FleetWindow,
+    verdicts: ChartVerdicts,
+    values: Float[np.ndarray, "N 6"],
+    of: tuple[slice, slice],
+    shown: tuple[Int[np.ndarray, " R"], Int[np.ndarray, " C"]],
+    edges: int,
 ) -> dict[str, Any]:
+    """Numbers of one vehicle.
+
+    Args:
+        window: records.
+        verdicts: of the charts.
+        values: of all records.
+        of: its rows among the records, and among the charts.
+        shown: places of their edges on the page.
+        edges: of the page.
+    """
+    (rows, charts), (pair, of_chart) = of, shown
     days, column = np.unique(window.day[rows], return_inverse=True)
-    pair = window.pair[rows]
-    letters = np.full((len(PAIRS), len(days)), ".")
+    letters = np.full((edges, len(days)), ".")
     letters[pair, column] = np.array(list(_STATUS_LETTERS))[window.status[rows]]
     scale = np.repeat([np.degrees(_PER_UNIT), _PER_UNIT], 3)
-    grid = np.full((2, len(PAIRS), len(days), _DOFS), np.nan)
+    grid = np.full((2, edges, len(days), _DOFS), np.nan)
     grid[0, pair, column] = values[rows] * scale
     grid[1, pair, column] = window.sigma[rows] * scale
     seen = np.isfinite(grid).all(axis=0)
     told = np.round(np.where(seen, grid, 0.0)).astype(np.int64).astype(object)
     told[:, ~seen] = None
     listed = []
-    for k in range(charts.start, charts.stop):
-        p, dof = int(verdicts.pair[k]), int(verdicts.dof[k])
+    for k, p in zip(range(charts.start, charts.stop), of_chart.tolist(), strict=True):
+        dof = int(verdicts.dof[k])
         value, sigma = told[:, p, :, dof].tolist()
         start = verdicts.start[k].tolist()
         limit = round(float(verdicts.limit[k] * scale[dof]))
@@ -69,9 +97,9 @@ def _vehicle(
 
 
 def _values(window: FleetWindow, verdicts: FleetVerdicts) -> Float[np.ndarray, "N 6"]:
-    """Changes [rad, m] of every record from its pair's level before the change; not finite where it does not say."""
+    """Changes [rad, m] of every record from its edge's level before the change; not finite where it does not say."""
     seen = np.isfinite(window.sigma) & window.observable
-    group = window.owner * len(PAIRS) + window.pair
+    group = window.owner * len(window.edges) + window.edge
     origin = _first_of_each(group, seen.any(axis=1))[group]
     change = np.full(seen.shape, np.nan)
     there = origin >= 0
@@ -89,14 +117,16 @@ def _values(window: FleetWindow, verdicts: FleetVerdicts) -> Float[np.ndarray, "
 
 
 def _starts(window: FleetWindow, verdicts: FleetVerdicts) -> Int[np.ndarray, "G 6"]:
-    """First day with the new value per vehicle and pair, and DoF; far in the future where nothing changed."""
-    starts = np.full((len(window.vehicles) * len(PAIRS), _DOFS), np.iinfo(np.int64).max)
+    """First day with the new value per vehicle and edge, and DoF; far in the future where nothing changed."""
+    starts = np.full((len(window.vehicles) * len(window.edges), _DOFS), np.iinfo(np.int64).max)
     place = {vehicle: v for v, vehicle in enumerate(window.vehicles)}
     own = np.array([place.get(vehicle, -1) for vehicle in verdicts.vehicles], np.int64)
     charts = verdicts.charts
     owner = own[charts.owner] if len(own) else charts.owner
-    changed = (owner >= 0) & (charts.start[:, 0] > 0)
-    rows = owner[changed] * len(PAIRS) + charts.pair[changed]
+    there = {edge: place for place, edge in enumerate(window.edges)}
+    edge = np.array([there.get(e, -1) for e in charts.edges], np.int64)[charts.edge]
+    changed = (owner >= 0) & (edge >= 0) & (charts.start[:, 0] > 0)
+    rows = owner[changed] * len(window.edges) + edge[changed]
     starts[rows, charts.dof[changed]] = charts.start[changed, 0]
     return starts
 

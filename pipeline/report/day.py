@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.report.words import AXIS_NAMES, PAIR_TITLES, dof_title, motion_in_words, scaled, unit_of
+from pipeline.report.words import AXIS_NAMES, dof_title, motion_in_words, scaled, unit_of
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
-from schemas.drift import DriftFinding, next_step, status_of
+from schemas.drift import DriftFinding, kind_of_sensor, next_step, status_of
 from schemas.faults import in_words
 
 __all__ = ["DofRow", "PairView", "answer_for", "clearest_alarm", "pair_view", "sigmas_of", "status_sentence"]
@@ -41,10 +41,11 @@ class DofRow:
 
 @dataclass(frozen=True)
 class PairView:
-    """One pair on the page."""
+    """One edge on the page."""
 
-    pair: str
+    pair: str  # names of its sensors, as T_PAIR has them
     title: str
+    sensors: tuple[str, str]
     status: str
     advice: str
     reason: str
@@ -85,7 +86,7 @@ def sigmas_of(record: CalibrationRecord) -> tuple[np.ndarray | None, np.ndarray 
 
 
 def pair_view(record: CalibrationRecord) -> PairView:
-    """Everything that the page says of one pair."""
+    """Everything that the page says of one edge."""
     T, T_prior = transform_of(record), prior_of(record)
     prior_sigma, sigma = sigmas_of(record)
     observable = record.observable or [sigma is not None] * 6
@@ -94,8 +95,9 @@ def pair_view(record: CalibrationRecord) -> PairView:
     quaternion = [record.qw, record.qx, record.qy, record.qz]
     translation = [record.tx_m, record.ty_m, record.tz_m]
     return PairView(
-        pair=record.pair,
-        title=PAIR_TITLES[record.pair],
+        pair=f"{record.parent_frame}_{record.child_frame}",
+        title=f"{record.parent_frame}-{record.child_frame}",
+        sensors=(record.parent_frame, record.child_frame),
         status=record.status,
         advice=_ADVICE[record.status],
         reason="; ".join(
@@ -156,7 +158,7 @@ def _mounting(record: CalibrationRecord) -> str:
 
 def _unchecked(record: CalibrationRecord) -> str:
     """As `roll (3.1 sigma)`: axes of an accepted record that left the prior clearly and that nothing checks."""
-    names = AXIS_NAMES[record.parent_frame]
+    names = AXIS_NAMES[record.pair.split("_")[0]]
     moves = {k: record.diagnostics.get(f"unchecked_{dof}_sigmas") for k, dof in enumerate(DOF_NAMES)}
     return ", ".join(f"{names[k]} ({sigmas:.1f} sigma)" for k, sigmas in moves.items() if sigmas is not None)
 
@@ -173,7 +175,7 @@ def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFind
     other = [v.title for v in views if v.status != "accepted"]
     stored = status_of(findings)
     sensor = stored.sensor if stored.status == "RED" else None
-    touched = [v.title for v in views if sensor in v.title.split("-")]
+    touched = [v.title for v in views if sensor in v.sensors]
     if (stored.since or "") > day and set(touched) & set(accepted):
         left = [t for t in accepted if t not in touched]
         still = f" Only {', '.join(left)} still holds." if left else ""
@@ -215,7 +217,8 @@ def status_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
     sentence = f"{stored.reason[:1].upper()}{stored.reason[1:]}."
     moved = clearest_alarm(findings)
     if moved is not None and moved.moved_sensor is not None:
-        motion = motion_in_words(moved.moved_sensor, moved.moved_motion or [], moved.moved_motion_sigma or [])
+        kind = kind_of_sensor(moved.moved_sensor, findings)
+        motion = motion_in_words(kind, moved.moved_motion or [], moved.moved_motion_sigma or [])
         sentence = f"{sentence} Its motion: {motion}."
     step = next_step(findings[0].vehicle, stored) if findings else ""
     return stored.status, f"{sentence} To do for {step}" if step else sentence

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, DamagedError
 from pipeline.report.day import PairView, answer_for, pair_view, sigmas_of, status_sentence
-from pipeline.report.figures import residual_figure, sigma_figure
+from pipeline.report.figures import SigmaPanel, residual_figure, sigma_figure
 from pipeline.report.in_use import InUseView
 from pipeline.report.overlays import Extrinsics
 from pipeline.report.page import render, write_page
@@ -18,6 +18,7 @@ from pipeline.report.picture_file import write_picture
 from pipeline.report.pictures import scene_pictures
 from pipeline.report.reading import (
     day_records,
+    drawn_records,
     drift_of,
     has_frames,
     scenes_among,
@@ -41,7 +42,7 @@ P = TypeVar("P", bound=PurePath)
 
 @dataclass(frozen=True)
 class DayRead:
-    """What the page of a vehicle-day tells: its current records by pair, and the vehicle's current findings."""
+    """What the page of a vehicle-day tells: its current records by edge, and the vehicle's current findings."""
 
     records: Mapping[str, CalibrationRecord]
     findings: Sequence[DriftFinding]
@@ -110,7 +111,8 @@ def write_day_picture(
         ConfigError: the day has no record of the method, nothing to draw, or `out` has another suffix.
     """
     records = day_records(lake, partition, method or fleet.audit.method)
-    states = states_of(records)
+    drawn = drawn_records(records)
+    states = states_of(drawn)
     spread = spread_observations(lake, partition) if has_frames(lake, partition) else []
     if states is None or not any("camera" in o.sensors for o in spread):
         problem = f"{partition.vehicle} has no image with a prior on {partition.day}"
@@ -118,7 +120,7 @@ def write_day_picture(
     before, after = states
     seen = [o for o in spread if "camera" in o.sensors]
     scene = scenes_among(lake, partition, seen, after.T_camera_lidar, 1, fleet.report)[0]
-    stamped = as_stamped(after, scene.observation, time_offsets_of(records))
+    stamped = as_stamped(after, scene.observation, time_offsets_of(drawn))
     labels = ("prior", _after_label([pair_view(r) for r in records.values()]))
     return write_picture(out, scene, before, stamped, labels)
 
@@ -128,10 +130,11 @@ def _content(
 ) -> dict[str, Any]:
     """What the records, the findings and the frames of a day tell, by the names that the template uses."""
     records, findings = read.records, read.findings
-    views = [pair_view(records[p]) for p in PAIRS if p in records]
-    before, after = states_of(records) or (None, None)
+    views = [pair_view(record) for record in records.values()]
+    of_three = drawn_records(records)
+    before, after = states_of(of_three) or (None, None)
     labels = ("prior", _after_label(views))
-    offsets = time_offsets_of(records)
+    offsets = time_offsets_of(of_three)
     drawn, residual_svg, no_pictures = (
         _pictures(lake, partition, before, after, labels, offsets, pictures)
         if pictures is not None
@@ -212,15 +215,13 @@ def _drawn(
 
 
 def _sigma_svg(records: Mapping[str, CalibrationRecord]) -> str:
-    prior, sigma, observable = {}, {}, {}
-    for pair, record in records.items():
-        before, after = sigmas_of(record)
-        if before is not None:
-            prior[pair] = before
-        if after is not None:
-            sigma[pair] = after
-            observable[pair] = record.observable or [True] * 6
-    return sigma_figure(prior, sigma, observable, [p for p in PAIRS if p in records])
+    panels = []
+    for record in records.values():
+        prior, sigma = sigmas_of(record)
+        seen = None if sigma is None else record.observable or [True] * 6
+        title = f"{record.parent_frame}-{record.child_frame}"
+        panels.append(SigmaPanel(title, record.pair, prior, sigma, seen))
+    return sigma_figure(panels)
 
 
 def _provenance(records: Sequence[CalibrationRecord]) -> list[tuple[str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
@@ -12,52 +13,44 @@ from pipeline.report.svg import MUTED, Plot, document, nice_step
 from pipeline.report.words import PAIR_TITLES, dof_title, scaled, unit_of
 from schemas.calibrations import DOF_NAMES, PAIRS
 
-__all__ = ["residual_figure", "sigma_figure"]
+__all__ = ["SigmaPanel", "residual_figure", "sigma_figure"]
 
 BEFORE, AFTER = "#e0813a", "#3b82c4"
+_COLUMNS, _SIGMA_HEIGHT = 3, 272.0  # edges side by side, and the height of a row of them
 
 
-def sigma_figure(
-    prior_sigma: Mapping[str, np.ndarray],
-    sigma: Mapping[str, np.ndarray],
-    observable: Mapping[str, Sequence[bool]],
-    pairs: Sequence[str] = PAIRS,
-) -> Markup:
+@dataclass(frozen=True, eq=False)
+class SigmaPanel:
+    """One edge of the figure: its title and kind, sigmas of prior and result (None = there is none), what was seen."""
+
+    title: str
+    pair: str
+    prior: np.ndarray | None
+    sigma: np.ndarray | None
+    observable: Sequence[bool] | None
+
+
+def sigma_figure(panels: Sequence[SigmaPanel]) -> Markup:
     """Sigma of each DoF beside that of the prior, on a log scale; hollow where the day did not determine it."""
     parts: list[str] = []
-    for column, pair in enumerate(pairs):
+    for place, panel in enumerate(panels):
+        left, above = place % _COLUMNS * 410.0, place // _COLUMNS * _SIGMA_HEIGHT
         for row, dofs in enumerate((DOF_NAMES[:3], DOF_NAMES[3:])):
-            values = [
-                s
-                for source in (prior_sigma, sigma)
-                if pair in source
-                for s in _page_units(source[pair], dofs)
-            ]
-            low, high = _decades(values)
-            plot = Plot(column * 410.0 + 80.0, row * 132.0 + 24.0, 310.0, 84.0, (low, high), (3.0, 0.0))
+            known = [source for source in (panel.prior, panel.sigma) if source is not None]
+            low, high = _decades([s for source in known for s in _page_units(source, dofs)])
+            plot = Plot(left + 80.0, above + row * 132.0 + 24.0, 310.0, 84.0, (low, high), (3.0, 0.0))
             if row == 0:
-                plot.text(column * 410.0, 12.0, PAIR_TITLES[pair], bold=True, size=12.5)
+                plot.text(left, above + 12.0, panel.title, bold=True, size=12.5)
             decades = [(float(d), f"{10.0**d:g}") for d in np.arange(np.ceil(low), high + 1e-9)]
             plot.frame(decades, [])
-            plot.text(
-                plot.left + 310,
-                plot.top + 110,
-                f"sigma [{unit_of(dofs[0])}], log",
-                anchor="end",
-                colour=MUTED,
-            )
+            unit = f"sigma [{unit_of(dofs[0])}], log"
+            plot.text(plot.left + 310, plot.top + 110, unit, anchor="end", colour=MUTED)
             for k, dof in enumerate(dofs):
-                plot.text(plot.left - 6, plot.top + 28 * k + 18, dof_title(pair, dof), anchor="end")
-                _sigma_bars(
-                    plot,
-                    k,
-                    DOF_NAMES.index(dof),
-                    prior_sigma.get(pair),
-                    sigma.get(pair),
-                    observable.get(pair),
-                )
+                plot.text(plot.left - 6, plot.top + 28 * k + 18, dof_title(panel.pair, dof), anchor="end")
+                _sigma_bars(plot, k, DOF_NAMES.index(dof), panel.prior, panel.sigma, panel.observable)
             parts += plot.parts
-    return document(1210.0, 272.0, parts, "Sigma of each degree of freedom, of the prior and of the result")
+    height = _SIGMA_HEIGHT * max(1, -(-len(panels) // _COLUMNS))
+    return document(1210.0, height, parts, "Sigma of each degree of freedom, of the prior and of the result")
 
 
 def _sigma_bars(

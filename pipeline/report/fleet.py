@@ -15,9 +15,9 @@ from pipeline.report.day import clearest_alarm, status_sentence
 from pipeline.report.names import page_stem
 from pipeline.report.verdicts import FleetVerdicts
 from pipeline.report.window import FleetWindow
-from pipeline.report.words import PAIR_TITLES, motion_in_words, with_sigma
+from pipeline.report.words import motion_in_words, with_sigma
 from schemas.calibrations import STATUSES
-from schemas.drift import DRIFT_STATUSES, DriftFinding, status_of
+from schemas.drift import DRIFT_STATUSES, DriftFinding, kind_of_sensor, status_of
 from schemas.words import DAY_WORDS, day_word
 
 __all__ = [
@@ -196,9 +196,8 @@ def _finding_view(vehicle: str, clearest: DriftFinding, own: Sequence[DriftFindi
     earliest, latest = clearest.start_day_earliest, clearest.start_day_latest
     motion = clearest.reason
     if clearest.moved_sensor is not None:
-        motion = motion_in_words(
-            clearest.moved_sensor, clearest.moved_motion or [], clearest.moved_motion_sigma or []
-        )
+        kind = kind_of_sensor(clearest.moved_sensor, own)
+        motion = motion_in_words(kind, clearest.moved_motion or [], clearest.moved_motion_sigma or [])
     alarms = sorted((f for f in own if f.start_day), key=lambda f: -(f.statistic or 0.0))
     return FindingView(
         vehicle,
@@ -223,10 +222,10 @@ def _sure(finding: DriftFinding) -> str:
 
 
 def _chart_words(finding: DriftFinding) -> str:
+    chart = f"{finding.parent_frame}-{finding.child_frame} {finding.dof}"
     if finding.magnitude is None or finding.magnitude_sigma is None:
-        return f"{PAIR_TITLES[finding.pair]} {finding.dof}"
-    size = with_sigma(finding.magnitude, finding.magnitude_sigma, finding.dof)
-    return f"{PAIR_TITLES[finding.pair]} {finding.dof} {size}"
+        return chart
+    return f"{chart} {with_sigma(finding.magnitude, finding.magnitude_sigma, finding.dof)}"
 
 
 def _count(number: int, noun: str) -> str:

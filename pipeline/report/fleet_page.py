@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline.config import FleetConfig
-from pipeline.report.charts import fleet_charts
+from pipeline.report.charts import charted_edges, fleet_charts
 from pipeline.report.fleet import DAY_LETTERS, VehicleRow, finding_views, fleet_rows, headline_for, index_row
 from pipeline.report.names import page_stem
 from pipeline.report.page import render, write_page
@@ -22,8 +22,9 @@ from pipeline.report.truth import truth_rows, truth_summary
 from pipeline.report.upkeep import Album
 from pipeline.report.verdicts import FleetVerdicts
 from pipeline.report.window import FleetWindow
-from pipeline.report.words import PAIR_TITLES, dof_title
-from schemas.calibrations import DOF_NAMES, PAIRS
+from pipeline.report.words import dof_title
+from pipeline.rig.graph import Edge
+from schemas.calibrations import DOF_NAMES
 from schemas.drift import DRIFT_STATUSES
 
 __all__ = ["render_fleet_page"]
@@ -55,7 +56,7 @@ def render_fleet_page(
     """
     days, rows = fleet_rows(window, verdicts, pages)
     views = finding_views(verdicts.findings)
-    charts = fleet_charts(window, verdicts)
+    edges, charts = charted_edges(window, verdicts), fleet_charts(window, verdicts)
     records = fleet_records(album.lake, album.method, album.fleet.audit.window_days) if truth else []
     known = truth_rows(records, truth or {})
     ends = [window.day.min(), window.day.max()] if len(window.day) else []
@@ -77,7 +78,7 @@ def render_fleet_page(
         words=DAY_LETTERS,
         link=lambda vehicle, day: f"{quote(album.folder.name)}/{day}/{quote(page_stem(vehicle))}.html",
         shown=rows[:_CHARTS],
-        index=json.dumps(_index(album, days, rows, {v.vehicle: v for v in views}, charts)),
+        index=json.dumps(_index(album, days, rows, {v.vehicle: v for v in views}, (edges, charts))),
         dofs=[f"{d} [{'deg' if d.startswith('r') else 'm'}]" for d in DOF_NAMES],
         truth=known,
         truth_summary=truth_summary(known),
@@ -91,9 +92,10 @@ def _index(
     days: Sequence[str],
     rows: Sequence[VehicleRow],
     views: Mapping[str, Any],
-    charts: Iterable[tuple[str, dict[str, Any]]],
+    charted: tuple[Sequence[Edge], Iterable[tuple[str, dict[str, Any]]]],
 ) -> dict[str, Any]:
-    """What `templates/fleet.js` is given."""
+    """What `templates/fleet.js` is given; `charted`: edges, and each vehicle's charts of them."""
+    edges, charts = charted
     sentences: dict[str, int] = {}
     told = [index_row(row, sentences, views.get(row.vehicle)) for row in rows]
     folder = album.page.parent / f"{album.page.stem}_charts"
@@ -106,8 +108,8 @@ def _index(
         "folder": quote(album.folder.name),
         "statuses": DRIFT_STATUSES,
         "words": DAY_LETTERS,
-        "pairs": [PAIR_TITLES[pair] for pair in PAIRS],
-        "dofs": [[dof_title(pair, dof) for dof in DOF_NAMES] for pair in PAIRS],
+        "pairs": [edge.name for edge in edges],
+        "dofs": [[dof_title(edge.kind, dof) for dof in DOF_NAMES] for edge in edges],
         "rows": told,
         "sentences": list(sentences),
         "charts": where,

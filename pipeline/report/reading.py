@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from pipeline.errors import ConfigError
 from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.privacy import without_road_users
 from pipeline.report.scenes import choose_frames
+from pipeline.rig.edges import edge_named, edge_order, words_of
 from pipeline.sections import ReportConfig
 from pipeline.store.current import current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
@@ -24,6 +25,7 @@ from schemas.observations import Observation
 
 __all__ = [
     "day_records",
+    "drawn_records",
     "drift_of",
     "fleet_records",
     "has_frames",
@@ -40,13 +42,13 @@ _FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 
 
 def day_records(lake: Lake, partition: Partition, method: str) -> dict[str, CalibrationRecord]:
-    """Current records of a vehicle-day by pair.
+    """Current records of a vehicle-day by edge, in order of edges.
 
     Raises:
         ConfigError: the day has no record of the method.
     """
     found = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle, day=partition.day)
-    records = {r.pair: r for r in current_records([r for r in found if r.method == method])}
+    records = _by_edge(r for r in found if r.method == method)
     if not records:
         known = sorted({r.method for r in found})
         problem = (
@@ -75,13 +77,35 @@ def fleet_records(lake: Lake, method: str, window_days: int) -> list[Calibration
 def records_of_day(
     lake: Lake, method: str, day: str, among: Collection[str]
 ) -> dict[str, dict[str, CalibrationRecord]]:
-    """Current records of some vehicles on a day, whole, by vehicle and pair."""
+    """Current records of some vehicles on a day, whole, by vehicle and edge, in order of edges."""
     rows = read_records(lake, CALIBRATIONS, CalibrationRecord, day=day, vehicle=set(among))
-    found = [r for r in rows if r.method == method]
-    records: dict[str, dict[str, CalibrationRecord]] = {}
-    for record in current_records(found):
-        records.setdefault(record.vehicle, {})[record.pair] = record
-    return records
+    by_vehicle: dict[str, list[CalibrationRecord]] = {}
+    for record in rows:
+        if record.method == method:
+            by_vehicle.setdefault(record.vehicle, []).append(record)
+    return {vehicle: _by_edge(own) for vehicle, own in by_vehicle.items()}
+
+
+def _by_edge(records: Iterable[CalibrationRecord]) -> dict[str, CalibrationRecord]:
+    """Current ones of a vehicle-day by the words of their edges: the kind of edge, or the names of its sensors."""
+    edges = {edge_named(r.pair, r.parent_frame, r.child_frame): r for r in current_records(list(records))}
+    return {words_of(edge): edges[edge] for edge in sorted(edges, key=edge_order)}
+
+
+def drawn_records(records: Mapping[str, CalibrationRecord]) -> dict[str, CalibrationRecord]:
+    """By pair, the records that pictures of one camera, one lidar and one radar are drawn from: the first of each kind.
+
+    Args:
+        records: of a vehicle-day, as `day_records` gives them.
+    """
+    chosen: dict[str, CalibrationRecord] = {}
+    names: dict[str, str] = {}  # of each kind the sensor that is drawn
+    for record in records.values():
+        ends = dict(zip(record.pair.split("_"), (record.parent_frame, record.child_frame), strict=True))
+        if record.pair in PAIRS and all(names.get(kind, name) == name for kind, name in ends.items()):
+            chosen[record.pair] = record
+            names |= ends
+    return chosen
 
 
 def drift_of(lake: Lake, method: str, vehicle: str) -> list[DriftFinding]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pipeline.errors import ConfigError
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import inverse
-from pipeline.report.words import PAIR_TITLES, scaled
+from pipeline.report.words import scaled
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
 
@@ -100,7 +100,13 @@ def _row(record: CalibrationRecord, T_true: np.ndarray) -> TruthRow:
     if T_prior is not None:
         off = change_between(T_true, T_prior)
         prior_error = f"{np.degrees(np.linalg.norm(off[:3])):.2f} deg, {100 * np.linalg.norm(off[3:]):.1f} cm"
-    head = (record.vehicle, record.day, PAIR_TITLES[record.pair], record.status, prior_error)
+    head = (
+        record.vehicle,
+        record.day,
+        f"{record.parent_frame}-{record.child_frame}",
+        record.status,
+        prior_error,
+    )
     if T is None or record.covariance is None:
         return TruthRow(*head, [""] * 6, [True] * 6, [False] * 6)
     error = change_between(T_true, T)

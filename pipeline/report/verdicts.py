@@ -10,12 +10,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
+from pipeline.rig.edges import edges_of_rows
+from pipeline.rig.graph import EDGE_KINDS, Edge
 from pipeline.store.columns import known_rows, ordinals, places
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_last_columns
 from pipeline.store.rows import from_table
-from schemas.calibrations import DOF_NAMES, PAIRS
+from schemas.calibrations import DOF_NAMES
 from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding
 
 __all__ = ["ChartVerdicts", "FleetVerdicts", "read_verdicts"]
@@ -31,15 +33,17 @@ class ChartVerdicts:
 
     Args:
         owner: place in `FleetVerdicts.vehicles`.
-        pair: place in PAIRS.
+        edges: that any chart is of, in order.
+        edge: which of them a chart is of.
         dof: place in DOF_NAMES.
         status: place in DRIFT_STATUSES.
         limit: size of a change that matters [rad or m].
         start: first day with the new value, its earliest and its latest.
     """
 
+    edges: tuple[Edge, ...]
     owner: Int[np.ndarray, " N"]
-    pair: Int[np.ndarray, " N"]
+    edge: Int[np.ndarray, " N"]
     dof: Int[np.ndarray, " N"]
     status: Int[np.ndarray, " N"]
     limit: Float[np.ndarray, " N"]
@@ -75,10 +79,10 @@ def read_verdicts(lake: Lake, method: str) -> FleetVerdicts:
     found = read_last_columns(lake, DRIFT, method, _COLUMNS)
     if found is None:
         none = np.zeros(0, np.int64)
-        empty = ChartVerdicts(none, none, none, none, np.zeros(0), np.zeros((0, 3), np.int64))
+        empty = ChartVerdicts((), none, none, none, none, np.zeros(0), np.zeros((0, 3), np.int64))
         return FleetVerdicts([], {}, empty)
     found = known_rows(
-        current_rows(found, DRIFT), {"pair": PAIRS, "dof": DOF_NAMES, "status": DRIFT_STATUSES}
+        current_rows(found, DRIFT), {"pair": EDGE_KINDS, "dof": DOF_NAMES, "status": DRIFT_STATUSES}
     )
     names = found["vehicle"].combine_chunks().dictionary_encode()
     vehicles, owner = names.dictionary.to_pylist(), np.asarray(names.indices).astype(np.int64)
@@ -103,9 +107,11 @@ def _findings(found: pa.Table, owner: Int[np.ndarray, " N"]) -> dict[str, list[D
 def _charts(found: pa.Table, owner: Int[np.ndarray, " N"]) -> ChartVerdicts:
     names = ("start_day", "start_day_earliest", "start_day_latest")
     starts = np.stack([ordinals(found[name]) for name in names], axis=1)
+    edges, edge = edges_of_rows(found)
     return ChartVerdicts(
+        edges,
         owner,
-        places(found["pair"], PAIRS),
+        edge,
         places(found["dof"], DOF_NAMES),
         places(found["status"], DRIFT_STATUSES),
         found["limit"].to_numpy(),

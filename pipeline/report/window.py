@@ -17,11 +17,13 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import from_quaternion
+from pipeline.rig.edges import edges_of_rows
+from pipeline.rig.graph import EDGE_KINDS, Edge
 from pipeline.store.columns import known_rows, matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import first_day, last_day, read_columns
-from schemas.calibrations import CALIBRATIONS, PAIRS, STATUSES
+from schemas.calibrations import CALIBRATIONS, STATUSES
 
 __all__ = ["FEWEST_DAYS", "FleetWindow", "read_window"]
 
@@ -34,13 +36,14 @@ _COLUMNS = ("status", *_POSE, "covariance", "observable", "code_version")
 
 @dataclass(frozen=True, eq=False)
 class FleetWindow:
-    """Current records of a method, in order of vehicle, day and pair.
+    """Current records of a method, in order of vehicle, day and edge.
 
     Args:
         vehicles: names, in order.
         owner: which of them a record is of.
         day: ordinals of the calendar.
-        pair: places in PAIRS.
+        edges: that any record is of, in order.
+        edge: which of them a record is of.
         status: places in STATUSES.
         T: T_parent_child; not finite where the day was refused.
         sigma: of (rotation vector [rad], origin [m]); not finite where the day was refused.
@@ -50,9 +53,10 @@ class FleetWindow:
     """
 
     vehicles: list[str]
+    edges: tuple[Edge, ...]
     owner: Int[np.ndarray, " N"]
     day: Int[np.ndarray, " N"]
-    pair: Int[np.ndarray, " N"]
+    edge: Int[np.ndarray, " N"]
     status: Int[np.ndarray, " N"]
     T: Float[np.ndarray, "N 4 4"]
     sigma: Float[np.ndarray, "N 6"]
@@ -124,17 +128,19 @@ def _window_of(table: pa.Table | None) -> FleetWindow:
     if table is None:
         none = np.zeros(0, np.int64)
         T, sigma = np.zeros((0, 4, 4)), np.zeros((0, 6))
-        return FleetWindow([], none, none, none, none, T, sigma, np.zeros((0, 6), bool), [], [])
+        return FleetWindow([], (), none, none, none, none, T, sigma, np.zeros((0, 6), bool), [], [])
     found = current_rows(table, CALIBRATIONS)
     # What no release writes is not drawn; the audit names such records.
-    found = known_rows(found, {"pair": PAIRS, "status": STATUSES})
+    found = known_rows(found, {"pair": EDGE_KINDS, "status": STATUSES})
+    edges, edge = edges_of_rows(found)
     names = found["vehicle"].combine_chunks().dictionary_encode()
     T, sigma = _estimates(found)
     return FleetWindow(
         names.dictionary.to_pylist(),  # rows are in order of vehicle, and so is what they are first met in
+        edges,
         np.asarray(names.indices).astype(np.int64),
         ordinals(found["day"]),
-        places(found["pair"], PAIRS),
+        edge,
         places(found["status"], STATUSES),
         T,
         sigma,

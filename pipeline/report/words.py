@@ -19,8 +19,8 @@ __all__ = [
 
 _BODY = ("roll", "pitch", "yaw", "forward", "left", "up")
 _OPTICAL = ("pitch", "yaw", "roll", "right", "down", "forward")
-# What the DoFs of a twist mean along the axes of a sensor.
-AXIS_NAMES = {"camera": _OPTICAL, "lidar": _BODY, "radar": _BODY}
+# What the DoFs of a twist mean along the axes of a kind of sensor.
+AXIS_NAMES = {"camera": _OPTICAL, "lidar": _BODY, "radar": _BODY, "base": _BODY}
 PAIR_TITLES = {pair: "-".join(frames) for pair, frames in FRAMES_OF_PAIR.items()}
 _CLEAR_SIGMAS = 3.0
 
@@ -43,8 +43,9 @@ def with_sigma(value: float, sigma: float, dof: str, *, sign: bool = True) -> st
 
 
 def dof_title(pair: str, dof: str) -> str:
-    """As `rz (yaw)`, along the axes of the pair's parent."""
-    return f"{dof} ({AXIS_NAMES[FRAMES_OF_PAIR[pair][0]][DOF_NAMES.index(dof)]})"
+    """As `rz (yaw)`, along the axes of the parent of an edge of this kind."""
+    names = AXIS_NAMES[pair.partition("_")[0]]
+    return f"{dof} ({names[DOF_NAMES.index(dof)]})"
 
 
 def significant_motion(motion: list[float], sigma: list[float]) -> list[int]:
@@ -53,9 +54,9 @@ def significant_motion(motion: list[float], sigma: list[float]) -> list[int]:
     return [int(k) for k in np.argsort(-ratio) if ratio[k] >= _CLEAR_SIGMAS]
 
 
-def motion_in_words(sensor: str, motion: list[float], sigma: list[float]) -> str:
-    """As `yaw +1.02 ± 0.05 deg, left +0.031 ± 0.010 m`: what stands out, in the sensor's own axes."""
-    names = AXIS_NAMES[sensor]
+def motion_in_words(kind: str, motion: list[float], sigma: list[float]) -> str:
+    """As `yaw +1.02 ± 0.05 deg, left +0.031 ± 0.010 m`: what stands out, in the axes of a sensor of this kind."""
+    names = AXIS_NAMES[kind]
     shown = significant_motion(motion, sigma)
     parts = [f"{names[k]} {with_sigma(motion[k], sigma[k], DOF_NAMES[k])}" for k in shown]
     return ", ".join(parts) or "no single axis stands out"

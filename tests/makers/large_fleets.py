@@ -55,13 +55,14 @@ def repeated(window, verdicts, count, rare=25):
     c = verdicts.charts
     return (
         FleetWindow(
-            [name for name, _ in names], owner, window.day[at], window.pair[at], window.status[at], window.T[at],
-            window.sigma[at], window.observable[at], [window.work_key[i] for i in at], window.code_versions,
+            [name for name, _ in names], window.edges, owner, window.day[at], window.edge[at], window.status[at],
+            window.T[at], window.sigma[at], window.observable[at], [window.work_key[i] for i in at],
+            window.code_versions,
         ),
         FleetVerdicts(
             [name for name, _ in names],
             {name: [replace(f, vehicle=name) for f in verdicts.findings[kind]] for name, kind in names},
-            ChartVerdicts(chart_owner, c.pair[on], c.dof[on], c.status[on], c.limit[on], c.start[on]),
+            ChartVerdicts(c.edges, chart_owner, c.edge[on], c.dof[on], c.status[on], c.limit[on], c.start[on]),
             verdicts.audited,
             verdicts.work_keys,
         ),

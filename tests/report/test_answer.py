@@ -6,8 +6,9 @@ from pipeline.report.day import PairView, answer_for
 
 
 def view(title, certified, status="accepted", unchecked=""):
-    made = object.__new__(PairView)  # of all that a page shows of a pair, the answer looks at these four
+    made = object.__new__(PairView)  # of all that a page shows of a pair, the answer looks at these five
     fields = {"title": title, "certified": certified, "status": status, "unchecked": unchecked}
+    fields["sensors"] = tuple(title.split("-"))
     for name, value in fields.items():
         object.__setattr__(made, name, value)
     return made

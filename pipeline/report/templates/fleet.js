@@ -130,10 +130,10 @@ function niceStep(span) {
   return power * [0.2, 0.5, 1, 2].find(m => span / (power * m) <= 5);
 }
 
-function panel(chart, days, letters) {
+function panel(chart, days, letters, row) {
   const [pair, dof, statusAt, limit, start, values, sigmas] = chart, status = fleet.statuses[statusAt];
   const colour = COLOURS[status], alarmed = status === "RED" || status === "YELLOW", unit = dof < 3 ? "deg" : "m";
-  const left = dof * 206 + 40, top = pair * 150 + 36, width = 158, height = 84;
+  const left = dof * 206 + 40, top = row * 150 + 36, width = 158, height = 84;
   const first = days[0] - 0.6, last = days[days.length - 1] + 0.6;
   const reach = 1.15 * Math.max(limit, ...values.map((v, i) => v === null ? 0 : Math.abs(v) + sigmas[i]));
   const x = day => (left + (day - first) / (last - first) * width).toFixed(1);
@@ -184,9 +184,10 @@ function panel(chart, days, letters) {
 
 function figure(name, found) {
   if (!found || !found.days.length) return `<p class="soft">No record in the window.</p>`;
-  const pairs = fleet.pairs.map((title, p) => `<text x="0" y="${p * 150 + 12}" font-weight="600" font-size="12.5">${title}</text>`);
-  const panels = found.charts.map(chart => panel(chart, found.days, found.pairs[chart[0]]));
-  return `<figure><svg viewBox="0 0 1246 446" font-size="11" fill="currentColor" role="img" aria-label="Control charts of ${escape(name)}">` +
+  const own = [...new Set(found.charts.map(chart => chart[0]))];  // edges of this vehicle
+  const pairs = own.map((p, row) => `<text x="0" y="${row * 150 + 12}" font-weight="600" font-size="12.5">${escape(fleet.pairs[p])}</text>`);
+  const panels = found.charts.map(chart => panel(chart, found.days, found.pairs[chart[0]], own.indexOf(chart[0])));
+  return `<figure><svg viewBox="0 0 1246 ${own.length * 150 - 4}" font-size="11" fill="currentColor" role="img" aria-label="Control charts of ${escape(name)}">` +
     pairs.join("") + panels.join("") + "</svg></figure>";
 }
 
