@@ -95,7 +95,12 @@ class _Equations:
 
 
 def estimate_camera_radar(
-    observations: Sequence[Observation], prior: Prior, config: SolveConfig, rng: np.random.Generator
+    observations: Sequence[Observation],
+    prior: Prior,
+    config: SolveConfig,
+    rng: np.random.Generator,
+    *,
+    boxes: bool = True,
 ) -> PairEstimate:
     """Estimate the rotation of T_camera_radar from what camera and radar both see; never uses the lidar.
 
@@ -104,8 +109,9 @@ def estimate_camera_radar(
         prior: start and prior; translation stays there.
         config: search range, resampling.
         rng: resamples.
+        boxes: whether elevations in vehicle boxes take part; without them pitch and roll stay at the prior.
     """
-    seen = _Seen(observations, moving_clusters(observations), vehicle_boxes(observations))
+    seen = _Seen(observations, moving_clusters(observations), vehicle_boxes(observations if boxes else []))
     prior_covariance = prior.covariance("camera_radar")
     before = np.append(np.diag(prior_covariance), np.full(len(BOX_CLASSES), BIAS_SIGMA_RAD**2))
     T_start, rival = _scan_azimuth(seen.clusters, prior.T_camera_radar, config)
