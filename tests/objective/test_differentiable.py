@@ -20,7 +20,6 @@ from pipeline.objective.differentiable.paper import (
 )
 from pipeline.objective.differentiable.poses import (
     euler_angles,
-    exp_se3,
     inverse,
     loop_loss,
     pose_of_euler_angles,
@@ -34,6 +33,7 @@ from pipeline.objective.paper.cost_maps import fold_frames, frame_costs
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
 from pipeline.store.partitions import Lake, Partition
 from tests.makers.simulated_days import perceived, simulated_day
+from tests.makers.torch_poses import exp_se3
 from tests.objective.test_kernels import CAMERAS, PENALTY, cloud, poses, smooth_cost
 from tests.objective.test_static_parity import check_static
 

@@ -13,7 +13,7 @@ import torch
 
 from pipeline.geometry import se3
 from pipeline.objective.differentiable.paper import padded
-from pipeline.objective.differentiable.poses import exp_se3, inverse, transform_points
+from pipeline.objective.differentiable.poses import inverse, transform_points
 from pipeline.objective.differentiable.static import (
     StaticFrames,
     elevation_limits,
@@ -30,6 +30,7 @@ from pipeline.objective.radar.registration import (
     registration_frames,
 )
 from tests.makers.radar_scenes import GROUND_M, T_LIDAR_RADAR, street_day
+from tests.makers.torch_poses import exp_se3
 
 PARITY = 1e-3
 ALL = 10**6  # thin nothing out

@@ -8,7 +8,7 @@ there gives the same batches as one that never stopped. The next window is read 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +19,7 @@ from pipeline.errors import ContractError
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.prepare.inventory import read_leaks
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake
 from pipeline.store.row_groups import RowGroup, read_columns, read_group, row_groups
 from pipeline.store.tables import read_manifest
 from schemas.training import TRAINING, TrainingRow
@@ -36,20 +36,17 @@ class _Chunk:
 
 
 class TrainingLoader:
-    """An iterator of batches.
+    """Batches of side train, epoch after epoch without end.
 
     Args:
         lake: where table `training` lies.
         batch_size: frames of a batch, on this rank.
-        split: train, val or test.
-        seed: of the frames' order, the same on all ranks; None: frames as the table has them.
-        repeat: True: epoch after epoch without end, all batches full. False: once, the last batch as it comes.
+        seed: of the frames' order, the same on all ranks.
         rank_of: rank of this process and number of processes; each takes its own row groups.
         window_groups: row groups that are mixed with each other and held in memory, twice (5-10 MB each).
-        partitions: only these vehicle-days.
 
     Raises:
-        ContractError: there is no frame of that split, or fewer row groups than ranks.
+        ContractError: there is no frame to train on, or fewer row groups than ranks.
     """
 
     def __init__(
@@ -57,19 +54,15 @@ class TrainingLoader:
         lake: Lake,
         batch_size: int,
         *,
-        split: str = "train",
-        seed: int | None = 0,
-        repeat: bool = True,
+        seed: int = 0,
         rank_of: tuple[int, int] = (0, 1),
         window_groups: int = 16,
-        partitions: Sequence[Partition] | None = None,
     ) -> None:
-        self._lake, self._batch_size = lake, batch_size
-        self._seed, self._shuffle, self._repeat = seed or 0, seed is not None, repeat
+        self._lake, self._batch_size, self._seed = lake, batch_size, seed
         (self._rank, self._ranks), self._window = rank_of, window_groups
-        self._chunks, self._data_key = _find_chunks(lake, split, partitions)
+        self._chunks, self._data_key = _find_chunks(lake, "train")
         if len(self._chunks) < self._ranks:
-            problem = f"{split} has {len(self._chunks)} row groups, not enough for {self._ranks} processes"
+            problem = f"train has {len(self._chunks)} row groups, not enough for {self._ranks} processes"
             raise ContractError(str(lake.root / TRAINING.name), problem)
         self._epoch, self._taken = 0, 0
         self._order: list[tuple[RowGroup, int]] = []
@@ -84,11 +77,6 @@ class TrainingLoader:
         """Frames of the split, on all ranks."""
         return sum(len(c.rows) for c in self._chunks)
 
-    @property
-    def epoch(self) -> int:
-        """Epoch that the next frame comes from."""
-        return self._epoch
-
     def __iter__(self) -> Iterator[TrainingBatch]:
         return self
 
@@ -97,15 +85,10 @@ class TrainingLoader:
         while len(rows) < self._batch_size:
             self._order_epoch()
             if self._taken == len(self._order):
-                if not self._repeat:
-                    break
                 self._epoch, self._taken = self._epoch + 1, 0
                 continue
             rows.append(self._row(self._taken))
             self._taken += 1
-        if not rows:
-            self._epoch, self._taken = 0, 0  # the next iteration begins anew
-            raise StopIteration
         return collate(rows)
 
     def state_dict(self) -> dict[str, Any]:
@@ -114,7 +97,7 @@ class TrainingLoader:
             "epoch": self._epoch,
             "taken": self._taken,
             "data": self._data_key,
-            "order": [self._seed, self._shuffle, self._rank, self._ranks, self._window],
+            "order": [self._seed, True, self._rank, self._ranks, self._window],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -139,7 +122,7 @@ class TrainingLoader:
         if self._ordered_epoch == self._epoch:
             return
         rng = np.random.default_rng([self._seed, self._epoch])
-        order = rng.permutation(len(self._chunks)) if self._shuffle else np.arange(len(self._chunks))
+        order = rng.permutation(len(self._chunks))
         mine = [self._chunks[i] for i in order[self._rank :: self._ranks]]
         # Every rank draws for itself; drawing more on one must not change another's order.
         rng = np.random.default_rng([self._seed, self._epoch, 1 + self._rank])
@@ -147,7 +130,7 @@ class TrainingLoader:
         for first in range(0, len(mine), self._window):
             window = mine[first : first + self._window]
             frames = [(chunk.group, row) for chunk in window for row in chunk.rows]
-            picked = rng.permutation(len(frames)) if self._shuffle else range(len(frames))
+            picked = rng.permutation(len(frames))
             self._windows += [(len(self._order), [chunk.group for chunk in window])]
             self._order += [frames[i] for i in picked]
         self._starts = {start for start, _ in self._windows}
@@ -169,11 +152,9 @@ class TrainingLoader:
                 self._held[group] = self._reader.submit(read_group, self._lake, TRAINING, group, TrainingRow)
 
 
-def load_split(
-    lake: Lake, split: str, *, limit: int | None = None, partitions: Sequence[Partition] | None = None
-) -> TrainingBatch:
+def load_split(lake: Lake, split: str, *, limit: int | None = None) -> TrainingBatch:
     """All frames of a split (at most `limit`, evenly spread) as one batch: to stay on a GPU, or for tests."""
-    chunks, _ = _find_chunks(lake, split, partitions)
+    chunks, _ = _find_chunks(lake, split)
     frames = [(chunk.group, row) for chunk in chunks for row in chunk.rows]
     if limit is not None and len(frames) > limit:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, limit).astype(int)]
@@ -184,13 +165,11 @@ def load_split(
     return collate(rows)
 
 
-def _find_chunks(
-    lake: Lake, split: str, partitions: Sequence[Partition] | None
-) -> tuple[list[_Chunk], list[str]]:
+def _find_chunks(lake: Lake, split: str) -> tuple[list[_Chunk], list[str]]:
     """Row groups that hold frames of the split, in order, and the work keys of what was found."""
     leaks = read_leaks(lake)
     chunks, keys = [], []
-    for partition in lake.partitions(TRAINING.name) if partitions is None else sorted(partitions):
+    for partition in lake.partitions(TRAINING.name):
         light = read_columns(lake, TRAINING, partition, ["frame_index", "split"])
         barred = leaks.get(partition, set())
         wanted = [

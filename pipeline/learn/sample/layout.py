@@ -9,35 +9,12 @@ from pipeline.learn.sample.grid import Grid
 from schemas.training import GRID_CLASSES
 
 __all__ = [
-    "CAMERA_CHANNELS",
-    "CLASS_CHANNELS",
-    "CLASS_CONFIDENCE",
-    "EDGE_BONUS",
-    "FEATURE_UNITS",
-    "GRAPH_INPUTS",
-    "GROUND_WEIGHT",
-    "INDEX_BITS",
-    "LIDAR_CHANNELS",
-    "LIDAR_FEATURES",
-    "LIKELIHOOD",
-    "MARGIN_DEG",
-    "MARKED_POINTS",
-    "MARK_FLAT",
-    "MARK_LEAST_SHARE",
-    "MARK_SIGMAS",
-    "MARK_WINDOW",
-    "MATCHED_POINTS",
-    "MILLIMETRES",
-    "NEARNESS_M",
-    "NEAR_M",
-    "OBJECT_BONUS",
-    "OBJECT_POINTS",
-    "PAIRS",
-    "RADAR_CHANNELS",
-    "RADAR_FEATURES",
-    "RADAR_POINTS",
-    "NetworkConfig",
-]
+    "CAMERA_CHANNELS", "CLASS_CHANNELS", "CLASS_CONFIDENCE", "EDGE_BONUS", "FEATURE_UNITS", "GRAPH_INPUTS",
+    "GROUND_WEIGHT", "INDEX_BITS", "LIDAR_CHANNELS", "LIDAR_FEATURES", "LIKELIHOOD", "MARGIN_DEG",
+    "MARKED_POINTS", "MARK_FLAT", "MARK_LEAST_SHARE", "MARK_SIGMAS", "MARK_WINDOW", "MATCHED_POINTS",
+    "MILLIMETRES", "NEARNESS_M", "NEAR_M", "OBJECT_BONUS", "OBJECT_POINTS", "PAIRS", "RADAR_CHANNELS",
+    "RADAR_FEATURES", "RADAR_POINTS", "NetworkConfig",
+]  # fmt: skip
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
 LIDAR_FEATURES = ("intensity", "height", "edge", "ground")

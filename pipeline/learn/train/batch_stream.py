@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import fields, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 
@@ -14,33 +13,7 @@ from pipeline.learn.train.processes import Processes
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.store.partitions import Lake
 
-__all__ = ["BatchStream", "batch_stream", "frames_at"]
-
-
-@runtime_checkable
-class BatchStream(Protocol):
-    """Batches without end, on the device, and the place in them."""
-
-    @property
-    def frames(self) -> int:
-        """Frames of the split."""
-        ...
-
-    def batch(self, step: int) -> TrainingBatch:
-        """The batch of a step; steps are asked for in order."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """The place after the last batch."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on there."""
-        ...
-
-    def close(self) -> None:
-        """Let go of threads and memory."""
-        ...
+__all__ = ["BatchStream", "batch_stream"]
 
 
 def batch_stream(data: str, config: TrainConfig, processes: Processes, *, resident: bool) -> BatchStream:
@@ -49,37 +22,27 @@ def batch_stream(data: str, config: TrainConfig, processes: Processes, *, reside
     Raises:
         ContractError: there are none.
     """
-    if resident:
-        return _ResidentStream(data, config, processes)
-    rank_of = (processes.rank, processes.count)
-    loader = TrainingLoader(Lake.at(data), config.batch_size, seed=config.seed, rank_of=rank_of)
-    return _LoaderStream(loader, processes.device)
+    kind = _ResidentStream if resident else BatchStream
+    return kind(data, config, processes)
 
 
-def frames_at(batch: TrainingBatch, rows: torch.Tensor) -> TrainingBatch:
-    """Some frames of a batch, in the order given."""
-    rows = rows.to(batch.T_camera_lidar.device)
-    values: dict[str, Any] = {f.name: getattr(batch, f.name) for f in fields(batch)}
-    picked: dict[str, Any] = {n: v[rows] for n, v in values.items() if isinstance(v, torch.Tensor)}
-    for name in ("vehicle", "day", "environment"):
-        picked[name] = tuple(values[name][i] for i in rows.tolist())
-    return replace(batch, **picked)
+class BatchStream:
+    """The loader's batches without end; on a GPU the next one is fetched while the current one is used."""
 
-
-class _LoaderStream:
-    """The loader's batches; on a GPU the next one is fetched while the current one is used."""
-
-    def __init__(self, loader: TrainingLoader, device: torch.device) -> None:
-        self._loader, self._device = loader, device
-        self._ahead = ThreadPoolExecutor(1, "next-batch") if device.type == "cuda" else None
+    def __init__(self, data: str, config: TrainConfig, processes: Processes) -> None:
+        rank_of = (processes.rank, processes.count)
+        self._loader = TrainingLoader(Lake.at(data), config.batch_size, seed=config.seed, rank_of=rank_of)
+        self._device, self._place = processes.device, self._loader.state_dict()
+        self._ahead = ThreadPoolExecutor(1, "next-batch") if self._device.type == "cuda" else None
         self._next: Future[tuple[TrainingBatch, dict[str, Any]]] | None = None
-        self._place = loader.state_dict()
 
     @property
     def frames(self) -> int:
+        """Frames of the split."""
         return self._loader.frames
 
     def batch(self, step: int) -> TrainingBatch:
+        """The batch of a step, on the device; steps are asked for in order."""
         del step
         if self._ahead is None:
             batch, self._place = self._fetch()
@@ -90,13 +53,16 @@ class _LoaderStream:
         return batch.to(self._device, non_blocking=True)
 
     def state_dict(self) -> dict[str, Any]:
+        """The place after the last batch."""
         return self._place
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on there."""
         self._loader.load_state_dict(state)
         self._place = state
 
     def close(self) -> None:
+        """Let go of threads and memory."""
         if self._ahead is not None:
             self._ahead.shutdown(wait=True, cancel_futures=True)
         self._loader.close()
@@ -107,7 +73,7 @@ class _LoaderStream:
         return (batch.pin_memory() if self._device.type == "cuda" else batch), place
 
 
-class _ResidentStream:
+class _ResidentStream(BatchStream):
     """All frames on the device; a step's frames are drawn from (seed, step, rank)."""
 
     def __init__(self, data: str, config: TrainConfig, processes: Processes) -> None:
@@ -125,7 +91,8 @@ class _ResidentStream:
         epoch, place = divmod(position, per_epoch)
         generator = torch.Generator().manual_seed(hash((self._seed, epoch)) % 2**63)
         order = torch.randperm(len(self._all), generator=generator)
-        return frames_at(self._all, order[place * self._size : (place + 1) * self._size])
+        rows = order[place * self._size : (place + 1) * self._size]
+        return self._all.take(rows.to(self._processes.device))
 
     def state_dict(self) -> dict[str, Any]:
         return {}

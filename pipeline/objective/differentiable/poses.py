@@ -14,7 +14,6 @@ from torch import Tensor
 
 __all__ = [
     "euler_angles",
-    "exp_se3",
     "exp_so3",
     "inverse",
     "loop_loss",
@@ -36,18 +35,9 @@ def hat(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 def exp_so3(phi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a rotation vector [rad]."""
-    a, b, _ = _series(phi)
+    a, b = _series(phi)
     W = hat(phi)
     return torch.eye(3, dtype=phi.dtype, device=phi.device) + a * W + b * (W @ W)
-
-
-def exp_se3(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
-    """Transform of a twist (rotation vector [rad], translation [m])."""
-    phi, rho = xi[..., :3], xi[..., 3:]
-    _, b, c = _series(phi)
-    W = hat(phi)
-    V = torch.eye(3, dtype=xi.dtype, device=xi.device) + b * W + c * (W @ W)
-    return pose(exp_so3(phi), (V @ rho[..., None])[..., 0])
 
 
 def pose(R: Float[Tensor, "*batch 3 3"], t: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
@@ -119,13 +109,12 @@ def loop_loss(
     return angle_unit * euler_angles(loop).abs().sum(-1) + metre_unit * loop[..., :3, 3].abs().sum(-1)
 
 
-def _series(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin(t)/t, (1 - cos t)/t^2, (t - sin t)/t^3 of t = |phi|, with two axes for matrices."""
+def _series(phi: Tensor) -> tuple[Tensor, Tensor]:
+    """sin(t)/t, (1 - cos t)/t^2 of t = |phi|, with two axes for matrices."""
     t2 = (phi * phi).sum(-1)[..., None, None]
     small = t2 < _SMALL_RAD2
     safe2 = torch.where(small, torch.ones_like(t2), t2)
     t = safe2.sqrt()
     a = torch.where(small, 1 - t2 / 6 + t2 * t2 / 120, torch.sin(t) / t)
     b = torch.where(small, 0.5 - t2 / 24 + t2 * t2 / 720, 2 * torch.sin(t / 2) ** 2 / safe2)
-    c = torch.where(small, 1 / 6 - t2 / 120 + t2 * t2 / 5040, (t - torch.sin(t)) / (safe2 * t))
-    return a, b, c
+    return a, b

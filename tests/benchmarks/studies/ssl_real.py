@@ -27,7 +27,6 @@ from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.loader import load_split
 from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.inputs import NetworkInputs, sensor_inputs
-from pipeline.learn.train.batch_stream import frames_at
 from pipeline.learn.train.frame_objective import frame_objective, weighted
 from pipeline.learn.train.run_state import network_of_run
 from pipeline.learn.train.settings import LossConfig
@@ -71,7 +70,7 @@ def answers(network: CalibrationNetwork, batch: TrainingBatch, guess: Poses) -> 
     network.eval()
     with torch.no_grad():
         for rows in torch.arange(len(batch)).split(_AT_ONCE):
-            sensors = sensor_inputs(frames_at(batch, rows), network.config.grid)
+            sensors = sensor_inputs(batch.take(rows), network.config.grid)
             asked = NetworkInputs(sensors, *(guess[f"{pair}"][rows] for pair in PAIRS))
             last = network.refine(asked, _PASSES)[-1]
             for pair in PAIRS:

@@ -71,19 +71,20 @@ def test_a_resumed_loader_continues_as_if_nothing_had_happened(lake, after):
         )  # fmt: skip
 
 
+def first_epoch(loader):
+    """Names of the frames until the second epoch begins; batches of one frame."""
+    seen = []
+    for batch in loader:
+        if loader.state_dict()["epoch"]:
+            return seen
+        seen += names(batch)
+    return seen
+
+
 def test_ranks_share_the_frames_without_overlap(lake):
-    loaders = [TrainingLoader(lake, 1, rank_of=(r, 3), repeat=False, seed=9) for r in range(3)]
-    shares = [[n for b in loader for n in names(b)] for loader in loaders]
+    shares = [first_epoch(TrainingLoader(lake, 1, rank_of=(r, 3), seed=9)) for r in range(3)]
     assert sorted(n for s in shares for n in s) == sorted(names(load_split(lake, "train")))
     assert min(len(s) for s in shares) >= 8
-
-
-def test_a_single_pass_in_order_ends_with_what_is_left_and_begins_again(lake):
-    loader = TrainingLoader(lake, 7, split="val", seed=None, repeat=False)
-    passes = [[names(b) for b in loader] for _ in range(2)]
-    assert passes[0] == passes[1]
-    assert [len(b) for b in passes[0]] == [7, 3]
-    assert [n for b in passes[0] for n in b] == names(load_split(lake, "val"))
 
 
 def test_a_batch_holds_what_the_rows_hold(lake):
@@ -119,7 +120,7 @@ def test_a_table_of_an_older_version_is_read_without_its_columns_that_are_gone(l
         writer.append(rows)
         writer.describe(kept={}, rejected={})
     batch = load_split(other, rows[0].split)
-    assert torch.equal(batch.radar_xyz_m, load_split(lake, rows[0].split, partitions=[partition]).radar_xyz_m)
+    assert np.array_equal(batch.radar_xyz_m, np.stack([row.radar_xyz_m for row in rows]))
 
 
 def test_a_changed_table_or_another_order_refuses_to_resume(lake, tmp_path):

@@ -9,11 +9,12 @@ from pipeline.learn.train.augment import random_guess, turned_view
 from pipeline.learn.train.frame_objective import PAIR_OF_TERM, frame_objective, weighted
 from pipeline.learn.train.running_mean import DayMeans, twist_between, uncertainty_loss
 from pipeline.learn.train.settings import PAIRS_OF, AugmentConfig, LossConfig
-from pipeline.objective.differentiable.poses import exp_se3, exp_so3, pose, transform_points
+from pipeline.objective.differentiable.poses import exp_so3, pose, transform_points
 from pipeline.objective.differentiable.terms import soft_clamp, soft_minimum
 from schemas.training import UNKNOWN_CLASS
 from tests.benchmarks.ssl_landscape import PAIRS, TOLERANCE, day_batch, minima, with_true_clocks
 from tests.makers.simulated_days import simulated_day
+from tests.makers.torch_poses import exp_se3
 
 # One vehicle's prior is off by its own error, which only a fleet's median takes out.
 DATA_ALONE = LossConfig(prior=0.0)
