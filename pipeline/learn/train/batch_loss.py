@@ -12,12 +12,13 @@ from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
 from pipeline.learn.network.outputs import Predictions
+from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS
 from pipeline.learn.train.augment import Guess, random_guess, turned_view
 from pipeline.learn.train.frame_objective import frame_objective, weighted
 from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.running_mean import DayMeans, uncertainty_loss
-from pipeline.learn.train.semantics_loss import semantics_loss
+from pipeline.learn.train.semantics_loss import class_of_points, semantics_loss
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
 from pipeline.learn.train.strangeness import made_strange
 from pipeline.objective.differentiable.poses import pose, transform_points
@@ -78,13 +79,12 @@ def batch_loss(
     sensors = made_strange(sensor_inputs(view, grid), config.strange, generator)
     inputs = NetworkInputs(sensors, guess.T_camera_lidar, guess.T_camera_radar, guess.T_lidar_radar)
     answers: list[Predictions] = passes(inputs, matched=matched)
+    semantics = _semantics(answers, view, guess, batch, day_means, grid)
     if not matched:
-        semantics = _semantics(answers, view, guess, batch, day_means, network)
         loss = config.loss.semantics * semantics
         return StepLoss(loss, {"loss": loss.detach(), "semantics": semantics.detach()})
     pairs = PAIRS_OF[config.pairs]
     total, terms = _alignment(answers, guess, batch, config, paper)
-    semantics = _semantics(answers, view, guess, batch, day_means, network)
     uncertainty, scatter = _uncertainty(answers[-1], guess, batch, day_means)
     loss = total + config.loss.semantics * semantics + config.uncertainty_weight * uncertainty
     report = {f"term/{name}": value.detach().mean() for name, value in terms.items()}
@@ -125,52 +125,33 @@ def _semantics(
     guess: Guess,
     batch: TrainingBatch,
     day_means: DayMeans,
-    network: CalibrationNetwork,
+    grid: Grid,
 ) -> Tensor:
     """Cross-entropy of the encoders; each day's running mean carries the classes to points."""
-    grid = network.config.grid
     turned = pose(guess.R_turned_camera, torch.zeros_like(guess.R_turned_camera[..., 0]))
-    days = _days(batch)
-    T_camera_lidar = turned @ day_means.pose(days, 0, batch.T_camera_lidar)
-    T_camera_radar = turned @ day_means.pose(days, 1, batch.T_camera_radar)
     grid_class = crop(view.grid_class, view.grid_step_deg, grid)
-    radar = transform_points(T_camera_radar, batch.radar_xyz_m)
+    clouds = (batch.lidar_xyz_m, batch.lidar_valid), (batch.radar_xyz_m, batch.radar_valid)
+    priors = batch.T_camera_lidar, batch.T_camera_radar
+    of_points = []
+    for k, ((xyz, valid), prior) in enumerate(zip(clouds, priors, strict=True)):
+        T = turned @ day_means.pose(_days(batch), k, prior)
+        of_points.append(class_of_points(grid_class, transform_points(T, xyz), valid, grid))
     # The camera's logits are the same in all passes; the lidar is rendered anew in each.
-    losses = [
-        semantics_loss(
-            a,
-            grid_class,
-            batch.lidar_xyz_m,
-            batch.lidar_valid,
-            T_camera_lidar,
-            grid,
-            radar,
-            batch.radar_valid,
-        )
-        for a in answers
-    ]
-    return torch.stack(losses).mean()
+    return torch.stack([semantics_loss(a, grid_class, *of_points) for a in answers]).mean()
 
 
 def _uncertainty(
     answer: Predictions, guess: Guess, batch: TrainingBatch, day_means: DayMeans
 ) -> tuple[Tensor, Tensor]:
     """Negative log-likelihood of the scatter, and the root mean square of its angles by pair [rad]."""
-    answers = torch.stack(
-        [
-            guess.unturned(answer.T_camera_lidar),
-            guess.unturned(answer.T_camera_radar),
-            answer.T_lidar_radar,
-        ],
-        1,
-    )
+    camera = guess.unturned(answer.T_camera_lidar), guess.unturned(answer.T_camera_radar)
+    answers = torch.stack([*camera, answer.T_lidar_radar], 1)
     references = torch.stack([batch.T_camera_lidar, batch.T_camera_radar, batch.T_lidar_radar], 1)
     days = _days(batch)
     known = torch.tensor(day_means.known(days), device=answers.device).float()
     scatter = day_means.scatter(days, answers, references)
-    return uncertainty_loss(answer.log_variance, scatter, known), scatter[..., :3].square().sum(-1).mean(
-        0
-    ).sqrt()
+    apart = scatter[..., :3].square().sum(-1).mean(0).sqrt()
+    return uncertainty_loss(answer.log_variance, scatter, known), apart
 
 
 def _days(batch: TrainingBatch) -> list[str]:

@@ -15,7 +15,6 @@ from torch.nn import functional as F  # noqa: N812 - the name that everybody use
 from pipeline.learn.network.outputs import Predictions
 from pipeline.learn.network.rendering import grid_cells, sphere
 from pipeline.learn.sample.grid import Grid
-from pipeline.objective.differentiable.poses import transform_points
 from schemas.training import UNKNOWN_CLASS
 
 __all__ = ["class_of_points", "semantics_loss"]
@@ -41,49 +40,29 @@ def class_of_points(
 def semantics_loss(
     predictions: Predictions,
     grid_class: UInt8[Tensor, "B H W"],
-    lidar_xyz_m: Float[Tensor, "B N 3"],
-    lidar_valid: Bool[Tensor, "B N"],
-    T_camera_lidar: Float[Tensor, "B 4 4"],
-    grid: Grid,
-    radar_camera: Float[Tensor, "B M 3"] | None = None,
-    radar_valid: Bool[Tensor, "B M"] | None = None,
+    lidar_class: Int64[Tensor, "B N"],
+    radar_class: Int64[Tensor, "B M"],
 ) -> Float[Tensor, ""]:
-    """Cross-entropy of all encoders that the predictions come from; 0 for networks without any.
+    """Cross-entropy of all encoders that the predictions of one pass come from; 0 for networks without any.
 
     Args:
-        predictions: of one pass.
+        predictions: of the pass.
         grid_class: the camera's classes on the network's grid (cropped as its image was).
-        lidar_xyz_m: points as in SensorInputs.
-        lidar_valid: which of them are real.
-        T_camera_lidar: the guess that carries classes to points: the day's prior, or the network's own estimate.
-        grid: the network's.
-        radar_camera: detections in the optical frame, by such a guess; needed where radar logits exist.
-        radar_valid: which of them are real.
+        lidar_class: of the points in SensorInputs, by `class_of_points`.
+        radar_class: of the detections, likewise.
     """
-    loss = torch.zeros((), device=lidar_xyz_m.device)
+    loss = torch.zeros((), device=grid_class.device)
     if predictions.camera_logits is not None:
         loss = loss + _cross_entropy(predictions.camera_logits, grid_class.long())
     if predictions.lidar_logits is not None:
-        loss = loss + _cross_entropy(
-            predictions.lidar_logits,
-            _lidar_target(predictions, grid_class, lidar_xyz_m, lidar_valid, T_camera_lidar, grid),
-        )
+        # Each cell has the class of the point that it shows.
+        index = predictions.lidar_index
+        target = torch.where(index >= 0, lidar_class.gather(1, index.clamp(min=0)), UNKNOWN_CLASS)
+        loss = loss + _cross_entropy(predictions.lidar_logits, target.reshape(grid_class.shape))
     if predictions.radar_logits is not None:
-        assert radar_camera is not None
-        assert radar_valid is not None
-        target = class_of_points(grid_class, radar_camera, radar_valid, grid)
-        loss = loss + _RADAR_WEIGHT * _cross_entropy(predictions.radar_logits.transpose(1, 2), target)
+        radar = _cross_entropy(predictions.radar_logits.transpose(1, 2), radar_class)
+        loss = loss + _RADAR_WEIGHT * radar
     return loss
-
-
-def _lidar_target(
-    predictions: Predictions, grid_class: Tensor, xyz: Tensor, valid: Tensor, T: Tensor, grid: Grid
-) -> Tensor:
-    """B H W: the class of the point that each cell shows."""
-    of_point = class_of_points(grid_class, transform_points(T.detach(), xyz), valid, grid)
-    index = predictions.lidar_index
-    target = of_point.gather(1, index.clamp(min=0))
-    return torch.where(index >= 0, target, UNKNOWN_CLASS).reshape(-1, grid.height, grid.width)
 
 
 def _cross_entropy(logits: Tensor, target: Tensor) -> Tensor:

@@ -126,6 +126,16 @@ def test_the_same_seed_gives_the_same_weights_and_leaves_torch_s_generator_alone
     assert any(not torch.equal(a, c) for a, _, c in pairs)
 
 
+def of_points(data, inputs, classes):
+    """Classes of lidar points and radar detections through the guess."""
+    lidar = transform_points(inputs.T_camera_lidar, data.lidar_xyz_m)
+    radar = transform_points(inputs.T_camera_radar, data.radar_xyz_m)
+    return (
+        class_of_points(classes, xyz, valid, GRID)
+        for xyz, valid in ((lidar, data.lidar_valid), (radar, data.radar_valid))
+    )
+
+
 def test_alignment_teaches_heads_and_temperatures_and_classes_teach_encoders():
     network, inputs = small(), inputs_of(batch())
     answer = network(inputs)
@@ -135,9 +145,7 @@ def test_alignment_teaches_heads_and_temperatures_and_classes_teach_encoders():
     assert untaught == {n for n, _ in network.named_parameters() if "_encoder" in n}
     data = batch()
     classes = crop(data.grid_class, data.grid_step_deg, GRID)
-    semantics_loss(
-        answer, classes, data.lidar_xyz_m, data.lidar_valid, inputs.T_camera_lidar, GRID
-    ).backward()
+    semantics_loss(answer, classes, *of_points(data, inputs, classes)).backward()
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.parameters())
 
 
@@ -146,15 +154,11 @@ def test_a_dozen_steps_on_two_frames_teach_classes(pairs):
     network, data = small(pairs=pairs), batch()
     inputs = inputs_of(data)
     classes = crop(data.grid_class, data.grid_step_deg, GRID)
-    radar = transform_points(inputs.T_camera_radar, inputs.sensors.radar_xyz_m)
     optimiser = torch.optim.Adam(network.parameters(), 1e-2)
     losses = []
     for _ in range(12):
         optimiser.zero_grad()
-        loss = semantics_loss(
-            network(inputs), classes, data.lidar_xyz_m, data.lidar_valid, inputs.T_camera_lidar, GRID,
-            radar, data.radar_valid,
-        )  # fmt: skip
+        loss = semantics_loss(network(inputs), classes, *of_points(data, inputs, classes))
         loss.backward()
         optimiser.step()
         losses.append(float(loss.detach()))

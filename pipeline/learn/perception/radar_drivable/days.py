@@ -5,16 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.config import FleetConfig
-from pipeline.errors import ContractError
 from pipeline.extrinsics.prior import read_prior
+from pipeline.learn.perception.days import is_held_out, vehicle_days
 from pipeline.learn.perception.radar_drivable.samples import DrivableSamples, day_samples
 from pipeline.rows import join_rows, take_rows
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.views import observations_of, perceived_days
+from pipeline.store.views import observations_of
 
 __all__ = ["drivable_samples", "samples_of_day"]
-
-_HELD_OUT_EVERY = 5  # vehicle-days
 
 
 def drivable_samples(
@@ -27,10 +25,7 @@ def drivable_samples(
     Raises:
         ContractError: no observations of a vehicle in fleet.toml.
     """
-    days = [p for p in perceived_days(lake) if fleet.knows(p.vehicle)]
-    if not days:
-        problem = "no observations of a vehicle in fleet.toml: run `boresight perceive`"
-        raise ContractError(str(lake.root), problem)
+    days = vehicle_days(fleet, lake, least=1)
     parts = [samples_of_day(fleet, lake, day, frames_per_day) for day in days]
     if len(parts) == 1:
         # Neighbouring scans are alike: a tenth between the two sides belongs to neither.
@@ -39,9 +34,9 @@ def drivable_samples(
             take_rows(parts[0], r) for r in (rows[: int(0.7 * total)], rows[int(0.8 * total) :])
         )
     else:
-        # The second day is held out already: two days are enough.
-        train = join_rows([p for i, p in enumerate(parts) if i % _HELD_OUT_EVERY != 1])
-        held_out = join_rows([p for i, p in enumerate(parts) if i % _HELD_OUT_EVERY == 1])
+        train, held_out = (
+            join_rows([p for i, p in enumerate(parts) if is_held_out(i) == side]) for side in (False, True)
+        )
     numbers = {"vehicle_days": len(days), "samples": len(train), "held_out_samples": len(held_out)}
     return train, held_out, numbers
 
