@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
     from pipeline.export.compare import Side
     from pipeline.geometry.transform_tree import TransformTree
+    from pipeline.rig.graph import Edge
 
 __all__ = ["mounting", "read_calibration", "read_side"]
 
@@ -41,6 +42,7 @@ def read_calibration(
     from pipeline.export.calibration import ExportedCalibration
     from pipeline.export.lake import (
         choose_pairs,
+        edges_of_vehicle,
         pairs_of_day,
         pairs_of_state,
         read_camera,
@@ -64,25 +66,28 @@ def read_calibration(
     days = {str(d) for detail in details for d in _listed(detail.get("days"))} | ({day} if day else set())
     camera = read_camera(lake, vehicle, days)
     names = frames.names(read_frame_ids(lake, vehicle, days) if own_frames else None)
-    T_base_lidar = None if mount is None else mounting(mount, names)
+    edges = edges_of_vehicle(lake, vehicle, day, method)
+    T_base_lidar = None if mount is None else mounting(mount, names, edges)
     if day is None:
         source = f"state of {max((str(d['day']) for d in details), default='no day')}"
     tell_damage(lake)
     return ExportedCalibration(
-        vehicle, source, method, CODE_VERSION, pairs, camera, names, T_base_lidar, without, word
-    )
+        vehicle, source, method, CODE_VERSION, pairs, camera, names, T_base_lidar, without, word,
+        known=edges,
+    )  # fmt: skip
 
 
 def _listed(value: object) -> list[object]:
     return list(value) if isinstance(value, list) else []
 
 
-def mounting(text: str, names: FrameNames) -> np.ndarray:
-    """T_base_lidar out of log:FILE (its /tf_static) or FORMAT:FILE.
+def mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarray:
+    """T_base_lidar, of the sensor that poses of these edges refer to, out of log:FILE (its /tf_static) or FORMAT:FILE.
 
     Raises:
         ConfigError: not of that form, or the file does not join the two frames.
     """
+    from pipeline.export.calibration import reference_of
     from pipeline.export.files import read_files
     from pipeline.export.formats import format_named
 
@@ -98,11 +103,12 @@ def mounting(text: str, names: FrameNames) -> np.ndarray:
         if form.tree is None:
             raise ConfigError("command line", "mount", f"{name} knows no frames of a car")
         tree = form.tree(read_files([Path(path)]))
-    T = tree.lookup(names.base, names.lidar)
+    reference = names.of(reference_of(edges).name)
+    T = tree.lookup(names.base, reference)
     if T is None:
         frames = ", ".join(sorted({*tree.edges, *tree.edges.values()}))
         problem = f"no chain joins these frames; the file has: {frames or 'none'}"
-        raise ConfigError(path, f"{names.base}, {names.lidar}", problem)
+        raise ConfigError(path, f"{names.base}, {reference}", problem)
     return T
 
 

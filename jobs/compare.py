@@ -72,7 +72,7 @@ def compare(
 
 
 def _plain(difference: PairDifference) -> dict[str, Any]:
-    from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR
+    from schemas.calibrations import DOF_NAMES
 
     sigma, z = difference.sigma, difference.z
     axes = [
@@ -86,11 +86,10 @@ def _plain(difference: PairDifference) -> dict[str, Any]:
         }
         for k, dof in enumerate(DOF_NAMES)
     ]
-    parent, child = FRAMES_OF_PAIR[difference.pair]
     return {
         "pair": difference.pair,
-        "parent_frame": parent,
-        "child_frame": child,
+        "parent_frame": difference.edge.parent.name,
+        "child_frame": difference.edge.child.name,
         "status_a": difference.statuses[0],
         "status_b": difference.statuses[1],
         "target_azimuth_rad": difference.targets_rad[0],
@@ -103,5 +102,5 @@ def _write_page(page: Path, titles: list[str], found: list[PairDifference], note
     from pipeline.report.comparison import PairView, comparison_page
     from pipeline.report.page import write_page
 
-    views = [PairView(d.pair, d.statuses, d.change, d.sigma, d.determined, d.targets_rad) for d in found]
+    views = [PairView(d.edge, d.statuses, d.change, d.sigma, d.determined, d.targets_rad) for d in found]
     write_page(page, comparison_page(titles[0], titles[1], views, notes))

@@ -54,12 +54,13 @@ def export(
         method: of the calibration.
         force: write held pairs too, marked as such; the exit code stays 3.
         unchecked: write axes too that lie far from the prior and that nothing checks; default: they rest at the prior.
-        mount: where the lidar sits on the car (frames --base-frame and --lidar-frame): log:FILE, whose /tf_static says
-            it, or FORMAT:FILE, as urdf:car.urdf; default: the lidar is the root of the tree.
-        update: of "autoware": your sensor_kit_calibration.yaml; --out is that file with new numbers for camera and
-            radar, all else as it was.
+        mount: where the reference lidar sits on the car (frames --base-frame and the lidar's): log:FILE, whose
+            /tf_static says it, or FORMAT:FILE, as urdf:car.urdf; default: the lidar is the root of the tree.
+        update: of "autoware": your sensor_kit_calibration.yaml; --out is that file with new numbers for its
+            sensors, all else as it was.
         frames: names of the frames.
-        generic_frames: call them camera, lidar and radar, not as the car's own logs do (autoware always does).
+        generic_frames: call them as the sensors (camera, lidar and radar), not as the car's own logs do (autoware
+            always does).
         most_frames: of "foxglove", which shows the drive of --day: so many frames, evenly spread.
         run: folder of `boresight train`; needed for "onnx".
         notes: JSON object for the card: what was measured, what the data was.
@@ -118,9 +119,9 @@ def _export_drive(
 
 
 def _written(calibration: ExportedCalibration) -> list[str]:
-    from pipeline.export.tree import ESTIMATED_PAIRS
+    from pipeline.export.calibration import written_pairs
 
-    return [pair for pair in ESTIMATED_PAIRS if pair in calibration.pairs]
+    return written_pairs(calibration)
 
 
 def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from pipeline.export.calibration import FrameNames
 
 __all__ = ["FrameOptions"]
+
+_KINDS = ("camera", "lidar", "radar", "base")
 
 
 @Parameter(name="*")
@@ -26,6 +28,10 @@ class FrameOptions:
     lidar: Annotated[str | None, Parameter(name="--lidar-frame", help="frame of the lidar")] = None
     radar: Annotated[str | None, Parameter(name="--radar-frame", help="frame of the radar")] = None
     base: Annotated[str | None, Parameter(name="--base-frame", help="frame of the car, of --mount")] = None
+    frame: Annotated[
+        tuple[str, ...],
+        Parameter(name="--frame", help="SENSOR=NAME, of any sensor; again for each", negative=()),
+    ] = ()
 
     def names(self, known: Mapping[str, str] | None = None) -> FrameNames:
         """The same for the pipeline; `known` names what no option does.
@@ -33,10 +39,16 @@ class FrameOptions:
         Raises:
             ConfigError: no names of frames.
         """
+        from pipeline.errors import ConfigError
         from pipeline.export.calibration import FrameNames
 
-        asked = {sensor: name for sensor, name in asdict(self).items() if name is not None}
-        return FrameNames(**{**(known or {}), **asked})
+        asked = {s: n for s in _KINDS if (n := getattr(self, s)) is not None}
+        for text in self.frame:
+            sensor, equals, name = text.partition("=")
+            if not (sensor and equals and name):
+                raise ConfigError("command line", "frame", f"{text!r} is not SENSOR=NAME, as front=cam_front")
+            asked[sensor] = name
+        return FrameNames.named({**(known or {}), **asked})
 
     def names_in(self, files: Iterable[str | Path]) -> FrameNames:
         """Names in files to read: those that an export noted in them or beside them.

@@ -32,7 +32,7 @@ def print_comparison(titles: Sequence[str], found: Sequence[PairDifference], not
             z = None if pair.z is None else float(pair.z[k])
             cells = [
                 pair.pair if k == 0 else "",
-                dof_title(pair.pair, dof),
+                dof_title(pair.edge.kind, dof),
                 f"{scaled(pair.change[k], dof):+.4f} {unit_of(dof)}",
                 "" if pair.sigma is None else f"{scaled(pair.sigma[k], dof):.4f}",
                 "" if z is None else f"{z:+.1f}",

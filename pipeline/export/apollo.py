@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.export.calibration import Edge, ExportedCalibration, edges_of
+from pipeline.export.calibration import ExportedCalibration, Pose, poses_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import field_of, load_yaml, number_of, pose_of_quaternion, to_yaml
@@ -27,13 +27,12 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     comments = comment_lines(calibration)
     files = {
         f"{_file_name(e.child)}_extrinsics.yaml": to_yaml(_extrinsics(e), comments)
-        for e in edges_of(calibration)
+        for e in poses_of(calibration)
     }
-    if calibration.camera is not None:
-        name = calibration.names.camera
-        files[f"{_file_name(name)}_intrinsics.yaml"] = to_yaml(
-            _intrinsics(name, calibration.camera), comments
-        )
+    for sensor in calibration.sensors:
+        camera, name = calibration.camera_of(sensor.name), calibration.names.of(sensor.name)
+        if camera is not None:
+            files[f"{_file_name(name)}_intrinsics.yaml"] = to_yaml(_intrinsics(name, camera), comments)
     return files
 
 
@@ -45,7 +44,7 @@ def _header(frame: str) -> dict[str, Any]:
     return {"seq": 0, "stamp": {"secs": 0, "nsecs": 0}, "frame_id": frame}
 
 
-def _extrinsics(edge: Edge) -> dict[str, Any]:
+def _extrinsics(edge: Pose) -> dict[str, Any]:
     q, t = to_quaternion(edge.T), edge.T[:3, 3]
     rotation = {name: float(v) + 0.0 for name, v in zip(_ROTATION, q, strict=True)}
     translation = {name: float(v) + 0.0 for name, v in zip(_TRANSLATION, t, strict=True)}

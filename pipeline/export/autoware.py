@@ -36,14 +36,15 @@ _KIT_FILE, _CAR_FILE, _XACRO_FILE = (
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
-    """The kit sits at the lidar unless the base frame is the kit itself."""
-    names, T_base_lidar = calibration.names, calibration.T_base_lidar
+    """The kit sits at the reference lidar unless the base frame is the kit itself."""
+    names, T_base_lidar = calibration.names, calibration.T_base
+    lidar = names.of(calibration.reference.name)
     is_kit_known = T_base_lidar is not None and names.base == _KIT
     T_kit_lidar = T_base_lidar if is_kit_known and T_base_lidar is not None else np.eye(4)
-    poses = {names.lidar: T_kit_lidar} | _links(calibration, T_kit_lidar)
+    poses = {lidar: T_kit_lidar} | _links(calibration, T_kit_lidar)
     comments = comment_lines(calibration, "the camera's link, not its optical frame: x forward, y left, z up")
     if not is_kit_known:
-        comments.append(f"{_KIT} sits at {names.lidar}")
+        comments.append(f"{_KIT} sits at {lidar}")
     children = {child: _entry(T) for child, T in poses.items()}
     files = {
         _KIT_FILE: to_yaml({_KIT: children}, comments),
@@ -55,27 +56,30 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
 
 
 def _links(calibration: ExportedCalibration, T_kit_lidar: np.ndarray) -> dict[str, np.ndarray]:
-    """Poses of the camera's link and of the radar in the kit, those of them that the calibration has."""
-    names, pairs, poses = calibration.names, calibration.pairs, {}
-    if "camera_lidar" in pairs:
-        poses[names.camera] = T_kit_lidar @ inverse(pairs["camera_lidar"].T) @ inverse(T_LINK_OPTICAL)
-    if "lidar_radar" in pairs:
-        poses[names.radar] = T_kit_lidar @ pairs["lidar_radar"].T
+    """Poses of cameras' links and of the other sensors in the kit, those of them that the calibration has."""
+    poses, reference = {}, calibration.reference.name
+    for sensor in calibration.sensors:
+        found = None if sensor.name == reference else calibration.between(reference, sensor.name)
+        if found is not None:
+            T = T_kit_lidar @ found[0]
+            is_camera = sensor.kind == "camera"
+            poses[calibration.names.of(sensor.name)] = T @ inverse(T_LINK_OPTICAL) if is_camera else T
     return poses
 
 
 def _update(file: str, content: bytes, calibration: ExportedCalibration) -> tuple[bytes, list[str]]:
-    """A kit's own sensor_kit_calibration.yaml with new numbers for camera and radar, and the frames that have them.
+    """A kit's own sensor_kit_calibration.yaml with new numbers for its sensors, and the frames that have them.
 
-    The lidar keeps its place in the kit; entries of other sensors, their order and all comments stay.
+    The reference lidar keeps its place in the kit; entries of other sensors, their order and all comments stay.
 
     Raises:
-        ConfigError: the file is no kit with that lidar, or has neither the camera nor the radar.
+        ConfigError: the file is no kit with that lidar, or has none of the other sensors.
     """
     names, changed = calibration.names, list[str]()
+    lidar = names.of(calibration.reference.name)
 
     def edit(held: Any) -> None:
-        values = np.array([number_of(file, held, _KIT, names.lidar, name) for name in _FIELDS])
+        values = np.array([number_of(file, held, _KIT, lidar, name) for name in _FIELDS])
         for child, T in _links(calibration, pose_of_rpy(values[:3], values[3:])).items():
             if child in held[_KIT]:
                 field_of(file, held, _KIT, child, "x")
@@ -84,8 +88,9 @@ def _update(file: str, content: bytes, calibration: ExportedCalibration) -> tupl
 
     text = edit_yaml(file, content, edit)
     if not changed:
-        problem = f"neither is in {_KIT}; name them with --camera-frame, --radar-frame"
-        raise ConfigError(file, f"{names.camera}, {names.radar}", problem)
+        others = [names.of(s.name) for s in calibration.sensors if names.of(s.name) != lidar]
+        problem = f"none is in {_KIT}; name them with --frame SENSOR=NAME"
+        raise ConfigError(file, ", ".join(others), problem)
     return text, changed
 
 

@@ -13,7 +13,8 @@ from pipeline.export.tree import ESTIMATED_PAIRS
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import inverse, log_se3
 from pipeline.geometry.target_sigmas import target_sigmas
-from schemas.calibrations import PAIRS
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import Edge
 
 __all__ = ["PairDifference", "Side", "compare", "composed"]
 
@@ -42,7 +43,7 @@ class PairDifference:
     """What leads from A's estimate of a pair to B's.
 
     Args:
-        pair: of sensors.
+        edge: of two sensors.
         statuses: of A and B.
         change: rotation vector [rad], shift of the child's origin [m], along the axes of the parent.
         sigma: of it; None where neither side states any.
@@ -50,12 +51,17 @@ class PairDifference:
         targets_rad: how far azimuth and elevation of targets 15 to 40 m away move, root mean square.
     """
 
-    pair: str
+    edge: Edge
     statuses: tuple[str, str]
     change: Float[np.ndarray, " 6"]
     sigma: Float[np.ndarray, " 6"] | None
     determined: Bool[np.ndarray, " 6"]
     targets_rad: Float[np.ndarray, " 2"]
+
+    @property
+    def pair(self) -> str:
+        """The edge in words."""
+        return words_of(self.edge)
 
     @property
     def z(self) -> Float[np.ndarray, " 6"] | None:
@@ -71,7 +77,7 @@ def compare(a: Side, b: Side) -> tuple[list[PairDifference], list[str]]:
     """
     apart = bool(a.vehicle) and a.vehicle == b.vehicle and bool(a.days and b.days) and not a.days & b.days
     found, lacks_common = [], False
-    for pair in (p for p in PAIRS if p in a.pairs and p in b.pairs):
+    for pair in (p for p in a.pairs if p in b.pairs):
         one, other = a.pairs[pair], b.pairs[pair]
         common = apart and one.common is not None and other.common is not None
         lacks_common |= apart and not common
@@ -80,12 +86,12 @@ def compare(a: Side, b: Side) -> tuple[list[PairDifference], list[str]]:
         xi = log_se3(other.T @ inverse(one.T))
         found.append(
             PairDifference(
-                pair,
+                one.edge,
                 (one.status, other.status),
                 change_between(one.T, other.T),
                 np.sqrt(np.diag(sum(stated, np.zeros((6, 6))))) if stated else None,
                 np.array(one.observable) & np.array(other.observable),
-                target_sigmas(pair, one.T, np.outer(xi, xi)),
+                target_sigmas(one.edge.kind, one.T, np.outer(xi, xi)),
             )
         )
     return found, _notes(a, b, apart=apart, lacks_common=lacks_common)

@@ -16,7 +16,7 @@ from foxglove import channels
 from foxglove import messages as fg
 from jaxtyping import Float
 
-from pipeline.export.calibration import ExportedCalibration, edges_of
+from pipeline.export.calibration import ExportedCalibration, poses_of
 from pipeline.export.foxglove_table import TABLE_SCHEMA, table_of
 from pipeline.export.provenance import provenance_of
 from pipeline.export.texts import to_json
@@ -151,7 +151,7 @@ def _transforms(
 ) -> list[fg.FrameTransform]:
     """Poses of child in parent: the calibrated tree, and on it the frames of what the prior would show."""
     names = calibration.names
-    edges = [(edge.parent, edge.child, edge.T) for edge in edges_of(calibration)]
+    edges = [(edge.parent, edge.child, edge.T) for edge in poses_of(calibration)]
     if "camera_lidar" in priors:
         edges.append((names.camera, f"{names.lidar}_prior", priors["camera_lidar"]))
     if "lidar_radar" in priors:

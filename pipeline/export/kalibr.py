@@ -1,7 +1,7 @@
-"""Kalibr's camera chain of one camera, with T_cam_lidar and T_cam_radar beside Kalibr's own keys.
+"""Kalibr's camera chain, with T_cam_SENSOR of the other sensors (T_cam_lidar, T_cam_radar) beside Kalibr's own keys.
 
 Source: ethz-asl/kalibr wiki "Yaml formats" and kalibr_common/ConfigReader.py (which counts the keys of the file as
-cameras, so all stands under cam0); T_cam_lidar as in Oxford Spires.
+cameras, so all stands under cam0, cam1, ...); T_cam_lidar as in Oxford Spires.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, FrameNames, needed_camera, needed_pair
+from pipeline.export.calibration import ExportedCalibration, FrameNames, cameras_of, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import field_of, load_yaml, matrix_of, to_yaml
@@ -24,28 +24,38 @@ _RADTAN = 4  # k1 k2 p1 p2
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
-    camera = needed_camera(calibration, "kalibr")
+    cameras = cameras_of(calibration, "kalibr")
+    chain = {f"cam{k}": _camera(calibration, name) for k, name in enumerate(cameras)}
+    for k, (name, before) in enumerate(zip(cameras[1:], cameras, strict=False), start=1):
+        found = calibration.between(name, before)
+        assert found is not None, "both have a pose to the reference"
+        chain[f"cam{k}"]["T_cn_cnm1"] = found[0].tolist()
+    comments = [
+        *comment_lines(calibration),
+        "T_cam_x takes coordinates in x to the camera's optical frame; rostopic is a name only",
+    ]
+    return {"camchain.yaml": to_yaml(chain, comments)}
+
+
+def _camera(calibration: ExportedCalibration, name: str) -> dict[str, Any]:
+    camera = needed_camera(calibration, "kalibr", name)
     model, coefficients = _distortion(camera)
     fx, fy = camera.focal_px
     cx, cy = camera.centre_px
-    T_camera_lidar = needed_pair(calibration, "camera_lidar", "kalibr").T
     cam: dict[str, Any] = {
         "camera_model": "pinhole",
         "intrinsics": [fx, fy, cx, cy],
         "distortion_model": model,
         "distortion_coeffs": coefficients,
         "resolution": [camera.width_px, camera.height_px],
-        "rostopic": f"/{calibration.names.camera}/image_raw",
+        "rostopic": f"/{calibration.names.of(name)}/image_raw",
         "cam_overlaps": [],
-        "T_cam_lidar": T_camera_lidar.tolist(),
     }
-    if "lidar_radar" in calibration.pairs:
-        cam["T_cam_radar"] = (T_camera_lidar @ calibration.pairs["lidar_radar"].T).tolist()
-    comments = [
-        *comment_lines(calibration),
-        "T_cam_x takes coordinates in x to the camera's optical frame; rostopic is a name only",
-    ]
-    return {"camchain.yaml": to_yaml({"cam0": cam}, comments)}
+    for other in (s.name for s in calibration.sensors if s.kind != "camera"):
+        found = calibration.between(name, other)
+        if found is not None:
+            cam[f"T_cam_{other}"] = found[0].tolist()
+    return cam
 
 
 def _distortion(camera: Camera) -> tuple[str, list[float]]:

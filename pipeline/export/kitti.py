@@ -1,4 +1,4 @@
-"""KITTI's calibration of one frame (object benchmark), with the radar's line of V2X-Radar and View-of-Delft's kin.
+"""KITTI's calibration of one frame (object benchmark), a file per camera, with V2X-Radar's line of a radar.
 
 Row-major numbers after a name: P0 to P3 (3x4), R0_rect (3x3), Tr_velo_to_cam, Tr_imu_to_velo, Tr_radar_to_velo (3x4);
 Tr_a_to_b takes coordinates in a to b, so Tr_velo_to_cam = T_camera_lidar where the camera of image_2 is the reference;
@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, FrameNames, needed_camera, needed_pair
+from pipeline.export.calibration import ExportedCalibration, FrameNames, cameras_of, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.texts import matrix_of, text_of
 from pipeline.geometry.se3 import inverse
@@ -33,19 +33,35 @@ _NOTES = (
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
-    camera = needed_camera(calibration, "kitti")
+    cameras = cameras_of(calibration, "kitti")
+    return {
+        "calib.txt" if len(cameras) == 1 else f"calib_{name}.txt": _of_camera(calibration, name)
+        for name in cameras
+    }
+
+
+def _of_camera(calibration: ExportedCalibration, name: str) -> bytes:
+    camera, lidar = needed_camera(calibration, "kitti", name), calibration.reference.name
     P = np.hstack([camera.K, np.zeros((3, 1))])
-    T_lidar_base = np.eye(4) if calibration.T_base_lidar is None else inverse(calibration.T_base_lidar)
+    T_lidar_base = np.eye(4) if calibration.T_base is None else inverse(calibration.T_base)
     values = {f"P{k}": P for k in range(4)} | {
         _RECTIFIED: np.eye(3),
-        _CAMERA: needed_pair(calibration, "camera_lidar", "kitti").T[:3],
+        _CAMERA: _pose(calibration, name, lidar)[:3],
         "Tr_imu_to_velo": T_lidar_base[:3],
     }
-    if "lidar_radar" in calibration.pairs:
-        values[_RADAR] = calibration.pairs["lidar_radar"].T[:3]
+    others = [s.name for s in calibration.sensors if s.kind != "camera" and s.name != lidar]
+    for other in others:  # Tr_radar_to_velo of a radar that is called so
+        if calibration.between(lidar, other) is not None:
+            values[f"Tr_{other}_to_velo"] = _pose(calibration, lidar, other)[:3]
     # KITTI prints 12 digits after the point; 16 give every float64 back.
     lines = (f"{name}: {' '.join(f'{v:.16e}' for v in M.reshape(-1))}\n" for name, M in values.items())
-    return {"calib.txt": "".join(lines).encode()}  # KITTI's own blank line at the end stops some readers
+    return "".join(lines).encode()  # KITTI's own blank line at the end stops some readers
+
+
+def _pose(calibration: ExportedCalibration, a: str, b: str) -> np.ndarray:
+    found = calibration.between(a, b)
+    assert found is not None, "asked for sensors whose pose is known"
+    return found[0]
 
 
 def _read(files: Files, names: FrameNames) -> dict[str, np.ndarray]:

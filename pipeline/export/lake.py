@@ -9,15 +9,18 @@ import numpy as np
 from pipeline.errors import ConfigError, ContractError
 from pipeline.export.calibration import USABLE, ExportedPair, is_frame
 from pipeline.geometry.cameras import Camera, camera_of
+from pipeline.rig.edges import edge_named, edge_order, words_of
+from pipeline.rig.graph import Edge
 from pipeline.store.current import current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.views import ingested, observations_of, perceived
-from schemas.calibrations import CALIBRATIONS, DOF_NAMES, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES, CalibrationRecord
 from schemas.states import STATES, StateRow
 
 __all__ = [
     "choose_pairs",
+    "edges_of_vehicle",
     "pairs_of_day",
     "pairs_of_state",
     "priors_of_day",
@@ -35,7 +38,7 @@ _DETAILS = (
 
 
 def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:
-    """By pair what the day's current records say: an estimate, or why there is none.
+    """By words of the edge what the day's current records say: an estimate, or why there is none.
 
     Raises:
         ConfigError: there is no record of that vehicle, day and method; it names those that there are.
@@ -44,20 +47,30 @@ def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, E
 
 
 def priors_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:
-    """By pair what was known before the day, as its records say.
+    """By words of the edge what was known before the day, as its records say.
 
     Raises:
         ConfigError: as `pairs_of_day`.
     """
     found: dict[str, ExportedPair | str] = {}
     for record in _records(lake, vehicle, day, method):
-        T = prior_of(record)
-        found[record.pair] = (
+        T, edge = prior_of(record), _edge(record)
+        words = words_of(edge)
+        found[words] = (
             "no prior was given"
             if T is None
-            else ExportedPair(record.pair, T, record.prior_covariance, "prior", certified=())
+            else ExportedPair(words, T, record.prior_covariance, "prior", certified=(), of=edge)
         )
     return found
+
+
+def edges_of_vehicle(lake: Lake, vehicle: str, day: str | None, method: str) -> tuple[Edge, ...]:
+    """All edges that the day's records, or without a day the states, are about."""
+    if day is None:
+        rows: Sequence[CalibrationRecord | StateRow] = _states(lake, vehicle, method)
+    else:
+        rows = _records(lake, vehicle, day, method)
+    return tuple(_edge(row) for row in rows)
 
 
 def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[CalibrationRecord]:
@@ -74,22 +87,30 @@ def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[Calibratio
 
 
 def pairs_of_state(lake: Lake, vehicle: str, method: str) -> dict[str, ExportedPair | str]:
-    """By pair what a vehicle should load tonight, or why nothing.
+    """By words of the edge what a vehicle should load tonight, or why nothing.
 
     Raises:
         ConfigError: no state of that vehicle and method is stored.
     """
+    return _pairs(_states(lake, vehicle, method))
+
+
+def _states(lake: Lake, vehicle: str, method: str) -> list[StateRow]:
     rows = current_states(read_records(lake, STATES, StateRow, vehicle=vehicle))
     found = [r for r in rows if r.method == method]
     if not found:
         problem = f"the lake has no state of {vehicle} by {method}: run `boresight audit`, or give --day"
         raise ConfigError("command line", "vehicle", problem)
-    return _pairs(found)
+    return found
 
 
 def _pairs(rows: Sequence[CalibrationRecord] | Sequence[StateRow]) -> dict[str, ExportedPair | str]:
-    of_pair = {row.pair: _pair(row) for row in rows}
-    return {pair: of_pair[pair] for pair in PAIRS if pair in of_pair}
+    by_edge = {_edge(row): _pair(row) for row in rows}
+    return {words_of(edge): by_edge[edge] for edge in sorted(by_edge, key=edge_order)}
+
+
+def _edge(row: CalibrationRecord | StateRow) -> Edge:
+    return edge_named(row.pair, row.parent_frame, row.child_frame)
 
 
 def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
@@ -97,8 +118,9 @@ def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
     if T is None:
         return f"{row.status}: {row.reason}"
     details = {name: value for name in _DETAILS if (value := getattr(row, name, None)) not in (None, "", [])}
+    edge = _edge(row)
     return ExportedPair(
-        row.pair,
+        words_of(edge),
         T,
         row.covariance,
         row.status,
@@ -108,6 +130,7 @@ def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
         row.common_covariance,
         details,
         _unchecked(row),
+        of=edge,
     )
 
 
@@ -131,7 +154,7 @@ def _rested(lake: Lake, vehicle: str, method: str, pair: ExportedPair) -> Export
         return pair
     for record in _records(lake, vehicle, str(days[-1]), method):
         T = prior_of(record)
-        if record.pair == pair.pair and T is not None and record.prior_covariance is not None:
+        if _edge(record) == pair.edge and T is not None and record.prior_covariance is not None:
             return pair.resting_at(T, record.prior_covariance)
     return pair
 

@@ -21,18 +21,21 @@ __all__ = ["MATLAB"]
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
-    content: dict[str, Any] = {f"T_{name}": pair.T.tolist() for name, pair in calibration.pairs.items()}
-    for name, pair in calibration.pairs.items():
+    pairs = calibration.pairs.values()
+    content: dict[str, Any] = {f"T_{pair.identifier}": pair.T.tolist() for pair in pairs}
+    for pair in pairs:
         if pair.covariance is not None:
-            content[f"covariance_{name}"] = pair.covariance.tolist()
-    camera = calibration.camera
-    if camera is not None:
-        content["camera"] = {
-            "model": camera.model,
-            "K": camera.K.tolist(),
-            "D": camera.D.tolist(),
-            "image_size_px": [camera.height_px, camera.width_px],  # rows first, as MATLAB's ImageSize
-        }
+            content[f"covariance_{pair.identifier}"] = pair.covariance.tolist()
+    cameras = [sensor.name for sensor in calibration.sensors if sensor.kind == "camera"]
+    for name in cameras:
+        camera = calibration.camera_of(name)
+        if camera is not None:
+            content["camera" if len(cameras) == 1 else f"camera_{name}"] = {
+                "model": camera.model,
+                "K": camera.K.tolist(),
+                "D": camera.D.tolist(),
+                "image_size_px": [camera.height_px, camera.width_px],  # rows first, as MATLAB's ImageSize
+            }
     content["provenance"] = provenance_of(calibration)
     return {"calibration.json": to_json(content)}
 

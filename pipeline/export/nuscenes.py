@@ -32,13 +32,13 @@ _NOTES = (
 
 def _write(calibration: ExportedCalibration, *, distortion: bool) -> dict[str, bytes]:
     sensors, calibrated = [], []
-    for modality in ("camera", "lidar", "radar"):
-        T = calibration.T_root(modality)
+    for own in calibration.sensors:
+        T = calibration.T_root(own.name)
         if T is None:
             continue
-        channel = calibration.names.of(modality)
-        sensor = {"token": _token("sensor", channel), "channel": channel, "modality": modality}
-        camera = needed_camera(calibration, "nuscenes") if modality == "camera" else None
+        channel = calibration.names.of(own.name)
+        sensor = {"token": _token("sensor", channel), "channel": channel, "modality": own.kind}
+        camera = needed_camera(calibration, "nuscenes", own.name) if own.kind == "camera" else None
         row: dict[str, Any] = {
             "token": _token("calibrated_sensor", calibration.vehicle, calibration.source, channel),
             "sensor_token": sensor["token"],

@@ -24,18 +24,21 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
         storage.writeComment(line)
     storage.write("vehicle", calibration.vehicle)
     storage.write("calibration_source", calibration.source)
-    for name, pair in calibration.pairs.items():
+    for name, pair in ((pair.identifier, pair) for pair in calibration.pairs.values()):
         storage.write(f"T_{name}", pair.T)
         storage.write(f"status_{name}", pair.status)
         if pair.covariance is not None:
             storage.write(f"covariance_{name}", pair.covariance)
-    camera = calibration.camera
-    if camera is not None:
-        storage.write("image_width", camera.width_px)
-        storage.write("image_height", camera.height_px)
-        storage.write("camera_matrix", camera.K)
-        storage.write("distortion_model", camera.model)
-        storage.write("distortion_coefficients", (camera.D if len(camera.D) else np.zeros(4)).reshape(1, -1))
+    cameras = [sensor.name for sensor in calibration.sensors if sensor.kind == "camera"]
+    for name in cameras:
+        camera, of = calibration.camera_of(name), f"_{name}" * (len(cameras) > 1)
+        if camera is not None:
+            D = (camera.D if len(camera.D) else np.zeros(4)).reshape(1, -1)
+            storage.write(f"image_width{of}", camera.width_px)
+            storage.write(f"image_height{of}", camera.height_px)
+            storage.write(f"camera_matrix{of}", camera.K)
+            storage.write(f"distortion_model{of}", camera.model)
+            storage.write(f"distortion_coefficients{of}", D)
     return {"calibration.yaml": storage.releaseAndGetString().encode()}
 
 

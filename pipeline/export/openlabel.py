@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, edges_of, sigmas_of
+from pipeline.export.calibration import ExportedCalibration, poses_of, sigmas_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import provenance_of
 from pipeline.export.texts import field_of, load_json, matrix_of, number_of, pose_of_quaternion, to_json
@@ -24,8 +24,8 @@ _FEWEST_COEFFICIENTS = 5  # of distortion_coeffs in the schema
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
-    edges, names = edges_of(calibration), calibration.names
-    root_type = "sensor_cs" if calibration.T_base_lidar is None else "local_cs"
+    edges, names = poses_of(calibration), calibration.names
+    root_type = "sensor_cs" if calibration.T_base is None else "local_cs"
     systems: dict[str, dict[str, Any]] = {calibration.root: {"type": root_type, "parent": "", "children": []}}
     for edge in edges:
         systems[edge.parent]["children"].append(edge.child)
@@ -36,14 +36,13 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
             "pose_wrt_parent": {"matrix4x4": [float(v) + 0.0 for v in edge.T.reshape(-1)]},
             "sigma": sigmas_of(edge.T, edge.covariance),
         }
-    present = {names.lidar, *(edge.child for edge in edges)}
-    streams: dict[str, dict[str, Any]] = {
-        names.of(sensor): {"type": sensor, "uri": "", "description": f"coordinate system {names.of(sensor)}"}
-        for sensor in ("camera", "lidar", "radar")
-        if names.of(sensor) in present
-    }
-    if calibration.camera is not None and names.camera in streams:
-        streams[names.camera]["stream_properties"] = _intrinsics(calibration.camera)
+    present = {names.of(calibration.reference.name), *(edge.child for edge in edges)}
+    streams: dict[str, dict[str, Any]] = {}
+    for sensor in calibration.sensors:
+        name, camera = names.of(sensor.name), calibration.camera_of(sensor.name)
+        if name in present:
+            streams[name] = {"type": sensor.kind, "uri": "", "description": f"coordinate system {name}"}
+            streams[name] |= {} if camera is None else {"stream_properties": _intrinsics(camera)}
     metadata = {
         "schema_version": "1.0.0",
         "annotator": f"Boresight {calibration.code_version}",

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from pipeline.export.calibration import USABLE, Edge, ExportedCalibration, ExportedPair, edges_of, sigmas_of
-from schemas.calibrations import FRAMES_OF_PAIR
+from pipeline.export.calibration import USABLE, ExportedCalibration, ExportedPair, Pose, poses_of, sigmas_of
 
 __all__ = ["comment_lines", "not_certified", "provenance_of", "warnings_of"]
 
@@ -36,8 +34,8 @@ def provenance_of(calibration: ExportedCalibration) -> dict[str, Any]:
         "warnings": warnings_of(calibration),
         "convention": _CONVENTION,
         "frames": _frames(calibration),
-        "frame_names": asdict(calibration.names),
-        "poses": [_pose(edge) for edge in edges_of(calibration)],
+        "frame_names": _frame_names(calibration),
+        "poses": [_pose(edge) for edge in poses_of(calibration)],
         "pairs": {name: _pair(pair) for name, pair in calibration.pairs.items()},
         "left_out": dict(calibration.left_out),
     }
@@ -87,13 +85,14 @@ def comment_lines(calibration: ExportedCalibration, camera_axes: str | None = No
     """
     frames = _frames(calibration)
     if camera_axes is not None:
-        frames[calibration.names.camera] = camera_axes
+        cameras = [s.name for s in calibration.sensors if s.kind == "camera"]
+        frames |= {calibration.names.of(name): camera_axes for name in cameras}
     lines = [
         f"Boresight {calibration.code_version}: {calibration.vehicle}, {calibration.source}, {calibration.method}",
         *(f"WARNING: {words}" for words in warnings_of(calibration)),
         *(f"frame {name}: {axes}" for name, axes in frames.items()),
     ]
-    for edge in edges_of(calibration):
+    for edge in poses_of(calibration):
         sure = "as given" if edge.covariance is None else f"sigma {_in_words(edge)}"
         lines.append(f"{edge.parent} -> {edge.child}: pose of {edge.child} in {edge.parent}; {sure}")
     return ["".join(c if c.isprintable() else " " for c in line) for line in lines]
@@ -101,35 +100,39 @@ def comment_lines(calibration: ExportedCalibration, camera_axes: str | None = No
 
 def _frames(calibration: ExportedCalibration) -> dict[str, str]:
     names = calibration.names
-    axes = {names.of(sensor): words for sensor, words in _AXES.items()}
-    if calibration.T_base_lidar is None:
-        axes[names.lidar] += "; the root: where it sits on the car is not known here"
+    axes = {names.of(sensor.name): _AXES[sensor.kind] for sensor in calibration.sensors}
+    if calibration.T_base is None:
+        axes[names.of(calibration.reference.name)] += "; the root: where it sits on the car is not known here"
     else:
         axes[names.base] = "x forward, y left, z up; the root"
     return axes
 
 
-def _in_words(edge: Edge) -> str:
+def _frame_names(calibration: ExportedCalibration) -> dict[str, str]:
+    names = (*(sensor.name for sensor in calibration.sensors), "base")
+    return {name: calibration.names.of(name) for name in names}
+
+
+def _in_words(edge: Pose) -> str:
     sigmas = list((sigmas_of(edge.T, edge.covariance) or {}).values())
     turn = " ".join(f"{v:.4f}" for v in np.degrees(sigmas[:3]))
     shift = " ".join(f"{v:.4f}" for v in sigmas[3:])
     return f"{turn} deg about and {shift} m along the axes of {edge.parent}"
 
 
-def _pose(edge: Edge) -> dict[str, Any]:
+def _pose(edge: Pose) -> dict[str, Any]:
     sigma = sigmas_of(edge.T, edge.covariance)
     return {"parent": edge.parent, "child": edge.child, "T_parent_child": edge.T.tolist(), "sigma": sigma}
 
 
 def _pair(pair: ExportedPair) -> dict[str, Any]:
-    parent, child = FRAMES_OF_PAIR[pair.pair]
     return {
         "status": pair.status,
         "reason": pair.reason,
         "certified": list(pair.certified),
         "kept_at_prior": [*pair.at_prior, *pair.resting],
         "unchecked_sigmas": dict(pair.unchecked),
-        f"T_{parent}_{child}": pair.T.tolist(),
+        f"T_{pair.identifier}": pair.T.tolist(),
         "sigma": sigmas_of(pair.T, pair.covariance),
         "covariance": None if pair.covariance is None else pair.covariance.tolist(),
         **_plain(pair.details),

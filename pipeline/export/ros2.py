@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import Edge, ExportedCalibration, edges_of
+from pipeline.export.calibration import ExportedCalibration, Pose, poses_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import field_of, load_yaml, pose_of_quaternion, text_of, to_yaml
@@ -27,7 +27,7 @@ _NUMBERS = ("--x", "--y", "--z", "--qw", "--qx", "--qy", "--qz")
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     comments = comment_lines(calibration)
-    edges = edges_of(calibration)
+    edges = poses_of(calibration)
     nodes = [
         {
             "node": {
@@ -42,7 +42,7 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     return {_PYTHON: _python(edges, comments).encode(), _YAML: to_yaml({"launch": nodes}, comments)}
 
 
-def _python(edges: Sequence[Edge], comments: Sequence[str]) -> str:
+def _python(edges: Sequence[Pose], comments: Sequence[str]) -> str:
     nodes = ",\n".join(
         f"            Node(\n"
         f'                package="tf2_ros",\n'
@@ -60,13 +60,13 @@ def _python(edges: Sequence[Edge], comments: Sequence[str]) -> str:
     )
 
 
-def _node_name(edge: Edge) -> str:
+def _node_name(edge: Pose) -> str:
     """A ROS node name of letters, digits and underscores."""
     words = f"boresight_{edge.parent}_{edge.child}"
     return "".join(c if c.isascii() and c.isalnum() else "_" for c in words)
 
 
-def _arguments(edge: Edge) -> list[str]:
+def _arguments(edge: Pose) -> list[str]:
     values = [*edge.T[:3, 3], *to_quaternion(edge.T)]
     pairs = [text for name, v in zip(_NUMBERS, values, strict=True) for text in (name, repr(float(v) + 0.0))]
     return [*pairs, "--frame-id", edge.parent, "--child-frame-id", edge.child]

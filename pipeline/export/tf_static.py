@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, edges_of
+from pipeline.export.calibration import ExportedCalibration, poses_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import provenance_of
 from pipeline.geometry.transform_tree import TransformTree
@@ -37,7 +37,7 @@ _MOST_BYTES = 1 << 30  # /tf_static comes first in a log; of a larger one, give 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     ros = RosMessages(get_typestore(Stores.ROS2_HUMBLE), 2)
-    edges = edges_of(calibration)
+    edges = poses_of(calibration)
     message = ros.transforms((ros.header(0, edge.parent), edge.child, edge.T) for edge in edges)
     stream = io.BytesIO()
     writer = Writer(stream, compression=CompressionType.NONE)

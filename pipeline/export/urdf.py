@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import Edge, ExportedCalibration, edges_of
+from pipeline.export.calibration import ExportedCalibration, Pose, poses_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.rotations import pose_of_rpy, rpy_of
@@ -27,7 +27,7 @@ _MACRO = "boresight_sensors"
 
 def _write_urdf(calibration: ExportedCalibration) -> dict[str, bytes]:
     robot = ET.Element("robot", name=_identifier(calibration.vehicle))
-    edges = edges_of(calibration)
+    edges = poses_of(calibration)
     for name in dict.fromkeys([calibration.root, *(e.child for e in edges)]):
         ET.SubElement(robot, "link", name=name)
     robot.extend(joint_of(edge) for edge in edges)
@@ -36,7 +36,7 @@ def _write_urdf(calibration: ExportedCalibration) -> dict[str, bytes]:
 
 def _write_xacro(calibration: ExportedCalibration) -> dict[str, bytes]:
     """A macro with all links and joints below the root, which the including file owns, and one call of it."""
-    edges = edges_of(calibration)
+    edges = poses_of(calibration)
     robot = ET.Element("robot", {"xmlns:xacro": _XACRO, "name": _identifier(calibration.vehicle)})
     macro = ET.SubElement(robot, "xacro:macro", name=_MACRO, params=f"parent:={calibration.root}")
     for edge in edges:
@@ -48,7 +48,7 @@ def _write_xacro(calibration: ExportedCalibration) -> dict[str, bytes]:
     return {"sensors.urdf.xacro": xml_of(robot, comment_lines(calibration))}
 
 
-def joint_of(edge: Edge, parent: str | None = None) -> ET.Element:
+def joint_of(edge: Pose, parent: str | None = None) -> ET.Element:
     """The fixed joint of a pose; `parent` where the link is named by a macro's parameter."""
     joint = ET.Element("joint", name=f"{edge.parent}_to_{edge.child}", type="fixed")
     ET.SubElement(joint, "origin", xyz=_numbers(edge.T[:3, 3]), rpy=_numbers(rpy_of(edge.T[:3, :3])))

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 from markupsafe import Markup
 
 from pipeline.report.page import render
-from pipeline.report.words import PAIR_TITLES, dof_title, scaled, unit_of
+from pipeline.report.words import dof_title, scaled, unit_of
+from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["PairView", "comparison_page"]
@@ -22,9 +23,9 @@ _WIDTH, _HEIGHT = 240, 18  # px of a bar
 
 @dataclass(frozen=True, eq=False)
 class PairView:
-    """A pair: statuses of A and B, the change along the parent's axes [rad, m], its sigma, determined axes, targets."""
+    """An edge: statuses of A and B, change along the parent's axes [rad, m], its sigma, determined axes, targets."""
 
-    pair: str
+    edge: Edge
     statuses: tuple[str, str]
     change: Float[np.ndarray, " 6"]
     sigma: Float[np.ndarray, " 6"] | None
@@ -35,7 +36,7 @@ class PairView:
 def comparison_page(first: str, second: str, pairs: Sequence[PairView], notes: Sequence[str]) -> str:
     """HTML of the change from one calibration to another."""
     clear = [
-        f"{PAIR_TITLES[p.pair]} {dof_title(p.pair, dof)}"
+        f"{p.edge.name} {dof_title(p.edge.kind, dof)}"
         for p in pairs
         for k, dof in enumerate(DOF_NAMES)
         if p.sigma is not None and abs(p.change[k]) > _CLEAR_SIGMAS * p.sigma[k]
@@ -59,7 +60,7 @@ def _view(p: PairView) -> dict[str, object]:
         z = None if p.sigma is None else float(p.change[k] / p.sigma[k])
         axes.append(
             {
-                "title": dof_title(p.pair, dof),
+                "title": dof_title(p.edge.kind, dof),
                 "change": f"{scaled(p.change[k], dof):+.4f} {unit_of(dof)}",
                 "sigma": "" if p.sigma is None else f"{scaled(p.sigma[k], dof):.4f}",
                 "z": "" if z is None else f"{z:+.1f}",
@@ -69,7 +70,7 @@ def _view(p: PairView) -> dict[str, object]:
             }
         )
     return {
-        "title": PAIR_TITLES[p.pair],
+        "title": p.edge.name,
         "statuses": p.statuses,
         "targets": f"{azimuth:.3f} deg in azimuth, {elevation:.3f} deg in elevation",
         "axes": axes,

@@ -262,7 +262,7 @@ def test_autoware_s_own_kit_keeps_its_comments_its_other_sensors_and_its_lidar(l
     np.testing.assert_allclose(found["camera_lidar"], wanted, atol=1e-12)
     for form, bad, words in (
         ("autoware", [*names[:2], "--lidar-frame", "side"], "sensor_kit_base_link.side: missing"),
-        ("autoware", ["--camera-frame", "c", *names[2:]], "neither is in sensor_kit_base_link"),
+        ("autoware", ["--camera-frame", "c", *names[2:]], "none is in sensor_kit_base_link"),
         ("urdf", names, "no files that are updated in place"),
     ):
         code, summary, _ = run(capsys, "export", form, *of_v, *bad)

@@ -11,6 +11,7 @@ from pipeline.export.calibration import ExportedPair
 from pipeline.export.compare import Side, compare, composed
 from pipeline.geometry.se3 import exp_se3, exp_so3
 from pipeline.report.comparison import PairView, comparison_page
+from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
@@ -150,7 +151,9 @@ def test_what_cannot_be_compared_is_a_usage_error(lake, capsys, arguments, words
 
 
 def test_the_page_escapes_names_and_says_when_nobody_states_a_sigma():
-    view = PairView("camera_lidar", ("given", "given"), np.zeros(6), None, np.ones(6, bool), np.zeros(2))
+    view = PairView(
+        EDGE_OF_PAIR["camera_lidar"], ("given", "given"), np.zeros(6), None, np.ones(6, bool), np.zeros(2)
+    )
     page = comparison_page("<b>a</b>", "b & c", [view], ["a < b"])
     assert "<b>a</b>" not in page
     assert "neither side states a sigma" in page

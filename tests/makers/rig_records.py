@@ -30,6 +30,7 @@ _SIGMAS = {
     "camera_lidar": np.array([0.02, 0.02, 0.03, 0.02, 0.02, 0.02]),
     "camera_radar": np.array([0.15, 0.06, 0.5, 0.05, 0.1, 0.05]),
     "lidar_radar": np.array([0.5, 0.15, 0.04, 0.05, 0.05, 0.1]),
+    "lidar_base": np.array([0.05, 0.05, 0.1, 0.1, 0.1, 0.02]),
 }
 
 
