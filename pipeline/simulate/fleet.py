@@ -260,7 +260,6 @@ def _truth(spec: FleetSpec, vehicle: int, day: int) -> dict[str, Any]:
         "seed": spec.seed,
         "reference": rig.reference.name,
         **_poses(morning),
-        "dt_s": {n: m.delay_s for n, m in morning.sensors.items()},  # after the reference's stamps
         "cameras": {s.name: _camera(s, morning, today) for s in rig.of_kind("camera")},
         "radars": {n: asdict(m.errors) for n, m in morning.sensors.items() if m.errors is not None},
         **(_of_three(morning, rig, today) if rig.is_short else {}),
@@ -270,7 +269,12 @@ def _truth(spec: FleetSpec, vehicle: int, day: int) -> dict[str, Any]:
 
 
 def _poses(mounting: Mounting) -> dict[str, Any]:
-    return {"T_base_sensor": {n: m.T_vehicle.tolist() for n, m in mounting.sensors.items()}}
+    """Where every sensor is, and how much later than the reference's its stamps of an event are."""
+    sensors = mounting.sensors.items()
+    return {
+        "T_base_sensor": {n: m.T_vehicle.tolist() for n, m in sensors},
+        "dt_s": {n: m.delay_s for n, m in sensors},
+    }
 
 
 def _camera(sensor: SensorSpec, mounting: Mounting, today: DayFaults) -> dict[str, Any]:

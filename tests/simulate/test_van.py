@@ -14,8 +14,10 @@ from pipeline.report.truth import read_truth
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
-from pipeline.simulate.sensors.mounting import mounting_of
+from pipeline.simulate.sensors.mounting import Mounting, mounting_of
 from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.simulate.sensors.semantics import SemanticsSpec
+from pipeline.simulate.sensors.simulated_frame import Seat, frame_of, scene_of
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
@@ -91,6 +93,25 @@ def test_every_sensor_but_the_reference_has_a_clock_of_its_own(days):
     assert all(len(own) == 3 for own in stamps.values())  # two moments, and one next nearest
     assert truth["dt_s"].pop("top") == 0
     assert len(set(truth["dt_s"].values())) == len(VAN.sensors) - 1
+
+
+def test_a_sensor_measures_its_delay_before_its_stamp():
+    rig = VAN.changed(small)
+    drive, prompt = Drive(5, "highway", 8.0, 0), mounting_of(rig, 1, 0, 0)
+    moment, scene = World(drive).moment(2.0), scene_of(drive)
+    names = ("left", "grille", "corner_fl")
+
+    def seen(delay_s, stamp_s):
+        late = {n: replace(m, delay_s=delay_s) for n, m in prompt.sensors.items()}
+        seat, rng = Seat(moment, scene, rig, Mounting(late)), np.random.default_rng(1)
+        return frame_of(seat, dict.fromkeys(names, stamp_s), rng, SemanticsSpec())
+
+    one, same, other = seen(0.0, 2.0), seen(0.125, 2.125), seen(-0.125, 2.125)
+    for frame, is_same in ((same, True), (other, False)):
+        assert (frame.images["left"].jpeg == one.images["left"].jpeg) is is_same
+        for clouds in ("sweeps", "scans"):
+            ((name, cloud),) = getattr(frame, clouds).items()
+            assert np.array_equal(cloud.xyz_m, getattr(one, clouds)[name].xyz_m) is is_same
 
 
 def test_sensors_point_where_their_names_say():
