@@ -10,7 +10,6 @@ from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry import se3
 from pipeline.objective.camera_lidar.edges import edge_residuals
 from pipeline.objective.camera_lidar.score import Alignments, prepare_terms
-from pipeline.objective.differentiable.edges import edge_residuals_px
 from pipeline.objective.differentiable.lookup import bilinear
 from pipeline.objective.differentiable.paper import (
     camera_radar_tensors,
@@ -26,6 +25,7 @@ from pipeline.objective.differentiable.poses import (
     transform_points,
 )
 from pipeline.objective.differentiable.projection import GridProjection, camera_projection
+from pipeline.objective.differentiable.terms import edge_residuals_px
 from pipeline.objective.paper import loop
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss

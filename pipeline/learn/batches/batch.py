@@ -89,10 +89,7 @@ class TrainingBatch:
 
     def __getitem__(self, rows: slice) -> TrainingBatch:
         """Some of the frames."""
-        part = self._map(lambda t: t[rows])
-        return replace(
-            part, vehicle=self.vehicle[rows], day=self.day[rows], environment=self.environment[rows]
-        )
+        return self.take(torch.arange(len(self), device=self.image.device)[rows])
 
     def take(self, rows: Int64[Tensor, " K"]) -> TrainingBatch:
         """Frames by number, in any order; `rows` on the batch's device."""

@@ -32,7 +32,7 @@ from pipeline.learn.sample.layout import (
     RADAR_CHANNELS,
     RADAR_POINTS,
     NetworkConfig,
-)
+)  # fmt: skip
 from schemas.training import GRID_CLASSES
 from schemas.versions import CODE_VERSION
 
@@ -86,34 +86,18 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
 
 
 def _examples(config: NetworkConfig) -> tuple[Tensor, ...]:
-    """Inputs of the right shapes with something ahead of the car."""
-    grid = config.grid
-    generator = torch.Generator().manual_seed(0)
+    """Inputs of the right shapes, in the order of GRAPH_INPUTS."""
+    cells = config.grid.height, config.grid.width
+    grids = [torch.rand(1, c, *cells) for c in (config.camera_channels, LIDAR_CHANNELS, RADAR_CHANNELS)]
 
-    def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
+    def points(count: int) -> tuple[Tensor, Tensor]:
+        return 10 + torch.rand(1, count, 3), torch.ones(1, count)
 
-    ahead = torch.tensor([20.0, 0.0, 0.0])
-    spread = torch.tensor([10.0, 10.0, 2.0])
-    to_camera = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-    points = ahead + spread * (random(1, MATCHED_POINTS, 3) - 0.5)
-    radar = ahead + spread * (random(1, RADAR_POINTS, 3) - 0.5)
+    radar, valid = points(RADAR_POINTS)
     return (
-        random(1, config.camera_channels, grid.height, grid.width),
-        random(1, LIDAR_CHANNELS, grid.height, grid.width),
-        random(1, RADAR_CHANNELS, grid.height, grid.width),
-        points @ to_camera.T,
-        torch.ones(1, MATCHED_POINTS),
-        ahead + spread * (random(1, OBJECT_POINTS, 3) - 0.5),
-        torch.ones(1, OBJECT_POINTS),
-        radar,
-        radar @ to_camera.T,
-        random(1, RADAR_POINTS, 3),
-        torch.ones(1, RADAR_POINTS, dtype=torch.bool),
-        torch.ones(1, dtype=torch.bool),
-        points[:, :MARKED_POINTS] @ to_camera.T,
-        torch.ones(1, MARKED_POINTS),
-    )
+        *grids, *points(MATCHED_POINTS), *points(OBJECT_POINTS), radar, radar, radar, valid > 0,
+        torch.ones(1, dtype=torch.bool), *points(MARKED_POINTS),
+    )  # fmt: skip
 
 
 def _shorten_names(model: onnx.ModelProto, kept: set[str]) -> None:

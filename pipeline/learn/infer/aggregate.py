@@ -29,7 +29,7 @@ from pipeline.extrinsics.estimates import PairEstimate
 from pipeline.geometry.se3 import exp_se3, hat, inverse, log_se3, transform_points
 from pipeline.geometry.spherical import from_spherical
 
-__all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "shared_bias", "twists_about"]
+__all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "twists_about"]
 
 OBSERVABLE = 0.5  # the day at least halved the variance, as in all methods
 _RESAMPLES = 200
@@ -160,14 +160,6 @@ def day_estimate(
             twist_of_bearing @ np.diag(np.square(_bias_sigma(pair, answers))) @ twist_of_bearing.T,
         ),
     )
-
-
-def shared_bias(answers: Answers, T_true: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 6"]:
-    """What `bias_sigma` should cover, measured against the truth: (bearing rotation [rad], translation [m])."""
-    S = _bearing_of_twist(answers.T_centre)
-    fit = _robust_regression(replace(answers, guess=answers.guess @ S.T, answer=answers.answer @ S.T))
-    H = np.eye(6) - fit.coefficients[1:].T
-    return np.asarray(fit.coefficients[0] - H @ S @ log_se3(T_true @ inverse(answers.T_centre)))
 
 
 def mean_answer(

@@ -33,7 +33,7 @@ from pipeline.learn.sample.layout import (
     OBJECT_BONUS,
     OBJECT_POINTS,
     RADAR_POINTS,
-)
+)  # fmt: skip
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
 
 __all__ = ["FrameSensors", "compiled_nearest_points", "frame_sensors", "render_frame"]

@@ -22,7 +22,7 @@ from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = ["day_answers", "single_frame_solution", "solve_by_networks"]
+__all__ = ["single_frame_solution", "solve_by_networks"]
 
 # Guesses are scattered by this much (standard deviation per axis): several times the scatter of one frame's answers.
 _SCATTER_RAD, _SCATTER_M = np.radians(0.4), 0.03
@@ -151,22 +151,6 @@ class _Asked:
         """Degrees of freedom that no frame of the day can determine."""
         measured = any(o.radar_has_elevation for o in self.observations)
         return np.zeros(6, bool) if measured else _BY_ELEVATION[pair]
-
-
-def day_answers(
-    observations: Mapping[str, Sequence[Observation]],
-    prior: Prior,
-    *,
-    networks: Sequence[FrameNetwork],
-    frames: FrameSource,
-    seed: int,
-) -> dict[str, Answers]:
-    """Each pair's answers at scattered guesses, from which `solve_by_networks` estimates.
-
-    Raises:
-        SolveError: too few frames can be shown to the networks.
-    """
-    return _asked_day(observations, prior, networks, frames, np.random.default_rng([seed, 7]), silent)[1]
 
 
 def _asked_day(
@@ -308,15 +292,8 @@ def _halves_disagree(
 
 
 def _part(answers: Answers, rows: np.ndarray) -> Answers:
-    return Answers(
-        answers.T_centre,
-        answers.guess[rows],
-        answers.answer[rows],
-        answers.variance[rows],
-        answers.block[rows],
-        max(1, round(answers.frames * float(rows.mean()))),
-        answers.bias_sigma,
-    )
+    kept = {name: getattr(answers, name)[rows] for name in ("guess", "answer", "variance", "block")}
+    return replace(answers, **kept, frames=max(1, round(answers.frames * float(rows.mean()))))
 
 
 def _loop(estimates: Mapping[str, PairEstimate]) -> tuple[float, float]:

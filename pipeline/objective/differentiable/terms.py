@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int8, Int64, UInt8
 from torch import Tensor
 
-from pipeline.objective.differentiable.edges import edge_residuals_px
+from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY
 from pipeline.objective.differentiable.lookup import bilinear_groups, masked_mean, nearest_pixel
 from pipeline.objective.differentiable.poses import transform_points
 from pipeline.objective.differentiable.projection import GridProjection
@@ -26,6 +26,7 @@ __all__ = [
     "RadarTracks",
     "cluster_class_cost",
     "edge_cost",
+    "edge_residuals_px",
     "sky_cost",
     "track_cluster_cost",
     "track_detection_cost",
@@ -116,11 +117,7 @@ def edge_cost(
     side: Int64[Tensor, "F N"],
     present: Bool[Tensor, "F N"],
 ) -> Float[Tensor, "*batch F"]:
-    """Depth jumps lie on mask boundaries of their own direction: distance along that direction's axis, robust.
-
-    As `pipeline.objective.camera_lidar.edges`: the boundary is looked up at the nearest cell, the distance is taken
-    from the point.
-    """
+    """Depth jumps lie on mask boundaries of their own direction: distance along that direction's axis, robust."""
     uv, seen = maps.pixels(T_camera_lidar, points)
     step_deg = maps.projection.step_rad * DEG
     residual, found = edge_residuals_px(
@@ -133,6 +130,39 @@ def edge_cost(
         score = (1 + (way / scale_deg).square()) ** -2
         cost = cost + 1 - torch.where(found, score, torch.zeros_like(score))
     return masked_mean(cost, present)
+
+
+def edge_residuals_px(
+    offsets: Int8[Tensor, "F 4 H W"],
+    uv: Float[Tensor, "*batch F N 2"],
+    seen: Bool[Tensor, "*batch F N"],
+    side: Int64[Tensor, "F N"],
+    *,
+    step_px: float = 1.0,
+    shift_px: float = 0.5,
+) -> tuple[Float[Tensor, "*batch F N"], Bool[Tensor, "*batch F N"]]:
+    """Signed way along its own axis from each jump to the nearest boundary of its direction class.
+
+    As in `pipeline.objective.camera_lidar.edges`, which has the reasons.
+
+    Args:
+        offsets: way from a pixel's centre to the boundary, in steps.
+        uv: projected jumps.
+        seen: which of them mean something.
+        side: direction class, EDGE_LEFT/RIGHT/ABOVE/BELOW.
+        step_px: pixels per step of `offsets`.
+        shift_px: what to add; the kernels' maps hold k for k + 1/2.
+
+    Returns:
+        Residuals [px], and which jumps lie in the image with a boundary in reach.
+    """
+    row, column, inside = nearest_pixel((offsets.shape[2], offsets.shape[3]), uv, seen)
+    frame = torch.arange(len(offsets), device=uv.device)[:, None]
+    offset = offsets[frame, side, row, column]
+    sideways = side < 2
+    centre = torch.where(sideways, column, row).to(uv.dtype)
+    at = torch.where(sideways, uv[..., 0], uv[..., 1])
+    return offset.to(uv.dtype) * step_px + shift_px + (centre - at), inside & (offset != NO_BOUNDARY)
 
 
 def sky_cost(

@@ -12,13 +12,17 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
-from pipeline.learn.infer.aggregate import shared_bias
+from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.learn.infer.aggregate import Answers, _bearing_of_twist, _robust_regression
 from pipeline.learn.infer.onnx_networks import open_networks
-from pipeline.learn.infer.vehicle_day import day_answers
+from pipeline.learn.infer.vehicle_day import _asked_day
+from pipeline.results import silent
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of
 from schemas.calibrations import PAIRS
@@ -26,7 +30,7 @@ from schemas.frames import Frame
 from tests.benchmarks.studies.ssl_days import ModelSet, SslDay, fleet_days, open_day
 from tests.benchmarks.studies.ssl_measures import STARTS
 
-__all__ = ["biases"]
+__all__ = ["biases", "shared_bias"]
 
 
 def biases(models: ModelSet, day: SslDay) -> dict[str, np.ndarray]:
@@ -37,15 +41,20 @@ def biases(models: ModelSet, day: SslDay) -> dict[str, np.ndarray]:
     def frames(indices: Sequence[int]) -> Iterator[Frame]:
         return frames_of(lake, partition, indices)
 
-    answers = day_answers(
-        dict.fromkeys(PAIRS, day.rows),
-        day.prior(*STARTS["prior"], seed=day.where.seed),
-        networks=open_networks(models.by_name, models.configured(day.fleet).learn, day.fleet.prepare),
-        frames=frames,
-        seed=0,
-    )
+    networks = open_networks(models.by_name, models.configured(day.fleet).learn, day.fleet.prepare)
+    prior = day.prior(*STARTS["prior"], seed=day.where.seed)
+    rng = np.random.default_rng([0, 7])  # as `solve_by_networks` of seed 0
+    answers = _asked_day(dict.fromkeys(PAIRS, day.rows), prior, networks, frames, rng, silent)[1]
     unit = np.array([np.degrees(1.0)] * 3 + [1.0] * 3)
     return {pair: shared_bias(answers[pair], day.true_of(pair)) * unit for pair in PAIRS}
+
+
+def shared_bias(answers: Answers, T_true: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 6"]:
+    """What `bias_sigma` should cover, measured against the truth: (bearing rotation [rad], translation [m])."""
+    S = _bearing_of_twist(answers.T_centre)
+    fit = _robust_regression(replace(answers, guess=answers.guess @ S.T, answer=answers.answer @ S.T))
+    H = np.eye(6) - fit.coefficients[1:].T
+    return np.asarray(fit.coefficients[0] - H @ S @ log_se3(T_true @ inverse(answers.T_centre)))
 
 
 def main() -> None:

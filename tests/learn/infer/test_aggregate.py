@@ -11,6 +11,7 @@ from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.learn.infer import aggregate
 from pipeline.learn.infer.aggregate import Answers, day_estimate, twists_about
+from tests.benchmarks.studies.ssl_bias import shared_bias
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 PRIOR_SD = np.array([*np.radians([1.2] * 3), *[0.05] * 3])
@@ -62,7 +63,7 @@ def test_what_all_answers_are_off_by_alike_is_found_where_the_truth_is_known():
     answers = day(rng, np.zeros((6, 6)), x, noise=NOISE / 5)
     S = aggregate._bearing_of_twist(answers.T_centre)
     biased = replace(answers, answer=answers.answer + np.linalg.solve(S, bias))
-    found = aggregate.shared_bias(biased, exp_se3(x) @ answers.T_centre)
+    found = shared_bias(biased, exp_se3(x) @ answers.T_centre)
     assert np.degrees(found[:3]) == pytest.approx(np.degrees(bias[:3]), abs=0.05)
     assert found[3:] == pytest.approx(bias[3:], abs=0.012)
 
