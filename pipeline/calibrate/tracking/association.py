@@ -21,7 +21,7 @@ from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import to_spherical, wrap_angle
 from pipeline.rows import join_rows, take_rows
 
-__all__ = ["Association", "Shared", "associate", "bearing_sigma_rad", "shared_rows", "shared_sightings"]
+__all__ = ["Association", "Shared", "associate", "bearing_sigma_rad", "shared_sightings"]
 
 _LEAST_SHARED = 2
 _MOST_COUNTED = 8  # sightings of one track err together: a longer one is not ever more certain
@@ -34,11 +34,12 @@ _RANGE_OFFSET_SIGMA_M = 1.0  # near side against centre
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """Pairs of tracks (rows of the reference's and of the other sensor's) and how well each pair agrees."""
+    """Pairs of tracks (rows of the reference's and of the other sensor's), and their shared sightings."""
 
     reference: Int64[np.ndarray, " K"]
     other: Int64[np.ndarray, " K"]
-    score: Float[np.ndarray, " K"]  # larger is better, positive
+    sightings: Int64[np.ndarray, " S"]  # rows of `Shared.of_reference`, pair by pair
+    pair: Int64[np.ndarray, " S"]  # 0..K-1
 
     @property
     def count(self) -> int:
@@ -73,11 +74,15 @@ def associate(
         rotation_sigma_rad: how uncertain its rotation is per axis.
         elevation: False where one of the two measures none.
     """
-    if not len(shared.first):
-        return Association(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-    score = _scores(shared, T_other_reference, rotation_sigma_rad, elevation=elevation)
-    kept = _without_conflict(shared, score)
-    return Association(shared.reference[kept], shared.other[kept], score[kept])
+    kept = np.zeros(0, np.int64)
+    if len(shared.first):
+        score = _scores(shared, T_other_reference, rotation_sigma_rad, elevation=elevation)
+        kept = _without_conflict(shared, score)
+    pair = np.repeat(np.arange(len(shared.first)), shared.count)
+    sightings = np.flatnonzero(np.isin(pair, kept))
+    return Association(
+        shared.reference[kept], shared.other[kept], sightings, np.searchsorted(kept, pair[sightings])
+    )
 
 
 def shared_sightings(reference: Sequence[Track], other: Sequence[Track]) -> Shared:
@@ -103,12 +108,6 @@ def shared_sightings(reference: Sequence[Track], other: Sequence[Track]) -> Shar
         _gathered(reference, joined[:, 0], joined[:, 2]),
         _gathered(other, joined[:, 1], joined[:, 3]),
     )
-
-
-def shared_rows(a: Track, b: Track) -> tuple[Int64[np.ndarray, " S"], Int64[np.ndarray, " S"]]:
-    """Sightings of two tracks in the same frames."""
-    _, rows_a, rows_b = np.intersect1d(a.frame, b.frame, assume_unique=True, return_indices=True)
-    return rows_a.astype(np.int64), rows_b.astype(np.int64)
 
 
 def bearing_sigma_rad(range_m: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
@@ -183,6 +182,6 @@ def _gathered(tracks: Sequence[Track], track: np.ndarray, row: np.ndarray) -> Tr
     """The named sightings of many tracks in one, in the order named."""
     if not tracks:
         none, nothing = np.zeros(0, np.int64), np.zeros(0)
-        return Track(-1, none, none, np.zeros((0, 3)), np.zeros((0, 3)), nothing, nothing)
+        return Track(-1, none, none, np.zeros((0, 3)), np.zeros((0, 3)), nothing, nothing, np.zeros((0, 3)))
     start = np.concatenate([[0], np.cumsum([t.sightings for t in tracks])[:-1]]).astype(np.int64)
     return take_rows(join_rows(tracks), start[track] + row)

@@ -26,20 +26,10 @@ _INTRACLASS = 0.5  # correlation of sightings of one track
 _LEAST_SCALE = 0.2  # of the sightings' spread, in their stated sigmas
 _OUTLIER_WEIGHT = 0.25
 _CONFIDENCE = 0.999
-
-
-@dataclass(frozen=True)
-class _Schedule:
-    """Graduated non-convexity: Geman-McClure scale in sigmas, narrowed at each step, then kept."""
-
-    widest: float = 12.0
-    narrowest: float = 2.0
-    narrowing: float = 0.7
-    last_steps: int = 12
-    spread_steps: int = 6  # of the last ones, the first in which the sightings' spread is estimated anew
-
-
-_SCHEDULE = _Schedule()
+# Graduated non-convexity: Geman-McClure scale in sigmas, narrowed at each step, then kept for the last steps, in the
+# first of which the sightings' spread is estimated anew.
+_WIDEST, _NARROWEST, _NARROWING = 12.0, 2.0, 0.7
+_LAST_STEPS, _SPREAD_STEPS = 12, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +114,7 @@ def align_bearings(
     count = np.bincount(bearings.track, minlength=bearings.tracks)[bearings.track]
     share = 1 / (1 + _INTRACLASS * (count - 1))  # sightings of one track err together
     scale = np.ones(bearings.bearing_rad.shape[1])
-    c, rounds = _SCHEDULE.widest, 0
+    c, rounds = _WIDEST, 0
     while True:
         z, J = _whitened(bearings, T, scale)
         weight = _geman_mcclure(z, c)
@@ -133,13 +123,13 @@ def align_bearings(
         g = np.einsum("n,nai,na->i", share * weight, J[..., :3], z) + prior_information @ turned
         step = -np.linalg.solve(H, g)
         T = from_rotation_translation(exp_so3(step) @ T[:3, :3], T[:3, 3])
-        if c <= _SCHEDULE.narrowest:
+        if c <= _NARROWEST:
             rounds += 1
-            if rounds == _SCHEDULE.last_steps:
+            if rounds == _LAST_STEPS:
                 break
             z, _ = _whitened(bearings, T, np.ones_like(scale))
-            scale = np.maximum(_spread(z), _LEAST_SCALE) if rounds < _SCHEDULE.spread_steps else scale
-        c = max(c * _SCHEDULE.narrowing, _SCHEDULE.narrowest)
+            scale = np.maximum(_spread(z), _LEAST_SCALE) if rounds < _SPREAD_STEPS else scale
+        c = max(c * _NARROWING, _NARROWEST)
     z, J = _whitened(bearings, T, scale)
     weight = _geman_mcclure(z, c)
     per_track = np.bincount(bearings.track, weight, minlength=bearings.tracks)

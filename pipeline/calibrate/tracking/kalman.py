@@ -62,6 +62,7 @@ class Track:
     velocity_mps: Float[np.ndarray, "N 3"]
     rate_sigma_mps: Float[np.ndarray, " N"]  # of the velocity along the line of sight
     range_sigma_m: Float[np.ndarray, " N"]
+    target_m: Float[np.ndarray, "N 3"]  # the point that another sensor's bearing means
 
     @property
     def sightings(self) -> int:
@@ -130,4 +131,4 @@ def _track(sightings: Sequence[tuple[Scan, int, np.ndarray, float]]) -> Track:
     u = lines_of_sight(position[:, :2])
     range_sigma = np.sqrt(np.einsum("ni,nij,nj->n", u, cov, u))
     frames = np.array([s.frame for s in scans])
-    return Track(scans[0].drive, frames, np.array(rows), position, velocity, sigma, range_sigma)
+    return Track(scans[0].drive, frames, np.array(rows), position, velocity, sigma, range_sigma, position)

@@ -121,17 +121,12 @@ def radar_tracks(observations: Sequence[Observation]) -> list[Track]:
         velocity = np.array([observations[i].radar_track_velocity_mps[k] for i, k in seen], np.float64)
         if np.median(np.linalg.norm(velocity, axis=1)) < _LEAST_SPEED_MPS:
             continue
-        tracks.append(
-            Track(
-                drive,
-                np.array([i for i, _ in seen]),
-                np.array([k for _, k in seen]),
-                np.array([observations[i].radar_track_xyz_m[k] for i, k in seen], np.float64),
-                velocity,
-                np.full(len(seen), _RADAR_RATE_SIGMA_MPS),
-                np.full(len(seen), _RADAR_RANGE_SIGMA_M),
-            )
+        frames, detections = (np.array(k) for k in zip(*seen, strict=True))
+        position = np.array([observations[i].radar_track_xyz_m[k] for i, k in seen], np.float64)
+        rate_sigma, range_sigma = (
+            np.full(len(seen), sigma) for sigma in (_RADAR_RATE_SIGMA_MPS, _RADAR_RANGE_SIGMA_M)
         )
+        tracks.append(Track(drive, frames, detections, position, velocity, rate_sigma, range_sigma, position))
     return tracks
 
 

@@ -22,9 +22,9 @@ from pipeline.calibrate.numerics.bias_floors import TRACKING_BIAS_RAD
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, posterior
 from pipeline.calibrate.tracking.association import (
     Association,
+    Shared,
     associate,
     bearing_sigma_rad,
-    shared_rows,
     shared_sightings,
 )
 from pipeline.calibrate.tracking.bearings import AlignedBearings, Bearings, align_bearings, consistency
@@ -64,9 +64,8 @@ _ROTATION_ONLY = "only the rotation is calibrated, as in the source; the transla
 class PairTracks:
     """Tracks of the lidar and of one other sensor, each in level axes; `inverted` as in `Bearings`."""
 
-    lidar: Sequence[Track]
+    lidar: Sequence[Track]  # `target_m`: what the other sensor's bearings mean
     other: Sequence[Track]
-    points_m: Sequence[np.ndarray]  # per lidar track: the points that the other sensor's bearings mean
     level: np.ndarray
     inverted: bool
     elevation: bool
@@ -161,7 +160,7 @@ def calibrate_pair(
     shared = shared_sightings(tracks.lidar, tracks.other)
     for _ in range(_ROUNDS):
         found = associate(shared, _level_transform(T, tracks), sigma, elevation=tracks.elevation)
-        bearings, used = _bearings(tracks, found, frames)
+        bearings, used = _bearings(tracks, shared, found, frames)
         if bearings.tracks < MIN_TRACKS:
             raise SolveError(_too_few(pair, tracks, bearings.tracks))
         aligned = align_bearings(bearings, prior.of(pair), covariance, rng)
@@ -185,14 +184,12 @@ def _tracked(frames: Sequence[Observation], prior: Prior) -> dict[str, PairTrack
     """
     motion = motions(frames, prior)
     lidar = [t for t in lidar_tracks(frames, motion) if passes_by(t)]
-    boxes = [box_centres(t, frames) for t in lidar]
+    boxes = [replace(t, target_m=box_centres(t, frames)) for t in lidar]
     moving = [t for t in lidar if moves_over_ground(t)]
     elevation = any(o.radar_has_elevation for o in frames)
     return {
-        "camera_lidar": PairTracks(lidar, camera_tracks(frames, motion), boxes, _CAMERA_LEVEL, False, True),
-        "lidar_radar": PairTracks(
-            moving, radar_tracks(frames), [t.position_m for t in moving], np.eye(3), True, elevation
-        ),
+        "camera_lidar": PairTracks(boxes, camera_tracks(frames, motion), _CAMERA_LEVEL, False, True),
+        "lidar_radar": PairTracks(moving, radar_tracks(frames), np.eye(3), True, elevation),
     }
 
 
@@ -213,36 +210,20 @@ def _steering(tracks: PairTracks) -> list[int]:
 
 
 def _bearings(
-    tracks: PairTracks, found: Association, frames: np.ndarray | None
+    tracks: PairTracks, shared: Shared, found: Association, frames: np.ndarray | None
 ) -> tuple[Bearings, np.ndarray]:
     """Shared sightings of the paired tracks, and the frame of each."""
-    names: list[np.ndarray] = []
-    points, angles, sigmas, at = [], [], [], []
-    for i, j in zip(found.reference, found.other, strict=True):
-        a, b = tracks.lidar[i], tracks.other[j]
-        rows_a, rows_b = shared_rows(a, b)
-        if frames is not None:
-            usable = np.isin(a.frame[rows_a], frames)
-            rows_a, rows_b = rows_a[usable], rows_b[usable]
-        if not len(rows_a):
-            continue
-        seen = to_spherical(b.position_m[rows_b])
-        points.append(tracks.points_m[i][rows_a])
-        angles.append(seen[:, : 2 if tracks.elevation else 1])
-        sigmas.append(bearing_sigma_rad(seen[:, 2]))
-        names.append(np.full(len(rows_a), len(names)))
-        at.append(a.frame[rows_a])
-    axes = 2 if tracks.elevation else 1
-    if not names:
-        nothing = np.zeros(0, np.int64)
-        empty = Bearings(
-            np.zeros((0, 3)), np.zeros((0, axes)), np.zeros(0), nothing, tracks.level, tracks.inverted
-        )
-        return empty, nothing
-    return Bearings(
-        np.concatenate(points), np.concatenate(angles), np.concatenate(sigmas), np.concatenate(names),
-        tracks.level, tracks.inverted,
-    ), np.concatenate(at)  # fmt: skip
+    rows, pair = found.sightings, found.pair
+    if frames is not None:
+        usable = np.isin(shared.of_reference.frame[rows], frames)
+        rows, pair = rows[usable], pair[usable]
+    seen = to_spherical(shared.of_other.position_m[rows])
+    names = np.unique(pair, return_inverse=True)[1].astype(np.int64)
+    bearings = Bearings(
+        shared.of_reference.target_m[rows], seen[:, : 2 if tracks.elevation else 1], bearing_sigma_rad(seen[:, 2]),
+        names, tracks.level, tracks.inverted,
+    )  # fmt: skip
+    return bearings, shared.of_reference.frame[rows]
 
 
 def _estimate(

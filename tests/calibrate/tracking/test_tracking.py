@@ -36,7 +36,7 @@ def make_track(position_m, velocity_mps, first_frame=0, drive=0):
     n = len(position_m)
     return Track(
         drive, np.arange(first_frame, first_frame + n), np.zeros(n, int),
-        position_m, np.tile(velocity_mps, (n, 1)), np.full(n, 0.5), np.full(n, 0.7),
+        position_m, np.tile(velocity_mps, (n, 1)), np.full(n, 0.5), np.full(n, 0.7), position_m,
     )  # fmt: skip
 
 
@@ -60,9 +60,7 @@ def tracks_of_a_pair(rng, T_other_lidar, count=30, wrong=0.0, noise_m=0.3, eleva
         # Objects one after another in time: what is asked here is the rotation, not who is who.
         lidar.append(make_track(path + rng.normal(size=path.shape) * noise_m, velocity, 10 * k))
         other.append(make_track(seen, turned, 10 * k))
-    return PairTracks(
-        lidar, other, [t.position_m for t in lidar], np.eye(3) if inverted else LEVEL, inverted, elevation
-    )
+    return PairTracks(lidar, other, np.eye(3) if inverted else LEVEL, inverted, elevation)
 
 
 def turned_prior(degrees=1.0):
@@ -205,7 +203,7 @@ def test_few_tracks_raise_the_threshold_of_the_miscalibration_test():
     thresholds = []
     for count in (6, 40):
         tracks = tracks_of_a_pair(np.random.default_rng(5), inverse(T_LIDAR_RADAR), count=count)
-        points = np.concatenate(tracks.points_m)
+        points = np.concatenate([t.target_m for t in tracks.lidar])
         bearings = Bearings(
             points, np.zeros((len(points), 2)), np.full(len(points), 0.01), np.repeat(np.arange(count), SIGHTINGS),
             np.eye(3), True,
