@@ -54,11 +54,17 @@ def simulate(
         seed: same seed, same logs.
         workers: processes.
     """
+    from pipeline.errors import ConfigError
     from pipeline.simulate.faults import parse_faults
     from pipeline.simulate.fleet import FleetSpec, day_names
     from pipeline.simulate.sensors.rigs import rig_named
 
-    named = parse_faults(faults, day_names(first_day, days), rig_named(rig))
+    spec_of_rig = rig_named(rig)
+    if reflectors and not spec_of_rig.is_short:
+        raise ConfigError(
+            "--reflectors", rig, "three reflectors are recorded by rigs of camera, lidar and radar"
+        )
+    named = parse_faults(faults, day_names(first_day, days), spec_of_rig)
     spec = FleetSpec(
         vehicles=vehicles,
         days=days,

@@ -17,15 +17,16 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.results import Progress, silent
-from pipeline.simulate.faults import DayFaults, Fault, faults_on, misread, shaken
+from pipeline.simulate.faults import Fault, faults_on, shaken
 from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
-from pipeline.simulate.logs.recording import FIRST_FRAME_S, Setup, record_drive
+from pipeline.simulate.logs.frame_messages import Setup
+from pipeline.simulate.logs.recording import FIRST_FRAME_S, record_drive
 from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log
-from pipeline.simulate.sensors.data_sheets import CameraSpec
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
+from pipeline.simulate.sensors.rig_spec import RigSpec
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.semantics import SemanticsSpec
+from pipeline.simulate.truth import truth_of
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
@@ -248,62 +249,12 @@ def drive_of(spec: FleetSpec, vehicle: int, day: int, number: int, frames: int) 
 
 
 def _truth(spec: FleetSpec, vehicle: int, day: int) -> dict[str, Any]:
-    """What a judge needs to know; stamp_a = stamp_b + dt_a_b_s, as in the calibration records."""
-    name, rig = vehicle_names(spec)[vehicle], rig_of(spec, vehicle)
+    name = vehicle_names(spec)[vehicle]
     morning, evening = (mounting_on(spec, vehicle, day, share) for share in (0.0, 1.0))
-    today = faults_on(spec.faults, name, day)
-    ends = _poses(evening) | (_pairs(evening) if rig.is_short else {})
     return {
         "vehicle": name,
         "day": day_names(spec.first_day, spec.days)[day],
-        "rig": rig.name,
         "seed": spec.seed,
-        "reference": rig.reference.name,
-        **_poses(morning),
-        "cameras": {s.name: _camera(s, morning, today) for s in rig.of_kind("camera")},
-        "radars": {n: asdict(m.errors) for n, m in morning.sensors.items() if m.errors is not None},
-        **(_of_three(morning, rig, today) if rig.is_short else {}),
+        **truth_of(rig_of(spec, vehicle), morning, evening, faults_on(spec.faults, name, day)),
         "faults": [asdict(f) | {"active": f.day <= day} for f in spec.faults if f.vehicle == name],
-        "at_end_of_day": ends,
-    }
-
-
-def _poses(mounting: Mounting) -> dict[str, Any]:
-    """Where every sensor is, and how much later than the reference's its stamps of an event are."""
-    sensors = mounting.sensors.items()
-    return {
-        "T_base_sensor": {n: m.T_vehicle.tolist() for n, m in sensors},
-        "dt_s": {n: m.delay_s for n, m in sensors},
-    }
-
-
-def _camera(sensor: SensorSpec, mounting: Mounting, today: DayFaults) -> dict[str, Any]:
-    assert isinstance(sensor.sheet, CameraSpec)
-    true, logged = mounting.camera(sensor.name)
-    stated = misread(logged, today, sensor.name)
-    return {"K": true.K.tolist(), "K_logged": stated.K.tolist(), "readout_s": sensor.sheet.readout_s}
-
-
-def _pairs(m: Mounting) -> dict[str, Any]:
-    """T_parent_child of the pairs of a rig of three."""
-    pairs = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
-    return {f"T_{a}_{b}": m.between(a, b).tolist() for a, b in pairs}
-
-
-def _of_three(m: Mounting, rig: RigSpec, today: DayFaults) -> dict[str, Any]:
-    """The same by the names that readers of rigs of three know."""
-    camera, radar, errors = m["camera"], m["radar"], m["radar"].errors
-    assert errors is not None
-    about = _camera(rig["camera"], m, today)
-    return {
-        **_pairs(m),
-        **{f"T_vehicle_{n}": mounted.T_vehicle.tolist() for n, mounted in m.sensors.items()},
-        "dt_camera_lidar_s": camera.delay_s,
-        "dt_lidar_radar_s": -radar.delay_s,
-        "dt_camera_radar_s": camera.delay_s - radar.delay_s,
-        "radar_range_bias_m": errors.range_bias_m,
-        "radar_elevation_bias_rad": errors.elevation_bias_rad,
-        "camera_K": about["K"],
-        "camera_K_logged": about["K_logged"],
-        "camera_readout_s": about["readout_s"],
     }

@@ -20,7 +20,8 @@ from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.results import Progress, silent
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, rig_of, vehicle_names
-from pipeline.simulate.logs.recording import Setup, messages_of, nominal_poses
+from pipeline.simulate.logs.frame_messages import Setup, messages_of
+from pipeline.simulate.logs.recording import nominal_poses
 from pipeline.simulate.logs.writers import open_log
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan

@@ -41,7 +41,9 @@ def test_the_job_records_reflectors_where_asked(tmp_path, capsys, monkeypatch):
     assert len(summary["reflectors"]) == 1
 
 
-@pytest.mark.parametrize("wrong", [{"first_day": "yesterday"}, {"faults": "x"}, {"frames": 0}])
+@pytest.mark.parametrize(
+    "wrong", [{"first_day": "yesterday"}, {"faults": "x"}, {"frames": 0}, {"rig": "van", "reflectors": True}]
+)
 def test_the_job_refuses_what_cannot_be_before_it_writes_anything(wrong, tmp_path):
     with pytest.raises(ConfigError):
         simulate(out=tmp_path / "out", **wrong)
