@@ -119,7 +119,7 @@ def _measured(report: CheckReport) -> list[str]:
     met = {name: of for name, of in found.items() if of[1] is not None}
     offsets = ", ".join(f"{sensor} {offset:+.1f} ms" for sensor, _, offset in met.values())
     nearest = ", ".join(f"to {name} {median:.2f} ms" for name, (_, median, _) in met.items())
-    sync = f"{s.trios} of {s.sweeps} sweeps have {' and '.join(met) or 'no partner'} {gate}"
+    sync = f"{s.moments} of {s.sweeps} sweeps have {' and '.join(met) or 'no partner'} {gate}"
     known = "; ".join(f"{name}: {value}" for name, value in facts.items())
     return [
         f"sync: {sync}" + (f" (median {nearest}; constant offsets: {offsets})" if met else ""),

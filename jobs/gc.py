@@ -8,9 +8,9 @@ __all__ = ["gc"]
 def gc(
     *, lake: str, images_days: int = 30, observations_days: int | None = None, dry_run: bool = False
 ) -> int:
-    """Take frames, with their images of public roads, and day pages that show them out of a lake. Records stay.
+    """Take moments, with their images of public roads, and day pages that show them out of a lake. Records stay.
 
-    Frames of days that a night is given again are made anew where a changed configuration asks for them. A page that
+    Moments of days that a night is given again are made anew where a changed configuration asks for them. A page that
     left is drawn again, without pictures, by the next night whose window holds its day, or by `boresight report`.
 
     Args:
@@ -26,14 +26,13 @@ def gc(
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake
     from pipeline.store.retention import collect, collect_pages, first_day_kept
-    from schemas.frames import FRAMES
-    from schemas.observations import OBSERVATIONS
+    from schemas.moments import MOMENTS, PERCEIVED
 
     for name, days in (("images-days", images_days), ("observations-days", observations_days)):
         if days is not None and days < 1:
             raise ConfigError("command line", name, f"{days} is less than one")
     tables, today = Lake.existing(lake), dt.datetime.now(dt.UTC).date()
-    kept = {FRAMES: images_days} | ({} if observations_days is None else {OBSERVATIONS: observations_days})
+    kept = {MOMENTS: images_days} | ({} if observations_days is None else {PERCEIVED: observations_days})
     gone = {
         schema.name: list(
             collect(tables, schema, first_day_kept(today, days), today.isoformat(), dry_run=dry_run)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 __all__ = ["show"]
 
 Table = Literal[
-    "calibrations", "poses", "drift", "states", "outcomes", "service_events", "frames", "observations"
+    "calibrations", "poses", "drift", "states", "outcomes", "service_events", "moments", "perceived"
 ]
 
 
@@ -26,7 +26,7 @@ def show(
     current: bool = False,
     json: bool = False,
 ) -> int:
-    """Show records (calibrations, poses, drift, states, ...) or partitions (frames, observations).
+    """Show records (calibrations, poses, drift, states, ...) or partitions (moments, perceived).
 
     Args:
         table: what to show.
@@ -43,7 +43,7 @@ def show(
     from pipeline.store.partitions import Lake
 
     tables = Lake.existing(lake)
-    if table in ("frames", "observations"):
+    if table in ("moments", "perceived"):
         rows = _partitions(tables, table, vehicle, day)
     else:
         rows = _records(tables, table, vehicle, day, method, current=current)

@@ -7,18 +7,19 @@ counts, outcome. Inline, in a pool of processes or elsewhere, this is what runs.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from contextlib import AbstractContextManager, closing
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pipeline.config import config_hash
 from pipeline.errors import BoresightError, ContractError, DamagedError, TooMuchMemoryError
 from pipeline.memory import at_most
 from pipeline.results import Outcome, Progress, measured
+from pipeline.store.moments import MomentWriter, groups, is_whole, write_moments
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.records import assert_records, commit_last, commit_records, read_records
-from pipeline.store.tables import Manifest, read_manifest, write_partition
+from pipeline.store.tables import Manifest, PartitionWriter, absence, read_manifest, write_partition
 from pipeline.work import NothingUsable, Run, Task, Window, Work
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
@@ -34,9 +35,6 @@ _RECORD_ROWS: dict[str, type] = {
     DRIFT.name: DriftFinding,
     STATES.name: StateRow,
 }
-# A row group: large enough to compress, small enough that a worker that holds one stays far below 2 GB.
-_GROUP_ROWS = 16
-_GROUP_BYTES = 24 << 20
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class Stage:
     Args:
         name: what its command and its outcomes are called.
         reads: tables that it reads.
-        writes: table that it writes; none where it writes files.
+        writes: table that it writes, then those of sensors' files that it joins; none where it writes files.
         function: import path of `work(task) -> Work`.
         needs_inputs: a vehicle-day without all that the stage reads is an error. False where the stage reads what
             the task's method asks for and answers for its absence itself.
@@ -93,7 +91,7 @@ def why_to_run(stage: Stage, task: Task) -> str:
         ConfigError, ContractError: see `run_stage`.
     """
     task, work, run = _prepared(stage, task)
-    [schema] = stage.writes
+    schema = stage.writes[0]
     if _refused_before(stage, task, run) is not None:
         return ""
     if schema.is_record_table:
@@ -115,7 +113,7 @@ def _run_stage(stage: Stage, task: Task) -> Outcome:
     task, work, run = _prepared(stage, task)
     if not stage.writes:
         return _write_files(stage, task, work, run)
-    [schema] = stage.writes
+    schema = stage.writes[0]
     if schema.is_record_table:
         return _add_records(stage, task, work, run, schema)
     return _replace_partition(stage, task, work, run, schema)
@@ -159,10 +157,10 @@ def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
 def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
     """Manifests of all tables that the stage reads, in that order."""
     found = {}
-    for schema in stage.reads:
+    for schema in (s for s in stage.reads if not s.of_sensor):
         manifest = read_manifest(task.lake, schema, task.partition)
         if manifest is None:
-            problem = f"no {schema.name} of this vehicle and day: run `boresight {schema.made_by}` first"
+            problem = absence(task.lake, schema, task.partition)
             raise ContractError(str(task.lake.folder(schema.name, task.partition)), problem)
         found[schema.name] = manifest
     return found
@@ -182,10 +180,14 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
         with (
             at_most(task.fleet.fleet.memory_gb),
             closing(work.rows(run)) as rows,
-            write_partition(task.lake, schema, task.partition, run.work_key, CODE_VERSION, run.inputs) as out,
+            _writer(stage)(task.lake, schema, task.partition, run.work_key, CODE_VERSION, run.inputs) as out,
         ):
-            for group in _groups(rows):
-                out.append(group)
+            if isinstance(out, MomentWriter):
+                for moment, captures in rows:
+                    out.append(moment, captures)
+            else:
+                for group in groups(rows):
+                    out.append(group)
             counts = {"kept": {"frames": out.rows, **run.kept}, "rejected": dict(run.rejected)}
             out.describe(**counts, remarks=run.remarks, **run.extra)
     except (NothingUsable, TooMuchMemoryError) as refusal:
@@ -214,9 +216,14 @@ def _refused_before(stage: Stage, task: Task, run: Run) -> Outcome | None:
 def _readable(task: Task, schema: TableSchema) -> Manifest | None:
     """Manifest of the partition as it is; None where it is absent, of another version or damaged: made anew."""
     try:
-        return read_manifest(task.lake, schema, task.partition)
+        found = read_manifest(task.lake, schema, task.partition)
+        return found if found is None or is_whole(task.lake, task.partition, found) else None
     except (ContractError, ValueError, OSError):
         return None
+
+
+def _writer(stage: Stage) -> Callable[..., AbstractContextManager[PartitionWriter | MomentWriter]]:
+    return write_moments if any(s.of_sensor for s in stage.writes) else write_partition
 
 
 def _partition_outcome(stage: Stage, task: Task, work: Work, status: str, manifest: Manifest) -> Outcome:
@@ -297,22 +304,3 @@ def _outcome(stage: Stage, task: Task, status: str, key: str, **told: Any) -> Ou
     of = task.of
     where = (of.vehicle, of.day) if isinstance(of, Partition) else ("", "")
     return Outcome(stage.name, *where, status, key, **told)
-
-
-def _groups(rows: Iterable[Any]) -> Iterator[list[Any]]:
-    """Rows by the row group; no more than one is held."""
-    group: list[Any] = []
-    size = 0
-    for row in rows:
-        group.append(row)
-        size += _bytes_of(row)
-        if size >= _GROUP_BYTES or len(group) >= _GROUP_ROWS:
-            yield group
-            group, size = [], 0
-    yield group
-
-
-def _bytes_of(row: Any) -> int:
-    """Memory of a row's arrays and blobs; the rest is small."""
-    values = (getattr(row, f.name) for f in fields(row))
-    return sum(len(v) if isinstance(v, bytes) else getattr(v, "nbytes", 0) for v in values)

@@ -8,20 +8,23 @@ from __future__ import annotations
 
 from pipeline.runner import Stage
 from schemas.calibrations import CALIBRATIONS
+from schemas.captures import CAPTURES
 from schemas.drift import DRIFT
-from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS
+from schemas.features import FEATURES
+from schemas.moments import MOMENTS, PERCEIVED
 from schemas.states import STATES
 from schemas.training import TRAINING
 
 __all__ = ["AUDIT", "CALIBRATE", "INGEST", "PERCEIVE", "PREPARE", "REPORT", "STAGES", "STATE"]
 
-INGEST = Stage("ingest", (), (FRAMES,), "pipeline.ingest.stage:work")
-PERCEIVE = Stage("perceive", (FRAMES,), (OBSERVATIONS,), "pipeline.perceive.stage:work")
-PREPARE = Stage("prepare", (FRAMES, OBSERVATIONS), (TRAINING,), "pipeline.learn.prepare.stage:work")
+_INGESTED, _PERCEIVED = (MOMENTS, *CAPTURES.values()), (PERCEIVED, *FEATURES.values())
+
+INGEST = Stage("ingest", (), _INGESTED, "pipeline.ingest.stage:work")
+PERCEIVE = Stage("perceive", _INGESTED, _PERCEIVED, "pipeline.perceive.stage:work")
+PREPARE = Stage("prepare", (*_INGESTED, *_PERCEIVED), (TRAINING,), "pipeline.learn.prepare.stage:work")
 CALIBRATE = Stage(
     "calibrate",
-    (FRAMES, OBSERVATIONS),
+    (*_INGESTED, *_PERCEIVED),
     (CALIBRATIONS,),
     "pipeline.calibrate.stage:work",
     needs_inputs=False,
@@ -32,7 +35,7 @@ STATE = Stage(
 )
 REPORT = Stage(
     "report",
-    (FRAMES, OBSERVATIONS, CALIBRATIONS, DRIFT),
+    (*_INGESTED, *_PERCEIVED, CALIBRATIONS, DRIFT),
     (),
     "pipeline.report.stage:work",
     per_vehicle_day=False,

@@ -110,6 +110,9 @@ class TableSchema:
     about: tuple[str, ...] = ()
     # Of a column that older releases did not write: the column that it follows from, and its value by that one's.
     follows: Mapping[str, tuple[str, Mapping[str, str]]] = field(default_factory=dict, hash=False)
+    of_sensor: bool = False  # a partition has a file per sensor, joined by another table
+    before: str = ""  # the table that stood in its place before 0.11
+    row_type: type | None = field(default=None, compare=False, repr=False)
 
     @property
     def is_record_table(self) -> bool:
@@ -186,12 +189,15 @@ def table_of(
     reads_versions: tuple[int, ...] = (),
     about: tuple[str, ...] = (),
     follows: Mapping[str, tuple[str, Mapping[str, str]]] | None = None,
+    of_sensor: bool = False,
+    before: str = "",
 ) -> TableSchema:
     """The table whose rows are `of`: a column for each field, in their order, those of every record last."""
     last = {f.name for f in fields(Recorded)} if issubclass(of, Recorded) else set[str]()
     types = get_type_hints(of)
     columns = [_column(f, types[f.name]) for f in sorted(fields(of), key=lambda f: f.name in last)]
-    return TableSchema(name, version, tuple(columns), doc, made_by, reads_versions, about, follows or {})
+    read = doc, made_by, reads_versions, about, follows or {}
+    return TableSchema(name, version, tuple(columns), *read, of_sensor, before, row_type=of)
 
 
 def _column(of: Field[Any], kind: Any) -> Column:

@@ -6,10 +6,11 @@ import json
 from pathlib import Path
 
 from schemas.calibrations import CALIBRATIONS
+from schemas.captures import CAPTURES
 from schemas.columns import TableSchema
 from schemas.drift import DRIFT
-from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS
+from schemas.features import FEATURES
+from schemas.moments import MOMENTS, PERCEIVED
 from schemas.outcomes import OUTCOMES
 from schemas.poses import POSES
 from schemas.service_events import SERVICE_EVENTS
@@ -23,8 +24,11 @@ CODE_VERSION = "0.10.0"
 
 TABLES: dict[str, TableSchema] = {
     t.name: t
-    for t in (FRAMES, OBSERVATIONS, TRAINING, CALIBRATIONS, POSES, DRIFT, STATES, OUTCOMES, SERVICE_EVENTS)
-}
+    for t in (
+        MOMENTS, *CAPTURES.values(), PERCEIVED, *FEATURES.values(), TRAINING, CALIBRATIONS, POSES, DRIFT, STATES,
+        OUTCOMES, SERVICE_EVENTS,
+    )
+}  # fmt: skip
 
 
 def write_json_schemas(folder: Path) -> list[Path]:

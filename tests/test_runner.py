@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import pipeline.runner
+import pipeline.store.moments
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError, ContractError, LogError
 from pipeline.fleet.ledger import outcome_row
@@ -21,15 +22,18 @@ from pipeline.results import Outcome
 from pipeline.runner import Stage, try_stage, why_to_run
 from pipeline.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_manifest, read_records, read_rows, write_partition
+from pipeline.store.tables import read_manifest, read_records
+from pipeline.store.views import observations_of, perceived
 from pipeline.work import NothingUsable, Records, Run, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
-from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.features import FEATURES
+from schemas.moments import FILES, PERCEIVED
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.lakes import joined_of, write_frames, write_observations
 from tests.makers.solve_scenes import make_day
 
 DAY = Partition("v", "2024-05-06")
+WRITES = (PERCEIVED, *FEATURES.values())
 
 
 @dataclass
@@ -64,21 +68,26 @@ def task(fleet, tmp_path):
 def stage(monkeypatch):
     """Observations out of nothing: `stage(rows, settings)`."""
 
-    def make(rows, settings=None, writes=OBSERVATIONS, **extra):
+    def make(rows, settings=None, writes=WRITES, **extra):
         made = MadeUp(settings or {}, rows, extra)
         monkeypatch.setattr(Stage, "load", lambda _: made)
-        return Stage("made-up", (), (writes,), ""), made
+        return Stage("made-up", (), writes, ""), made
 
     return make
 
 
 def some(count):
     """Rows of that many frames."""
-    return lambda _run: iter(make_day(count))
+    return lambda _run: rows_of_day(count)
+
+
+def rows_of_day(count):
+    """Moments with the features of their sensors, as perceive has them."""
+    return (joined_of(o) for o in make_day(count))
 
 
 def kept(task):
-    return [o.frame_index for o in read_rows(task.lake, OBSERVATIONS, DAY, Observation)]
+    return [o.frame_index for o in observations_of(task.lake, DAY)]
 
 
 def leftovers(task):
@@ -111,7 +120,7 @@ def test_a_stage_that_raises_leaves_what_was_there_and_nothing_else(error, task,
     before = kept(task)
 
     def raising(_run):
-        yield from make_day(20)  # more than a row group: some of it is written already
+        yield from rows_of_day(20)  # more than a row group: some of it is written already
         raise error
 
     with pytest.raises(type(error)):
@@ -122,12 +131,12 @@ def test_a_stage_that_raises_leaves_what_was_there_and_nothing_else(error, task,
 
 def test_a_first_run_that_raises_leaves_no_partition(task, stage):
     def raising(_run):
-        yield from make_day(20)
+        yield from rows_of_day(20)
         raise LogError("a.mcap", "ends early")
 
     with pytest.raises(LogError):
         stage(raising)[0].run(task)
-    assert read_manifest(task.lake, OBSERVATIONS, DAY) is None
+    assert perceived(task.lake, DAY) is None
     assert leftovers(task) == []
 
 
@@ -138,16 +147,18 @@ from pipeline.config import load_fleet
 from pipeline.runner import Stage
 from pipeline.store.partitions import Lake, Partition
 from pipeline.work import Task, Work
-from schemas.observations import OBSERVATIONS
+from schemas.features import FEATURES
+from schemas.moments import PERCEIVED
+from tests.makers.lakes import joined_of
 from tests.makers.solve_scenes import make_day
 
 def rows(run):
-    yield from make_day(20)
+    yield from map(joined_of, make_day(20))
     os.kill(os.getpid(), signal.SIGKILL)
 
 Stage.load = lambda stage: lambda task: Work(({"killed": 1},), rows)
 task = Task(load_fleet(Path(sys.argv[1])), Lake.at(sys.argv[2]), Partition("v", "2024-05-06"))
-Stage("made-up", (), (OBSERVATIONS,), "").run(task)
+Stage("made-up", (), (PERCEIVED, *FEATURES.values()), "").run(task)
 """
 
 
@@ -171,19 +182,20 @@ def test_the_manifest_says_what_was_kept_and_left_out_and_so_does_the_outcome(ta
         run.rejected["dark"] += 3
         run.extra["grid"] = [1, 2]
         run.remarks = "one log ends early"
-        yield from make_day(2)
+        yield from rows_of_day(2)
 
     outcome = stage(rows)[0].run(task)
-    manifest = read_manifest(task.lake, OBSERVATIONS, DAY)
+    manifest = perceived(task.lake, DAY)
     assert manifest.rows == outcome.rows == 2
     assert manifest.kept == outcome.kept == {"frames": 2, "night": 2}
     assert manifest.rejected == outcome.rejected == {"dark": 3}
-    assert manifest.extra == {"grid": [1, 2]}
+    files = {kind: table.name for kind, table in FEATURES.items()}
+    assert manifest.extra == {"grid": [1, 2], FILES: files}
     assert manifest.work_key == outcome.work_key
     assert outcome.reason == "one log ends early"
     again = stage(rows)[0].run(task)  # a night that was killed may have told nobody
     assert (again.status, again.reason) == ("cached", "one log ends early")
-    assert outcome.outputs == [str(task.lake.folder("observations", DAY))]
+    assert outcome.outputs == [str(task.lake.folder("perceived", DAY))]
 
 
 def test_a_partition_without_a_row_is_refused_with_counted_reasons_also_from_the_cache(task, stage):
@@ -194,7 +206,7 @@ def test_a_partition_without_a_row_is_refused_with_counted_reasons_also_from_the
     empty, _ = stage(rows, nothing="no usable frame")
     for outcome in (empty.run(task), empty.run(task)):
         assert (outcome.status, outcome.reason) == ("refused", "no usable frame: 1 bright, 2 dark")
-    assert read_manifest(task.lake, OBSERVATIONS, DAY).rows == 0
+    assert perceived(task.lake, DAY).rows == 0
 
 
 def test_where_nothing_is_usable_nothing_is_written_and_the_day_is_refused(task, stage):
@@ -224,7 +236,7 @@ def test_inputs_that_were_refused_are_not_worked_out_again_and_others_are(task, 
     assert (again, made.asked) == (first, 1)
     assert why_to_run(refusing, task) == ""
     other, made = stage(rows, {"voxel_m": 0.5})
-    assert why_to_run(other, task) == "no observations yet"
+    assert why_to_run(other, task) == "no perceived yet"
     assert (other.run(task).status, made.asked) == ("refused", 1)
 
 
@@ -237,13 +249,13 @@ def test_a_day_that_asks_for_more_memory_than_a_worker_may_take_is_refused_until
 
     def rows(_run):
         keep = [np.ones(1 << 22) for _ in range(16)]  # half a gigabyte
-        yield from make_day(len(keep))
+        yield from rows_of_day(len(keep))
 
     greedy, made = stage(rows)
     found = greedy.run(with_bound(0.2))
     assert (found.status, found.faults) == ("refused", ("memory",))
     assert "needed more than 0.2 GB of memory (fleet.memory_gb)" in found.reason
-    assert read_manifest(task.lake, OBSERVATIONS, DAY) is None
+    assert perceived(task.lake, DAY) is None
     task = replace(task, before=[outcome_row(found, "")])
     assert (greedy.run(with_bound(0.2)).status, made.asked) == ("refused", 1)
     assert (greedy.run(with_bound(2.0)).status, made.asked) == ("done", 2)
@@ -253,7 +265,7 @@ def test_why_a_stage_would_run_names_what_changed(task, stage, monkeypatch):
     def why(settings=None, inputs=("a",)):
         return why_to_run(stage(some(1), settings, inputs=inputs)[0], task)
 
-    assert why() == "no observations yet"
+    assert why() == "no perceived yet"
     stage(some(1), inputs=("a",))[0].run(task)
     assert why() == ""
     assert why({"voxel_m": 0.5}) == "other configuration"
@@ -267,14 +279,17 @@ def test_an_outcome_says_when_it_began_how_long_it_took_and_what_it_read_and_wro
     assert effort.began_at.endswith("Z")
     assert 0 < effort.seconds < 60
     if effort.bytes_written is not None:  # known on Linux
-        [file] = task.lake.folder("observations", DAY).glob("*.parquet")
-        assert effort.bytes_written >= file.stat().st_size
+        files = task.lake.root.rglob("*.parquet")
+        assert effort.bytes_written >= sum(file.stat().st_size for file in files)
 
 
-def test_a_damaged_partition_is_made_anew(task, stage):
+@pytest.mark.parametrize(
+    "damaged", [("perceived", DAY), ("scan_features", DAY, "radar")], ids=["moments", "a sensor's file"]
+)
+def test_a_damaged_partition_is_made_anew(damaged, task, stage):
     made_up, made = stage(some(2))
     made_up.run(task)
-    [file] = task.lake.folder("observations", DAY).glob("*.parquet")
+    file = task.lake.file(*damaged)
     file.write_bytes(file.read_bytes()[:-20])
     assert made_up.run(task).status == "done"
     assert made.asked == 2
@@ -283,13 +298,13 @@ def test_a_damaged_partition_is_made_anew(task, stage):
 def test_row_groups_are_small_and_rows_are_asked_for_as_they_are_written(task, stage, monkeypatch):
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr(pipeline.runner, "_GROUP_ROWS", 4)
+    monkeypatch.setattr(pipeline.store.moments, "_GROUP_ROWS", 4)
     stage(some(10))[0].run(task)
-    [file] = task.lake.folder("observations", DAY).glob("*.parquet")
+    file = task.lake.file("sweep_features", DAY, "lidar")
     with pq.ParquetFile(file) as parquet:
         sizes = [parquet.metadata.row_group(g).num_rows for g in range(parquet.num_row_groups)]
     assert sizes == [4, 4, 2]
-    monkeypatch.setattr(pipeline.runner, "_GROUP_BYTES", 1)  # a row alone is more than that
+    monkeypatch.setattr(pipeline.store.moments, "_GROUP_BYTES", 1)  # a row alone is more than that
     stage(some(3), {"bytes": 1})[0].run(task)
     with pq.ParquetFile(file) as parquet:
         assert parquet.num_row_groups == 3
@@ -308,7 +323,7 @@ def test_records_are_added_once_unless_they_shall_become_current_again(again, ta
         yield Records([record(run.work_key)])
 
     told = {"tell": lambda rows: Told({"held": len(rows)}, reason="close"), "again": again}
-    recording, made = stage(rows, writes=CALIBRATIONS, **told)
+    recording, made = stage(rows, writes=(CALIBRATIONS,), **told)
     first, second = recording.run(task), recording.run(task)
     assert (first.status, second.status) == ("done", "done" if again else "cached")
     assert made.asked == (2 if again else 1)
@@ -373,12 +388,11 @@ def test_every_stage_of_a_vehicle_day_refuses_vehicles_that_the_file_does_not_na
 @pytest.mark.parametrize("stage", STAGES, ids=lambda s: s.name)
 def test_every_stage_names_settings_that_can_be_hashed_and_rows_that_wait_to_be_asked(stage, fleet, tmp_path):
     lake = Lake.at(tmp_path / "lake")
-    for schema in (FRAMES, OBSERVATIONS):
-        with write_partition(lake, schema, DAY, f"{schema.name}-key", "0") as writer:
-            writer.describe(kept={}, rejected={})
+    write_frames(lake, DAY, [])
+    write_observations(lake, DAY, [])
     task = task_of(stage, fleet, lake, tmp_path)
     if stage.per_vehicle_day:
-        found = {s.name: read_manifest(lake, s, DAY) for s in stage.reads}
+        found = {s.name: read_manifest(lake, s, DAY) for s in stage.reads if not s.of_sensor}
         task = replace(task, inputs=found)
     files = sorted(lake.root.rglob("*"))
     works = [stage.load()(task) for _ in range(2)]

@@ -93,13 +93,17 @@ figure.savefig(f"{PICTURES}/history.png", dpi=110)
 
 # %% [markdown]
 # ## One frame at one record
-# Frames are plain Parquet by vehicle and day, which any engine can glob; only what is asked for is read. The picture's
-# left half is drawn at the prior, its right half at the record.
+# Images and sweeps are plain Parquet, a file per vehicle, day and sensor, joined by the moment; only what is asked for
+# is read. The picture's left half is drawn at the prior, its right half at the record.
 
 # %%
 record = history.filter(pl.col("status") == "accepted").tail(1)
 day = record["day"][0]
-frames = pl.scan_parquet(f"{LAKE}/frames/vehicle={VEHICLE}/day={day}/*.parquet")
+camera_file, lidar_file = (
+    f"{LAKE}/{table}/vehicle={VEHICLE}/day={day}/{record[side][0]}.parquet"
+    for table, side in (("images", "parent_frame"), ("sweeps", "child_frame"))
+)
+frames = pl.scan_parquet(camera_file).join(pl.scan_parquet(lidar_file), on="moment").sort("moment")
 middle = frames.select(pl.len()).collect().item() // 2
 columns = ["image", "image_width_px", "image_height_px", "camera_model", "camera_K", "camera_D"]
 columns += [f"lidar_{axis}_m" for axis in "xyz"]

@@ -23,7 +23,8 @@ from pipeline.store.views import frames_of, ingested, observations_of, perceived
 from pipeline.work import Task
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.moments import PERCEIVED
+from schemas.observations import Observation
 
 __all__ = ["FrameCalibration", "calibrate_frame", "ssl_settings", "ssl_solver"]
 
@@ -125,8 +126,8 @@ def _one_observation(lake: Lake, partition: Partition, wanted: int) -> tuple[int
         raise SolveError(
             "no frames or no observations of this day: run `boresight ingest` and `perceive` first"
         )
-    light = read_columns(lake, OBSERVATIONS, partition, ["frame_index", "stamp_ns"])
-    index, stamp = np.array(light["frame_index"], np.int64), np.array(light["stamp_ns"], np.int64)
+    light = read_columns(lake, PERCEIVED, partition, ["moment", "stamp_ns"])
+    index, stamp = np.array(light["moment"], np.int64), np.array(light["stamp_ns"], np.int64)
     found = np.flatnonzero((index == wanted) | (stamp == wanted))
     if not len(found):
         known = f"{index[0]} to {index[-1]}" if len(index) else "none"

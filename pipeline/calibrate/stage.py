@@ -40,10 +40,11 @@ from pipeline.config import FleetConfig, VerifyConfig
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.extrinsics.prior import no_prior, perturbed, prior_key, read_prior
+from pipeline.extrinsics.prior import day_prior, no_prior, perturbed, prior_key
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.results import Outcome, Progress, silent
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import Manifest
 from pipeline.store.views import ingested, observations_of, perceived
 from pipeline.work import Records, Run, Task, Told, Work
 from schemas.calibrations import (
@@ -54,7 +55,7 @@ from schemas.calibrations import (
     CalibrationRecord,
     pairs_of,
 )
-from schemas.frames import SENSORS_ABSENT
+from schemas.moments import PRIOR, SENSORS_ABSENT
 from schemas.observations import Observation
 
 __all__ = ["calibrate_observations", "work"]
@@ -110,8 +111,9 @@ def _records(task: Task, method: Method, about: Inputs, progress: Progress) -> l
     """Of a day that can be calibrated or not."""
     fleet, prior, rows = task.fleet, None, list[Observation]()
     try:
-        rows = _observations(task.lake, task.partition)
-        prior = perturbed(read_prior(rows, fleet, task.partition.vehicle), task.perturb, about.seed)
+        told, rows = _perceived(task.lake, task.partition)
+        prior = day_prior(told.extra.get(PRIOR, ()), fleet, task.partition.vehicle)
+        prior = perturbed(prior, task.perturb, about.seed)
         before = accepted_before(task.lake, task.partition, method.name)
         prior = replace(prior, T_camera_lidar_before=before)
         return calibrate_observations(rows, prior, fleet, about, progress, method.solver_of(task))
@@ -300,10 +302,11 @@ def _composed_of(method: Method, pairs: Collection[str]) -> tuple[str, ...]:
     return method.composed if len(pairs) == len(PAIRS) else ()
 
 
-def _observations(lake: Lake, partition: Partition) -> list[Observation]:
-    if perceived(lake, partition) is None:
+def _perceived(lake: Lake, partition: Partition) -> tuple[Manifest, list[Observation]]:
+    told = perceived(lake, partition)
+    if told is None:
         raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
-    return list(observations_of(lake, partition))
+    return told, list(observations_of(lake, partition))
 
 
 def _judge_all(

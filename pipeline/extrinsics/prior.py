@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -14,26 +14,22 @@ from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior_file import read_star
 from pipeline.geometry.se3 import perturb_exactly
-from pipeline.rig.prior import RigPrior, from_rows, middle_of
+from pipeline.rig.prior import RigPrior, Star, agreed, from_rows, middle_of
 from pipeline.rig.rig import Rig
 from pipeline.rigs import CameraPrior, SensorPrior
 from schemas.calibrations import FRAMES_OF_PAIR, SENSORS, pairs_of
 from schemas.observations import Observation
 
 __all__ = [
-    "PRIOR",
+    "day_prior",
     "no_prior",
     "perturbed",
     "prior_key",
     "read_prior",
     "require_named_files",
     "rig_prior",
-    "rows_of",
     "trio_prior",
 ]
-
-PRIOR: Final = "prior"  # of the extra of ingest's manifest: transforms that the logs carry
-_QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
 
 
 def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle: str) -> Prior:
@@ -45,15 +41,26 @@ def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle:
     """
     rig = fleet.rig_of(vehicle)
     names = _only(rig)
-    rows = rows_of(observations, [name or kind for name, kind in zip(names, SENSORS, strict=True)])
-    return trio_prior(rig_prior(rows, fleet, rig), rig, *names)
+    stars = _carried(observations, [name or kind for name, kind in zip(names, SENSORS, strict=True)])
+    return trio_prior(_prior(lambda: agreed(stars), fleet, rig), rig, *names)
+
+
+def day_prior(rows: Iterable[Mapping[str, Any]], fleet: FleetConfig, vehicle: str) -> Prior:
+    """The same of what a manifest says of a whole day, under `schemas.moments.PRIOR`.
+
+    Raises:
+        SolveError: the logs carry no transform between any two sensors, or one changes over the day.
+        ConfigError: unknown vehicle, or the prior file cannot be read.
+    """
+    rig = fleet.rig_of(vehicle)
+    return trio_prior(rig_prior(rows, fleet, rig), rig, *_only(rig))
 
 
 def rig_prior(rows: Iterable[Mapping[str, Any]], fleet: FleetConfig, rig: Rig) -> RigPrior:
     """The prior of all sensors of a rig: as logged, or from the file that the rig names.
 
     Args:
-        rows: what ingest says in its manifest under PRIOR (`to_rows`).
+        rows: what ingest says in its manifest under `schemas.moments.PRIOR`.
         fleet: which the file's path is relative to.
         rig: sigmas are its sensors' own, else its own.
 
@@ -61,8 +68,12 @@ def rig_prior(rows: Iterable[Mapping[str, Any]], fleet: FleetConfig, rig: Rig) -
         SolveError: the logs carry no transform between any two sensors, or one changes over the day.
         ConfigError: the prior file cannot be read, or is not of this rig.
     """
+    return _prior(lambda: from_rows(rows), fleet, rig)
+
+
+def _prior(logged: Callable[[], Star], fleet: FleetConfig, rig: Rig) -> RigPrior:
     file = rig.prior.file
-    T = from_rows(rows) if file is None else read_star(fleet.path_of(file), rig)
+    T = logged() if file is None else read_star(fleet.path_of(file), rig)
     if not T:
         raise SolveError(no_prior("any pair"))
     nodes = {node.name: node for node in rig.nodes}
@@ -98,15 +109,13 @@ def trio_prior(prior: RigPrior, rig: Rig, camera: str | None, lidar: str | None,
     )
 
 
-def rows_of(observations: Sequence[Observation], names: Sequence[str] = SENSORS) -> list[dict[str, Any]]:
-    """The logged prior that observations of one camera, one lidar and one radar carry, as ingest's manifest says it."""
-    rows = []
-    for pair, kinds in FRAMES_OF_PAIR.items():
-        parent, child = (names[SENSORS.index(kind)] for kind in kinds)
-        columns = [f"prior_{pair}_{part}" for part in (*_QUATERNION, *_TRANSLATION)]
-        known = {tuple(getattr(o, column) for column in columns) for o in observations}
-        rows += [{"parent": parent, "child": child, "q": v[:4], "t_m": v[4:]} for v in known if None not in v]
-    return rows
+def _carried(observations: Sequence[Observation], names: Sequence[str]) -> list[Star]:
+    """The transforms that the logs of observations carry: those of one log share theirs."""
+    ends = {
+        pair: tuple(names[SENSORS.index(kind)] for kind in kinds) for pair, kinds in FRAMES_OF_PAIR.items()
+    }
+    carried = {id(o.priors): o.priors for o in observations}.values()
+    return [{(ends[p][0], ends[p][1]): T for p, T in priors.items()} for priors in carried]
 
 
 def no_prior(pair: str) -> str:

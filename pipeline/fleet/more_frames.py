@@ -9,7 +9,7 @@ from pipeline.results import Effort, Outcome
 from pipeline.stages import CALIBRATE, INGEST
 from pipeline.work import Task
 from schemas.calibrations import ASKS_FOR_FRAMES
-from schemas.frames import SWEEPS_LOGGED, SWEEPS_PLANNED
+from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
 
 __all__ = ["MOST_TIMES_MORE", "asks_for_more", "spent_before", "with_more_sweeps"]
 

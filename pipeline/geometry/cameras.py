@@ -14,8 +14,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from schemas.frames import Frame
-from schemas.observations import Observation
+from schemas.captures import CameraColumns
 
 __all__ = ["CAMERA_MODELS", "Camera", "camera_of"]
 
@@ -223,7 +222,7 @@ class Camera:
         return np.stack([s * xd, s * yd, np.cos(theta)], -1)
 
 
-def camera_of(row: Frame | Observation) -> Camera:
+def camera_of(row: CameraColumns) -> Camera:
     """The camera of a row, at the size of the full image.
 
     Raises:

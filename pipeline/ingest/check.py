@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,18 +14,23 @@ from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.spherical import to_spherical
+from pipeline.ingest.captures import Rejected
 from pipeline.ingest.directions_and_units import Motion, motion_of, prior_transform
-from pipeline.ingest.frame_builder import FrameBuilder, Rejected, lacks_prior
-from pipeline.ingest.index import ACCEPTED_TYPES, NEEDED, DayIndex, index_logs, topics_of
+from pipeline.ingest.index import ACCEPTED_TYPES, DayIndex, index_logs
+from pipeline.ingest.moments import MomentBuilder
 from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
-from pipeline.ingest.stage import pick_trios, read_file_prior
+from pipeline.ingest.roles import NEEDED, topics_of
+from pipeline.ingest.stage import pick_moments, read_file_prior
 from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns
 from pipeline.results import Progress, silent
 from pipeline.rig.rig import Rig
 from pipeline.rigs import OnnxSemantics
+from pipeline.store.views import frame_of, logged_stars, priors_of
 from schemas.calibrations import SENSORS, pairs_of
+from schemas.captures import Capture
 from schemas.faults import FAULTS
 from schemas.frames import Frame
+from schemas.moments import Moment
 
 __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
 
@@ -53,7 +58,7 @@ class SyncQuality:
     """
 
     sweeps: int
-    trios: int
+    moments: int
     camera_median_ms: float | None
     radar_median_ms: float | None
     gate_ms: float | None
@@ -95,41 +100,58 @@ def check_logs(
     progress(0, 0, "reading the index")
     index = index_logs(logs, rig, survey=True)
     try:
-        trios, rejected = pick_trios(index, fleet.ingest)
-        builder = FrameBuilder(index, rig, fleet.ingest, read_file_prior(rig, fleet))
-        frames: list[Frame] = []
-        picked = np.unique(np.linspace(0, max(len(trios) - 1, 0), _SAMPLE).round().astype(int))
-        for done, i in enumerate(picked if trios else [], 1):
+        anchored, rejected = pick_moments(index, fleet.ingest)
+        builder = MomentBuilder(index, rig, fleet.ingest, read_file_prior(rig, fleet))
+        built = []
+        picked = np.unique(np.linspace(0, max(len(anchored) - 1, 0), _SAMPLE).round().astype(int))
+        for done, i in enumerate(picked if anchored else [], 1):
             try:
-                frames.append(builder.build(trios[i], int(i)))
+                built.append(builder.build(anchored[i], int(i)))
             except Rejected as outcome:
                 rejected[outcome.reason] += 1
                 index.complain(str(outcome))
             progress(done, len(picked), "frames looked at")
-        frame_ids = builder.frame_ids
         without = Counter({k: n for k, n in builder.counts.items() if k.startswith("without_")})
     finally:
         index.close()
-    usable = round(len(trios) * len(frames) / len(picked)) if trios else 0
+    frames = _frames(built, index, builder)
+    usable = round(len(anchored) * len(frames) / len(picked)) if anchored else 0
     topics = _topics(index, rig)
-    missing = [f"{t.topic} ({t.role}): {t.problem}" for t in topics if t.problem and t.role in NEEDED]
+    needed = {str(role) for role in topics_of(rig).values() if role.what in NEEDED}
+    missing = [f"{t.topic} ({t.role}): {t.problem}" for t in topics if t.problem and t.role in needed]
     missing += _of_another_unit(rejected + builder.counts, rig, index.problems)
     motion = motion_of(frames, rig)
-    evidence = replace(_evidence(frames, usable, rig, motion), missing=tuple(missing))
+    has_prior = 2 * builder.counts["frames_without_prior"] < len(frames)
+    evidence = replace(_evidence(frames, usable, rig, motion, has_prior=has_prior), missing=tuple(missing))
     verdicts = judge(evidence)
     return CheckReport(
         answer=overall(verdicts),
         verdicts=verdicts,
         evidence=evidence,
         topics=topics,
-        sync=_sync(index, len(trios), fleet.ingest),
-        frame_ids=frame_ids,
+        sync=_sync(index, len(anchored), fleet.ingest),
+        frame_ids=builder.prior.frame_ids,
         has_point_time=any(f.lidar_time_s is not None for f in frames),
         has_odometry=any(f.ego_speed_mps is not None for f in frames),
         rejected={str(k): int(v) for k, v in (rejected + index.damage + without).items() if v},
         problems=index.problems,
         advice=[*motion.advice, *_advice(frames, rig, topics, usable)],
     )
+
+
+def _frames(
+    built: Sequence[tuple[Moment, Mapping[str, Capture]]], index: DayIndex, builder: MomentBuilder
+) -> list[Frame]:
+    """Moments as the first camera, lidar and radar saw them."""
+    chosen = {kind: sensor for sensor, kind in reversed(index.kinds.items())}
+    stars = logged_stars(builder.prior.rows())
+    priors = {log: priors_of(star, chosen) for log, star in stars.items()}
+    return [
+        frame_of(
+            moment, {k: captures[s] for k, s in chosen.items() if s in captures}, priors.get(moment.log, {})
+        )
+        for moment, captures in built
+    ]
 
 
 def _of_another_unit(counts: Counter[str], rig: Rig, problems: Sequence[str]) -> list[str]:
@@ -144,7 +166,7 @@ def _of_another_unit(counts: Counter[str], rig: Rig, problems: Sequence[str]) ->
     return found
 
 
-def _evidence(frames: list[Frame], usable: int, rig: Rig, motion: Motion) -> Evidence:
+def _evidence(frames: list[Frame], usable: int, rig: Rig, motion: Motion, *, has_prior: bool) -> Evidence:
     def share(flags: list[bool]) -> float:
         return float(np.mean(flags)) if flags else 0.0
 
@@ -154,7 +176,7 @@ def _evidence(frames: list[Frame], usable: int, rig: Rig, motion: Motion) -> Evi
     seen, swept, scanned = ([f for f in frames if sensor in f.sensors] for sensor in SENSORS)
     return Evidence(
         frames=usable,
-        has_prior=share([not lacks_prior(f.sensors, f.__dict__) for f in frames]) > 0.5,
+        has_prior=has_prior,
         labels_share=1.0 if has_labels else share([f.labels_png is not None for f in seen]),
         detections_share=1.0
         if isinstance(rig.semantics, OnnxSemantics)
@@ -187,7 +209,7 @@ def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
     findings = []
     for topic, role in topics_of(rig).items():
         types = Counter({kind: n for (name, kind), n in index.surveyed.items() if name == topic})
-        wanted = ACCEPTED_TYPES[role]
+        wanted = ACCEPTED_TYPES[role.what]
         problem = ""
         if not types:
             others = sorted(
@@ -198,18 +220,20 @@ def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
             problem = f"type {', '.join(types)}, not {' or '.join(wanted)}"
         stamps = np.unique(index.stream(role).stamps_ns)
         rate = float(1e9 / np.median(np.diff(stamps))) if len(stamps) > 2 else None
-        findings.append(TopicFinding(role, topic, sorted(types), sum(types.values()), rate, problem))
+        findings.append(TopicFinding(str(role), topic, sorted(types), sum(types.values()), rate, problem))
     return findings
 
 
-def _sync(index: DayIndex, trios: int, config: IngestConfig) -> SyncQuality:
+def _sync(index: DayIndex, moments: int, config: IngestConfig) -> SyncQuality:
+    others = [
+        next((s for s, k in index.kinds.items() if k == kind and s != index.anchor), "") for kind in SENSORS
+    ]
     lidar, image, radar = (
-        np.unique(index.stream(role).stamps_ns) for role in (index.anchor, "image", "radar")
+        np.unique(index.captures(s).stamps_ns) for s in (index.anchor, others[0], others[2])
     )
-    radar = radar if index.anchor == "lidar" else radar[:0]
     return SyncQuality(
-        sweeps=len(index.stream(index.anchor).stamps),
-        trios=trios,
+        sweeps=len(index.captures(index.anchor).stamps),
+        moments=moments,
         camera_median_ms=_median_distance_ms(lidar, image),
         radar_median_ms=_median_distance_ms(lidar, radar),
         gate_ms=None if config.sync_gate_s is None else config.sync_gate_s * 1e3,
@@ -232,7 +256,7 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
     advice = [
         f"{t.topic}: {t.problem}" for t in topics if t.problem and t.role not in {"tf_static", "odometry"}
     ]
-    if frames and frames[0].prior_camera_lidar_qw is not None:
+    if frames and "camera_lidar" in frames[0].priors:
         R = prior_transform(frames[0], "camera_lidar")[:3, :3]
         # Up of the lidar is -y of an optical frame; more than 45 deg off, the frame is no optical one.
         if -R[1, 2] < np.cos(np.pi / 4):

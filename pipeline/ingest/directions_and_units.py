@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import from_quaternion
 from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.rig.rig import Rig
 from pipeline.rigs import RadarTopics
@@ -79,11 +78,7 @@ def motion_of(frames: Sequence[Frame], rig: Rig) -> Motion:
 
 def prior_transform(frame: Frame, pair: str) -> Float[np.ndarray, "4 4"]:
     """A pair's prior; identity where the frame has none."""
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    values = [getattr(frame, f"prior_{pair}_{name}") for name in names]
-    if values[0] is None:
-        return np.eye(4)
-    return from_quaternion(np.array(values[:4], np.float64), np.array(values[4:], np.float64))
+    return frame.priors.get(pair, np.eye(4))
 
 
 def _fit(frame: Frame, radar: RadarTopics | None, factor: float = 1.0) -> tuple[float, float]:

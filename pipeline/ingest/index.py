@@ -26,11 +26,11 @@ from pipeline.ingest.messages.generation import encoding_fault
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
+from pipeline.ingest.roles import CAPTURED, INFO, NEEDED, ODOMETRY, TF_STATIC, Role, topics_of
 from pipeline.rig.rig import Rig
-from pipeline.rigs import TopicSemantics
 from pipeline.store.remote_logs import LogPath
 
-__all__ = ["ACCEPTED_TYPES", "NEEDED", "DayIndex", "Located", "Stream", "index_logs", "topics_of"]
+__all__ = ["ACCEPTED_TYPES", "DayIndex", "Located", "Stream", "index_logs"]
 
 _IMAGE_TYPES = (
     "sensor_msgs/msg/CompressedImage",
@@ -55,8 +55,6 @@ ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
 }
 _MOST_OPEN_FILES = 65536  # as many minutes are 45 days: more than one vehicle-day has
 _MOST_CAMERAS = 1000  # distinct camera_info contents remembered: a bound where a driver writes noise into it
-# Roles without which a sensor is missing.
-NEEDED = ("image", "info", "lidar", "radar")
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +82,18 @@ class Stream:
 
 @dataclass(eq=False)
 class DayIndex:
-    """What the logs of a day hold. `problems` says in words, `damage` counts, what could not be read."""
+    """What the logs of a day hold. `problems` says in words, `damage` counts, what could not be read.
 
+    Args:
+        kinds: of the rig's sensors by name; the lidar that others are matched to comes before other lidars.
+    """
+
+    kinds: dict[str, str] = field(default_factory=dict)
     logs: list[LogReader] = field(default_factory=list)
     log_names: list[str] = field(default_factory=list)
-    streams: dict[str, Stream] = field(default_factory=dict)
-    cameras: list[tuple[int, int, Camera]] = field(default_factory=list)  # log, stamp, intrinsics
+    streams: dict[Role, Stream] = field(default_factory=dict)
+    # By camera: log, stamp, intrinsics.
+    cameras: dict[str, list[tuple[int, int, Camera]]] = field(default_factory=dict)
     trees: list[TransformTree] = field(default_factory=list)
     ego: EgoTrack = field(default_factory=EgoTrack)
     topics_seen: set[str] = field(default_factory=set)
@@ -102,17 +106,22 @@ class DayIndex:
 
     @property
     def anchor(self) -> str:
-        """The role whose messages moments are built about: the lidar's, the radar's where there is no sweep."""
-        return "lidar" if self.stream("lidar").stamps or not self.stream("radar").stamps else "radar"
+        """The sensor whose captures moments are built about: the first lidar, a radar where there is no sweep."""
+        able = sorted((s for s in self.kinds if self.kinds[s] != "camera"), key=lambda s: self.kinds[s])
+        return next((s for s in able if self.captures(s).stamps), able[0] if able else "")
+
+    def captures(self, sensor: str) -> Stream:
+        """Images, sweeps or scans of a sensor."""
+        return self.stream(Role(CAPTURED[self.kinds[sensor]], sensor)) if sensor else Stream()
 
     def sweeps_in_bursts(self) -> Int64[np.ndarray, " N"]:
-        """Places of the sweeps that may become trios: all, or those that the plan is about."""
-        located = self.stream(self.anchor).located
+        """Places of the sweeps that may become moments: all, or those that the plan is about."""
+        located = self.captures(self.anchor).located
         if self.reading is None:
             return np.arange(len(located), dtype=np.int64)
         return np.array([i for i, at in enumerate(located) if at.logged_ns in self.reading.bursts], np.int64)
 
-    def stream(self, role: str) -> Stream:
+    def stream(self, role: Role) -> Stream:
         """Messages of a role; empty where there are none."""
         return self.streams.setdefault(role, Stream())
 
@@ -120,9 +129,10 @@ class DayIndex:
         """Payload of a message."""
         return self.logs[located.log].read(located.position)
 
-    def camera_at(self, log: int, stamp_ns: int) -> Camera | None:
+    def camera_at(self, sensor: str, log: int, stamp_ns: int) -> Camera | None:
         """Intrinsics nearest in time within the same log, else within any; None where no log has any."""
-        own = [c for c in self.cameras if c[0] == log] or self.cameras
+        known = self.cameras.get(sensor, [])
+        own = [c for c in known if c[0] == log] or known
         return min(own, key=lambda c: abs(c[1] - stamp_ns))[2] if own else None
 
     def complain(self, problem: str) -> None:
@@ -137,23 +147,6 @@ class DayIndex:
             log.close()
 
 
-def topics_of(rig: Rig) -> dict[str, str]:
-    """Role of each topic that the rig names."""
-    topics: dict[str, str] = {}
-    if rig.camera is not None:
-        topics |= {rig.camera.image: "image", rig.camera.info: "info"}
-    if rig.lidar is not None:
-        topics[rig.lidar.points] = "lidar"
-    if rig.radar is not None:
-        topics[rig.radar.points] = "radar"
-    topics[rig.prior.topic] = "tf_static"
-    if isinstance(rig.semantics, TopicSemantics):
-        topics |= {rig.semantics.labels: "labels", rig.semantics.detections: "detections"}
-    if rig.ego is not None:
-        topics[rig.ego.odometry] = "odometry"
-    return topics
-
-
 def index_logs(
     paths: Sequence[LogPath], rig: Rig, *, survey: bool = False, budget: int | None = None
 ) -> DayIndex:
@@ -165,7 +158,7 @@ def index_logs(
         survey: every topic is counted in `surveyed`, for those who ask what a log holds at all.
         budget: sweeps beyond which a day is read in bursts, None = it is read whole.
     """
-    index = DayIndex()
+    index = DayIndex({role.sensor: role.kind for role in topics_of(rig).values() if role.is_capture})
     _allow_open_files()
     try:
         _open_logs(index, paths)
@@ -187,15 +180,16 @@ def _read_day(index: DayIndex, rig: Rig, budget: int | None, *, survey: bool) ->
             _read_log(index, number, topics, survey=survey)
         else:
             _read_bursts(index, number, topics, timeline, index.reading.around)
-    if budget is not None and index.reading is None and len(index.stream(index.anchor).stamps) > budget:
+    if budget is not None and index.reading is None and len(index.captures(index.anchor).stamps) > budget:
         _take_bursts(index, timelines, budget)
     for topic, role in topics.items():
-        if role in NEEDED and topic not in index.topics_seen:
+        if role.what in NEEDED and topic not in index.topics_seen:
             index.complain(f"topic {topic} ({role}) has no message in any log")
     for tree in index.trees:
         for other in index.trees:
             tree.fill_from(other)
-    index.cameras.sort(key=lambda c: c[1])
+    for cameras in index.cameras.values():
+        cameras.sort(key=lambda c: c[1])
 
 
 def _open_logs(index: DayIndex, paths: Sequence[LogPath]) -> None:
@@ -214,7 +208,7 @@ def _open_logs(index: DayIndex, paths: Sequence[LogPath]) -> None:
 def _read_log(
     index: DayIndex,
     number: int,
-    topics: dict[str, str],
+    topics: dict[str, Role],
     within: Stretches | None = None,
     *,
     survey: bool = False,
@@ -227,7 +221,7 @@ def _read_log(
 
 
 def _read_bursts(
-    index: DayIndex, number: int, topics: dict[str, str], timeline: Timeline | None, around: Stretches
+    index: DayIndex, number: int, topics: dict[str, Role], timeline: Timeline | None, around: Stretches
 ) -> None:
     """What a log has of the stretches to read, and before it what a driver may log but once."""
     if timeline is None:
@@ -235,9 +229,10 @@ def _read_bursts(
         index.damage["logs_left_unread"] += 1
         return
     rare, first = rare_topics(timeline, topics)
-    known = {"tf_static": any(tree.edges for tree in index.trees), "info": bool(index.cameras)}
+    known = {TF_STATIC} if any(tree.edges for tree in index.trees) else set()
+    known |= {Role(INFO, camera) for camera in index.cameras}
     is_wanted = any(timeline.recorded.touch(*span) for span in around.spans_ns)
-    if is_wanted or any(not known[role] for role in rare.values()):
+    if is_wanted or set(rare.values()) - known:
         _read_log(index, number, rare, first)
     if is_wanted:
         _read_log(index, number, topics, around)
@@ -245,7 +240,7 @@ def _read_bursts(
 
 def _take_bursts(index: DayIndex, timelines: Sequence[Timeline | None], budget: int) -> None:
     """Of a long day that had to be read whole, the bursts that become frames; and which logs made it so."""
-    sweeps = index.stream(index.anchor)
+    sweeps = index.captures(index.anchor)
     logged_ns = np.array([at.logged_ns for at in sweeps.located], np.int64)
     index.reading = plan_sweeps(logged_ns, sweeps.stamps_ns, index.ego, budget)
     unusable = [n for n, t in zip(index.log_names, timelines, strict=True) if t is None]
@@ -264,7 +259,7 @@ def _allow_open_files() -> None:
 
 
 def _index_log(
-    index: DayIndex, number: int, topics: dict[str, str], within: Stretches | None, *, survey: bool
+    index: DayIndex, number: int, topics: dict[str, Role], within: Stretches | None, *, survey: bool
 ) -> None:
     log = index.logs[number]
     for message in log.scan(None if survey else topics, within):
@@ -274,13 +269,13 @@ def _index_log(
         if role is None:
             continue
         index.topics_seen.add(message.channel.topic)
-        if message.channel.msgtype not in ACCEPTED_TYPES[role]:
+        if message.channel.msgtype not in ACCEPTED_TYPES[role.what]:
             index.damage["wrong_type"] += 1
             index.complain(
                 f"{index.log_names[number]}, topic {message.channel.topic}: {_refusal(message, role)}"
             )
             continue
-        if role == "tf_static":
+        if role == TF_STATIC:
             _take_transforms(index, number, message)
         elif _is_of_another_encoding(index, number, message):
             index.damage["wrong_encoding"] += 1
@@ -292,14 +287,14 @@ def _index_log(
         index.complain(f"{log.path.name}: {what}")
 
 
-def _take(index: DayIndex, number: int, message: RawMessage, role: str) -> None:
+def _take(index: DayIndex, number: int, message: RawMessage, role: Role) -> None:
     """A message that begins with a header."""
     stamp = header_stamp_ns(message.channel, message.data)
     if stamp is None:
-        index.damage[f"{role}_without_stamp"] += 1
-    elif role == "info":
-        _take_camera(index, number, stamp, message)
-    elif role == "odometry":
+        index.damage[f"{role.what}_without_stamp"] += 1
+    elif role.what == INFO:
+        _take_camera(index, number, stamp, message, role)
+    elif role == ODOMETRY:
         _take_odometry(index, stamp, message)
     else:
         index.stream(role).stamps.append(stamp)
@@ -325,11 +320,11 @@ def _is_of_another_encoding(index: DayIndex, number: int, message: RawMessage) -
     return bool(fault)
 
 
-def _refusal(message: RawMessage, role: str) -> str:
+def _refusal(message: RawMessage, role: Role) -> str:
     """Why a message of this type cannot be what the rig says that its topic is."""
     found = message.channel.msgtype or "no type"
     reason = REFUSED.get(found.removeprefix("foxglove.").removeprefix("foxglove_msgs/msg/"))
-    return f"{found}: {reason}" if reason else f"{found}, not {' or '.join(ACCEPTED_TYPES[role])}"
+    return f"{found}: {reason}" if reason else f"{found}, not {' or '.join(ACCEPTED_TYPES[role.what])}"
 
 
 def _take_transforms(index: DayIndex, number: int, message: RawMessage) -> None:
@@ -350,8 +345,8 @@ def _take_odometry(index: DayIndex, stamp: int, message: RawMessage) -> None:
         index.damage["odometry_undecodable"] += 1
 
 
-def _take_camera(index: DayIndex, number: int, stamp: int, message: RawMessage) -> None:
-    index.stream("info").stamps.append(stamp)
+def _take_camera(index: DayIndex, number: int, stamp: int, message: RawMessage, role: Role) -> None:
+    index.stream(role).stamps.append(stamp)
     content = content_without_stamp(message.channel, message.data)  # the same for hours
     camera = index.camera_of_bytes.get(content)
     if camera is None:
@@ -366,7 +361,7 @@ def _take_camera(index: DayIndex, number: int, stamp: int, message: RawMessage) 
         index.complain(f"{index.log_names[number]}, topic {message.channel.topic}: {camera}")
         return
     # One entry per change and log is enough for "nearest": keep the first and the last of each run.
-    runs = [c for c in index.cameras[-2:] if c[0] == number and c[2] is camera]
-    if len(runs) == 2:
-        index.cameras.pop()
-    index.cameras.append((number, stamp, camera))
+    known = index.cameras.setdefault(role.sensor, [])
+    if len([c for c in known[-2:] if c[0] == number and c[2] is camera]) == 2:
+        known.pop()
+    known.append((number, stamp, camera))

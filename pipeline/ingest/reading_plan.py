@@ -17,7 +17,9 @@ from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stamp_ns
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.messages.radar import read_radar
+from pipeline.ingest.roles import INFO, LIDAR, ODOMETRY, RADAR, TF_STATIC, Role
 from pipeline.rig.rig import Rig
+from pipeline.rigs import RadarTopics
 
 __all__ = ["Reading", "plan_reading", "plan_sweeps", "rare_topics"]
 
@@ -35,7 +37,7 @@ class Reading:
     """What is read of a day.
 
     Args:
-        bursts: log time of the sweeps that become trios.
+        bursts: log time of the sweeps that become moments.
         around: log time of everything that is read: images and scans of the bursts' sweeps may be logged beside them.
         sweeps: sweeps that the logs hold, by their indices.
         planned: sweeps of as many bursts, had each its full length.
@@ -53,9 +55,9 @@ class _Day:
 
     logs: tuple[LogReader, ...]
     rig: Rig
-    roles: Mapping[str, str]  # of topics
+    roles: Mapping[str, Role]  # of topics
 
-    def messages(self, roles: Collection[str], within: Stretches) -> Iterator[tuple[str, RawMessage]]:
+    def messages(self, roles: Collection[Role], within: Stretches) -> Iterator[tuple[Role, RawMessage]]:
         """Messages of some roles with their role; a log that cannot be read now is read, and counted, later."""
         topics = {topic for topic, role in self.roles.items() if role in roles}
         for log in self.logs:
@@ -65,7 +67,7 @@ class _Day:
 
 
 def plan_reading(
-    logs: Mapping[LogReader, Timeline | None], rig: Rig, roles: Mapping[str, str], budget: int
+    logs: Mapping[LogReader, Timeline | None], rig: Rig, roles: Mapping[str, Role], budget: int
 ) -> Reading | None:
     """The bursts to read, None where the day is to be read whole.
 
@@ -79,18 +81,24 @@ def plan_reading(
         budget: sweeps that shall be read.
     """
     indexed = {log: t for log, t in logs.items() if t is not None}
-    anchor = next((r for r in ("lidar", "radar") if any(_holds(t, r, roles) for t in indexed.values())), "")
-    about = next((topic for topic, role in roles.items() if role == anchor), "")
+    held = {
+        role: topic for topic, role in roles.items() if any(t.messages.get(topic) for t in indexed.values())
+    }
+    anchors = [role for role in held if role.what in (LIDAR, RADAR)]
+    if not anchors:
+        return None
+    anchor = min(anchors, key=lambda role: role.what)
+    about = held[anchor]
     timeline = Timeline.joined(t for t in indexed.values() if t.messages.get(about))
     sweeps = timeline.messages.get(about, 0)
     counted = timeline.counted.get(about)
     if counted is None or sweeps <= budget or 2 * len(indexed) < len(logs) or not timeline.recorded.length_ns:
         return None
     day = _Day(tuple(indexed), rig, roles)
-    by = next((r for r in ("odometry", "radar") if any(_holds(t, r, roles) for t in indexed.values())), "")
-    possible = possible_bursts(counted.times_ns(), budget, is_motion_known=bool(by))
+    by = next((r for r in (ODOMETRY, *anchors) if r in held and r.what != LIDAR), None)
+    possible = possible_bursts(counted.times_ns(), budget, is_motion_known=by is not None)
     motion = _motion_at(day, possible.middle_ns, by)
-    needed = {r for r in ("image", "lidar", "radar") if any(_holds(t, r, roles) for t in indexed.values())}
+    needed = {role for role in held if role.is_capture}
     margin_ns = _margin_ns(day, possible.middle_ns, needed, anchor)
     if margin_ns is None:
         return None
@@ -114,12 +122,12 @@ def plan_sweeps(
     return _reading(possible, _ego_motion(ego, stamps), len(order), budget, 0)
 
 
-def rare_topics(timeline: Timeline, roles: Mapping[str, str]) -> tuple[dict[str, str], Stretches]:
+def rare_topics(timeline: Timeline, roles: Mapping[str, Role]) -> tuple[dict[str, Role], Stretches]:
     """Topics that a driver may log once, at the beginning, with their roles; and where their first messages lie."""
     rare = {
         topic: role
         for topic, role in roles.items()
-        if role in ("tf_static", "info") and topic in timeline.first
+        if (role == TF_STATIC or role.what == INFO) and topic in timeline.first
     }
     return rare, Stretches.merged(timeline.first[topic] for topic in rare)
 
@@ -132,14 +140,10 @@ def _reading(
     return Reading(bursts, bursts.widened(margin_ns), sweeps, min(sweeps, possible.sweeps * len(chosen)))
 
 
-def _holds(timeline: Timeline, role: str, roles: Mapping[str, str]) -> bool:
-    return any(timeline.messages.get(topic) for topic, its in roles.items() if its == role)
-
-
-def _motion_at(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], by: str) -> BurstMotion:
+def _motion_at(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], by: Role | None) -> BurstMotion:
     """Motion of the car at these sweeps, by odometry or by a radar scan's Doppler."""
     motion = BurstMotion.unknown(len(middle_ns))
-    if not by:
+    if by is None:
         return motion
     edges = _between(middle_ns)
     for _, message in day.messages({by}, _glances(middle_ns, _GLANCE_NS)):
@@ -147,8 +151,8 @@ def _motion_at(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], by: str) -> Burst
         if not np.isnan(motion.speed_mps[i]):
             continue
         with suppress(LogError, *DECODE_ERRORS):
-            if by == "radar":
-                motion.speed_mps[i] = _speed_by_doppler(message, day.rig)
+            if by.what == RADAR:
+                motion.speed_mps[i] = _speed_by_doppler(message, day.rig.radars[by.sensor])
             else:
                 numbers = _by_odometry(message)
                 motion.speed_mps[i], motion.yaw_rate_radps[i], *motion.position_m[i] = numbers
@@ -165,14 +169,13 @@ def _by_odometry(message: RawMessage) -> Float[np.ndarray, " 4"]:
     return np.array([state.speed_mps, state.yaw_rate_radps, *state.T_odom_vehicle[:2, 3]])
 
 
-def _speed_by_doppler(message: RawMessage, rig: Rig) -> float:
+def _speed_by_doppler(message: RawMessage, radar: RadarTopics) -> float:
     """Speed by a scan, NaN where it shows no static world."""
-    assert rig.radar is not None, "only a rig with a radar has scans"
-    cloud = read_radar(decode(message.channel, message.data), message.channel.msgtype, rig.radar)
+    cloud = read_radar(decode(message.channel, message.data), message.channel.msgtype, radar)
     distance = np.linalg.norm(cloud.xyz_m, axis=1, keepdims=True)
     directions = (cloud.xyz_m / np.maximum(distance, 1e-3)).astype(np.float64)
     rates = cloud.range_rate_mps.astype(np.float64)
-    speed, share = doppler_speed(directions, rates, rig.radar.doppler_period_mps)
+    speed, share = doppler_speed(directions, rates, radar.doppler_period_mps)
     return speed if share >= _FIT_SHARE else np.nan
 
 
@@ -186,15 +189,15 @@ def _ego_motion(ego: EgoTrack, stamps_ns: Int64[np.ndarray, " M"]) -> BurstMotio
     return motion
 
 
-def _margin_ns(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], needed: set[str], anchor: str) -> int | None:
+def _margin_ns(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], needed: set[Role], anchor: Role) -> int | None:
     """By how much longer than a burst the stretch must be that is read for it.
 
     None where that is too much, or where of the needed roles one is never logged when the anchor is.
     """
     glances = middle_ns[np.unique(np.linspace(0, len(middle_ns) - 1, _LATENCY_GLANCES).round().astype(int))]
     edges = _between(glances)
-    late: dict[tuple[int, str], list[int]] = {}
-    measured = set(day.roles.values()) - {"tf_static", "info"}
+    late: dict[tuple[int, Role], list[int]] = {}
+    measured = {role for role in day.roles.values() if role != TF_STATIC and role.what != INFO}
     for role, message in day.messages(measured, _glances(glances, _MARGIN_NS)):
         stamp = header_stamp_ns(message.channel, message.data)
         if stamp is not None:

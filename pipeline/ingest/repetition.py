@@ -7,7 +7,6 @@ or scans of a day are alike to the byte. A list of a few objects may be: it is l
 from __future__ import annotations
 
 from hashlib import blake2b
-from typing import Any
 
 import numpy as np
 
@@ -26,14 +25,14 @@ _FEWEST_POINTS = 10
 
 
 class Repetitions:
-    """Remembers what each sensor delivered so far."""
+    """Remembers what a sensor delivered so far."""
 
     def __init__(self) -> None:
         self._seen: set[bytes] = set()
 
-    def is_new(self, part: Any) -> bool:
+    def is_new(self, measured: LidarCloud | RadarCloud | bytes) -> bool:
         """Whether no picture, sweep or scan before was the same, whatever its stamp."""
-        content = _content(part)
+        content = _content(measured)
         if not content:
             return True
         digest = blake2b(content, digest_size=16).digest()
@@ -42,11 +41,11 @@ class Repetitions:
         return not known
 
 
-def _content(part: Any) -> bytes:
+def _content(part: LidarCloud | RadarCloud | bytes) -> bytes:
     """What was measured, without stamps; empty where equal ones may be two measurements."""
     if isinstance(part, LidarCloud):
         return np.stack([part.x_m, part.y_m, part.z_m]).tobytes()
     if isinstance(part, RadarCloud):
         few = len(part.xyz_m) < _FEWEST_POINTS
         return b"" if few else part.xyz_m.tobytes() + part.range_rate_mps.tobytes()
-    return bytes(part["image"])
+    return part

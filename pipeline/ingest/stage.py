@@ -1,4 +1,4 @@
-"""Stage ingest: the logs of one vehicle-day to one partition of `frames`."""
+"""Stage ingest: the logs of one vehicle-day to its moments, and to a file of each sensor."""
 
 from __future__ import annotations
 
@@ -12,34 +12,36 @@ from jaxtyping import Int64
 
 from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError
-from pipeline.extrinsics.prior_file import read_transforms
+from pipeline.extrinsics.prior_file import read_star
+from pipeline.ingest.captures import Rejected
 from pipeline.ingest.containers.reader import content_identity
-from pipeline.ingest.frame_builder import FrameBuilder, Rejected, Trio
-from pipeline.ingest.index import DayIndex, index_logs, topics_of
+from pipeline.ingest.index import DayIndex, index_logs
+from pipeline.ingest.moments import Anchored, MomentBuilder
 from pipeline.ingest.repetition import REPEATED
+from pipeline.ingest.roles import topics_of
 from pipeline.ingest.sync import (
     WRONG_UNIT,
+    Matched,
     Rejection,
-    Trios,
     match_by_motion,
-    match_nearest,
-    match_trios,
+    match_by_stamp,
     motion_gates_ns,
+    none_near,
     number_drives,
 )
 from pipeline.results import Progress
+from pipeline.rig.prior import Star
 from pipeline.rig.rig import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
+from schemas.captures import Capture
 from schemas.faults import FAULTS
-from schemas.frames import SENSORS_ABSENT, SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ, Frame
+from schemas.moments import PRIOR, SENSORS_ABSENT, SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ, Moment
 
-__all__ = ["find_trios", "pick_trios", "read_file_prior", "work"]
+__all__ = ["find_moments", "pick_moments", "read_file_prior", "work"]
 
 _PROBLEMS_SHOWN = 3
 # Reasons that state a fault.
 _STATED = dict.fromkeys(REPEATED.values(), "stuck_sensor") | dict.fromkeys(WRONG_UNIT.values(), "unit")
-_NO_STAMP_NS = -(10**18)  # long before any log
-_SAME_IMAGE_NS = 5_000_000  # labels and detections carry the stamp of the image that they were computed on
 _FAR_FROM_DAY = dt.timedelta(hours=12 + 14 + 12)  # half a day, the earliest time zone, and a night's drive
 _UNUSABLE = (
     Rejection.IMAGE_DAMAGED,
@@ -54,11 +56,11 @@ _UNUSABLE = (
 
 
 def work(task: Task) -> Work:
-    """The partition of `frames` that the task's logs give.
+    """The moments that the task's logs give, and the captures of each sensor.
 
     A day without a single moment that two sensors saw is refused: nothing is written (an empty table would look like a
     day that was looked at and gave nothing), a partition of earlier inputs stays, and the reason names topics and what
-    to do. `rejected` counts each sweep that became no frame under one Rejection, and damage, dropped points and missing
+    to do. `rejected` counts each sweep that became no moment under one reason, and damage, dropped points and missing
     parts under names of their own.
 
     Raises:
@@ -69,7 +71,9 @@ def work(task: Task) -> Work:
     if missing:
         raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
     file_prior = read_file_prior(rig, task.fleet)
-    prior_key = {} if file_prior is None else {"prior": [T.tolist() for T in file_prior.values()]}
+    prior_key = (
+        {} if file_prior is None else {"prior": [[*ends, T.tolist()] for ends, T in file_prior.items()]}
+    )
     config = task.fleet.ingest
     wider = (config.wider, config.wider.wider)  # as a night reads a long day that asked for more
     return Work(
@@ -81,25 +85,30 @@ def work(task: Task) -> Work:
 
 
 def _rows(
-    task: Task, rig: Rig, file_prior: dict[str, np.ndarray] | None, run: Run
-) -> Generator[Frame, None, None]:
-    """The day's frames in order of time, one at a time."""
+    task: Task, rig: Rig, file_prior: Star | None, run: Run
+) -> Generator[tuple[Moment, dict[str, Capture]], None, None]:
+    """The day's moments in order of time, one at a time."""
     config = task.fleet.ingest
     run.progress(0, 0, "reading the index")
     index = index_logs(task.logs, rig, budget=config.read_budget)
     try:
-        builder = FrameBuilder(index, rig, config, file_prior)
-        trios, rejected = pick_trios(index, config)
+        builder = MomentBuilder(index, rig, config, file_prior)
+        anchored, rejected = pick_moments(index, config)
         made = 0
-        for frame in _frames(trios, builder, index, rejected, run.progress):
+        for row in _built(anchored, builder, index, rejected, run.progress):
             made += 1
-            yield frame
+            yield row
         run.rejected.update(_all_counts(rejected, index, builder))
         run.kept.update(_reading_counts(index))
         if not made:
             raise NothingUsable(*refusal(index, rig, rejected, config))
         _complain_of_date(index, task.partition.day)
-        run.extra |= {"problems": index.problems, "logs": index.log_names, "frame_ids": builder.frame_ids}
+        run.extra |= {
+            "problems": index.problems,
+            "logs": index.log_names,
+            "frame_ids": builder.prior.frame_ids,
+        }
+        run.extra[PRIOR] = builder.prior.rows()
         run.extra[SENSORS_ABSENT] = absences(index, rig, builder.counts, config)
         run.remarks = _shorten(index.problems)
     finally:
@@ -108,7 +117,7 @@ def _rows(
 
 def _complain_of_date(index: DayIndex, day: str) -> None:
     """Name a day whose sweeps were stamped on another one, whatever the time zone and also of a drive over midnight."""
-    stamps_ns = index.stream(index.anchor).stamps_ns
+    stamps_ns = index.captures(index.anchor).stamps_ns
     stamped = dt.datetime.fromtimestamp(float(np.median(stamps_ns)) * 1e-9, dt.UTC)
     if abs(stamped - dt.datetime.fromisoformat(f"{day}T12:00+00:00")) > _FAR_FROM_DAY:
         index.complain(
@@ -116,66 +125,53 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
         )
 
 
-def pick_trios(index: DayIndex, config: IngestConfig) -> tuple[list[Trio], Counter[str]]:
-    """Trios in order of time, thinned evenly to `max_frames`, and why the other sweeps are left out."""
-    found, drives = find_trios(index, config), _drives(index)
-    # Both are as long as there are moments; of one without an image they match nothing.
-    images_ns = np.append(index.stream("image").stamps_ns, _NO_STAMP_NS)[found.camera]
-    labels = match_nearest(images_ns, index.stream("labels").stamps_ns, _SAME_IMAGE_NS)
-    detections = match_nearest(images_ns, index.stream("detections").stamps_ns, _SAME_IMAGE_NS)
-    picked = _spread(len(found.lidar), config.max_frames)
-    anchors = found.lidar if index.anchor == "lidar" else found.radar
-    trios = [
-        Trio(
-            camera=_place(found.camera[i]),
-            lidar=_place(found.lidar[i]),
-            radar=_place(found.radar[i]),
-            labels=_place(labels[i]),
-            detections=_place(detections[i]),
-            drive=int(drives[anchors[i]]),
+def pick_moments(index: DayIndex, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
+    """What belongs together, in order of time, thinned evenly to `max_frames`; and why other sweeps are left out."""
+    found, drives = find_moments(index, config), _drives(index)
+    picked = _spread(len(found.anchor), config.max_frames)
+    places = {index.anchor: found.anchor, **found.others}
+    anchored = [
+        Anchored(
+            {sensor: int(at[i]) for sensor, at in places.items() if at[i] >= 0},
+            index.anchor,
+            int(drives[found.anchor[i]]),
         )
         for i in picked
     ]
-    return trios, +(found.rejected + Counter({Rejection.NOT_PICKED: len(found.lidar) - len(picked)}))
+    return anchored, +(found.rejected + Counter({Rejection.NOT_PICKED: len(found.anchor) - len(picked)}))
 
 
-def _place(at: np.int64) -> int | None:
-    return int(at) if at >= 0 else None
+def find_moments(index: DayIndex, config: IngestConfig) -> Matched:
+    """All moments of the day, or of its bursts, within the gate that the configuration asks for.
 
-
-def find_trios(index: DayIndex, config: IngestConfig) -> Trios:
-    """All trios of the day, or of its bursts, within the gate that the configuration asks for.
-
-    Without a sweep all day, the radar's scans with an image.
+    They are built about the sweeps of the first lidar; without a sweep all day, about the first radar's scans.
     """
-    lidar, camera, radar = (index.stream(role).stamps_ns for role in (index.anchor, "image", "radar"))
-    is_swept = index.anchor == "lidar"
-    radar = radar if is_swept else radar[:0]
     wanted = index.sweeps_in_bursts()
-    lidar = lidar[wanted]
+    anchors_ns = index.captures(index.anchor).stamps_ns[wanted]
+    others_ns = {s: index.captures(s).stamps_ns for s in index.kinds if s != index.anchor}
     if config.sync_gate_s is not None:
-        found = match_trios(lidar, camera, radar, round(config.sync_gate_s * 1e9))
+        found = match_by_stamp(anchors_ns, others_ns, round(config.sync_gate_s * 1e9))
     else:
-        speed, yaw_rate = index.ego.motion_at(lidar)
+        speed, yaw_rate = index.ego.motion_at(anchors_ns)
         gates = motion_gates_ns(speed, yaw_rate, config.sync_gate_m, float(np.radians(config.sync_gate_deg)))
-        found = match_by_motion(lidar, camera, radar, gates)
-    taken = wanted[found.lidar]
-    return replace(found, lidar=taken) if is_swept else replace(found, lidar=found.radar, radar=taken)
+        found = match_by_motion(anchors_ns, others_ns, gates)
+    return replace(found, anchor=wanted[found.anchor])
 
 
 def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig) -> tuple[str, ...]:
     """Why a day gives no frame, in words: which topic, and what to do; then the faults that this states."""
-    topics = {role: topic for topic, role in topics_of(rig).items()}
-    streams = [r for r in ("image", "lidar", "radar") if r in topics]
-    absent = [f"{topics[r]} ({r})" for r in streams if not index.stream(r).stamps]
+    topics = {role.sensor: f"{topic} ({role})" for topic, role in topics_of(rig).items() if role.is_capture}
+    absent = [name for sensor, name in topics.items() if not index.captures(sensor).stamps]
     faults: tuple[str, ...] = ()
-    if len(streams) - len(absent) < 2:
+    if len(topics) - len(absent) < 2:
         what, faults = _nothing_on(", ".join(absent)), ("configuration",)
     elif rejected.get(Rejection.CAMERA_INFO):
-        what = _no_intrinsics(topics["info"])
+        cameras = [c for c in rig.cameras if not index.cameras.get(c)] or list(rig.cameras)
+        what = _no_intrinsics(rig.cameras[cameras[0]].info)
     elif not set(rejected) & set(_UNUSABLE):
-        of = {"image": "an image", "lidar": "a sweep", "radar": "a scan"}
-        met = " and ".join(f"{of[r]} of {topics[r]}" for r in streams if f"{topics[r]} ({r})" not in absent)
+        of = {"camera": "an image", "lidar": "a sweep", "radar": "a scan"}
+        heard = {s: _topic_of(rig, s) for s, name in topics.items() if name not in absent}
+        met = " and ".join(f"{of[index.kinds[s]]} of {topic}" for s, topic in heard.items())
         what = f"{met} never come {_near_enough(config)}"
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
@@ -187,25 +183,31 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestCon
 
 def absences(index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConfig) -> dict[str, str]:
     """Why moments lack a sensor of the rig, in words, by sensor: which topic, and what to do."""
-    topics = {role: topic for topic, role in topics_of(rig).items()}
     found = {}
-    for sensor in rig.sensors:
-        role = "image" if sensor == "camera" else sensor
-        own = Counter({r: counts[f"without_{sensor}_{r}"] for r in Rejection})
+    for topic, role in topics_of(rig).items():
+        if not role.is_capture:
+            continue
+        sensor, kind = role.sensor, role.kind
+        near = none_near(kind)
+        own = Counter({r: counts[f"without_{sensor}_{r}"] for r in (*Rejection, near)})
         reason, count = own.most_common(1)[0]
         if not count:
             continue
-        if not index.stream(role).stamps:
-            found[sensor] = _nothing_on(f"{topics[role]} ({role})")
+        if not index.captures(sensor).stamps:
+            found[sensor] = _nothing_on(f"{topic} ({role})")
         elif reason == Rejection.CAMERA_INFO:
-            found[sensor] = _no_intrinsics(topics["info"])
-        elif reason in (Rejection.NO_CAMERA, Rejection.NO_RADAR):
-            found[sensor] = f"nothing of {topics[role]} is near enough: not {_near_enough(config)}"
+            found[sensor] = _no_intrinsics(rig.cameras[sensor].info)
+        elif reason == near:
+            found[sensor] = f"nothing of {topic} is near enough: not {_near_enough(config)}"
         else:
             stated = f"{FAULTS[_STATED[reason]]}: " if reason in _STATED else ""
             why = next((p for p in index.problems if p.startswith(f"{reason}: ")), reason)
-            found[sensor] = f"{stated}{topics[role]} was unusable, most often {why} ({count})"
+            found[sensor] = f"{stated}{topic} was unusable, most often {why} ({count})"
     return found
+
+
+def _topic_of(rig: Rig, sensor: str) -> str:
+    return next(topic for topic, role in topics_of(rig).items() if role.is_capture and role.sensor == sensor)
 
 
 def _nothing_on(topics: str) -> str:
@@ -228,21 +230,18 @@ def _near_enough(config: IngestConfig) -> str:
     )
 
 
-def read_file_prior(rig: Rig, fleet: FleetConfig) -> dict[str, np.ndarray] | None:
-    """Transforms of a prior file by pair, None where the prior comes from /tf_static.
+def read_file_prior(rig: Rig, fleet: FleetConfig) -> Star | None:
+    """Transforms of a prior file, None where the prior comes from /tf_static.
 
     Raises:
         ConfigError: no such file, or not the rigid 4x4 transforms in it that the rig needs.
     """
-    if rig.prior.file is None:
-        return None
-    found = read_transforms(fleet.path_of(rig.prior.file), [n.kind for n in rig.nodes])
-    return {pair: T for pair, T in found.items() if len(found) == 1 or pair != "camera_radar"}
+    return None if rig.prior.file is None else read_star(fleet.path_of(rig.prior.file), rig)
 
 
 def _drives(index: DayIndex) -> Int64[np.ndarray, " N"]:
     """Drive of each sweep, by its place in the stream."""
-    sweeps = index.stream(index.anchor)
+    sweeps = index.captures(index.anchor)
     order = np.argsort(sweeps.stamps_ns, kind="stable")
     drives = np.zeros(len(order), np.int64)
     drives[order] = number_drives([sweeps.stamps[i] for i in order], [sweeps.located[i].log for i in order])
@@ -255,22 +254,26 @@ def _spread(count: int, limit: int | None) -> Int64[np.ndarray, " N"]:
     return np.unique(np.linspace(0, count - 1, limit).round().astype(np.int64))
 
 
-def _frames(
-    trios: list[Trio], builder: FrameBuilder, index: DayIndex, rejected: Counter[str], progress: Progress
-) -> Iterator[Frame]:
-    frame_index = 0
-    for done, trio in enumerate(trios, 1):
+def _built(
+    anchored: list[Anchored],
+    builder: MomentBuilder,
+    index: DayIndex,
+    rejected: Counter[str],
+    progress: Progress,
+) -> Iterator[tuple[Moment, dict[str, Capture]]]:
+    moment = 0
+    for done, at in enumerate(anchored, 1):
         try:
-            yield builder.build(trio, frame_index)
-            frame_index += 1
+            yield builder.build(at, moment)
+            moment += 1
         except Rejected as outcome:
             rejected[outcome.reason] += 1
             if rejected[outcome.reason] == 1 and outcome.detail:
                 index.complain(f"{outcome.reason}: {outcome.detail}")
-        progress(done, len(trios), "frames")
+        progress(done, len(anchored), "frames")
 
 
-def _all_counts(rejected: Counter[str], index: DayIndex, builder: FrameBuilder) -> dict[str, int]:
+def _all_counts(rejected: Counter[str], index: DayIndex, builder: MomentBuilder) -> dict[str, int]:
     return {str(k): int(v) for k, v in (rejected + index.damage + builder.counts).items() if v}
 
 

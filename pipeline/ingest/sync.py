@@ -1,9 +1,9 @@
-"""Which image, sweep and scan belong together: stamps in, indices out; nothing is decoded for it."""
+"""Which captures of a rig's sensors belong together: stamps in, indices out; nothing is decoded for it."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
@@ -11,18 +11,19 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
-from schemas.frames import SAME_SCENE_NS
+from schemas.moments import SAME_SCENE_NS
 
 __all__ = [
     "WRONG_UNIT",
+    "Matched",
     "Rejection",
-    "Trios",
     "constant_gap_ns",
     "first_occurrences",
     "match_by_motion",
+    "match_by_stamp",
     "match_nearest",
-    "match_trios",
     "motion_gates_ns",
+    "none_near",
     "number_drives",
 ]
 
@@ -30,21 +31,21 @@ _DRIVE_GAP_NS = 10 * 10**9
 _HALF_A_PERIOD = 0.55  # and a tenth for jitter
 # Length of the gaps' mean on the circle of a period: they scatter by a tenth of it, one sigma.
 _TRIGGERED = 0.8
+# A moment with so many times the sensors of another within a second shows all that the other does: of three sensors,
+# three against two. In rigs with many sensors, whole moments may be rare.
+_RICHER = 1.5
 # What is taken for a car that nobody measured, and for others that drive past one that stands.
 _UNKNOWN_MPS, _UNKNOWN_RADPS, _OTHERS_MPS = 40.0, float(np.radians(30.0)), 10.0
 
 
 class Rejection(StrEnum):
-    """Why a lidar sweep became no frame; each sweep is kept or counted under exactly one of these.
+    """Why a sweep became no moment; each is kept, or counted under one of these or by the sensors that are apart.
 
     Of a moment that is kept without a sensor, why it lacks that is counted as `without_SENSOR_REASON`.
     """
 
     DUPLICATE_STAMP = "duplicate_stamp"
-    NO_CAMERA = "no_camera_in_gate"
     NO_LIDAR = "no_lidar_all_day"
-    NO_RADAR = "no_radar_in_gate"
-    SPREAD = "camera_radar_outside_gate"
     NOT_PICKED = "beyond_max_frames"
     IMAGE_DAMAGED = "image_damaged"
     IMAGE_SIZE = "image_size_differs_from_camera_info"
@@ -64,18 +65,27 @@ WRONG_UNIT: Final = {"lidar": Rejection.LIDAR_UNIT, "radar": Rejection.RADAR_UNI
 
 
 @dataclass(frozen=True, eq=False)
-class Trios:
-    """Indices into the three stamp lists, in order of the lidar's stamp, and why sweeps found no partner.
+class Matched:
+    """Indices into the stamp lists, in order of the anchor's stamp, and why anchors found no partner.
 
-    -1 where a moment has no image or no scan. `len(lidar) + sum(rejected.values())` is the number of sweeps.
+    `len(anchor) + sum(rejected.values())` is the number of anchors.
+
+    Args:
+        anchor: of the sweeps that moments are built about.
+        others: by sensor, -1 where a moment has nothing of it.
+        rejected: anchors that became no moment.
+        constant_ns: by sensor, the constant part of its stamps' gaps to the anchor's, found before gating.
     """
 
-    lidar: Int64[np.ndarray, " N"]
-    camera: Int64[np.ndarray, " N"]
-    radar: Int64[np.ndarray, " N"]
+    anchor: Int64[np.ndarray, " N"]
+    others: Mapping[str, Int64[np.ndarray, " N"]]
     rejected: Counter[str] = field(default_factory=Counter)
-    camera_gap_ns: int = 0  # the constant part of the stamps' gaps to the sweep's, found before gating
-    radar_gap_ns: int = 0
+    constant_ns: Mapping[str, int] = field(default_factory=dict)
+
+
+def none_near(sensor: str) -> str:
+    """The count of anchors that nothing of a sensor is near enough to."""
+    return f"no_{sensor}_in_gate"
 
 
 def first_occurrences(stamps_ns: Int[np.ndarray, " N"]) -> Int64[np.ndarray, " M"]:
@@ -112,58 +122,46 @@ def match_nearest(
     return partner
 
 
-def match_trios(
-    lidar_ns: Int[np.ndarray, " L"],
-    camera_ns: Int[np.ndarray, " C"],
-    radar_ns: Int[np.ndarray, " R"],
-    gate_ns: int,
-) -> Trios:
-    """Synchronised trios: every two stamps of one lie within the gate (paper, section 4.5.1: under 5 ms).
+def match_by_stamp(
+    anchor_ns: Int[np.ndarray, " L"], others_ns: Mapping[str, Int[np.ndarray, " M"]], gate_ns: int
+) -> Matched:
+    """Synchronised moments: every two stamps of one lie within the gate (paper, section 4.5.1: under 5 ms).
 
-    A sweep with an image or a scan alone is taken where no whole trio within a second shows the same scene.
+    One that lacks sensors is taken where no richer one within a second shows the same scene.
 
     Stamps may come in any order and more than once: the first of equal stamps counts.
     """
-    lidar, camera, radar = (first_occurrences(s) for s in (lidar_ns, camera_ns, radar_ns))
-    to_camera = match_nearest(lidar_ns[lidar], camera_ns[camera], gate_ns)
-    to_radar = match_nearest(lidar_ns[lidar], radar_ns[radar], gate_ns)
-    gates = np.full(len(lidar_ns), gate_ns, np.int64)
-    stamps = lidar_ns, camera_ns, radar_ns
-    return _gated(stamps, (lidar, camera, radar), (to_camera, to_radar), (0, 0), gates)
+    anchor = first_occurrences(anchor_ns)
+    once = {s: stamps[first_occurrences(stamps)] for s, stamps in others_ns.items()}
+    partners = {s: match_nearest(anchor_ns[anchor], stamps, gate_ns) for s, stamps in once.items()}
+    gates = np.full(len(anchor), gate_ns, np.int64)
+    return _gated(anchor_ns, others_ns, partners, dict.fromkeys(once, 0), gates)
 
 
 def match_by_motion(
-    lidar_ns: Int[np.ndarray, " L"],
-    camera_ns: Int[np.ndarray, " C"],
-    radar_ns: Int[np.ndarray, " R"],
+    anchor_ns: Int[np.ndarray, " L"],
+    others_ns: Mapping[str, Int[np.ndarray, " M"]],
     gates_ns: Int[np.ndarray, " L"],
-) -> Trios:
-    """Each sweep with the image and the scan nearest to it, where the stamps' gaps are within the sweep's own gate.
+) -> Matched:
+    """Each anchor with what of each sensor is nearest to it, where the stamps' gaps are within the anchor's own gate.
 
     The constant part of a sensor's gaps is found first and counts for nothing: a calibration estimates it. Nearest
-    means within half a period, so that a sweep without a partner does not borrow a neighbour's.
+    means within half a period, so that an anchor without a partner does not borrow a neighbour's.
 
     Args:
-        lidar_ns: stamps, in any order, the first of equal ones counts.
-        camera_ns: likewise.
-        radar_ns: likewise.
-        gates_ns: per sweep, the largest gap beyond the constant ones between any two of its trio.
+        anchor_ns: stamps of the sensor that moments are built about, in any order, the first of equal ones counts.
+        others_ns: of the others by name, likewise.
+        gates_ns: per anchor, the largest gap beyond the constant ones between any two captures of its moment.
     """
-    lidar, camera, radar = (first_occurrences(s) for s in (lidar_ns, camera_ns, radar_ns))
-    partners, constant = [], []
-    for stamps in (camera_ns[camera], radar_ns[radar]):
-        constant.append(constant_gap_ns(lidar_ns[lidar], stamps))
+    anchor = first_occurrences(anchor_ns)
+    partners, constant = {}, {}
+    for sensor, stamps_ns in others_ns.items():
+        stamps = stamps_ns[first_occurrences(stamps_ns)]
+        constant[sensor] = constant_gap_ns(anchor_ns[anchor], stamps)
         period = _period_ns(stamps)
         half = int(gates_ns.max(initial=0)) if period is None else int(_HALF_A_PERIOD * period)
-        partners.append(match_nearest(lidar_ns[lidar] + constant[-1], stamps, half))
-    stamps_ns = lidar_ns, camera_ns, radar_ns
-    return _gated(
-        stamps_ns,
-        (lidar, camera, radar),
-        (partners[0], partners[1]),
-        (constant[0], constant[1]),
-        gates_ns,
-    )
+        partners[sensor] = match_nearest(anchor_ns[anchor] + constant[sensor], stamps, half)
+    return _gated(anchor_ns, others_ns, partners, constant, gates_ns[anchor])
 
 
 def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, " M"]) -> int:
@@ -213,58 +211,70 @@ def _period_ns(stamps_ns: Int[np.ndarray, " M"]) -> float | None:
 
 
 def _gated(
-    stamps_ns: tuple[np.ndarray, np.ndarray, np.ndarray],
-    once: tuple[np.ndarray, np.ndarray, np.ndarray],
-    partners: tuple[np.ndarray, np.ndarray],
-    constant_ns: tuple[int, int],
-    gates_ns: np.ndarray,
-) -> Trios:
-    """The trios of which every two stamps, less the constant gaps, lie within the sweep's gate; the others counted.
+    anchor_ns: np.ndarray,
+    others_ns: Mapping[str, np.ndarray],
+    partners: Mapping[str, np.ndarray],
+    constant_ns: Mapping[str, int],
+    gates: np.ndarray,
+) -> Matched:
+    """The moments of which every two stamps, less the constant gaps, lie within the anchor's gate; the others counted.
 
-    Sweeps with one partner are taken far from whole trios only: there a sensor is silent or the rig has none.
+    Anchors without all partners are taken far from richer moments only: there a sensor is silent or the rig has none.
 
-    `once` are the places of the stamps that count, of lidar, camera and radar; `partners` are places in those of camera
-    and radar, -1 = none.
+    `partners` are places in the stamps that count of each sensor, -1 = none.
     """
-    lidar, own = once[0], stamps_ns[0][once[0]]
-    gates, gaps = gates_ns[lidar], []
-    for sensor in (0, 1):
-        to, others = partners[sensor], stamps_ns[sensor + 1][once[sensor + 1]]
-        gap = np.zeros(len(lidar), np.int64)
-        gap[to >= 0] = others[to[to >= 0]] - own[to >= 0] - constant_ns[sensor]
-        gaps.append(gap)
-    has_camera = (partners[0] >= 0) & (np.abs(gaps[0]) <= gates)
-    has_radar = (partners[1] >= 0) & (np.abs(gaps[1]) <= gates)
-    both = has_camera & has_radar
-    whole = both & (np.abs(gaps[0] - gaps[1]) <= gates)
-    kept = whole | ((has_camera ^ has_radar) & _far_from(own, own[whole]))
-    lacks_camera = ~kept & ~has_camera & (len(stamps_ns[1]) > 0 or len(stamps_ns[2]) == 0)
-    rejected = Counter[str](
-        {
-            Rejection.DUPLICATE_STAMP: len(stamps_ns[0]) - len(lidar),
-            Rejection.NO_CAMERA: int(np.sum(lacks_camera)),
-            Rejection.NO_RADAR: int(np.sum(~kept & ~has_radar & ~lacks_camera)),
-            Rejection.SPREAD: int(np.sum(both & ~kept)),
-        }
-    )
-    camera, radar = (
-        np.where(has[kept], _at(once[i + 1], partners[i][kept]), -1)
-        for i, has in enumerate((has_camera, has_radar))
-    )
-    return Trios(lidar[kept], camera, radar, +rejected, *constant_ns)
+    anchor = first_occurrences(anchor_ns)
+    names, own = list(others_ns), anchor_ns[anchor]
+    once = {s: first_occurrences(others_ns[s]) for s in names}
+    gap, has = np.zeros((len(names), len(own)), np.int64), np.zeros((len(names), len(own)), bool)
+    for k, s in enumerate(names):
+        near, stamps = partners[s] >= 0, others_ns[s][once[s]]
+        gap[k, near] = stamps[partners[s][near]] - own[near] - constant_ns[s]
+        has[k] = near & (np.abs(gap[k]) <= gates)
+    together, apart = _together(gap, has, gates)
+    kept = _worth_having(own, 1 + together.sum(0), min(2, 1 + len(names)))
+    rejected = Counter[str]({Rejection.DUPLICATE_STAMP: len(anchor_ns) - len(anchor)})
+    heard = [k for k, s in enumerate(names) if len(others_ns[s])] or list(range(len(names)))
+    for i in np.flatnonzero(~kept):
+        lacking = next((names[k] for k in heard if not has[k, i]), "")
+        a, b = sorted(apart.get(int(i), (0, 0)))
+        rejected[none_near(lacking) if lacking else f"{names[a]}_{names[b]}_outside_gate"] += 1
+    others = {
+        s: np.where(together[k, kept], _at(once[s], partners[s][kept]), -1) for k, s in enumerate(names)
+    }
+    return Matched(anchor[kept], others, +rejected, constant_ns)
+
+
+def _together(
+    gap: Int64[np.ndarray, "S N"], has: Bool[np.ndarray, "S N"], gates: Int64[np.ndarray, " N"]
+) -> tuple[Bool[np.ndarray, "S N"], dict[int, tuple[int, int]]]:
+    """What of each moment lies within its gate, the farthest from the anchor left out while two are farther apart.
+
+    Also the two that were, by moment.
+    """
+    kept, apart = has.copy(), {}
+    low, high = np.where(kept, gap, 0).min(0, initial=0), np.where(kept, gap, 0).max(0, initial=0)
+    for i in np.flatnonzero(high - low > gates):
+        apart[int(i)] = (int(np.argmin(gap[:, i])), int(np.argmax(gap[:, i])))
+        while np.ptp(np.append(gap[kept[:, i], i], 0)) > gates[i]:
+            there = np.flatnonzero(kept[:, i])
+            kept[there[np.argmax(np.abs(gap[there, i]))], i] = False
+    return kept, apart
+
+
+def _worth_having(
+    stamps_ns: Int64[np.ndarray, " N"], sensors: Int[np.ndarray, " N"], least: int
+) -> Bool[np.ndarray, " N"]:
+    """Moments, in order, of so many sensors or more that no richer one near in time shows too."""
+    first = np.searchsorted(stamps_ns, stamps_ns - SAME_SCENE_NS, "left")
+    end = np.searchsorted(stamps_ns, stamps_ns + SAME_SCENE_NS, "right")
+    most = np.array([sensors[a:b].max() for a, b in zip(first, end, strict=True)], np.int64)
+    return (sensors >= least) & (most < _RICHER * sensors)
 
 
 def _at(places: np.ndarray, index: np.ndarray) -> np.ndarray:
     """`places[index]`, -1 where the index is."""
     return np.append(places, -1)[index]
-
-
-def _far_from(
-    stamps_ns: Int64[np.ndarray, " N"], others_ns: Int64[np.ndarray, " M"]
-) -> Bool[np.ndarray, " N"]:
-    """True where none of `others_ns`, in order, is so near in time that it shows the same scene."""
-    first = np.searchsorted(others_ns, stamps_ns - SAME_SCENE_NS, "left")
-    return first == np.searchsorted(others_ns, stamps_ns + SAME_SCENE_NS, "right")
 
 
 def number_drives(stamps_ns: Sequence[int], logs: Sequence[int]) -> Int64[np.ndarray, " N"]:

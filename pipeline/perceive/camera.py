@@ -14,7 +14,7 @@ from pipeline.config import PerceiveConfig
 from pipeline.perceive.labels import ROAD_ID, SKY_ID, road_user_name, to_cityscapes
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
 from pipeline.rigs import RoadUser, TopicSemantics
-from schemas.frames import Frame
+from schemas.captures import ImageColumns
 
 __all__ = [
     "CameraSemantics",
@@ -65,7 +65,7 @@ class CameraSemantics:
 class SemanticsSource(Protocol):
     """Where semantics come from."""
 
-    def read(self, frame: Frame) -> CameraSemantics:
+    def read(self, frame: ImageColumns) -> CameraSemantics:
         """Semantics of one frame; FrameRejectedError where there are none."""
         ...
 
@@ -78,7 +78,7 @@ class TopicSource:
         self._classes = topics.classes
         self._config = config
 
-    def read(self, frame: Frame) -> CameraSemantics:
+    def read(self, frame: ImageColumns) -> CameraSemantics:
         """Logged labels in Cityscapes ids at label size, and logged road users above the minimum score.
 
         Raises:
@@ -119,7 +119,7 @@ def resize_labels(labels: UInt8[np.ndarray, "H W"], size: tuple[int, int]) -> UI
     )
 
 
-def decode_colour(frame: Frame) -> UInt8[np.ndarray, "H W 3"]:
+def decode_colour(frame: ImageColumns) -> UInt8[np.ndarray, "H W 3"]:
     """The frame's image as BGR.
 
     Raises:
@@ -128,7 +128,7 @@ def decode_colour(frame: Frame) -> UInt8[np.ndarray, "H W 3"]:
     return _sized(_decode(frame.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), frame, 1.0)
 
 
-def decode_grey(frame: Frame, scale: float) -> UInt8[np.ndarray, "h w"]:
+def decode_grey(frame: ImageColumns, scale: float) -> UInt8[np.ndarray, "h w"]:
     """The frame's image as grey at label size; JPEG is decoded at half size where that is enough.
 
     Raises:
@@ -159,7 +159,7 @@ def _decode(blob: bytes, flag: int) -> np.ndarray | None:
         return None
 
 
-def _sized(image: np.ndarray | None, frame: Frame, scale: float) -> np.ndarray:
+def _sized(image: np.ndarray | None, frame: ImageColumns, scale: float) -> np.ndarray:
     if image is None:
         raise FrameRejectedError(FrameReason.UNDECODABLE_IMAGE)
     # JPEG's reduced decoding rounds odd sizes up.
@@ -175,7 +175,7 @@ def _same_aspect(shape: tuple[int, ...], size: tuple[int, int]) -> bool:
     return abs(scale_rows - scale_columns) <= max(1 / size[0], 1 / size[1]) * max(scale_rows, scale_columns)
 
 
-def _logged_detections(frame: Frame, own_classes: Mapping[str, RoadUser]) -> Detections:
+def _logged_detections(frame: ImageColumns, own_classes: Mapping[str, RoadUser]) -> Detections:
     boxes, classes, scores = frame.detection_boxes_px, frame.detection_classes, frame.detection_scores
     if boxes is None or classes is None or scores is None:
         raise FrameRejectedError(FrameReason.NO_DETECTIONS)

@@ -26,7 +26,18 @@ from pipeline.geometry.se3 import (
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import KINDS, Kind, Sensor
 
-__all__ = ["RigPrior", "Star", "from_rows", "middle_of", "moved", "star_of", "to_rows"]
+__all__ = [
+    "RigPrior",
+    "Star",
+    "agreed",
+    "between",
+    "from_rows",
+    "middle_of",
+    "moved",
+    "star_of",
+    "to_rows",
+    "transform_of_row",
+]
 
 Star = Mapping[tuple[str, str], np.ndarray]  # T_parent_child 4 4 by (parent, child)
 
@@ -54,14 +65,7 @@ class RigPrior:
 
     def between(self, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
         """T_a_b; None where the star does not tie them."""
-        direct = _direct(self.T, a, b)
-        if direct is not None:
-            return direct
-        for node in self.nodes:
-            first, second = _direct(self.T, a, node.name), _direct(self.T, node.name, b)
-            if node.name not in (a, b) and first is not None and second is not None:
-                return first @ second
-        return None
+        return between(self.T, a, b)
 
     def sigmas_between(self, a: str, b: str) -> tuple[float, float]:
         """Rotation [rad] and translation [m] of T_a_b, without lever arms: of a given transform as of one sensor."""
@@ -138,10 +142,24 @@ def from_rows(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Float[
     Raises:
         SolveError: a transform changes over the day.
     """
+    ordered = sorted(rows, key=lambda row: (*row["q"], *row["t_m"]))
+    return agreed({(row["parent"], row["child"]): transform_of_row(row)} for row in ordered)
+
+
+def transform_of_row(row: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
+    """T_parent_child of a row."""
+    return from_quaternion(np.array(row["q"], np.float64), np.array(row["t_m"], np.float64))
+
+
+def agreed(stars: Iterable[Star]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
+    """The star that all of these agree on, as the first of each has it.
+
+    Raises:
+        SolveError: a transform changes over the day.
+    """
     found: dict[tuple[str, str], list[np.ndarray]] = {}
-    for row in sorted(rows, key=lambda row: (*row["q"], *row["t_m"])):
-        T = from_quaternion(np.array(row["q"], np.float64), np.array(row["t_m"], np.float64))
-        found.setdefault((row["parent"], row["child"]), []).append(T)
+    for ends, T in (item for star in stars for item in star.items()):
+        found.setdefault(ends, []).append(T)
     for (a, b), values in found.items():
         if max(np.abs(log_se3(inverse(values[0]) @ T)).max() for T in values) > _SAME:
             raise SolveError(f"the logged prior of {a}_{b} changes over the day ({len(values)} values)")
@@ -180,6 +198,18 @@ def _moved_as_pairs(
         drawn = perturb_exactly(T.get(ends, np.eye(4)), angle_rad, shift_m, rng)
         T |= {ends: drawn} if ends in T else {}
     return T
+
+
+def between(T: Star, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
+    """T_a_b by a star; None where it does not tie them."""
+    direct = _direct(T, a, b)
+    if direct is not None:
+        return direct
+    for middle in dict.fromkeys(name for ends in T for name in ends):
+        first, second = _direct(T, a, middle), _direct(T, middle, b)
+        if middle not in (a, b) and first is not None and second is not None:
+            return first @ second
+    return None
 
 
 def _direct(T: Star, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:

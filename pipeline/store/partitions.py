@@ -133,9 +133,9 @@ class Lake:
         """The folder of one partition of one table."""
         return self.root / table / partition.folder
 
-    def file(self, table: str, partition: Partition) -> PurePath:
-        """The file of a partition that is replaced as a whole (records have tables of their own)."""
-        return self.folder(table, partition) / "part-0.parquet"
+    def file(self, table: str, partition: Partition, sensor: str | None = None) -> PurePath:
+        """The file of a partition, or the one that it has of a sensor (records have tables of their own)."""
+        return self.folder(table, partition) / f"{sensor or 'part-0'}.parquet"
 
     def partitions(self, table: str, vehicle: str | None = None, day: str | None = None) -> list[Partition]:
         """Partitions of a table that hold at least one file, in order; only those of a vehicle or day if given."""

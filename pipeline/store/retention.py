@@ -1,4 +1,4 @@
-"""What leaves a lake after a time: frames, with their images of public roads. Records stay."""
+"""What leaves a lake after a time: moments, with their images of public roads. Records stay."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from pipeline.errors import ContractError
+from pipeline.store.moments import sensor_files, sensor_tables
 from pipeline.store.partitions import Lake, Partition, is_day
 from pipeline.store.tables import COLLECTED, read_manifest, write_manifest
 from schemas.columns import TableSchema
@@ -32,37 +33,52 @@ def collect(
 
     Args:
         lake: where the tables are.
-        schema: of a table of partitions.
+        schema: of a table that joins the files of sensors; what an older release had in its place goes as a whole.
         before: first day that stays, YYYY-MM-DD.
         today: written down as the day on which they left.
         dry_run: only say what would go.
     """
-    for partition in lake.partitions(schema.name):
-        if partition.day >= before:
-            continue
-        path = lake.file(schema.name, partition)
-        try:
-            manifest = read_manifest(lake, schema, partition)
-        except (
-            ContractError
-        ) as err:  # of another release, or damaged: nothing is known of it that would have to stay
-            lake.damage.append(str(err))
+    days = [p for p in lake.partitions(schema.name) if p.day < before]
+    yield from (c for p in days if (c := _collect_day(lake, schema, p, today, dry_run=dry_run)) is not None)
+    yield from _collect_older(lake, schema, before, dry_run=dry_run)
+    for table in (schema, *sensor_tables(schema)):
+        for aside in lake.files.find(lake.root / table.name, "vehicle=*/day=*/*.damaged"):
+            if aside.parent.name.removeprefix("day=") < before and not dry_run:
+                lake.files.delete(aside)
+
+
+def _collect_day(
+    lake: Lake, schema: TableSchema, partition: Partition, today: str, *, dry_run: bool
+) -> Collected | None:
+    """Take the rows of one partition; None where they are gone."""
+    path, gone = lake.file(schema.name, partition), sensor_files(lake, schema, partition)
+    size = sum(lake.files.size(file) for file in (path, *gone))
+    try:
+        manifest = read_manifest(lake, schema, partition)
+    except ContractError as err:
+        # Of another release, or damaged: nothing is known of it that would have to stay.
+        lake.damage.append(str(err))
+        gone.append(path)
+    else:
+        if manifest is None or COLLECTED in manifest.extra:
+            return None
+        if not dry_run:
+            told = replace(manifest, extra=manifest.extra | {COLLECTED: today})
+            write_manifest(lake, schema, partition, told)
+    for file in gone if not dry_run else ():
+        lake.files.delete(file)
+    return Collected(partition, size)
+
+
+def _collect_older(lake: Lake, schema: TableSchema, before: str, *, dry_run: bool) -> Iterator[Collected]:
+    """What a release before 0.11 left in the table's place: nobody reads it."""
+    for partition in lake.partitions(schema.before) if schema.before else ():
+        path = lake.file(schema.before, partition)
+        if partition.day < before:
             size = lake.files.size(path)
             if not dry_run:
                 lake.files.delete(path)
             yield Collected(partition, size)
-            continue
-        if manifest is None or COLLECTED in manifest.extra:
-            continue
-        size = lake.files.size(path)
-        if not dry_run:
-            write_manifest(
-                lake, schema, partition, replace(manifest, extra=manifest.extra | {COLLECTED: today})
-            )
-        yield Collected(partition, size)
-    for aside in lake.files.find(lake.root / schema.name, "vehicle=*/day=*/*.damaged"):
-        if aside.parent.name.removeprefix("day=") < before and not dry_run:
-            lake.files.delete(aside)
 
 
 def collect_pages(lake: Lake, before: str, *, dry_run: bool = False) -> list[str]:

@@ -23,8 +23,10 @@ __all__ = [
     "COLLECTED",
     "Manifest",
     "PartitionWriter",
+    "absence",
     "iterate_rows",
     "naming_damage",
+    "opened_for_writing",
     "read_manifest",
     "read_records",
     "read_rows",
@@ -58,14 +60,14 @@ class PartitionWriter:
     """Streams rows of one partition into a temporary file; nothing is visible until the block ends without an error."""
 
     def __init__(self, writer: pq.ParquetWriter, schema: TableSchema) -> None:
-        self._writer, self._schema = writer, schema
+        self._writer, self.schema = writer, schema
         self.rows = 0
         self.manifest_fields: dict[str, Any] = {}
 
     def append(self, rows: Sequence[Any]) -> None:
         """Write rows as one row group."""
         if rows:
-            self._writer.write_table(to_table(rows, self._schema), row_group_size=len(rows))
+            self._writer.write_table(to_table(rows, self.schema), row_group_size=len(rows))
             self.rows += len(rows)
 
     def describe(
@@ -73,6 +75,20 @@ class PartitionWriter:
     ) -> None:
         """Counts and words for the manifest."""
         self.manifest_fields = {"kept": kept, "rejected": rejected, "remarks": remarks, "extra": extra}
+
+    def close(self, work_key: str, code_version: str, inputs: Iterable[str] = ()) -> None:
+        """Write the manifest, as a file's last."""
+        of = self.schema.name, self.schema.version, work_key, code_version, list(inputs), self.rows
+        manifest = Manifest(*of, **self.manifest_fields)
+        self._writer.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
+        self._writer.close()
+
+
+@contextmanager
+def opened_for_writing(lake: Lake, path: PurePath, schema: TableSchema) -> Iterator[PartitionWriter]:
+    """A file of a partition, which takes its name when the block ends without an error."""
+    with _replacing(lake, path, schema) as parquet:
+        yield PartitionWriter(parquet, schema)
 
 
 @contextmanager
@@ -85,19 +101,9 @@ def write_partition(
     inputs: Iterable[str] = (),
 ) -> Iterator[PartitionWriter]:
     """Replace one partition as a whole, atomically; on an error the old file stays."""
-    with _replacing(lake, lake.file(schema.name, partition), schema) as parquet:
-        writer = PartitionWriter(parquet, schema)
+    with opened_for_writing(lake, lake.file(schema.name, partition), schema) as writer:
         yield writer
-        manifest = Manifest(
-            schema.name,
-            schema.version,
-            work_key,
-            code_version,
-            list(inputs),
-            writer.rows,
-            **writer.manifest_fields,
-        )
-        parquet.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
+        writer.close(work_key, code_version, inputs)
 
 
 def write_manifest(lake: Lake, schema: TableSchema, partition: Partition, manifest: Manifest) -> None:
@@ -106,13 +112,24 @@ def write_manifest(lake: Lake, schema: TableSchema, partition: Partition, manife
         parquet.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
 
 
-def read_manifest(lake: Lake, schema: TableSchema, partition: Partition) -> Manifest | None:
-    """Manifest of a partition, None where there is no such partition."""
-    path = lake.file(schema.name, partition)
+def read_manifest(
+    lake: Lake, schema: TableSchema, partition: Partition, sensor: str | None = None
+) -> Manifest | None:
+    """Manifest of a partition, or of the file that it has of a sensor; None where there is no such file."""
+    path = lake.file(schema.name, partition, sensor)
     try:
         return _manifest(lake, path, schema)
     except FileNotFoundError:
         return None
+
+
+def absence(lake: Lake, schema: TableSchema, partition: Partition) -> str:
+    """What is missing where there is no such partition, and what to do."""
+    problem = f"table {schema.name} has no partition for {partition.vehicle} on {partition.day}"
+    problem += f": run `boresight {schema.made_by}` first" if schema.made_by else ""
+    if schema.before and lake.partitions(schema.before, partition.vehicle, partition.day):
+        problem += f" (its {schema.before} are of a release before 0.11, and are made anew)"
+    return problem
 
 
 def read_rows(lake: Lake, schema: TableSchema, partition: Partition, row_type: type[Row]) -> list[Row]:
@@ -126,19 +143,19 @@ def iterate_rows(
     partition: Partition,
     row_type: type[Row],
     rows: Sequence[int] | None = None,
+    sensor: str | None = None,
 ) -> Iterator[list[Row]]:
-    """Rows of a partition, one row group at a time, so that memory stays bounded; `rows` picks row numbers.
+    """Rows of a partition, or of a sensor's file, one row group at a time; `rows` picks row numbers.
 
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
         DamagedError: its file cannot be read.
         CollectedError: its rows left the lake after their time.
     """
-    path = lake.file(schema.name, partition)
-    manifest = read_manifest(lake, schema, partition)
+    path = lake.file(schema.name, partition, sensor)
+    manifest = read_manifest(lake, schema, partition, sensor)
     if manifest is None:
-        problem = f"table {schema.name} has no partition for {partition.vehicle} on {partition.day}"
-        raise ContractError(str(path), problem)
+        raise ContractError(str(path), absence(lake, schema, partition))
     if COLLECTED in manifest.extra:
         raise CollectedError(str(path), manifest.extra[COLLECTED])
     wanted = None if rows is None else set(rows)

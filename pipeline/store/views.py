@@ -2,15 +2,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import chain
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from typing import Any, Final
 
+import numpy as np
+
+from pipeline.rig.prior import Star, between, transform_of_row
+from pipeline.store.moments import joined, sensors_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import Manifest, iterate_rows, read_manifest
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from pipeline.store.tables import Manifest, read_manifest
+from schemas.calibrations import FRAMES_OF_PAIR, PAIRS
+from schemas.captures import ImageColumns, ScanColumns, SweepColumns
+from schemas.columns import TableSchema
+from schemas.features import ImageFeatureColumns, ScanFeatureColumns, SweepFeatureColumns
+from schemas.frames import Frame
+from schemas.moments import MOMENTS, PERCEIVED, PRIOR, EgoColumns, Moment
+from schemas.observations import Observation
 
-__all__ = ["frames_of", "ingested", "observations_of", "perceived", "perceived_days"]
+__all__ = [
+    "Chosen",
+    "frame_of",
+    "frames_of",
+    "ingested",
+    "logged_stars",
+    "observations_of",
+    "perceived",
+    "perceived_days",
+    "priors_of",
+]
+
+Chosen = Mapping[
+    str, str
+]  # names of the camera, lidar and radar that a view is of, by kind; some may be left out
+
+_EACH, _LABEL, _BYTE = np.zeros(0, np.float32), np.zeros(0, np.int32), np.zeros(0, np.uint8)
+_XYZ = np.zeros((0, 3), np.float32)
+_NO_CAMERA: Final[dict[str, Any]] = {
+    "image_width_px": 0, "image_height_px": 0, "camera_model": "", "camera_K": np.full((3, 3), np.nan),
+    "camera_D": np.zeros(0),
+}  # fmt: skip
+# What a view holds of a sensor that it goes without.
+_NOTHING: Final[dict[type, Any]] = {
+    ImageColumns: ImageColumns(
+        image=b"", image_format="", labels_png=None, detection_boxes_px=None, detection_classes=None,
+        detection_scores=None, **_NO_CAMERA,
+    ),
+    SweepColumns: SweepColumns(
+        lidar_x_m=_EACH, lidar_y_m=_EACH, lidar_z_m=_EACH, lidar_intensity=None, lidar_ring=None, lidar_time_s=None,
+        lidar_deskewed=False,
+    ),
+    ScanColumns: ScanColumns(
+        radar_x_m=_EACH, radar_y_m=_EACH, radar_z_m=_EACH, radar_range_rate_mps=_EACH, radar_power_db=None,
+        radar_has_elevation=False, doppler_period_mps=None,
+    ),
+    ImageFeatureColumns: ImageFeatureColumns(
+        labels_png=b"", label_scale=1.0, sky_fraction=0.0, drivable_fraction=0.0, road_contrast_png=None,
+        road_user_boxes_px=np.zeros((0, 4), np.float32), road_user_classes=[], road_user_scores=_EACH, **_NO_CAMERA,
+    ),
+    SweepFeatureColumns: SweepFeatureColumns(
+        lidar_map_xyz_m=_XYZ, lidar_map_is_ground=_BYTE, lidar_map_cluster=_LABEL, lidar_cluster_centre_m=_XYZ,
+        lidar_cluster_min_m=_XYZ, lidar_cluster_max_m=_XYZ, lidar_edge_xyz_m=_XYZ, lidar_edge_side=_BYTE,
+        lidar_edge_jump_m=_EACH, lidar_edge_gap_rad=_EACH, lidar_edge_points=_LABEL, marking_xyz_m=_XYZ,
+        marking_z=_EACH, ground_plane=None, lidar_drivable_xyz_m=_XYZ,
+    ),
+    ScanFeatureColumns: ScanFeatureColumns(
+        radar_xyz_m=_XYZ, radar_power_db=None, radar_residual_mps=_EACH, radar_motion=_BYTE, radar_cluster=_LABEL,
+        radar_has_elevation=False, radar_velocity_mps=None, radar_velocity_cov=None, radar_track_xyz_m=_XYZ,
+        radar_track_velocity_mps=_XYZ, radar_track_id=_LABEL, radar_track_age=_LABEL, radar_track_points=_LABEL,
+        radar_drivable_azimuth_rad=_EACH, radar_drivable_range_m=_EACH,
+    ),
+}  # fmt: skip
+_MEASURED = {"camera": ImageColumns, "lidar": SweepColumns, "radar": ScanColumns}
+_FOUND = {"camera": ImageFeatureColumns, "lidar": SweepFeatureColumns, "radar": ScanFeatureColumns}
 
 
 def ingested(lake: Lake, partition: Partition) -> Manifest | None:
@@ -19,7 +83,7 @@ def ingested(lake: Lake, partition: Partition) -> Manifest | None:
     Raises:
         ContractError: it is damaged, or of another release.
     """
-    return read_manifest(lake, FRAMES, partition)
+    return read_manifest(lake, MOMENTS, partition)
 
 
 def perceived(lake: Lake, partition: Partition) -> Manifest | None:
@@ -28,35 +92,126 @@ def perceived(lake: Lake, partition: Partition) -> Manifest | None:
     Raises:
         ContractError: it is damaged, or of another release.
     """
-    return read_manifest(lake, OBSERVATIONS, partition)
+    return read_manifest(lake, PERCEIVED, partition)
 
 
 def perceived_days(lake: Lake) -> list[Partition]:
     """Vehicle-days that were perceived, in order."""
-    return lake.partitions(OBSERVATIONS.name)
+    return lake.partitions(PERCEIVED.name)
 
 
-def frames_of(lake: Lake, partition: Partition, moments: Sequence[int] | None = None) -> Iterator[Frame]:
-    """Frames of a vehicle-day in order of time, a row group in memory at a time; of some moments where these are named.
+def frames_of(
+    lake: Lake, partition: Partition, moments: Sequence[int] | None = None, chosen: Chosen | None = None
+) -> Iterator[Frame]:
+    """Frames of a vehicle-day in order of time, a row group of each sensor in memory at a time.
+
+    Args:
+        lake: where the tables are.
+        partition: the vehicle-day.
+        moments: the moments that are wanted; None = all.
+        chosen: whose frames; None = the first camera, lidar and radar of the day. Moments that have fewer than two of
+            several chosen sensors are left out.
 
     Raises:
         ContractError: the lake has none of that day, or they are of another release.
         DamagedError: a file cannot be read.
         CollectedError: they left the lake after their time.
     """
-    return chain.from_iterable(iterate_rows(lake, FRAMES, partition, Frame, moments))
+    for moment, rows, priors in _seen(lake, MOMENTS, partition, moments, chosen):
+        yield frame_of(moment, rows, priors)
 
 
 def observations_of(
-    lake: Lake, partition: Partition, moments: Sequence[int] | None = None
+    lake: Lake, partition: Partition, moments: Sequence[int] | None = None, chosen: Chosen | None = None
 ) -> Iterator[Observation]:
-    """Observations of a vehicle-day, likewise.
+    """Observations of a vehicle-day, as `frames_of` has its frames.
 
     Raises:
         ContractError: the lake has none of that day, or they are of another release.
         DamagedError: a file cannot be read.
         CollectedError: they left the lake after their time.
     """
-    wanted = None if moments is None else set(moments)
-    rows = chain.from_iterable(iterate_rows(lake, OBSERVATIONS, partition, Observation))
-    return (o for o in rows if wanted is None or o.frame_index in wanted)
+    for moment, rows, priors in _seen(lake, PERCEIVED, partition, moments, chosen):
+        yield Observation(
+            **_stamps(moment, rows), priors=priors, ego_speed_mps=moment.ego_speed_mps,
+            ego_yaw_rate_radps=moment.ego_yaw_rate_radps, **_columns(rows, _FOUND),
+        )  # fmt: skip
+
+
+def frame_of(moment: Moment, rows: Mapping[str, Any], priors: Mapping[str, np.ndarray]) -> Frame:
+    """A moment as one camera, one lidar and one radar saw it: its captures by kind, and the priors of their pairs."""
+    return Frame(
+        **_stamps(moment, rows), priors=priors, lidar_stamp_ns=_stamp(moment, rows, "lidar"),
+        **_values(moment, EgoColumns), **_columns(rows, _MEASURED),
+    )  # fmt: skip
+
+
+def priors_of(star: Star, chosen: Chosen) -> dict[str, np.ndarray]:
+    """Transforms of the pairs of chosen sensors; camera-radar only where it does not follow from the other two."""
+    found = {}
+    for pair in PAIRS:
+        a, b = (chosen.get(kind) for kind in FRAMES_OF_PAIR[pair])
+        T = None if a is None or b is None else between(star, a, b)
+        if T is not None:
+            found[pair] = T
+    if len(found) == len(PAIRS):
+        del found["camera_radar"]
+    return found
+
+
+def logged_stars(rows: Iterable[Mapping[str, Any]]) -> Mapping[str, Star]:
+    """The transforms that each log carries, by its name; the first where a log has several.
+
+    Args:
+        rows: of a manifest's extra, under `schemas.moments.PRIOR`.
+    """
+    found: dict[str, dict[tuple[str, str], np.ndarray]] = {}
+    for row in rows:
+        found.setdefault(row["log"], {}).setdefault((row["parent"], row["child"]), transform_of_row(row))
+    return found
+
+
+def _seen(
+    lake: Lake,
+    schema: TableSchema,
+    partition: Partition,
+    moments: Sequence[int] | None,
+    chosen: Chosen | None,
+) -> Iterator[tuple[Any, dict[str, Any], dict[str, np.ndarray]]]:
+    """Moments with the rows of the chosen sensors, by kind, and the priors of those."""
+    manifest = read_manifest(lake, schema, partition)
+    sensors = {} if manifest is None else sensors_of(manifest)
+    logged = () if manifest is None else manifest.extra.get(PRIOR, ())
+    names = {kind: name for name, kind in reversed(sensors.items())} if chosen is None else dict(chosen)
+    priors = {log: priors_of(star, names) for log, star in logged_stars(logged).items()}
+    for moment, found in joined(lake, schema, partition, list(names.values()), moments):
+        rows = {kind: found[name] for kind, name in names.items() if name in found}
+        if len(rows) >= min(2, len(names)):
+            yield moment, rows, priors.get(moment.log, {})
+
+
+def _stamps(moment: Any, rows: Mapping[str, Any]) -> dict[str, Any]:
+    stamps = {f"{kind}_stamp_ns": _stamp(moment, rows, kind) for kind in ("camera", "radar")}
+    return stamps | {
+        "frame_index": moment.moment,
+        "log": moment.log,
+        "drive": moment.drive,
+        "stamp_ns": _stamp(moment, rows, "lidar"),
+        "sensors": [kind for kind in ("camera", "lidar", "radar") if kind in rows],
+    }
+
+
+def _stamp(moment: Any, rows: Mapping[str, Any], kind: str) -> int:
+    stamp_ns: int = rows[kind].stamp_ns if kind in rows else moment.stamp_ns
+    return stamp_ns
+
+
+def _columns(rows: Mapping[str, Any], of_kind: Mapping[str, type]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for kind, columns in of_kind.items():
+        values |= _values(rows.get(kind, _NOTHING[columns]), columns)
+    return values
+
+
+def _values(row: Any, columns: type) -> dict[str, Any]:
+    return {f.name: getattr(row, f.name) for f in fields(columns)}

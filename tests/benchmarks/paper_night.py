@@ -51,7 +51,17 @@ def small_night(logs):
         )
         assert done.returncode in (0, 3), done.stderr[-2000:]
         counts = s3.faults()
-        tables = s3.stored("lake/frames/") + s3.stored("lake/observations/")
+        names = (
+            "moments",
+            "images",
+            "sweeps",
+            "scans",
+            "perceived",
+            "image_features",
+            "sweep_features",
+            "scan_features",
+        )
+        tables = sum(s3.stored(f"lake/{name}/") for name in names)
         pages = s3.stored("lake/report/fleet_days/")
     log_bytes = sum(p.stat().st_size for p in (logs / "logs").rglob("*") if p.is_file())
     days = json.loads(done.stdout.splitlines()[-1])["vehicle_days"]

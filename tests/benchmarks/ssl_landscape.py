@@ -31,7 +31,7 @@ from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.frame_objective import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
 from pipeline.learn.train.settings import LossConfig
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.views import frames_of, observations_of
+from pipeline.store.views import frames_of, observations_of, perceived_days
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
 DOFS = ("roll", "pitch", "yaw", "tx", "ty", "tz")
@@ -166,7 +166,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     lake = Lake.at(args.lake)
-    for partition in lake.partitions("observations"):
+    for partition in perceived_days(lake):
         told = json.loads((args.truth / partition.vehicle / f"{partition.day}.json").read_text())
         truth = {pair: np.array(told[f"T_{pair}"]) for pair in PAIRS}
         batch = day_batch(lake, partition, args.fleet, args.frames)

@@ -14,7 +14,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.makers.lakes import write_observations
-from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day, prior_columns
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 from tests.makers.stages import calibrate_day
 
 DAY = Partition("car 1", "2024-05-06")
@@ -170,16 +170,16 @@ def test_no_frames_at_all_are_refused(tmp_path):
 def test_a_prior_that_changes_over_the_day_is_refused(tmp_path, day):
     other = T_CAMERA_LIDAR.copy()
     other[0, 3] += 0.01
-    changed = [replace(o, **prior_columns("camera_lidar", other)) if i > 20 else o for i, o in enumerate(day)]
+    changed = [
+        replace(o, priors=o.priors | {"camera_lidar": other}) if i > 20 else o for i, o in enumerate(day)
+    ]
     assert "changes over the day" in refusal(tmp_path, changed)
 
 
 def test_a_missing_prior_is_refused_and_some_frames_without_one_are_not(tmp_path, day):
-    none = [
-        replace(o, **prior_columns("camera_lidar", None), **prior_columns("lidar_radar", None)) for o in day
-    ]
+    none = [replace(o, priors={}) for o in day]
     assert "no tf_static chain for any pair" in refusal(tmp_path / "none", none)
-    bare = [replace(o, **prior_columns("lidar_radar", None)) for o in day]
+    bare = [replace(o, priors={"camera_lidar": T_CAMERA_LIDAR}) for o in day]
     lake = lake_with(tmp_path / "a", bare)
     calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation")
     records = {r.pair: r for r in records_of(lake)}
@@ -192,7 +192,7 @@ def test_a_missing_prior_is_refused_and_some_frames_without_one_are_not(tmp_path
 
 def test_a_prior_file_is_read_beside_fleet_toml_and_its_content_is_part_of_the_work(tmp_path, day):
     fleet = fleet_of(prior={"source": "file", "file": "prior.json"})
-    lake = lake_with(tmp_path, [replace(o, **prior_columns("camera_lidar", None)) for o in day])
+    lake = lake_with(tmp_path, [replace(o, priors={"lidar_radar": T_LIDAR_RADAR}) for o in day])
     content = '{"T_camera_lidar": %s, "T_lidar_radar": %s}'
     path = tmp_path / "prior.json"
     path.write_text(content % (T_CAMERA_LIDAR.tolist(), T_LIDAR_RADAR.tolist()))

@@ -159,9 +159,9 @@ def test_damaged_tables_cost_the_fleet_nothing_and_the_next_night_heals_them(fle
     lake = tmp_path / "lake"
     shutil.copytree(first_night[0], lake)
     ill = Partition("vehicle-1", DAYS[0])
-    # Pages of the observations behind a whole footer, and the records' footers.
+    # Pages of a lidar's features behind a whole footer, and the records' footers.
     files = dict.fromkeys(lake.glob("calibrations/*/*.parquet"), 0)
-    files[Lake.at(lake).file("observations", ill)] = 4
+    files[Lake.at(lake).file("sweep_features", ill, "lidar")] = 4
     for path, keep in files.items():
         whole = path.read_bytes()
         path.write_bytes(whole[:keep] + bytes(len(whole) // 2) + whole[keep + len(whole) // 2 :])
@@ -229,7 +229,7 @@ def test_all_executors_record_the_same_though_a_worker_and_a_node_of_a_cluster_d
             assert process.poll() is None, process.communicate()
             time.sleep(0.02)
         tasks[0].kill()
-        while not any(Path(tmp_path / "ray").rglob("observations/*/*/*.parquet")):
+        while not any(Path(tmp_path / "ray").rglob("perceived/*/*/*.parquet")):
             assert time.monotonic() < deadline
             time.sleep(0.02)
         cluster.remove_node(node, allow_graceful=False)

@@ -45,7 +45,7 @@ def planted_differences_are_seen(soak, lake, wanted):
     assert differences(soak, lake, wanted) == []
     record = read_records(lake, CALIBRATIONS, CalibrationRecord)[0]
     commit_records(lake, CALIBRATIONS, [replace(record, work_key="other", recorded_at="", asserted_at="")])
-    frames = next(iter(lake.files.find(lake.root / "frames", "*/*/*.parquet")))
+    frames = next(iter(lake.files.find(lake.root / "sweeps", "*/*/*.parquet")))
     frames.write_bytes(frames.read_bytes() + b" ")
     next(iter(lake.files.find(lake.root / "report", "*/*/*.html"))).unlink()
     (frames.parent / ".writing-host-1-x.tmp").touch()

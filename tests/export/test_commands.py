@@ -18,7 +18,7 @@ from schemas.states import STATES, StateRow
 from tests.audit.fleet_records import vehicle_records
 from tests.makers.calibrations import CAMERA, T_BASE_LIDAR, calibration
 from tests.makers.lakes import write_observations
-from tests.makers.table_rows import make_row
+from tests.makers.table_rows import make_observation
 
 BOTH = ["azimuth", "elevation"]
 
@@ -70,8 +70,8 @@ def lake(tmp_path_factory):
         for r in first
     ]  # fmt: skip
     commit_records(tables, STATES, states)
-    row = make_row(
-        "observations", np.random.default_rng(2), nulls=True, camera_model=CAMERA.model, camera_K=CAMERA.K,
+    row = make_observation(
+        np.random.default_rng(2), nulls=True, camera_model=CAMERA.model, camera_K=CAMERA.K,
         camera_D=CAMERA.D, image_width_px=CAMERA.width_px, image_height_px=CAMERA.height_px,
     )  # fmt: skip
     write_observations(tables, Partition("v", days[0]), [row], "k")

@@ -20,7 +20,7 @@ from tests.makers.calibrations import SIGMA, T_CAMERA_LIDAR, T_LIDAR_RADAR
 from tests.makers.foxglove_logs import schema
 from tests.makers.lakes import write_frames, write_observations
 from tests.makers.stages import ingest_day
-from tests.makers.table_rows import make_row
+from tests.makers.table_rows import make_frame, make_observation, make_row
 from tests.makers.written_logs import fleet_config, jpeg
 
 pytest.importorskip("foxglove")
@@ -56,7 +56,7 @@ def frame(i):
     xyz = rng.uniform((3, -9, -2), (40, 9, 3), (600, 3)).astype(np.float32)
     clouds = {f"lidar_{n}_m": xyz[:, k] for k, n in enumerate("xyz")}
     clouds |= {"lidar_intensity": xyz[:, 0], "lidar_ring": None, "lidar_time_s": None}
-    return make_row("frames", rng, frame_index=i, drive=0, image=jpeg(i), **stamps, **INTRINSICS, **clouds)
+    return make_frame(rng, frame_index=i, drive=0, image=jpeg(i), **stamps, **INTRINSICS, **clouds)
 
 
 def observation(i):
@@ -65,7 +65,7 @@ def observation(i):
     boxes = {"road_user_boxes_px": np.array([[10, 20, 30, 40]], np.float32), "road_user_classes": ["car"],
              "road_user_scores": np.ones(1, np.float32)}  # fmt: skip
     edges = rng.uniform((5, -3, -1), (30, 3, 2), (7, 3)).astype(np.float32)
-    return make_row("observations", rng, frame_index=i, **same, **boxes, lidar_edge_xyz_m=edges)
+    return make_observation(rng, frame_index=i, **same, **boxes, lidar_edge_xyz_m=edges)
 
 
 def records():
@@ -220,7 +220,7 @@ def test_our_own_ingest_reads_the_drive_back(exported, tmp_path):
         )
         np.testing.assert_array_equal(a.lidar_xyz_m, b.lidar_xyz_m)
         np.testing.assert_array_equal(a.radar_range_rate_mps, b.radar_range_rate_mps)
-        np.testing.assert_allclose(b.prior_camera_lidar_tx_m, T_CAMERA_LIDAR[0, 3], atol=1e-12)
+        np.testing.assert_allclose(b.priors["camera_lidar"], T_CAMERA_LIDAR, atol=1e-12)
 
 
 def test_a_layout_lies_beside_it_that_names_topics_of_the_file(exported):

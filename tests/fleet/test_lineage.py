@@ -138,12 +138,12 @@ def test_a_server_gets_a_run_per_stage_below_the_nights(lineage, tmp_path, monke
     assert ingest["run"]["runId"] == run_id_of("ingest", "car", DAY, "key of ingest")
     assert ingest["run"]["facets"]["parent"]["run"]["runId"] == night["run"]["runId"]
     assert [(d["namespace"], d["name"]) for d in ingest["inputs"]] == [("file", "/logs/a.mcap")]
-    frames = f"{tmp_path}/lake/frames/vehicle=car/day={DAY}"
-    [made] = ingest["outputs"]
-    assert (made["namespace"], made["name"]) == ("file", frames)
+    tables = [f"{tmp_path}/lake/{t}/vehicle=car/day={DAY}" for t in ("moments", "images", "sweeps", "scans")]
+    assert [(d["namespace"], d["name"]) for d in ingest["outputs"]] == [("file", table) for table in tables]
+    made = ingest["outputs"][0]
     assert made["outputFacets"]["outputStatistics"]["rowCount"] == 7
     assert made["facets"]["version"]["datasetVersion"] == "key of ingest"
-    assert [d["name"] for d in perceive["inputs"]] == [frames]
+    assert [d["name"] for d in perceive["inputs"]] == tables
     assert [d["name"] for d in calibrate["outputs"]] == [f"{tmp_path}/lake/calibrations"]
     assert ingest["eventTime"] == "2026-03-03T01:00:02+00:00"
 
@@ -162,9 +162,8 @@ def test_what_lies_in_a_bucket_is_named_after_it(lineage):
     logs = {Partition("car", DAY): (RemoteLog("logs-of-cars", "car/a.mcap"),)}
     _, ended = list(NightLineage(night, logs).of_day(good_day()))[:2]
     assert [(d.namespace, d.name) for d in ended.inputs] == [("s3://logs-of-cars", "car/a.mcap")]
-    assert [(d.namespace, d.name) for d in ended.outputs] == [
-        ("s3://fleet", f"lake/frames/vehicle=car/day={DAY}")
-    ]
+    made = ended.outputs[0]
+    assert (made.namespace, made.name) == ("s3://fleet", f"lake/moments/vehicle=car/day={DAY}")
 
 
 def test_what_was_up_to_date_is_not_told_again(lineage):

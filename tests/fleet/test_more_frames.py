@@ -22,7 +22,7 @@ from pipeline.stages import INGEST
 from pipeline.store.partitions import Lake, Partition
 from pipeline.work import Task
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord
-from schemas.frames import SWEEPS_LOGGED, SWEEPS_PLANNED
+from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
 from tests.fleet.test_nightly import DAY, FLEET
 from tests.makers.written_logs import Kit, fleet_config
 

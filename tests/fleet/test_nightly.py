@@ -201,7 +201,7 @@ def test_a_surprise_fails_its_day_with_a_traceback(night, monkeypatch):
 
 @pytest.mark.parametrize("error", [DamagedError, CollectedError])
 def test_what_is_damaged_or_left_the_lake_is_set_aside_and_made_anew_at_once(error, night, monkeypatch):
-    path = Path(night.lake.file("frames", Partition("car", DAY)))
+    path = Path(night.lake.file("moments", Partition("car", DAY)))
     path.parent.mkdir(parents=True)
     path.write_bytes(b"damaged")
     script = StagesThatSay(monkeypatch, night.lake)

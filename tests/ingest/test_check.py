@@ -98,7 +98,7 @@ def test_a_complete_drive_is_fit_and_its_facts_are_right(kit, tmp_path):
     # Its points lie anywhere, whatever their ring numbers say: no rows.
     frames_of = dict.fromkeys(PAIRS, 40)
     assert report.evidence == Evidence(40, True, 1.0, 1.0, True, 0, 1.0, 1.0, "", frames_of=frames_of)
-    assert (report.sync.sweeps, report.sync.trios) == (40, 40)
+    assert (report.sync.sweeps, report.sync.moments) == (40, 40)
     assert report.sync.camera_median_ms == pytest.approx(1.0)
     assert report.sync.radar_median_ms == pytest.approx(2.0)
     assert report.frame_ids == {"camera": ["camera_optical"], "lidar": ["lidar"], "radar": ["radar"]}
@@ -144,7 +144,7 @@ def test_a_rig_of_two_sensors_is_judged_by_its_one_pair(kit, tmp_path, sensor):
     (pair,) = {v.pair for v in report.verdicts}
     assert sensor not in FRAMES_OF_PAIR[pair]
     assert report.answer in ("yes", "partly")
-    assert (report.sync.sweeps, report.sync.trios) == (40, 40)
+    assert (report.sync.sweeps, report.sync.moments) == (40, 40)
 
 
 def test_sensors_that_never_meet_are_told_from_absent_ones():

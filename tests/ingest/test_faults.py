@@ -8,11 +8,11 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.ingest.containers.mcap import McapLog
-from pipeline.ingest.sync import Rejection
+from pipeline.ingest.sync import Rejection, none_near
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import ingested
 from schemas.calibrations import SENSORS
-from schemas.frames import SENSORS_ABSENT
+from schemas.moments import SENSORS_ABSENT
 from tests.makers.stages import ingest_day
 
 
@@ -125,7 +125,7 @@ def test_a_sensor_that_is_missing_is_named_by_its_topic_and_leaves_the_others(
     manifest = ingested(Lake.at(tmp_path / "lake"), Partition("car", "2023-11-14"))
     assert name in manifest.extra[SENSORS_ABSENT][sensor]
     if sensor == "lidar":
-        assert all(f.prior_camera_radar_qw is not None for f in frames)
+        assert all(set(f.priors) == {"camera_radar"} for f in frames)
         assert all(f.stamp_ns == f.radar_stamp_ns for f in frames)
 
 
@@ -191,7 +191,9 @@ def test_each_fault_of_one_frame_costs_that_frame_under_its_own_name(kit, tmp_pa
     result, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"), fleet=paper)
     assert [(f.stamp_ns - start) // period for f in frames] == [0, 11]
     assert [f.frame_index for f in frames] == [0, 1]
-    counted = {k: v for k, v in result.rejected.items() if k in set(Rejection)}
+    counted = {
+        k: v for k, v in result.rejected.items() if k in {*Rejection, none_near("camera"), none_near("radar")}
+    }
     assert counted == {
         "image_damaged": 2,
         "too_few_lidar_points": 1,
@@ -241,7 +243,7 @@ def test_intrinsics_that_are_not_calibrated_cost_the_camera_with_what_to_do(kit,
 
 def test_without_a_chain_of_transforms_there_is_no_prior_rather_than_an_identity(kit, tmp_path, run_ingest):
     result, frames = run_ingest(kit.Kit().drive().without("/tf_static").mcap(tmp_path / "a.mcap"))
-    assert all(f.prior_camera_lidar_qw is None and f.prior_lidar_radar_tx_m is None for f in frames)
+    assert all(f.priors == {} for f in frames)
     assert result.rejected["frames_without_prior"] == 4
     assert "/tf_static has no chain from camera_optical to lidar" in result.reason
 
@@ -294,7 +296,7 @@ def test_a_refused_day_leaves_the_lake_as_it_was(kit, tmp_path, run_ingest):
     lake, day = Lake.at(tmp_path / "lake"), Partition("car", "2023-11-14")
     refused = kit.Kit().drive().without(kit.RADAR).without(kit.LIDAR).mcap(tmp_path / "b.mcap")
     assert run_ingest(refused)[0].status == "refused"
-    assert lake.partitions("frames") == []
+    assert lake.partitions("moments") == []
     key = run_ingest(log)[0].work_key
     assert run_ingest(refused)[0].status == "refused"
     assert ingested(lake, day).work_key == key
@@ -336,8 +338,7 @@ def test_a_prior_file_stands_in_for_tf_static_and_enters_the_work_key(kit, tmp_p
         run_ingest(log, fleet=fleet, file=toml)
     file.write_text(json.dumps({"T_camera_lidar": T.tolist(), "T_lidar_radar": np.eye(4).tolist()}))
     first, frames = run_ingest(log, fleet=fleet, file=toml)
-    assert frames[0].prior_camera_lidar_tx_m == 0.25
-    assert frames[0].prior_camera_lidar_qw == 1.0
+    np.testing.assert_array_equal(frames[0].priors["camera_lidar"], T)
     T[0, 3] = 0.5
     file.write_text(json.dumps({"T_camera_lidar": T.tolist(), "T_lidar_radar": np.eye(4).tolist()}))
     assert run_ingest(log, fleet=fleet, file=toml)[0].work_key != first.work_key

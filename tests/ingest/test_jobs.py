@@ -52,6 +52,6 @@ def test_check_as_json_is_one_object_on_stdout(kit, tmp_path, fleet, capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["answer"] == "yes"
     assert {v["pair"] for v in report["verdicts"]} == {"camera_lidar", "lidar_radar", "camera_radar"}
-    assert report["sync"]["trios"] == 40
+    assert report["sync"]["moments"] == 40
     with pytest.raises(ConfigError, match="no rig"):
         check(fleet, tmp_path / "a.mcap", rig="truck")

@@ -1,4 +1,4 @@
-"""Trios by stamps alone: within the gate, one to one, each sweep accounted for."""
+"""Moments by stamps alone: within the gate, one to one, each sweep accounted for."""
 
 import numpy as np
 import pytest
@@ -9,8 +9,8 @@ from pipeline.ingest.sync import (
     constant_gap_ns,
     first_occurrences,
     match_by_motion,
+    match_by_stamp,
     match_nearest,
-    match_trios,
     motion_gates_ns,
     number_drives,
 )
@@ -27,18 +27,24 @@ def seen(stamps_ns, places):
 
 @settings(max_examples=200, deadline=None)
 @given(stamps, stamps, stamps)
-def test_trios_lie_within_the_gate_are_one_to_one_and_no_sweep_is_lost(lidar, camera, radar):
-    trios = match_trios(lidar, camera, radar, GATE)
-    for own, stamps_ns in ((trios.lidar, lidar), (trios.camera, camera), (trios.radar, radar)):
+def test_moments_lie_within_the_gate_are_one_to_one_and_no_sweep_is_lost(lidar, camera, radar):
+    found = match_by_stamp(lidar, {"camera": camera, "radar": radar}, GATE)
+    for own, stamps_ns in (
+        (found.anchor, lidar),
+        (found.others["camera"], camera),
+        (found.others["radar"], radar),
+    ):
         assert len(set(stamps_ns[own[own >= 0]])) == np.sum(own >= 0)
-    together = np.stack([lidar[trios.lidar], seen(camera, trios.camera), seen(radar, trios.radar)])
+    together = np.stack(
+        [lidar[found.anchor], seen(camera, found.others["camera"]), seen(radar, found.others["radar"])]
+    )
     apart = np.nanmax(together, axis=0) - np.nanmin(together, axis=0)
     assert apart.size == 0 or apart.max() <= GATE
-    whole = (trios.camera >= 0) & (trios.radar >= 0)
+    whole = (found.others["camera"] >= 0) & (found.others["radar"] >= 0)
     assert whole.all() or not whole.any()  # stamps of these days are less than a second apart
-    assert np.all((trios.camera >= 0) | (trios.radar >= 0))
-    assert np.all(np.diff(lidar[trios.lidar]) > 0)
-    assert len(trios.lidar) + sum(trios.rejected.values()) == len(lidar)
+    assert np.all((found.others["camera"] >= 0) | (found.others["radar"] >= 0))
+    assert np.all(np.diff(lidar[found.anchor]) > 0)
+    assert len(found.anchor) + sum(found.rejected.values()) == len(lidar)
 
 
 @settings(max_examples=100, deadline=None)
@@ -46,10 +52,13 @@ def test_trios_lie_within_the_gate_are_one_to_one_and_no_sweep_is_lost(lidar, ca
 def test_the_order_of_logging_does_not_matter(lidar, camera, radar, seed):
     rng = np.random.default_rng(seed)
     mixed = [rng.permutation(s) for s in (lidar, camera, radar)]
-    a, b = match_trios(lidar, camera, radar, GATE), match_trios(*mixed, GATE)
-    assert lidar[a.lidar].tolist() == mixed[0][b.lidar].tolist()
-    np.testing.assert_array_equal(seen(camera, a.camera), seen(mixed[1], b.camera))
-    np.testing.assert_array_equal(seen(radar, a.radar), seen(mixed[2], b.radar))
+    a, b = (
+        match_by_stamp(lidar, {"camera": camera, "radar": radar}, GATE),
+        match_by_stamp(mixed[0], {"camera": mixed[1], "radar": mixed[2]}, GATE),
+    )
+    assert lidar[a.anchor].tolist() == mixed[0][b.anchor].tolist()
+    np.testing.assert_array_equal(seen(camera, a.others["camera"]), seen(mixed[1], b.others["camera"]))
+    np.testing.assert_array_equal(seen(radar, a.others["radar"]), seen(mixed[2], b.others["radar"]))
     assert a.rejected == b.rejected
 
 
@@ -68,16 +77,49 @@ def test_no_pair_could_come_closer_than_the_partners_that_it_got(a, b):
 
 
 def test_a_gate_of_five_milliseconds_holds_between_every_two_sensors():
-    ms = 1_000_000
-    lidar, camera = np.array([0]), np.array([3 * ms])
-    assert len(match_trios(lidar, camera, np.array([-2 * ms]), 5 * ms).lidar) == 1
-    apart = match_trios(lidar, camera, np.array([-2 * ms - 1]), 5 * ms)
-    assert dict(apart.rejected) == {"camera_radar_outside_gate": 1}
+    lidar, camera = np.array([0]), np.array([3 * MS])
+    found = match_by_stamp(lidar, {"camera": camera, "radar": np.array([-2 * MS])}, 5 * MS)
+    assert (found.others["camera"].tolist(), found.others["radar"].tolist()) == ([0], [0])
+    apart = match_by_stamp(lidar, {"camera": camera, "radar": np.array([-2 * MS - 1])}, 5 * MS)
+    # The one farther from the sweep goes; the other's pair has what it needs.
+    assert (apart.others["camera"].tolist(), apart.others["radar"].tolist()) == ([-1], [0])
+    lidar, camera, radar = (np.array([0, 100 * MS]) + [0, late] for late in (0, 3 * MS, -2 * MS - 1))
+    beside = match_by_stamp(lidar, {"camera": camera, "radar": radar}, 5 * MS)
+    assert beside.anchor.tolist() == [0]  # where a whole moment shows the same
+    assert dict(beside.rejected) == {"camera_radar_outside_gate": 1}
+
+
+@settings(max_examples=100, deadline=None)
+@given(stamps, st.dictionaries(st.sampled_from("abcdefg"), stamps), st.integers(0, 40))
+def test_of_any_number_of_sensors_no_sweep_is_lost_and_every_two_captures_lie_within_the_gate(
+    lidar, others, gate
+):
+    found = match_by_motion(lidar, others, np.full(len(lidar), gate))
+    assert list(found.others) == list(others)
+    together = [np.zeros(len(found.anchor))]
+    for name, stamps_ns in others.items():
+        own = found.others[name]
+        assert len(set(stamps_ns[own[own >= 0]])) == np.sum(own >= 0)
+        together.append(seen(stamps_ns, own) - lidar[found.anchor] - found.constant_ns[name])
+    apart = np.nanmax(together, axis=0) - np.nanmin(together, axis=0)
+    assert apart.size == 0 or apart.max() <= gate
+    assert len(found.anchor) + sum(found.rejected.values()) == len(lidar)
+
+
+def test_a_moment_of_many_sensors_may_lack_some_and_not_a_third_of_them():
+    sweeps = ticks(10, 0)
+    others = {name: sweeps.copy() for name in "abcde"}
+    others["a"] = others["a"][::2]
+    found = match_by_motion(sweeps, others, gates(sweeps, speed=0.0))
+    assert len(found.anchor) == len(sweeps)  # five of six sensors in every other moment
+    others["b"] = others["b"][::2]
+    found = match_by_motion(sweeps, others, gates(sweeps, speed=0.0))
+    assert dict(found.rejected) == {"no_a_in_gate": len(sweeps) // 2}
 
 
 def test_reasons_name_the_sensor_that_is_missing():
     sweeps = np.arange(5) * 100
-    assert dict(match_trios(sweeps, sweeps[1:], sweeps[:3], 7).rejected) == {
+    assert dict(match_by_stamp(sweeps, {"camera": sweeps[1:], "radar": sweeps[:3]}, 7).rejected) == {
         "no_camera_in_gate": 1,
         "no_radar_in_gate": 2,
     }
@@ -98,66 +140,70 @@ def gates(sweeps, speed=20.0, yaw_rate=0.1):
 def test_by_motion_too_no_sweep_is_lost_and_gaps_beyond_the_constant_ones_stay_within_the_gate(
     lidar, camera, radar, gate
 ):
-    trios = match_by_motion(lidar, camera, radar, np.full(len(lidar), gate))
-    for own, stamps_ns in ((trios.lidar, lidar), (trios.camera, camera), (trios.radar, radar)):
+    found = match_by_motion(lidar, {"camera": camera, "radar": radar}, np.full(len(lidar), gate))
+    for own, stamps_ns in (
+        (found.anchor, lidar),
+        (found.others["camera"], camera),
+        (found.others["radar"], radar),
+    ):
         assert len(set(stamps_ns[own[own >= 0]])) == np.sum(own >= 0)
     apart = np.stack(
         [
-            seen(camera, trios.camera) - lidar[trios.lidar] - trios.camera_gap_ns,
-            seen(radar, trios.radar) - lidar[trios.lidar] - trios.radar_gap_ns,
-            np.zeros(len(trios.lidar)),
+            seen(camera, found.others["camera"]) - lidar[found.anchor] - found.constant_ns["camera"],
+            seen(radar, found.others["radar"]) - lidar[found.anchor] - found.constant_ns["radar"],
+            np.zeros(len(found.anchor)),
         ]
     )
     assert apart.size == 0 or (np.nanmax(apart, axis=0) - np.nanmin(apart, axis=0)).max() <= gate
-    assert np.all(np.diff(lidar[trios.lidar]) > 0)
-    assert len(trios.lidar) + sum(trios.rejected.values()) == len(lidar)
+    assert np.all(np.diff(lidar[found.anchor]) > 0)
+    assert len(found.anchor) + sum(found.rejected.values()) == len(lidar)
 
 
 def test_every_sweep_of_free_running_sensors_gets_the_image_and_scan_nearest_to_it():
     sweeps, images, scans = ticks(10.03, 3, jitter_ms=0.1), ticks(30, 11), ticks(13, 40)
-    trios = match_by_motion(sweeps, images, scans, gates(sweeps, speed=35.0))
-    assert (trios.camera_gap_ns, trios.radar_gap_ns) == (0, 0)
-    assert min(trios.radar) >= 0
-    assert len(trios.lidar) >= len(sweeps) - 2  # the last ones outlive the radar
-    for stamps_ns, own in ((images, trios.camera), (scans, trios.radar)):
-        distance = np.abs(stamps_ns[None] - sweeps[trios.lidar][:, None])
+    found = match_by_motion(sweeps, {"camera": images, "radar": scans}, gates(sweeps, speed=35.0))
+    assert (found.constant_ns["camera"], found.constant_ns["radar"]) == (0, 0)
+    assert min(found.others["radar"]) >= 0
+    assert len(found.anchor) >= len(sweeps) - 2  # the last ones outlive the radar
+    for stamps_ns, own in ((images, found.others["camera"]), (scans, found.others["radar"])):
+        distance = np.abs(stamps_ns[None] - sweeps[found.anchor][:, None])
         np.testing.assert_array_equal(distance.argmin(1), own)
-    strict = match_trios(sweeps, images, scans, 5 * MS)
-    assert np.sum((strict.camera >= 0) & (strict.radar >= 0)) < 0.1 * len(sweeps)
+    strict = match_by_stamp(sweeps, {"camera": images, "radar": scans}, 5 * MS)
+    assert np.sum((strict.others["camera"] >= 0) & (strict.others["radar"] >= 0)) < 0.1 * len(sweeps)
 
 
 @pytest.mark.parametrize("offset_ms", [-60.0, -25.0, 0.0, 25.0, 49.0, 50.0, 60.0])
 def test_a_constant_offset_costs_no_sweep_and_is_found_up_to_whole_periods(offset_ms):
     sweeps = ticks(10, 0, jitter_ms=0.5)
     images, scans = sweeps + int(offset_ms * MS), sweeps + 2 * MS
-    trios = match_by_motion(sweeps, images, scans, gates(sweeps, speed=40.0))
-    assert len(trios.lidar) >= len(sweeps) - 1
-    found_ms = trios.camera_gap_ns / MS
+    found = match_by_motion(sweeps, {"camera": images, "radar": scans}, gates(sweeps, speed=40.0))
+    assert len(found.anchor) >= len(sweeps) - 1
+    found_ms = found.constant_ns["camera"] / MS
     assert (found_ms - offset_ms + 50) % 100 - 50 == pytest.approx(0, abs=0.2)
     assert abs(found_ms) <= 50.2
-    assert trios.radar_gap_ns / MS == pytest.approx(2.0, abs=0.2)
+    assert found.constant_ns["radar"] / MS == pytest.approx(2.0, abs=0.2)
 
 
 def test_where_a_message_is_missing_the_sweep_goes_and_takes_no_neighbour_s():
     sweeps = ticks(10, 0)
     images = np.delete(sweeps + MS, [5, 6, 17])
-    trios = match_by_motion(sweeps, images, sweeps, gates(sweeps, speed=0.0))
-    assert dict(trios.rejected) == {"no_camera_in_gate": 3}
-    np.testing.assert_array_equal(np.setdiff1d(np.arange(len(sweeps)), trios.lidar), [5, 6, 17])
+    found = match_by_motion(sweeps, {"camera": images, "radar": sweeps}, gates(sweeps, speed=0.0))
+    assert dict(found.rejected) == {"no_camera_in_gate": 3}
+    np.testing.assert_array_equal(np.setdiff1d(np.arange(len(sweeps)), found.anchor), [5, 6, 17])
 
 
 def test_a_sensor_that_falls_silent_leaves_the_others_their_moments():
     sweeps = ticks(10, 0)
     scans = sweeps[:300] + MS
-    trios = match_by_motion(sweeps, sweeps + 2 * MS, scans, gates(sweeps, speed=0.0))
-    without = np.flatnonzero(trios.radar < 0)
+    found = match_by_motion(sweeps, {"camera": sweeps + 2 * MS, "radar": scans}, gates(sweeps, speed=0.0))
+    without = np.flatnonzero(found.others["radar"] < 0)
     # Beside the last whole moment a second long nothing new is to be seen.
-    np.testing.assert_array_equal(trios.lidar[without], np.arange(310, len(sweeps)))
-    assert dict(trios.rejected) == {"no_radar_in_gate": 10}
-    assert trios.camera.min() >= 0
-    silent = match_by_motion(sweeps, sweeps[:0], scans, gates(sweeps, speed=0.0))
-    np.testing.assert_array_equal(silent.lidar, np.arange(300))
-    assert set(silent.camera) == {-1}
+    np.testing.assert_array_equal(found.anchor[without], np.arange(310, len(sweeps)))
+    assert dict(found.rejected) == {"no_radar_in_gate": 10}
+    assert found.others["camera"].min() >= 0
+    silent = match_by_motion(sweeps, {"camera": sweeps[:0], "radar": scans}, gates(sweeps, speed=0.0))
+    np.testing.assert_array_equal(silent.anchor, np.arange(300))
+    assert set(silent.others["camera"]) == {-1}
     assert dict(silent.rejected) == {"no_radar_in_gate": 300}
 
 

@@ -16,7 +16,7 @@ from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
 from tests.conftest import REPO
 from tests.makers.lakes import write_frames
-from tests.makers.table_rows import make_row
+from tests.makers.table_rows import make_frame
 
 DAYS, HELD = 12, (3, 11)
 CAMERA = Camera("plumb_bob", np.array([[200.0, 0, 160], [0, 200, 100], [0, 0, 1]]), np.zeros(5), 320, 200)
@@ -29,9 +29,7 @@ def frame(rng):
     points = {"lidar_x_m": np.full_like(y, 12.0), "lidar_y_m": y, "lidar_z_m": z}
     picture = {"image": grey, "image_format": "png", "image_width_px": 320, "image_height_px": 200}
     camera = {"camera_model": CAMERA.model, "camera_K": CAMERA.K, "camera_D": CAMERA.D}
-    return make_row(
-        "frames", rng, **picture, **camera, **{k: v.astype(np.float32) for k, v in points.items()}
-    )
+    return make_frame(rng, **picture, **camera, **{k: v.astype(np.float32) for k, v in points.items()})
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,7 @@ def nothing_new(folder: Path) -> list[str]:
 def full_disk(folder: Path) -> list[str]:
     command = night(rig_of(folder, car="default"))
     (folder / "lake").mkdir()
-    (folder / "lake" / "frames").touch()  # no folder can be made here
+    (folder / "lake" / "moments").touch()  # no folder can be made here
     return command
 
 

@@ -1,24 +1,25 @@
 """Lakes that hold given frames and observations, as ingest and perceive would have written them."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
+from pipeline.rig.prior import to_rows
+from pipeline.store.moments import write_moments
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import write_partition
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.calibrations import FRAMES_OF_PAIR
+from schemas.captures import CAPTURES
+from schemas.features import FEATURES
+from schemas.frames import Frame
+from schemas.moments import MOMENTS, PERCEIVED, PRIOR, Moment, Perceived
+from schemas.observations import Observation
 
 
 def write_frames(
-    lake: Lake,
-    partition: Partition,
-    frames: Sequence[Frame],
-    key: str = "frames-key",
-    group: int = 4,
-    **extra: Any,
+    lake: Lake, partition: Partition, frames: Sequence[Frame], key: str = "frames-key", **extra: Any
 ) -> None:
-    """Put frames into a lake, so many in a row group."""
-    _write(lake, FRAMES, partition, frames, key, group, extra)
+    """Put the frames of a rig with a camera, a lidar and a radar into a lake."""
+    _write(lake, partition, MOMENTS, frames, key, extra)
 
 
 def write_observations(
@@ -26,15 +27,43 @@ def write_observations(
     partition: Partition,
     observations: Sequence[Observation],
     key: str = "observations-key",
-    group: int = 4,
     **extra: Any,
 ) -> None:
-    """Put observations into a lake, so many in a row group."""
-    _write(lake, OBSERVATIONS, partition, observations, key, group, extra)
+    """Put the observations of such a rig into a lake."""
+    _write(lake, partition, PERCEIVED, observations, key, extra)
 
 
-def _write(lake, schema, partition, rows, key, group, extra):
-    with write_partition(lake, schema, partition, key, "test") as writer:
-        for first in range(0, len(rows), group):
-            writer.append(rows[first : first + group])
-        writer.describe(kept={"frames": len(rows)}, rejected={}, **extra)
+def joined_of(seen: Frame | Observation) -> tuple[Moment | Perceived, dict[str, Any]]:
+    """The rows that a view joins: the moment's, and one of each sensor."""
+    tables = CAPTURES if isinstance(seen, Frame) else FEATURES
+    return _moment(seen), {kind: _part(seen, kind, tables[kind]) for kind in seen.sensors}
+
+
+def _write(lake, partition, schema, seen, key, extra):
+    with write_moments(lake, schema, partition, key, "test") as writer:
+        for one in seen:
+            writer.append(*joined_of(one))
+        counts = {"kept": {"frames": len(seen)}, "rejected": {}}
+        writer.describe(**counts, **{PRIOR: prior_rows(seen)} | extra)
+
+
+def prior_rows(seen):
+    """What a manifest says of the priors that frames or observations carry, by log."""
+    rows = []
+    for one in seen:
+        star = {FRAMES_OF_PAIR[pair]: T for pair, T in one.priors.items()}
+        rows += [{"log": one.log, **row} for row in to_rows([star])]
+    return [row for i, row in enumerate(rows) if row not in rows[:i]]
+
+
+def _moment(one):
+    kind = Moment if isinstance(one, Frame) else Perceived
+    own = {"moment": one.frame_index, "rows": {}, "gap_ns": {}}
+    return kind(**{f.name: own[f.name] if f.name in own else getattr(one, f.name) for f in fields(kind)})
+
+
+def _part(one, kind, table):
+    stamp_ns = one.stamp_ns if kind == "lidar" else getattr(one, f"{kind}_stamp_ns")
+    own = {"moment": one.frame_index, "stamp_ns": stamp_ns}
+    row = table.row_type
+    return row(**{f.name: own[f.name] if f.name in own else getattr(one, f.name) for f in fields(row)})

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, to_quaternion, transform_points
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, transform_points
+from schemas.calibrations import SENSORS
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # camera axes of lidar axes
@@ -18,6 +19,7 @@ T_CAMERA_LIDAR = from_rotation_translation(
 T_LIDAR_RADAR = from_rotation_translation(
     exp_so3(np.array([0.01, 0.005, -0.03])), np.array([0.6, 0.05, -0.9])
 )
+PRIORS = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_LIDAR_RADAR}
 CAMERA = Camera(
     "plumb_bob", np.array([[500.0, 0, 319.5], [0, 500.0, 159.5], [0, 0, 1]]), np.zeros(0), 640, 320
 )
@@ -62,7 +64,7 @@ def make_observation(
         "stamp_ns": stamp_ns, "camera_stamp_ns": stamp_ns + 1_000_000, "radar_stamp_ns": stamp_ns - 1_000_000,
         "image_width_px": CAMERA.width_px, "image_height_px": CAMERA.height_px,
         "camera_model": CAMERA.model, "camera_K": CAMERA.K, "camera_D": CAMERA.D,
-        **prior_columns("camera_lidar", T_CAMERA_LIDAR), **prior_columns("lidar_radar", T_LIDAR_RADAR),
+        "priors": PRIORS, "sensors": list(SENSORS),
         "ego_speed_mps": 10.0, "ego_yaw_rate_radps": None,
         "labels_png": cv2.imencode(".png", labels)[1].tobytes(), "label_scale": LABEL_SCALE,
         "sky_fraction": float(np.mean(labels == SKY)), "drivable_fraction": float(np.mean(labels == ROAD)),
@@ -151,10 +153,3 @@ def free_sector(cells_radar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     index = np.digitize(azimuth, edges) - 1
     reach = np.array([distance[index == k].max(initial=0.0) for k in range(75)])
     return (edges[:-1] + edges[1:]) / 2, reach
-
-
-def prior_columns(pair: str, T: np.ndarray | None) -> dict:
-    """The seven prior columns of a pair."""
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    values = [None] * 7 if T is None else [*map(float, to_quaternion(T)), *map(float, T[:3, 3])]
-    return {f"prior_{pair}_{name}": value for name, value in zip(names, values, strict=True)}

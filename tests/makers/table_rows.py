@@ -1,20 +1,27 @@
 """Rows of any table, filled by what its schema promises."""
 
+from dataclasses import fields
+
 import numpy as np
 
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, SENSORS, CalibrationRecord
+from schemas.captures import CAPTURES
 from schemas.drift import DRIFT, DriftFinding
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.features import FEATURES
+from schemas.frames import Frame
+from schemas.moments import MOMENTS, PERCEIVED
+from schemas.observations import Observation
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import STATES, StateRow
 from schemas.training import TRAINING, TrainingRow
+from tests.makers.whole_tables import FRAMES, OBSERVATIONS, WholeFrame, WholeObservation
 
 ROW_TYPES = {
-    FRAMES.name: (FRAMES, Frame),
-    OBSERVATIONS.name: (OBSERVATIONS, Observation),
+    **{t.name: (t, t.row_type) for t in (MOMENTS, PERCEIVED, *CAPTURES.values(), *FEATURES.values())},
+    FRAMES.name: (FRAMES, WholeFrame),
+    OBSERVATIONS.name: (OBSERVATIONS, WholeObservation),
     TRAINING.name: (TRAINING, TrainingRow),
     CALIBRATIONS.name: (CALIBRATIONS, CalibrationRecord),
     DRIFT.name: (DRIFT, DriftFinding),
@@ -28,13 +35,30 @@ ROW_TYPES = {
 def make_row(table, rng, *, nulls=False, free=5, **values):
     """A row of `table` whose fields are random values of the right kind, or null where that is allowed."""
     schema, row_type = ROW_TYPES[table]
-    values = {"sensors": list(SENSORS)} | values if "sensors" in [c.name for c in schema.columns] else values
     if values.get("pair") in FRAMES_OF_PAIR:
         values = (
             dict(zip(("parent_frame", "child_frame"), FRAMES_OF_PAIR[values["pair"]], strict=True)) | values
         )
     filled = {c.name: None if nulls and c.nullable else make_value(c, rng, free) for c in schema.columns}
     return row_type(**filled | values)
+
+
+def make_frame(rng, *, nulls=False, free=5, **values):
+    """A frame of all three sensors, likewise."""
+    return _view(Frame, FRAMES, rng, nulls, free, values)
+
+
+def make_observation(rng, *, nulls=False, free=5, **values):
+    """An observation of all three sensors, likewise."""
+    return _view(Observation, OBSERVATIONS, rng, nulls, free, values)
+
+
+def _view(view, schema, rng, nulls, free, values):
+    columns = {c.name: None if nulls and c.nullable else make_value(c, rng, free) for c in schema.columns}
+    stamps = {f"{kind}_stamp_ns": columns["stamp_ns"] for kind in SENSORS}
+    own = {"log": "a.mcap", "drive": 0, "sensors": list(SENSORS), "priors": {}, **stamps}
+    own |= {} if "ego_speed_mps" in columns else {"ego_speed_mps": None, "ego_yaw_rate_radps": None}
+    return view(**{f.name: (columns | own | values)[f.name] for f in fields(view)})
 
 
 def make_value(column, rng, free):

@@ -70,7 +70,8 @@ def make_frame(index: int = 0, *, speed: float = 8.0, car_m: float = 20.0, car_s
     stamp_ns = 1_700_000_000_000_000_000 + index * 100_000_000
     boxes = [[60, 100, 140, 150], [200, 90, 220, 140], [10, 10, 20, 30], [300, 100, 330, 120]]
     values = {f.name: None for f in fields(Frame)} | {
-        "sensors": list(SENSORS), "frame_index": index, "log": "made.mcap", "drive": 0, "stamp_ns": stamp_ns,
+        "sensors": list(SENSORS), "priors": {},
+        "frame_index": index, "log": "made.mcap", "drive": 0, "stamp_ns": stamp_ns,
         "camera_stamp_ns": stamp_ns, "lidar_stamp_ns": stamp_ns, "radar_stamp_ns": stamp_ns,
         "image": cv2.imencode(".jpg", _image())[1].tobytes(), "image_format": "jpeg",
         "image_width_px": WIDTH, "image_height_px": HEIGHT, "camera_model": "plumb_bob",

@@ -11,9 +11,9 @@ from pipeline.config import PerceiveConfig
 from pipeline.geometry.se3 import exp_so3
 from pipeline.perceive.camera import TopicSource
 from pipeline.perceive.deskew import deskew_straight, velocity_ahead
-from pipeline.perceive.stage import AS_LOGGED, BY_DOPPLER, perceive_frame
-from pipeline.perceive.tracks import TrackState
+from pipeline.perceive.stage import AS_LOGGED, BY_DOPPLER, Shown, Sources, perceive_moment
 from pipeline.rigs import TopicSemantics
+from tests.makers.lakes import joined_of
 
 SPEED_MPS = 8.0  # of the made frames
 
@@ -35,19 +35,23 @@ def skewed(made_frame, **changes):
     """A frame without odometry, as a lidar that turns within 100 ms would log it."""
     frame = made_frame(3)
     time_s = np.linspace(-0.1, 0.0, len(frame.lidar_x_m)).astype(np.float32)
-    prior = {"prior_lidar_radar_qw": 1.0, **{f"prior_lidar_radar_q{k}": 0.0 for k in "xyz"}}
+    prior = {"priors": {"lidar_radar": np.eye(4)}}
     as_seen = {"lidar_x_m": (frame.lidar_x_m - SPEED_MPS * time_s).astype(np.float32), "lidar_time_s": time_s}
-    return frame, replace(frame, lidar_deskewed=False, **as_seen, **prior, **changes)
+    return frame, replace(frame, lidar_deskewed=False, **(as_seen | prior | changes))
 
 
 def perceived(frame, **options):
     source = TopicSource(TopicSemantics(source="topics", labels="/l", detections="/d"), PerceiveConfig())
-    return perceive_frame(frame, source, PerceiveConfig(), TrackState.empty(), **options)
+    moment, captures = joined_of(frame)
+    star = {tuple(pair.split("_")): T for pair, T in frame.priors.items()}
+    shown = Shown(moment, captures, {kind: kind for kind in captures}, star)
+    sources = Sources({"camera": source}, {"lidar": None}, {"radar": None}, PerceiveConfig(), **options)
+    return perceive_moment(shown, sources, {})
 
 
 def farthest(found, frame):
     """How far the sampled cloud lies from the points of a frame, at most."""
-    cloud = found.observation.lidar_map_xyz_m
+    cloud = found.features["lidar"].lidar_map_xyz_m
     apart = np.linalg.norm(cloud[:, None] - frame.lidar_xyz_m[None], axis=2)
     return apart.min(1).max()
 
@@ -55,18 +59,18 @@ def farthest(found, frame):
 def test_a_sweep_without_odometry_is_moved_by_the_radar_s_velocity(made_frame):
     right, frame = skewed(made_frame)
     found = perceived(frame)
-    assert found.deskew == BY_DOPPLER
+    assert found.notes == [BY_DOPPLER]
     # 0.05 m/s of Doppler noise times a tenth of a second
     assert farthest(found, right) < 0.03
     left = perceived(frame, deskew=False)
-    assert left.deskew is None
+    assert left.notes == []
     assert farthest(left, frame) == 0.0
     assert farthest(left, right) > 0.2
 
 
 @pytest.mark.parametrize(
     "changes",
-    [{"prior_lidar_radar_qw": None}, {"radar_range_rate_mps": None}],
+    [{"priors": {}}, {"radar_range_rate_mps": None}],
     ids=["no prior", "no velocity"],
 )
 def test_where_the_velocity_is_unknown_the_sweep_stays_as_logged_and_is_counted(made_frame, changes):
@@ -76,7 +80,7 @@ def test_where_the_velocity_is_unknown_the_sweep_stays_as_logged_and_is_counted(
         changes = {"radar_range_rate_mps": noise.astype(np.float32)}
     frame = replace(frame, **changes)
     found = perceived(frame)
-    assert found.deskew == AS_LOGGED
+    assert found.notes == [AS_LOGGED]
     assert farthest(found, frame) == 0.0
 
 
@@ -84,5 +88,5 @@ def test_what_ingest_moved_or_has_no_times_is_left_alone_and_not_counted(made_fr
     _, frame = skewed(made_frame)
     for same in (replace(frame, lidar_deskewed=True), replace(frame, lidar_time_s=None)):
         found = perceived(same)
-        assert found.deskew is None
+        assert found.notes == []
         assert farthest(found, same) == 0.0

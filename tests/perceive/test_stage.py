@@ -37,8 +37,8 @@ def fleet(**perceive):
     )  # fmt: skip
 
 
-def write(lake, frames, key="frames-key", group=3):
-    write_frames(lake, DAY, frames, key, group)
+def write(lake, frames, key="frames-key"):
+    write_frames(lake, DAY, frames, key)
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_a_radar_that_looks_back_still_drives_forwards(lake, made_frame):
     frame = made_frame(0)
     turned = replace(
         frame, radar_x_m=-frame.radar_x_m, radar_y_m=-frame.radar_y_m,
-        prior_lidar_radar_qw=0.0, prior_lidar_radar_qx=0.0, prior_lidar_radar_qy=0.0, prior_lidar_radar_qz=1.0,
+        priors={"lidar_radar": np.diag([-1.0, -1.0, 1.0, 1.0])},
     )  # fmt: skip
     write(lake, [turned], key="turned")
     perceive_day(DAY, fleet(), lake)
@@ -106,7 +106,7 @@ def test_the_same_work_is_cached_and_other_work_is_not(lake, made_frame):
 def test_the_same_frames_give_the_same_bytes(lake, tmp_path, made_frame):
     perceive_day(DAY, fleet(), lake)
     twin = Lake.at(tmp_path / "twin")
-    write(twin, [made_frame(i) for i in range(5)], group=1)
+    write(twin, [made_frame(i) for i in range(5)])
     perceive_day(DAY, fleet(), twin)
     for a, b in zip(rows(lake), rows(twin), strict=True):
         assert a.labels_png == b.labels_png

@@ -57,7 +57,7 @@ def test_filters_choose_vehicle_day_and_method(lake: Path, capsys: pytest.Captur
 
 
 def test_a_lake_without_records_is_an_empty_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for table in ("calibrations", "drift", "frames", "observations"):
+    for table in ("calibrations", "drift", "moments", "perceived"):
         assert show(table, lake=str(tmp_path), json=True) == 0
         assert json.loads(capsys.readouterr().out) == []
         assert show(table, lake=str(tmp_path)) == 0

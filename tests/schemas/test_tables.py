@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.captures import CAPTURES
 from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.features import FEATURES
+from schemas.moments import MOMENTS, PERCEIVED
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
@@ -19,8 +20,7 @@ from schemas.training import TRAINING, TrainingRow
 from schemas.versions import TABLES, write_json_schemas
 
 ROW_TYPES = {
-    FRAMES.name: Frame,
-    OBSERVATIONS.name: Observation,
+    **{t.name: t.row_type for t in (MOMENTS, *CAPTURES.values(), PERCEIVED, *FEATURES.values())},
     TRAINING.name: TrainingRow,
     CALIBRATIONS.name: CalibrationRecord,
     DRIFT.name: DriftFinding,

@@ -20,9 +20,9 @@ from pipeline.store.records import assert_records, commit_records, last_day, rea
 from pipeline.store.row_groups import read_columns, read_group, row_groups
 from pipeline.store.tables import read_manifest, read_rows, write_partition
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
-from schemas.frames import FRAMES, Frame
 from tests.makers.s3_server import BUCKET, running
 from tests.makers.table_rows import make_row, same
+from tests.makers.whole_tables import FRAMES, WholeFrame
 
 REPO = Path(__file__).resolve().parents[2]
 DAY = Partition("bus 7%", "2026-03-02")  # a name that must be quoted
@@ -83,7 +83,7 @@ def test_partitions_are_written_whole_found_and_read_by_row_and_column(lake, rng
     write(lake, rows)
     write(lake, rows[:1], partition=Partition("car", "2026-03-03"))
     assert lake.exists()
-    assert all(same(a, b) for a, b in zip(rows, read_rows(lake, FRAMES, DAY, Frame), strict=True))
+    assert all(same(a, b) for a, b in zip(rows, read_rows(lake, FRAMES, DAY, WholeFrame), strict=True))
     assert read_manifest(lake, FRAMES, DAY).rows == 5
     assert lake.partitions("frames") == [DAY, Partition("car", "2026-03-03")]
     assert lake.partitions("frames", vehicle="car") == [Partition("car", "2026-03-03")]
@@ -91,7 +91,7 @@ def test_partitions_are_written_whole_found_and_read_by_row_and_column(lake, rng
     assert read_columns(lake, FRAMES, DAY, ["frame_index"]) == {"frame_index": [0, 1, 2, 3, 4]}
     groups = row_groups(lake, FRAMES, DAY)
     assert [g.rows for g in groups] == [2, 2, 1]
-    assert [f.frame_index for f in read_group(lake, FRAMES, groups[1], Frame)] == [2, 3]
+    assert [f.frame_index for f in read_group(lake, FRAMES, groups[1], WholeFrame)] == [2, 3]
     write(lake, rows[:2], key="k2")
     assert read_manifest(lake, FRAMES, DAY).work_key == "k2"
 
@@ -177,7 +177,7 @@ def test_answers_of_5xx_late_ones_and_lost_ones_are_asked_for_again(fault, lake,
     before = s3.faults(**fault)
     write(lake, rows)
     commit_records(lake, CALIBRATIONS, [record(rng, "k", pair=pair) for pair in PAIRS])
-    assert len(read_rows(lake, FRAMES, DAY, Frame)) == 3
+    assert len(read_rows(lake, FRAMES, DAY, WholeFrame)) == 3
     assert len(read(lake)) == 3
     after = s3.faults(fail=0, stall=0)
     assert sum(after[kind] - before[kind] for kind in ("failed", "stalled", "lost")) > 1

@@ -12,9 +12,9 @@ from pipeline.store.records import commit_records, read_records
 from pipeline.store.row_groups import read_columns, read_group, row_groups
 from pipeline.store.tables import read_rows, write_partition
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from schemas.frames import FRAMES, Frame
 from tests.makers.s3_server import BUCKET, running
 from tests.makers.table_rows import make_row
+from tests.makers.whole_tables import FRAMES, WholeFrame
 
 DAY = Partition("car", "2026-03-02")
 
@@ -30,9 +30,9 @@ def fill_and_read(lake):
     def read():
         groups = row_groups(lake, FRAMES, DAY)
         return (
-            len(read_rows(lake, FRAMES, DAY, Frame)),
+            len(read_rows(lake, FRAMES, DAY, WholeFrame)),
             len(read_columns(lake, FRAMES, DAY, ["frame_index"])["frame_index"]),
-            len(read_group(lake, FRAMES, groups[0], Frame)),
+            len(read_group(lake, FRAMES, groups[0], WholeFrame)),
             len(read_records(lake, CALIBRATIONS, CalibrationRecord)),
         )
 

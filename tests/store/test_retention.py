@@ -12,15 +12,19 @@ from pipeline.config import load_fleet
 from pipeline.errors import CollectedError, ConfigError
 from pipeline.report.reading import has_frames
 from pipeline.runner import Stage
+from pipeline.store.moments import sensor_files
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.retention import collect, first_day_kept
 from pipeline.store.row_groups import read_columns
-from pipeline.store.tables import read_manifest, read_rows, write_partition
+from pipeline.store.tables import write_partition
+from pipeline.store.views import frames_of, ingested, observations_of
 from pipeline.work import Task, Work
-from schemas.frames import FRAMES, Frame
-from schemas.observations import OBSERVATIONS
+from schemas.captures import CAPTURES
+from schemas.moments import MOMENTS
 from tests.makers.fleet_files import fleet_toml
-from tests.makers.table_rows import make_row
+from tests.makers.lakes import joined_of, write_frames, write_observations
+from tests.makers.table_rows import make_frame, make_observation, make_row
+from tests.makers.whole_tables import FRAMES, OBSERVATIONS
 
 OLD, NEW = Partition("car", "2026-03-02"), Partition("car", "2026-03-20")
 
@@ -29,30 +33,32 @@ OLD, NEW = Partition("car", "2026-03-02"), Partition("car", "2026-03-20")
 def lake(tmp_path):
     lake, rng = Lake.at(tmp_path / "lake"), np.random.default_rng(0)
     for partition in (OLD, NEW):
-        for schema in (FRAMES, OBSERVATIONS):
-            with write_partition(lake, schema, partition, "key", "0", ["in"]) as writer:
-                writer.append([make_row(schema.name, rng, free=400) for _ in range(3)])
-                writer.describe(kept={"frames": 3}, rejected={"dark": 1})
+        write_frames(lake, partition, [make_frame(rng, free=400, frame_index=i) for i in range(3)])
+        write_observations(
+            lake, partition, [make_observation(rng, free=400, frame_index=i) for i in range(3)]
+        )
     return lake
 
 
 def frames_before(lake, day="2026-03-10", **options):
-    return list(collect(lake, FRAMES, day, "2026-04-01", **options))
+    return list(collect(lake, MOMENTS, day, "2026-04-01", **options))
 
 
 def test_old_frames_leave_with_their_bytes_and_nothing_else_does(lake):
-    size = lake.file("frames", OLD).stat().st_size
+    files = [lake.file("moments", OLD), *sensor_files(lake, MOMENTS, OLD)]
+    assert len(files) == 4
+    size = sum(file.stat().st_size for file in files)
     [gone] = frames_before(lake)
     assert (gone.partition, gone.freed_bytes) == (OLD, size)
-    assert lake.file("frames", OLD).stat().st_size < size
+    assert [file.exists() for file in files] == [True, False, False, False]
     with pytest.raises(CollectedError, match=r"left the lake on 2026-04-01: ingest the day's logs again"):
-        read_rows(lake, FRAMES, OLD, Frame)
+        next(frames_of(lake, OLD))
     with pytest.raises(CollectedError):
-        read_columns(lake, FRAMES, OLD, ["frame_index"])
-    assert len(read_rows(lake, FRAMES, NEW, Frame)) == 3
-    manifest = read_manifest(lake, FRAMES, OLD)
-    assert (manifest.rows, manifest.work_key, manifest.kept) == (3, "key", {"frames": 3})
-    assert read_manifest(lake, OBSERVATIONS, OLD).extra == {}
+        read_columns(lake, MOMENTS, OLD, ["moment"])
+    assert len(list(frames_of(lake, NEW))) == 3
+    manifest = ingested(lake, OLD)
+    assert (manifest.rows, manifest.work_key, manifest.kept) == (3, "frames-key", {"frames": 3})
+    assert len(list(observations_of(lake, OLD))) == 3
     assert not has_frames(lake, OLD)
     assert has_frames(lake, NEW)
     assert frames_before(lake) == []
@@ -60,17 +66,18 @@ def test_old_frames_leave_with_their_bytes_and_nothing_else_does(lake):
 
 def test_a_dry_run_says_what_would_go_and_takes_nothing(lake):
     assert [c.partition for c in frames_before(lake, dry_run=True)] == [OLD]
-    assert len(read_rows(lake, FRAMES, OLD, Frame)) == 3
+    assert len(list(frames_of(lake, OLD))) == 3
 
 
 def test_damaged_files_go_as_a_whole_after_the_same_time(lake):
-    path = lake.file("frames", OLD)
+    path = lake.file("moments", OLD)
     path.write_bytes(path.read_bytes()[:50])
     aside = path.parent / "part-0.parquet.damaged"
     aside.write_bytes(b"x")
     frames_before(lake)
     assert not path.exists()
     assert not aside.exists()
+    assert sensor_files(lake, MOMENTS, OLD) == []
     assert "damaged" in lake.damage[0]
 
 
@@ -78,9 +85,9 @@ def test_the_same_logs_are_up_to_date_after_their_images_left(lake, tmp_path, mo
     (tmp_path / "fleet.toml").write_text(fleet_toml("car"))
     task = Task(load_fleet(tmp_path / "fleet.toml"), lake, OLD)
     rng = np.random.default_rng(1)
-    made = Work(({"a": 1},), lambda _run: (make_row("frames", rng) for _ in range(2)))
+    made = Work(({"a": 1},), lambda _run: (joined_of(make_frame(rng, frame_index=i)) for i in range(2)))
     monkeypatch.setattr(Stage, "load", lambda _: lambda _task: replace(made))
-    stage = Stage("ingest", (), (FRAMES,), "")
+    stage = Stage("ingest", (), (MOMENTS, *CAPTURES.values()), "")
     done = stage.run(task)
     frames_before(lake)
     cached = stage.run(task)
@@ -102,15 +109,30 @@ def test_the_command_takes_images_and_pages_and_says_how_much(lake, capsys):
     assert {k: planned[k] for k in ("partitions", "freed_bytes", "pages")} == {
         k: done[k] for k in ("partitions", "freed_bytes", "pages")
     }
-    assert (done["partitions"], done["pages"]) == ({"frames": 2}, 2)
+    assert (done["partitions"], done["pages"]) == ({"moments": 2}, 2)
     assert done["freed_bytes"] > 0
     assert sorted(p for p in pages.rglob("*.html")) == [pages / recent / "car.html", pages / "index.html"]
     assert gc(lake=str(lake.root), observations_days=1) == 0
-    assert json.loads(capsys.readouterr().out)["partitions"] == {"frames": 0, "observations": 2}
+    assert json.loads(capsys.readouterr().out)["partitions"] == {"moments": 0, "perceived": 2}
     with pytest.raises(ConfigError, match="images-days"):
         gc(lake=str(lake.root), images_days=0)
     with pytest.raises(ConfigError, match="no such folder"):
         gc(lake=str(lake.root / "x"))
+
+
+def test_frames_and_observations_of_an_older_release_go_with_the_moments_that_took_their_place(lake, capsys):
+    rng = np.random.default_rng(0)
+    for schema in (FRAMES, OBSERVATIONS):
+        for partition in (OLD, Partition("car", "2999-01-01")):
+            with write_partition(lake, schema, partition, "key", "0.9.0") as writer:
+                writer.append([make_row(schema.name, rng)])
+                writer.describe(kept={}, rejected={})
+    assert gc(lake=str(lake.root)) == 0
+    assert json.loads(capsys.readouterr().out)["partitions"] == {"moments": 3}
+    assert [p.day for p in lake.partitions("frames")] == [
+        "2999-01-01"
+    ]  # its images may stay as long as others
+    assert len(lake.partitions("observations")) == 2
 
 
 def test_a_month_kept_is_thirty_days_with_today():

@@ -26,8 +26,8 @@ from pipeline.store.tables import (
 )
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
-from schemas.frames import FRAMES, Frame
 from tests.makers.table_rows import ROW_TYPES, make_row, same
+from tests.makers.whole_tables import FRAMES, WholeFrame
 
 REPO = Path(__file__).resolve().parents[2]
 DAY = Partition("car", "2026-03-02")
@@ -74,7 +74,7 @@ def test_the_manifest_says_where_a_partition_comes_from(lake, rng):
 def test_picked_rows_come_from_their_row_groups_alone(lake, rng):
     rows = [make_row("frames", rng, frame_index=i) for i in range(7)]
     write(lake, rows)
-    chunks = list(iterate_rows(lake, FRAMES, DAY, Frame, rows=[6, 0, 3]))
+    chunks = list(iterate_rows(lake, FRAMES, DAY, WholeFrame, rows=[6, 0, 3]))
     assert [[r.frame_index for r in chunk] for chunk in chunks] == [[0], [3], [6]]
 
 
@@ -86,7 +86,7 @@ def test_an_error_while_writing_leaves_the_old_partition_and_nothing_else(lake, 
     ):
         writer.append([make_row("frames", rng)])
         raise RuntimeError("sensor")
-    assert [r.frame_index for r in read_rows(lake, FRAMES, DAY, Frame)] == [7]
+    assert [r.frame_index for r in read_rows(lake, FRAMES, DAY, WholeFrame)] == [7]
     assert read_manifest(lake, FRAMES, DAY).work_key == "k1"
     assert [p.name for p in lake.folder("frames", DAY).iterdir()] == ["part-0.parquet"]
 
@@ -111,17 +111,17 @@ def test_another_version_a_foreign_file_and_a_damaged_one_are_named(lake, rng):
     path = lake.folder("frames", DAY) / "part-0.parquet"
     newer = TableSchema("frames", FRAMES.version + 1, FRAMES.columns)
     with pytest.raises(ContractError, match=rf"part-0\.parquet.*frames/{FRAMES.version}.*anew"):
-        read_rows(lake, newer, DAY, Frame)
+        read_rows(lake, newer, DAY, WholeFrame)
     whole = path.read_bytes()
     pq.write_table(pa.table({"a": [1]}), path)
     with pytest.raises(ContractError, match="not written by Boresight"):
-        read_rows(lake, FRAMES, DAY, Frame)
+        read_rows(lake, FRAMES, DAY, WholeFrame)
     for damaged in (whole[: len(whole) // 2], b"", whole[:-8] + b"\xff" * 8):
         path.write_bytes(damaged)
         with pytest.raises(ContractError, match="damaged"):
             read_manifest(lake, FRAMES, DAY)
     with pytest.raises(ContractError, match="no partition for car on 2026-03-03"):
-        read_rows(lake, FRAMES, Partition("car", "2026-03-03"), Frame)
+        read_rows(lake, FRAMES, Partition("car", "2026-03-03"), WholeFrame)
 
 
 def test_damage_behind_a_whole_footer_is_named_as_damage(lake, rng):
@@ -131,7 +131,7 @@ def test_damage_behind_a_whole_footer_is_named_as_damage(lake, rng):
     path.write_bytes(whole[:4] + bytes(len(whole) // 2) + whole[4 + len(whole) // 2 :])
     assert read_manifest(lake, FRAMES, DAY).rows == 4
     with pytest.raises(DamagedError, match=r"part-0\.parquet.*damaged"):
-        read_rows(lake, FRAMES, DAY, Frame)
+        read_rows(lake, FRAMES, DAY, WholeFrame)
     lake.set_aside(str(path))
     assert read_manifest(lake, FRAMES, DAY) is None
     assert lake.partitions("frames") == []
@@ -193,7 +193,7 @@ def test_duckdb_and_polars_read_every_table_of_partitions_by_plain_glob(name, la
 def assert_whole(lake):
     """One generation in the partition, and all three rows of every commit of records."""
     manifest = read_manifest(lake, FRAMES, DAY)
-    rows = read_rows(lake, FRAMES, DAY, Frame)
+    rows = read_rows(lake, FRAMES, DAY, WholeFrame)
     assert len(rows) == 12
     assert {f"key-{r.drive}" for r in rows} == {manifest.work_key}
     counts = Counter(r.work_key for r in read_records(lake, CALIBRATIONS, CalibrationRecord))
@@ -247,7 +247,7 @@ def test_two_writers_on_one_partition_end_with_one_of_them_whole(lake):
         if manifest is not None:
             assert manifest.rows == 6
     assert [p.exitcode for p in writers] == [0, 0]
-    rows = read_rows(lake, FRAMES, DAY, Frame)
+    rows = read_rows(lake, FRAMES, DAY, WholeFrame)
     assert len(rows) == 6
     assert {r.log for r in rows} == {read_manifest(lake, FRAMES, DAY).work_key}
     assert {r.log for r in rows} <= {"a24", "b24"}

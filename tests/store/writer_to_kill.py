@@ -10,8 +10,8 @@ import numpy as np
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import write_partition, write_records
 from schemas.calibrations import CALIBRATIONS, PAIRS
-from schemas.frames import FRAMES
 from tests.makers.table_rows import make_row
+from tests.makers.whole_tables import FRAMES
 
 
 def make_rows():

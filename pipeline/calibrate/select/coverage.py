@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import from_quaternion, transform_points
+from pipeline.geometry.se3 import transform_points
 from pipeline.geometry.spherical import camera_direction_angles, to_spherical
 from schemas.observations import Observation
 
@@ -102,10 +102,8 @@ def _seen(observation: Observation, kind: _Kind) -> Float[np.ndarray, "N 3"]:
     """Azimuth, elevation [rad] and range [m]; in the camera only what lies before it."""
     points = np.asarray(getattr(observation, kind.name), np.float64).reshape(-1, 3)
     o = observation
-    if kind.camera_axes and o.prior_camera_lidar_qw is not None:
-        q = np.array([getattr(o, f"prior_camera_lidar_{n}") for n in ("qw", "qx", "qy", "qz")], np.float64)
-        t = np.array([getattr(o, f"prior_camera_lidar_{n}") for n in ("tx_m", "ty_m", "tz_m")], np.float64)
-        points = transform_points(from_quaternion(q, t), points)
+    if kind.camera_axes and "camera_lidar" in o.priors:
+        points = transform_points(o.priors["camera_lidar"], points)
         points = points[points[:, 2] > 1.0]
         return np.column_stack([camera_direction_angles(points), np.linalg.norm(points, axis=1)])
     return to_spherical(points)

@@ -107,7 +107,7 @@ def _samples(task: Task, about: Mapping[int, About], rejected: Counter[str]) -> 
         rejected[SampleReason.NO_PRIOR.value] += len(about)
         return
     first = _logged_prior(observation)
-    for row, frame in zip(sorted(about), frames, strict=True):
+    for frame in frames:
         while observation.frame_index < frame.frame_index:
             following = next(whole, None)
             if following is None:
@@ -118,7 +118,7 @@ def _samples(task: Task, about: Mapping[int, About], rejected: Counter[str]) -> 
             yield None
             continue
         try:
-            yield _sample(frame, observation, prior, first, about[row], fleet.prepare)
+            yield _sample(frame, observation, prior, first, about[frame.frame_index], fleet.prepare)
         except SampleRejectedError as rejection:
             rejected[rejection.reason.value] += 1
             yield None
@@ -132,16 +132,14 @@ def _sample(
     about: About,
     config: PrepareConfig,
 ) -> TrainingRow:
-    logged = _logged_prior(observation)
-    if not np.allclose(logged, first, atol=_SAME, rtol=0, equal_nan=True):
+    if not np.allclose(_logged_prior(observation), first, atol=_SAME, rtol=0, equal_nan=True):
         raise SampleRejectedError(SampleReason.PRIOR_CHANGED)
     return make_row(frame, observation, prior, about, config)
 
 
 def _logged_prior(observation: Observation) -> np.ndarray:
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    pairs = ("camera_lidar", "lidar_radar")
-    return np.array([getattr(observation, f"prior_{p}_{n}") for p in pairs for n in names], np.float64)
+    unknown = np.full((4, 4), np.nan)
+    return np.stack([observation.priors.get(pair, unknown) for pair in ("camera_lidar", "lidar_radar")])
 
 
 def _sides_given(survey: Survey, plan: SplitPlan) -> list[list[str]]:

@@ -12,12 +12,11 @@ from pipeline.config import PrepareConfig
 from pipeline.learn.prepare.split import SplitPlan, Unit, environment_of_speeds, plan_split
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns
-from schemas.frames import FRAMES
-from schemas.observations import OBSERVATIONS
+from schemas.moments import MOMENTS, PERCEIVED
 
 __all__ = ["Survey", "plan_days", "survey_day"]
 
-_LIGHT = ("frame_index", "log", "drive", "stamp_ns", "ego_speed_mps", "ego_tx_m", "ego_ty_m")
+_LIGHT = ("moment", "log", "drive", "stamp_ns", "ego_speed_mps", "ego_tx_m", "ego_ty_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +43,8 @@ def survey_day(partition: Partition, lake: Lake, config: PrepareConfig) -> Surve
     Raises:
         ContractError: the day has no frames or no observations yet.
     """
-    light = read_columns(lake, FRAMES, partition, _LIGHT)
-    perceived = set(read_columns(lake, OBSERVATIONS, partition, ["frame_index"])["frame_index"])
+    light = read_columns(lake, MOMENTS, partition, _LIGHT)
+    perceived = set(read_columns(lake, PERCEIVED, partition, ["moment"])["moment"])
     stamp = np.array(light["stamp_ns"], np.int64) * 1e-9
     drive = np.array(light["drive"], np.int64)
     x, y, speed = (np.array(light[n], np.float64) for n in ("ego_tx_m", "ego_ty_m", "ego_speed_mps"))
@@ -59,7 +58,7 @@ def survey_day(partition: Partition, lake: Lake, config: PrepareConfig) -> Surve
         partition,
         stamp,
         drive,
-        np.array([i in perceived for i in light["frame_index"]], bool),
+        np.array([i in perceived for i in light["moment"]], bool),
         _moved(stamp, drive, np.nan_to_num(speed, nan=np.inf), config.min_step_m),
         _places(partition, light["log"], drive, stamp, x, y, config),
         [environments[int(d)] for d in drive],

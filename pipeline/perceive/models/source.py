@@ -11,7 +11,7 @@ from pipeline.perceive.models.manifest import Manifest, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
 from pipeline.rig.rig import Rig
 from pipeline.rigs import OnnxSemantics
-from schemas.frames import Frame
+from schemas.captures import ImageColumns
 
 __all__ = ["ModelSource", "check_models"]
 
@@ -48,7 +48,7 @@ class ModelSource:
         detector = load_manifest(fleet.path_of(wanted.detector), "detect")
         return cls(segmenter, detector, fleet.perceive)
 
-    def read(self, frame: Frame) -> CameraSemantics:
+    def read(self, frame: ImageColumns) -> CameraSemantics:
         """Run both models on the frame's image.
 
         Raises:

@@ -33,7 +33,10 @@ from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.calibrations import PAIRS
-from schemas.observations import OBSERVATIONS, Observation
+from schemas.captures import CAPTURES
+from schemas.features import FEATURES
+from schemas.moments import MOMENTS, PERCEIVED
+from schemas.observations import Observation
 from tests.benchmarks.studies.commits import commit_now
 from tests.makers.stages import ingest_day, perceive_day
 
@@ -87,7 +90,7 @@ class Day:
 
 
 def generate_day(spec: DaySpec, root: Path, *, images: bool = False, lidar_semantics: str = "") -> Path:
-    """Simulate, ingest and perceive a day unless it is there; returns its folder. `images` keeps table frames."""
+    """Simulate, ingest and perceive a day unless it is there; returns its folder. `images` keeps images and points."""
     folder = root / spec.name
     if (folder / _FINISHED).exists():
         return folder
@@ -110,7 +113,8 @@ def generate_day(spec: DaySpec, root: Path, *, images: bool = False, lidar_seman
     result = perceive_day(partition, config, lake)
     shutil.rmtree(folder / "logs")
     if not images:
-        shutil.rmtree(folder / "lake" / "frames")
+        for table in (MOMENTS, *CAPTURES.values()):
+            shutil.rmtree(folder / "lake" / table.name)
     note = asdict(spec) | {"kept_frames": result.rows, "cpu_s": round(time.process_time() - began, 1)}
     note |= {"simulated_by": commit, "perceived_by": commit}
     (folder / _FINISHED).write_text(json.dumps(note) + "\n")
@@ -134,23 +138,28 @@ def adopt_day(fleet_file: Path, lake: str, partition: Partition, root: Path) -> 
     truth.parent.mkdir(parents=True)
     truth.write_text(json.dumps({f"T_{pair}": given.of(pair).tolist() for pair in PAIRS}))
     shutil.copy(fleet_file, folder / "fleet.toml")
-    shutil.copytree(
-        Lake.at(lake).folder(OBSERVATIONS.name, partition),
-        Lake.at(folder / "lake").folder(OBSERVATIONS.name, partition),
-    )
+    copy_perceived(Lake.at(lake), partition, Lake.at(folder / "lake"), partition)
     note = asdict(REAL) | {"vehicle": partition.vehicle, "day": partition.day, "kept_frames": len(rows)}
     note |= {"simulated_by": "", "perceived_by": commit_now()}
     (folder / _FINISHED).write_text(json.dumps(note) + "\n")
     return folder
 
 
+def copy_perceived(source: Lake, day: Partition, target: Lake, copy: Partition) -> None:
+    """What perception found on a day, into another lake, perhaps under another name."""
+    for table in (PERCEIVED, *FEATURES.values()):
+        if source.exists() and Path(source.folder(table.name, day)).exists():
+            shutil.copytree(
+                source.folder(table.name, day), target.folder(table.name, copy), dirs_exist_ok=True
+            )
+
+
 def gather_days(specs: Sequence[DaySpec], root: Path, out: Path) -> Path:
     """Observations of generated days of one rig as a fleet of their own: FLEET/fleet.toml and FLEET/lake."""
     [rig] = {spec.rig for spec in specs}
     for spec in specs:
-        source = Lake.at(root / spec.name / "lake").folder(OBSERVATIONS.name, Partition(VEHICLE, DATE))
-        target = Lake.at(out / "lake").folder(OBSERVATIONS.name, Partition(spec.name, DATE))
-        shutil.copytree(source, target, dirs_exist_ok=True)
+        source, target = Lake.at(root / spec.name / "lake"), Lake.at(out / "lake")
+        copy_perceived(source, Partition(VEHICLE, DATE), target, Partition(spec.name, DATE))
     path = out / "fleet.toml"
     path.write_text(fleet_toml("gathered", rig, rig_named(rig), [spec.name for spec in specs]))
     return path

@@ -33,7 +33,7 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.views import observations_of
+from pipeline.store.views import observations_of, perceived_days
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 from tests.benchmarks.studies.commits import commit_now
@@ -252,8 +252,7 @@ def gather(args: argparse.Namespace) -> None:
     fleet, lake = load_fleet(args.fleet), Lake.at(args.lake)
     known = json.loads(RECORDS.read_text())["records"] if RECORDS.exists() else []
     found = [r for r in known if r["name"] != args.name]
-    for folder in sorted((Path(args.lake) / "observations").glob("vehicle=*/day=*")):
-        partition = Partition(*(part.partition("=")[2] for part in folder.parts[-2:]))
+    for partition in perceived_days(lake):
         rows = list(observations_of(lake, partition))
         for part, chosen in _parts(rows, halves=args.parts):
             found += _accepted(chosen, fleet, partition, {"name": args.name, "part": part})

@@ -39,7 +39,9 @@ from pipeline.store.current import current_drift, current_states
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.captures import CAPTURES
 from schemas.drift import DRIFT, DriftFinding
+from schemas.features import FEATURES
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.states import STATES, StateRow
 from tests.benchmarks.studies.commits import commit_now
@@ -173,7 +175,12 @@ def _disturb(
 def contents(lake: Lake) -> dict[str, Any]:
     """What a lake holds, without when it came there: by table and key."""
     found: dict[str, Any] = {}
-    for table in ("frames", "observations"):
+    for table in (
+        "moments",
+        *(t.name for t in CAPTURES.values()),
+        "perceived",
+        *(t.name for t in FEATURES.values()),
+    ):
         for path in lake.files.find(lake.root / table, "vehicle=*/day=*/*.parquet"):
             with lake.files.opened(path) as stream:
                 found[f"{table} {path.relative_to(lake.root / table)}"] = hashlib.sha256(

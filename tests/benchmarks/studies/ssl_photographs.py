@@ -23,10 +23,8 @@ import numpy as np
 from pipeline.config import load_fleet
 from pipeline.extrinsics.prior import read_prior
 from pipeline.store.partitions import Lake
-from pipeline.store.row_groups import read_columns
 from pipeline.store.views import observations_of, perceived_days
 from schemas.calibrations import PAIRS
-from schemas.frames import FRAMES
 from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.ssl_days import ModelSet, SslDay, Where
 from tests.benchmarks.studies.ssl_measures import measure_day, measure_frames
@@ -49,10 +47,8 @@ def real_day(folder: Path) -> SslDay:
 
 def by_log(day: SslDay) -> dict[str, SslDay]:
     """The day's logs, each as a day of its own."""
-    light = read_columns(day.lake, FRAMES, day.partition, ["log", "frame_index"])
-    log_of = dict(zip(light["frame_index"], light["log"], strict=True))
-    names = sorted(set(log_of.values()))
-    return {name: replace(day, rows=[o for o in day.rows if log_of[o.frame_index] == name]) for name in names}
+    names = sorted({o.log for o in day.rows})
+    return {name: replace(day, rows=[o for o in day.rows if o.log == name]) for name in names}
 
 
 def days_told(models: ModelSet, day: SslDay, draws: int) -> list[dict[str, Any]]:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import zstandard
 
+from pipeline.geometry.se3 import to_quaternion
+
 CONTAINERS = (
     "mcap",
     "mcap_lz4",
@@ -62,8 +64,8 @@ def test_every_container_gives_every_frame_as_logged(kit, tmp_path, run_ingest, 
         assert frame.detection_classes == ["car"]
         assert frame.ego_speed_mps is None
         assert not frame.lidar_deskewed
-        assert frame.prior_lidar_radar_tx_m == pytest.approx(2.6)
-        assert frame.prior_camera_lidar_qw == pytest.approx(0.5)
+        assert frame.priors["lidar_radar"][0, 3] == pytest.approx(2.6)
+        assert to_quaternion(frame.priors["camera_lidar"])[0] == pytest.approx(0.5)
 
 
 def test_a_folder_without_its_metadata_is_read_by_its_files(kit, tmp_path, run_ingest):
@@ -126,7 +128,7 @@ def test_a_recording_split_by_time_is_one_day_and_its_first_file_holds_the_trans
     _, frames = run_ingest(second, first)
     assert [f.log for f in frames] == ["a.mcap"] * 4 + ["b.mcap"] * 4
     assert [f.drive for f in frames] == [0] * 4 + [1] * 4
-    assert all(f.prior_camera_lidar_qw is not None for f in frames)
+    assert all("camera_lidar" in f.priors for f in frames)
 
 
 def test_a_recording_split_by_sensor_still_gives_trios(kit, tmp_path, run_ingest):

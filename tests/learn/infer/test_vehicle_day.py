@@ -318,7 +318,7 @@ def test_a_day_without_frames_is_refused_not_crashed(lake, tmp_path):
     from pipeline.config import load_fleet
 
     training_lakes.fill(Lake.at(tmp_path), "a", "2026-01-01", 24)
-    (Lake.at(tmp_path).folder("frames", DAY) / "part-0.parquet").unlink()
+    Lake.at(tmp_path).file("moments", DAY).unlink()
     result = calibrate_day(DAY, load_fleet(lake / "fleet.toml"), Lake.at(tmp_path), method="joint-ssl")
     assert result.status == "refused"
     assert "no frames of this day" in result.reason

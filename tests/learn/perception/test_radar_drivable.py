@@ -24,7 +24,7 @@ from pipeline.rows import take_rows
 from pipeline.store.partitions import Lake, Partition
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.lakes import write_observations
-from tests.makers.solve_scenes import make_observation, prior_columns
+from tests.makers.solve_scenes import make_observation
 
 PRIOR = np.eye(4)
 QUICK = DrivableTraining(steps=40, batch_size=4, width=12, log_every=10)
@@ -52,7 +52,7 @@ def road(rng, **changes):
         "radar_residual_mps": np.zeros(147, np.float32), "radar_cluster": np.full(147, -1, np.int32),
         "lidar_drivable_xyz_m": cells[free].astype(np.float32), "lidar_map_xyz_m": cells[seen].astype(np.float32),
         "radar_drivable_azimuth_rad": sector.azimuth_rad, "radar_drivable_range_m": sector.range_m,
-        **prior_columns("lidar_radar", PRIOR), "radar_velocity_mps": None, "ego_speed_mps": None,
+        "priors": {"lidar_radar": PRIOR}, "radar_velocity_mps": None, "ego_speed_mps": None,
     }  # fmt: skip
     return make_observation(rng, 0, 0, 0.0, **(values | changes))
 
@@ -157,7 +157,7 @@ def test_the_job_labels_by_the_logged_prior_trains_and_leaves_model_manifest_and
     lake, labels = Lake.at(tmp_path / "lake"), []
     for vehicle, prior in (("a", PRIOR), ("b", turned)):
         rng = np.random.default_rng(8)  # the same roads, told otherwise
-        rows = [road(rng, **prior_columns("lidar_radar", prior)) for _ in range(4)]
+        rows = [road(rng, priors={"lidar_radar": prior}) for _ in range(4)]
         write_observations(lake, Partition(vehicle, "2026-01-01"), rows, vehicle)
         found = samples_of_day(load_fleet(fleet), lake, Partition(vehicle, "2026-01-01"), 9)
         assert np.array_equal(found.label, np.stack([label_grid(o, prior) for o in rows]))

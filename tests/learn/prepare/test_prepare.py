@@ -9,6 +9,7 @@ import pytest
 from jobs.cli import main
 from pipeline.config import load_fleet
 from pipeline.errors import ContractError
+from pipeline.geometry.se3 import exp_se3
 from pipeline.learn.prepare.inventory import alike, read_leaks, take_inventory, write_inventory
 from pipeline.learn.prepare.survey import survey_day
 from pipeline.store.partitions import Lake, Partition
@@ -125,7 +126,9 @@ def test_frames_that_perception_refused_or_that_changed_their_prior_are_counted(
     training_lakes.fill(lake, "a", "2026-01-01", 6)
     partition = Partition("a", "2026-01-01")
     observations = list(observations_of(lake, partition))
-    observations[4] = replace(observations[4], prior_camera_lidar_tx_m=9.0)
+    moved = exp_se3(np.array([0, 0, 0, 9.0, 0, 0])) @ observations[4].priors["camera_lidar"]
+    priors = observations[4].priors | {"camera_lidar": moved}
+    observations[4] = replace(observations[4], log="b.mcap", priors=priors)
     write_observations(lake, partition, [o for o in observations if o.frame_index != 2], "other")
     result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], split_by=["vehicle"]))[partition]
     assert (result.rows, result.rejected) == (4, {"not_perceived": 1, "prior_changed": 1})
@@ -135,7 +138,10 @@ def test_a_day_without_prior_is_refused_with_its_reason(tmp_path):
     lake = Lake.at(tmp_path)
     training_lakes.fill(lake, "a", "2026-01-01", 3)
     partition = Partition("a", "2026-01-01")
-    rows = [replace(o, prior_camera_lidar_qw=None) for o in list(observations_of(lake, partition))]
+    rows = [
+        replace(o, priors={"lidar_radar": o.priors["lidar_radar"]})
+        for o in list(observations_of(lake, partition))
+    ]
     write_observations(lake, partition, rows, "other")
     result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], split_by=["vehicle"]))[partition]
     assert result.status == "refused"

@@ -1,0 +1,121 @@
+"""One moment of a day to its row, with a row of each sensor that it has.
+
+A sensor whose payload is damaged, says too little or repeats an earlier one is left out of its moment, which goes on
+with the others where no whole moment within the second before shows the same scene.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.config import IngestConfig
+from pipeline.geometry.se3 import to_quaternion
+from pipeline.ingest.captures import Read, Rejected, readers_of
+from pipeline.ingest.index import DayIndex
+from pipeline.ingest.logged_prior import LoggedPrior
+from pipeline.ingest.repetition import REPEATED, Repetitions
+from pipeline.ingest.sync import Rejection, none_near
+from pipeline.rig.prior import Star
+from pipeline.rig.rig import Rig
+from schemas.captures import Capture
+from schemas.moments import SAME_SCENE_NS, Moment
+
+__all__ = ["Anchored", "MomentBuilder"]
+
+
+@dataclass(frozen=True, slots=True)
+class Anchored:
+    """What belongs together.
+
+    Args:
+        places: by sensor, in its stream; of sensors that the moment has.
+        anchor: the sensor whose stamp is the moment's.
+        drive: the stretch of driving.
+    """
+
+    places: Mapping[str, int]
+    anchor: str
+    drive: int
+
+
+class MomentBuilder:
+    """Builds rows from an index. `counts` gathers, by name, dropped points and what moments go without."""
+
+    def __init__(
+        self, index: DayIndex, rig: Rig, ingest: IngestConfig, file_prior: Star | None = None
+    ) -> None:
+        self._index, self._rig = index, rig
+        self.counts: Counter[str] = Counter()
+        self.prior = LoggedPrior(index, rig, file_prior)
+        self._readers = readers_of(index, rig, ingest, self.counts)
+        self._kinds = {node.name: node.kind for node in rig.nodes if node.name in self._readers}
+        self._repetitions = {sensor: Repetitions() for sensor in self._readers}
+        self._whole_ns = -SAME_SCENE_NS  # of the last moment with all sensors
+
+    def build(self, at: Anchored, moment: int) -> tuple[Moment, dict[str, Capture]]:
+        """The row of a moment, and those of its sensors by name; ask in order of time.
+
+        Raises:
+            Rejected: a payload is damaged or says too little, and fewer than two sensors are left, or a whole moment
+                shows the same; nothing is made up.
+        """
+        missing: dict[str, Rejected] = {}
+        parts = {s: part for s in self._readers if (part := self._part(s, at, moment, missing)) is not None}
+        stream = self._index.captures(at.anchor)
+        stamp_ns, log = stream.stamps[at.places[at.anchor]], stream.located[at.places[at.anchor]].log
+        damaged = [why for sensor, why in missing.items() if sensor in at.places]
+        if damaged and (
+            len(parts) < min(2, len(self._readers)) or stamp_ns - self._whole_ns <= SAME_SCENE_NS
+        ):
+            raise damaged[0]
+        self._whole_ns = self._whole_ns if missing else stamp_ns
+        self._count(missing)
+        for part in parts.values():
+            self.counts.update(part.dropped)
+        is_tied = self.prior.take(log, {sensor: part.frame_id for sensor, part in parts.items()})
+        self.counts["frames_without_prior"] += not is_tied
+        ego = self._index.ego.at(stamp_ns)
+        captures = {sensor: part.capture for sensor, part in parts.items()}
+        row = Moment(
+            moment=moment, log=self._index.log_names[log], drive=at.drive, stamp_ns=stamp_ns, rows={},
+            gap_ns={sensor: capture.stamp_ns - stamp_ns for sensor, capture in captures.items()},
+            ego_speed_mps=None if ego is None else ego.speed_mps,
+            ego_yaw_rate_radps=None if ego is None else ego.yaw_rate_radps,
+            **_pose_columns(None if ego is None else ego.T_odom_vehicle),
+        )  # fmt: skip
+        return row, captures
+
+    def _part(self, sensor: str, at: Anchored, moment: int, missing: dict[str, Rejected]) -> Read | None:
+        """What a sensor of the rig adds to the moment; None, and why in `missing`, where it adds nothing."""
+        kind = self._kinds[sensor]
+        try:
+            if sensor in at.places:
+                part = self._readers[sensor].read(at.places[sensor], moment)
+                if self._repetitions[sensor].is_new(part.measured):
+                    return part
+                missing[sensor] = Rejected(REPEATED[kind])
+            else:
+                silent = kind == "lidar" and not self._index.captures(sensor).stamps
+                missing[sensor] = Rejected(Rejection.NO_LIDAR if silent else none_near(kind))
+        except Rejected as why:
+            missing[sensor] = why
+        return None
+
+    def _count(self, missing: Mapping[str, Rejected]) -> None:
+        """Sensors that the moment goes without, by reason; what a payload's trouble is, is said once."""
+        for sensor, why in missing.items():
+            name = f"without_{sensor}_{why.reason}"
+            self.counts[name] += 1
+            if self.counts[name] == 1 and why.detail:
+                self._index.complain(str(why))
+
+
+def _pose_columns(T: Float[np.ndarray, "4 4"] | None) -> dict[str, float | None]:
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    values = [None] * 7 if T is None else [float(v) for v in (*to_quaternion(T), *T[:3, 3])]
+    return {f"ego_{n}": v for n, v in zip(names, values, strict=True)}

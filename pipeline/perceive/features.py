@@ -1,0 +1,253 @@
+"""What one image, one sweep or one scan shows: a function per kind of sensor, from captures to features."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.config import PerceiveConfig
+from pipeline.geometry.cameras import camera_of
+from pipeline.geometry.radar_grid import Scan as RadarScan
+from pipeline.perceive.camera import SemanticsSource, decode_grey, encode_png
+from pipeline.perceive.depth_edges import lidar_edges
+from pipeline.perceive.deskew import deskew_straight, velocity_ahead
+from pipeline.perceive.drivable import DrivableSource, free_sector
+from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
+from pipeline.perceive.ground import PointSource, find_ground
+from pipeline.perceive.label_gradients import label_gradients
+from pipeline.perceive.labels import ROAD_ID
+from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
+from pipeline.perceive.rejections import FrameReason
+from pipeline.perceive.road_markings import lidar_markings, road_contrast
+from pipeline.perceive.tracks import EgoMotion, TrackState, advance_tracks, measure_clusters
+from schemas.captures import CameraColumns, Capture, Image, Scan, Sweep, SweepColumns
+from schemas.features import ImageFeatures, ScanFeatures, SweepFeatures
+from schemas.moments import Moment
+
+__all__ = [
+    "deskewed",
+    "heading_of",
+    "motion_of",
+    "perceive_image",
+    "perceive_scan",
+    "perceive_sweep",
+    "speed_of",
+    "why_unusable",
+]
+
+_MIN_LIDAR_POINTS = 100  # less shows neither ground nor objects
+_CAMERA = ("image_width_px", "image_height_px", "camera_model", "camera_K", "camera_D")
+
+
+def why_unusable(capture: Capture) -> FrameReason | None:
+    """Why the columns of an image, a sweep or a scan say too little; the image itself is not looked at."""
+    if isinstance(capture, CameraColumns):
+        try:
+            camera_of(capture)
+        except ValueError:
+            return FrameReason.CAMERA_MODEL
+    if isinstance(capture, Sweep) and np.isfinite(capture.lidar_xyz_m).all(axis=1).sum() < _MIN_LIDAR_POINTS:
+        return FrameReason.FEW_LIDAR_POINTS
+    if isinstance(capture, Scan) and not len(capture.radar_x_m):
+        return FrameReason.FEW_RADAR_POINTS
+    return None
+
+
+def perceive_image(image: Image, source: SemanticsSource, config: PerceiveConfig) -> ImageFeatures:
+    """Labels and road users of an image.
+
+    Raises:
+        FrameRejectedError: no image, labels or detections that could be read.
+    """
+    semantics = source.read(image)
+    grey = decode_grey(image, config.label_scale)
+    users = semantics.detections
+    return ImageFeatures(
+        **_begin(image),
+        **{name: getattr(image, name) for name in _CAMERA},
+        labels_png=encode_png(semantics.labels),
+        label_scale=config.label_scale,
+        sky_fraction=semantics.sky_fraction,
+        drivable_fraction=semantics.drivable_fraction,
+        road_user_boxes_px=users.boxes_px,
+        road_user_classes=users.classes,
+        road_user_scores=users.scores,
+        road_contrast_png=encode_png(road_contrast(grey, semantics.labels == ROAD_ID)),
+        label_gradients=label_gradients(grey, semantics.labels),
+    )
+
+
+def perceive_sweep(
+    sweep: Sweep, config: PerceiveConfig, rng: np.random.Generator, points: PointSource | None
+) -> tuple[SweepFeatures, bool]:
+    """Ground, objects, edges and markings of a sweep; and whether it has rows, which a rosette has not."""
+    finite = _finite(sweep)
+    xyz = finite.xyz_m
+    kind = None if points is None else points.kinds(xyz, finite.intensity)
+    ground = find_ground(xyz, config.ground_inlier_m, rng, kind)
+    cluster = cluster_objects(xyz, ground.is_ground, config.cluster_eps_m, config.cluster_min_points)
+    boxes = cluster_boxes(xyz, cluster)
+    sample = sample_uniformly(xyz, config.voxel_m)
+    edges = lidar_edges(xyz, finite.ring, cluster, config)
+    markings = lidar_markings(xyz, finite.intensity, finite.ring, ground.is_road)
+    features = SweepFeatures(
+        **_begin(sweep),
+        lidar_map_xyz_m=xyz[sample],
+        lidar_map_is_ground=ground.is_ground[sample].astype(np.uint8),
+        lidar_map_cluster=cluster[sample],
+        lidar_map_time_s=None if finite.time_s is None else finite.time_s[sample],
+        lidar_cluster_centre_m=boxes.centre_m,
+        lidar_cluster_min_m=boxes.min_m,
+        lidar_cluster_max_m=boxes.max_m,
+        lidar_edge_xyz_m=edges.xyz_m,
+        lidar_edge_side=edges.side,
+        lidar_edge_jump_m=edges.jump_m,
+        lidar_edge_gap_rad=edges.gap_rad,
+        lidar_edge_points=edges.points,
+        marking_xyz_m=markings.xyz_m,
+        marking_z=markings.z,
+        ground_plane=ground.plane,
+        lidar_drivable_xyz_m=ground.drivable_xyz_m,
+    )
+    return features, edges.has_rows
+
+
+def perceive_scan(
+    scan: Scan, moment: Moment, motion: RadarMotion, tracks: TrackState, drivable: DrivableSource | None
+) -> tuple[ScanFeatures, TrackState]:
+    """Motion, tracks and free sector of a scan, and the tracks after it."""
+    xyz, ego = scan.radar_xyz_m, _ego_motion(moment, motion)
+    returns = measure_clusters(xyz, motion.residual_mps, motion.cluster, scan.doppler_period_mps)
+    state, found = advance_tracks(tracks, scan.stamp_ns, moment.drive, ego, returns, scan.doppler_period_mps)
+    sector = (
+        free_sector(xyz, motion.motion, scan.radar_has_elevation)
+        if drivable is None
+        else drivable.free_sector(_as_scan(scan, moment, motion, ego))
+    )
+    features = ScanFeatures(
+        **_begin(scan),
+        radar_xyz_m=xyz,
+        radar_power_db=scan.radar_power_db,
+        radar_residual_mps=motion.residual_mps,
+        radar_motion=motion.motion,
+        radar_cluster=motion.cluster,
+        radar_has_elevation=scan.radar_has_elevation,
+        radar_velocity_mps=motion.velocity_mps,
+        radar_velocity_cov=motion.velocity_cov,
+        radar_track_xyz_m=found.xyz_m,
+        radar_track_velocity_mps=found.velocity_mps,
+        radar_track_id=found.identity,
+        radar_track_age=found.age,
+        radar_track_points=found.points,
+        radar_drivable_azimuth_rad=sector.azimuth_rad,
+        radar_drivable_range_m=sector.range_m,
+    )
+    return features, state
+
+
+def motion_of(
+    scan: Scan,
+    speed_mps: float | None,
+    heading: float | None,
+    config: PerceiveConfig,
+    rng: np.random.Generator,
+) -> RadarMotion:
+    """What moves in a scan, and the radar's own velocity.
+
+    Args:
+        scan: the scan.
+        speed_mps: the car's by odometry; None = unknown.
+        heading: azimuth of the way ahead in radar axes; None = unknown.
+        config: gates.
+        rng: of the search.
+    """
+    return radar_motion(
+        scan.radar_xyz_m, scan.radar_range_rate_mps, scan.radar_power_db, scan.doppler_period_mps,
+        Travel(speed_mps, heading), scan.radar_has_elevation, config, rng,
+    )  # fmt: skip
+
+
+def heading_of(T_lidar_radar: Float[np.ndarray, "4 4"] | None) -> float | None:
+    """Azimuth in radar axes of a lidar's x axis, which points ahead; None where nobody knows the radar's place."""
+    if T_lidar_radar is None:
+        return None
+    ahead = T_lidar_radar[0, :3]
+    return float(np.arctan2(ahead[1], ahead[0]))
+
+
+def deskewed(sweep: Sweep, motion: RadarMotion, heading: float | None) -> Sweep:
+    """The sweep with its points moved to the stamp by a radar's velocity; itself where that is unknown."""
+    time_s = sweep.lidar_time_s
+    if motion.velocity_mps is None or heading is None or time_s is None:
+        return sweep
+    velocity = velocity_ahead(motion.velocity_mps, heading)
+    x, y, z = deskew_straight(sweep.lidar_xyz_m, time_s, velocity).T
+    return replace(sweep, lidar_x_m=x, lidar_y_m=y, lidar_z_m=z, lidar_deskewed=True)
+
+
+def speed_of(
+    moment: Moment, motions: Mapping[str, RadarMotion], headings: Mapping[str, float | None]
+) -> float | None:
+    """The car's speed ahead: by odometry, else by the first radar that knows its velocity."""
+    known = (r for r, m in motions.items() if m.velocity_mps is not None)
+    radar = next(known, None)
+    if moment.ego_speed_mps is not None or radar is None:
+        return moment.ego_speed_mps
+    velocity = motions[radar].velocity_mps
+    assert velocity is not None, "the radar was chosen for it"
+    vx, vy = float(velocity[0]), float(velocity[1])
+    # Moments without a prior are not calibrated; for other readers the radar looks ahead.
+    heading = headings[radar] or 0.0
+    return float(np.copysign(np.hypot(vx, vy), vx * np.cos(heading) + vy * np.sin(heading)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Finite:
+    """The finite points of one sweep."""
+
+    xyz_m: np.ndarray
+    intensity: np.ndarray | None
+    ring: np.ndarray | None
+    time_s: np.ndarray | None
+
+
+def _finite(sweep: SweepColumns) -> _Finite:
+    xyz = sweep.lidar_xyz_m
+    finite = np.isfinite(xyz).all(axis=1)
+    # Of points as logged, nobody can tell whether the driver de-skewed them.
+    times = sweep.lidar_time_s if sweep.lidar_deskewed else None
+    columns = (sweep.lidar_intensity, sweep.lidar_ring, times)
+    if finite.all():
+        return _Finite(xyz, *columns)
+    return _Finite(xyz[finite], *(None if column is None else column[finite] for column in columns))
+
+
+def _begin(capture: Capture) -> dict[str, Any]:
+    return {"moment": capture.moment, "stamp_ns": capture.stamp_ns}
+
+
+def _ego_motion(moment: Moment, motion: RadarMotion) -> EgoMotion:
+    """The radar's velocity, or the odometry's speed where the scan shows no static world."""
+    velocity = motion.velocity_mps
+    if velocity is not None:
+        return EgoMotion((float(velocity[0]), float(velocity[1])), moment.ego_yaw_rate_radps)
+    speed = moment.ego_speed_mps
+    return EgoMotion(None if speed is None else (speed, 0.0), moment.ego_yaw_rate_radps)
+
+
+def _as_scan(scan: Scan, moment: Moment, motion: RadarMotion, ego: EgoMotion) -> RadarScan:
+    return RadarScan(
+        scan.stamp_ns,
+        moment.drive,
+        scan.radar_xyz_m,
+        scan.radar_power_db,
+        motion.residual_mps,
+        motion.motion,
+        scan.radar_has_elevation,
+        ego.velocity_mps,
+        ego.yaw_rate_radps,
+    )

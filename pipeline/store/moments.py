@@ -1,0 +1,249 @@
+"""Moments of a vehicle-day: a table that joins rows of its sensors' files, all replaced together.
+
+The joining table (`moments`, `perceived`) has the manifest. It is taken away before the first of its sensors' files is
+replaced and written last: where it is there, all are of one work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import fields, replace
+from pathlib import PurePath
+from typing import Any, TypeVar
+
+from pipeline.errors import ContractError
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import (
+    COLLECTED,
+    Manifest,
+    PartitionWriter,
+    iterate_rows,
+    opened_for_writing,
+    read_manifest,
+    read_rows,
+)
+from schemas.captures import CAPTURES
+from schemas.columns import TableSchema
+from schemas.features import FEATURES
+from schemas.moments import FILES
+
+__all__ = [
+    "MomentWriter",
+    "groups",
+    "is_whole",
+    "joined",
+    "sensor_files",
+    "sensor_tables",
+    "sensors_of",
+    "write_moments",
+]
+
+Row = TypeVar("Row")
+# A row group: large enough to compress, small enough that a worker that holds one of each sensor stays far below 2 GB.
+_GROUP_ROWS = 16
+_GROUP_BYTES = 24 << 20
+_OF_SENSORS = {t.name: t for t in (*CAPTURES.values(), *FEATURES.values())}
+_KINDS = {t.name: kind for tables in (CAPTURES, FEATURES) for kind, t in tables.items()}
+
+
+def groups(rows: Iterable[Any]) -> Iterator[list[Any]]:
+    """Rows by the row group; no more than one is held."""
+    group: list[Any] = []
+    size = 0
+    for row in rows:
+        group.append(row)
+        size += _bytes_of(row)
+        if size >= _GROUP_BYTES or len(group) >= _GROUP_ROWS:
+            yield group
+            group, size = [], 0
+    yield group
+
+
+class _File:
+    """One sensor's file while it is written: what makes a row group is held."""
+
+    def __init__(self, writer: PartitionWriter) -> None:
+        self.writer, self.rows = writer, 0
+        self._held: list[Any] = []
+        self._size = 0
+
+    def add(self, row: Any) -> int:
+        """Take a row; returns its place in the file."""
+        self._held.append(row)
+        self._size += _bytes_of(row)
+        self.rows += 1
+        if self._size >= _GROUP_BYTES or len(self._held) >= _GROUP_ROWS:
+            self.flush()
+        return self.rows - 1
+
+    def flush(self) -> None:
+        """Write what is held."""
+        self.writer.append(self._held)
+        self._held, self._size = [], 0
+
+
+class MomentWriter:
+    """Streams moments and the rows of their sensors; nothing is visible until the block ends without an error."""
+
+    def __init__(self, stack: ExitStack, lake: Lake, partition: Partition, index: PartitionWriter) -> None:
+        self._stack, self._lake, self._partition, self._index = stack, lake, partition, index
+        self._held: list[Any] = []
+        self.files: dict[str, _File] = {}
+
+    @property
+    def rows(self) -> int:
+        """Moments so far."""
+        return len(self._held)
+
+    def append(self, moment: Any, captures: Mapping[str, Any]) -> None:
+        """Take a moment and what it has of each sensor, by name."""
+        rows = {sensor: self._file(sensor, row).add(row) for sensor, row in captures.items()}
+        self._held.append(replace(moment, rows=rows))
+
+    def describe(self, **told: Any) -> None:
+        """Counts and words for the manifest; see `PartitionWriter.describe`."""
+        files = {sensor: file.writer.schema.name for sensor, file in self.files.items()}
+        self._index.describe(**told | {FILES: files})
+
+    def finish(self) -> None:
+        """Write what is held."""
+        for file in self.files.values():
+            file.flush()
+        self._index.append(self._held)  # a kilobyte each
+
+    def _file(self, sensor: str, row: Any) -> _File:
+        if sensor not in self.files:
+            [schema] = [t for t in _OF_SENSORS.values() if t.row_type is type(row)]
+            path = self._lake.file(schema.name, self._partition, sensor)
+            self.files[sensor] = _File(
+                self._stack.enter_context(opened_for_writing(self._lake, path, schema))
+            )
+        return self.files[sensor]
+
+
+@contextmanager
+def write_moments(
+    lake: Lake,
+    schema: TableSchema,
+    partition: Partition,
+    work_key: str,
+    code_version: str,
+    inputs: Iterable[str] = (),
+) -> Iterator[MomentWriter]:
+    """Replace the moments of a vehicle-day and the files of its sensors; on an error the old ones stay.
+
+    A writer that is killed while files take their names leaves a day without moments, which the next one makes anew.
+    """
+    path = lake.file(schema.name, partition)
+    with ExitStack() as stack:
+        # Left last: the joining table takes its name after all files have theirs.
+        index = stack.enter_context(opened_for_writing(lake, path, schema))
+        writer = MomentWriter(stack, lake, partition, index)
+        yield writer
+        writer.finish()
+        for file in writer.files.values():
+            file.writer.close(work_key, code_version)
+        index.close(work_key, code_version, inputs)
+        lake.files.delete(path)
+    _tidy(lake, schema, partition, writer.files)
+
+
+def is_whole(lake: Lake, partition: Partition, manifest: Manifest) -> bool:
+    """Whether all files that a joining table's manifest names are there, and of the same work."""
+    if COLLECTED in manifest.extra:
+        return True
+    for sensor, table in manifest.extra.get(FILES, {}).items():
+        found = read_manifest(lake, _OF_SENSORS[table], partition, sensor)
+        if found is None or found.work_key != manifest.work_key:
+            return False
+    return True
+
+
+def sensors_of(manifest: Manifest) -> dict[str, str]:
+    """Kind of each sensor that has rows, by name, in the order in which they came."""
+    return {sensor: _KINDS[table] for sensor, table in manifest.extra.get(FILES, {}).items()}
+
+
+def sensor_tables(schema: TableSchema) -> list[TableSchema]:
+    """The tables of sensors' files that a table joins; none that is not such a one."""
+    return [table for table in _OF_SENSORS.values() if table.made_by == schema.made_by]
+
+
+def sensor_files(lake: Lake, schema: TableSchema, partition: Partition) -> list[PurePath]:
+    """Files of all sensors of a partition."""
+    folders = [lake.folder(table.name, partition) for table in sensor_tables(schema)]
+    return [path for folder in folders for path in lake.files.find(folder, "*.parquet")]
+
+
+def joined(
+    lake: Lake,
+    schema: TableSchema,
+    partition: Partition,
+    sensors: Sequence[str] | None = None,
+    moments: Sequence[int] | None = None,
+) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Moments of a vehicle-day in order, each with what it has of each sensor; a row group of each in memory at a time.
+
+    Args:
+        lake: where the tables are.
+        schema: of the joining table.
+        partition: the vehicle-day.
+        sensors: whose files are read; None = all.
+        moments: the moments that are wanted; None = all.
+
+    Raises:
+        ContractError: the lake has none of that day, or they are of another release.
+        DamagedError: a file cannot be read.
+        CollectedError: they left the lake after their time.
+    """
+    assert schema.row_type is not None, "a joining table is made of a row type"
+    wanted = None if moments is None else set(moments)
+    rows: list[Any] = read_rows(lake, schema, partition, schema.row_type)
+    index = [m for m in rows if wanted is None or m.moment in wanted]
+    manifest = read_manifest(lake, schema, partition)
+    assert manifest is not None, "its rows were just read"
+    files = manifest.extra.get(FILES, {})
+    names = list(files) if sensors is None else [s for s in sensors if s in files]
+    streams = {
+        s: _rows_of(
+            lake, _OF_SENSORS[files[s]], partition, s, manifest, [m.rows[s] for m in index if s in m.rows]
+        )
+        for s in names
+    }
+    for moment in index:
+        yield moment, {s: next(stream) for s, stream in streams.items() if s in moment.rows}
+
+
+def _rows_of(
+    lake: Lake, schema: TableSchema, partition: Partition, sensor: str, index: Manifest, rows: Sequence[int]
+) -> Iterator[Any]:
+    """Rows of a sensor's file, in order.
+
+    Raises:
+        ContractError: the file is not of the same work as the table that names its rows.
+    """
+    if not rows:
+        return
+    assert schema.row_type is not None, "a sensor's table is made of a row type"
+    found = read_manifest(lake, schema, partition, sensor)
+    if found is None or found.work_key != index.work_key:
+        problem = f"is not what {index.table} refer to: run `boresight {schema.made_by}` again"
+        raise ContractError(str(lake.file(schema.name, partition, sensor)), problem)
+    chunks: Iterator[list[Any]] = iterate_rows(lake, schema, partition, schema.row_type, rows, sensor)
+    for chunk in chunks:
+        yield from chunk
+
+
+def _tidy(lake: Lake, schema: TableSchema, partition: Partition, files: Mapping[str, _File]) -> None:
+    """Take away files of sensors that the day has no longer."""
+    kept = {lake.file(f.writer.schema.name, partition, sensor) for sensor, f in files.items()}
+    for path in sensor_files(lake, schema, partition):
+        if path not in kept:
+            lake.files.delete(path)
+
+
+def _bytes_of(row: Any) -> int:
+    """Memory of a row's arrays and blobs; the rest is small."""
+    values = (getattr(row, f.name) for f in fields(row))
+    return sum(len(v) if isinstance(v, bytes) else getattr(v, "nbytes", 0) for v in values)

@@ -1,0 +1,166 @@
+"""What perception found, a file per sensor: tables `image_features`, `sweep_features`, `scan_features`.
+
+Points stay in the frame of the sensor that saw them.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from schemas.captures import CameraColumns, Capture
+from schemas.columns import array, column, row, table_of
+
+__all__ = [
+    "FEATURES",
+    "IMAGE_FEATURES",
+    "SCAN_FEATURES",
+    "SWEEP_FEATURES",
+    "ImageFeatureColumns",
+    "ImageFeatures",
+    "ScanFeatureColumns",
+    "ScanFeatures",
+    "SweepFeatureColumns",
+    "SweepFeatures",
+]
+
+
+@row()
+class ImageFeatureColumns(CameraColumns):
+    """What an image shows, and the camera that saw it."""
+
+    labels_png: bytes = column(
+        "PNG mono8 of Cityscapes train ids (0 road .. 18 bicycle, 255 void), usually at half size"
+    )
+    label_scale: float = column("label pixels per image pixel (0.5 = half size)")
+    sky_fraction: float = column("share of the image labelled sky")
+    drivable_fraction: float = column("share of the image labelled road")
+    road_user_boxes_px: np.ndarray = array(
+        "<f4", ("N", 4), "detected road users: x0 y0 x1 y1 in full-image pixels"
+    )
+    road_user_classes: list[str] = column("person, rider, car, truck, bus, train, motorcycle, bicycle")
+    road_user_scores: np.ndarray = array("<f4", ("N",), "0..1")
+    road_contrast_png: bytes | None = column(
+        "PNG mono8: top-hat contrast inside the road mask (0 outside), at label size; null without an image"
+    )
+    label_gradients: np.ndarray | None = array(
+        "<f4",
+        (4, 6, 33),
+        (
+            "image gradients across the labels' borders: by EDGE_* side, sixth of the image and distance from -16"
+            " to 16 label pixels; null without an image"
+        ),
+        default=None,
+    )
+
+
+@row()
+class SweepFeatureColumns:
+    """What a sweep shows."""
+
+    lidar_map_xyz_m: np.ndarray = array(
+        "<f4", ("N", 3), "the cloud, uniformly sampled (voxels), ground kept; lidar frame"
+    )
+    lidar_map_is_ground: np.ndarray = array(
+        "|u1", ("N",), "1 = on the drivable ground (RANSAC), for lidar_map_xyz_m"
+    )
+    lidar_map_cluster: np.ndarray = array(
+        "<i4", ("N",), "DBSCAN object cluster of each point, -1 = none, for lidar_map_xyz_m"
+    )
+    lidar_map_time_s: np.ndarray | None = array(
+        "<f4",
+        ("N",),
+        "when each point was measured, against stamp_ns, for lidar_map_xyz_m; null where not de-skewed here",
+        default=None,
+    )
+    lidar_cluster_centre_m: np.ndarray = array(
+        "<f4", ("N", 3), "centre (of the cluster's points) of each object cluster"
+    )
+    lidar_cluster_min_m: np.ndarray = array("<f4", ("N", 3), "lower corner of its axis-aligned box")
+    lidar_cluster_max_m: np.ndarray = array("<f4", ("N", 3), "upper corner")
+    lidar_edge_xyz_m: np.ndarray = array(
+        "<f4", ("N", 3), "depth jumps: foreground range at the mid-beam direction"
+    )
+    lidar_edge_side: np.ndarray = array(
+        "|u1", ("N",), "EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies"
+    )
+    lidar_edge_jump_m: np.ndarray = array("<f4", ("N",), "background range minus foreground range")
+    lidar_edge_gap_rad: np.ndarray = array(
+        "<f4", ("N",), "angle between the two beams: the edge lies within +- half of it"
+    )
+    lidar_edge_points: np.ndarray = array(
+        "<i4", ("N",), "points of the foreground's object (its cluster), a weight; 1 where unknown"
+    )
+    marking_xyz_m: np.ndarray = array(
+        "<f4", ("N", 3), "ground points, for reflectivity against image brightness"
+    )
+    marking_z: np.ndarray = array(
+        "<f4", ("N",), "how far the reflectivity stands out of its ring or range band [robust sd]"
+    )
+    ground_plane: np.ndarray | None = array(
+        "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; null where no plane was found"
+    )
+    lidar_drivable_xyz_m: np.ndarray = array("<f4", ("N", 3), "drivable ground on a 1 m grid, lidar frame")
+
+
+@row()
+class ScanFeatureColumns:
+    """What a radar scan shows."""
+
+    radar_xyz_m: np.ndarray = array("<f4", ("N", 3), "all detections, radar frame")
+    radar_power_db: np.ndarray | None = array("<f4", ("N",), "power or RCS")
+    radar_residual_mps: np.ndarray = array(
+        "<f4", ("N",), "range rate minus what a static point would have (wrapped where Doppler is ambiguous)"
+    )
+    radar_motion: np.ndarray = array("|u1", ("N",), "0 static, 1 moving, 2 undecided")
+    radar_cluster: np.ndarray = array("<i4", ("N",), "cluster of moving detections, -1 = none")
+    radar_has_elevation: bool = column("as in scans")
+    radar_velocity_mps: np.ndarray | None = array(
+        "<f8", (3,), "the radar's own velocity in the radar frame, from the Doppler fit"
+    )
+    radar_velocity_cov: np.ndarray | None = array("<f8", (3, 3), "its covariance [m2/s2]")
+    radar_track_xyz_m: np.ndarray = array("<f4", ("N", 3), "centres of tracked moving clusters, radar frame")
+    radar_track_velocity_mps: np.ndarray = array(
+        "<f4", ("N", 3), "their velocity over ground, radar frame axes"
+    )
+    radar_track_id: np.ndarray = array(
+        "<i4", ("N",), "identity within the drive; a single-frame cluster has an id of its own"
+    )
+    radar_track_age: np.ndarray = array("<i4", ("N",), "frames in which the track was seen so far")
+    radar_track_points: np.ndarray = array("<i4", ("N",), "detections in the cluster")
+    radar_drivable_azimuth_rad: np.ndarray = array(
+        "<f4", ("N",), "bin centres of the free sector, radar frame"
+    )
+    radar_drivable_range_m: np.ndarray = array("<f4", ("N",), "drivable until this range in each bin")
+
+
+@row()
+class ImageFeatures(ImageFeatureColumns, Capture):
+    """One row of `image_features`."""
+
+
+@row()
+class SweepFeatures(SweepFeatureColumns, Capture):
+    """One row of `sweep_features`."""
+
+
+@row()
+class ScanFeatures(ScanFeatureColumns, Capture):
+    """One row of `scan_features`."""
+
+
+_ONE = "; a file per {}, joined by the table perceived."
+IMAGE_FEATURES = table_of(
+    ImageFeatures, "image_features", 1, "What a camera's images show" + _ONE.format("camera"),
+    made_by="perceive", of_sensor=True,
+)  # fmt: skip
+SWEEP_FEATURES = table_of(
+    SweepFeatures, "sweep_features", 1, "What a lidar's sweeps show" + _ONE.format("lidar"),
+    made_by="perceive", of_sensor=True,
+)  # fmt: skip
+SCAN_FEATURES = table_of(
+    ScanFeatures, "scan_features", 1, "What a radar's scans show" + _ONE.format("radar"),
+    made_by="perceive", of_sensor=True,
+)  # fmt: skip
+FEATURES: Final = {"camera": IMAGE_FEATURES, "lidar": SWEEP_FEATURES, "radar": SCAN_FEATURES}

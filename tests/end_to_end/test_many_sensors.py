@@ -1,0 +1,85 @@
+"""Two cameras, a lidar and two radars through ingest and perceive: each has files and features of its own."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.config import load_fleet
+from pipeline.extrinsics.prior import rig_prior, trio_prior
+from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.simulate.faults import parse_faults
+from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.store.moments import sensors_of
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import frames_of, ingested, observations_of, perceived
+from schemas.moments import PRIOR, SENSORS_ABSENT
+from tests.makers.stages import ingest_day, perceive_day
+
+DAY, MOMENTS = Partition("vehicle-1", "2026-03-02"), 8
+DUO = rig_named("duo")
+KINDS = {"front": "camera", "left": "camera", "top": "lidar", "nose": "radar", "corner_fl": "radar"}
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory):
+    """The day's lake, configuration, truth, and outcomes; the left radar is silent in its second half."""
+    out = tmp_path_factory.mktemp("duo")
+    faults = parse_faults("vehicle-1:0:corner_fl:missing:1@0.5", [DAY.day], DUO)
+    spec = FleetSpec(
+        vehicles=1, days=1, frames=MOMENTS, drives=1, rig="duo", environments="urban", seed=5, faults=faults
+    )
+    simulate_fleet(spec, out)
+    fleet, lake = load_fleet(out / "fleet.toml"), Lake.at(out / "lake")
+    logs = sorted((out / "logs" / DAY.vehicle / DAY.day).iterdir())
+    outcomes = ingest_day(logs, DAY, fleet, lake), perceive_day(DAY, fleet, lake)
+    truth = json.loads((out / "truth" / DAY.vehicle / f"{DAY.day}.json").read_text())
+    return lake, fleet, truth, outcomes
+
+
+def test_every_sensor_has_a_file_and_what_it_lacks_is_counted_under_its_name(day):
+    lake, _, _, (ingest, perceive) = day
+    assert (ingest.status, perceive.status, perceive.rows) == ("done", "done", ingest.rows)
+    assert sensors_of(ingested(lake, DAY)).keys() == sensors_of(perceived(lake, DAY)).keys() == KINDS.keys()
+    assert sensors_of(ingested(lake, DAY)) == KINDS
+    assert ingest.rejected["without_corner_fl_no_radar_in_gate"] >= 2
+    assert "corner_fl" in ingested(lake, DAY).extra[SENSORS_ABSENT]
+
+
+@pytest.mark.parametrize("camera", ["front", "left"])
+@pytest.mark.parametrize("radar", ["nose", "corner_fl"])
+def test_any_three_of_them_are_seen_as_a_rig_of_three(day, camera, radar):
+    lake, _, _, _ = day
+    chosen = {"camera": camera, "lidar": "top", "radar": radar}
+    frames = list(frames_of(lake, DAY, chosen=chosen))
+    observations = list(observations_of(lake, DAY, chosen=chosen))
+    assert [o.frame_index for o in observations] == [f.frame_index for f in frames]
+    assert len({(f.image_width_px, f.image_height_px) for f in frames if "camera" in f.sensors}) == 1
+    whole = [o for o in observations if len(o.sensors) == 3]
+    assert len(whole) >= MOMENTS // 2 - 1
+    for o in whole:
+        assert len(o.radar_xyz_m) > 10
+        assert len(o.lidar_map_xyz_m) > 100
+        assert o.labels_png
+        # The radar's own velocity is that of the car, wherever it looks, and the car's is the odometry's.
+        if o.radar_velocity_mps is not None:
+            ahead = o.priors["lidar_radar"][:3, :3] @ o.radar_velocity_mps
+            assert ahead[0] == pytest.approx(o.ego_speed_mps, abs=1.5)
+    assert {f.image for f in frames if f.image} != set()
+
+
+def test_the_prior_is_kept_once_and_ties_every_sensor_to_the_lidar(day):
+    lake, fleet, truth, _ = day
+    rows = ingested(lake, DAY).extra[PRIOR]
+    assert rows == perceived(lake, DAY).extra[PRIOR]
+    rig = fleet.rig_of(DAY.vehicle)
+    prior = rig_prior(rows, fleet, rig)
+    base = {name: np.array(T) for name, T in truth["T_base_sensor"].items()}
+    for name in KINDS:
+        T = prior.between("top", name)
+        assert np.abs(log_se3(inverse(inverse(base["top"]) @ base[name]) @ T))[:3].max() < np.radians(12)
+    three = trio_prior(prior, rig, "left", "top", "nose")
+    seen = next(observations_of(lake, DAY, chosen={"camera": "left", "lidar": "top", "radar": "nose"}))
+    np.testing.assert_array_equal(three.T_camera_lidar, seen.priors["camera_lidar"])
+    np.testing.assert_array_equal(three.T_lidar_radar, seen.priors["lidar_radar"])
