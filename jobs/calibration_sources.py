@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
 
     from jobs.frame_options import FrameOptions
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
     from pipeline.geometry.transform_tree import TransformTree
     from pipeline.rig.graph import Edge
 
-__all__ = ["mounting", "read_calibration", "read_side"]
+__all__ = ["mounting", "read_calibration", "read_sides"]
 
 
 def read_calibration(
@@ -127,37 +129,49 @@ def _logged(path: Path) -> TransformTree:
     return tree
 
 
-def read_side(
-    text: str, location: str | None, vehicle: str | None, method: str, frames: FrameOptions
-) -> Side:
-    """What `boresight compare` calls A or B: FORMAT:FILE[,FILE], a prior file, or of the lake [VEHICLE@]DAY[/METHOD].
+def read_sides(
+    texts: Sequence[str], location: str | None, vehicle: str | None, method: str, frames: FrameOptions
+) -> list[Side]:
+    """What `boresight compare` calls A and B: FORMAT:FILE[,FILE], a prior file, or of the lake [VEHICLE@]DAY[/METHOD].
 
-    METHOD may be "prior": what was known before the day; DAY may be "state": what to load tonight.
+    Of a file that is held against the lake the edges are read that the lake has; of two files those of one camera, one
+    lidar and one radar. METHOD may be "prior": what was known before the day; DAY may be "state": what to load tonight.
 
     Raises:
         ConfigError: it is none of these, or there is none.
     """
     from pipeline.export.formats import FORMATS
+    from pipeline.export.tree import ESTIMATED_EDGES
 
-    form, colon, files = text.partition(":")
-    if (colon and form in FORMATS) or text.endswith(".json"):
-        named = form if colon and form in FORMATS else ""
-        return _side_of_files(text, named, files, frames.names_in((files if named else text).split(",")))
-    return _side_of_lake(text, location, vehicle, method)
+    forms = [text.partition(":")[0] if ":" in text else "" for text in texts]
+    forms = [form if form in FORMATS else "" for form in forms]
+    of_file = [bool(form) or text.endswith(".json") for form, text in zip(forms, texts, strict=True)]
+    sides = {
+        k: _side_of_lake(text, location, vehicle, method) for k, text in enumerate(texts) if not of_file[k]
+    }
+    known = tuple(pair.edge for side in sides.values() for pair in side.pairs.values()) or ESTIMATED_EDGES
+    for k, text in enumerate(texts):
+        if of_file[k]:
+            files = text.partition(":")[2] if forms[k] else text
+            names = frames.names_in(files.split(","))
+            sides[k] = _side_of_files(text, forms[k], files, names, known)
+    return [sides[k] for k in range(len(texts))]
 
 
-def _side_of_files(text: str, form: str, files: str, names: FrameNames) -> Side:
+def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: tuple[Edge, ...]) -> Side:
     from pipeline.export.calibration import ExportedPair
     from pipeline.export.compare import Side, composed
     from pipeline.export.files import read_files
     from pipeline.export.formats import format_named
     from pipeline.extrinsics.prior_file import read_transforms
+    from pipeline.rig.edges import words_of
 
     if form:
-        found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names)
+        found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names, edges)
     else:
         found = read_transforms(Path(text))
-    pairs = {pair: ExportedPair(pair, T, status="given") for pair, T in found.items()}
+    of = {words_of(edge): edge for edge in edges}
+    pairs = {pair: ExportedPair(pair, T, status="given", of=of.get(pair)) for pair, T in found.items()}
     return Side(text, composed(pairs))
 
 

@@ -41,13 +41,13 @@ def compare(
         json: print one JSON object and nothing else: changes and sigmas in rad and m.
         frames: what the frames are called in files.
     """
-    from jobs.calibration_sources import read_side
+    from jobs.calibration_sources import read_sides
     from jobs.terminal.summary import print_json, print_summary
     from pipeline.errors import ConfigError
     from pipeline.export.compare import compare as compare_sides
 
     names = frames or FrameOptions()
-    sides = [read_side(text, lake, vehicle, method, names) for text in (a, b)]
+    sides = read_sides([a, b], lake, vehicle, method, names)
     found, notes = compare_sides(*sides)
     titles = [side.title for side in sides]
     if not found:

@@ -109,11 +109,11 @@ def _for_one_look(config: FleetConfig, frames: int) -> FleetConfig:
 
 def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, named: FrameOptions) -> Path:
     """What `--calibration` names, as a prior file; raises before the first log is opened."""
-    from jobs.calibration_sources import read_side
+    from jobs.calibration_sources import read_sides
     from pipeline.errors import ConfigError
     from pipeline.export.files import prior_text
 
-    side = read_side(calibration, lake, vehicle, "joint", named)
+    [side] = read_sides([calibration], lake, vehicle, "joint", named)
     for pair, why in side.missing.items():
         raise ConfigError(side.title, pair, f"no transform to verify: {why}")
     file = folder / "in_use.json"

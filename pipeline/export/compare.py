@@ -13,7 +13,7 @@ from pipeline.export.tree import ESTIMATED_PAIRS
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import inverse, log_se3
 from pipeline.geometry.target_sigmas import target_sigmas
-from pipeline.rig.edges import words_of
+from pipeline.rig.edges import edge_order, words_of
 from pipeline.rig.graph import Edge
 
 __all__ = ["PairDifference", "Side", "compare", "composed"]
@@ -77,7 +77,8 @@ def compare(a: Side, b: Side) -> tuple[list[PairDifference], list[str]]:
     """
     apart = bool(a.vehicle) and a.vehicle == b.vehicle and bool(a.days and b.days) and not a.days & b.days
     found, lacks_common = [], False
-    for pair in (p for p in a.pairs if p in b.pairs):
+    both = [pair for pair in a.pairs if pair in b.pairs]
+    for pair in sorted(both, key=lambda pair: edge_order(a.pairs[pair].edge)):
         one, other = a.pairs[pair], b.pairs[pair]
         common = apart and one.common is not None and other.common is not None
         lacks_common |= apart and not common

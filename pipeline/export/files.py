@@ -28,7 +28,6 @@ __all__ = [
 ]
 
 SIDE_FILE = ".provenance.json"
-_FRAMES = ("camera", "lidar", "radar", "base")
 _MOST_BYTES = 1 << 30  # a calibration is kilobytes; a log that is read for /tf_static may be larger
 
 
@@ -104,7 +103,7 @@ def noted_frames(paths: Sequence[Path]) -> dict[str, str]:
                 with suppress(ValueError):
                     found = _within(json.loads(file.read_bytes()), "frame_names")
                     if isinstance(found, dict):
-                        return {sensor: str(name) for sensor, name in found.items() if sensor in _FRAMES}
+                        return {str(sensor): str(name) for sensor, name in found.items()}
     return {}
 
 

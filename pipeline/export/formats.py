@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
@@ -10,9 +10,11 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, FrameNames
-from pipeline.export.tree import pairs_of_tree
+from pipeline.export.tree import ESTIMATED_EDGES, pairs_of_tree
 from pipeline.geometry.se3 import inverse
 from pipeline.geometry.transform_tree import TransformTree
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import Edge
 
 __all__ = ["FORMATS", "Files", "Format", "format_named"]
 
@@ -28,8 +30,8 @@ class Format:
         write: files of a calibration; None of a format that is only read. Raises ConfigError where the format cannot
             hold it.
         tree: frames that files hold, where the format names frames.
-        read: transforms by pair that files hold, where it has names of its own for them. Both raise ConfigError that
-            names file and field.
+        read: transforms that files hold of edges, by their words, where it has names of its own for them. Both raise
+            ConfigError that names file and field.
         update: of a format whose files hold more than a calibration: a file with new numbers in place of the old, and
             the frames that have them.
         T_frame_camera: of a format whose camera frame is not the optical one: from the optical frame to its own.
@@ -40,24 +42,32 @@ class Format:
     name: str
     write: Callable[[ExportedCalibration], dict[str, bytes]] | None = None
     tree: Callable[[Files], TransformTree] | None = None
-    read: Callable[[Files, FrameNames], dict[str, np.ndarray]] | None = None
+    read: Callable[[Files, Sequence[Edge]], dict[str, np.ndarray]] | None = None
     update: Callable[[str, bytes, ExportedCalibration], tuple[bytes, list[str]]] | None = None
     T_frame_camera: np.ndarray | None = None
     holds_provenance: bool = False
     notes: tuple[str, ...] = ()
 
-    def pairs(self, files: Files, names: FrameNames) -> dict[str, np.ndarray]:
-        """T_camera_lidar and T_lidar_radar, those of them that the files hold, by pair.
+    def pairs(
+        self, files: Files, names: FrameNames, edges: Sequence[Edge] = ESTIMATED_EDGES
+    ) -> dict[str, np.ndarray]:
+        """T_parent_child of edges, those of them that the files hold, by their words.
+
+        Args:
+            files: by name.
+            names: of the frames.
+            edges: that are asked for; as they are given, T_camera_lidar and T_lidar_radar.
 
         Raises:
-            ConfigError: neither, or the files cannot be read; it names file and field.
+            ConfigError: none, or the files cannot be read; it names file and field.
         """
         if self.read is not None:
-            return self.read(files, names)
+            return self.read(files, edges)
         assert self.tree is not None, "a format names frames or pairs"
-        found = pairs_of_tree(", ".join(files), self.tree(files), names)
-        if self.T_frame_camera is not None and "camera_lidar" in found:
-            found["camera_lidar"] = inverse(self.T_frame_camera) @ found["camera_lidar"]
+        found = pairs_of_tree(", ".join(files), self.tree(files), names, edges)
+        for edge in edges:
+            if self.T_frame_camera is not None and edge.parent.kind == "camera" and words_of(edge) in found:
+                found[words_of(edge)] = inverse(self.T_frame_camera) @ found[words_of(edge)]
         return found
 
 

@@ -6,17 +6,20 @@ cameras, so all stands under cam0, cam1, ...); T_cam_lidar as in Oxford Spires.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, FrameNames, cameras_of, needed_camera
+from pipeline.export.calibration import ExportedCalibration, cameras_of, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import field_of, load_yaml, matrix_of, to_yaml
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import inverse
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import Edge
 
 __all__ = ["KALIBR"]
 
@@ -68,15 +71,24 @@ def _distortion(camera: Camera) -> tuple[str, list[float]]:
     return "radtan", [*D[:_RADTAN], *[0.0] * (_RADTAN - len(D))]
 
 
-def _read(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
-    del names
+def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
+    """Transforms from the first lidar's of an edge; cameras are in the order of their names, as they are written."""
+    cameras = sorted({edge.parent.name for edge in edges if edge.parent.kind == "camera"})
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
-        cam = field_of(file, load_yaml(file, content), "cam0")
-        T = matrix_of(file, "cam0.T_cam_lidar", field_of(file, {"cam0": cam}, "cam0", "T_cam_lidar"))
-        found["camera_lidar"] = T
-        if "T_cam_radar" in cam:
-            found["lidar_radar"] = inverse(T) @ matrix_of(file, "cam0.T_cam_radar", cam["T_cam_radar"])
+        chain = load_yaml(file, content)
+        for edge in edges:
+            is_camera = edge.parent.kind == "camera"
+            key = f"cam{cameras.index(edge.parent.name)}" if is_camera else "cam0"
+            cam = field_of(file, chain, key)
+            child = f"T_cam_{edge.child.name}"
+            if edge.child.kind == "radar" and child not in cam:
+                continue
+            T = matrix_of(file, f"{key}.{child}", field_of(file, chain, key, child))
+            if not is_camera:
+                parent = f"T_cam_{edge.parent.name}"
+                T = inverse(matrix_of(file, f"{key}.{parent}", field_of(file, chain, key, parent))) @ T
+            found[words_of(edge)] = T
     return found
 
 

@@ -9,19 +9,21 @@ Source: KITTI object development kit, readme and matlab/; V2X-Radar (Tr_radar_to
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, FrameNames, cameras_of, needed_camera
+from pipeline.export.calibration import ExportedCalibration, cameras_of, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.texts import matrix_of, text_of
 from pipeline.geometry.se3 import inverse
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import Edge
 
 __all__ = ["KITTI", "VOD"]
 
-_CAMERA, _RADAR, _RECTIFIED, _IMAGE = "Tr_velo_to_cam", "Tr_radar_to_velo", "R0_rect", "P2"
+_CAMERA, _TO_LIDAR, _RECTIFIED, _IMAGE = "Tr_velo_to_cam", "_to_velo", "R0_rect", "P2"
 _NOTES = (
     "P0 to P3 are all K [I | 0] of the one camera: undistort its images before they are used with them.",
     "R0_rect is the identity: the camera's optical frame counts as rectified.",
@@ -52,7 +54,7 @@ def _of_camera(calibration: ExportedCalibration, name: str) -> bytes:
     others = [s.name for s in calibration.sensors if s.kind != "camera" and s.name != lidar]
     for other in others:  # Tr_radar_to_velo of a radar that is called so
         if calibration.between(lidar, other) is not None:
-            values[f"Tr_{other}_to_velo"] = _pose(calibration, lidar, other)[:3]
+            values[f"Tr_{other}{_TO_LIDAR}"] = _pose(calibration, lidar, other)[:3]
     # KITTI prints 12 digits after the point; 16 give every float64 back.
     lines = (f"{name}: {' '.join(f'{v:.16e}' for v in M.reshape(-1))}\n" for name, M in values.items())
     return "".join(lines).encode()  # KITTI's own blank line at the end stops some readers
@@ -64,23 +66,25 @@ def _pose(calibration: ExportedCalibration, a: str, b: str) -> np.ndarray:
     return found[0]
 
 
-def _read(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
-    del names
+def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
+    cameras = {edge.parent.name for edge in edges if edge.parent.kind == "camera"}
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
         lines = _lines(file, content)
-        if _CAMERA in lines:
-            found["camera_lidar"] = _rectified(file, lines) @ matrix_of(file, _CAMERA, lines[_CAMERA])
-        if _RADAR in lines:
-            found["lidar_radar"] = matrix_of(file, _RADAR, lines[_RADAR])
+        for edge in edges:
+            of_file = len(cameras) == 1 or file.endswith(f"calib_{edge.parent.name}.txt")
+            if edge.kind == "camera_lidar" and _CAMERA in lines and of_file:
+                found[words_of(edge)] = _rectified(file, lines) @ matrix_of(file, _CAMERA, lines[_CAMERA])
+            name = f"Tr_{edge.child.name}{_TO_LIDAR}"
+            if edge.kind in ("lidar_radar", "lidar_lidar") and name in lines:
+                found[words_of(edge)] = matrix_of(file, name, lines[name])
     if not found:
         raise ConfigError(", ".join(files), _CAMERA, "missing")
     return found
 
 
-def _read_vod(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
+def _read_vod(files: Files, _edges: Sequence[Edge]) -> dict[str, np.ndarray]:
     """View-of-Delft has a file per sensor, and calls either one's transform into the camera Tr_velo_to_cam."""
-    del names
     if len(files) != 2:
         problem = (
             "give two files: the lidar's calibration, then the radar's (lidar/.../calib, radar/.../calib)"
@@ -109,7 +113,7 @@ def _numbers(file: str, name: str, words: Iterable[str]) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as err:
-        if name in (_CAMERA, _RADAR, _RECTIFIED, _IMAGE):
+        if name in (_CAMERA, _RECTIFIED, _IMAGE) or name.endswith(_TO_LIDAR):
             raise ConfigError(file, name, f"holds what is no number: {err}") from err
         return []  # a line of others, as calib_time
 

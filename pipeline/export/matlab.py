@@ -6,16 +6,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, FrameNames
+from pipeline.export.calibration import ExportedCalibration
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import provenance_of
 from pipeline.export.texts import load_json, matrix_of, to_json
-from pipeline.export.tree import ESTIMATED_PAIRS
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import Edge
 
 __all__ = ["MATLAB"]
 
@@ -40,16 +42,16 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     return {"calibration.json": to_json(content)}
 
 
-def _read(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
-    del names
+def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
         held = load_json(file, content)
         if not isinstance(held, dict):
             raise ConfigError(file, "", "holds no object")
-        found |= {p: matrix_of(file, f"T_{p}", held[f"T_{p}"]) for p in ESTIMATED_PAIRS if f"T_{p}" in held}
+        keys = {words_of(edge): f"T_{edge.parent.name}_{edge.child.name}" for edge in edges}
+        found |= {words: matrix_of(file, key, held[key]) for words, key in keys.items() if key in held}
     if not found:
-        raise ConfigError(", ".join(files), "T_camera_lidar", "missing")
+        raise ConfigError(", ".join(files), f"T_{edges[0].parent.name}_{edges[0].child.name}", "missing")
     return found
 
 

@@ -5,15 +5,18 @@ Source: OpenCV core/persistence; samples/cpp/tutorial_code/calib3d (image_width,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, FrameNames
+from pipeline.export.calibration import ExportedCalibration
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import matrix_of, text_of
-from pipeline.export.tree import ESTIMATED_PAIRS
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import Edge
 
 __all__ = ["OPENCV"]
 
@@ -42,19 +45,18 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     return {"calibration.yaml": storage.releaseAndGetString().encode()}
 
 
-def _read(files: Files, names: FrameNames) -> dict[str, np.ndarray]:
-    del names
+def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
         try:
             storage = cv2.FileStorage(text_of(file, content), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-            nodes = {pair: storage.getNode(f"T_{pair}") for pair in ESTIMATED_PAIRS}
-            values = {pair: node.mat() for pair, node in nodes.items() if not node.empty()}
+            nodes = {edge: storage.getNode(f"T_{edge.parent.name}_{edge.child.name}") for edge in edges}
+            values = {words_of(edge): node.mat() for edge, node in nodes.items() if not node.empty()}
         except (cv2.error, SystemError) as err:
             raise ConfigError(file, "", f"no readable FileStorage: {' '.join(str(err).split())}") from err
         found |= {pair: matrix_of(file, f"T_{pair}", value) for pair, value in values.items()}
     if not found:
-        raise ConfigError(", ".join(files), "T_camera_lidar", "missing")
+        raise ConfigError(", ".join(files), f"T_{edges[0].parent.name}_{edges[0].child.name}", "missing")
     return found
 
 

@@ -1,6 +1,8 @@
-"""Pairs of sensors out of the trees of frames that most formats hold."""
+"""Edges out of the trees of frames that most formats hold."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -8,33 +10,37 @@ from jaxtyping import Float
 from pipeline.errors import ConfigError
 from pipeline.export.calibration import FrameNames
 from pipeline.geometry.transform_tree import TransformTree
-from schemas.calibrations import FRAMES_OF_PAIR
+from pipeline.rig.edges import EDGE_OF_PAIR, words_of
+from pipeline.rig.graph import Edge
 
-__all__ = ["ESTIMATED_PAIRS", "pairs_of_tree", "require_frames"]
+__all__ = ["ESTIMATED_EDGES", "ESTIMATED_PAIRS", "pairs_of_tree", "require_frames"]
 
 # The pairs that a prior file holds; the third is their composition.
 ESTIMATED_PAIRS = ("camera_lidar", "lidar_radar")
+ESTIMATED_EDGES = tuple(EDGE_OF_PAIR[pair] for pair in ESTIMATED_PAIRS)
 
 
-def pairs_of_tree(file: str, tree: TransformTree, names: FrameNames) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """T_camera_lidar and T_lidar_radar, those of them that the tree joins.
+def pairs_of_tree(
+    file: str, tree: TransformTree, names: FrameNames, edges: Sequence[Edge]
+) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """T_parent_child of edges by their words, those of them that the tree joins.
 
     Raises:
-        ConfigError: neither; it names the frames that the file holds.
+        ConfigError: none; it names the frames that the file holds.
     """
     found = {}
-    for pair in ESTIMATED_PAIRS:
-        parent, child = FRAMES_OF_PAIR[pair]
-        T = tree.lookup(names.of(parent), names.of(child))
+    for edge in edges:
+        T = tree.lookup(names.of(edge.parent.name), names.of(edge.child.name))
         if T is not None:
-            found[pair] = T
+            found[words_of(edge)] = T
     if not found:
         frames = sorted({*tree.edges, *tree.edges.values()})
+        asked = dict.fromkeys(names.of(sensor.name) for edge in edges for sensor in edge.sensors)
         raise ConfigError(
             file,
-            f"{names.camera}, {names.lidar}, {names.radar}",
+            ", ".join(asked),
             f"no chain joins these frames; the file has: {', '.join(frames) or 'none'}. "
-            "Name them with --camera-frame, --lidar-frame, --radar-frame",
+            "Name them with --camera-frame, --lidar-frame, --radar-frame, or --frame SENSOR=NAME",
         )
     return found
 

@@ -218,3 +218,27 @@ def test_two_days_of_five_sensors_are_compared_edge_by_edge(lake, capsys):
         (e.parent.name, e.child.name) for e in EDGES
     ]
     assert max(abs(axis["z"]) for p in found for axis in p["axes"]) < 5
+
+
+@pytest.mark.parametrize("form", [f for f in FORMATS if format_named(f).write is not None])
+def test_what_was_written_of_five_sensors_is_compared_with_the_lake_it_came_from(form):
+    sent = five()
+    files = format_named(form).write(sent)
+    found = format_named(form).pairs(files, sent.names, EDGES)
+    assert {"front-top", "left-top", "top-bumper", "top-corner"} <= found.keys()
+    for edge in EDGES:
+        if words_of(edge) in found:
+            np.testing.assert_allclose(found[words_of(edge)], T_of(edge), atol=1e-12)
+
+
+def test_a_file_of_five_sensors_is_held_against_the_day_that_it_was_written_from(lake, tmp_path, capsys):
+    of_van = ("--lake", lake, "--vehicle", "van")
+    asked = ("--day", "2026-03-01", "--frame", "front=cam_front")
+    assert said(capsys, "export", "urdf", "--out", tmp_path / "car.urdf", *of_van, *asked)[0] == 0
+    assert (
+        main([str(a) for a in ("compare", f"urdf:{tmp_path}/car.urdf", "2026-03-01", *of_van, "--json")]) == 0
+    )
+    found = json.loads(capsys.readouterr().out)["pairs"]
+    assert len(found) == len(EDGES)
+    tied = [p for p in found if p["pair"] != "front-bumper"]
+    assert max(abs(axis["change"]) for p in tied for axis in p["axes"]) < 1e-9
