@@ -12,6 +12,7 @@ of cameras and lasers".
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from jaxtyping import Float32, Int32, UInt8, UInt16
 from pipeline.config import PerceiveConfig
 from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.spherical import from_spherical, to_spherical
-from pipeline.perceive.scattered_edges import jumps_between_neighbours
+from pipeline.perceive.scattered_edges import Jumps, jumps_between_neighbours
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
 __all__ = ["LidarEdges", "lidar_edges"]
@@ -66,20 +67,18 @@ def lidar_edges(
     aer = to_spherical(xyz_m.astype(np.float64))
     keep = np.flatnonzero(np.isfinite(aer).all(1) & (aer[:, 2] > _MIN_RANGE_M))
     if keep.size < 2:
-        return _edges([], cluster, has_rows=False)
+        return _edges([], keep, cluster, has_rows=False)
     aer = aer[keep]
     row = rows_of(aer, None if ring is None else ring[keep])
     if row is None:
         found = jumps_between_neighbours(aer, cluster[keep], config.edge_jump_m, config.edge_jump_fraction)
-        return _edges([(*f[:4], keep[f.foreground]) for f in found], cluster, has_rows=False)
+        return _edges(found, keep, cluster, has_rows=False)
     order = np.lexsort((aer[:, 0], row))
     aer, row, keep = aer[order], row[order], keep[order]
     step_rad = _azimuth_step(aer[:, 0], row)
-    in_rows = [
-        *_along_rings(aer, row, step_rad, config),
-        *_between_rings(aer, row, cluster[keep], step_rad, config),
-    ]
-    return _edges([(a, s, j, g, keep[i]) for a, s, j, g, i in in_rows], cluster, has_rows=True)
+    along = _along_rings(aer, row, step_rad, config)
+    between = _between_rings(aer, row, cluster[keep], step_rad, config)
+    return _edges([*along, *between], keep, cluster, has_rows=True)
 
 
 def _azimuth_step(azimuth: np.ndarray, row: np.ndarray) -> float:
@@ -89,12 +88,7 @@ def _azimuth_step(azimuth: np.ndarray, row: np.ndarray) -> float:
     return float(np.median(steps)) if steps.size else np.radians(0.2)
 
 
-_Found = tuple[
-    np.ndarray, int, np.ndarray, np.ndarray, np.ndarray
-]  # (az, el, range), side, jump, gap, foreground index
-
-
-def _along_rings(aer: np.ndarray, row: np.ndarray, step_rad: float, config: PerceiveConfig) -> list[_Found]:
+def _along_rings(aer: np.ndarray, row: np.ndarray, step_rad: float, config: PerceiveConfig) -> list[Jumps]:
     """Jumps between azimuth neighbours; azimuth grows to the left: the earlier point of a pair is the right one."""
     right = np.arange(len(aer) - 1)
     gap = aer[1:, 0] - aer[:-1, 0]
@@ -115,41 +109,28 @@ def _along_rings(aer: np.ndarray, row: np.ndarray, step_rad: float, config: Perc
     ):
         i, f = right[mask], foreground[mask]
         middle = (aer[i, :2] + aer[i + 1, :2]) / 2
-        found.append((np.column_stack([middle, aer[f, 2]]), side, np.abs(rise[i]), gap[i], f))
+        found.append(Jumps(np.column_stack([middle, aer[f, 2]]), side, np.abs(rise[i]), gap[i], f))
     return found
 
 
 def _between_rings(
     aer: np.ndarray, row: np.ndarray, cluster: np.ndarray, step_rad: float, config: PerceiveConfig
-) -> list[_Found]:
+) -> list[Jumps]:
     """Jumps between a clustered point and the beam of the next ring above or below it."""
-    starts = np.searchsorted(row, np.arange(row.max() + 2))
+    ring = [slice(*pair) for pair in itertools.pairwise(np.searchsorted(row, np.arange(row.max() + 2)))]
     found = []
     # The foreground lies below what the ring above it sees.
     for side, up in ((EDGE_BELOW, 1), (EDGE_ABOVE, -1)):
         parts = [
-            _jumps_to_row(
-                aer,
-                slice(starts[k], starts[k + 1]),
-                slice(starts[k + up], starts[k + up + 1]),
-                cluster,
-                step_rad,
-                config,
-            )
+            _jumps_to_row(aer, ring[k], ring[k + up], cluster, step_rad, config)
             for k in range(max(0, -up), int(row.max()) + 1 - max(0, up))
         ]
         if not parts:
             continue
         here, there = (np.concatenate(p) for p in zip(*parts, strict=True))
-        found.append(
-            (
-                np.column_stack([aer[here, 0], (aer[here, 1] + aer[there, 1]) / 2, aer[here, 2]]),
-                side,
-                aer[there, 2] - aer[here, 2],
-                np.abs(aer[there, 1] - aer[here, 1]),
-                here,
-            )
-        )
+        at = np.column_stack([aer[here, 0], (aer[here, 1] + aer[there, 1]) / 2, aer[here, 2]])
+        gap = np.abs(aer[there, 1] - aer[here, 1])
+        found.append(Jumps(at, side, aer[there, 2] - aer[here, 2], gap, here))
     return found
 
 
@@ -178,18 +159,16 @@ def _jumps_to_row(
     return here[ok], there[ok]
 
 
-def _edges(found: list[_Found], cluster: np.ndarray, *, has_rows: bool) -> LidarEdges:
-    """Stack what was found; `points` counts the foreground's cluster."""
-    if not found:
-        found = [(np.empty((0, 3)), EDGE_LEFT, np.empty(0), np.empty(0), np.empty(0, np.int64))]
-    foreground = np.concatenate([f[4] for f in found])
+def _edges(found: list[Jumps], keep: np.ndarray, cluster: np.ndarray, *, has_rows: bool) -> LidarEdges:
+    """Stack what was found among the points `keep`; `points` counts the foreground's cluster."""
+    found = found or [Jumps(np.empty((0, 3)), EDGE_LEFT, np.empty(0), np.empty(0), np.empty(0, np.int64))]
+    own = cluster[keep[np.concatenate([f.foreground for f in found])]]
     sizes = np.bincount(cluster[cluster >= 0]) if (cluster >= 0).any() else np.ones(1, np.int64)
-    own = cluster[foreground]
     return LidarEdges(
-        xyz_m=from_spherical(np.concatenate([f[0] for f in found])).astype(np.float32),
-        side=np.concatenate([np.full(len(f[2]), f[1], np.uint8) for f in found]),
-        jump_m=np.concatenate([f[2] for f in found]).astype(np.float32),
-        gap_rad=np.concatenate([f[3] for f in found]).astype(np.float32),
+        xyz_m=from_spherical(np.concatenate([f.at_aer for f in found])).astype(np.float32),
+        side=np.concatenate([np.full(len(f.jump_m), f.side, np.uint8) for f in found]),
+        jump_m=np.concatenate([f.jump_m for f in found]).astype(np.float32),
+        gap_rad=np.concatenate([f.gap_rad for f in found]).astype(np.float32),
         points=np.where(own >= 0, sizes[np.maximum(own, 0)], 1).astype(np.int32),
         has_rows=has_rows,
     )

@@ -102,15 +102,19 @@ def radar_motion(
     )
     if usable.sum() < _MIN_POINTS:
         return undecided
-    u = _directions(xyz_m[usable].astype(np.float64), has_elevation)
-    rate = range_rate_mps[usable].astype(np.float64)
     power = None if power_db is None else power_db[usable].astype(np.float64)
-    fit = _fit(u, rate, power, period_mps or 0.0, travel, config.static_gate_mps, rng)
+    scan = _Doppler(
+        _directions(xyz_m[usable].astype(np.float64), has_elevation),
+        range_rate_mps[usable].astype(np.float64),
+        period_mps or 0.0,
+        config.static_gate_mps,
+    )
+    fit = _fit(scan, power, travel, rng)
     if fit is None:
         return undecided
     velocity, covariance, noise = fit
     residual = np.zeros(M)
-    residual[usable] = wrapped(rate + u @ velocity, period_mps or 0.0)
+    residual[usable] = scan.residual(velocity)
     motion = np.full(M, UNDECIDED, np.uint8)
     # Between three sigmas of the static world and the gate, slow walkers and noise look alike: undecided.
     motion[usable & (np.abs(residual) < min(max(3 * noise, 0.12), config.static_gate_mps))] = STATIC
@@ -125,64 +129,70 @@ def _directions(xyz: np.ndarray, has_elevation: bool) -> np.ndarray:
     return xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
 
 
-def _fit(
-    u: np.ndarray,
-    rate: np.ndarray,
-    power: np.ndarray | None,
-    period: float,
-    travel: Travel,
-    gate: float,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray, float] | None:
+_Fit = tuple[np.ndarray, np.ndarray, float]  # velocity, covariance, noise
+
+
+@dataclass(frozen=True, eq=False)
+class _Doppler:
+    """Directions and range rates of a scan; `gate` is what the static world fits within."""
+
+    u: np.ndarray
+    rate: np.ndarray
+    period: float
+    gate: float
+
+    def residual(self, velocity: np.ndarray) -> np.ndarray:
+        """Measured less static range rates, wrapped."""
+        return wrapped(self.rate + self.u @ velocity, self.period)
+
+    def static_share(self, fit: _Fit) -> float:
+        """Share of detections within the gate."""
+        return float(np.mean(np.abs(self.residual(fit[0])) < self.gate))
+
+    def value(self, fit: _Fit) -> float:
+        """Share of detections within the gate, and how many of them agree finely: 0 to 2."""
+        return float(np.mean(np.exp(-0.5 * (self.residual(fit[0]) / 0.15) ** 2))) + self.static_share(fit)
+
+    def best_fit(self, starts: np.ndarray) -> _Fit | None:
+        """The refined start that explains most; None without starts."""
+        fits = [_refine(self, np.append(start, 0.0)) for start in starts]
+        return max(fits, key=self.value, default=None)
+
+
+def _fit(scan: _Doppler, power: np.ndarray | None, travel: Travel, rng: np.random.Generator) -> _Fit | None:
     """The fit of the static world as odometry and mounting suggest, or as the scan alone shows where they mislead.
 
     A wrong odometry, mounting or sign of the Doppler would else be filled with what little of the scan fits it; what
     the scan alone shows tells which of them is wrong (`calibrate/verify/motion_sources.py`).
     """
-    fit = _fit_static_world(u, rate, power, period, travel, gate, rng)
-    share = 0.0 if fit is None else _static_share(u, rate, fit, period, gate)
-    is_fine = fit is not None and fit[2] < _COARSE * gate
+    fit = _fit_static_world(scan, power, travel, rng)
+    share = 0.0 if fit is None else scan.static_share(fit)
+    is_fine = fit is not None and fit[2] < _COARSE * scan.gate
     if travel == Travel() or share >= _MIN_STATIC_FRACTION or is_fine:
         return fit
-    alone = _fit_static_world(u, rate, power, period, Travel(), gate, rng)
-    is_better = alone is not None and _static_share(u, rate, alone, period, gate) > share + _MISLED
+    alone = _fit_static_world(scan, power, Travel(), rng)
+    is_better = alone is not None and scan.static_share(alone) > share + _MISLED
     return alone if is_better else fit
 
 
-def _static_share(
-    u: np.ndarray, rate: np.ndarray, fit: tuple[np.ndarray, np.ndarray, float], period: float, gate: float
-) -> float:
-    return float(np.mean(np.abs(wrapped(rate + u @ fit[0], period)) < gate))
-
-
 def _fit_static_world(
-    u: np.ndarray,
-    rate: np.ndarray,
-    power: np.ndarray | None,
-    period: float,
-    travel: Travel,
-    gate: float,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray, float] | None:
+    scan: _Doppler, power: np.ndarray | None, travel: Travel, rng: np.random.Generator
+) -> _Fit | None:
     """Velocity, covariance and noise of the hypothesis that explains most; None where too little."""
-    chosen = _search_points(u, power, rng)
-    searched = u[chosen], rate[chosen]
-    best = _best_fit(u, rate, _starts(*searched, _ahead(travel), period, _GRID_SIGMA_MPS), period, gate)
-    if best is None or travel.heading_rad is None or _value(u, rate, best, period, gate) < _CONVINCING:
+    chosen = _search_points(scan.u, power, rng)
+    u, rate = scan.u[chosen], scan.rate[chosen]
+    best = scan.best_fit(_starts(u, rate, _ahead(travel), scan.period, _GRID_SIGMA_MPS))
+    if best is None or travel.heading_rad is None or scan.value(best) < _CONVINCING:
         # Every third detection: the coarse grid is large.
-        some = searched[0][::3], searched[1][::3]
-        wide = _best_fit(u, rate, _starts(*some, _around(travel), period, _WIDE_SIGMA_MPS), period, gate)
-        if wide is not None and (
-            best is None
-            or _value(u, rate, wide, period, gate) > _value(u, rate, best, period, gate) + _CLEARLY
-        ):
+        wide = scan.best_fit(_starts(u[::3], rate[::3], _around(travel), scan.period, _WIDE_SIGMA_MPS))
+        if wide is not None and (best is None or scan.value(wide) > scan.value(best) + _CLEARLY):
             best = wide
     if best is None:
         return None
-    share = _static_share(u, rate, best, period, gate)
+    share = scan.static_share(best)
     # A bus alongside may answer with most detections of a scan; odometry tells which of the others stand still.
     least = _MIN_STATIC_FRACTION if travel.speed_mps is None else _MIN_STATIC_FRACTION_WITH_HINT
-    return best if share * len(u) >= _MIN_POINTS - 0.5 and share >= least else None
+    return best if share * len(scan.u) >= _MIN_POINTS - 0.5 and share >= least else None
 
 
 def _ahead(travel: Travel) -> np.ndarray:
@@ -229,26 +239,6 @@ def _starts(
     return np.array(peaks).reshape(-1, 2)
 
 
-def _best_fit(
-    u: np.ndarray, rate: np.ndarray, starts: np.ndarray, period: float, gate: float
-) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """The refined start that explains most; None without starts."""
-    fits = [_refine(u, rate, np.append(start, 0.0), period, gate) for start in starts]
-    return max(fits, key=lambda fit: _value(u, rate, fit, period, gate), default=None)
-
-
-def _value(
-    u: np.ndarray,
-    rate: np.ndarray,
-    fit: tuple[np.ndarray, np.ndarray, float],
-    period: float,
-    gate: float,
-) -> float:
-    """Share of detections within the gate, and how many of them agree finely: 0 to 2."""
-    r = wrapped(rate + u @ fit[0], period)
-    return float(np.mean(np.exp(-0.5 * (r / 0.15) ** 2)) + np.mean(np.abs(r) < gate))
-
-
 def _search_points(u: np.ndarray, power: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
     """A few detections, spread in azimuth (the sides lift the ambiguity), the stronger half where known."""
     n = len(u)
@@ -283,14 +273,13 @@ def _scores(u: np.ndarray, rate: np.ndarray, v: np.ndarray, period: float, sigma
     return out
 
 
-def _refine(
-    u: np.ndarray, rate: np.ndarray, velocity: np.ndarray, period: float, gate: float
-) -> tuple[np.ndarray, np.ndarray, float]:
+def _refine(scan: _Doppler, velocity: np.ndarray) -> _Fit:
     """Reweighted least squares (Geman-McClure, from the gate to the noise), weak prior on the vertical."""
+    u, gate = scan.u, scan.gate
     scale = max(gate, _GRID_SIGMA_MPS)
     noise, information = scale, np.eye(3)
     for _ in range(12):
-        r = wrapped(rate + u @ velocity, period)
+        r = scan.residual(velocity)
         near = np.abs(r[np.abs(r) < gate])
         noise = float(np.clip(1.4826 * np.median(near), _NOISE_FLOOR_MPS, gate)) if len(near) else gate
         scale = max(0.6 * scale, 2.5 * noise)

@@ -89,19 +89,28 @@ def find_ground(
         rng: of RANSAC.
         kind: the PointKind of each point by a model; None = geometry alone.
     """
-    if kind is not None:
-        return _find_labelled_ground(xyz_m, inlier_m, rng, kind)
-    plane = _fit_plane(*_lowest_of_cells(xyz_m), inlier_m, rng)
-    if plane is None:
-        nothing = np.zeros(len(xyz_m), bool)
-        return Ground(None, nothing, nothing, np.zeros((0, 3), np.float32))
-    above_local = _follow_surface(xyz_m, height_over(plane, xyz_m), inlier_m)
+    every = np.ones(len(xyz_m), bool)
+    road = every if kind is None else kind == PointKind.ROAD
+    labelled = ~every if kind is None else road | (kind == PointKind.FLAT)
+    may_be_ground = every if kind is None else labelled | (kind == PointKind.UNKNOWN)
     range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
+    seen = (range_m > _NEAR_M) & (range_m < _FAR_M)
+    plane = _fit_plane(*_lowest_of_cells(xyz_m[road]), inlier_m, rng)
+    if plane is None:  # too little road: what a model calls ground is no object all the same
+        return Ground(None, labelled & seen, labelled & road & seen, np.zeros((0, 3), np.float32))
+    above_local = _follow_surface(xyz_m, height_over(plane, xyz_m), inlier_m, may_be_ground)
     # Range noise on a grazing beam and ring tilt show as height: 0.3 % of the range.
-    is_ground = (np.abs(above_local) < inlier_m + 0.003 * range_m) & (range_m > _NEAR_M) & (range_m < _FAR_M)
+    on_surface = np.abs(above_local) < inlier_m + 0.003 * range_m
+    # Grass is rough, and a model knows it for ground; what stands higher it mistook.
+    near_surface = np.abs(above_local) < _OBSTACLE_M[0] + 0.003 * range_m
+    is_ground = seen & np.where(labelled, near_surface, on_surface & may_be_ground)
+    is_road = seen & road & on_surface
     blocks = (above_local > _OBSTACLE_M[0]) & (above_local < _OBSTACLE_M[1])
+    if kind is not None:  # a road user blocks by its feet and wheels too
+        user = (kind == PointKind.ROAD_USER) & (above_local < _OBSTACLE_M[1])
+        blocks = (blocks & ~is_ground) | user
     free = _reachable(xyz_m, range_m, blocks)
-    return Ground(plane, is_ground, is_ground, _on_grid(xyz_m[is_ground & free]))
+    return Ground(plane, is_ground, is_road, _on_grid(xyz_m[is_road & free]))
 
 
 def height_over(
@@ -109,30 +118,6 @@ def height_over(
 ) -> Float32[np.ndarray, " N"]:
     """Signed distance to the plane [m], positive upwards."""
     return (xyz_m @ plane[:3].astype(np.float32) + np.float32(plane[3])).astype(np.float32)
-
-
-def _find_labelled_ground(
-    xyz_m: np.ndarray, inlier_m: float, rng: np.random.Generator, kind: np.ndarray
-) -> Ground:
-    """RANSAC on a model's road, and what of the model's ground lies on the surface that it starts."""
-    road, labelled = kind == PointKind.ROAD, (kind == PointKind.ROAD) | (kind == PointKind.FLAT)
-    range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
-    seen = (range_m > _NEAR_M) & (range_m < _FAR_M)
-    plane = _fit_plane(*_lowest_of_cells(xyz_m[road]), inlier_m, rng)
-    if plane is None:  # too little road: its points are no objects all the same
-        return Ground(None, labelled & seen, road & seen, np.zeros((0, 3), np.float32))
-    may_be_ground = labelled | (kind == PointKind.UNKNOWN)
-    above_local = _follow_surface(xyz_m, height_over(plane, xyz_m), inlier_m, may_be_ground)
-    # As without a model. Grass is rough, and a model knows it for ground; what stands higher it mistook.
-    on_surface = np.abs(above_local) < inlier_m + 0.003 * range_m
-    near_surface = np.abs(above_local) < _OBSTACLE_M[0] + 0.003 * range_m
-    is_ground = seen & np.where(labelled, near_surface, on_surface & may_be_ground)
-    is_road = seen & road & on_surface
-    stands = (above_local > _OBSTACLE_M[0]) & (above_local < _OBSTACLE_M[1])
-    # A road user blocks by its feet and wheels too.
-    blocks = (stands & ~is_ground) | ((kind == PointKind.ROAD_USER) & (above_local < _OBSTACLE_M[1]))
-    free = _reachable(xyz_m, range_m, blocks)
-    return Ground(plane, is_ground, is_road, _on_grid(xyz_m[is_road & free]))
 
 
 def _lowest_of_cells(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -194,12 +179,9 @@ def _refine(low: np.ndarray, weight: np.ndarray, plane: np.ndarray, inlier_m: fl
 
 
 def _follow_surface(
-    xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float, may_be_ground: np.ndarray | None = None
+    xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float, may_be_ground: np.ndarray
 ) -> np.ndarray:
-    """Height over the local ground: each sector carries the ground's height over the plane outwards.
-
-    Only points that may be ground make the surface, all of them where nobody knows.
-    """
+    """Height over the local ground: each sector carries the height of what may be ground outwards."""
     azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
     sector = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _SECTORS).astype(np.int32), _SECTORS - 1)
     ring = (np.hypot(xyz_m[:, 0], xyz_m[:, 1]) / _BIN_M).astype(np.int32)
@@ -207,7 +189,7 @@ def _follow_surface(
     ring = np.minimum(ring, bins - 1)
     cell = sector * bins + ring
     order = np.argsort(cell, kind="stable")
-    order = order if may_be_ground is None else order[may_be_ground[order]]
+    order = order[may_be_ground[order]]
     start = np.searchsorted(cell[order], np.arange(_SECTORS * bins + 1))
     surface = _walk(height_m[order].astype(np.float64), start, _SECTORS, bins, inlier_m)
     # Neighbouring sectors see the same road: their median drops the sector that climbed onto a car.

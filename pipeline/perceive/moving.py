@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import no_type_check
-
 import numpy as np
 from jaxtyping import Float, Float32, Int32
-from numba import njit
+from scipy.sparse.csgraph import connected_components
 
 __all__ = ["cluster_moving", "wrapped"]
 
@@ -43,34 +41,10 @@ def cluster_moving(
     doppler = np.abs(wrapped(residual_mps[index][:, None] - residual_mps[index][None], period_mps))
     near = np.hypot(distance, doppler) <= 1.0
     core = near.sum(1) >= min_points
-    label[index] = _connect(near, core)
-    return label
-
-
-@no_type_check  # keeps the tests' shape checks out of compiled code
-@njit(cache=True)
-def _connect(near: np.ndarray, core: np.ndarray) -> np.ndarray:
-    """Labels of the connected cores and the points that they reach."""
-    n = len(core)
-    label = np.full(n, -1, np.int32)
-    stack = np.empty(n, np.int64)
-    count = 0
-    for seed in range(n):
-        if not core[seed] or label[seed] >= 0:
-            continue
-        label[seed] = count
-        stack[0] = seed
-        top = 1
-        while top:
-            top -= 1
-            i = stack[top]
-            for j in range(n):
-                if near[i, j] and label[j] < 0:
-                    label[j] = count
-                    if core[j]:
-                        stack[top] = j
-                        top += 1
-        count += 1
+    # Cores are numbered by their first detection; what is no core joins the first of the clusters that reach it.
+    of_core = connected_components(near[core][:, core], directed=False)[1] if core.any() else np.zeros(0, int)
+    reached = np.where(near[:, core], of_core, len(index)).min(axis=1, initial=len(index))
+    label[index] = np.where(reached < len(index), reached, -1)
     return label
 
 
