@@ -69,6 +69,8 @@ def _print_report(report: CheckReport, rig: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from jobs.terminal.rig_table import print_rig
+
     console = Console(stderr=True)
     topics = Table(title=f"Topics of rig {rig}", title_justify="left")
     for heading in ("role", "topic", "type", "messages", "rate", ""):
@@ -88,12 +90,7 @@ def _print_report(report: CheckReport, rig: str) -> None:
     console.print(topics)
     for line in _measured(report):
         console.print(line, markup=False, highlight=False)
-    verdicts = Table(title="What can be calibrated", title_justify="left")
-    for heading in ("pair", "DoF", "", "why"):
-        verdicts.add_column(heading)
-    for v in report.verdicts:
-        verdicts.add_row(v.pair, v.dof, f"[{_COLOUR[v.verdict]}]{v.verdict}[/]", "; ".join(v.reasons))
-    console.print(verdicts)
+    print_rig(console, report.rig)
     for line in [*report.problems, *report.advice]:
         console.print(f"  - {line}", markup=False)
     console.print(f"Can these logs be calibrated: [{_COLOUR[report.answer]} bold]{report.answer}[/]")

@@ -23,7 +23,7 @@ def print_rig(console: Console, rig: RigFinding) -> None:
     pairs = {(p.parent, p.child): p for p in rig.pairs}
     columns = [s for s in rig.sensors if any(child == s for _, child in pairs)]
     rows = [s for s in rig.sensors if any(parent == s for parent, _ in pairs)]
-    table = Table(title="Who sees the same", title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
+    table = Table(title="Shared views", title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("")
     for column in columns:
         table.add_column(column, justify="right")
@@ -35,11 +35,11 @@ def print_rig(console: Console, rig: RigFinding) -> None:
         "share of the smaller view, moments with both; below, of edges, DoF that they give + in part"
     )
     console.print(f"poses refer to {rig.reference} (*); what has no second line is not calibrated")
-    for (dof, verdict, reason), edges in _reasons(rig).items():
+    for (verdict, reason, edges), dofs in _reasons(rig).items():
         named = ", ".join(edges[:_NAMED]) + (
             f" and {len(edges) - _NAMED} more" if len(edges) > _NAMED else ""
         )
-        console.print(f"  - {dof} of {named}: [{_COLOUR[verdict]}]{verdict}[/], {escape(reason)}")
+        console.print(f"  - [{_COLOUR[verdict]}]{verdict}[/]: {'; '.join(dofs)} of {named}: {escape(reason)}")
     if rig.loose:
         console.print(f"  - nothing ties {', '.join(rig.loose)} to {rig.reference}", markup=False)
 
@@ -57,10 +57,13 @@ def _cell(pair: PairFinding | None) -> str:
     return f"{share}{pair.moments}\n[{colour}]{given}+{weak}[/]"
 
 
-def _reasons(rig: RigFinding) -> dict[tuple[str, str, str], list[str]]:
-    """What edges lack: class of DoF, verdict and reason, with the edges that they are of."""
-    found: dict[tuple[str, str, str], list[str]] = {}
+def _reasons(rig: RigFinding) -> dict[tuple[str, str, tuple[str, ...]], list[str]]:
+    """What edges lack: classes of DoF by verdict, reason and the edges that all of these are of."""
+    edges: dict[tuple[str, str, str], list[str]] = {}
     for verdict in (v for pair in rig.pairs for v in pair.verdicts):
         for reason in verdict.reasons:
-            found.setdefault((verdict.dof, verdict.verdict, reason), []).append(verdict.pair)
+            edges.setdefault((verdict.dof, verdict.verdict, reason), []).append(verdict.pair)
+    found: dict[tuple[str, str, tuple[str, ...]], list[str]] = {}
+    for (dof, word, reason), pairs in edges.items():
+        found.setdefault((word, reason, tuple(pairs)), []).append(dof)
     return found

@@ -3,34 +3,34 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64
 
 from pipeline.config import FleetConfig, IngestConfig
-from pipeline.errors import ConfigError
-from pipeline.geometry.scan_rows import rows_of
-from pipeline.geometry.spherical import to_spherical
+from pipeline.errors import ConfigError, SolveError
+from pipeline.extrinsics.prior import rig_prior
 from pipeline.ingest.captures import Rejected
-from pipeline.ingest.directions_and_units import Motion, motion_of, prior_transform
+from pipeline.ingest.directions_and_units import prior_transform
 from pipeline.ingest.index import ACCEPTED_TYPES, DayIndex, index_logs
 from pipeline.ingest.moments import MomentBuilder
-from pipeline.ingest.readiness import DofVerdict, Evidence, judge, overall
+from pipeline.ingest.readiness import DofVerdict, Evidence, overall
+from pipeline.ingest.rig_matrix import RigFinding
+from pipeline.ingest.rig_sample import RigSample
 from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.stage import pick_moments, read_file_prior
 from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns
 from pipeline.results import Progress, silent
+from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
-from pipeline.rigs import OnnxSemantics
-from pipeline.store.views import frame_of, logged_stars, priors_of
-from schemas.calibrations import SENSORS, pairs_of
-from schemas.captures import Capture
+from pipeline.store.views import logged_stars
+from schemas.calibrations import SENSORS
 from schemas.faults import FAULTS
 from schemas.frames import Frame
-from schemas.moments import Moment
 
 __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
 
@@ -72,6 +72,7 @@ class CheckReport:
 
     answer: str
     verdicts: list[DofVerdict]
+    rig: RigFinding
     evidence: Evidence
     topics: list[TopicFinding]
     sync: SyncQuality
@@ -114,95 +115,60 @@ def check_logs(
         without = Counter({k: n for k, n in builder.counts.items() if k.startswith("without_")})
     finally:
         index.close()
-    frames = _frames(built, index, builder)
-    usable = round(len(anchored) * len(frames) / len(picked)) if anchored else 0
     topics = _topics(index, rig)
-    needed = {str(role) for role in topics_of(rig).values() if role.what in NEEDED}
-    missing = [f"{t.topic} ({t.role}): {t.problem}" for t in topics if t.problem and t.role in needed]
-    missing += _of_another_unit(rejected + builder.counts, rig, index.problems)
-    motion = motion_of(frames, rig)
-    has_prior = 2 * builder.counts["frames_without_prior"] < len(frames)
-    evidence = replace(_evidence(frames, usable, rig, motion, has_prior=has_prior), missing=tuple(missing))
-    verdicts = judge(evidence)
+    silent = dict[str, tuple[str, ...]]()
+    for found, role in zip(topics, topics_of(rig).values(), strict=True):
+        if role.what in NEEDED and found.problem:
+            said = f"{found.topic} ({found.role}): {found.problem}"
+            silent[role.sensor] = (*silent.get(role.sensor, ()), said)
+    shown = {sensor for _, captures in built for sensor in captures}
+    silent |= _of_another_unit(rejected + builder.counts, rig, index.problems, shown)
+    rows = builder.prior.rows()
+    present = [frozenset(a.places) for a in anchored]
+    prior = _prior(rows, fleet, rig, index.problems)
+    sample = RigSample(rig, built, len(picked) if anchored else 0, present, logged_stars(rows), prior, silent)
+    verdicts = [v for own in sample.verdicts.values() for v in own]
+    first = sample.frames({str(kind): sensor for sensor, kind in reversed(index.kinds.items())})
     return CheckReport(
-        answer=overall(verdicts),
+        answer=overall(verdicts) if verdicts else "no",
         verdicts=verdicts,
-        evidence=evidence,
+        rig=sample.finding,
+        evidence=sample.whole,
         topics=topics,
         sync=_sync(index, len(anchored), fleet.ingest),
         frame_ids=builder.prior.frame_ids,
-        has_point_time=any(f.lidar_time_s is not None for f in frames),
-        has_odometry=any(f.ego_speed_mps is not None for f in frames),
+        has_point_time=any(f.lidar_time_s is not None for f in first),
+        has_odometry=any(f.ego_speed_mps is not None for f in first),
         rejected={str(k): int(v) for k, v in (rejected + index.damage + without).items() if v},
         problems=index.problems,
-        advice=[*motion.advice, *_advice(frames, rig, topics, usable)],
+        advice=[*sample.advice, *_advice(first, rig, topics, sample.whole.frames)],
     )
 
 
-def _frames(
-    built: Sequence[tuple[Moment, Mapping[str, Capture]]], index: DayIndex, builder: MomentBuilder
-) -> list[Frame]:
-    """Moments as the first camera, lidar and radar saw them."""
-    chosen = {kind: sensor for sensor, kind in reversed(index.kinds.items())}
-    stars = logged_stars(builder.prior.rows())
-    priors = {log: priors_of(star, chosen) for log, star in stars.items()}
-    return [
-        frame_of(
-            moment, {k: captures[s] for k, s in chosen.items() if s in captures}, priors.get(moment.log, {})
-        )
-        for moment, captures in built
-    ]
+def _prior(
+    rows: Sequence[Mapping[str, Any]], fleet: FleetConfig, rig: Rig, problems: list[str]
+) -> RigPrior | None:
+    """The prior of all sensors; None, and why among the problems, where there is none."""
+    try:
+        return rig_prior(rows, fleet, rig)
+    except SolveError as err:
+        problems.append(err.reason)
+        return None
 
 
-def _of_another_unit(counts: Counter[str], rig: Rig, problems: Sequence[str]) -> list[str]:
+def _of_another_unit(
+    counts: Counter[str], rig: Rig, problems: Sequence[str], shown: Collection[str]
+) -> dict[str, tuple[str, ...]]:
     """Sensors whose points are no metres, as topics that are as good as missing, and which unit fits."""
-    named = {"lidar": rig.lidar, "radar": rig.radar}
-    found = []
-    for sensor, reason in WRONG_UNIT.items():
-        topics = named[sensor]
-        if topics is not None and counts[reason] + counts[f"without_{sensor}_{reason}"]:
+    found = dict[str, tuple[str, ...]]()
+    for node in (n for n in rig.nodes if n.kind in WRONG_UNIT):
+        reason = WRONG_UNIT[node.kind]
+        rejected = 0 if node.name in shown else counts[reason]
+        if counts[f"without_{node.name}_{reason}"] + rejected:
             why = next((p for p in problems if p.startswith(reason)), FAULTS["unit"])
-            found.append(f"{topics.points} ({sensor}): {why}")
+            topics = rig.lidars if node.kind == "lidar" else rig.radars
+            found[node.name] = (f"{topics[node.name].points} ({node.name}): {why}",)
     return found
-
-
-def _evidence(frames: list[Frame], usable: int, rig: Rig, motion: Motion, *, has_prior: bool) -> Evidence:
-    def share(flags: list[bool]) -> float:
-        return float(np.mean(flags)) if flags else 0.0
-
-    # A rig without a camera lacks no labels, but has no boxes either.
-    has_labels = rig.camera is None or isinstance(rig.semantics, OnnxSemantics)
-    rings = max((_rings(f) for f in frames), default=0)
-    seen, swept, scanned = ([f for f in frames if sensor in f.sensors] for sensor in SENSORS)
-    return Evidence(
-        frames=usable,
-        has_prior=has_prior,
-        labels_share=1.0 if has_labels else share([f.labels_png is not None for f in seen]),
-        detections_share=1.0
-        if isinstance(rig.semantics, OnnxSemantics)
-        else share([f.detection_boxes_px is not None for f in seen]),
-        has_intensity=share([f.lidar_intensity is not None for f in swept]) > 0.5,
-        rings=rings,
-        elevation_share=share([f.radar_has_elevation for f in scanned]),
-        moving_share=motion.moving_share,
-        doppler_problem=motion.doppler_problem,
-        doppler_is_wrong=motion.doppler_is_wrong,
-        wrong=motion.wrong,
-        frames_of={
-            pair: round(usable * share([pair in pairs_of(f.sensors) for f in frames]))
-            for pair in pairs_of(rig.sensors)
-        },
-    )
-
-
-def _rings(frame: Frame) -> int:
-    """Rows that the log names; none where what it calls rings are lasers of a pattern without rows."""
-    if frame.lidar_ring is None:
-        return 0
-    xyz = frame.lidar_xyz_m.astype(np.float64)
-    finite = np.isfinite(xyz).all(axis=1)
-    row = rows_of(to_spherical(xyz[finite]), frame.lidar_ring[finite])
-    return 0 if row is None else int(row.max()) + 1
 
 
 def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
@@ -263,7 +229,7 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
             advice.append(
                 "the image's frame id is no optical frame (x right, y down, z forward): check /tf_static"
             )
-    if rig.ego is None and rig.radar is None:
+    if rig.ego is None and not rig.radars:
         advice.append(
             "no odometry configured, and no radar: the car's speed and the time offset stay unknown"
         )

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-__all__ = ["DofVerdict", "Evidence", "judge", "judge_edge", "overall"]
+__all__ = ["DofVerdict", "Evidence", "in_order", "judge", "judge_edge", "overall"]
 
 # 30 frames give camera-lidar within 0.1 deg and lidar-radar yaw within 0.15 deg on real logs, 10 twice that.
 _ENOUGH_FRAMES, _FEW_FRAMES = 30, 10
 _MOVING_SHARE = 0.2  # time offsets show only where the car moves
-_ORDER = ("camera_lidar", "lidar_radar", "camera_radar")  # in which three are shown: the composed one last
+_ORDER = ("camera_lidar", "lidar_radar", "camera_radar")  # in which they are shown, other kinds behind
 _DENSE_RINGS = 32  # below, reflectivity on the road has to carry pitch
 
 
@@ -57,6 +57,11 @@ def judge(evidence: Evidence) -> list[DofVerdict]:
     ]
 
 
+def in_order(kind: str) -> int:
+    """Place of an edge's kind among those that are shown."""
+    return _ORDER.index(kind) if kind in _ORDER else len(_ORDER)
+
+
 def judge_edge(name: str, kind: str, evidence: Evidence) -> list[DofVerdict]:
     """One verdict per class of DoF of an edge, by what is known of its two sensors."""
     needs = [(dof, needs) for of, dof, needs in _needs(evidence) if of == kind]
@@ -91,7 +96,6 @@ def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
         ("lidar_base", "x and y", ground + [("weak", "only turns say where the vehicle's x and y are")]),
         ("radar_base", "yaw", moving + radar),
         ("radar_base", "pitch", moving + radar + _elevation_needs(evidence)),
-        ("radar_base", "roll and translation", [("no", "Doppler does not show it: the prior stays")]),
     ]
 
 

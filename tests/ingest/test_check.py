@@ -1,6 +1,7 @@
 """`boresight check` says what logs can give before anyone spends a night on them."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from pipeline.ingest.check import check_logs
 from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.ingest.readiness import Evidence, judge, overall
 from pipeline.ingest.units import unit_that_fits
+from pipeline.rig.rig import Rig
 from pipeline.rigs import RadarTopics
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from tests.makers.fleet_files import fleet_toml
@@ -362,3 +364,28 @@ def test_a_sign_that_nobody_wrote_down_is_said_with_what_the_log_shows(kit, tmp_
     assert "cannot tell" in advice(0.0)
     written = report_on(kit, tmp_path, street_drive(kit))
     assert not any("doppler_positive" in a for a in written.advice)
+
+
+def test_the_rig_is_a_matrix_with_what_each_two_sensors_share(kit, tmp_path):
+    report = report_on(kit, tmp_path, kit.Kit(frames=40).drive())
+    found = {(p.parent, p.child): p for p in report.rig.pairs}
+    assert set(found) == set(FRAMES_OF_PAIR.values())
+    assert all(p.is_edge and p.moments == 40 and p.verdicts for p in found.values())
+    assert report.rig.reference == "lidar"
+    assert json.loads(json.dumps(asdict(report)))["rig"]["pairs"][0]["kind"] == "camera_lidar"
+
+
+def test_of_many_sensors_edges_are_judged_by_name_and_a_silent_one_is_left_out(kit, tmp_path):
+    config = kit.fleet(ingest={"min_lidar_points": 500})
+    rig = config.rigs["default"]
+    radars = {"ahead": rig.radar, "behind": RadarTopics(points="/behind/points")}
+    rig = Rig.model_validate(
+        {"cameras": {"front": rig.camera}, "lidars": {"top": rig.lidar}, "radars": radars}
+    )
+    report = check_logs([kit.Kit(frames=40).drive().mcap(tmp_path / "a.mcap")], rig, config)
+    assert {v.pair for v in report.verdicts} == {"front-top", "front-ahead", "top-ahead"}
+    assert report.rig.loose == ["behind"]
+    assert any(a.startswith("/behind/points: no message") for a in report.advice)
+    found = {(p.parent, p.child): p for p in report.rig.pairs}
+    assert found["top", "behind"].why_not == "no data of behind"
+    assert report.evidence.frames_of == dict.fromkeys(("front-top", "top-ahead", "front-ahead"), 40)

@@ -22,9 +22,10 @@ def check_models(rig: Rig, fleet: FleetConfig) -> None:
     Raises:
         ModelError: a manifest or model is missing, wrong, or not the one that its hash says.
     """
-    if isinstance(rig.semantics, OnnxSemantics):
-        load_manifest(fleet.path_of(rig.semantics.segmenter), "segment")
-        load_manifest(fleet.path_of(rig.semantics.detector), "detect")
+    for camera in rig.cameras.values():
+        if isinstance(camera.semantics, OnnxSemantics):
+            load_manifest(fleet.path_of(camera.semantics.segmenter), "segment")
+            load_manifest(fleet.path_of(camera.semantics.detector), "detect")
 
 
 class ModelSource:

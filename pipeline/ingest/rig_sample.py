@@ -1,0 +1,231 @@
+"""What a sample of a day's moments shows of a rig: views, edges, and what each edge's verdict rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry.cameras import camera_of
+from pipeline.geometry.scan_rows import rows_of
+from pipeline.geometry.spherical import to_spherical
+from pipeline.ingest.directions_and_units import Motion, motion_of
+from pipeline.ingest.readiness import DofVerdict, Evidence, in_order, judge_edge
+from pipeline.ingest.rig_matrix import RigFinding, rig_finding
+from pipeline.rig.graph import Edge, RigGraph, Sensor
+from pipeline.rig.overlap import Overlap, find_edges, overlaps_of
+from pipeline.rig.prior import RigPrior, Star, between, middle_of
+from pipeline.rig.rig import Rig
+from pipeline.rig.views import FRAMES, View, view_of_camera, view_of_clouds
+from pipeline.rigs import OnnxSemantics
+from pipeline.store.views import frame_of, priors_of
+from schemas.calibrations import SENSORS
+from schemas.captures import Capture, Image, Scan, Sweep
+from schemas.frames import Frame
+from schemas.moments import Moment
+
+__all__ = ["RigSample"]
+
+Topics = TypeVar("Topics")
+
+
+@dataclass(frozen=True, eq=False)
+class RigSample:
+    """Moments of a day that were looked into.
+
+    Args:
+        rig: whose.
+        built: the sample, in order of time.
+        looked: how many moments were looked into, with those of which nothing was usable.
+        present: of each moment of the day, the sensors that it has by their stamps.
+        stars: transforms that the logs carry, by log.
+        prior: of all sensors; None where there is none.
+        missing: by sensor, topics without which it is silent and why.
+    """
+
+    rig: Rig
+    built: Sequence[tuple[Moment, Mapping[str, Capture]]]
+    looked: int
+    present: Sequence[frozenset[str]]
+    stars: Mapping[str, Star]
+    prior: RigPrior | None
+    missing: Mapping[str, tuple[str, ...]]
+    _motions: dict[tuple[str, str], Motion] = field(default_factory=dict)
+    _ring_counts: dict[str, int] = field(default_factory=dict)
+
+    @cached_property
+    def overlaps(self) -> tuple[Overlap, ...]:
+        """Of all sensors that have data and a prior."""
+        return () if self.prior is None else overlaps_of(self.prior, self._views())
+
+    @cached_property
+    def graph(self) -> RigGraph:
+        """The rig's edges by the views of the sample."""
+        nodes = {node.name: node for node in self.rig.nodes}
+        reference = None if self.rig.reference is None else nodes[self.rig.reference]
+        prior = self.prior or RigPrior(self.rig.nodes, middle_of(self.rig.nodes), {}, {})
+        return find_edges(prior, self.overlaps, named=self.rig.named_edges, reference=reference)
+
+    @cached_property
+    def evidence(self) -> dict[Edge, Evidence]:
+        """What each edge's verdict rests on."""
+        edges = sorted(self.graph.edges, key=lambda edge: in_order(edge.kind))
+        return {edge: self._evidence(edge) for edge in edges}
+
+    @cached_property
+    def verdicts(self) -> dict[Edge, list[DofVerdict]]:
+        """Of every edge."""
+        return {edge: judge_edge(self.name(edge), edge.kind, of) for edge, of in self.evidence.items()}
+
+    @property
+    def whole(self) -> Evidence:
+        """Of the rig: what is known of sensors by its first edge, of moments by them all."""
+        if not self.evidence:
+            return Evidence(self._usable(len(self.built)), False, 0.0, 0.0, False, 0, 0.0, None)
+        return replace(
+            next(iter(self.evidence.values())),
+            frames=self._usable(len(self.built)),
+            has_prior=all(e.has_prior for e in self.evidence.values()),
+            missing=tuple(why for own in self.missing.values() for why in own),
+            frames_of={self.name(edge): of.frames for edge, of in self.evidence.items()},
+        )
+
+    def name(self, edge: Edge) -> str:
+        """Its kind where the rig's sensors are called so, else names of its sensors."""
+        return edge.kind if all(node.name == node.kind for node in self.rig.nodes) else edge.name
+
+    @property
+    def finding(self) -> RigFinding:
+        """The rig as a matrix."""
+        return rig_finding(self.graph, self.overlaps, self.present, self.verdicts)
+
+    def _evidence(self, edge: Edge) -> Evidence:
+        """Of an edge's two sensors, and of one of each other kind beside them."""
+        chosen, ends = self._beside(edge), {s.name for s in edge.sensors if s.kind != "base"}
+        own = [m for m, captures in self.built if ends <= captures.keys()]
+        tied = [
+            between(self.stars.get(m.log, {}), edge.parent.name, edge.child.name) is not None for m in own
+        ]
+        found = _evidence(self.frames(chosen), _only(self.rig, chosen), self.motion(chosen))
+        return replace(
+            found,
+            frames=self._usable(len(own)),
+            rings=self._rings(chosen),
+            has_prior=2 * sum(tied) > len(tied),
+            missing=tuple(why for name in self.missing if name in ends for why in self.missing[name]),
+        )
+
+    def frames(self, chosen: Mapping[str, str]) -> list[Frame]:
+        """Moments as some of the sensors saw them, names by kind."""
+        priors = {log: priors_of(star, chosen) for log, star in self.stars.items()}
+        return [
+            frame_of(m, {k: captures[s] for k, s in chosen.items() if s in captures}, priors.get(m.log, {}))
+            for m, captures in self.built
+        ]
+
+    def motion(self, chosen: Mapping[str, str]) -> Motion:
+        """How the chosen lidar and radar show the car to move, found out once."""
+        shown = (chosen.get("lidar", ""), chosen.get("radar", ""))
+        if shown not in self._motions:
+            self._motions[shown] = motion_of(self.frames(chosen), _only(self.rig, chosen))
+        return self._motions[shown]
+
+    def _rings(self, chosen: Mapping[str, str]) -> int:
+        """Of the chosen lidar, counted once."""
+        lidar = chosen.get("lidar", "")
+        if lidar not in self._ring_counts:
+            self._ring_counts[lidar] = max((_rings(f) for f in self.frames(chosen)), default=0)
+        return self._ring_counts[lidar]
+
+    @property
+    def advice(self) -> list[str]:
+        """What each radar's Doppler gives reason to say, once."""
+        edges = [edge for edge in self.graph.edges if "radar" in edge.kind]
+        return list(dict.fromkeys(a for edge in edges for a in self.motion(self._beside(edge)).advice))
+
+    def _usable(self, looked_into: int) -> int:
+        """Of the day, as of the sample."""
+        return round(len(self.present) * looked_into / max(self.looked, 1))
+
+    def _beside(self, edge: Edge) -> dict[str, str]:
+        """The edge's sensors by kind, and of each kind that it lacks the one that shares most with them."""
+        chosen: dict[str, str] = {s.kind: s.name for s in edge.sensors if s.kind != "base"}
+        for node in self.rig.nodes:
+            if node.kind not in ("base", *chosen):
+                others = [n for n in self.rig.nodes if n.kind == node.kind]
+                chosen[node.kind] = max(others, key=lambda n: self._shared(n, edge)).name
+        return chosen
+
+    def _shared(self, sensor: Sensor, edge: Edge) -> float:
+        ends = {frozenset((sensor, end)) for end in edge.sensors}
+        return sum((o.shared_sr for o in self.overlaps if frozenset(o.edge.sensors) in ends), 0.0)
+
+    def _views(self) -> dict[str, View]:
+        views: dict[str, View | None] = {}
+        for node in self.rig.nodes:
+            own = [captures[node.name] for _, captures in self.built if node.name in captures]
+            cameras = [c for c in own if isinstance(c, Image)]
+            clouds = [_points(c) for c in own[:: max(len(own) // FRAMES, 1)] if isinstance(c, Sweep | Scan)]
+            views[node.name] = view_of_camera(camera_of(cameras[0])) if cameras else view_of_clouds(clouds)
+        return {name: view for name, view in views.items() if view is not None}
+
+
+def _only(rig: Rig, chosen: Mapping[str, str]) -> Rig:
+    """The rig with these sensors alone, at most one of a kind."""
+
+    def kept(kind: str, of: Mapping[str, Topics]) -> dict[str, Topics]:
+        return {name: topics for name, topics in of.items() if chosen.get(kind) == name}
+
+    cameras, lidars, radars = (
+        kept("camera", rig.cameras),
+        kept("lidar", rig.lidars),
+        kept("radar", rig.radars),
+    )
+    return rig.model_copy(update={"cameras": cameras, "lidars": lidars, "radars": radars})
+
+
+def _points(capture: Sweep | Scan) -> Float[np.ndarray, "N 3"]:
+    if isinstance(capture, Sweep):
+        xyz = np.stack((capture.lidar_x_m, capture.lidar_y_m, capture.lidar_z_m), -1)
+    else:
+        xyz = np.stack((capture.radar_x_m, capture.radar_y_m, capture.radar_z_m), -1)
+    return xyz[np.isfinite(xyz).all(axis=1)]
+
+
+def _evidence(frames: list[Frame], rig: Rig, motion: Motion) -> Evidence:
+    """Of a camera, a lidar and a radar at most; how many frames and rows there are is asked elsewhere."""
+
+    def share(flags: list[bool]) -> float:
+        return float(np.mean(flags)) if flags else 0.0
+
+    # A rig without a camera lacks no labels, but has no boxes either.
+    computed = isinstance(rig.semantics, OnnxSemantics)
+    seen, swept, scanned = ([f for f in frames if kind in f.sensors] for kind in SENSORS)
+    labelled = share([f.labels_png is not None for f in seen])
+    return Evidence(
+        frames=len(frames),
+        has_prior=True,
+        labels_share=1.0 if rig.camera is None or computed else labelled,
+        detections_share=1.0 if computed else share([f.detection_boxes_px is not None for f in seen]),
+        has_intensity=share([f.lidar_intensity is not None for f in swept]) > 0.5,
+        rings=0,
+        elevation_share=share([f.radar_has_elevation for f in scanned]),
+        moving_share=motion.moving_share,
+        doppler_problem=motion.doppler_problem,
+        doppler_is_wrong=motion.doppler_is_wrong,
+        wrong=motion.wrong,
+    )
+
+
+def _rings(frame: Frame) -> int:
+    """Rows that the log names; none where what it calls rings are lasers of a pattern without rows."""
+    if frame.lidar_ring is None:
+        return 0
+    xyz = frame.lidar_xyz_m.astype(np.float64)
+    finite = np.isfinite(xyz).all(axis=1)
+    row = rows_of(to_spherical(xyz[finite]), frame.lidar_ring[finite])
+    return 0 if row is None else int(row.max()) + 1
