@@ -44,8 +44,9 @@ def verify(
         logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of one drive.
         fleet: fleet.toml: topics, and from where on an error matters ([verify]).
         calibration: what the car uses: JSON {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}, FORMAT:FILE[,FILE] of
-            `boresight export`, or of a lake [VEHICLE@]DAY or state; default: the prior that fleet.toml names
-            (tf_static of the log, or its file).
+            `boresight export`, or of a lake [VEHICLE@]DAY or state; of a rig with more sensors JSON {"reference":
+            "top", "T": {"front": 4x4, ...}}; default: the prior that fleet.toml names (tf_static of the log, or
+            its file).
         lake: folder of the tables, where the calibration is one of its days or a state.
         vehicle: whose rig the log is of; default: the only one of fleet.toml.
         camera_lidar_deg: an error of this size must not go unseen: a pass says that it would have failed.
@@ -71,7 +72,10 @@ def verify(
     with TemporaryDirectory(prefix="boresight-verify-") as folder:
         config = _for_one_look(config, frames)
         if calibration is not None:
-            in_use = _as_prior(Path(folder), calibration, lake, name, named or FrameOptions())
+            if config.rig_of(name).is_one_of_each:
+                in_use = _as_prior(Path(folder), calibration, lake, name, named or FrameOptions())
+            else:
+                in_use = _of_poses(calibration)
             config = config.with_prior_file(name, in_use)
         require_named_files(config)
         tables = Lake.at(Path(folder) / "lake")
@@ -119,6 +123,16 @@ def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, na
     file = folder / "in_use.json"
     file.write_bytes(prior_text({pair: p.T for pair, p in side.pairs.items()}, side.title, [calibration]))
     return file
+
+
+def _of_poses(calibration: str) -> Path:
+    """The prior file that `--calibration` names, of a rig with more than one sensor of a kind."""
+    from pipeline.errors import ConfigError
+
+    if not calibration.endswith(".json"):
+        problem = 'of this rig give a file .json: {"reference": "top", "T": {"front": 4x4, ...}}'
+        raise ConfigError("command line", "--calibration", problem)
+    return Path(calibration)
 
 
 def _checked(
@@ -169,24 +183,35 @@ def _spelled_alike(config: FleetConfig, lake: Lake, partition: Partition) -> Fle
     """
     from pipeline.errors import SolveError
     from pipeline.export.texts import to_json
-    from pipeline.extrinsics.prior import read_prior
+    from pipeline.extrinsics.prior import rig_prior
     from pipeline.in_use.spelling import on_grid
-    from pipeline.store.views import observations_of, perceived
-    from schemas.calibrations import pairs_of
+    from pipeline.store.views import perceived
+    from schemas.calibrations import FRAMES_OF_PAIR
+    from schemas.moments import PRIOR
 
-    if perceived(lake, partition) is None:
+    manifest, rig = perceived(lake, partition), config.rig_of(partition.vehicle)
+    if manifest is None:
         return config
     try:
-        prior = read_prior(list(observations_of(lake, partition)), config, partition.vehicle)
+        prior = rig_prior(manifest.extra.get(PRIOR, ()), config, rig)
     except SolveError:  # no prior: calibrate refuses the log and says why
         return config
-    file = lake.local_root / "on_grid.json"
-    has = pairs_of(config.rig_of(partition.vehicle).sensors)
-    given = [pair for pair in has if pair != "camera_radar" or len(has) == 1]
-    if not all(prior.knows(pair) for pair in given):  # a sensor is silent: its prior stays as logged
+    if prior.untied:  # a sensor is silent: its prior stays as logged
         return config
-    transforms = {f"T_{pair}": on_grid(prior.of(pair)).tolist() for pair in given}
-    file.write_bytes(to_json(transforms))
+    if rig.is_one_of_each:
+        kinds = {node.name: node.kind for node in rig.nodes}
+        ends = {(kinds[a], kinds[b]): T for (a, b), T in prior.T.items()}
+        said: dict[str, Any] = {
+            f"T_{pair}": on_grid(ends[of]).tolist() for pair, of in FRAMES_OF_PAIR.items() if of in ends
+        }
+    else:
+        poses = prior.extrinsics()
+        said = {
+            "reference": prior.reference.name,
+            "T": {n: on_grid(poses.T[n]).tolist() for n in poses.order},
+        }
+    file = lake.local_root / "on_grid.json"
+    file.write_bytes(to_json(said))
     return config.with_prior_file(partition.vehicle, file)
 
 

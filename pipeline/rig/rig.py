@@ -66,6 +66,16 @@ class Rig(Section):
         return own if self.base is None else (*own, BASE)
 
     @property
+    def kinds(self) -> tuple[str, ...]:
+        """Which of camera, lidar and radar it has."""
+        return tuple(kind for kind, of in self._of_kind.items() if of)
+
+    @property
+    def is_one_of_each(self) -> bool:
+        """At most one camera, one lidar and one radar, and no vehicle frame: what methods of three sensors know."""
+        return self.base is None and all(len(of) <= 1 for of in self._of_kind.values())
+
+    @property
     def named_edges(self) -> tuple[Edge, ...] | None:
         """The edges that the file names; None where they are to be found."""
         if self.edges is None:
