@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.extrinsics.checks import FailedCheck
+from pipeline.geometry.changes import change_jacobian
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge
@@ -61,7 +63,7 @@ class AdjustedSensor:
     Degrees of freedom: rotation vector about the reference's axes, then the sensor's origin in them.
 
     Args:
-        observability: 6, share 0..1 of its variance that is not the prior's error.
+        observability: 6, as `AdjustedRig.observability` of reference and sensor.
         determined: 6, bool; the others rest on the prior.
         rests_on: edges that its pose rests on: without one of them it is less sure.
         untied: why the day says nothing of its pose to the reference; empty = it does.
@@ -83,13 +85,25 @@ class AdjustedRig:
 
     Args:
         poses: with the covariance of all at once.
+        of_prior: part of that covariance that is the error of the prior.
         sensors: by name, less the reference.
         edges: every edge that had evidence.
     """
 
     poses: Extrinsics
+    of_prior: np.ndarray
     sensors: Mapping[str, AdjustedSensor]
     edges: Mapping[Edge, AdjustedEdge]
+
+    def observability(self, a: str, b: str) -> Float[np.ndarray, " 6"]:
+        """Share of each variance of T_a_b (rotation vector in a's axes, b's origin) that is not the prior's error.
+
+        1 - posterior/prior where a sensor has one unknown. Counted so, a position that the prior knows given its turn
+        is not called determined because the day found the turn.
+        """
+        J = change_jacobian(self.poses.between(a, b)) @ self.poses.jacobian_between(a, b)
+        share = np.diag(J @ self.of_prior @ J.T) / np.diag(J @ self.poses.covariance @ J.T)
+        return np.clip(1 - share, 0.0, 1.0)
 
     @property
     def left_out(self) -> tuple[Edge, ...]:

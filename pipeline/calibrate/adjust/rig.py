@@ -27,7 +27,6 @@ from pipeline.calibrate.adjust.innovations import innovation
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.common_share import common_part
-from pipeline.geometry.changes import change_jacobian
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge, RigGraph, Sensor
@@ -155,40 +154,26 @@ def _concluded(
     """The rig with its covariances, and what each sensor is worth."""
     n, order = 6 * len(rig.prior.order), rig.prior.order
     C = inverse_of_information(equations.H)
-    observability = _observability(rig, equations, C[:n, :n])
+    follow = C[:n, :n] @ equations.prior_information[:n, :n]
     poses = replace(
         rig.poses,
         covariance=C[:n, :n],
         common=common_part(equations.common(C, rig)[:n, :n], C[:n, :n]),
     )
+    found = AdjustedRig(poses, follow @ rig.prior.covariance @ follow.T, {}, edges)
     rests_on = _rests_on(equations, C, len(order))
     clock = np.sqrt(np.diag(C)[n : n + len(order)])
+    used = [e.evidence.edge for e in equations.edges]
     sensors = {}
     for k, name in enumerate(order):
-        at, on = slice(6 * k, 6 * k + 6), rests_on[k]
-        doubts = tuple(dict.fromkeys(d for e in on for d in edges[e].doubts))
-        untied = _untied(graph, graph[name], [e.evidence.edge for e in equations.edges])
+        observability = found.observability(graph.reference.name, name)
+        untied = _untied(graph, graph[name], used)
+        determined = (observability >= OBSERVABLE) & (not untied)
+        doubts = tuple(dict.fromkeys(d for e in rests_on[k] for d in edges[e].doubts))
         sensors[name] = AdjustedSensor(
-            observability[at],
-            (observability[at] >= OBSERVABLE) & (not untied),
-            on,
-            untied,
-            doubts,
-            float(clock[k]),
+            observability, determined, rests_on[k], untied, doubts, float(clock[k])
         )
-    return AdjustedRig(poses, sensors, edges)
-
-
-def _observability(rig: Rig, equations: Equations, C: Float[np.ndarray, "P P"]) -> Float[np.ndarray, " P"]:
-    """Share of each variance that is not the prior's error: 1 - posterior/prior where a sensor has one unknown.
-
-    Counted so, a position that the prior knows given its turn is not called determined because the day found the turn.
-    """
-    n = len(C)
-    to_change = _blocks([change_jacobian(rig.poses.T[name]) for name in rig.prior.order])
-    follow = to_change @ C @ equations.prior_information[:n, :n]
-    of_prior = np.diag(follow @ rig.prior.covariance @ follow.T)
-    return np.clip(1 - of_prior / np.diag(to_change @ C @ to_change.T), 0.0, 1.0)
+    return replace(found, sensors=sensors)
 
 
 def _rests_on(equations: Equations, C: Float[np.ndarray, "N N"], sensors: int) -> list[tuple[Edge, ...]]:
@@ -215,11 +200,3 @@ def _untied(graph: RigGraph, sensor: Sensor, used: Sequence[Edge]) -> str:
         f"nothing ties it, {', '.join(with_it)} to the reference {graph.reference.name}: "
         "what joins them is the prior"
     )
-
-
-def _blocks(parts: Sequence[Float[np.ndarray, "6 6"]]) -> Float[np.ndarray, "P P"]:
-    """Block-diagonal matrix."""
-    out = np.zeros((6 * len(parts),) * 2)
-    for k, part in enumerate(parts):
-        out[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = part
-    return out

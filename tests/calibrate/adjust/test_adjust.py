@@ -329,6 +329,27 @@ def test_an_error_of_a_sensor_shows_in_its_edges_as_a_turn_of_that_sensor():
     assert np.degrees(np.sqrt(np.maximum(of_radar[:3], 0))).max() < 0.03
 
 
+def test_it_does_not_matter_where_an_edge_was_linearised():
+    scene = Scene(np.random.default_rng(19), "cam0", "rad0")
+    own = {EDGE: np.diag([np.radians(0.1) ** 2] * 3 + [4e-4] * 3), "cam0": np.eye(6) * 1e-6}
+    edges = [
+        scene.edge("cam0", "top", bias=own),
+        scene.edge("top", "rad0"),
+        scene.edge("cam0", "rad0", bias=own),
+    ]
+    d = np.array([1e-4, -2e-4, 1e-4, 1e-3, -1e-3, 2e-3, 0.002])
+    moved = [
+        replace(e, T=exp_se3(-d[:6]) @ e.T, dt_s=e.dt_s - d[6], gradient=e.information @ d) for e in edges
+    ]
+    a, b = scene.adjusted(edges, innovation_sigmas=9.0), scene.adjusted(moved, innovation_sigmas=9.0)
+    for name in ("cam0", "rad0"):
+        np.testing.assert_allclose(
+            log_se3(a.poses.T[name] @ inverse(b.poses.T[name])), np.zeros(6), atol=5e-5
+        )
+        assert a.poses.dt_s[name] == pytest.approx(b.poses.dt_s[name], abs=1e-6)
+    np.testing.assert_allclose(np.diag(a.poses.covariance), np.diag(b.poses.covariance), rtol=0.01)
+
+
 def test_evidence_of_an_edge_that_the_rig_lacks_is_an_error():
     scene = Scene(np.random.default_rng(18), "cam0", "rad0")
     edges = [scene.edge("cam0", "top"), scene.edge("top", "rad0")]
