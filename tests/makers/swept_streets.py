@@ -1,16 +1,16 @@
 """Simulated streets as lidars of one car sweep them: no camera, no log, poses in the vehicle frame known."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pipeline.calibrate.edges.lidar_base import Scenes
-from pipeline.calibrate.edges.sweeps import Sweep
+from pipeline.calibrate.edges.sweeps import Sweep, vehicle_sized
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, perturb_exactly
 from pipeline.ingest.deskew import deskew
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.perceive.ground import find_ground
-from pipeline.perceive.lidar import sample_uniformly
+from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.world.casting import World
@@ -85,6 +85,12 @@ def swept_streets(
     return SweptStreets(sweeps, ego, Scenes(np.arange(frames), block), nominal)
 
 
+def chosen(sweep, keep):
+    """Some points of a sweep."""
+    columns = {name: getattr(sweep, name)[keep] for name in ("xyz_m", "is_ground", "may_move", "time_s")}
+    return replace(sweep, **columns)
+
+
 def _odometry(drive, at_s, rng):
     t = np.array([at_s])
     T = drive.ego.poses(t)[0]
@@ -95,4 +101,9 @@ def _odometry(drive, at_s, rng):
 def _perceived(xyz, time_s, stamp_ns, drive, rng):
     ground = find_ground(xyz, _GROUND_INLIER_M, rng)
     some = sample_uniformly(xyz, _VOXEL_M)
-    return Sweep(stamp_ns, drive, xyz[some].astype(float), ground.is_ground[some], time_s[some].astype(float))
+    cluster = cluster_objects(xyz, ground.is_ground, 0.7, 8)
+    boxes = cluster_boxes(xyz, cluster)
+    may_move = vehicle_sized(cluster[some], boxes.min_m, boxes.max_m)
+    return Sweep(
+        stamp_ns, drive, xyz[some].astype(float), ground.is_ground[some], may_move, time_s[some].astype(float)
+    )

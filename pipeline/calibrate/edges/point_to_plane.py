@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3, transform_points
 
-__all__ = ["Registration", "Surfaces", "register"]
+__all__ = ["PlaneEquations", "Registration", "Surfaces", "plane_equations", "register"]
 
 _NEIGHBOURS = 10
 _PLANAR = 0.1  # a patch's smallest variance over its middle one: beyond it there is no plane
@@ -48,13 +48,21 @@ class Surfaces:
 
 
 @dataclass(frozen=True, eq=False)
+class PlaneEquations:
+    """Of points near surfaces, for a left perturbation (rotation, shift) of where they are."""
+
+    information: np.ndarray  # 6 6
+    gradient: np.ndarray  # 6, downhill
+    scatter_m: float  # of points from the surfaces
+    share: float  # of the points that lie on a surface
+
+
+@dataclass(frozen=True, eq=False)
 class Registration:
-    """T_target_source and how the data alone curve about it (left perturbation)."""
+    """T_target_source, and the equations of the data alone there."""
 
     T: np.ndarray  # 4 4
-    information: np.ndarray  # 6 6, of the data alone
-    scatter_m: float  # of points from the surfaces
-    share: float  # of the source's points that lie on a surface
+    found: PlaneEquations
 
 
 def register(
@@ -77,29 +85,30 @@ def register(
         None where hardly any point meets a surface.
     """
     T, held = start, np.diag(sigmas**-2.0)
+    found = None
     for gate in gates_m:
         for _ in range(_STEPS):
-            found = _equations(transform_points(T, source_m), target, gate)
+            found = plane_equations(transform_points(T, source_m), target, gate)
             if found is None:
                 return None
-            H, g, scatter, share = found
-            step = np.linalg.solve(H + held, g + held @ log_se3(start @ inverse(T)))
+            downhill = found.gradient + held @ log_se3(start @ inverse(T))
+            step = np.linalg.solve(found.information + held, downhill)
             T = exp_se3(step) @ T
             if np.abs(step).max() < _CONVERGED:
                 break
-    return Registration(T, H, scatter, share)
+    return None if found is None else Registration(T, found)
 
 
-def _equations(
-    moved: np.ndarray, target: Surfaces, gate_m: float
-) -> tuple[np.ndarray, np.ndarray, float, float] | None:
-    """Information, gradient (descent), scatter and share of the points that meet a plane within the gate."""
-    distance, index = target.tree.query(moved, distance_upper_bound=gate_m)
+def plane_equations(
+    moved_m: Float[np.ndarray, "N 3"], target: Surfaces, gate_m: float
+) -> PlaneEquations | None:
+    """Robust equations of the points that meet a plane within the gate; None of hardly any."""
+    distance, index = target.tree.query(moved_m, distance_upper_bound=gate_m)
     meets = np.isfinite(distance)
     meets[meets] = target.is_planar[index[meets]]
     if meets.sum() < _FEWEST:
         return None
-    p, n, q = moved[meets], target.normal[index[meets]], target.xyz_m[index[meets]]
+    p, n, q = moved_m[meets], target.normal[index[meets]], target.xyz_m[index[meets]]
     r = np.einsum("ij,ij->i", n, p - q)
     # Of level surfaces only the vertical part is believed.
     level = np.abs(n[:, 2]) > _LEVEL
@@ -107,4 +116,4 @@ def _equations(
     J = np.concatenate([np.cross(p, n), n], 1)
     scatter = max(1.4826 * float(np.median(np.abs(r))), _LEAST_SCATTER_M)
     w = (1 + (r / (2 * scatter)) ** 2) ** -2 / scatter**2
-    return (J.T * w) @ J, -(J.T * w) @ r, scatter, float(meets.mean())
+    return PlaneEquations((J.T * w) @ J, -(J.T * w) @ r, scatter, float(meets.mean()))

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from schemas.observations import Observation
 
-__all__ = ["Sweep", "deskewed_again", "sweeps_of"]
+__all__ = ["Sweep", "deskewed_again", "sweeps_of", "vehicle_sized"]
+
+_VEHICLE_M = (0.7, 18.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +24,7 @@ class Sweep:
         drive: continuous stretch of driving.
         xyz_m: N 3.
         is_ground: N, on the drivable ground.
+        may_move: N, on something of a vehicle's size.
         time_s: N, when each point was measured, against the stamp; None where nobody knows.
     """
 
@@ -29,6 +32,7 @@ class Sweep:
     drive: int
     xyz_m: np.ndarray
     is_ground: np.ndarray
+    may_move: np.ndarray
     time_s: np.ndarray | None = None
 
 
@@ -40,10 +44,20 @@ def sweeps_of(observations: Sequence[Observation]) -> list[Sweep]:
             o.drive,
             o.lidar_map_xyz_m.astype(np.float64),
             o.lidar_map_is_ground.astype(bool),
+            vehicle_sized(o.lidar_map_cluster, o.lidar_cluster_min_m, o.lidar_cluster_max_m),
             None if o.lidar_map_time_s is None else o.lidar_map_time_s.astype(np.float64),
         )
         for o in observations
     ]
+
+
+def vehicle_sized(
+    cluster: Int[np.ndarray, " N"], low_m: Float[np.ndarray, "K 3"], high_m: Float[np.ndarray, "K 3"]
+) -> Bool[np.ndarray, " N"]:
+    """Points of clusters as large as bicycles to lorries: neither posts nor walls and rails."""
+    length_m = (high_m - low_m)[:, :2].max(1, initial=0.0)
+    is_vehicle = (length_m > _VEHICLE_M[0]) & (length_m < _VEHICLE_M[1])
+    return np.asarray(np.append(is_vehicle, False)[cluster])  # of no cluster: the last
 
 
 def deskewed_again(

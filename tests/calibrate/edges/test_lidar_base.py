@@ -10,7 +10,7 @@ from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.geometry.se3 import adjoint, exp_se3, exp_so3, inverse, perturb_exactly
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.graph import BASE, Edge, Sensor
-from tests.makers.swept_streets import AROUND, Mounted, pose, swept_streets
+from tests.makers.swept_streets import AROUND, Mounted, chosen, pose, swept_streets
 
 EDGE = Edge(Sensor("top", "lidar"), BASE)
 AXES = [0, 1, 2, 5]  # of a change of T_base_lidar: roll, pitch, yaw, height
@@ -91,8 +91,7 @@ def test_the_information_is_of_left_perturbations(evidence):
 
 
 def test_an_empty_square_shows_no_yaw_and_still_the_road(street):
-    flat = [replace(s, xyz_m=s.xyz_m[s.is_ground], time_s=s.time_s[s.is_ground], is_ground=s.is_ground[s.is_ground])
-            for s in street.sweeps["top"]]  # fmt: skip
+    flat = [chosen(s, s.is_ground) for s in street.sweeps["top"]]
     evidence = estimated(replace(street, sweeps={"top": flat}))
     error, sigma = errors(evidence, T_BASE_TOP)
     assert not np.isfinite(sigma[2])
@@ -140,11 +139,7 @@ def test_a_car_that_parks_on_a_kerb_for_half_of_the_day_is_one_scene(street):
 def test_cars_that_keep_their_distance_do_not_slow_the_way(street):
     box = np.random.default_rng(1).uniform([9.0, -1.0, -1.2], [9.3, 1.0, 0.2], (400, 3))
     beside = box + [2.0, 4.0, 0.0]
-    convoy = [
-        replace(s, xyz_m=np.concatenate([s.xyz_m, box, beside]), is_ground=np.r_[s.is_ground, np.zeros(800, bool)],
-                time_s=np.r_[s.time_s, np.zeros(800)])
-        for s in street.sweeps["top"]
-    ]  # fmt: skip
+    convoy = [with_points(s, np.concatenate([box, beside])) for s in street.sweeps["top"]]
     error, _ = errors(estimated(replace(street, sweeps={"top": convoy})), T_BASE_TOP)
     assert (np.abs(error) < LIMITS).all()
 
@@ -157,6 +152,15 @@ def test_a_measured_height_is_one_more_measurement_and_is_checked(street, eviden
     wrong = estimated(street, height_m=(height_m + 0.2, 0.01))
     assert any("height" in c.sentence for c in wrong.checks)
     assert by_axis(agreed)[0][2, 3] == pytest.approx(alone[2, 3], abs=0.01)
+
+
+def with_points(sweep, xyz_m):
+    """The sweep and points on something that stands on the ground, of a size that nobody knows."""
+    nothing = np.zeros(len(xyz_m), bool)
+    return replace(
+        sweep, xyz_m=np.concatenate([sweep.xyz_m, xyz_m]), is_ground=np.r_[sweep.is_ground, nothing],
+        may_move=np.r_[sweep.may_move, nothing], time_s=np.r_[sweep.time_s, 0.0 * nothing],
+    )  # fmt: skip
 
 
 def turned(sweep, rotation_base):
