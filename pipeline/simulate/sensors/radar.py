@@ -209,7 +209,10 @@ def _unsuppressed(x: np.ndarray) -> np.ndarray:
     for i in range(len(x)):
         if keep[i]:
             for j in range(i + 1, len(x)):
-                if np.all(np.abs(x[i] - x[j]) < 1.0):
+                k = 0  # np.all would make an array of each pair
+                while k < x.shape[1] and abs(x[i, k] - x[j, k]) < 1.0:
+                    k += 1
+                if k == x.shape[1]:
                     keep[j] = False
     return keep
 
