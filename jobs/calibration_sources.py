@@ -47,7 +47,7 @@ def read_calibration(
         edges_of_vehicle,
         pairs_of_day,
         pairs_of_state,
-        read_camera,
+        read_cameras,
         read_frame_ids,
         rest_at_prior,
     )
@@ -66,16 +66,17 @@ def read_calibration(
     pairs = pairs if unchecked else rest_at_prior(lake, vehicle, method, pairs)
     details = [p.details for p in pairs.values()]
     days = {str(d) for detail in details for d in _listed(detail.get("days"))} | ({day} if day else set())
-    camera = read_camera(lake, vehicle, days)
     names = frames.names(read_frame_ids(lake, vehicle, days) if own_frames else None)
     edges = edges_of_vehicle(lake, vehicle, day, method)
+    seen = sorted({sensor.name for edge in edges for sensor in edge.sensors if sensor.kind == "camera"})
+    cameras = read_cameras(lake, vehicle, days, seen)
     T_base_lidar = None if mount is None else mounting(mount, names, edges)
     if day is None:
         source = f"state of {max((str(d['day']) for d in details), default='no day')}"
     tell_damage(lake)
     return ExportedCalibration(
-        vehicle, source, method, CODE_VERSION, pairs, camera, names, T_base_lidar, without, word,
-        known=edges,
+        vehicle, source, method, CODE_VERSION, pairs, None, names, T_base_lidar, without, word,
+        known=edges, cameras=cameras,
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ __all__ = [
     "pairs_of_day",
     "pairs_of_state",
     "priors_of_day",
-    "read_camera",
+    "read_cameras",
     "read_frame_ids",
     "rest_at_prior",
 ]
@@ -175,21 +175,24 @@ def choose_pairs(
     return chosen, left_out
 
 
-def read_camera(lake: Lake, vehicle: str, days: Iterable[str]) -> Camera | None:
-    """Intrinsics of the latest of these days whose observations are in the lake; None where none are."""
+def read_cameras(lake: Lake, vehicle: str, days: Iterable[str], cameras: Sequence[str]) -> dict[str, Camera]:
+    """Intrinsics of cameras by name, each of the latest of these days whose observations show it in the lake."""
+    found: dict[str, Camera] = {}
     for day in sorted(days, reverse=True):
         partition = Partition(vehicle, day)
         try:
             if perceived(lake, partition) is None:
                 continue
-            seen = next((o for o in observations_of(lake, partition) if "camera" in o.sensors), None)
-            if seen is not None:
-                camera = camera_of(seen)
-                K, D = np.array(camera.K), np.array(camera.D)
-                return Camera(camera.model, K, D, camera.width_px, camera.height_px)
+            for name in (name for name in cameras if name not in found):
+                own = observations_of(lake, partition, chosen={"camera": name})
+                seen = next((o for o in own if "camera" in o.sensors), None)
+                if seen is not None:
+                    camera = camera_of(seen)
+                    K, D = np.array(camera.K), np.array(camera.D)
+                    found[name] = Camera(camera.model, K, D, camera.width_px, camera.height_px)
         except ContractError as err:  # damaged, or collected after its time
             lake.damage.append(str(err))
-    return None
+    return found
 
 
 def read_frame_ids(lake: Lake, vehicle: str, days: Iterable[str]) -> dict[str, str]:
