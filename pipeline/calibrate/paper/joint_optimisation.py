@@ -15,14 +15,13 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.paper.minimise import at_border, minimise, poses_about
+from pipeline.calibrate.paper.minimise import at_border, half_widths, minimise, poses_about
 from pipeline.calibrate.paper.pairwise import (
     PairProblem,
     border_failures,
     estimate_of,
     loop_size,
     pair_problem,
-    search_of,
     solve_pair,
 )
 from pipeline.config import SolveConfig
@@ -62,14 +61,13 @@ def solve_joint_optimisation(
     if active:
         found = minimise(
             lambda x: joint_costs(problems, prior, scales, x),
-            search_of(config),
+            config,
             np.concatenate(starts),
             np.random.default_rng([seed, len(PAIRS)]),
             spread=_SPREAD,
         )
         for pair, x in zip(active, found.x.reshape(-1, 6), strict=True):
-            half = search_of(config).half_widths(1)
-            own = replace(found, x=x, at_border=at_border(x, half))
+            own = replace(found, x=x, at_border=at_border(x, half_widths(config, 1)))
             pairs[pair] = estimate_of(problems[pair], poses_about(prior.of(pair), x[None])[0], prior, own)
     return Solution("joint-optimisation", pairs, *loop_size(pairs), failed_checks=border_failures(pairs))
 

@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import differential_evolution, minimize
 
+from pipeline.config import SolveConfig
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 
-__all__ = ["Minimum", "Search", "at_border", "minimise", "poses_about"]
+__all__ = ["Minimum", "at_border", "half_widths", "minimise", "poses_about"]
 
 # Costs of a batch of parameter vectors: (S, D) -> (S,)
 Objective = Callable[[np.ndarray], np.ndarray]
@@ -24,20 +25,6 @@ Objective = Callable[[np.ndarray], np.ndarray]
 _BORDER = 0.98  # of the half-width: a minimum beyond it counts as at the border
 _SIMPLEX = 0.05  # edge of Nelder-Mead's first simplex, as a share of the half-width
 _EVALUATIONS_PER_PARAMETER = 150
-
-
-@dataclass(frozen=True)
-class Search:
-    """Box and effort of one search."""
-
-    rotation_rad: float
-    translation_m: float
-    population: int
-    generations: int
-
-    def half_widths(self, poses: int) -> Float[np.ndarray, " D"]:
-        """Half the box along each parameter of `poses` poses."""
-        return np.tile([self.rotation_rad] * 3 + [self.translation_m] * 3, poses)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +42,14 @@ def poses_about(T_start: Float[np.ndarray, "4 4"], x: Float[np.ndarray, "S 6"]) 
     return from_rotation_translation(exp_so3(x[:, :3]) @ T_start[:3, :3], T_start[:3, 3] + x[:, 3:])
 
 
+def half_widths(config: SolveConfig, poses: int) -> Float[np.ndarray, " D"]:
+    """Half the search box along each parameter of `poses` poses."""
+    return np.tile([np.radians(config.search_rotation_deg)] * 3 + [config.search_translation_m] * 3, poses)
+
+
 def minimise(
     objective: Objective,
-    search: Search,
+    config: SolveConfig,
     start: Float[np.ndarray, " D"],
     rng: np.random.Generator,
     *,
@@ -67,13 +59,13 @@ def minimise(
 
     Args:
         objective: costs of a batch of parameter vectors.
-        search: box and effort.
+        config: box and effort.
         start: member of the first population, and its centre.
         rng: decides everything random.
         spread: size of the first population as a share of the box, 1 = all of it.
     """
-    half = search.half_widths(len(start) // 6)
-    members = start + spread * half * (2 * _latin_hypercube(search.population, len(start), rng) - 1)
+    half = half_widths(config, len(start) // 6)
+    members = start + spread * half * (2 * _latin_hypercube(config.paper_population, len(start), rng) - 1)
     members = np.clip(members, -half, half)
     members[0] = np.clip(start, -half, half)
     evaluations = 0
@@ -87,7 +79,7 @@ def minimise(
         lambda x: counted(x.T),
         list(zip(-half, half, strict=True)),
         init=members,
-        maxiter=search.generations,
+        maxiter=config.paper_generations,
         mutation=(0.5, 0.9),
         recombination=0.8,
         tol=1e-4,

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from pipeline.calibrate.numerics.bias_floors import PAPER_BIAS
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
-from pipeline.calibrate.paper.minimise import Minimum, Search, minimise, poses_about
+from pipeline.calibrate.paper.minimise import Minimum, minimise, poses_about
 from pipeline.calibrate.paper.sandwich import sandwich_covariance
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.checks import FailedCheck
@@ -45,7 +45,6 @@ __all__ = [
     "estimate_of",
     "loop_size",
     "pair_problem",
-    "search_of",
     "solve_pair",
     "solve_pairwise",
 ]
@@ -67,11 +66,9 @@ class PairProblem:
 
     def loss(self, T: Float[np.ndarray, "P 4 4"]) -> Float[np.ndarray, " P"]:
         """Mean over the informative frames."""
-        return (
-            self.frame_losses(T)[:, self.informative].mean(axis=1)
-            if self.informative.any()
-            else np.zeros(len(T))
-        )
+        if not self.informative.any():
+            return np.zeros(len(T))
+        return np.asarray(self.frame_losses(T)[:, self.informative].mean(axis=1))
 
 
 def pair_problem(
@@ -123,19 +120,7 @@ def solve_pairwise(
 
 def solve_pair(problem: PairProblem, config: SolveConfig, rng: np.random.Generator) -> Minimum:
     """Minimise one pair's loss about its prior."""
-    return minimise(
-        lambda x: problem.loss(poses_about(problem.T_prior, x)), search_of(config), np.zeros(6), rng
-    )
-
-
-def search_of(config: SolveConfig) -> Search:
-    """The paper's search as configured."""
-    return Search(
-        np.radians(config.search_rotation_deg),
-        config.search_translation_m,
-        config.paper_population,
-        config.paper_generations,
-    )
+    return minimise(lambda x: problem.loss(poses_about(problem.T_prior, x)), config, np.zeros(6), rng)
 
 
 def estimate_of(

@@ -20,6 +20,7 @@ from pipeline.objective.paper.classes import (
     camera_at_label_size,
     distance_cost,
     in_camera,
+    in_range,
     labels_of,
     safely_in_view,
     thin,
@@ -32,7 +33,6 @@ __all__ = ["CameraRadarLoss", "camera_radar_loss"]
 SCALE_RAD = np.radians(2.0)
 PENALTY = 1.0
 _DETECTIONS = 300  # per frame
-_RANGE_M = (2.0, 80.0)
 _FAR_PX = 1e6  # where absent targets are put
 
 
@@ -82,14 +82,14 @@ def camera_radar_loss(
         labels = labels_of(observation)
         camera = camera_at_label_size(observation, labels)
         cameras.append(camera)
-        near = _in_range(observation.radar_track_xyz_m)
+        near = in_range(observation.radar_track_xyz_m)
         near = near[safely_in_view(camera, in_camera(T_prior, near), margin_rad)]
         tracks.append(near)
         frame_of.append(np.full(len(near), index))
         boxes = observation.road_user_boxes_px.astype(np.float64).reshape(-1, 4)
         # Pixel centres are integers: a full-image pixel u lies at (u + 1/2) s - 1/2 in the label image.
         centres.append(((boxes[:, :2] + boxes[:, 2:]) / 2 + 0.5) * observation.label_scale - 0.5)
-        cloud = _in_range(observation.radar_xyz_m)
+        cloud = in_range(observation.radar_xyz_m)
         clouds.append(thin(cloud[safely_in_view(camera, in_camera(T_prior, cloud), margin_rad)], _DETECTIONS))
         costs.append(np.where(labels == SKY, PENALTY, 0.0))
     return CameraRadarLoss(
@@ -98,11 +98,6 @@ def camera_radar_loss(
         centres_px=_padded(centres, _FAR_PX),
         detections=fold_frames(clouds, costs, cameras, PENALTY),
     )
-
-
-def _in_range(points: np.ndarray) -> np.ndarray:
-    distance = np.linalg.norm(points, axis=1)
-    return points[(distance > _RANGE_M[0]) & (distance < _RANGE_M[1])].astype(np.float64)
 
 
 def _padded(arrays: list[np.ndarray], fill: float) -> np.ndarray:

@@ -18,12 +18,14 @@ __all__ = [
     "camera_at_label_size",
     "distance_cost",
     "in_camera",
+    "in_range",
     "labels_of",
     "safely_in_view",
     "thin",
 ]
 
 ROAD, SKY = 0, 10  # Cityscapes train ids
+_RANGE_M = (2.0, 80.0)
 # Paper, section 4.3: "vehicles, pedestrians, signs, poles, buildings, fences, and vegetation"; walls and
 # traffic lights go with fences and signs.
 REFLECTING = np.array([2, 3, 4, 5, 6, 7, 8, 11, 12, 13, 14, 15, 16, 17, 18], np.uint8)
@@ -62,6 +64,12 @@ def safely_in_view(
     size = np.array([camera.width_px, camera.height_px])
     margin = np.minimum(margin_rad * np.array(camera.focal_px), size / 8)
     return valid & np.all((uv >= margin) & (uv <= size - 1 - margin), axis=1)
+
+
+def in_range(points: np.ndarray) -> Float[np.ndarray, "M 3"]:
+    """Points from 2 m (nearer is the car itself) to the paper's far limit, as float64."""
+    distance = np.linalg.norm(points, axis=1)
+    return points[(distance > _RANGE_M[0]) & (distance < _RANGE_M[1])].astype(np.float64)
 
 
 def thin(points: Float[np.ndarray, "N 3"], limit: int) -> Float[np.ndarray, "M 3"]:

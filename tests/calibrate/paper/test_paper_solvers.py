@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.calibrate.methods import METHODS, method_named
 from pipeline.calibrate.paper.joint_optimisation import joint_costs, solve_joint_optimisation
-from pipeline.calibrate.paper.minimise import Search, minimise, poses_about
+from pipeline.calibrate.paper.minimise import minimise, poses_about
 from pipeline.calibrate.paper.pairwise import pair_problem, solve_pairwise
 from pipeline.calibrate.paper.sandwich import sandwich_covariance
 from pipeline.config import SolveConfig
@@ -50,6 +50,14 @@ def joint(frames, prior):
     return solve_joint_optimisation(frames, prior, CONFIG, seed=1)
 
 
+def searched(population, generations):
+    """A search of 0.07 rad and 0.2 m to each side."""
+    return SolveConfig(
+        search_rotation_deg=np.degrees(0.07), search_translation_m=0.2, paper_population=population,
+        paper_generations=generations,
+    )  # fmt: skip
+
+
 def test_minimise_finds_the_lowest_of_several_basins():
     target = np.array([0.03, -0.02, 0.01, 0.05, -0.1, 0.0])
 
@@ -57,14 +65,14 @@ def test_minimise_finds_the_lowest_of_several_basins():
         d = (x - target) / np.array([0.02] * 3 + [0.1] * 3)
         return (d**2).sum(axis=1) + 2 * (1 - np.cos(5 * d)).sum(axis=1)
 
-    found = minimise(bumpy, Search(0.07, 0.2, 60, 120), np.zeros(6), np.random.default_rng(0))
+    found = minimise(bumpy, searched(60, 120), np.zeros(6), np.random.default_rng(0))
     np.testing.assert_allclose(found.x, target, atol=1e-3)
     assert not found.at_border
     assert found.evaluations > 60 * 30
 
 
 def test_minimise_says_when_the_minimum_lies_at_the_border():
-    found = minimise(lambda x: x[:, 0], Search(0.07, 0.2, 20, 20), np.zeros(6), np.random.default_rng(0))
+    found = minimise(lambda x: x[:, 0], searched(20, 20), np.zeros(6), np.random.default_rng(0))
     assert found.at_border
     assert found.x[0] == pytest.approx(-0.07)
 
