@@ -42,12 +42,7 @@ class CameraEncoder(nn.Module):
         x = standardised(camera[:, :CAMERA_CHANNELS])
         if self.trust is not None:
             x = torch.cat([x, camera[:, CAMERA_CHANNELS:]], 1)
-        skips = []
-        for block in self.down:
-            x = block(x)
-            skips.append(x)
-        for block, skip in zip(self.up, reversed(skips[:-1]), strict=True):
-            x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
+        x = _down_and_up(x, self.down, self.up)
         logits = F.pixel_shuffle(self.logits(x), 2)
         if self.trust is None:
             return logits
@@ -79,13 +74,7 @@ class LidarEncoder(nn.Module):
 
     def features(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B F h w"]:
         """What the convolutions make of the sweep, by squares of four cells."""
-        x, skips = rendered, []
-        for block in self.down:
-            x = block(x)
-            skips.append(x)
-        for block, skip in zip(self.up, reversed(skips[:-1]), strict=True):
-            x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
-        return x
+        return _down_and_up(rendered, self.down, self.up)
 
     def logits_at(
         self, features: Tensor, rendered: Tensor, row: Int64[Tensor, "B N"], column: Int64[Tensor, "B N"]
@@ -143,6 +132,17 @@ def standardised(camera: Float[Tensor, "B 4 H W"]) -> Float[Tensor, "B 4 H W"]:
     centred = (colours - mean) * seen
     variance = (centred * centred).sum((1, 2, 3), keepdim=True) / (3 * count)
     return torch.cat([centred / torch.sqrt(variance + 1e-6), seen], 1)
+
+
+def _down_and_up(x: Tensor, down: nn.ModuleList, up: nn.ModuleList) -> Tensor:
+    """Halve the grid block by block, and double it again beside what it was at that size."""
+    skips = []
+    for block in down:
+        x = block(x)
+        skips.append(x)
+    for block, skip in zip(up, reversed(skips[:-1]), strict=True):
+        x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
+    return x
 
 
 def _block(inputs: int, outputs: int, stride: int) -> nn.Sequential:

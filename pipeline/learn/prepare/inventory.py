@@ -47,28 +47,22 @@ def take_inventory(lake: Lake, duplicate_bits: int) -> Inventory:
         duplicate_bits: fingerprints that differ in fewer bits show the same view; 0 = do not look.
     """
     rejected: Counter[str] = Counter()
-    environments: dict[str, Counter[str]] = {side: Counter() for side in SPLITS}
-    vehicles: dict[str, set[str]] = {side: set() for side in SPLITS}
-    days: dict[str, set[str]] = {side: set() for side in SPLITS}
+    frames: dict[str, list[tuple[str, str, str, int]]] = {side: [] for side in SPLITS}  # environment first
     views: dict[str, list[np.ndarray]] = {side: [] for side in SPLITS}
-    names: dict[str, list[tuple[str, str, int]]] = {side: [] for side in SPLITS}
     for partition in lake.partitions(TRAINING.name):
         manifest = read_manifest(lake, TRAINING, partition)
         rejected.update(manifest.rejected if manifest else {})
         light = read_columns(lake, TRAINING, partition, _COLUMNS)
         for index, side, environment, bits in zip(*(light[name] for name in _COLUMNS), strict=True):
-            environments[side][environment] += 1
-            vehicles[side].add(partition.vehicle)
-            days[side].add(partition.day)
             views[side].append(np.frombuffer(bits, np.uint8))
-            names[side].append((partition.vehicle, partition.day, index))
+            frames[side].append((environment, partition.vehicle, partition.day, index))
     return Inventory(
-        {side: len(names[side]) for side in SPLITS},
-        {side: dict(environments[side]) for side in SPLITS},
-        {side: sorted(vehicles[side]) for side in SPLITS},
-        {side: sorted(days[side]) for side in SPLITS},
+        {side: len(frames[side]) for side in SPLITS},
+        {side: dict(Counter(f[0] for f in frames[side])) for side in SPLITS},
+        {side: sorted({f[1] for f in frames[side]}) for side in SPLITS},
+        {side: sorted({f[2] for f in frames[side]}) for side in SPLITS},
         dict(rejected),
-        _leaks(views, names, duplicate_bits),
+        _leaks(views, {side: [f[1:] for f in own] for side, own in frames.items()}, duplicate_bits),
     )
 
 
