@@ -1,0 +1,173 @@
+"""Edge radar-base: how a radar stands on the car, by its own velocity against the way that the car drives.
+
+Straight on, the way is the base's x axis: its azimuth in radar axes is yaw. In turns a radar ahead of the rear axle
+goes sideways by the yaw rate times its lever arm; that and the slip of the axle are one slope over curvature, so x
+stays without information: no log tells them apart. Pitch needs elevations, and least squares on them is pulled towards
+their mean; the velocities of `objective/radar/travel`, which a lidar with the same view mends, show it, and a radar
+that shares its view with none has no pitch. Roll and position turn or shift nothing of the way. Changes of speed show
+the clock. The motion must be of other sources than this radar.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.calibrate.edges.lidar_base import STANCE, Scenes
+from pipeline.calibrate.edges.robust_regression import Regression, regress
+from pipeline.geometry.changes import change_jacobian
+from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
+from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
+from pipeline.objective.radar.travel import DOPPLER_PITCH_FLOOR_RAD, TravelDirections
+from pipeline.rig.evidence import EDGE, EdgeEvidence
+from pipeline.rig.graph import BASE, Edge
+
+__all__ = ["Stamps", "estimate_radar_base"]
+
+_LEAST_SPEED_MPS = 4.0  # slower, noise of 0.05 m/s is a degree
+_LEVER_SIGMA_M = (
+    1.5  # what the lever arm, the base's place before the axle, and slip differ by from the prior
+)
+_SCALE_SIGMA = 0.02  # of an odometer
+_LEAST_AZIMUTH_RAD = np.radians(0.1)
+_LEAST_SPEED_SIGMA_MPS = 0.05
+_BEND_M = 50.0  # in one bend a car slips the same way
+_LONGEST_S = 2.0  # between moments from which accelerations are told
+_YAW_FLOOR_RAD = np.radians(0.02)  # errors of 8 tuning days were 0.018 deg RMS
+_CLOCK_FLOOR_S = 0.004  # 12 ms RMS, as scenes scatter; of no clock less is promised
+_NO_CLOCK_S = 1.0  # a clock that is not known to half of this is not known
+_PASSES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Stamps:
+    """When moments and a radar's scans were: each by its own clock; and the drives."""
+
+    moment_ns: np.ndarray  # F
+    scan_ns: np.ndarray  # F
+    drive: np.ndarray  # F
+
+
+def estimate_radar_base(
+    edge: Edge,
+    radar: DopplerMotion,
+    ego: EgoMotion,
+    stamps: Stamps,
+    scenes: Scenes,
+    directions: TravelDirections | None = None,
+) -> EdgeEvidence:
+    """What a day shows of T_radar_base and of the base's clock.
+
+    Args:
+        edge: radar, base.
+        radar: its Doppler, and the start; nothing of its rotation enters the information.
+        ego: motion of the base at the same moments, by other sources.
+        stamps: of the moments.
+        scenes: of the moments.
+        directions: velocities by a lidar's elevations; None of a radar that shares its view with none.
+    """
+    T = radar.T_base_radar
+    for _ in range(_PASSES):
+        yaw, clock = _by_doppler(radar, T, ego, stamps)
+        pitch = None if directions is None else _pitch(directions, T, scenes)
+        turn = np.array([0.0, 0.0 if pitch is None else pitch.value[0], 0.0 if yaw is None else yaw.value[0]])
+        T = from_rotation_translation(exp_so3(turn) @ T[:3, :3], T[:3, 3])
+    variance = np.array([np.inf if fit is None else fit.covariance[0, 0] for fit in (pitch, yaw, clock)])
+    variance += np.array([0.0, 0.0, _CLOCK_FLOOR_S]) ** 2
+    J = np.zeros((3, 7))
+    # exp(xi) T_radar_base is the inverse of exp(-Ad(T_base_radar) xi) T_base_radar.
+    J[:2, :6] = -(change_jacobian(T) @ adjoint(T))[[1, 2]]
+    J[2, 6] = 1.0
+    moments = int(np.sum(_moving(radar, ego)))
+    return EdgeEvidence(
+        edge, inverse(T), 0.0 if clock is None else float(clock.value[0]), (J.T / variance) @ J, np.zeros(7),
+        _biases(T), frames_used=moments, diagnostics=_numbers(yaw, moments), notes=_notes(yaw, pitch, clock),
+    )  # fmt: skip
+
+
+def _moving(radar: DopplerMotion, ego: EgoMotion) -> np.ndarray:
+    known = np.isfinite(radar.velocity_mps).all(1) & np.isfinite(ego.velocity_mps).all(1)
+    return np.asarray(known & (np.abs(np.nan_to_num(ego.velocity_mps[:, 0])) > _LEAST_SPEED_MPS))
+
+
+def _by_doppler(
+    radar: DopplerMotion, T: np.ndarray, ego: EgoMotion, stamps: Stamps
+) -> tuple[Regression | None, Regression | None]:
+    """Change of yaw, and the clock: stamp of the radar less that of the base."""
+    use = _moving(radar, ego)
+    R, ways = T[:2, :3], np.copysign(1.0, ego.velocity_mps[use, :1])
+    seen = radar.velocity_mps[use] @ R.T
+    (vx, vy), turn = ego.velocity_mps[use].T, ego.yaw_rate_radps[use]
+    expected = np.stack([vx - turn * T[1, 3], vy + turn * T[0, 3]], 1)
+    speed = np.hypot(*expected.T)
+    off = np.arctan2(*(seen * ways).T[::-1]) - np.arctan2(*(expected * ways).T[::-1])
+    covariance = R @ radar.covariance[use] @ R.T
+    aside = np.sqrt(covariance[:, 1, 1] + ego.covariance[use, 1, 1]) / speed
+    sigma = np.hypot(aside, _LEAST_AZIMUTH_RAD)
+    bend = _bends(ego, stamps)[use]
+    turning = np.stack([np.ones(len(off)), turn / vx], 1)
+    yaw = regress(
+        turning, -np.arctan2(np.sin(off), np.cos(off)), sigma, bend, np.array([np.inf, _LEVER_SIGMA_M])
+    )
+    faster, late_s = _accelerations(ego, stamps)[use], (stamps.scan_ns - stamps.moment_ns)[use] * 1e-9
+    apart = np.hypot(*seen.T) - speed - faster * ways[:, 0] * late_s
+    sigma = np.sqrt(covariance[:, 0, 0] + _LEAST_SPEED_SIGMA_MPS**2)
+    design = np.stack([-faster * ways[:, 0], speed], 1)
+    told = np.isfinite(faster)
+    clock = regress(design[told], apart[told], sigma[told], bend[told], np.array([_NO_CLOCK_S, _SCALE_SIGMA]))
+    return yaw, None if clock is None or clock.covariance[0, 0] > (_NO_CLOCK_S / 2) ** 2 else clock
+
+
+def _pitch(directions: TravelDirections, T: np.ndarray, scenes: Scenes) -> Regression | None:
+    """Change of pitch that lays the velocities into the base's level."""
+    v = directions.velocity_mps @ T[:3, :3].T
+    elevation = np.arctan2(v[:, 2], np.hypot(v[:, 0], v[:, 1])) * np.copysign(1.0, v[:, 0])
+    return regress(
+        np.ones((len(v), 1)), elevation, np.hypot(directions.sigma_rad, _LEAST_AZIMUTH_RAD),
+        scenes.block[directions.frame], np.array([np.inf]),
+    )  # fmt: skip
+
+
+def _bends(ego: EgoMotion, stamps: Stamps) -> Int64[np.ndarray, " F"]:
+    """Block of each moment, by the way driven."""
+    gap_s = np.diff(stamps.moment_ns, prepend=stamps.moment_ns[:1]) * 1e-9
+    way_m = np.abs(np.nan_to_num(ego.velocity_mps[:, 0])) * np.clip(gap_s, 0.0, _LONGEST_S)
+    return np.asarray(np.cumsum(way_m) // _BEND_M, np.int64)
+
+
+def _accelerations(ego: EgoMotion, stamps: Stamps) -> Float[np.ndarray, " F"]:
+    """Forward acceleration of each moment by its neighbours; NaN at ends of drives and across gaps."""
+    found = np.full(len(stamps.drive), np.nan)
+    span_s = (stamps.moment_ns[2:] - stamps.moment_ns[:-2]) * 1e-9
+    near = (stamps.drive[2:] == stamps.drive[:-2]) & (span_s > 0) & (span_s < _LONGEST_S)
+    change = ego.velocity_mps[2:, 0] - ego.velocity_mps[:-2, 0]
+    found[1:-1] = np.where(near, change / np.where(near, span_s, 1.0), np.nan)
+    return found
+
+
+def _biases(T: np.ndarray) -> dict[str, np.ndarray]:
+    """The car's stance, and what the matching leaves: pitch by Doppler is good to 0.15 deg."""
+    axes = np.zeros((4, 6))
+    axes[[0, 1, 2, 3], [0, 1, 2, 5]] = 1.0
+    floor = np.diag([0.0, DOPPLER_PITCH_FLOOR_RAD, _YAW_FLOOR_RAD, 0.0, 0.0, 0.0]) ** 2
+    to_radar = adjoint(inverse(T)) @ np.linalg.inv(change_jacobian(T))
+    return {BASE.name: axes.T @ np.diag(STANCE**2) @ axes, EDGE: to_radar @ floor @ to_radar.T}
+
+
+def _numbers(yaw: Regression | None, moments: int) -> dict[str, float]:
+    lever = {} if yaw is None else {"lever_less_prior_m": float(-yaw.value[1])}
+    return {"moments": float(moments)} | lever
+
+
+def _notes(yaw: Regression | None, pitch: Regression | None, clock: Regression | None) -> tuple[str, ...]:
+    shown = {
+        "yaw to the base: the radar shows too little of the way": yaw,
+        "pitch to the base: no lidar shares the radar's view": pitch,
+        "clock against the base: the car hardly changes its speed": clock,
+    }
+    return (
+        *(told for told, fit in shown.items() if fit is None),
+        "roll, x, y, z to the base: no way shows them",
+    )
