@@ -19,7 +19,7 @@ from pipeline.calibrate.joint.camera_lidar.estimate import estimate_camera_lidar
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_covariance
-from pipeline.geometry.se3 import from_quaternion, inverse, log_so3, perturb_exactly, transform_points
+from pipeline.geometry.se3 import inverse, log_so3, perturb_exactly, transform_points
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
@@ -41,11 +41,7 @@ def reference_of(rows: list[Observation], truth: Path | None) -> tuple[np.ndarra
     if truth is not None:
         known = json.loads(truth.read_text())
         return np.array(known["T_camera_lidar"]), np.array(known["T_lidar_radar"])
-    row, transforms = rows[0], []
-    for pair in ("camera_lidar", "lidar_radar"):
-        values = [getattr(row, f"prior_{pair}_{c}") for c in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")]
-        transforms.append(from_quaternion(np.array(values[:4]), np.array(values[4:])))
-    return transforms[0], transforms[1]
+    return rows[0].priors["camera_lidar"], rows[0].priors["lidar_radar"]
 
 
 def evenly(rows: list[Observation], count: int) -> list[Observation]:

@@ -83,7 +83,7 @@ def test_a_folder_of_kitti_s_own_without_a_radar_becomes_a_rig_of_camera_and_lid
     assert len(frames) == WHAT["kitti"][2]
     assert all(f.sensors == ["camera", "lidar"] and not len(f.radar_x_m) for f in frames)
     wanted = np.linalg.inv(T_BASE_CAMERA) @ T_BASE_LIDAR
-    np.testing.assert_allclose(transform_in(frames[0], "prior_camera_lidar"), wanted, atol=1e-9)
+    np.testing.assert_allclose(frames[0].priors["camera_lidar"], wanted, atol=1e-9)
 
 
 def test_sensors_are_where_the_data_set_says(converted):
@@ -93,7 +93,7 @@ def test_sensors_are_where_the_data_set_says(converted):
         "lidar_radar": np.linalg.inv(T_BASE_LIDAR) @ T_BASE_RADAR,
     }
     for pair, T in wanted.items():
-        found = transform_in(frames[0], f"prior_{pair}")
+        found = frames[0].priors[pair]
         np.testing.assert_allclose(found, T, atol=1e-9, err_msg=pair)
 
 
@@ -256,10 +256,10 @@ def test_the_data_sets_own_devkits_find_the_same_in_these_folders(converted, fou
     devkit = {key: np.array(value) for key, value in found_by_devkits[name].items() if key != "devkit"}
     frame = frames[0 if name == "nuscenes" else 3]
     np.testing.assert_allclose(frame.radar_xyz_m, devkit["radar"], atol=1e-5)
-    T_lidar_radar = transform_in(frame, "prior_lidar_radar")
+    T_lidar_radar = frame.priors["lidar_radar"]
     if name == "nuscenes":
         np.testing.assert_allclose(frame.lidar_xyz_m + T_BASE_LIDAR[:3, 3], devkit["lidar_base"], atol=1e-5)
-        T_camera_radar = transform_in(frame, "prior_camera_lidar") @ T_lidar_radar
+        T_camera_radar = frame.priors["camera_lidar"] @ T_lidar_radar
         np.testing.assert_allclose(T_camera_radar, devkit["camera_radar"], atol=1e-9)
     else:
         np.testing.assert_allclose(frame.lidar_xyz_m, devkit["lidar"], atol=1e-5)

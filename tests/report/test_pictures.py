@@ -54,7 +54,7 @@ def _blank(row_type: Any, **known: Any) -> Any:
             values[f.name] = np.zeros((0, 3) if "xyz" in f.name or "centre" in f.name else (0,), np.float32)
         elif kind.startswith("list"):
             values[f.name] = list(SENSORS) if f.name == "sensors" else []
-    return row_type(**(values | known))
+    return row_type(**(values | {"priors": {}} | known))
 
 
 def _scene() -> Scene:
