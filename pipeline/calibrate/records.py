@@ -21,6 +21,7 @@ from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.rig.graph import Kind
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.observations import Observation
@@ -34,6 +35,7 @@ __all__ = [
     "record_of",
     "refused_record",
     "refused_records",
+    "transform_fields",
 ]
 
 # Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
@@ -53,6 +55,8 @@ class Inputs:
     inputs: tuple[str, ...]
     pairs: tuple[str, ...] = PAIRS  # of the rig: others have no record
     absent: Mapping[str, str] = field(default_factory=dict)  # why frames lack a sensor, in words by sensor
+    # Names of the sensors that play camera, lidar and radar; those left out are called by their kinds.
+    chosen: Mapping[Kind, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -175,7 +179,7 @@ def environment_of(observations: Sequence[Observation]) -> str:
 
 
 def _identity(about: Inputs, pair: str, frames: int, prior: Prior | None) -> dict[str, Any]:
-    parent, child = FRAMES_OF_PAIR[pair]
+    parent, child = (about.chosen.get(kind, kind) for kind in FRAMES_OF_PAIR[pair])
     fields: dict[str, Any] = {
         "vehicle": about.partition.vehicle,
         "day": about.partition.day,
@@ -190,11 +194,12 @@ def _identity(about: Inputs, pair: str, frames: int, prior: Prior | None) -> dic
         "frames_total": frames,
     }
     if prior is not None and prior.knows(pair):
-        fields |= _transform_fields("prior_", prior.of(pair)) | {"prior_covariance": prior.covariance(pair)}
+        fields |= transform_fields("prior_", prior.of(pair)) | {"prior_covariance": prior.covariance(pair)}
     return fields
 
 
-def _transform_fields(prefix: str, T: np.ndarray) -> dict[str, float]:
+def transform_fields(prefix: str, T: np.ndarray) -> dict[str, float]:
+    """Columns of a pose, their names with a prefix."""
     names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     values = (*to_quaternion(T), *T[:3, 3])
     return {f"{prefix}{name}": float(value) for name, value in zip(names, values, strict=True)}
@@ -289,7 +294,7 @@ def _estimate_fields(estimate: PairEstimate, judged: Judged) -> dict[str, Any]:
         "azimuth_sigma_rad": sigma["azimuth"],
         "elevation_sigma_rad": sigma["elevation"],
         "targets_m": judged.targets,
-        **_transform_fields("", estimate.T),
+        **transform_fields("", estimate.T),
     }
 
 

@@ -151,6 +151,22 @@ def calibrate_observations(
     Raises:
         SolveError: the day cannot be calibrated.
     """
+    return calibrate_day(observations, prior, fleet, about, progress, solver)[0]
+
+
+def calibrate_day(
+    observations: Sequence[Observation],
+    prior: Prior,
+    fleet: FleetConfig,
+    about: Inputs,
+    progress: Progress = silent,
+    solver: Solver | None = None,
+) -> tuple[list[CalibrationRecord], SolvedDay | None]:
+    """`calibrate_observations`, and the solved day behind the records; None where every pair was refused.
+
+    Raises:
+        SolveError: the day cannot be calibrated.
+    """
     motion = compared_sources(observations, prior.T_lidar_radar)
     try:
         return _solved(observations, prior, fleet, about, motion, progress, solver)
@@ -173,7 +189,7 @@ def _solved(
     motion: MotionFindings,
     progress: Progress,
     solver: Solver | None,
-) -> list[CalibrationRecord]:
+) -> tuple[list[CalibrationRecord], SolvedDay | None]:
     """The records of a day whose sources of motion were compared."""
     progress(0, 4, "select frames")
     method, select = method_named(about.method), fleet.select
@@ -194,7 +210,7 @@ def _solved(
         for pair, why in refused.items()
     }
     if not pairs:
-        return list(refusals.values())
+        return list(refusals.values()), None
     frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in pairs}
     sample = _spread(observations, frames)
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in pairs})
@@ -230,7 +246,8 @@ def _solved(
         motion.numbers,
     )
     progress(4, 4, "done")
-    return [refusals[pair] if pair in refusals else record_of(about, pair, day) for pair in about.pairs]
+    records = [refusals[pair] if pair in refusals else record_of(about, pair, day) for pair in about.pairs]
+    return records, day
 
 
 def _absent(lake: Lake, partition: Partition) -> dict[str, str]:

@@ -1,0 +1,140 @@
+"""Rows of table `poses`: where each sensor of an adjusted rig is, and what that is good for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustedSensor
+from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.verify.seen_targets import targets_of
+from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
+from pipeline.config import VerifyConfig
+from pipeline.geometry.changes import change_covariance
+from pipeline.geometry.se3 import inverse, to_quaternion
+from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.graph import RigGraph, Sensor
+from pipeline.rig.views import View
+from schemas.poses import PoseRow
+from schemas.versions import CODE_VERSION
+
+__all__ = ["pose_rows"]
+
+
+def pose_rows(
+    about: Inputs,
+    graph: RigGraph,
+    adjusted: AdjustedRig | None,
+    views: Mapping[str, View],
+    verify: VerifyConfig,
+) -> list[PoseRow]:
+    """A row for each sensor but the reference.
+
+    Args:
+        about: vehicle, day, method and provenance.
+        graph: the rig.
+        adjusted: its poses; None where no edge had evidence.
+        views: what each sensor sees, by name: a pose is certified where its sensor looks.
+        verify: limits.
+    """
+    return [_row(about, graph, s, adjusted, views, verify) for s in graph.sensors if s != graph.reference]
+
+
+def _row(
+    about: Inputs,
+    graph: RigGraph,
+    sensor: Sensor,
+    adjusted: AdjustedRig | None,
+    views: Mapping[str, View],
+    verify: VerifyConfig,
+) -> PoseRow:
+    told = {
+        "vehicle": about.partition.vehicle,
+        "day": about.partition.day,
+        "method": about.method,
+        "sensor": sensor.name,
+        "kind": sensor.kind,
+        "reference": graph.reference.name,
+        "work_key": about.work_key,
+        "code_version": CODE_VERSION,
+        "inputs": list(about.inputs),
+    }
+    found = None if adjusted is None else adjusted.sensors.get(sensor.name)
+    if adjusted is None or found is None:
+        why = "no edge of the rig has evidence" if adjusted is None else "its prior pose is unknown"
+        return PoseRow(**told, status="refused", reason=why)
+    if found.untied:
+        return PoseRow(**told, status="refused", reason=found.untied)
+    poses, reference = adjusted.poses, graph.reference.name
+    claims = _claims(sensor, poses, views, verify)
+    determined = [name for name, claim in claims.items() if claim.margin >= 0]
+    status, reason = _verdict(sensor, found, claims, determined)
+    return PoseRow(
+        **told,
+        **_transform(poses.T[sensor.name]),
+        covariance=poses.covariance_between(reference, sensor.name),
+        common_covariance=poses.covariance_between(reference, sensor.name, common=True),
+        observability=[float(v) for v in found.observability],
+        observable=[bool(v) for v in found.determined],
+        status=status,
+        reason=reason,
+        faults=["witnesses_disagree"] if found.doubts else [],
+        determined=determined,
+        azimuth_sigma_rad=claims["azimuth"].sigma_rad,
+        elevation_sigma_rad=claims["elevation"].sigma_rad,
+        dt_s=poses.dt_s.get(sensor.name),
+        dt_sigma_s=found.dt_sigma_s,
+        edges=[edge.name for edge in found.rests_on],
+    )
+
+
+def _claims(
+    sensor: Sensor, poses: Extrinsics, views: Mapping[str, View], verify: VerifyConfig
+) -> dict[str, Claim]:
+    """How well directions of the reference's points are known in the sensor, at targets where it looks."""
+    reference = poses.reference.name
+    T = poses.between(sensor.name, reference)
+    targets = targets_of(T, views.get(sensor.name), None)
+    camera_deg = verify.camera_lidar_limit_deg
+    azimuth_deg, elevation_deg = (
+        (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
+        if sensor.kind == "radar"
+        else (camera_deg, camera_deg)
+    )
+    return claims_of(
+        f"{sensor.kind}_{poses.reference.kind}",
+        T,
+        poses.covariance_between(sensor.name, reference),
+        None,
+        float(np.radians(azimuth_deg)),
+        verify.confidence,
+        elevation_limit_rad=float(np.radians(elevation_deg)),
+        targets=DEFAULT_TARGETS if targets is None else targets,
+    )
+
+
+def _verdict(
+    sensor: Sensor, found: AdjustedSensor, claims: Mapping[str, Claim], determined: Sequence[str]
+) -> tuple[str, str]:
+    """Status and reason: a radar is worth its azimuth alone, other sensors need both directions."""
+    doubts = ", ".join(e.name for e in found.doubts)
+    if doubts:
+        return "held", f"its edges contradict each other and nothing tells which is wrong: {doubts}"
+    needed = ("azimuth",) if sensor.kind == "radar" else tuple(claims)
+    unsure = {name: claim for name, claim in claims.items() if name not in determined}
+    words = "; ".join(
+        f"{name} known to {np.degrees(c.sigma_rad):.2f} deg (1 sigma), not within {np.degrees(c.limit_rad):.2f} deg "
+        f"at {100 * c.confidence:g} %"
+        for name, c in unsure.items()
+    )
+    if set(needed) & set(unsure):
+        return "held", words
+    return "accepted", f"not certified: {words}" if words else ""
+
+
+def _transform(T: Float[np.ndarray, "4 4"]) -> dict[str, float]:
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    return {n: float(v) for n, v in zip(names, (*to_quaternion(T), *T[:3, 3]), strict=True)}

@@ -1,0 +1,101 @@
+"""What calibrate reads of a rig of several sensors of a kind: its prior, its views, its edges, rows of each edge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.calibrate.pose_rows import pose_rows
+from pipeline.calibrate.records import Inputs, SolvedDay, refused_record
+from pipeline.calibrate.rig_day import Chosen, RigDay, calibrate_rig
+from pipeline.calibrate.stage import calibrate_day
+from pipeline.calibrate.verify.seen_targets import views_of
+from pipeline.errors import SolveError
+from pipeline.extrinsics.estimates import Prior
+from pipeline.extrinsics.prior import rig_prior
+from pipeline.results import Progress
+from pipeline.rig.graph import Edge, edge_between
+from pipeline.rig.overlap import find_edges, overlaps_of
+from pipeline.rig.prior import moved
+from pipeline.rig.rig import Rig
+from pipeline.rig.views import FRAMES, View
+from pipeline.store.moments import sensors_of
+from pipeline.store.views import observations_of, perceived
+from pipeline.work import Task
+from schemas.calibrations import CalibrationRecord
+from schemas.moments import PRIOR
+from schemas.observations import Observation
+from schemas.poses import PoseRow
+
+__all__ = ["expected_edges", "rig_rows"]
+
+
+def rig_rows(
+    task: Task, about: Inputs, progress: Progress
+) -> list[CalibrationRecord | PoseRow]:
+    """Records of all edges of a vehicle-day, and a pose of each sensor.
+
+    Raises:
+        SolveError: the day cannot be calibrated at all.
+    """
+    fleet, rig = task.fleet, task.fleet.rig_of(task.partition.vehicle)
+    day = _read(task, rig, about.seed)
+
+    def solve_pair(
+        rows: Sequence[Observation], prior: Prior, of_pair: Inputs
+    ) -> tuple[list[CalibrationRecord], SolvedDay | None]:
+        try:
+            return calibrate_day(rows, prior, fleet, of_pair)
+        except SolveError as err:
+            return [refused_record(of_pair, p, err, rows, prior, {}) for p in of_pair.pairs], None
+
+    found = calibrate_rig(day, fleet, about, solve_pair, progress)
+    return [*found.records, *pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify)]
+
+
+def expected_edges(rig: Rig) -> tuple[Edge, ...]:
+    """Edges that records of a day name which nobody could look at: named ones, else all to the reference."""
+    named = rig.named_edges
+    if named:
+        return named
+    nodes = [node for node in rig.nodes if node.kind != "base"]
+    middle = next((n for n in nodes if n.name == rig.reference), nodes[0])
+    if rig.reference is None:
+        middle = min(nodes, key=lambda n: ("lidar", "radar", "camera").index(n.kind))
+    pairs = [(n, middle) for n in nodes if n != middle and n.kind != middle.kind]
+    return tuple(edge_between(a, b) for a, b in pairs)
+
+
+def _read(task: Task, rig: Rig, seed: int) -> RigDay:
+    """Prior, views and edges of a vehicle-day."""
+    manifest = perceived(task.lake, task.partition)
+    if manifest is None:
+        raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
+    prior = rig_prior(manifest.extra.get(PRIOR, ()), task.fleet, rig)
+    if task.perturb is not None:
+        prior = moved(prior, float(np.radians(task.perturb[0])), task.perturb[1], seed)
+    moments = np.unique(np.linspace(0, manifest.rows - 1, min(FRAMES, manifest.rows)).astype(int)).tolist()
+    views = {
+        name: view
+        for name, kind in sensors_of(manifest).items()
+        if (view := _view(task, {kind: name}, moments)) is not None
+    }
+    nodes = {node.name: node for node in rig.nodes}
+    graph = find_edges(
+        prior,
+        overlaps_of(prior, views),
+        named=rig.named_edges,
+        reference=None if rig.reference is None else nodes[rig.reference],
+    )
+    return RigDay(rig, graph, prior, views, lambda chosen: _rows(task, chosen))
+
+
+def _view(task: Task, chosen: Chosen, moments: Sequence[int]) -> View | None:
+    [kind] = chosen
+    rows = list(observations_of(task.lake, task.partition, moments, chosen))
+    return views_of(rows).get(kind)
+
+
+def _rows(task: Task, chosen: Chosen) -> list[Observation]:
+    return list(observations_of(task.lake, task.partition, chosen=chosen))
