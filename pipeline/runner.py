@@ -21,20 +21,10 @@ from pipeline.store.partitions import Partition, work_key
 from pipeline.store.records import assert_records, commit_last, commit_records, read_records
 from pipeline.store.tables import Manifest, PartitionWriter, absence, read_manifest, write_partition
 from pipeline.work import NothingUsable, Run, Task, Window, Work
-from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
-from schemas.drift import DRIFT, DriftFinding
-from schemas.states import STATES, StateRow
 from schemas.versions import CODE_VERSION
 
 __all__ = ["Stage", "run_stage", "try_stage", "why_to_run"]
-
-# Row types of the tables of records: small, added to and never replaced. The others are replaced by whole partitions.
-_RECORD_ROWS: dict[str, type] = {
-    CALIBRATIONS.name: CalibrationRecord,
-    DRIFT.name: DriftFinding,
-    STATES.name: StateRow,
-}
 
 
 @dataclass(frozen=True)
@@ -95,7 +85,8 @@ def why_to_run(stage: Stage, task: Task) -> str:
     if _refused_before(stage, task, run) is not None:
         return ""
     if schema.is_record_table:
-        made = [(r.work_key, r.code_version, tuple(r.inputs)) for r in task.recorded or ()]
+        own = schema.rows_among(task.recorded or ())
+        made = [(r.work_key, r.code_version, tuple(r.inputs)) for r in own]
     else:
         done = _readable(task, schema)
         made = [(done.work_key, done.code_version, tuple(done.inputs))] if done is not None else []
@@ -115,7 +106,7 @@ def _run_stage(stage: Stage, task: Task) -> Outcome:
         return _write_files(stage, task, work, run)
     schema = stage.writes[0]
     if schema.is_record_table:
-        return _add_records(stage, task, work, run, schema)
+        return _add_records(stage, task, work, run)
     return _replace_partition(stage, task, work, run, schema)
 
 
@@ -245,45 +236,53 @@ def _partition_outcome(stage: Stage, task: Task, work: Work, status: str, manife
     )
 
 
-def _add_records(stage: Stage, task: Task, work: Work, run: Run, schema: TableSchema) -> Outcome:
+def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
     """Records of work that is not recorded yet; committed here, unless who gave the task does that."""
-    where = [task.lake.table(schema.name)]
-    recorded = [] if work.again else _recorded(task, run.work_key, schema)
-    if recorded:
+    tables = [task.lake.table(schema.name) for schema in stage.writes]
+    recorded = [] if work.again else _recorded(stage, task, run.work_key)
+    if stage.writes[0].rows_among(recorded):
         if task.commit:
-            assert_records(task.lake, schema, recorded)
-        cached = _record_outcome(stage, task, work, "cached", run.work_key, recorded, where)
+            for schema in stage.writes:
+                assert_records(task.lake, schema, schema.rows_among(recorded))
+        cached = _record_outcome(stage, task, work, "cached", run.work_key, recorded, tables)
         return replace(cached, inputs=run.inputs)
     written: list[Any] = []
     with at_most(task.fleet.fleet.memory_gb), closing(work.rows(run)) as batches:
         for records in batches:
             written += records.rows
     if task.commit:
-        (commit_last if isinstance(task.of, Window) else commit_records)(task.lake, schema, written)
-    outcome = _record_outcome(stage, task, work, "done", run.work_key, written, where if written else [])
+        commit = commit_last if isinstance(task.of, Window) else commit_records
+        # The first table last: where its rows are, those beside them are too.
+        for schema in reversed(stage.writes):
+            commit(task.lake, schema, schema.rows_among(written))
+    outcome = _record_outcome(stage, task, work, "done", run.work_key, written, tables if written else [])
     return replace(outcome, inputs=run.inputs)
 
 
-def _recorded(task: Task, key: str, schema: TableSchema) -> list[Any]:
+def _recorded(stage: Stage, task: Task, key: str) -> list[Any]:
     """What the same work has recorded already."""
     if task.recorded is not None:
         return [r for r in task.recorded if r.work_key == key]
     vehicle, day = task.partition.vehicle, task.partition.day
-    kind: type[Any] = _RECORD_ROWS[schema.name]
-    found = read_records(task.lake, schema, kind, vehicle=vehicle, day=day)
+    found: list[Any] = []
+    for schema in stage.writes:
+        assert schema.row_type is not None, "a table of records is made of a row type"
+        of_day: list[Any] = read_records(task.lake, schema, schema.row_type, vehicle=vehicle, day=day)
+        found += of_day
     return [r for r in found if r.work_key == key]
 
 
 def _record_outcome(
     stage: Stage, task: Task, work: Work, status: str, key: str, rows: list[Any], outputs: list[str]
 ) -> Outcome:
-    told = work.tell(rows)
+    own = stage.writes[0].rows_among(rows)
+    told = work.tell(own)
     return _outcome(
         stage,
         task,
         "refused" if told.refused and status == "done" else status,
         key,
-        rows=len(rows),
+        rows=len(own),
         kept=told.kept,
         rejected=told.rejected,
         reason=told.reason,

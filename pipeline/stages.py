@@ -12,6 +12,7 @@ from schemas.captures import CAPTURES
 from schemas.drift import DRIFT
 from schemas.features import FEATURES
 from schemas.moments import MOMENTS, PERCEIVED
+from schemas.poses import POSES
 from schemas.states import STATES
 from schemas.training import TRAINING
 
@@ -25,7 +26,7 @@ PREPARE = Stage("prepare", (*_INGESTED, *_PERCEIVED), (TRAINING,), "pipeline.lea
 CALIBRATE = Stage(
     "calibrate",
     (*_INGESTED, *_PERCEIVED),
-    (CALIBRATIONS,),
+    (CALIBRATIONS, POSES),
     "pipeline.calibrate.stage:work",
     needs_inputs=False,
 )

@@ -9,7 +9,7 @@ engine can decode them: `numpy.frombuffer(blob, dtype).reshape(shape)`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import Field, dataclass, field, fields
 from types import UnionType
 from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
@@ -118,6 +118,10 @@ class TableSchema:
     def is_record_table(self) -> bool:
         """True for a table of records, which are added; False for one of partitions, which are replaced."""
         return bool(self.about)
+
+    def rows_among(self, rows: Iterable[Any]) -> list[Any]:
+        """Of rows of several tables, this one's."""
+        return [row for row in rows if type(row) is self.row_type]
 
     def arrow_schema(self) -> pa.Schema:
         """The Arrow schema that every file of the table has."""

@@ -5,7 +5,7 @@ Their estimators take plain arrays; this is where a day's rows become those, and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,8 +16,9 @@ from pipeline.calibrate.edges.sweeps import sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import blocks_of, scenes_of
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion, Odometry, ego_motion, motion_of
 from pipeline.rig.evidence import EdgeEvidence
-from pipeline.rig.graph import BASE, Edge, Kind
+from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.prior import RigPrior
+from pipeline.store.views import Chosen
 from schemas.observations import Observation
 
 __all__ = ["BaseEdges"]
@@ -35,7 +36,7 @@ class BaseEdges:
 
     prior: RigPrior
     radars: tuple[str, ...]
-    rows: Callable[[Mapping[Kind, str]], list[Observation]]
+    rows: Callable[[Chosen], list[Observation]]
 
     def solve(self, edge: Edge) -> tuple[EdgeEvidence | None, int]:
         """What the day shows of an edge, and of how many frames; None of a kind that has no estimator."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,9 @@ def record_of_evidence(
     """
     edge, limits = evidence.edge, AdjustmentLimits(fleet.solve.time_offset_sigma_s)
     before = _prior_of(edge, prior)
-    alone = adjust(RigGraph(edge.sensors, (edge,), edge.parent), before, [replace(evidence, checks=())], limits)
+    alone = adjust(
+        RigGraph(edge.sensors, (edge,), edge.parent), before, [replace(evidence, checks=())], limits
+    )
     found = alone.sensors[edge.child.name]
     T, covariance = alone.poses.T[edge.child.name], alone.poses.covariance
     status, reason, determined, sigmas = _judged(alone, evidence, views, fleet)
@@ -119,7 +122,7 @@ def _judged(
     return "accepted", "", determined, sigmas
 
 
-def _identity(about: Inputs, edge: Edge, frames_total: int) -> dict[str, object]:
+def _identity(about: Inputs, edge: Edge, frames_total: int) -> dict[str, Any]:
     return {
         "vehicle": about.partition.vehicle,
         "day": about.partition.day,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,8 +13,7 @@ from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.config import VerifyConfig
-from pipeline.geometry.changes import change_covariance
-from pipeline.geometry.se3 import inverse, to_quaternion
+from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor
@@ -51,7 +51,7 @@ def _row(
     views: Mapping[str, View],
     verify: VerifyConfig,
 ) -> PoseRow:
-    told = {
+    told: dict[str, Any] = {
         "vehicle": about.partition.vehicle,
         "day": about.partition.day,
         "method": about.method,
@@ -135,6 +135,6 @@ def _verdict(
     return "accepted", f"not certified: {words}" if words else ""
 
 
-def _transform(T: Float[np.ndarray, "4 4"]) -> dict[str, float]:
+def _transform(T: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
     names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     return {n: float(v) for n, v in zip(names, (*to_quaternion(T), *T[:3, 3]), strict=True)}

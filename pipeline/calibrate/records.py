@@ -21,7 +21,6 @@ from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.geometry.targets import DEFAULT_TARGETS
-from pipeline.rig.graph import Kind
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.observations import Observation
@@ -56,7 +55,7 @@ class Inputs:
     pairs: tuple[str, ...] = PAIRS  # of the rig: others have no record
     absent: Mapping[str, str] = field(default_factory=dict)  # why frames lack a sensor, in words by sensor
     # Names of the sensors that play camera, lidar and radar; those left out are called by their kinds.
-    chosen: Mapping[Kind, str] = field(default_factory=dict)
+    chosen: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,7 @@ def _identity(about: Inputs, pair: str, frames: int, prior: Prior | None) -> dic
     return fields
 
 
-def transform_fields(prefix: str, T: np.ndarray) -> dict[str, float]:
+def transform_fields(prefix: str, T: np.ndarray) -> dict[str, Any]:
     """Columns of a pose, their names with a prefix."""
     names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     values = (*to_quaternion(T), *T[:3, 3])

@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustmentLimits
 from pipeline.calibrate.adjust.evidence import evidence_of
 from pipeline.calibrate.adjust.rig import adjust
@@ -24,17 +22,18 @@ from pipeline.extrinsics.prior import no_prior, trio_prior
 from pipeline.results import Progress
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
-from pipeline.rig.graph import Edge, Kind, RigGraph
+from pipeline.rig.graph import Edge, RigGraph
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import View
+from pipeline.store.views import Chosen
 from schemas.calibrations import CalibrationRecord
 from schemas.observations import Observation
 
 __all__ = ["CalibratedRig", "RigDay", "calibrate_rig"]
 
 PAIR_KINDS = ("camera_lidar", "camera_radar", "lidar_radar")  # estimated as pairs of three kinds of sensors
-Chosen = Mapping[Kind, str]
+
 # Of one pair's frames: its records, and the day where it was computed.
 _SolvePair = Callable[
     [Sequence[Observation], Prior, Inputs], tuple[list[CalibrationRecord], SolvedDay | None]
@@ -90,15 +89,19 @@ def calibrate_rig(
         if edge.kind not in PAIR_KINDS:
             shown, frames = others.solve(edge)
             if shown is None:
-                why = "the day has no frames of it" if not frames else "nothing estimates edges of this kind yet"
+                why = (
+                    "the day has no frames of it"
+                    if not frames
+                    else "nothing estimates edges of this kind yet"
+                )
                 records.append(refused_edge(about, edge, why, frames))
             else:
                 records.append(record_of_evidence(about, shown, day.prior, day.views, fleet, frames))
                 evidence.append(shown)
             continue
         chosen: Chosen = {s.kind: s.name for s in edge.sensors}
-        names: Mapping[str, str | None] = {kind: chosen.get(kind) for kind in ("camera", "lidar", "radar")}
-        prior = trio_prior(day.prior, day.rig, names["camera"], names["lidar"], names["radar"])
+        of_three = (chosen.get(kind) for kind in ("camera", "lidar", "radar"))
+        prior = trio_prior(day.prior, day.rig, *of_three)
         found, solved = solve_pair(day.rows(chosen), prior, replace(about, pairs=(edge.kind,), chosen=chosen))
         records += found
         if solved is not None:
@@ -128,9 +131,7 @@ def _adjusted(
 def _of_known(graph: RigGraph, prior: Extrinsics) -> RigGraph:
     """The graph of the sensors whose prior pose is known; without one nobody knows where to begin."""
     sensors = tuple(s for s in graph.sensors if s.name in prior.T)
-    return RigGraph(
-        sensors, tuple(e for e in graph.edges if set(e.sensors) <= set(sensors)), graph.reference
-    )
+    return RigGraph(sensors, tuple(e for e in graph.edges if set(e.sensors) <= set(sensors)), graph.reference)
 
 
 def _expected_clocks(graph: RigGraph, clocks: Mapping[Edge, float]) -> dict[str, float]:

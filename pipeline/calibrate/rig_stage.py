@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.calibrate.edge_records import refused_edge
 from pipeline.calibrate.pose_rows import pose_rows
 from pipeline.calibrate.records import Inputs, SolvedDay, refused_record
-from pipeline.calibrate.rig_day import Chosen, RigDay, calibrate_rig
+from pipeline.calibrate.rig_day import RigDay, calibrate_rig
 from pipeline.calibrate.stage import calibrate_day
 from pipeline.calibrate.verify.seen_targets import views_of
 from pipeline.errors import SolveError
@@ -21,19 +22,17 @@ from pipeline.rig.prior import moved
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import FRAMES, View
 from pipeline.store.moments import sensors_of
-from pipeline.store.views import observations_of, perceived
+from pipeline.store.views import Chosen, observations_of, perceived
 from pipeline.work import Task
 from schemas.calibrations import CalibrationRecord
 from schemas.moments import PRIOR
 from schemas.observations import Observation
 from schemas.poses import PoseRow
 
-__all__ = ["expected_edges", "rig_rows"]
+__all__ = ["refused_edges", "rig_rows"]
 
 
-def rig_rows(
-    task: Task, about: Inputs, progress: Progress
-) -> list[CalibrationRecord | PoseRow]:
+def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord | PoseRow]:
     """Records of all edges of a vehicle-day, and a pose of each sensor.
 
     Raises:
@@ -54,8 +53,12 @@ def rig_rows(
     return [*found.records, *pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify)]
 
 
-def expected_edges(rig: Rig) -> tuple[Edge, ...]:
-    """Edges that records of a day name which nobody could look at: named ones, else all to the reference."""
+def refused_edges(about: Inputs, rig: Rig, why: str, *faults: str) -> list[CalibrationRecord]:
+    """Records of a day that could not be calibrated at all: of the edges that the rig names, else to the reference."""
+    return [refused_edge(about, edge, why, 0, *faults) for edge in _expected_edges(rig)]
+
+
+def _expected_edges(rig: Rig) -> tuple[Edge, ...]:
     named = rig.named_edges
     if named:
         return named

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from dataclasses import asdict, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,7 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.extrinsics.prior import day_prior, no_prior, perturbed, prior_key
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.results import Outcome, Progress, silent
+from pipeline.rig.rig import Rig
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import Manifest
 from pipeline.store.views import ingested, observations_of, perceived
@@ -57,6 +59,7 @@ from schemas.calibrations import (
 )
 from schemas.moments import PRIOR, SENSORS_ABSENT
 from schemas.observations import Observation
+from schemas.poses import PoseRow
 
 __all__ = ["calibrate_observations", "work"]
 
@@ -81,23 +84,25 @@ def work(task: Task) -> Work:
         raise ConfigError("command line", "seed", f"{seed} is less than 0")
     rig = fleet.rig_of(task.partition.vehicle)
     if task.given is not None:
-        return _refusal(task.given, task.partition, method, seed, pairs_of(rig.sensors))
+        return _refusal(task.given, task.partition, method, seed, rig)
     settings = {"method": method.name} | method.settings_of(task)
     settings |= {
         "perturb": task.perturb,
         "seed": seed,
         "prior_file": prior_key(fleet, task.partition.vehicle),
-        "camera": {} if rig.camera is None else asdict(rig.camera.known),
+        "camera": _known_cameras(rig),
     }
     prior = rig.prior
     tables = (ingested, perceived) if method.needs_images else (perceived,)
     manifests = [manifest_of(task.lake, task.partition) for manifest_of in tables]
 
     def rows(run: Run) -> Generator[Records, None, None]:
-        pairs = pairs_of(rig.sensors)
         absent = _absent(task.lake, task.partition)
-        about = Inputs(task.partition, method.name, run.work_key, seed, run.inputs, pairs, absent)
-        yield Records(_records(task, method, about, run.progress))
+        about = Inputs(
+            task.partition, method.name, run.work_key, seed, run.inputs, pairs_of(rig.kinds), absent
+        )
+        records = _records if rig.is_one_of_each else _rig_records
+        yield Records(records(task, method, about, run.progress))
 
     return Work(
         (fleet.select, fleet.trigger, fleet.solve, fleet.verify, prior, settings),
@@ -121,15 +126,42 @@ def _records(task: Task, method: Method, about: Inputs, progress: Progress) -> l
         return refused_records(about, err.reason, len(rows), prior, err.fault)
 
 
-def _refusal(
-    refused: Outcome, partition: Partition, method: Method, seed: int, pairs: tuple[str, ...]
-) -> Work:
+def _rig_records(
+    task: Task, method: Method, about: Inputs, progress: Progress
+) -> Sequence[CalibrationRecord | PoseRow]:
+    """Of a rig of several sensors of a kind, or with a vehicle frame."""
+    # It calibrates pairs by this module's means.
+    from pipeline.calibrate.rig_stage import refused_edges, rig_rows  # noqa: PLC0415
+
+    if method.name != "joint":
+        raise ConfigError(
+            "command line", "method", f"{method.name} calibrates three sensors, the rig has more"
+        )
+    try:
+        return rig_rows(task, about, progress)
+    except SolveError as err:
+        return refused_edges(about, task.fleet.rig_of(task.partition.vehicle), err.reason, err.fault)
+
+
+def _known_cameras(rig: Rig) -> dict[str, Any]:
+    """What calibration takes as known of the rig's cameras, for the work key."""
+    if rig.is_one_of_each:
+        return {} if rig.camera is None else asdict(rig.camera.known)
+    return {name: asdict(camera.known) for name, camera in rig.cameras.items()}
+
+
+def _refusal(refused: Outcome, partition: Partition, method: Method, seed: int, rig: Rig) -> Work:
     """Records of a day that never reached the solver, so that whoever reads the lake finds the reason."""
     reason = f"{refused.stage}: {refused.reason}"
 
     def rows(run: Run) -> Generator[Records, None, None]:
-        about = Inputs(partition, method.name, run.work_key, seed, run.inputs, pairs)
-        yield Records(refused_records(about, reason, 0, None, *refused.faults))
+        about = Inputs(partition, method.name, run.work_key, seed, run.inputs, pairs_of(rig.kinds))
+        if rig.is_one_of_each:
+            yield Records(refused_records(about, reason, 0, None, *refused.faults))
+            return
+        from pipeline.calibrate.rig_stage import refused_edges  # noqa: PLC0415 - as in _rig_records
+
+        yield Records(refused_edges(about, rig, reason, *refused.faults))
 
     inputs = (refused.work_key,) if refused.work_key else ()
     # Recorded each time: an older record of a day that was not refused then must not pass for the current one.

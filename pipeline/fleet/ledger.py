@@ -14,6 +14,7 @@ from pipeline.store.records import RecordIndex, assert_records, commit_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.outcomes import OUTCOMES, OutcomeRow
+from schemas.poses import POSES, PoseRow
 from schemas.versions import CODE_VERSION, TABLES
 
 __all__ = ["Known", "Ledger", "outcome_row", "record_outcome"]
@@ -28,7 +29,7 @@ _ROWS = 3000
 class Known:
     """What the lake has of one vehicle-day: its records (without what outcomes do not say), and what became of it."""
 
-    records: tuple[CalibrationRecord, ...] = ()
+    records: tuple[CalibrationRecord | PoseRow, ...] = ()
     outcomes: tuple[OutcomeRow, ...] = ()
 
 
@@ -59,7 +60,8 @@ class Ledger:
                     lake, schema
                 )  # one that could not be written to after a night's work is named before it
         self._lake = lake
-        self._waiting = [_Waiting(CALIBRATIONS), _Waiting(OUTCOMES)]
+        # In the order of commits: where a calibration is, its poses are too, and no outcome tells of what is not there.
+        self._waiting = [_Waiting(POSES), _Waiting(CALIBRATIONS), _Waiting(OUTCOMES)]
         self._committed_at = time.monotonic()
         days = sorted({p.day for p in partitions})
         # A night without a vehicle-day asks for none.
@@ -67,6 +69,7 @@ class Ledger:
         self._records = RecordIndex(
             lake, CALIBRATIONS, CalibrationRecord, *span, ("frames_rejected", "inputs")
         )
+        self._poses = RecordIndex(lake, POSES, PoseRow, *span, ("inputs",))
         self._outcomes = RecordIndex(
             lake, OUTCOMES, OutcomeRow, *span, ("rows", "kept", "rejected", "faults")
         )
@@ -74,7 +77,7 @@ class Ledger:
     def known(self, partition: Partition) -> Known:
         """What the lake had of a vehicle-day when the night began; the current one of a kind comes last."""
         of = (partition.vehicle, partition.day)
-        return Known(tuple(self._records.of(*of)), tuple(self._outcomes.of(*of)))
+        return Known((*self._records.of(*of), *self._poses.of(*of)), tuple(self._outcomes.of(*of)))
 
     def add(self, outcome: Outcome, method: str) -> None:
         """Take an outcome and its records; commit those that came together, if it is time.
@@ -82,17 +85,18 @@ class Ledger:
         Raises:
             OSError: the storage does not answer; the rows are kept, and the next commit has them too.
         """
-        records, outcomes = self._waiting
+        poses, records, outcomes = self._waiting
         of = (outcome.vehicle, outcome.day)
         if outcome.records:
-            _sort(records, outcome.records, self._records.of(*of))
+            _sort(poses, POSES.rows_among(outcome.records), self._poses.of(*of))
+            _sort(records, CALIBRATIONS.rows_among(outcome.records), self._records.of(*of))
         _sort(outcomes, [outcome_row(outcome, method)], self._outcomes.of(*of))
         waiting = sum(len(w.new) + len(w.again) for w in self._waiting)
         if waiting >= _ROWS or (waiting and time.monotonic() - self._committed_at > _EVERY_S):
             self.commit()
 
     def commit(self) -> None:
-        """Commit what has not been yet: records first, so that no outcome tells of records that are not there.
+        """Commit what has not been yet.
 
         Raises:
             OSError: the storage does not answer; the rows are kept.
