@@ -24,7 +24,7 @@ from pipeline.geometry.se3 import (
     to_quaternion,
 )
 from pipeline.rig.extrinsics import Extrinsics
-from pipeline.rig.graph import KINDS, Kind, Sensor
+from pipeline.rig.graph import BASE, KINDS, Kind, Sensor
 
 __all__ = [
     "RigPrior",
@@ -51,11 +51,14 @@ _DRAWN: tuple[tuple[Kind, Kind], ...] = (("camera", "lidar"), ("lidar", "radar")
 class RigPrior:
     """Transforms between sensors, and each sensor's sigmas.
 
+    Where the rig has a vehicle frame, all sensors are mounted on it, the reference too: what that is off by, all poses
+    in it are. Without one, transforms are known between sensors, and the reference is where poses are said to be from.
+
     Args:
         nodes: sensors, and `base` where the rig has it.
-        reference: the sensor that poses refer to, and the one without sigmas.
+        reference: the sensor that poses refer to.
         T: of a star, by (parent, child).
-        sigmas: rotation [rad] and translation [m] of a node's pose in the reference, isotropic about itself, by name.
+        sigmas: rotation [rad] and translation [m] by which a sensor is mounted otherwise, isotropic about itself.
     """
 
     nodes: tuple[Sensor, ...]
@@ -69,12 +72,16 @@ class RigPrior:
 
     def sigmas_between(self, a: str, b: str) -> tuple[float, float]:
         """Rotation [rad] and translation [m] of T_a_b, without lever arms: of a given transform as of one sensor."""
-        rotation, translation = zip(
-            *(self.sigmas[n] for n in (a, b) if n != self.reference.name), strict=True
-        )
-        if _direct(self.T, a, b) is not None:
-            return max(rotation), max(translation)
-        return float(np.hypot.reduce(rotation)), float(np.hypot.reduce(translation))
+        own = [self.sigmas[n] for n in (a, b) if n not in self._exact]
+        rotation, translation = zip(*own, strict=True)
+        if self._exact == (BASE.name,) or _direct(self.T, a, b) is None:
+            return float(np.hypot.reduce(rotation)), float(np.hypot.reduce(translation))
+        return max(rotation), max(translation)
+
+    @property
+    def _exact(self) -> tuple[str]:
+        """The node that the others are mounted on."""
+        return (BASE.name,) if BASE in self.nodes else (self.reference.name,)
 
     @property
     def untied(self) -> tuple[Sensor, ...]:
@@ -92,11 +99,18 @@ class RigPrior:
         order = tuple(name for name in poses if name != self.reference.name)
         covariance = np.zeros((6 * len(order), 6 * len(order)))
         for k, name in enumerate(order):
-            rotation, translation = self.sigmas[name]
-            A = adjoint(from_rotation_translation(np.eye(3), poses[name][:3, 3]))
-            own = np.diag([rotation**2] * 3 + [translation**2] * 3)
-            covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = A @ own @ A.T
+            if name not in self._exact:
+                covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = self._mounted(name, poses[name])
+        if self.reference.name not in self._exact:
+            shared = self._mounted(self.reference.name, np.eye(4))
+            covariance += np.tile(shared, (len(order), len(order)))
         return Extrinsics(self.reference, poses, order, covariance, covariance.copy())
+
+    def _mounted(self, name: str, T_reference_sensor: np.ndarray) -> np.ndarray:
+        """Covariance 6 6 of a sensor's own mounting, as left perturbation in the reference."""
+        rotation, translation = self.sigmas[name]
+        A = adjoint(from_rotation_translation(np.eye(3), T_reference_sensor[:3, 3]))
+        return A @ np.diag([rotation**2] * 3 + [translation**2] * 3) @ A.T
 
 
 def middle_of(nodes: Iterable[Sensor]) -> Sensor:
