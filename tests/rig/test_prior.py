@@ -6,7 +6,7 @@ import pytest
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.prior import perturbed, rig_prior, trio_prior
-from pipeline.geometry.se3 import exp_se3, inverse, log_so3
+from pipeline.geometry.se3 import adjoint, exp_se3, inverse, log_so3
 from pipeline.rig.prior import RigPrior, from_rows, moved, star_of, to_rows
 from schemas.calibrations import pairs_of
 from tests.makers.fleet_files import fleet_toml
@@ -63,8 +63,22 @@ def test_a_sensor_is_unsure_about_itself_by_its_own_sigmas(tmp_path):
     for name, degrees in (("left", 2.0), ("corner_fl", 4.0)):
         # In its own axes nothing of the lever arm is left.
         expected = np.diag([np.radians(degrees) ** 2] * 3 + [0.05**2] * 3)
-        np.testing.assert_allclose(known.covariance_between(name, "top"), expected, atol=1e-12)
+        np.testing.assert_allclose(known.covariance_between(name, "base"), expected, atol=1e-12)
     assert np.array_equal(known.covariance, known.common)
+
+
+def test_the_reference_is_mounted_with_a_tolerance_of_its_own_that_all_poses_in_it_share(tmp_path):
+    _, prior, T = prior_of(tmp_path)
+    known = prior.extrinsics()
+    own = np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3)
+    np.testing.assert_allclose(known.covariance_between("top", "base"), own, atol=1e-12)
+    A = adjoint(inverse(T["top"]) @ T["left"])
+    both = own + A @ known.covariance_between("left", "base") @ A.T
+    np.testing.assert_allclose(known.covariance_between("top", "left"), both, atol=1e-12)
+    assert prior.sigmas_between("top", "left") == pytest.approx(
+        (np.radians(2 * np.sqrt(2)), 0.05 * np.sqrt(2))
+    )
+    assert prior.sigmas_between("left", "base") == pytest.approx((np.radians(2), 0.05))
 
 
 def test_sensors_that_no_chain_reaches_are_named_and_know_each_other(tmp_path):
