@@ -10,10 +10,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.calibrate.edges.lidar_base import Scenes, estimate_lidar_base
+from pipeline.calibrate.edges.lidar_lidar import LidarPair, estimate_lidar_lidar
 from pipeline.calibrate.edges.sweeps import sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import blocks_of, scenes_of
+from pipeline.errors import SolveError
+from pipeline.extrinsics.prior import no_prior
+from pipeline.geometry.se3 import inverse
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion, Odometry, ego_motion, motion_of
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
@@ -39,16 +44,50 @@ class BaseEdges:
     rows: Callable[[Chosen], list[Observation]]
 
     def solve(self, edge: Edge) -> tuple[EdgeEvidence | None, int]:
-        """What the day shows of an edge, and of how many frames; None of a kind that has no estimator."""
-        if edge.kind != "lidar_base":
-            return None, 0
-        rows = self.rows({"lidar": edge.parent.name})
-        T_base_lidar = self.prior.between(BASE.name, edge.parent.name)
-        if T_base_lidar is None or not rows:
-            return None, len(rows)
+        """What the day shows of an edge, and of how many frames; None of a kind that has no estimator.
+
+        Raises:
+            SolveError: too few frames show it.
+        """
+        if edge.kind == "lidar_base":
+            return self._lidar_base(edge)
+        if edge.kind == "lidar_lidar":
+            return self._lidar_lidar(edge)
+        return None, 0
+
+    def _lidar_base(self, edge: Edge) -> tuple[EdgeEvidence, int]:
+        rows = self._sweeps(edge.parent.name)
         scenes = Scenes(scenes_of(rows), blocks_of(rows))
-        found = estimate_lidar_base(edge, sweeps_of(rows), self._ego_at(rows), T_base_lidar, scenes)
+        T = self._on_base(edge.parent.name)
+        return estimate_lidar_base(edge, sweeps_of(rows), self._ego_at(rows), T, scenes), len(rows)
+
+    def _lidar_lidar(self, edge: Edge) -> tuple[EdgeEvidence, int]:
+        parents = self._sweeps(edge.parent.name)
+        of_child = {o.frame_index: o for o in self._sweeps(edge.child.name)}
+        rows = [o for o in parents if o.frame_index in of_child]
+        T = self._on_base(edge.parent.name), self._on_base(edge.child.name)
+        pair = LidarPair(
+            sweeps_of(rows),
+            sweeps_of([of_child[o.frame_index] for o in rows]),
+            T[0],
+            T,
+            self.prior.sigmas_between(edge.parent.name, BASE.name)[0],
+        )
+        scenes = Scenes(scenes_of(rows), blocks_of(rows))
+        found = estimate_lidar_lidar(edge, pair, self._ego_at(rows), inverse(T[0]) @ T[1], scenes)
         return found, len(rows)
+
+    def _sweeps(self, lidar: str) -> list[Observation]:
+        rows = self.rows({"lidar": lidar})
+        if not rows:
+            raise SolveError(f"{lidar} is silent: the day has no sweep of it", "silent_sensor")
+        return rows
+
+    def _on_base(self, name: str) -> Float[np.ndarray, "4 4"]:
+        T = self.prior.between(BASE.name, name)
+        if T is None:
+            raise SolveError(no_prior(f"{BASE.name} and {name}"))
+        return T
 
     @cached_property
     def _dopplers(self) -> dict[str, dict[int, Observation]]:

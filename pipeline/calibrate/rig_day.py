@@ -16,6 +16,7 @@ from pipeline.calibrate.base_edges import BaseEdges
 from pipeline.calibrate.edge_records import record_of_evidence, refused_edge
 from pipeline.calibrate.records import Inputs, SolvedDay
 from pipeline.config import FleetConfig
+from pipeline.errors import SolveError
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import no_prior, trio_prior
@@ -87,14 +88,15 @@ def calibrate_rig(
             records.append(refused_edge(about, edge, no_prior(edge.name), 0))
             continue
         if edge.kind not in PAIR_KINDS:
-            shown, frames = others.solve(edge)
+            try:
+                shown, frames = others.solve(edge)
+            except SolveError as err:
+                records.append(refused_edge(about, edge, err.reason, 0, err.fault))
+                continue
             if shown is None:
-                why = (
-                    "the day has no frames of it"
-                    if not frames
-                    else "nothing estimates edges of this kind yet"
+                records.append(
+                    refused_edge(about, edge, f"edges of kind {edge.kind} have no estimator yet", frames)
                 )
-                records.append(refused_edge(about, edge, why, frames))
             else:
                 records.append(record_of_evidence(about, shown, day.prior, day.views, fleet, frames))
                 evidence.append(shown)

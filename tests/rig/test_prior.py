@@ -144,7 +144,7 @@ def test_any_three_sensors_have_the_prior_of_a_three_sensor_rig(tmp_path):
     pair = trio_prior(prior, rig, None, "top", "corner_fl")
     assert pair.knows("lidar_radar")
     assert not pair.knows("camera_lidar")
-    assert pair.rotation_sigma_rad == np.radians(4)
+    assert pair.rotation_sigma_rad == pytest.approx(np.radians(np.hypot(2, 4)))  # both are mounted on the car
 
 
 def test_a_prior_file_says_where_every_sensor_is(tmp_path):

@@ -1,0 +1,79 @@
+"""A day of two cameras, a lidar and two radars, from logs to a pose of every sensor with the truth beside it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.config import load_fleet
+from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.stages import CALIBRATE
+from pipeline.store.current import current_poses, transform_of
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import read_records
+from pipeline.work import Task
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.poses import POSES, PoseRow
+from tests.makers.stages import ingest_day, perceive_day
+
+pytestmark = pytest.mark.slow
+DAY, MOMENTS = Partition("vehicle-1", "2026-03-02"), 60
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory):
+    out = tmp_path_factory.mktemp("duo")
+    simulate_fleet(
+        FleetSpec(vehicles=1, days=1, frames=MOMENTS, drives=2, rig="duo", environments="mixed", seed=31), out
+    )
+    fleet, lake = load_fleet(out / "fleet.toml"), Lake.at(out / "lake")
+    ingest_day(sorted((out / "logs" / DAY.vehicle / DAY.day).iterdir()), DAY, fleet, lake)
+    perceive_day(DAY, fleet, lake)
+    task = Task(fleet=fleet, lake=lake, of=DAY, method="joint")
+    outcome = CALIBRATE.run(task)
+    truth = json.loads((out / "truth" / DAY.vehicle / f"{DAY.day}.json").read_text())
+    return task, outcome, {name: np.array(T) for name, T in truth["T_base_sensor"].items()}
+
+
+def poses_of(task):
+    return {p.sensor: p for p in current_poses(read_records(task.lake, POSES, PoseRow))}
+
+
+def test_every_edge_has_a_record_and_every_sensor_a_pose(day):
+    task, outcome, _ = day
+    records = read_records(task.lake, CALIBRATIONS, CalibrationRecord)
+    assert outcome.status == "done"
+    assert len(records) == outcome.rows
+    names = {(r.parent_frame, r.child_frame) for r in records}
+    assert {("front", "top"), ("left", "top"), ("top", "nose"), ("front", "nose")} <= names
+    assert set(poses_of(task)) == set(task.fleet.rig_of(DAY.vehicle).sensors) - {"top"} | (
+        {"base"} if task.fleet.rig_of(DAY.vehicle).base else set()
+    )
+
+
+def test_what_is_accepted_is_right(day):
+    task, _, truth = day
+    for name, pose in poses_of(task).items():
+        if pose.status != "accepted" or name == "base":
+            continue
+        off = log_se3(inverse(truth["top"]) @ truth[name] @ inverse(transform_of(pose)))
+        sigma = np.sqrt(np.diag(pose.covariance))
+        assert (np.abs(off) <= np.maximum(4 * sigma, np.radians(0.1))).all(), name
+
+
+def test_a_front_camera_is_known_to_a_tenth_of_a_degree(day):
+    task, _, truth = day
+    front = poses_of(task)["front"]
+    off = log_se3(inverse(truth["top"]) @ truth["front"] @ inverse(transform_of(front)))
+    assert np.degrees(np.linalg.norm(off[:3])) < 0.25
+    assert front.edges
+    assert front.reference == "top"
+
+
+def test_the_same_work_is_not_done_again_and_its_poses_are_current(day):
+    task, outcome, _ = day
+    again = CALIBRATE.run(task)
+    assert again.status == "cached"
+    assert again.work_key == outcome.work_key
+    assert len(read_records(task.lake, POSES, PoseRow)) == len(poses_of(task))
