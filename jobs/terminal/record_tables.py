@@ -58,7 +58,7 @@ def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
         "vehicle": row["vehicle"],
         "day": row["day"],
         "method": row["method"],
-        "pair": row["pair"],
+        "pair": _edge(row),
         "status": row["status"],
         **_pose_cells(row["T"], _prior_of(row)),
         "sigma [deg, m]": f"{degrees} deg\n{metres} m",
@@ -126,7 +126,7 @@ def _drift_cells(row: dict[str, Any]) -> dict[str, str]:
         "vehicle": row["vehicle"],
         "vehicle is": row["vehicle_status"] or "",
         "day": row["day"],
-        "pair": row["pair"],
+        "pair": _edge(row),
         "dof": row["dof"],
         "chart": row["status"],
         "change": size,
@@ -146,7 +146,7 @@ def _state_cells(row: dict[str, Any]) -> dict[str, str]:
     days = row["days"]
     return {
         "vehicle": row["vehicle"],
-        "pair": row["pair"],
+        "pair": _edge(row),
         "state": row["status"],
         **_pose_cells(row["T"], row["T_prior"]),
         "sigma azimuth [deg]": degrees(row["azimuth_sigma_rad"]),
@@ -192,3 +192,9 @@ def _partition_cells(row: dict[str, Any]) -> dict[str, str]:
         "work key": row["work_key"],
         "rejected": counts,
     }
+
+
+def _edge(row: dict[str, Any]) -> str:
+    """Kinds of the two sensors, or their names where these are others."""
+    kinds = row["pair"] == f"{row['parent_frame']}_{row['child_frame']}"
+    return row["pair"] if kinds else f"{row['parent_frame']}-{row['child_frame']}"

@@ -39,7 +39,7 @@ class Method:
 
     Args:
         name: on the command line and in records.
-        run: import path of its `Solver`; of `(method's name, task) -> Solver` where it needs images.
+        run: import path of its `Solver`; of `(method's name, task, chosen) -> Solver` where it needs images.
         composed: pairs that it composes of the other two instead of estimating them.
         frames: "selected" takes `select.frames` of a day; "all" takes all that are not held out, since it follows
             objects from frame to frame.
@@ -64,15 +64,19 @@ class Method:
         solver: Solver = _resolved(self.run)
         return solver
 
-    def solver_of(self, task: Task) -> Solver:
+    def solver_of(self, task: Task, chosen: Mapping[str, str] | None = None) -> Solver:
         """The solver for one vehicle-day.
+
+        Args:
+            task: which day.
+            chosen: names of its camera, lidar and radar by kind; None = the rig has one of each at most.
 
         Raises:
             ConfigError: a network that the method needs does not exist.
         """
         if not self.needs_images:
             return self.solver()
-        solver: Solver = _resolved(self.run)(self.name, task)
+        solver: Solver = _resolved(self.run)(self.name, task, chosen)
         return solver
 
     def settings_of(self, task: Task) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.calibrate.methods import METHODS, Solver, method_named
+from pipeline.calibrate.rig_stage import three_of_day
 from pipeline.config import SolveConfig, config_hash
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import Prior, Solution
@@ -19,7 +20,7 @@ from pipeline.learn.infer.way import informed_by_way
 from pipeline.results import Progress
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns
-from pipeline.store.views import frames_of, ingested, observations_of, perceived
+from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
 from pipeline.work import Task
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
@@ -51,8 +52,8 @@ def ssl_settings(method: str, task: Task) -> dict[str, str]:
     }
 
 
-def ssl_solver(method: str, task: Task) -> Solver:
-    """The method as a solver of a vehicle-day: networks are opened and frames read when it is called."""
+def ssl_solver(method: str, task: Task, chosen: Chosen | None = None) -> Solver:
+    """The method as a solver of a vehicle-day: networks are opened and frames of `chosen` read when it is called."""
     fleet, lake, partition = task.fleet, task.lake, task.partition
 
     def solve(
@@ -72,7 +73,7 @@ def ssl_solver(method: str, task: Task) -> Solver:
             observations,
             prior,
             networks=open_networks(model_files(method, fleet), fleet.learn, fleet.prepare),
-            frames=_frames_of(lake, partition),
+            frames=_frames_of(lake, partition, chosen),
             method=method,
             seed=seed,
             triggered=triggered,
@@ -103,11 +104,15 @@ def calibrate_frame(task: Task, frame: int) -> FrameCalibration:
         known = " or ".join(m.name for m in METHODS if m.needs_images)
         raise ConfigError("command line", "--frame", f"{method.name} needs many frames; choose {known}")
     seed = fleet.solve.seed if task.seed is None else task.seed
-    fleet.rig_of(partition.vehicle)
-    row, observation = _one_observation(task.lake, partition, frame)
-    prior = perturbed(read_prior([observation], fleet, partition.vehicle), task.perturb, seed)
+    if fleet.rig_of(partition.vehicle).is_one_of_each:
+        chosen = None
+        row, observation = _one_observation(task.lake, partition, frame, chosen)
+        prior = perturbed(read_prior([observation], fleet, partition.vehicle), task.perturb, seed)
+    else:
+        chosen, prior = three_of_day(replace(task, method=method.name), seed)
+        row, observation = _one_observation(task.lake, partition, frame, chosen)
     networks = open_networks(model_files(method.name, fleet), fleet.learn, fleet.prepare)
-    shown = next(_frames_of(task.lake, partition)([row]))
+    shown = next(_frames_of(task.lake, partition, chosen)([row]))
     solution = single_frame_solution(
         shown, observation, prior, networks=networks, method=method.name, seed=seed
     )
@@ -116,12 +121,16 @@ def calibrate_frame(task: Task, frame: int) -> FrameCalibration:
     return FrameCalibration(shown, observation, prior, solution)
 
 
-def _frames_of(lake: Lake, partition: Partition) -> Callable[[Sequence[int]], Iterator[Frame]]:
+def _frames_of(
+    lake: Lake, partition: Partition, chosen: Chosen | None
+) -> Callable[[Sequence[int]], Iterator[Frame]]:
     """Frames by frame_index, in order of time."""
-    return lambda moments: frames_of(lake, partition, moments)
+    return lambda moments: frames_of(lake, partition, moments, chosen)
 
 
-def _one_observation(lake: Lake, partition: Partition, wanted: int) -> tuple[int, Observation]:
+def _one_observation(
+    lake: Lake, partition: Partition, wanted: int, chosen: Chosen | None
+) -> tuple[int, Observation]:
     if perceived(lake, partition) is None or ingested(lake, partition) is None:
         raise SolveError(
             "no frames or no observations of this day: run `boresight ingest` and `perceive` first"
@@ -134,7 +143,7 @@ def _one_observation(lake: Lake, partition: Partition, wanted: int) -> tuple[int
         problem = f"no perceived frame has the index or stamp_ns {wanted}; indices are {known}"
         raise ConfigError("command line", "--frame", problem)
     row = int(index[int(found[0])])
-    return row, next(observations_of(lake, partition, [row]))
+    return row, next(observations_of(lake, partition, [row], chosen))
 
 
 def _polished(

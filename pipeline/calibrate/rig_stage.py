@@ -3,33 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.calibrate.edge_records import refused_edge
+from pipeline.calibrate.methods import Method
 from pipeline.calibrate.pose_rows import pose_rows
-from pipeline.calibrate.records import Inputs, SolvedDay, refused_record
+from pipeline.calibrate.records import Inputs, SolvedDay, refused_record, refused_records
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
-from pipeline.calibrate.stage import calibrate_day
+from pipeline.calibrate.stage import calibrate_day, calibrate_observations
+from pipeline.calibrate.three_sensors import three_sensors
 from pipeline.calibrate.verify.seen_targets import views_of
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
-from pipeline.extrinsics.prior import rig_prior
+from pipeline.extrinsics.prior import rig_prior, trio_prior
 from pipeline.results import Progress
 from pipeline.rig.graph import Edge, edge_between
 from pipeline.rig.overlap import find_edges, overlaps_of
-from pipeline.rig.prior import moved
+from pipeline.rig.prior import RigPrior, moved
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import FRAMES, View
 from pipeline.store.moments import sensors_of
 from pipeline.store.views import Chosen, observations_of, perceived
 from pipeline.work import Task
-from schemas.calibrations import CalibrationRecord
+from schemas.calibrations import SENSORS, CalibrationRecord, pairs_of
 from schemas.moments import PRIOR
 from schemas.observations import Observation
 from schemas.poses import PoseRow
 
-__all__ = ["refused_edges", "rig_rows"]
+__all__ = ["refused_edges", "rig_rows", "three_of_day", "three_rows"]
 
 
 def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord | PoseRow]:
@@ -53,6 +56,33 @@ def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationR
     return [*found.records, *pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify)]
 
 
+def three_rows(task: Task, method: Method, about: Inputs, progress: Progress) -> list[CalibrationRecord]:
+    """Records of three sensors of the rig, by a method that knows one of each kind.
+
+    Raises:
+        SolveError: no three share a view, or the day has no prior.
+    """
+    chosen, prior = three_of_day(task, about.seed)
+    rows, of_three = _rows(task, chosen), replace(about, chosen=chosen, pairs=pairs_of(chosen))
+    try:
+        solver = method.solver_of(task, chosen)
+        return calibrate_observations(rows, prior, task.fleet, of_three, progress, solver)
+    except SolveError as err:
+        return refused_records(of_three, err.reason, len(rows), prior, err.fault)
+
+
+def three_of_day(task: Task, seed: int) -> tuple[Chosen, Prior]:
+    """The three sensors that the task's method is run on, and their prior.
+
+    Raises:
+        SolveError: no three share a view, or the day has no prior.
+    """
+    rig = task.fleet.rig_of(task.partition.vehicle)
+    prior, views = _known(task, rig, seed)
+    chosen: Chosen = three_sensors(task.method or "joint", rig, overlaps_of(prior, views))
+    return chosen, trio_prior(prior, rig, *(chosen.get(kind) for kind in SENSORS))
+
+
 def refused_edges(about: Inputs, rig: Rig, why: str, *faults: str) -> list[CalibrationRecord]:
     """Records of a day that could not be calibrated at all: of the edges that the rig names, else to the reference."""
     return [refused_edge(about, edge, why, 0, *faults) for edge in _expected_edges(rig)]
@@ -72,6 +102,19 @@ def _expected_edges(rig: Rig) -> tuple[Edge, ...]:
 
 def _read(task: Task, rig: Rig, seed: int) -> RigDay:
     """Prior, views and edges of a vehicle-day."""
+    prior, views = _known(task, rig, seed)
+    nodes = {node.name: node for node in rig.nodes}
+    graph = find_edges(
+        prior,
+        overlaps_of(prior, views),
+        named=rig.named_edges,
+        reference=None if rig.reference is None else nodes[rig.reference],
+    )
+    return RigDay(rig, graph, prior, views, lambda chosen: _rows(task, chosen))
+
+
+def _known(task: Task, rig: Rig, seed: int) -> tuple[RigPrior, dict[str, View]]:
+    """Prior and views of a vehicle-day."""
     manifest = perceived(task.lake, task.partition)
     if manifest is None:
         raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
@@ -84,14 +127,7 @@ def _read(task: Task, rig: Rig, seed: int) -> RigDay:
         for name, kind in sensors_of(manifest).items()
         if (view := _view(task, {kind: name}, moments)) is not None
     }
-    nodes = {node.name: node for node in rig.nodes}
-    graph = find_edges(
-        prior,
-        overlaps_of(prior, views),
-        named=rig.named_edges,
-        reference=None if rig.reference is None else nodes[rig.reference],
-    )
-    return RigDay(rig, graph, prior, views, lambda chosen: _rows(task, chosen))
+    return prior, views
 
 
 def _view(task: Task, chosen: Chosen, moments: Sequence[int]) -> View | None:

@@ -91,7 +91,7 @@ def work(task: Task) -> Work:
         "seed": seed,
         "prior_file": prior_key(fleet, task.partition.vehicle),
         "camera": _known_cameras(rig),
-    }
+    } | rig.told_to_calibrate
     prior = rig.prior
     tables = (ingested, perceived) if method.needs_images else (perceived,)
     manifests = [manifest_of(task.lake, task.partition) for manifest_of in tables]
@@ -131,14 +131,12 @@ def _rig_records(
 ) -> Sequence[CalibrationRecord | PoseRow]:
     """Of a rig of several sensors of a kind, or with a vehicle frame."""
     # It calibrates pairs by this module's means.
-    from pipeline.calibrate.rig_stage import refused_edges, rig_rows  # noqa: PLC0415
+    from pipeline.calibrate.rig_stage import refused_edges, rig_rows, three_rows  # noqa: PLC0415
 
-    if method.name != "joint":
-        raise ConfigError(
-            "command line", "method", f"{method.name} calibrates three sensors, the rig has more"
-        )
     try:
-        return rig_rows(task, about, progress)
+        if method.name == "joint":
+            return rig_rows(task, about, progress)
+        return three_rows(task, method, about, progress)
     except SolveError as err:
         return refused_edges(about, task.fleet.rig_of(task.partition.vehicle), err.reason, err.fault)
 

@@ -5,21 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from pipeline.errors import SolveError
-from pipeline.rig.graph import Kind
 from pipeline.rig.overlap import Overlap, best_three
 from pipeline.rig.rig import Rig
 
 __all__ = ["three_sensors"]
 
 
-def three_sensors(method: str, rig: Rig, overlaps: Sequence[Overlap]) -> Mapping[Kind, str]:
+def three_sensors(method: str, rig: Rig, overlaps: Sequence[Overlap]) -> Mapping[str, str]:
     """Names by kind: those that the rig names, else the three that share most; of a rig with one of each, these.
 
     Raises:
         SolveError: no three of the rig share a view.
     """
     sensors = [node for node in rig.nodes if node.kind != "base"]
-    only = {sensor.kind: sensor.name for sensor in sensors}
+    only: Mapping[str, str] = {sensor.kind: sensor.name for sensor in sensors}
     if len(only) == len(sensors):
         return only
     named = rig.three or ()

@@ -103,6 +103,18 @@ class Rig(Section):
         """Where the only camera's labels and road users come from; None without a camera or semantics."""
         return None if self.camera is None else self.camera.semantics
 
+    @property
+    def told_to_calibrate(self) -> dict[str, Any]:
+        """What dumps leave out and calibration depends on, for its work key; empty where nothing of it is said."""
+        told: dict[str, Any] = {"edges": self.edges, "three": self.three}
+        told["priors"] = {
+            name: of[name].prior.model_dump(exclude_none=True)
+            for of in self._of_kind.values()
+            for name in of
+            if "prior" in of[name].model_fields_set
+        }
+        return {key: value for key, value in told.items() if value}
+
     def prior_of(self, name: str) -> SensorPrior:
         """How far a sensor's prior is to be trusted: what it is told itself, else the rig's."""
         own = next((of[name].prior for of in self._of_kind.values() if name in of), SensorPrior())

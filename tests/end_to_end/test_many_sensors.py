@@ -1,6 +1,7 @@
 """Two cameras, a lidar and two radars through ingest and perceive: each has files and features of its own."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from pipeline.geometry.se3 import inverse, log_se3
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.stages import CALIBRATE
 from pipeline.store.moments import sensors_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, ingested, observations_of, perceived
+from pipeline.work import Task
+from schemas.calibrations import CalibrationRecord
 from schemas.moments import PRIOR, SENSORS_ABSENT
 from tests.makers.stages import ingest_day, perceive_day
 
@@ -83,3 +87,19 @@ def test_the_prior_is_kept_once_and_ties_every_sensor_to_the_lidar(day):
     seen = next(observations_of(lake, DAY, chosen={"camera": "left", "lidar": "top", "radar": "nose"}))
     np.testing.assert_array_equal(three.T_camera_lidar, seen.priors["camera_lidar"])
     np.testing.assert_array_equal(three.T_lidar_radar, seen.priors["lidar_radar"])
+
+
+@pytest.mark.parametrize("three", [("front", "top", "nose"), None])
+def test_methods_of_three_are_run_on_three_that_share_a_view(day, tmp_path, three):
+    lake, fleet, _, _ = day
+    copy = Lake.at(tmp_path / "lake")
+    shutil.copytree(lake.root, copy.root)
+    name, rig = next(iter(fleet.rigs.items()))
+    fleet = fleet.model_copy(update={"rigs": {name: rig.model_copy(update={"three": three})}})
+    found = CALIBRATE.run(Task(fleet, copy, DAY, method="tracking"))
+    records = [r for r in found.records if isinstance(r, CalibrationRecord)]
+    camera, lidar, radar = three or ("left", "top", "corner_fl")
+    ends = {(r.pair, r.parent_frame, r.child_frame) for r in records}
+    pairs = {("camera_lidar", camera, lidar), ("camera_radar", camera, radar), ("lidar_radar", lidar, radar)}
+    assert ends == pairs
+    assert not any("share a view" in r.reason for r in records)
