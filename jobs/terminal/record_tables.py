@@ -196,5 +196,6 @@ def _partition_cells(row: dict[str, Any]) -> dict[str, str]:
 
 def _edge(row: dict[str, Any]) -> str:
     """Kinds of the two sensors, or their names where these are others."""
-    kinds = row["pair"] == f"{row['parent_frame']}_{row['child_frame']}"
-    return row["pair"] if kinds else f"{row['parent_frame']}-{row['child_frame']}"
+    from pipeline.rig.edges import edge_named, words_of
+
+    return words_of(edge_named(row["pair"], row["parent_frame"], row["child_frame"]))

@@ -23,6 +23,7 @@ from pipeline.config import VerifyConfig
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import inverse, log_se3
 from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
+from pipeline.rig.edges import edge_named, words_of
 from pipeline.store.current import prior_of, targets_of, transform_of
 from schemas.calibrations import CalibrationRecord
 
@@ -174,8 +175,7 @@ def _silent(record: CalibrationRecord, axis: str, limits: AxisLimits, reason: st
 
 
 def _pair(record: CalibrationRecord) -> str:
-    kinds = record.pair == f"{record.parent_frame}_{record.child_frame}"
-    return record.pair if kinds else f"{record.parent_frame}-{record.child_frame}"
+    return words_of(edge_named(record.pair, record.parent_frame, record.child_frame))
 
 
 def _why_not(record: CalibrationRecord) -> str:
