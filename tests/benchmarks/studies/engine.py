@@ -26,13 +26,12 @@ from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import FleetConfig, SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
-from pipeline.extrinsics.prior import perturbed, rows_of
+from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.geometry.targets import loop_errors
 from pipeline.in_use.axes import check_axes, limits_of
 from pipeline.learn.perception.radar_drivable.samples import scan_of
 from pipeline.perceive.models.radar_drivable import RadarDrivable
-from pipeline.rig.prior import from_rows
 from pipeline.store.partitions import Partition
 from schemas.calibrations import PAIRS, CalibrationRecord
 from schemas.observations import Observation
@@ -124,8 +123,8 @@ def prior_of(day: Day, how: tuple[str, float, float], seed: int) -> Prior:
         moved = perturbed(true, (deg, shift_m), seed)
         return moved if kind == "exact" else Prior(moved.T_camera_lidar, moved.T_lidar_radar, *default)
     if kind == "logged":
-        logged = from_rows(rows_of(day.rows))
-        return Prior(logged["camera", "lidar"], logged["lidar", "radar"], *stated)
+        logged = read_prior(day.rows, day.fleet, next(iter(day.fleet.vehicles)))
+        return Prior(logged.T_camera_lidar, logged.T_lidar_radar, *stated)
     rng = np.random.default_rng([seed, 7])
     drawn = [
         from_rotation_translation(
