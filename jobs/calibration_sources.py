@@ -46,20 +46,26 @@ def read_calibration(
         choose_pairs,
         edges_of_vehicle,
         pairs_of_day,
+        pairs_of_poses,
         pairs_of_state,
         read_cameras,
         read_frame_ids,
         rest_at_prior,
     )
+    from pipeline.rig.edges import words_of
     from pipeline.store.partitions import Lake
     from schemas.versions import CODE_VERSION
     from schemas.words import day_word
 
     lake = Lake.existing(location)
+    # A day whose rig was adjusted as a whole says it by sensor, others by edge.
+    poses = {} if day is None else pairs_of_poses(lake, vehicle, day, method)
     if day is None:
         found, source = pairs_of_state(lake, vehicle, method), "state"
     else:
-        found, source = pairs_of_day(lake, vehicle, day, method), f"record of {day}"
+        source = f"record of {day}"
+        by_sensor = {words_of(edge): pair for edge, pair in poses.items()}
+        found = by_sensor or pairs_of_day(lake, vehicle, day, method)
     # What has no transform was refused, or of a state is not there.
     word = day_word("refused" if isinstance(p, str) else p.status for p in found.values())
     pairs, without = choose_pairs(found, force=force)
@@ -67,7 +73,7 @@ def read_calibration(
     details = [p.details for p in pairs.values()]
     days = {str(d) for detail in details for d in _listed(detail.get("days"))} | ({day} if day else set())
     names = frames.names(read_frame_ids(lake, vehicle, days) if own_frames else None)
-    edges = edges_of_vehicle(lake, vehicle, day, method)
+    edges = tuple(poses) or edges_of_vehicle(lake, vehicle, day, method)
     seen = sorted({sensor.name for edge in edges for sensor in edge.sensors if sensor.kind == "camera"})
     cameras = read_cameras(lake, vehicle, days, seen)
     T_base_lidar = None if mount is None else mounting(mount, names, edges)

@@ -9,19 +9,22 @@ import numpy as np
 from pipeline.errors import ConfigError, ContractError
 from pipeline.export.calibration import USABLE, ExportedPair, is_frame
 from pipeline.geometry.cameras import Camera, camera_of
+from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.edges import edge_named, edge_order, words_of
-from pipeline.rig.graph import Edge
-from pipeline.store.current import current_records, current_states, prior_of, transform_of
+from pipeline.rig.graph import Edge, edge_between
+from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.views import ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, CalibrationRecord
+from schemas.poses import POSES, PoseRow
 from schemas.states import STATES, StateRow
 
 __all__ = [
     "choose_pairs",
     "edges_of_vehicle",
     "pairs_of_day",
+    "pairs_of_poses",
     "pairs_of_state",
     "priors_of_day",
     "read_cameras",
@@ -44,6 +47,44 @@ def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, E
         ConfigError: there is no record of that vehicle, day and method; it names those that there are.
     """
     return _pairs(_records(lake, vehicle, day, method))
+
+
+def pairs_of_poses(lake: Lake, vehicle: str, day: str, method: str) -> dict[Edge, ExportedPair | str]:
+    """Each sensor against the reference as the day's adjusted rig has it, by the edge between them.
+
+    Raises:
+        ConfigError: as `pairs_of_day`.
+    """
+    nodes = {s.name: s for edge in edges_of_vehicle(lake, vehicle, day, method) for s in edge.sensors}
+    rows = current_poses(read_records(lake, POSES, PoseRow, vehicle=vehicle, day=day))
+    found: dict[Edge, ExportedPair | str] = {}
+    for row in rows:
+        if row.method == method and {row.sensor, row.reference} <= nodes.keys():
+            edge = edge_between(nodes[row.sensor], nodes[row.reference])
+            found[edge] = _pair_of_pose(row, edge)
+    return {edge: found[edge] for edge in sorted(found, key=edge_order)}
+
+
+def _pair_of_pose(row: PoseRow, edge: Edge) -> ExportedPair | str:
+    """A sensor's pose as the edge between it and the reference, whichever is the parent."""
+    T, covariance, common = transform_of(row), row.covariance, row.common_covariance
+    if T is None or covariance is None:
+        return f"{row.status}: {row.reason}"
+    seen, reason = tuple(row.observable or [True] * 6), row.reason
+    if edge.parent.name == row.sensor:
+        T = inverse(T)
+        A = adjoint(T)
+        covariance, common = A @ covariance @ A.T, None if common is None else A @ common @ A.T
+        unseen = ", ".join(dof for dof, is_seen in zip(DOF_NAMES, seen, strict=True) if not is_seen)
+        # Degrees of freedom are those of the reference's axes: in the sensor's own they are mixed.
+        own = f"{unseen} along the axes of {row.reference} kept at the prior" if unseen else ""
+        seen, reason = (True,) * 6, "; ".join(words for words in (reason, own) if words)
+    details = {"day": row.day, "work_key": row.work_key, "edges": row.edges, "dt_s": row.dt_s}
+    told = {name: value for name, value in details.items() if value not in (None, "", [])}
+    certified = tuple(row.determined)
+    return ExportedPair(
+        words_of(edge), T, covariance, row.status, reason, seen, certified, common, told, of=edge
+    )
 
 
 def priors_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:

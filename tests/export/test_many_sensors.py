@@ -13,13 +13,15 @@ from pipeline.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, poses_of
 from pipeline.export.files import write_files, written_files
 from pipeline.export.formats import FORMATS, format_named
-from pipeline.geometry.se3 import adjoint, exp_se3, inverse
+from pipeline.geometry.se3 import adjoint, exp_se3, inverse, to_quaternion
 from pipeline.rig.edges import edge_named, words_of
 from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
+from schemas.poses import POSES
 from tests.makers.calibrations import CAMERA, T_BASE_LIDAR, random_transform
 from tests.makers.rig_records import EDGES, T_TOP, T_of, covariance_of, rig_records
+from tests.makers.table_rows import make_row
 
 T_LINK_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 NAMES = {"front": "cam_front_optical", "corner": "ars548_fl"}
@@ -202,6 +204,31 @@ def test_commands_name_frames_of_any_sensor_and_write_all_of_them(lake, tmp_path
     code, summary = said(capsys, "export", "urdf", "--out", tmp_path / "b", *of_van, "--frame", "front")
     assert code == 2
     assert "'front' is not SENSOR=NAME" in summary["reason"]
+
+
+def test_a_day_whose_rig_was_adjusted_is_exported_by_its_poses(lake, tmp_path, capsys):
+    rng, moved = np.random.default_rng(8), exp_se3(np.r_[0, 0, 0.004, 0.01, 0, 0])
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    for sensor, kind, status in (
+        ("front", "camera", "accepted"), ("left", "camera", "accepted"),
+        ("bumper", "radar", "accepted"), ("corner", "radar", "held"),
+    ):  # fmt: skip
+        T = moved @ T_TOP[sensor]
+        pose = dict(zip(names, (*to_quaternion(T).tolist(), *T[:3, 3].tolist()), strict=True))
+        row = make_row(
+            "poses", rng, vehicle="van", day="2026-03-01", method="joint", sensor=sensor, kind=kind, reference="top",
+            status=status, determined=["azimuth", "elevation"], observable=[True] * 6, recorded_at="", asserted_at="",
+            covariance=np.eye(6) * 1e-6, common_covariance=np.eye(6) * 1e-7, **pose,
+        )  # fmt: skip
+        commit_records(Lake.at(lake), POSES, [row])
+    of_van = ("--lake", lake, "--vehicle", "van", "--day", "2026-03-01")
+    code, summary = said(capsys, "export", "urdf", "--out", tmp_path / "car.urdf", *of_van)
+    assert (code, summary["pairs"]) == (3, ["front-top", "left-top", "top-bumper"])
+    assert summary["not_certified"]["top-corner"].startswith("held")
+    tree = format_named("urdf").tree({"car.urdf": (tmp_path / "car.urdf").read_bytes()})
+    for sensor in ("front", "left", "bumper"):
+        np.testing.assert_allclose(tree.lookup("top", sensor), moved @ T_TOP[sensor], atol=1e-9)
+    assert tree.lookup("top", "corner") is None
 
 
 def test_a_camera_frame_option_is_that_of_the_sensor_called_camera():
