@@ -6,7 +6,7 @@ Their estimators take plain arrays; this is where a day's rows become those, and
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,12 +14,14 @@ from jaxtyping import Float
 
 from pipeline.calibrate.edges.lidar_base import Scenes, estimate_lidar_base
 from pipeline.calibrate.edges.lidar_lidar import LidarPair, estimate_lidar_lidar
+from pipeline.calibrate.edges.radar_base import Stamps, estimate_radar_base
 from pipeline.calibrate.edges.sweeps import sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import blocks_of, scenes_of
 from pipeline.errors import SolveError
 from pipeline.extrinsics.prior import no_prior
 from pipeline.geometry.se3 import inverse
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion, Odometry, ego_motion, motion_of
+from pipeline.objective.radar.travel import TravelDirections, travel_directions
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.prior import RigPrior
@@ -28,6 +30,8 @@ from schemas.observations import Observation
 
 __all__ = ["BaseEdges"]
 
+_FEWEST_DIRECTIONS = 8  # scans whose elevations a lidar mends: fewer show no pitch
+
 
 @dataclass(frozen=True)
 class BaseEdges:
@@ -35,11 +39,13 @@ class BaseEdges:
 
     Args:
         prior: of the rig.
-        radars: names of all of them.
+        lidars: names of all of them.
+        radars: likewise.
         rows: observations of chosen sensors.
     """
 
     prior: RigPrior
+    lidars: tuple[str, ...]
     radars: tuple[str, ...]
     rows: Callable[[Chosen], list[Observation]]
 
@@ -53,6 +59,8 @@ class BaseEdges:
             return self._lidar_base(edge)
         if edge.kind == "lidar_lidar":
             return self._lidar_lidar(edge)
+        if edge.kind == "radar_base":
+            return self._radar_base(edge)
         return None, 0
 
     def _lidar_base(self, edge: Edge) -> tuple[EdgeEvidence, int]:
@@ -77,6 +85,34 @@ class BaseEdges:
         found = estimate_lidar_lidar(edge, pair, self._ego_at(rows), inverse(T[0]) @ T[1], scenes)
         return found, len(rows)
 
+    def _radar_base(self, edge: Edge) -> tuple[EdgeEvidence, int]:
+        name = edge.parent.name
+        rows = self.rows({"radar": name})
+        self._on_base(name)
+        radar = self._doppler(name, rows) if rows else None
+        if radar is None:
+            raise SolveError(f"{name} is silent: the day has no scan of it", "silent_sensor")
+        scenes = Scenes(scenes_of(rows), blocks_of(rows))
+        stamps = Stamps(*(np.array(column) for column in zip(*_stamps(rows), strict=True)))
+        ego = self._ego_at(rows, without=name)
+        found = estimate_radar_base(edge, radar, ego, stamps, scenes, self._directions(name, rows))
+        return found, len(rows)
+
+    def _directions(self, radar: str, rows: Sequence[Observation]) -> TravelDirections | None:
+        """Velocities that a lidar's elevations mend, of the lidar that most scans share their view with."""
+        place = {o.frame_index: k for k, o in enumerate(rows)}
+        found: list[TravelDirections] = []
+        for lidar in self.lidars:
+            T = self.prior.between(lidar, radar)
+            both = [] if T is None else self.rows({"lidar": lidar, "radar": radar})
+            both = [o for o in both if o.frame_index in place]
+            if T is not None and both:
+                seen = travel_directions(both, T, 0.0)
+                at = np.array([place[both[k].frame_index] for k in seen.frame], np.int64)
+                found.append(replace(seen, frame=at))
+        best = max(found, key=lambda seen: seen.count, default=None)
+        return None if best is None or best.count < _FEWEST_DIRECTIONS else best
+
     def _sweeps(self, lidar: str) -> list[Observation]:
         rows = self.rows({"lidar": lidar})
         if not rows:
@@ -94,9 +130,9 @@ class BaseEdges:
         """Scans of each radar by moment."""
         return {name: {o.frame_index: o for o in self.rows({"radar": name})} for name in self.radars}
 
-    def _ego_at(self, rows: Sequence[Observation]) -> EgoMotion:
-        """Motion of the base at the rows' moments, by all radars and odometry."""
-        measured = [self._doppler(name, rows) for name in self.radars]
+    def _ego_at(self, rows: Sequence[Observation], without: str = "") -> EgoMotion:
+        """Motion of the base at the rows' moments, by odometry and all radars but one."""
+        measured = [self._doppler(name, rows) for name in self.radars if name != without]
         return ego_motion([m for m in measured if m is not None], _odometry(rows), heading=(0.0, 0.0))
 
     def _doppler(self, name: str, rows: Sequence[Observation]) -> DopplerMotion | None:
@@ -119,6 +155,11 @@ class BaseEdges:
             T_base_radar,
             sigma_rad,
         )
+
+
+def _stamps(rows: Sequence[Observation]) -> list[tuple[int, int, int]]:
+    """Of each row: the moment, the scan, the drive."""
+    return [(o.stamp_ns, o.radar_stamp_ns, o.drive) for o in rows]
 
 
 def _odometry(rows: Sequence[Observation]) -> Odometry:

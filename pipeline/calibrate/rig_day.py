@@ -81,7 +81,10 @@ def calibrate_rig(
         progress: told about each edge.
     """
     records, evidence, clocks = list[CalibrationRecord](), list[EdgeEvidence](), dict[Edge, float]()
-    edges, others = day.graph.edges, BaseEdges(day.prior, tuple(day.rig.radars), day.rows)
+    edges, others = (
+        day.graph.edges,
+        BaseEdges(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows),
+    )
     for done, edge in enumerate(edges):
         progress(done, len(edges) + 1, f"calibrate {edge.name}")
         if day.prior.between(edge.parent.name, edge.child.name) is None:
