@@ -55,6 +55,7 @@ class FleetSpec:
     rate_hz: float = 2.0
     rig: str = "demo"
     own_rigs: tuple[tuple[str, str], ...] = ()  # vehicles that have another rig, and which
+    own_frames: int | None = None  # of those vehicles' days; None = as many as the others'
     environments: str = "mixed"  # urban, highway, mixed
     container: str = "mcap"  # mcap, ros1, db3, mixed
     faults: tuple[Fault, ...] = ()
@@ -224,7 +225,8 @@ def _setup(spec: FleetSpec, vehicle: int, day: int, share: float) -> Setup:
 
 
 def _frames(spec: FleetSpec, vehicle: str, day: int) -> int:
-    return int(faults_on(spec.faults, vehicle, day).amount("few")) or spec.frames
+    own = spec.own_frames if vehicle in dict(spec.own_rigs) else None
+    return int(faults_on(spec.faults, vehicle, day).amount("few")) or own or spec.frames
 
 
 def _shares(frames: int, drives: int) -> list[int]:

@@ -182,8 +182,10 @@ def test_faults_name_sensors_of_the_rig_that_they_can_happen_to(item):
 
 
 def test_vehicles_of_one_fleet_can_carry_other_sensors_than_the_rest(tmp_path):
-    spec = FleetSpec(vehicles=2, days=1, frames=1, drives=1, own_rigs=(("vehicle-2", "duo"),))
+    spec = FleetSpec(vehicles=2, days=1, frames=2, drives=1, own_rigs=(("vehicle-2", "duo"),), own_frames=1)
     simulate_fleet(spec, tmp_path)
+    truths = [json.loads(p.read_text()) for p in sorted((tmp_path / "truth").glob("*/*.json"))]
+    assert [t["drives"][0]["frames"] for t in truths] == [2, 1]
     fleet = load_fleet(tmp_path / "fleet.toml")
     assert fleet.rig_of("vehicle-1").sensors == ("camera", "lidar", "radar")
     assert fleet.rig_of("vehicle-2").sensors == ("front", "left", "top", "nose", "corner_fl")
