@@ -23,10 +23,12 @@ from pipeline.fleet.ledger import Known, Ledger
 from pipeline.fleet.more_frames import MOST_TIMES_MORE, asks_for_more, spent_before, with_more_sweeps
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import Outcome, Progress, silent
+from pipeline.rig.edges import edge_named, words_of
 from pipeline.runner import Stage, try_stage
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.store.partitions import Lake, Partition, last_possible_day
 from pipeline.work import Task
+from schemas.calibrations import CalibrationRecord
 from schemas.words import day_word
 
 __all__ = ["DayOutcome", "Night", "refused_at_once", "run_night", "run_vehicle_day", "task_of"]
@@ -208,7 +210,8 @@ def _outcome(finished: Finished[_Job, DayOutcome]) -> DayOutcome:
 
 
 def _summarise(partition: Partition, results: Sequence[Outcome]) -> DayOutcome:
-    pairs = {r.pair: r.status for r in results[-1].records if results[-1].stage == CALIBRATE.name}
+    records = [r for r in results[-1].records if isinstance(r, CalibrationRecord)]
+    pairs = {words_of(edge_named(r.pair, r.parent_frame, r.child_frame)): r.status for r in records}
     worst = next((r for r in results if r.status in ("failed", "refused")), None)
     status = worst.status if worst is not None else day_word(pairs.values()) if pairs else "done"
     if status == "done" and all(r.status == "cached" for r in results):

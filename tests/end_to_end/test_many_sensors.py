@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from jobs.cli import main
 from pipeline.config import load_fleet
 from pipeline.extrinsics.prior import rig_prior, trio_prior
 from pipeline.geometry.se3 import inverse, log_se3
@@ -103,3 +104,16 @@ def test_methods_of_three_are_run_on_three_that_share_a_view(day, tmp_path, thre
     pairs = {("camera_lidar", camera, lidar), ("camera_radar", camera, radar), ("lidar_radar", lidar, radar)}
     assert ends == pairs
     assert not any("share a view" in r.reason for r in records)
+
+
+def test_a_night_of_many_sensors_ends_in_records_by_edge_and_in_pages(day, tmp_path, capsys):
+    lake, _, _, _ = day
+    out = lake.root.parent
+    logs = f"{out}/logs/{{vehicle}}/{{day}}/*"
+    call = ["nightly", "--fleet", str(out / "fleet.toml"), "--lake", str(tmp_path / "lake"), "--logs", logs]
+    assert main([*call, "--executor", "inline", "--report", str(tmp_path / "fleet.html")]) in (0, 3)
+    (problem,) = json.loads(capsys.readouterr().out.splitlines()[-1])[
+        "problems"
+    ]  # eight moments certify little
+    assert {"front-top", "left-top", "top-nose", "top-corner_fl", "top-base"} <= problem["pairs"].keys()
+    assert DAY.vehicle in (tmp_path / "fleet.html").read_text()
