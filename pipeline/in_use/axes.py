@@ -110,11 +110,24 @@ def check_axes(record: CalibrationRecord, limits: Mapping[str, AxisLimits]) -> l
 
 
 def answer_of(checks: Sequence[AxisCheck]) -> str:
-    """Of all pairs: "wrong" where an axis fails, "right" where all that the pairs are good for passes or warns."""
+    """Of all pairs: "wrong" where an axis fails, "right" where all that they are good for passes or warns.
+
+    Of sensors with names, several pairs see the same sensor: there it is right where the pairs of which that is so tie
+    all sensors to each other.
+    """
     if any(c.status == "fail" for c in checks):
         return "wrong"
-    needed = [c for c in checks if c.axis in NEEDED_AXES[c.kind]]
-    return "right" if needed and all(c.status in {"pass", "warn"} for c in needed) else "inconclusive"
+    good: dict[str, bool] = {}
+    for c in checks:
+        if c.axis in NEEDED_AXES[c.kind]:
+            good[c.pair] = good.get(c.pair, True) and c.status in {"pass", "warn"}
+    edges = [set(pair.split("-")) for pair in good if "-" in pair]
+    if len(edges) < len(good):  # sensors are called by their kinds
+        return "right" if all(good.values()) else "inconclusive"
+    tied: set[str] = set()
+    for ends in len(edges) * [set(pair.split("-")) for pair, is_good in good.items() if is_good]:
+        tied |= ends if not tied or tied & ends else set()
+    return "right" if good and tied == set().union(*edges) else "inconclusive"
 
 
 def _off(

@@ -67,6 +67,18 @@ def test_sensors_that_have_names_are_told_apart_and_judged_by_their_kinds():
     assert answer_of(list(of_yaw.values())) == "wrong"
 
 
+def test_of_many_sensors_it_is_right_where_pairs_that_pass_tie_them_all():
+    def checks(*pairs):
+        named = [replace(record(0.0, sigma), parent_frame=a, child_frame=b) for a, b, sigma in pairs]
+        return [c for r in named for c in check_axes(r, limits_of("camera_lidar", VerifyConfig(), ASKED_DEG))]
+
+    # The right camera is unsure beside the nose, and sure beside the top, which the nose is tied to by the left one.
+    tied = [("left", "top", 0.04), ("left", "nose", 0.04), ("right", "top", 0.04), ("right", "nose", 0.4)]
+    assert answer_of(checks(*tied)) == "right"
+    assert answer_of(checks(*tied[:2], tied[3])) == "inconclusive"
+    assert answer_of(checks(("left", "top", 0.04), ("right", "nose", 0.04))) == "inconclusive"
+
+
 def test_an_error_that_is_measured_but_does_not_matter_is_a_warning():
     assert axes(record(0.15, 0.03))["azimuth"].status == "warn"
 
