@@ -37,6 +37,7 @@ COLUMNS = (
     "common_covariance",
     "observable",
     "half_days",
+    "targets_m",
     _DISPROVED,
     *_SHIFTS,
     *_UNCHECKED,
@@ -67,6 +68,7 @@ class Estimates:
         shown_wrong_rad: the angle that the checks of a held record found it off by.
         unchecked_sigmas: by DoF, how far it lies from the prior where that is far and nothing checks it, else 0.
         half_days: of a day within which a sensor moved, changes from the pose and their sigmas, by part of the day.
+        targets: that its sigmas are stated at, in the child's frame; not finite in rows of older releases.
         work_key: of each record.
     """
 
@@ -86,6 +88,7 @@ class Estimates:
     shown_wrong_rad: Float[np.ndarray, " N"]
     unchecked_sigmas: Float[np.ndarray, "N 6"]
     half_days: Float[np.ndarray, "N 2 2 6"]
+    targets: Float[np.ndarray, "N 3 3"]
     work_key: pa.Array
 
     def at(self, rows: slice | np.ndarray) -> Estimates:
@@ -95,7 +98,7 @@ class Estimates:
             self.vehicles, self.edges, self.owner[rows], self.day[rows], self.edge[rows], self.status[rows],
             self.pose[rows], self.has_estimate[rows], self.covariance[rows], self.common[rows], self.has_common[rows],
             self.observable[rows], self.disproved[rows], self.shown_wrong_rad[rows],
-            self.unchecked_sigmas[rows], self.half_days[rows], keys,
+            self.unchecked_sigmas[rows], self.half_days[rows], self.targets[rows], keys,
         )  # fmt: skip
 
     def of(self, vehicle: str) -> Estimates:
@@ -164,7 +167,8 @@ def estimates_of(table: pa.Table | None) -> Estimates:
         is_there, matrices(found["covariance"]), matrices(found["common_covariance"]),
         there(found["common_covariance"]), observable_dofs(found["observable"]),
         pc.fill_null(found[_DISPROVED], 0.0).to_numpy() != 0.0, np.where(np.isfinite(worst), worst, 0.0),
-        unchecked, matrices(found["half_days"], (2, 2, 6)), found["work_key"].combine_chunks(),
+        unchecked, matrices(found["half_days"], (2, 2, 6)), matrices(found["targets_m"], (3, 3)),
+        found["work_key"].combine_chunks(),
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from pipeline.audit.state import DayEstimate, State, fuse
 from pipeline.config import AuditConfig, FleetConfig, VerifyConfig, config_hash
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.target_sigmas import target_sigmas
+from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Partition, content_hash, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
@@ -188,7 +189,8 @@ def _days(records: Estimates) -> list[DayEstimate]:
 
 
 def _with_state(base: StateRow, found: State, records: Estimates, verify: VerifyConfig) -> StateRow:
-    sigma = target_sigmas(base.pair, found.T, found.covariance)
+    own = records.at(np.flatnonzero([day_name(day) in found.days for day in records.day.tolist()]))
+    sigma = target_sigmas(base.pair, found.T, found.covariance, _targets(own))
     azimuth, elevation = (
         (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
         if "radar" not in base.pair
@@ -197,7 +199,6 @@ def _with_state(base: StateRow, found: State, records: Estimates, verify: Verify
     reach = float(ndtri(0.5 + verify.confidence / 2)) * np.degrees(sigma)
     names = ("azimuth", "elevation")
     T, q = found.T, to_quaternion(found.T)
-    own = records.at(np.flatnonzero([day_name(day) in found.days for day in records.day.tolist()]))
     return replace(
         base,
         status="current",
@@ -213,6 +214,12 @@ def _with_state(base: StateRow, found: State, records: Estimates, verify: Verify
         unchecked=_unchecked(own),
         inputs=own.keys(),
     )  # fmt: skip
+
+
+def _targets(days: Estimates) -> Float[np.ndarray, "N 3"]:
+    """Where the sensors look, as the last of the days that says it has it."""
+    known = np.flatnonzero(np.isfinite(days.targets).all(axis=(1, 2)))
+    return days.targets[known[-1]] if len(known) else DEFAULT_TARGETS
 
 
 def _unchecked(days: Estimates) -> dict[str, float]:

@@ -1,5 +1,7 @@
 """Audit and state of rigs of many sensors: charts by edge, sensors by name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -114,6 +116,24 @@ def test_vehicles_of_different_rigs_are_charted_side_by_side(fleet, lake):
     assert {edge(f) for f in found["a"]} == EDGE_NAMES
     assert {edge(f) for f in found["old"]} == {("camera", "lidar"), ("camera", "radar"), ("lidar", "radar")}
     assert {f.vehicle_status for f in found["new"]} == {"UNKNOWN"}  # it has no record
+
+
+def test_a_state_s_sigmas_are_of_targets_where_the_sensors_look(fleet, lake):
+    """Ahead of a radar that looks left, elevation is the lidar's roll; beside it, the pitch, known better."""
+    [edge] = [e for e in EDGES if e.child.name == "corner"]
+    ahead, beside = np.array([[25.0, 0, 0]] * 3), np.array([[0, 25.0, 0]] * 3)
+    found = {}
+    for vehicle, targets in (
+        ("a", beside),
+        ("b", ahead),
+        ("c", None),
+    ):  # of the radar, which looks to the left
+        rows = rig_records(vehicle, 3, np.random.default_rng(9), edges=[edge])
+        commit_records(lake, CALIBRATIONS, [replace(r, targets_m=targets) for r in rows])
+    STATE.run(Task(fleet, lake, Window()))
+    found = {s.vehicle: np.degrees(s.elevation_sigma_rad) for s in read_records(lake, STATES, StateRow)}
+    assert found["b"] > 1.5 * found["a"]
+    assert found["c"] == pytest.approx(found["b"], rel=0.1)
 
 
 def test_a_state_is_written_for_every_edge(fleet, lake):
