@@ -1,4 +1,4 @@
-"""Which parts of a long day are read: bursts of consecutive trios, spread over time, speed, turn and place.
+"""Which parts of a long day are read: bursts of consecutive moments, spread over time, speed, turn and place.
 
 A calibration takes some hundred frames, and the ones that come next in a drive show much the same. So the day is cut
 into parts of equally many sweeps; in the middle of each lies a burst that could be read, and of these those are read

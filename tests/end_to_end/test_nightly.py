@@ -149,7 +149,7 @@ def test_status_and_a_dry_run_say_how_every_day_stands_and_why(fleet, first_nigh
     assert sorted(lake.rglob("*")) == before
     _, plan, _ = run(*command(fleet, tmp_path / "lake", "--dry-run"))
     assert {(*p["stages"], p["why"]) for p in plan["plan"] if p["vehicle"] == "vehicle-1"} == {
-        ("ingest", "perceive", "calibrate", "no frames yet")
+        ("ingest", "perceive", "calibrate", "no moments yet")
     }
     assert not (tmp_path / "lake").exists()
 

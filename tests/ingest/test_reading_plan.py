@@ -159,7 +159,7 @@ def test_a_day_split_into_files_has_bursts_of_many_and_transforms_of_the_first(k
 
 @pytest.mark.parametrize("container", ["mcap", "bag", "folder"])
 def test_of_sweeps_in_clumps_as_many_are_read_as_planned(kit, tmp_path, run_ingest, container):
-    # Runs of 3 to 9 trios, 4 to 40 s apart: no stretch without pause is as long as a burst.
+    # Runs of 3 to 9 moments, 4 to 40 s apart: no stretch without pause is as long as a burst.
     made, at = kit.Kit(ros=1 if container == "bag" else 2), kit.START_NS
     rng = np.random.default_rng(3)
     for _ in range(30):
