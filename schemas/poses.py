@@ -65,6 +65,9 @@ class PoseRow(Recorded):
     )
     dt_sigma_s: float | None = column("its sigma", default=None)
     edges: list[str] = column("edges that the pose rests on, as front-top", default_factory=list)
+    view_azimuth_rad: float | None = column(
+        "width in azimuth of the sensor's view, as its data show; null where they show none", default=None
+    )
     notes: list[str] = column("what else a reader should know", default_factory=list)
     code_version: str = column("boresight version")
     inputs: list[str] = column("work keys or paths of what was read", default_factory=list)
@@ -74,7 +77,7 @@ POSES = table_of(
     PoseRow,
     "poses",
     1,
-    "One row per sensor and method. boresight show poses --json prints these names plus T, 4x4 row-major.",
+    "One row per sensor and method, the reference too. boresight show poses --json prints these names plus T, 4x4.",
     made_by="calibrate",
     about=("vehicle", "day", "method", "sensor"),
 )

@@ -14,6 +14,7 @@ from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.config import VerifyConfig
 from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.spherical import from_spherical
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor
@@ -23,6 +24,9 @@ from schemas.versions import CODE_VERSION
 
 __all__ = ["pose_rows"]
 
+# Ahead, left, up of a body as right, down, ahead of a camera.
+_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
 
 def pose_rows(
     about: Inputs,
@@ -31,7 +35,7 @@ def pose_rows(
     views: Mapping[str, View],
     verify: VerifyConfig,
 ) -> list[PoseRow]:
-    """A row for each sensor but the reference.
+    """A row for each sensor; the reference's says that poses refer to it.
 
     Args:
         about: vehicle, day, method and provenance.
@@ -40,7 +44,7 @@ def pose_rows(
         views: what each sensor sees, by name: a pose is certified where its sensor looks.
         verify: limits.
     """
-    return [_row(about, graph, s, adjusted, views, verify) for s in graph.sensors if s != graph.reference]
+    return [_row(about, graph, sensor, adjusted, views, verify) for sensor in graph.sensors]
 
 
 def _row(
@@ -61,7 +65,14 @@ def _row(
         "work_key": about.work_key,
         "code_version": CODE_VERSION,
         "inputs": list(about.inputs),
+        "view_azimuth_rad": None if sensor.name not in views else _azimuth_seen(views[sensor.name], sensor),
     }
+    if sensor == graph.reference:
+        where = _transform(np.eye(4)) | {
+            "covariance": np.zeros((6, 6)),
+            "common_covariance": np.zeros((6, 6)),
+        }
+        return PoseRow(**told, **where, status="accepted", reason="poses refer to it", dt_s=0.0)
     found = None if adjusted is None else adjusted.sensors.get(sensor.name)
     if adjusted is None or found is None:
         why = "no edge of the rig has evidence" if adjusted is None else "its prior pose is unknown"
@@ -133,6 +144,17 @@ def _verdict(
     if set(needed) & set(unsure):
         return "held", words
     return "accepted", f"not certified: {words}" if words else ""
+
+
+def _azimuth_seen(view: View, sensor: Sensor) -> float:
+    """Width in azimuth of what a sensor sees near its horizon [rad]."""
+    azimuth, elevation = np.radians(np.arange(-179.5, 180.0)), np.radians([-10.0, 0.0, 10.0])
+    points = from_spherical(
+        np.stack([*np.meshgrid(azimuth, elevation, indexing="ij"), np.full((360, 3), 25.0)], -1)
+    )
+    if sensor.kind == "camera":
+        points = points @ _OPTICAL
+    return float(2 * np.pi * view(points).any(axis=1).mean())
 
 
 def _transform(T: Float[np.ndarray, "4 4"]) -> dict[str, Any]:

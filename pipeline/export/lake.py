@@ -59,7 +59,11 @@ def pairs_of_poses(lake: Lake, vehicle: str, day: str, method: str) -> dict[Edge
     rows = current_poses(read_records(lake, POSES, PoseRow, vehicle=vehicle, day=day))
     found: dict[Edge, ExportedPair | str] = {}
     for row in rows:
-        if row.method == method and {row.sensor, row.reference} <= nodes.keys():
+        if (
+            row.method == method
+            and row.sensor != row.reference
+            and {row.sensor, row.reference} <= nodes.keys()
+        ):
             edge = edge_between(nodes[row.sensor], nodes[row.reference])
             found[edge] = _pair_of_pose(row, edge)
     return {edge: found[edge] for edge in sorted(found, key=edge_order)}

@@ -17,6 +17,7 @@ from pipeline.report.page import render, write_page
 from pipeline.report.picture_file import write_picture
 from pipeline.report.pictures import scene_pictures
 from pipeline.report.reading import (
+    day_poses,
     day_records,
     drawn_records,
     drift_of,
@@ -26,6 +27,7 @@ from pipeline.report.reading import (
     states_of,
 )
 from pipeline.report.residuals import frame_residuals
+from pipeline.report.rig_figure import rig_of_day
 from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
 from pipeline.sections import ReportConfig
 from pipeline.store.files import Files, LocalFiles
@@ -149,6 +151,7 @@ def _content(
         "scenes": drawn,
         "no_pictures": no_pictures,
         "offsets": offsets.in_words(),
+        "rig_svg": rig_of_day(day_poses(lake, partition, records), records.values()),
         "sigma_svg": _sigma_svg(records),
         "residual_svg": residual_svg,
         "provenance": _provenance(list(records.values())),

@@ -13,17 +13,19 @@ from pipeline.report.privacy import without_road_users
 from pipeline.report.scenes import choose_frames
 from pipeline.rig.edges import edge_named, edge_order, words_of
 from pipeline.sections import ReportConfig
-from pipeline.store.current import current_records, prior_of, transform_of
+from pipeline.store.current import current_poses, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import last_day, read_last, read_records
 from pipeline.store.tables import COLLECTED
 from pipeline.store.views import frames_of, ingested, observations_of, perceived
-from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, PAIRS, SENSORS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import Frame
 from schemas.observations import Observation
+from schemas.poses import POSES, PoseRow
 
 __all__ = [
+    "day_poses",
     "day_records",
     "drawn_records",
     "drift_of",
@@ -56,6 +58,15 @@ def day_records(lake: Lake, partition: Partition, method: str) -> dict[str, Cali
         )
         raise ConfigError("command line", "day", problem)
     return records
+
+
+def day_poses(lake: Lake, partition: Partition, records: Mapping[str, CalibrationRecord]) -> list[PoseRow]:
+    """Current poses of a vehicle-day, of the method of its records; none of a rig whose sensors are named by kind."""
+    methods = {r.method for r in records.values() if {r.parent_frame, r.child_frame} - set(SENSORS)}
+    if not methods:
+        return []
+    found = read_records(lake, POSES, PoseRow, vehicle=partition.vehicle, day=partition.day)
+    return [p for p in current_poses(found) if p.method in methods]
 
 
 def fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:

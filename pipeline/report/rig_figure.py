@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup, escape
 
+from pipeline.geometry.se3 import inverse
 from pipeline.report.svg import MUTED, document
-from pipeline.rig.graph import Kind
+from pipeline.rig.graph import BASE, Kind
+from pipeline.store.current import transform_of
+from schemas.calibrations import CalibrationRecord
+from schemas.poses import PoseRow
 
-__all__ = ["DrawnEdge", "DrawnSensor", "rig_figure"]
+__all__ = ["DrawnEdge", "DrawnSensor", "rig_figure", "rig_of_day"]
 
 _WIDTH, _MARGIN, _PICTURE = (
     900.0,
@@ -86,6 +90,57 @@ def rig_figure(sensors: Sequence[DrawnSensor], edges: Sequence[DrawnEdge]) -> Ma
     parts += [_dot(s, place[s.name]) for s in sensors]
     parts += _legend(sensors, height)
     return document(_WIDTH, height, parts, f"The rig from above: {', '.join(s.name for s in sensors)}")
+
+
+def rig_of_day(poses: Sequence[PoseRow], records: Iterable[CalibrationRecord]) -> Markup:
+    """The rig as a day's poses have it; empty without them.
+
+    Args:
+        poses: of one vehicle-day, current ones.
+        records: of its edges.
+    """
+    T = {p.sensor: pose for p in poses if (pose := transform_of(p)) is not None}
+    by_name = {p.sensor: p for p in poses}
+    if len(T) < 2:
+        return Markup("")
+    T_body_reference = inverse(T[BASE.name]) if BASE.name in T else _upright(by_name[poses[0].reference].kind)
+    sensors = [
+        DrawnSensor(
+            name,
+            cast("Kind", by_name[name].kind),
+            T_body_reference @ pose,
+            by_name[name].view_azimuth_rad or 0.0,
+            by_name[name].status,
+            _known(by_name[name]),
+        )
+        for name, pose in T.items()
+    ]
+    edges = [
+        DrawnEdge(
+            r.parent_frame,
+            r.child_frame,
+            r.status,
+            f"{r.parent_frame}-{r.child_frame}: {r.status}. {r.reason}",
+        )
+        for r in records
+    ]
+    return rig_figure(sensors, edges)
+
+
+def _upright(kind: str) -> Float[np.ndarray, "4 4"]:
+    """T_body_sensor of a sensor that looks ahead."""
+    T = np.eye(4)
+    if kind == "camera":
+        T[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    return T
+
+
+def _known(pose: PoseRow) -> str:
+    """How well directions in the sensor are known."""
+    if pose.azimuth_sigma_rad is None or pose.elevation_sigma_rad is None:
+        return pose.reason
+    azimuth_deg, elevation_deg = np.degrees([pose.azimuth_sigma_rad, pose.elevation_sigma_rad])
+    return f"azimuth ± {azimuth_deg:.2f}°, elevation ± {elevation_deg:.2f}°"
 
 
 def _places(sensors: Sequence[DrawnSensor], height: float) -> dict[str, tuple[float, float]]:
