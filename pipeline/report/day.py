@@ -14,8 +14,19 @@ from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
 from schemas.drift import DriftFinding, kind_of_sensor, next_step, status_of
 from schemas.faults import in_words
+from schemas.poses import PoseRow
 
-__all__ = ["DofRow", "PairView", "answer_for", "clearest_alarm", "pair_view", "sigmas_of", "status_sentence"]
+__all__ = [
+    "Answered",
+    "DofRow",
+    "PairView",
+    "answer_for",
+    "answered",
+    "clearest_alarm",
+    "pair_view",
+    "sigmas_of",
+    "status_sentence",
+]
 
 _SAID_BY_THE_AXES = "not determined by the day"  # the page lists those axes by name
 _ADVICE = {
@@ -163,12 +174,31 @@ def _unchecked(record: CalibrationRecord) -> str:
     return ", ".join(f"{names[k]} ({sigmas:.1f} sigma)" for k, sigmas in moves.items() if sigmas is not None)
 
 
-def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFinding]) -> tuple[str, str]:
+@dataclass(frozen=True)
+class Answered:
+    """What the first sentence of a page says of a sensor: attributes as those of `PairView`."""
+
+    title: str
+    status: str
+    sensors: tuple[str, ...]
+    certified: str
+    unchecked: str = ""
+
+
+def answered(views: Sequence[PairView], poses: Sequence[PoseRow]) -> Sequence[PairView | Answered]:
+    """Sensors where the day has poses of them, the reference left out; else edges."""
+    told = [p for p in poses if p.sensor != p.reference]
+    return [Answered(p.sensor, p.status, (p.sensor,), ", ".join(p.determined)) for p in told] or views
+
+
+def answer_for(
+    views: Sequence[PairView | Answered], day: str, findings: Sequence[DriftFinding]
+) -> tuple[str, str]:
     """The first thing on the page: (good, partly or bad; a sentence) on whether these numbers may go on the car.
 
     Args:
-        views: the day's pairs.
-        day: the page's day; a sensor that moved after it makes its pairs outdated.
+        views: the day's edges, or its sensors.
+        day: the page's day; a sensor that moved after it makes what is of it outdated.
         findings: the vehicle's current findings.
     """
     accepted = [v.title for v in views if v.status == "accepted"]
@@ -189,13 +219,14 @@ def answer_for(views: Sequence[PairView], day: str, findings: Sequence[DriftFind
         return "bad", "No. Nothing was accepted: keep the transforms that the car has."
     if not other:
         unchecked = _not_in(views)
-        sentence = f"Yes{unchecked}. All pairs are accepted: they may go on the car, with the sigmas below."
+        what = "pairs" if any(len(v.sensors) > 1 for v in views) else "sensors"
+        sentence = f"Yes{unchecked}. All {what} are accepted: they may go on the car, with the sigmas below."
         return "partly" if unchecked else "good", sentence + _azimuth_only(views)
     sentence = f"Partly. Accepted: {', '.join(accepted)}{_not_in(views)}. Keep what the car has for {', '.join(other)}."
     return "partly", sentence + _azimuth_only(views)
 
 
-def _not_in(views: Sequence[PairView]) -> str:
+def _not_in(views: Sequence[PairView | Answered]) -> str:
     """As `, but not in lidar-radar's roll (...)`: what accepted pairs say without anything to check it."""
     parts = [f"{v.title}'s {v.unchecked}" for v in views if v.status == "accepted" and v.unchecked]
     if not parts:
@@ -203,7 +234,7 @@ def _not_in(views: Sequence[PairView]) -> str:
     return f", but not in {' and '.join(parts)}: far from the prior, checked by nothing, not certified"
 
 
-def _azimuth_only(views: Sequence[PairView]) -> str:
+def _azimuth_only(views: Sequence[PairView | Answered]) -> str:
     """A sentence on accepted pairs whose elevation nobody certifies; empty where there is none."""
     limited = [
         v.title for v in views if v.status == "accepted" and v.certified and "elevation" not in v.certified

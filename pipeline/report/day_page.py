@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, DamagedError
-from pipeline.report.day import PairView, answer_for, pair_view, sigmas_of, status_sentence
+from pipeline.report.day import PairView, answer_for, answered, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import SigmaPanel, residual_figure, sigma_figure
 from pipeline.report.in_use import InUseView
 from pipeline.report.overlays import Extrinsics
@@ -132,6 +132,7 @@ def _content(
 ) -> dict[str, Any]:
     """What the records, the findings and the frames of a day tell, by the names that the template uses."""
     records, findings = read.records, read.findings
+    poses = day_poses(lake, partition, records)
     views = [pair_view(record) for record in records.values()]
     of_three = drawn_records(records)
     before, after = states_of(of_three) or (None, None)
@@ -144,14 +145,14 @@ def _content(
     )
     return {
         "environment": next(iter(records.values())).environment,
-        "answer": answer_for(views, partition.day, findings),
+        "answer": answer_for(answered(views, poses), partition.day, findings),
         "drift": _as_of(findings),
         "pairs": views,
         "labels": labels,
         "scenes": drawn,
         "no_pictures": no_pictures,
         "offsets": offsets.in_words(),
-        "rig_svg": rig_of_day(day_poses(lake, partition, records), records.values()),
+        "rig_svg": rig_of_day(poses, records.values()),
         "sigma_svg": _sigma_svg(records),
         "residual_svg": residual_svg,
         "provenance": _provenance(list(records.values())),
