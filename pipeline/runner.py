@@ -238,13 +238,12 @@ def _partition_outcome(stage: Stage, task: Task, work: Work, status: str, manife
 
 def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
     """Records of work that is not recorded yet; committed here, unless who gave the task does that."""
-    tables = [task.lake.table(schema.name) for schema in stage.writes]
     recorded = [] if work.again else _recorded(stage, task, run.work_key)
     if stage.writes[0].rows_among(recorded):
         if task.commit:
             for schema in stage.writes:
                 assert_records(task.lake, schema, schema.rows_among(recorded))
-        cached = _record_outcome(stage, task, work, "cached", run.work_key, recorded, tables)
+        cached = _record_outcome(stage, task, work, "cached", run.work_key, recorded)
         return replace(cached, inputs=run.inputs)
     written: list[Any] = []
     with at_most(task.fleet.fleet.memory_gb), closing(work.rows(run)) as batches:
@@ -255,7 +254,7 @@ def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
         # The first table last: where its rows are, those beside them are too.
         for schema in reversed(stage.writes):
             commit(task.lake, schema, schema.rows_among(written))
-    outcome = _record_outcome(stage, task, work, "done", run.work_key, written, tables if written else [])
+    outcome = _record_outcome(stage, task, work, "done", run.work_key, written)
     return replace(outcome, inputs=run.inputs)
 
 
@@ -272,9 +271,7 @@ def _recorded(stage: Stage, task: Task, key: str) -> list[Any]:
     return [r for r in found if r.work_key == key]
 
 
-def _record_outcome(
-    stage: Stage, task: Task, work: Work, status: str, key: str, rows: list[Any], outputs: list[str]
-) -> Outcome:
+def _record_outcome(stage: Stage, task: Task, work: Work, status: str, key: str, rows: list[Any]) -> Outcome:
     own = stage.writes[0].rows_among(rows)
     told = work.tell(own)
     return _outcome(
@@ -287,7 +284,7 @@ def _record_outcome(
         rejected=told.rejected,
         reason=told.reason,
         faults=told.faults,
-        outputs=outputs,
+        outputs=[task.lake.table(t.name) for t in stage.writes if t.rows_among(rows)],
         records=tuple(rows),
     )
 
