@@ -49,8 +49,8 @@ class BaseEdges:
     radars: tuple[str, ...]
     rows: Callable[[Chosen], list[Observation]]
 
-    def solve(self, edge: Edge) -> tuple[EdgeEvidence | None, int]:
-        """What the day shows of an edge, and of how many frames; None of a kind that has no estimator.
+    def solve(self, edge: Edge) -> tuple[EdgeEvidence, int]:
+        """What the day shows of an edge, and of how many frames.
 
         Raises:
             SolveError: too few frames show it.
@@ -59,9 +59,8 @@ class BaseEdges:
             return self._lidar_base(edge)
         if edge.kind == "lidar_lidar":
             return self._lidar_lidar(edge)
-        if edge.kind == "radar_base":
-            return self._radar_base(edge)
-        return None, 0
+        assert edge.kind == "radar_base", f"{edge.kind} is estimated as a pair"
+        return self._radar_base(edge)
 
     def _lidar_base(self, edge: Edge) -> tuple[EdgeEvidence, int]:
         rows = self._sweeps(edge.parent.name)

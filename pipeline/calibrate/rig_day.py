@@ -96,13 +96,8 @@ def calibrate_rig(
             except SolveError as err:
                 records.append(refused_edge(about, edge, err.reason, 0, err.fault))
                 continue
-            if shown is None:
-                records.append(
-                    refused_edge(about, edge, f"edges of kind {edge.kind} have no estimator yet", frames)
-                )
-            else:
-                records.append(record_of_evidence(about, shown, day.prior, day.views, fleet, frames))
-                evidence.append(shown)
+            records.append(record_of_evidence(about, shown, day.prior, day.views, fleet, frames))
+            evidence.append(shown)
             continue
         chosen: Chosen = {s.kind: s.name for s in edge.sensors}
         of_three = (chosen.get(kind) for kind in ("camera", "lidar", "radar"))
