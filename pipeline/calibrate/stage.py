@@ -225,11 +225,15 @@ def _solved(
     method, select = method_named(about.method), fleet.select
     if method.frames == "all":
         select = select.model_copy(update={"frames": max(len(observations), 1)})
+    sync_gate_s, by_motion = _sync_gate_s(method, fleet), fleet.ingest
     selection = select_frames(
         observations,
         select,
         paper=method.paper_selection,
-        sync_gate_s=_sync_gate_s(method, fleet),
+        sync_gate_s=sync_gate_s,
+        motion_gate=None
+        if sync_gate_s
+        else (by_motion.sync_gate_m, float(np.radians(by_motion.sync_gate_deg))),
         pairs=about.pairs,
         absent=about.absent,
     )

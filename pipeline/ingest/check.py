@@ -101,7 +101,7 @@ def check_logs(
     progress(0, 0, "reading the index")
     index = index_logs(logs, rig, survey=True)
     try:
-        anchored, rejected = pick_moments(index, fleet.ingest)
+        anchored, rejected = pick_moments(index, rig, fleet.ingest)
         builder = MomentBuilder(index, rig, fleet.ingest, read_file_prior(rig, fleet))
         built = []
         picked = np.unique(np.linspace(0, max(len(anchored) - 1, 0), _SAMPLE).round().astype(int))

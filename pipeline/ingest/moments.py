@@ -1,13 +1,14 @@
 """One moment of a day to its row, with a row of each sensor that it has.
 
-A sensor whose payload is damaged, says too little or repeats an earlier one is left out of its moment, which goes on
-with the others where no whole moment within the second before shows the same scene.
+A sensor whose payload is damaged, says too little or repeats an earlier one is left out of its moment. Of a rig with
+one sensor of each kind the moment goes on where no whole one within the second before shows the same scene, of others
+where an edge can still join two of its sensors.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from pipeline.ingest.index import DayIndex
 from pipeline.ingest.logged_prior import LoggedPrior
 from pipeline.ingest.repetition import REPEATED, Repetitions
 from pipeline.ingest.sync import Rejection, none_near
+from pipeline.rig.graph import possible_edges
 from pipeline.rig.prior import Star
 from pipeline.rig.rig import Rig
 from schemas.captures import Capture
@@ -69,9 +71,7 @@ class MomentBuilder:
         stream = self._index.captures(at.anchor)
         stamp_ns, log = stream.stamps[at.places[at.anchor]], stream.located[at.places[at.anchor]].log
         damaged = [why for sensor, why in missing.items() if sensor in at.places]
-        if damaged and (
-            len(parts) < min(2, len(self._readers)) or stamp_ns - self._whole_ns <= SAME_SCENE_NS
-        ):
+        if damaged and not self._is_worth_having(parts, stamp_ns):
             raise damaged[0]
         self._whole_ns = self._whole_ns if missing else stamp_ns
         self._count(missing)
@@ -89,6 +89,14 @@ class MomentBuilder:
             **_pose_columns(None if ego is None else ego.T_odom_vehicle),
         )  # fmt: skip
         return row, captures
+
+    def _is_worth_having(self, parts: Collection[str], stamp_ns: int) -> bool:
+        """Whether what is left of a moment shows what no other does."""
+        if len(set(self._kinds.values())) == len(self._kinds):
+            is_seen = stamp_ns - self._whole_ns <= SAME_SCENE_NS
+            return len(parts) >= min(2, len(self._readers)) and not is_seen
+        left = [n for n in self._rig.nodes if n.name in parts or n.kind == "base"]
+        return len(parts) > 1 and bool(possible_edges(left))
 
     def _part(self, sensor: str, at: Anchored, moment: int, missing: dict[str, Rejected]) -> Read | None:
         """What a sensor of the rig adds to the moment; None, and why in `missing`, where it adds nothing."""

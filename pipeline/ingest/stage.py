@@ -25,11 +25,12 @@ from pipeline.ingest.sync import (
     Rejection,
     match_by_motion,
     match_by_stamp,
-    motion_gates_ns,
     none_near,
     number_drives,
 )
+from pipeline.objective.stamp_gaps import motion_gates_ns
 from pipeline.results import Progress
+from pipeline.rig.graph import possible_edges
 from pipeline.rig.prior import Star
 from pipeline.rig.rig import Rig
 from pipeline.work import NothingUsable, Run, Task, Work
@@ -93,7 +94,7 @@ def _rows(
     index = index_logs(task.logs, rig, budget=config.read_budget)
     try:
         builder = MomentBuilder(index, rig, config, file_prior)
-        anchored, rejected = pick_moments(index, config)
+        anchored, rejected = pick_moments(index, rig, config)
         made = 0
         for row in _built(anchored, builder, index, rejected, run.progress):
             made += 1
@@ -125,9 +126,9 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
         )
 
 
-def pick_moments(index: DayIndex, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
+def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
     """What belongs together, in order of time, thinned evenly to `max_frames`; and why other sweeps are left out."""
-    found, drives = find_moments(index, config), _drives(index)
+    found, drives = find_moments(index, rig, config), _drives(index)
     picked = _spread(len(found.anchor), config.max_frames)
     places = {index.anchor: found.anchor, **found.others}
     anchored = [
@@ -141,7 +142,7 @@ def pick_moments(index: DayIndex, config: IngestConfig) -> tuple[list[Anchored],
     return anchored, +(found.rejected + Counter({Rejection.NOT_PICKED: len(found.anchor) - len(picked)}))
 
 
-def find_moments(index: DayIndex, config: IngestConfig) -> Matched:
+def find_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> Matched:
     """All moments of the day, or of its bursts, within the gate that the configuration asks for.
 
     They are built about the sweeps of the first lidar; without a sweep all day, about the first radar's scans.
@@ -149,13 +150,23 @@ def find_moments(index: DayIndex, config: IngestConfig) -> Matched:
     wanted = index.sweeps_in_bursts()
     anchors_ns = index.captures(index.anchor).stamps_ns[wanted]
     others_ns = {s: index.captures(s).stamps_ns for s in index.kinds if s != index.anchor}
+    tied = _tied(rig, index.anchor)
     if config.sync_gate_s is not None:
-        found = match_by_stamp(anchors_ns, others_ns, round(config.sync_gate_s * 1e9))
+        found = match_by_stamp(anchors_ns, others_ns, round(config.sync_gate_s * 1e9), tied)
     else:
         speed, yaw_rate = index.ego.motion_at(anchors_ns)
         gates = motion_gates_ns(speed, yaw_rate, config.sync_gate_m, float(np.radians(config.sync_gate_deg)))
-        found = match_by_motion(anchors_ns, others_ns, gates)
+        found = match_by_motion(anchors_ns, others_ns, gates, tied)
     return replace(found, anchor=wanted[found.anchor])
+
+
+def _tied(rig: Rig, anchor: str) -> set[str] | None:
+    """Sensors that an edge can tie to the anchor, by way of the vehicle too; None of a rig with one of each kind."""
+    sensors = [node for node in rig.nodes if node.kind != "base"]
+    if len({node.kind for node in sensors}) == len(sensors):
+        return None
+    ends = [{s.name for s in edge.sensors} for edge in possible_edges(sensors)]
+    return {s.name for s in sensors if rig.base is not None or {s.name, anchor} in ends}
 
 
 def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig) -> tuple[str, ...]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Int, Int64
 
 from schemas.moments import SAME_SCENE_NS
 
@@ -22,7 +22,6 @@ __all__ = [
     "match_by_motion",
     "match_by_stamp",
     "match_nearest",
-    "motion_gates_ns",
     "none_near",
     "number_drives",
 ]
@@ -31,11 +30,6 @@ _DRIVE_GAP_NS = 10 * 10**9
 _HALF_A_PERIOD = 0.55  # and a tenth for jitter
 # Length of the gaps' mean on the circle of a period: they scatter by a tenth of it, one sigma.
 _TRIGGERED = 0.8
-# A moment with so many times the sensors of another within a second shows all that the other does: of three sensors,
-# three against two. In rigs with many sensors, whole moments may be rare.
-_RICHER = 1.5
-# What is taken for a car that nobody measured, and for others that drive past one that stands.
-_UNKNOWN_MPS, _UNKNOWN_RADPS, _OTHERS_MPS = 40.0, float(np.radians(30.0)), 10.0
 
 
 class Rejection(StrEnum):
@@ -123,11 +117,15 @@ def match_nearest(
 
 
 def match_by_stamp(
-    anchor_ns: Int[np.ndarray, " L"], others_ns: Mapping[str, Int[np.ndarray, " M"]], gate_ns: int
+    anchor_ns: Int[np.ndarray, " L"],
+    others_ns: Mapping[str, Int[np.ndarray, " M"]],
+    gate_ns: int,
+    tied: Collection[str] | None = None,
 ) -> Matched:
     """Synchronised moments: every two stamps of one lie within the gate (paper, section 4.5.1: under 5 ms).
 
-    One that lacks sensors is taken where no richer one within a second shows the same scene.
+    One that lacks sensors is taken where no whole one within a second shows the same scene. For rigs of many sensors
+    (`tied`) the gate is between each stamp and the anchor's.
 
     Stamps may come in any order and more than once: the first of equal stamps counts.
     """
@@ -135,13 +133,14 @@ def match_by_stamp(
     once = {s: stamps[first_occurrences(stamps)] for s, stamps in others_ns.items()}
     partners = {s: match_nearest(anchor_ns[anchor], stamps, gate_ns) for s, stamps in once.items()}
     gates = np.full(len(anchor), gate_ns, np.int64)
-    return _gated(anchor_ns, others_ns, partners, dict.fromkeys(once, 0), gates)
+    return _gated(anchor_ns, others_ns, partners, dict.fromkeys(once, 0), gates, tied)
 
 
 def match_by_motion(
     anchor_ns: Int[np.ndarray, " L"],
     others_ns: Mapping[str, Int[np.ndarray, " M"]],
     gates_ns: Int[np.ndarray, " L"],
+    tied: Collection[str] | None = None,
 ) -> Matched:
     """Each anchor with what of each sensor is nearest to it, where the stamps' gaps are within the anchor's own gate.
 
@@ -152,6 +151,9 @@ def match_by_motion(
         anchor_ns: stamps of the sensor that moments are built about, in any order, the first of equal ones counts.
         others_ns: of the others by name, likewise.
         gates_ns: per anchor, the largest gap beyond the constant ones between any two captures of its moment.
+        tied: of a rig with several sensors of a kind, those that can be calibrated against the anchor. A moment is what
+            one of them belongs to, each sensor within the gate of the anchor, whatever others it lacks: every edge
+            takes the moments that its own two sensors have.
     """
     anchor = first_occurrences(anchor_ns)
     partners, constant = {}, {}
@@ -161,7 +163,7 @@ def match_by_motion(
         period = _period_ns(stamps)
         half = int(gates_ns.max(initial=0)) if period is None else int(_HALF_A_PERIOD * period)
         partners[sensor] = match_nearest(anchor_ns[anchor] + constant[sensor], stamps, half)
-    return _gated(anchor_ns, others_ns, partners, constant, gates_ns[anchor])
+    return _gated(anchor_ns, others_ns, partners, constant, gates_ns[anchor], tied)
 
 
 def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, " M"]) -> int:
@@ -190,21 +192,6 @@ def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, 
     return round(middle + float(np.median((gap - middle + period / 2) % period - period / 2)))
 
 
-def motion_gates_ns(
-    speed_mps: Float[np.ndarray, " L"],
-    yaw_rate_radps: Float[np.ndarray, " L"],
-    move_m: float,
-    turn_rad: float,
-) -> Int64[np.ndarray, " L"]:
-    """Per sweep, the time in which the car drives `move_m` or turns `turn_rad`, whichever comes first [ns].
-
-    Speeds and yaw rates that are unknown (NaN) are taken for as high as a car's are.
-    """
-    speed = np.maximum(np.where(np.isnan(speed_mps), _UNKNOWN_MPS, np.abs(speed_mps)), _OTHERS_MPS)
-    turn = np.where(np.isnan(yaw_rate_radps), _UNKNOWN_RADPS, np.abs(yaw_rate_radps))
-    return (1e9 * np.minimum(move_m / speed, turn_rad / np.maximum(turn, 1e-6))).astype(np.int64)
-
-
 def _period_ns(stamps_ns: Int[np.ndarray, " M"]) -> float | None:
     """Median time between stamps, None of fewer than two."""
     return float(np.median(np.diff(np.sort(stamps_ns)))) if len(stamps_ns) > 1 else None
@@ -216,10 +203,12 @@ def _gated(
     partners: Mapping[str, np.ndarray],
     constant_ns: Mapping[str, int],
     gates: np.ndarray,
+    tied: Collection[str] | None,
 ) -> Matched:
     """The moments of which every two stamps, less the constant gaps, lie within the anchor's gate; the others counted.
 
-    Anchors without all partners are taken far from richer moments only: there a sensor is silent or the rig has none.
+    Anchors without all partners are taken far from whole moments only: there a sensor is silent or the rig has none.
+    Where sensors are `tied` to the anchor, gates and what a moment may lack are as `match_by_motion` says.
 
     `partners` are places in the stamps that count of each sensor, -1 = none.
     """
@@ -231,8 +220,12 @@ def _gated(
         near, stamps = partners[s] >= 0, others_ns[s][once[s]]
         gap[k, near] = stamps[partners[s][near]] - own[near] - constant_ns[s]
         has[k] = near & (np.abs(gap[k]) <= gates)
-    together, apart = _together(gap, has, gates)
-    kept = _worth_having(own, 1 + together.sum(0), min(2, 1 + len(names)))
+    if tied is None:
+        together, apart = _together(gap, has, gates)
+        kept = _worth_having(own, 1 + together.sum(0), min(2, 1 + len(names)))
+    else:
+        together, apart = has, {}
+        kept = np.logical_or.reduce(has[[name in tied for name in names]], axis=0)
     rejected = Counter[str]({Rejection.DUPLICATE_STAMP: len(anchor_ns) - len(anchor)})
     heard = [k for k, s in enumerate(names) if len(others_ns[s])] or list(range(len(names)))
     for i in np.flatnonzero(~kept):
@@ -265,11 +258,11 @@ def _together(
 def _worth_having(
     stamps_ns: Int64[np.ndarray, " N"], sensors: Int[np.ndarray, " N"], least: int
 ) -> Bool[np.ndarray, " N"]:
-    """Moments, in order, of so many sensors or more that no richer one near in time shows too."""
+    """Moments, in order, of so many sensors or more that none with more near in time shows too."""
     first = np.searchsorted(stamps_ns, stamps_ns - SAME_SCENE_NS, "left")
     end = np.searchsorted(stamps_ns, stamps_ns + SAME_SCENE_NS, "right")
     most = np.array([sensors[a:b].max() for a, b in zip(first, end, strict=True)], np.int64)
-    return (sensors >= least) & (most < _RICHER * sensors)
+    return (sensors >= least) & (most == sensors)
 
 
 def _at(places: np.ndarray, index: np.ndarray) -> np.ndarray:

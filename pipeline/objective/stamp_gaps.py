@@ -12,11 +12,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from schemas.observations import Observation
 
-__all__ = ["camera_gaps_s", "constant_gap_s", "radar_gaps_s", "scan_to_image_s"]
+__all__ = ["camera_gaps_s", "constant_gap_s", "motion_gates_ns", "radar_gaps_s", "scan_to_image_s"]
+
+# What is taken for a car that nobody measured, and for others that drive past one that stands.
+_UNKNOWN_MPS, _UNKNOWN_RADPS, _OTHERS_MPS = 40.0, float(np.radians(30.0)), 10.0
 
 
 def camera_gaps_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:
@@ -40,6 +43,21 @@ def scan_to_image_s(observations: Sequence[Observation]) -> Float[np.ndarray, " 
     """By how much each scan was taken after its image [s], if the constant gaps of both are errors of their clocks."""
     radar, camera = radar_gaps_s(observations), camera_gaps_s(observations)
     return (radar - constant_gap_s(radar)) - (camera - constant_gap_s(camera))
+
+
+def motion_gates_ns(
+    speed_mps: Float[np.ndarray, " L"],
+    yaw_rate_radps: Float[np.ndarray, " L"],
+    move_m: float,
+    turn_rad: float,
+) -> Int64[np.ndarray, " L"]:
+    """Per sweep, the time in which the car drives `move_m` or turns `turn_rad`, whichever comes first [ns].
+
+    Speeds and yaw rates that are unknown (NaN) are taken for as high as a car's are.
+    """
+    speed = np.maximum(np.where(np.isnan(speed_mps), _UNKNOWN_MPS, np.abs(speed_mps)), _OTHERS_MPS)
+    turn = np.where(np.isnan(yaw_rate_radps), _UNKNOWN_RADPS, np.abs(yaw_rate_radps))
+    return (1e9 * np.minimum(move_m / speed, turn_rad / np.maximum(turn, 1e-6))).astype(np.int64)
 
 
 def _filled(gaps_s: np.ndarray, sensor: str, observations: Sequence[Observation]) -> np.ndarray:

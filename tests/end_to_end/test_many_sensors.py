@@ -10,6 +10,7 @@ from jobs.cli import main
 from pipeline.config import load_fleet
 from pipeline.extrinsics.prior import rig_prior, trio_prior
 from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.ingest.index import DayIndex
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.simulate.sensors.rigs import rig_named
@@ -50,6 +51,23 @@ def test_every_sensor_has_a_file_and_what_it_lacks_is_counted_under_its_name(day
     assert sensors_of(ingested(lake, DAY)) == KINDS
     assert ingest.rejected["without_corner_fl_no_radar_in_gate"] >= 2
     assert "corner_fl" in ingested(lake, DAY).extra[SENSORS_ABSENT]
+
+
+def test_damaged_images_of_one_camera_cost_that_camera_alone(day, tmp_path, monkeypatch):
+    lake, fleet, _, (before, _) = day
+    topic, whole, seen = fleet.rig_of(DAY.vehicle).cameras["left"].image, DayIndex.read, []
+
+    def damaged(self, located):
+        payload = whole(self, located)
+        seen.append(located.channel.topic)
+        is_bad = seen[-1] == topic and seen.count(topic) % 2 == 0
+        return payload[: len(payload) // 2] if is_bad else payload
+
+    monkeypatch.setattr(DayIndex, "read", damaged)
+    logs = sorted((lake.root.parent / "logs" / DAY.vehicle / DAY.day).iterdir())
+    found = ingest_day(logs, DAY, fleet, Lake.at(tmp_path / "lake"))
+    assert (found.status, found.rows) == ("done", before.rows)
+    assert found.rejected["without_left_image_damaged"] == MOMENTS // 2
 
 
 @pytest.mark.parametrize("camera", ["front", "left"])

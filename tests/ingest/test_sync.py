@@ -11,9 +11,9 @@ from pipeline.ingest.sync import (
     match_by_motion,
     match_by_stamp,
     match_nearest,
-    motion_gates_ns,
     number_drives,
 )
+from pipeline.objective.stamp_gaps import motion_gates_ns
 
 stamps = st.lists(st.integers(0, 400), max_size=30).map(lambda v: np.array(v, np.int64))
 GATE = 7
@@ -106,15 +106,21 @@ def test_of_any_number_of_sensors_no_sweep_is_lost_and_every_two_captures_lie_wi
     assert len(found.anchor) + sum(found.rejected.values()) == len(lidar)
 
 
-def test_a_moment_of_many_sensors_may_lack_some_and_not_a_third_of_them():
+def test_a_moment_of_many_sensors_lives_where_one_is_tied_to_the_anchor_whatever_it_lacks():
     sweeps = ticks(10, 0)
     others = {name: sweeps.copy() for name in "abcde"}
-    others["a"] = others["a"][::2]
-    found = match_by_motion(sweeps, others, gates(sweeps, speed=0.0))
-    assert len(found.anchor) == len(sweeps)  # five of six sensors in every other moment
-    others["b"] = others["b"][::2]
-    found = match_by_motion(sweeps, others, gates(sweeps, speed=0.0))
-    assert dict(found.rejected) == {"no_a_in_gate": len(sweeps) // 2}
+    others["a"], others["b"] = others["a"][::2], others["b"][::3]
+    found = match_by_motion(sweeps, others, gates(sweeps, speed=0.0), tied={"a", "b", "c", "d", "e"})
+    assert len(found.anchor) == len(sweeps)
+    assert {s: int(np.sum(at >= 0)) for s, at in found.others.items()} == {s: len(others[s]) for s in others}
+    found = match_by_motion(sweeps, others, gates(sweeps, speed=0.0), tied={"b"})
+    assert (len(found.anchor), dict(found.rejected)) == (200, {"no_a_in_gate": 200, "no_b_in_gate": 200})
+
+
+def test_of_many_sensors_each_is_gated_against_the_anchor_and_none_for_another():
+    early_and_late = {"a": np.array([-4 * MS]), "b": np.array([4 * MS]), "c": np.array([6 * MS])}
+    found = match_by_stamp(np.array([0]), early_and_late, 5 * MS, tied={"a", "b", "c"})
+    assert {s: at.tolist() for s, at in found.others.items()} == {"a": [0], "b": [0], "c": [-1]}
 
 
 def test_reasons_name_the_sensor_that_is_missing():

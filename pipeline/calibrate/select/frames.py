@@ -17,12 +17,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES, scenes_of
 from pipeline.calibrate.select.coverage import choose_for_information, contents_of, missing_in_view
 from pipeline.config import SelectConfig
 from pipeline.errors import SolveError
+from pipeline.objective.stamp_gaps import motion_gates_ns
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from schemas.faults import FAULTS
 from schemas.observations import Observation
@@ -68,6 +69,7 @@ def select_frames(
     *,
     paper: bool,
     sync_gate_s: float | None = PAPER_SYNC_GATE_S,
+    motion_gate: tuple[float, float] | None = None,
     pairs: Sequence[str] = PAIRS,
     absent: Mapping[str, str] | None = None,
 ) -> Selection:
@@ -78,6 +80,7 @@ def select_frames(
         config: thresholds, number of frames, share held out.
         paper: prefer frames that meet the paper's conditions; else choose by content alone.
         sync_gate_s: largest difference of a pair's stamps; None = any that ingest let in.
+        motion_gate: how far the car may drive and turn [m, rad] between a pair's stamps, their constant gap aside.
         pairs: those of the rig. One for which fewer than MIN_FRAMES frames are left is refused.
         absent: why frames lack a sensor, in words by sensor, as far as the caller knows.
     """
@@ -87,6 +90,8 @@ def select_frames(
     refused: dict[str, SolveError] = {}
     for pair in pairs:
         reasons = [unmet_conditions(o, pair, config, sync_gate_s) for o in observations]
+        for i in [] if motion_gate is None else np.flatnonzero(_apart(observations, pair, *motion_gate)):
+            reasons[i].append("sync")
         usable = [i for i, r in enumerate(reasons) if not _HARD & set(r)]
         candidates = _few_of_each([i for i in usable if held_out[i] is False], scene)
         ideal = [i for i in candidates if not reasons[i]]
@@ -122,15 +127,10 @@ def unmet_conditions(
     "empty" where it has nothing to align; "no_radar" and the like alone where it lacks a sensor.
     """
     camera, lidar, radar = (s in FRAMES_OF_PAIR[pair] for s in ("camera", "lidar", "radar"))
-    stamps = {
-        "camera": observation.camera_stamp_ns,
-        "lidar": observation.stamp_ns,
-        "radar": observation.radar_stamp_ns,
-    }
-    first, second = FRAMES_OF_PAIR[pair]
+    first_ns, second_ns = _stamps_ns(observation, pair)
     clusters = len(observation.radar_track_xyz_m)
     unmet = {
-        "sync": sync_gate_s is not None and abs(stamps[first] - stamps[second]) > sync_gate_s * 1e9,
+        "sync": sync_gate_s is not None and abs(first_ns - second_ns) > sync_gate_s * 1e9,
         "sky": camera and observation.sky_fraction < config.min_sky,
         "drivable": lidar and observation.drivable_fraction < config.min_drivable,
         "road_users": camera and len(observation.road_user_boxes_px) < config.min_road_users,
@@ -140,6 +140,34 @@ def unmet_conditions(
     }
     absent = [f"no_{sensor}" for sensor in FRAMES_OF_PAIR[pair] if sensor not in observation.sensors]
     return absent or [name for name, is_unmet in unmet.items() if is_unmet]
+
+
+def _apart(
+    observations: Sequence[Observation], pair: str, move_m: float, turn_rad: float
+) -> Bool[np.ndarray, " F"]:
+    """Frames in which the car moved further between a pair's captures than it may.
+
+    Ingest asks that of each sensor and the moment; two of a large rig can lie on either side of it.
+    """
+    speed, yaw_rate = (
+        np.array([getattr(o, name) for o in observations], np.float64)
+        for name in ("ego_speed_mps", "ego_yaw_rate_radps")
+    )
+    both = np.array([set(FRAMES_OF_PAIR[pair]) <= set(o.sensors) for o in observations], bool)
+    gap_ns = np.array([np.subtract(*_stamps_ns(o, pair)) for o in observations], np.float64)
+    beyond = np.abs(gap_ns - (np.median(gap_ns[both]) if both.any() else 0.0))
+    return both & (beyond > motion_gates_ns(speed, yaw_rate, move_m, turn_rad))
+
+
+def _stamps_ns(observation: Observation, pair: str) -> tuple[int, int]:
+    """Stamps of a pair's two sensors."""
+    of_kind = {
+        "camera": observation.camera_stamp_ns,
+        "lidar": observation.stamp_ns,
+        "radar": observation.radar_stamp_ns,
+    }
+    first, second = FRAMES_OF_PAIR[pair]
+    return of_kind[first], of_kind[second]
 
 
 def missing_content(observations: Sequence[Observation], pair: str) -> list[str]:

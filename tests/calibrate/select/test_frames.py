@@ -113,6 +113,24 @@ def test_every_frame_is_used_or_counted_with_a_reason(day):
     assert "sync" not in chosen.rejected["lidar_radar"]
 
 
+def test_frames_are_left_out_of_a_pair_whose_captures_the_car_drove_too_far_between():
+    """Two sensors of a large rig can lie on either side of the moment, as far from it as ingest lets each of them."""
+    late_ns = 400_000_000  # of a trigger, the same all day
+    day = [
+        make_changed(
+            o,
+            ego_speed_mps=20.0,
+            ego_yaw_rate_radps=0.0,
+            camera_stamp_ns=o.stamp_ns + late_ns + (70_000_000 if i % 10 == 0 else 0),
+            radar_stamp_ns=o.stamp_ns - (70_000_000 if i % 10 == 0 else 0),
+        )
+        for i, o in enumerate(make_day(60))
+    ]  # 2.5 m at 20 m/s take 125 ms
+    chosen = select_frames(day, CONFIG, paper=False, sync_gate_s=None, motion_gate=(2.5, 0.03))
+    assert chosen.rejected["camera_radar"]["sync"] == 6
+    assert not any("sync" in chosen.rejected[pair] for pair in ("camera_lidar", "lidar_radar"))
+
+
 def test_where_the_paper_leaves_too_few_frames_the_nearest_fill_up_and_the_record_says_so():
     day = [make_changed(o, sky_fraction=0.05 if i > 3 else 0.3) for i, o in enumerate(make_day(60))]
     chosen = select_frames(day, CONFIG, paper=True)
