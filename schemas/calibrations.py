@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from schemas.columns import Recorded, array, column, row, table_of
+from schemas.columns import Posed, array, column, row, table_of
 
 __all__ = [
     "ASKS_FOR_FRAMES",
@@ -36,7 +36,6 @@ ASKS_FOR_FRAMES = ("too few frames", "too few held-out frames", "(1 sigma), not 
 # both along the axes of the parent frame.
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
-_POSE = "the estimate of T_parent_child; null where refused"
 _PRIOR = "the prior; null where none was given"
 
 
@@ -46,8 +45,8 @@ def pairs_of(sensors: Collection[str]) -> tuple[str, ...]:
 
 
 @row(eq=False)
-class CalibrationRecord(Recorded):
-    """One row of `calibrations`; fields are the columns of the same name."""
+class CalibrationRecord(Posed):
+    """One row of `calibrations`: T_parent_child; fields are the columns of the same name."""
 
     vehicle: str = column("vehicle id")
     day: str = column("YYYY-MM-DD")
@@ -55,34 +54,8 @@ class CalibrationRecord(Recorded):
     pair: str = column("kind of the edge: kinds of its two sensors, as camera_lidar")
     parent_frame: str = column("a of T_a_b: name of a sensor, or base")
     child_frame: str = column("b of T_a_b: name of a sensor, or base")
-    qw: float | None = column(_POSE, default=None)
-    qx: float | None = column(_POSE, default=None)
-    qy: float | None = column(_POSE, default=None)
-    qz: float | None = column(_POSE, default=None)
-    tx_m: float | None = column(_POSE, default=None)
-    ty_m: float | None = column(_POSE, default=None)
-    tz_m: float | None = column(_POSE, default=None)
-    covariance: np.ndarray | None = array(
-        "<f8",
-        (6, 6),
-        "of (rx ry rz tx ty tz), left perturbation in parent axes [rad, m]; null where refused",
-        default=None,
-    )
-    common_covariance: np.ndarray | None = array(
-        "<f8",
-        (6, 6),
-        (
-            "the part of covariance that all days of a vehicle err by alike: bias floors, and the prior where the"
-            " day leaves it its weight; covariance less it varies from day to day and averages down. Null where "
-            "refused and in rows of version 1"
-        ),
-        default=None,
-    )
     observability: list[float] | None = column(
         "per DoF: 1 - posterior/prior variance along it; 0 = the day adds nothing to the prior", default=None
-    )
-    observable: list[bool] | None = column(
-        "per DoF: the day determined it; else it keeps prior and prior sigma", default=None
     )
     prior_qw: float | None = column(_PRIOR, default=None)
     prior_qx: float | None = column(_PRIOR, default=None)
@@ -103,13 +76,6 @@ class CalibrationRecord(Recorded):
         "smallest margin over the checks of the verdict: 1 = far inside, 0 = at a limit, below 0 = beyond",
         default=None,
     )
-    determined: list[str] = column(
-        (
-            "of azimuth and elevation at targets 15 to 40 m away that both sensors see: those whose error is "
-            "below limit_rad with probability verify.confidence"
-        ),
-        default_factory=list,
-    )
     limit_rad: float | None = column(
         (
             "the largest error that the calibration's use allows; elevation's own is diagnostics' "
@@ -117,8 +83,6 @@ class CalibrationRecord(Recorded):
         ),
         default=None,
     )
-    azimuth_sigma_rad: float | None = column("sigma of a target's azimuth, from the covariance", default=None)
-    elevation_sigma_rad: float | None = column("sigma of its elevation", default=None)
     targets_m: np.ndarray | None = array(
         "<f8",
         (3, 3),

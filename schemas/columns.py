@@ -14,9 +14,10 @@ from dataclasses import Field, dataclass, field, fields
 from types import UnionType
 from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
 
+import numpy as np
 import pyarrow as pa
 
-__all__ = ["Column", "Recorded", "TableSchema", "array", "column", "row", "table_of"]
+__all__ = ["Column", "Posed", "Recorded", "TableSchema", "array", "column", "row", "table_of"]
 
 Row = TypeVar("Row")
 
@@ -183,6 +184,46 @@ class Recorded:
     )
 
 
+_POSE = "of the estimate T_a_b: a quaternion, scalar first, and b's origin in a; null where there is none"
+
+
+@row()
+class Posed(Recorded):
+    """Columns of a record that estimates T_a_b, after its own: the pose, and how sure it is."""
+
+    qw: float | None = column(_POSE, default=None)
+    qx: float | None = column(_POSE, default=None)
+    qy: float | None = column(_POSE, default=None)
+    qz: float | None = column(_POSE, default=None)
+    tx_m: float | None = column(_POSE, default=None)
+    ty_m: float | None = column(_POSE, default=None)
+    tz_m: float | None = column(_POSE, default=None)
+    covariance: np.ndarray | None = array(
+        "<f8",
+        (6, 6),
+        "of (rx ry rz tx ty tz), left perturbation in a's axes [rad, m]; null where there is no estimate",
+        default=None,
+    )
+    common_covariance: np.ndarray | None = array(
+        "<f8",
+        (6, 6),
+        "the part of it that all days of a vehicle err by alike: bias floors, and the prior where the days leave it "
+        "its weight; covariance less it varies from day to day and averages down",
+        default=None,
+    )
+    observable: list[bool] | None = column(
+        "per DoF: the day, of a state one of its days, determined it; else it keeps prior and prior sigma",
+        default=None,
+    )
+    determined: list[str] = column(
+        "of azimuth and elevation at targets 15 to 40 m away that the sensors see: those whose error is below the "
+        "limit with probability verify.confidence",
+        default_factory=list,
+    )
+    azimuth_sigma_rad: float | None = column("sigma of a target's azimuth, from the covariance", default=None)
+    elevation_sigma_rad: float | None = column("sigma of its elevation", default=None)
+
+
 def table_of(
     of: type,
     name: str,
@@ -196,10 +237,14 @@ def table_of(
     of_sensor: bool = False,
     before: str = "",
 ) -> TableSchema:
-    """The table whose rows are `of`: a column for each field, in their order, those of every record last."""
-    last = {f.name for f in fields(Recorded)} if issubclass(of, Recorded) else set[str]()
+    """The table whose rows are `of`: a column for each field, in their order, inherited ones after its own."""
+    from_ = {
+        name: k
+        for k, base in reversed([*enumerate(of.__mro__)])
+        for name in vars(base).get("__annotations__", ())
+    }
     types = get_type_hints(of)
-    columns = [_column(f, types[f.name]) for f in sorted(fields(of), key=lambda f: f.name in last)]
+    columns = [_column(f, types[f.name]) for f in sorted(fields(of), key=lambda f: from_[f.name])]
     read = doc, made_by, reads_versions, about, follows or {}
     return TableSchema(name, version, tuple(columns), *read, of_sensor, before, row_type=of)
 

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.columns import Recorded, array, column, row, table_of
+from schemas.columns import Posed, array, column, row, table_of
 
 __all__ = ["POSES", "PoseRow"]
 
-_POSE = "the estimate of T_reference_sensor; null where refused"
-
 
 @row(eq=False)
-class PoseRow(Recorded):
-    """One row of `poses`; fields are the columns of the same name."""
+class PoseRow(Posed):
+    """One row of `poses`: T_reference_sensor; fields are the columns of the same name."""
 
     vehicle: str = column("vehicle id")
     day: str = column("YYYY-MM-DD")
@@ -24,27 +22,8 @@ class PoseRow(Recorded):
     sensor: str = column("name of the sensor, or base for the vehicle frame: b of T_a_b")
     kind: str = column("camera, lidar, radar or base")
     reference: str = column("name of the sensor that poses refer to: a of T_a_b")
-    qw: float | None = column(_POSE, default=None)
-    qx: float | None = column(_POSE, default=None)
-    qy: float | None = column(_POSE, default=None)
-    qz: float | None = column(_POSE, default=None)
-    tx_m: float | None = column(_POSE, default=None)
-    ty_m: float | None = column(_POSE, default=None)
-    tz_m: float | None = column(_POSE, default=None)
-    covariance: np.ndarray | None = array(
-        "<f8",
-        (6, 6),
-        "of (rx ry rz tx ty tz), left perturbation in the reference's axes [rad, m]; null where refused",
-        default=None,
-    )
-    common_covariance: np.ndarray | None = array(
-        "<f8", (6, 6), "the part of it that all days of a vehicle err by alike", default=None
-    )
     observability: list[float] | None = column(
         "per DoF: 1 - posterior/prior variance along it; 0 = the day adds nothing to the prior", default=None
-    )
-    observable: list[bool] | None = column(
-        "per DoF: the day determined it; else it keeps prior and prior sigma", default=None
     )
     status: str = column(
         "accepted (use it), held (computed, the prior stays current), refused (nothing computed)"
@@ -53,13 +32,13 @@ class PoseRow(Recorded):
     faults: list[str] = column(
         "faults that the reason names, keys of FAULTS in schemas/faults.py", default_factory=list
     )
-    determined: list[str] = column(
-        "of azimuth and elevation at the sensor's own targets: those whose error is below the limit with probability "
-        "verify.confidence",
-        default_factory=list,
+    targets_m: np.ndarray | None = array(
+        "<f8",
+        (3, 3),
+        "the targets, in the reference's frame: 15, 25 and 40 m away, where the sensor looks; null where refused and "
+        "in rows of version 1",
+        default=None,
     )
-    azimuth_sigma_rad: float | None = column("sigma of a target's azimuth in the sensor", default=None)
-    elevation_sigma_rad: float | None = column("sigma of its elevation", default=None)
     dt_s: float | None = column(
         "clock: stamp_reference = stamp_sensor + dt; null where not estimated", default=None
     )
@@ -76,8 +55,9 @@ class PoseRow(Recorded):
 POSES = table_of(
     PoseRow,
     "poses",
-    1,
+    2,
     "One row per sensor and method, the reference too. boresight show poses --json prints these names plus T, 4x4.",
     made_by="calibrate",
+    reads_versions=(1,),
     about=("vehicle", "day", "method", "sensor"),
 )

@@ -1,59 +1,42 @@
-"""Table `states`: what each vehicle should load tonight, per edge: its accepted days since the last change as one."""
+"""Table `states`: what each vehicle should load tonight: its accepted days since the last change as one.
+
+A row per edge; of vehicles whose rig is adjusted as a whole (table `poses`), a row per sensor too, which are what to
+load: all edges of a day agree on them.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from schemas.columns import Recorded, array, column, row, table_of
+from schemas.columns import Posed, array, column, row, table_of
 
 __all__ = ["STATES", "StateRow"]
 
-_POSE = "the estimate of T_parent_child; null where there is none"
 _REFERENCE = "their mean pose T_parent_child; null until it is made"
 
 
 @row(eq=False)
-class StateRow(Recorded):
-    """One row of `states`; fields are the columns of the same name."""
+class StateRow(Posed):
+    """One row of `states`: T_parent_child; fields are the columns of the same name."""
 
     vehicle: str = column("vehicle id")
     day: str = column("last day of the audited window, YYYY-MM-DD")
     method: str = column("method of the records")
-    pair: str = column("kind of the edge: kinds of its two sensors, as camera_lidar")
-    parent_frame: str = column("a of T_a_b: name of a sensor, or base")
+    pair: str = column(
+        "kind of the edge: kinds of its two sensors, as camera_lidar; pose in a row per sensor"
+    )
+    parent_frame: str = column("a of T_a_b: name of a sensor, or base; of a pose the reference")
     child_frame: str = column("b of T_a_b: name of a sensor, or base")
     status: str = column("current (load it) or none (no accepted day since the last change)")
     reason: str = column("in words: since when, and what it does not rest on")
-    qw: float | None = column(_POSE, default=None)
-    qx: float | None = column(_POSE, default=None)
-    qy: float | None = column(_POSE, default=None)
-    qz: float | None = column(_POSE, default=None)
-    tx_m: float | None = column(_POSE, default=None)
-    ty_m: float | None = column(_POSE, default=None)
-    tz_m: float | None = column(_POSE, default=None)
-    covariance: np.ndarray | None = array(
-        "<f8",
-        (6, 6),
-        "of (rx ry rz tx ty tz), left perturbation in parent axes [rad, m]; null where there is none",
-        default=None,
-    )
-    common_covariance: np.ndarray | None = array(
-        "<f8", (6, 6), "the part of it that more days do not lower", default=None
-    )
-    observable: list[bool] | None = column("per DoF: at least one of the days determined it", default=None)
-    determined: list[str] = column(
-        (
-            "of azimuth and elevation at targets 15 to 40 m away: those whose error is below verify's limit with "
-            "probability verify.confidence"
-        ),
-        default_factory=list,
-    )
-    azimuth_sigma_rad: float | None = column("sigma of a target's azimuth", default=None)
-    elevation_sigma_rad: float | None = column("sigma of its elevation", default=None)
     unchecked: dict[str, float] = column(
         "DoF that at least half of its days found far from the prior and that nothing checks: the most sigmas",
         default_factory=dict,
     )
+    sensor: str | None = column(
+        "whose pose to the reference it is, child_frame once more; null in a row per edge", default=None
+    )
+    kind: str | None = column("camera, lidar, radar or base: of that sensor", default=None)
     since: str | None = column("first day that may count; null where all may", default=None)
     days: list[str] = column("days that it rests on", default_factory=list)
     inputs: list[str] = column("work keys of their records", default_factory=list)
@@ -92,9 +75,9 @@ class StateRow(Recorded):
 STATES = table_of(
     StateRow,
     "states",
-    4,
+    5,
     "boresight state prints the latest rows.",
     made_by="state",
-    reads_versions=(1, 2, 3),
+    reads_versions=(1, 2, 3, 4),
     about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame"),
 )

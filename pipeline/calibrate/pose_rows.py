@@ -80,7 +80,8 @@ def _row(
     if found.untied:
         return PoseRow(**told, status="refused", reason=found.untied)
     poses, reference = adjusted.poses, graph.reference.name
-    claims = _claims(sensor, poses, views, verify)
+    targets = _targets(sensor, poses, views)
+    claims = _claims(sensor, poses, targets, verify)
     determined = [name for name, claim in claims.items() if claim.margin >= 0]
     status, reason = _verdict(sensor, found, claims, determined)
     return PoseRow(
@@ -94,6 +95,7 @@ def _row(
         reason=reason,
         faults=["witnesses_disagree"] if found.doubts else [],
         determined=determined,
+        targets_m=targets,
         azimuth_sigma_rad=claims["azimuth"].sigma_rad,
         elevation_sigma_rad=claims["elevation"].sigma_rad,
         dt_s=poses.dt_s.get(sensor.name),
@@ -102,13 +104,18 @@ def _row(
     )
 
 
+def _targets(sensor: Sensor, poses: Extrinsics, views: Mapping[str, View]) -> Float[np.ndarray, "3 3"]:
+    """Targets where the sensor looks, in the reference's frame."""
+    found = targets_of(poses.between(sensor.name, poses.reference.name), views.get(sensor.name), None)
+    return DEFAULT_TARGETS if found is None else found
+
+
 def _claims(
-    sensor: Sensor, poses: Extrinsics, views: Mapping[str, View], verify: VerifyConfig
+    sensor: Sensor, poses: Extrinsics, targets: Float[np.ndarray, "3 3"], verify: VerifyConfig
 ) -> dict[str, Claim]:
-    """How well directions of the reference's points are known in the sensor, at targets where it looks."""
+    """How well directions of the reference's points are known in the sensor, at these targets."""
     reference = poses.reference.name
     T = poses.between(sensor.name, reference)
-    targets = targets_of(T, views.get(sensor.name), None)
     camera_deg = verify.camera_lidar_limit_deg
     azimuth_deg, elevation_deg = (
         (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
@@ -123,7 +130,7 @@ def _claims(
         float(np.radians(azimuth_deg)),
         verify.confidence,
         elevation_limit_rad=float(np.radians(elevation_deg)),
-        targets=DEFAULT_TARGETS if targets is None else targets,
+        targets=targets,
     )
 
 
