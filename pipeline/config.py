@@ -233,7 +233,9 @@ def validated(kind: type[_Kind], values: dict[str, Any], file: str, *above: str)
         problems = [
             (
                 ".".join(map(str, (*above, *_written(p["loc"], values)))),
-                _unknown_key(p["loc"][-1], whole) if p["type"] == "extra_forbidden" else p["msg"],
+                _unknown_key(p["loc"][-1], whole)
+                if p["type"] == "extra_forbidden"
+                else p["msg"].removeprefix("Value error, "),
             )
             for p in err.errors(include_url=False)
         ]

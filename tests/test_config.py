@@ -49,7 +49,7 @@ def test_a_small_file_is_enough_and_defaults_are_physical(tmp_path):
         (("[fleet]", "[perceive]\nlabel_scale = 1e-9\n[fleet]"), "perceive.label_scale"),
         (
             ("[fleet]", "[solve]\nsearch_rotation_deg = 1e9\n[fleet]"),
-            "solve.search_rotation_deg: Value error, 1e+09 deg",
+            "solve.search_rotation_deg: 1e+09 deg",
         ),
         (("[fleet]", "[rigs.default.prior]\nrotation_sigma_deg = 181\n[fleet]"), "prior.rotation_sigma_deg"),
         (

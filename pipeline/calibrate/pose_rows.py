@@ -78,7 +78,8 @@ def _row(
         why = "no edge of the rig has evidence" if adjusted is None else "its prior pose is unknown"
         return PoseRow(**told, status="refused", reason=why)
     if found.untied:
-        return PoseRow(**told, status="refused", reason=found.untied)
+        why = f" ({about.absent[sensor.name]})" if sensor.name in about.absent else ""
+        return PoseRow(**told, status="refused", reason=found.untied + why)
     poses, reference = adjusted.poses, graph.reference.name
     targets = _targets(sensor, poses, views)
     claims = _claims(sensor, poses, targets, verify)

@@ -102,7 +102,11 @@ def calibrate_rig(
         chosen: Chosen = {s.kind: s.name for s in edge.sensors}
         of_three = (chosen.get(kind) for kind in ("camera", "lidar", "radar"))
         prior = trio_prior(day.prior, day.rig, *of_three)
-        found, solved = solve_pair(day.rows(chosen), prior, replace(about, pairs=(edge.kind,), chosen=chosen))
+        absent: dict[str, str] = {
+            s.kind: about.absent[s.name] for s in edge.sensors if s.name in about.absent
+        }
+        of_pair = replace(about, pairs=(edge.kind,), chosen=chosen, absent=absent)
+        found, solved = solve_pair(day.rows(chosen), prior, of_pair)
         records += found
         if solved is not None:
             estimate = solved.solution.pairs[edge.kind]

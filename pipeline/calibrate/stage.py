@@ -45,6 +45,7 @@ from pipeline.extrinsics.prior import day_prior, no_prior, perturbed, prior_key
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.results import Outcome, Progress, silent
 from pipeline.rig.rig import Rig
+from pipeline.store.moments import sensors_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import Manifest
 from pipeline.store.views import ingested, observations_of, perceived
@@ -287,14 +288,15 @@ def _solved(
 def _absent(lake: Lake, partition: Partition) -> dict[str, str]:
     """Why frames lack a sensor, by the manifests of perceive and of ingest, which says more."""
     told, told_before = perceived(lake, partition), ingested(lake, partition)
-    found = {}
-    for sensor in SENSORS:
-        counts = {} if told is None else told.rejected
+    found, counts = {}, {} if told is None else told.rejected
+    for sensor in SENSORS if told is None else (*SENSORS, *sensors_of(told)):
         own = {name: n for name, n in counts.items() if name.startswith(f"without_{sensor}_")}
         if own:
             most = max(own, key=lambda name: own[name])
             found[sensor] = f"most often {most.removeprefix(f'without_{sensor}_')}, {own[most]} times"
-    return found | ({} if told_before is None else told_before.extra.get(SENSORS_ABSENT, {}))
+    for manifest in (told_before, told):
+        found |= {} if manifest is None else manifest.extra.get(SENSORS_ABSENT, {})
+    return found
 
 
 def _refused(

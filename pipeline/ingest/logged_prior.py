@@ -22,6 +22,7 @@ class LoggedPrior:
         self._index, self._rig, self._given = index, rig, given
         self._found: dict[tuple[int, tuple[str, str], tuple[str, str]], np.ndarray | None] = {}
         self._stars: dict[tuple[int, tuple[tuple[str, str], ...]], tuple[Star, bool]] = {}
+        self._untied: set[tuple[str, str]] = set()
         self.frame_ids: dict[str, list[str]] = {}
 
     def take(self, log: int, ids: Mapping[str, str]) -> bool:
@@ -58,7 +59,9 @@ class LoggedPrior:
         if (log, a, b) not in self._found:
             T = self._index.trees[log].lookup(a[1], b[1])
             self._found[log, a, b] = T
-            if T is None:
+            # Once for each sensor: of several without a chain every two have none.
+            if T is None and not {a, b} <= self._untied:
+                self._untied |= {a, b}
                 names = f"{a[1] or '(no frame id)'} to {b[1] or '(no frame id)'}"
                 self._index.complain(f"{self._rig.prior.topic} has no chain from {names}: no prior")
         return self._found[log, a, b]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+from collections.abc import Collection, Generator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from pipeline.perceive.features import (
 from pipeline.perceive.ground import PointSource
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
 from pipeline.perceive.tracks import TrackState
+from pipeline.rig.graph import BASE, Kind, Sensor, possible_edges
 from pipeline.rig.prior import Star, between
 from pipeline.rig.rig import Rig
 from pipeline.rigs import LidarTopics, OnnxSemantics, RadarTopics, TopicSemantics
@@ -34,7 +35,7 @@ from pipeline.store.views import logged_stars
 from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.captures import Capture, Sweep
 from schemas.faults import FAULTS
-from schemas.moments import MOMENTS, PRIOR, SAME_SCENE_NS, Moment, Perceived
+from schemas.moments import MOMENTS, PRIOR, SAME_SCENE_NS, SENSORS_ABSENT, Moment, Perceived
 
 __all__ = ["AS_LOGGED", "BY_DOPPLER", "WITHOUT_ROWS", "Found", "Shown", "Sources", "perceive_moment", "work"]
 
@@ -49,7 +50,8 @@ def work(task: Task) -> Work:
     """What a day's moments show: the partition of `perceived`, and the features of each sensor.
 
     A sensor that cannot be used is left out of its moment, a moment without two sensors is left out, counted by reason.
-    Where none is left, the partition is empty and the outcome "refused". A camera without semantics is left out.
+    Where none is left, the partition is empty and the outcome "refused". A camera without semantics is left out, and
+    what to set is said.
 
     Raises:
         ConfigError: the vehicle or a model manifest is not as fleet.toml says.
@@ -57,15 +59,19 @@ def work(task: Task) -> Work:
     """
     rig = task.fleet.rig_of(task.partition.vehicle)
     sources, keys = _sources(rig, task.fleet)
-    return Work((task.fleet.perceive, keys), lambda run: _rows(task, sources, run), nothing="no usable frame")
+    section = f"[rigs.{task.fleet.vehicle(task.partition.vehicle).rig}.cameras.NAME.semantics]"
+    return Work(
+        (task.fleet.perceive, keys), lambda run: _rows(task, sources, section, run), nothing="no usable frame"
+    )
 
 
 def _rows(
-    task: Task, sources: Sources, run: Run
+    task: Task, sources: Sources, section: str, run: Run
 ) -> Generator[tuple[Perceived, dict[str, Capture]], None, None]:
     """The day's moments with what they show, a row group of each sensor in memory at a time."""
     ingested = task.inputs[MOMENTS.name]
     stars, kinds = logged_stars(ingested.extra.get(PRIOR, ())), sensors_of(ingested)
+    blind = [s for s, kind in kinds.items() if kind == "camera" and s not in sources.cameras]
     tracks: dict[str, TrackState] = {}
     whole_ns = -SAME_SCENE_NS
     for seen, (moment, captures) in enumerate(joined(task.lake, MOMENTS, task.partition), 1):
@@ -78,13 +84,18 @@ def _rows(
         except ModelOutputError as err:
             raise NothingUsable(f"{FAULTS['model_output']}: {err}", "model_output") from err
         run.progress(seen, ingested.rows, "perceive")
+        run.rejected.update(f"without_{s}_{FrameReason.NO_SEMANTICS.value}" for s in blind if s in captures)
         if found is not None:
             tracks = tracks | found.tracks
             whole_ns = whole_ns if found.unusable else moment.stamp_ns
             run.kept.update(found.notes)
             run.rejected.update(f"without_{sensor}_{why.value}" for sensor, why in found.unusable.items())
             yield found.moment, found.features
-    run.extra |= {PRIOR: ingested.extra.get(PRIOR, [])}
+    told = {
+        s: f"no semantics of {s}: name its topics or models in {section.replace('NAME', s)}" for s in blind
+    }
+    run.remarks = "; ".join(told.values())
+    run.extra |= {PRIOR: ingested.extra.get(PRIOR, []), SENSORS_ABSENT: told}
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,11 +156,13 @@ def perceive_moment(
         shown: the next moment of the day.
         sources: what its sensors are looked at with.
         tracks: by radar, from the moment before.
-        alone: no moment with all its sensors shows the same scene; else one that lacks a sensor is not worth having.
+        alone: no moment with all its sensors shows the same scene; else one that lacks a sensor is not worth having in
+            a rig with one sensor of each kind.
 
     Raises:
         ModelError: a model does not do what its manifest says.
-        FrameRejectedError: a sensor cannot be used, and not two are left or the moment is not alone.
+        FrameRejectedError: a sensor cannot be used, and not two are left that show anything together, or the moment is
+            not alone.
     """
     moment, config = shown.moment, sources.config
     asked = {s: c for s, c in shown.captures.items() if shown.kinds[s] != "camera" or s in sources.cameras}
@@ -161,7 +174,9 @@ def perceive_moment(
         except FrameRejectedError as why:
             unusable[camera] = why.reason
     usable = _less(asked, unusable)
-    if len(usable) < min(2, len(shown.kinds)) or (unusable and not alone):
+    if len(usable) < min(2, len(shown.kinds)) or (
+        unusable and not _is_worth_having(shown, usable, alone=alone)
+    ):
         raise FrameRejectedError(next(iter(unusable.values()), FrameReason.NO_LABELS))
     # One generator per moment: the result does not depend on which came before.
     seed = [moment.stamp_ns & 0x7FFFFFFFFFFFFFFF, moment.moment]
@@ -189,6 +204,13 @@ def perceive_moment(
             scan, moment, motions[radar], before, sources.radars[radar]
         )
     return Found(_row(moment, speed_of(moment, motions, headings)), features, after, notes, unusable)
+
+
+def _is_worth_having(shown: Shown, usable: Collection[str], *, alone: bool) -> bool:
+    """Whether what is left of a moment shows what no other does."""
+    if len(set(shown.kinds.values())) == len(shown.kinds):
+        return alone
+    return bool(possible_edges([BASE, *(Sensor(s, cast("Kind", shown.kinds[s])) for s in usable)]))
 
 
 def _row(moment: Moment, speed_mps: float | None) -> Perceived:

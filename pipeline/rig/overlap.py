@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 
@@ -18,7 +18,9 @@ __all__ = ["Overlap", "best_three", "find_edges", "overlaps_of"]
 
 _RANGES_M = (15.0, 25.0, 40.0)  # of the targets that pairs are certified at
 _LEAST = 0.05  # of the directions of the sensor that sees fewer
-_BEST = 3  # edges that each sensor keeps: more add cost, and sigma falls with the root of their number
+# Edges that each sensor keeps, whichever cut is clearer: more add cost, and sigma falls with the root of their number.
+# What two sensors share differs by 1 to 5 % from day to day (eight days of a van), and charts need the same edges.
+_BEST = (3, 4)
 _DIRECTIONS = 10_000  # about 2 deg apart, as fine as a view's borders are known
 
 
@@ -67,26 +69,21 @@ def find_edges(
     *,
     named: Sequence[Edge] | None = None,
     reference: Sensor | None = None,
-    without_doppler: Collection[str] = (),
 ) -> RigGraph:
     """The rig's graph: edges that it names, or those of sensors that see the same.
 
-    Each sensor keeps its three best edges by what they share, and those that a tree needs which ties all that can be
-    tied. Where the rig has `base`, every lidar has an edge to it, and every radar with Doppler. What nothing ties to
-    the reference is in another of the graph's components. A rig with one sensor of each kind has all pairs as edges.
+    Each sensor keeps its three or four best edges by what they share, and those that a tree needs which ties all that
+    can be tied. Where the rig has `base`, every lidar and every radar has an edge to it. What nothing ties to the
+    reference is in another of the graph's components. A rig with one sensor of each kind has all pairs as edges.
 
     Args:
         prior: of the rig, which knows its nodes.
         overlaps: of its sensors.
         named: edges of fleet.toml; they are all that the graph has.
         reference: sensor of fleet.toml; None = the lidar with most edges, of a rig without one the radar.
-        without_doppler: radars that measure none.
     """
     found = _of_overlaps(prior.nodes, overlaps)
-    own = [
-        s for s in prior.nodes if s.kind == "lidar" or (s.kind == "radar" and s.name not in without_doppler)
-    ]
-    base = [edge_between(s, b) for s, b in product(own, [n for n in prior.nodes if n.kind == "base"])]
+    base = [edge for edge in possible_edges(prior.nodes) if edge.child.kind == "base"]
     edges = (*found, *base) if named is None else tuple(named)
     return RigGraph(prior.nodes, edges, reference or _most_tied(prior.nodes, edges))
 
@@ -112,7 +109,8 @@ def _of_overlaps(nodes: Sequence[Sensor], overlaps: Sequence[Overlap]) -> list[E
     best_first = sorted((o for o in overlaps if o.is_enough), key=lambda o: -o.shared_sr)
     kept: set[Edge] = set()
     for sensor in sensors:
-        kept |= {o.edge for o in [o for o in best_first if sensor in o.edge.sensors][:_BEST]}
+        own = [o for o in best_first if sensor in o.edge.sensors]
+        kept |= {o.edge for o in own[: max(_BEST, key=lambda best: _clearness(own, best))]}
     tied = {s: i for i, s in enumerate(sensors)}
     for edge in (o.edge for o in best_first):
         a, b = (tied[s] for s in edge.sensors)
@@ -120,6 +118,14 @@ def _of_overlaps(nodes: Sequence[Sensor], overlaps: Sequence[Overlap]) -> list[E
             kept.add(edge)
             tied = {s: a if group == b else group for s, group in tied.items()}
     return [o.edge for o in overlaps if o.edge in kept]
+
+
+def _clearness(best_first: Sequence[Overlap], best: int) -> float:
+    """How much more the last of so many edges shares than the next one does, or than an edge has to."""
+    if best > len(best_first):
+        return 0.0
+    last = best_first[best - 1]
+    return last.share / _LEAST if best == len(best_first) else last.shared_sr / best_first[best].shared_sr
 
 
 def _most_tied(nodes: Sequence[Sensor], edges: Sequence[Edge]) -> Sensor:

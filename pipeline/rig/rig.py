@@ -48,7 +48,9 @@ class Rig(Section):
     ego: EgoTopics | None = None
     prior: PriorConfig = PriorConfig()
     reference: str | None = None  # sensor that poses refer to; None = the lidar with most edges
-    base: str | None = None  # the vehicle frame as transforms call it; None = no edges to it
+    base: str | None = Field(
+        default=None, min_length=1
+    )  # the vehicle frame as transforms call it; None = no edges to it
     # Pairs of sensors; None = found from overlap. Left out of dumps: no reason to ingest a rig's logs again.
     edges: tuple[tuple[str, str], ...] | None = Field(default=None, exclude=True)
     # Camera, lidar and radar for methods that work on three; None = those that share most. Likewise.

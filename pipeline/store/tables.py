@@ -240,6 +240,7 @@ def _manifest(lake: Lake, path: PurePath, schema: TableSchema) -> Manifest:
     values = json.loads(raw)
     found, version = values.get("table"), values.get("version")
     if found != schema.name or version not in (schema.version, *schema.reads_versions):
-        problem = f"holds {found}/{version}, this version reads {schema.name}/{schema.version}: make it anew"
-        raise ContractError(str(path), problem)
+        problem = f"holds {found}/{version}, this version reads {schema.name}/{schema.version}"
+        is_newer = found == schema.name and version > schema.version
+        raise ContractError(str(path), problem + ("" if is_newer else ": make it anew"))
     return Manifest(**{f.name: values[f.name] for f in fields(Manifest) if f.name in values})

@@ -21,6 +21,7 @@ from pipeline.store.views import frames_of, ingested, observations_of, perceived
 from pipeline.work import Task
 from schemas.calibrations import CalibrationRecord
 from schemas.moments import PRIOR, SENSORS_ABSENT
+from schemas.poses import PoseRow
 from tests.makers.stages import ingest_day, perceive_day
 
 DAY, MOMENTS = Partition("vehicle-1", "2026-03-02"), 8
@@ -68,6 +69,23 @@ def test_damaged_images_of_one_camera_cost_that_camera_alone(day, tmp_path, monk
     found = ingest_day(logs, DAY, fleet, Lake.at(tmp_path / "lake"))
     assert (found.status, found.rows) == ("done", before.rows)
     assert found.rejected["without_left_image_damaged"] == MOMENTS // 2
+
+
+def test_a_camera_without_semantics_is_counted_and_told_what_to_set_and_the_others_go_on(day, tmp_path):
+    lake, fleet, _, (_, before) = day
+    copy = Lake.at(tmp_path / "lake")
+    shutil.copytree(lake.root, copy.root)
+    name, rig = next(iter(fleet.rigs.items()))
+    blind = rig.cameras | {"left": rig.cameras["left"].model_copy(update={"semantics": None})}
+    fleet = fleet.model_copy(update={"rigs": {name: rig.model_copy(update={"cameras": blind})}})
+    found = perceive_day(DAY, fleet, copy)
+    assert (found.status, found.rows) == ("done", before.rows)
+    assert found.rejected["without_left_no_semantics"] == before.rows
+    assert "left: name its topics or models in [rigs.duo.cameras.left.semantics]" in found.reason
+    assert sensors_of(perceived(copy, DAY)).keys() == KINDS.keys() - {"left"}
+    poses = CALIBRATE.run(Task(fleet, copy, DAY)).records
+    (left,) = [r for r in poses if isinstance(r, PoseRow) and r.sensor == "left"]
+    assert (left.status, "[rigs.duo.cameras.left.semantics]" in left.reason) == ("refused", True)
 
 
 @pytest.mark.parametrize("camera", ["front", "left"])

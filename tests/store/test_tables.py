@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import multiprocessing
 import os
@@ -17,6 +18,7 @@ import pytest
 
 from pipeline.errors import ContractError, DamagedError
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import commit_records
 from pipeline.store.tables import (
     iterate_rows,
     read_manifest,
@@ -24,10 +26,12 @@ from pipeline.store.tables import (
     read_rows,
     write_partition,
 )
+from pipeline.store.views import perceived_days
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
+from schemas.versions import TABLES
 from tests.makers.table_rows import ROW_TYPES, make_row, same
-from tests.makers.whole_tables import FRAMES, WholeFrame
+from tests.makers.whole_tables import FRAMES, OBSERVATIONS, WholeFrame
 
 REPO = Path(__file__).resolve().parents[2]
 DAY = Partition("car", "2026-03-02")
@@ -104,6 +108,29 @@ def test_a_row_that_breaks_its_contract_is_not_written(field, value, match, lake
         object.__setattr__(row, field, value)  # as code without a type check would
         writer.append([row])
     assert read_manifest(lake, FRAMES, DAY) is None
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_what_a_newer_release_wrote_is_refused_with_its_version_whatever_table(table, lake, rng):
+    schema, row_type = ROW_TYPES[table]
+    newer = dataclasses.replace(schema, version=schema.version + 1)
+    words = f"{table}/{newer.version}, this version reads {table}/{schema.version}$"
+    if schema.is_record_table:
+        times = {"recorded_at": "", "asserted_at": ""}
+        commit_records(lake, newer, [make_row(table, rng, vehicle="v", day="2026-03-02", **times)])
+        with pytest.raises(ContractError, match=words):
+            read_records(lake, schema, row_type)
+    else:
+        write(lake, [make_row(table, rng)], schema=newer)
+        with pytest.raises(ContractError, match=words):
+            read_rows(lake, schema, DAY, row_type)
+
+
+def test_days_that_an_older_release_perceived_are_said_to_be_its_and_none(lake, rng):
+    assert perceived_days(lake) == []
+    write(lake, [make_row("observations", rng)], schema=OBSERVATIONS)
+    with pytest.raises(ContractError, match=r"release before 0\.11: run `boresight ingest` and `perceive`"):
+        perceived_days(lake)
 
 
 def test_another_version_a_foreign_file_and_a_damaged_one_are_named(lake, rng):

@@ -278,15 +278,23 @@ def _notes(pair: str, passed: int, below: Sequence[int], chosen: int, *, paper: 
 
 def _silent(pair: str, observations: Sequence[Observation], absent: Mapping[str, str]) -> SolveError | None:
     """What refuses a pair of which a sensor has too few frames; None where both have enough."""
+    known = [absent[sensor] for sensor in FRAMES_OF_PAIR[pair] if sensor in absent]
+    if known and len(observations) < MIN_FRAMES:
+        both = sum(set(FRAMES_OF_PAIR[pair]) <= set(o.sensors) for o in observations)
+        told = f"{both} moments have both sensors, {MIN_FRAMES} are needed ({known[0]})"
+        return SolveError(told, fault=_fault_in(known[0]))
     for sensor in FRAMES_OF_PAIR[pair]:
         seen = sum(sensor in o.sensors for o in observations)
         if seen < MIN_FRAMES <= len(observations):
             told = f"the {sensor} is silent: {seen} of {len(observations)} frames have it, {MIN_FRAMES} are needed"
             why = f" ({absent[sensor]})" if sensor in absent else ""
-            # Whoever knows the fault begins with its sentence.
-            known = (code for code, sentence in FAULTS.items() if absent.get(sensor, "").startswith(sentence))
-            return SolveError(told + why, fault=next(known, "silent_sensor"))
+            return SolveError(told + why, fault=_fault_in(absent.get(sensor, "")))
     return None
+
+
+def _fault_in(why: str) -> str:
+    """The fault that words state: whoever knows it begins with its sentence."""
+    return next((code for code, sentence in FAULTS.items() if why.startswith(sentence)), "silent_sensor")
 
 
 def _too_few(pair: str, chosen: Sequence[int], reasons: Sequence[Sequence[str]]) -> str:
