@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config import load_fleet
-from pipeline.geometry.se3 import inverse, log_se3, transform_points
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_se3, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical, to_spherical, wrap_angle
 from pipeline.store.current import current_poses, transform_of
 from pipeline.store.partitions import Lake, Partition
@@ -63,16 +63,26 @@ def rows_of_day(folder: Path, lake_path: Path) -> Iterator[dict[str, Any]]:
         for pose in current_poses(found):
             if pose.sensor != pose.reference:
                 about = {"code_version": CODE_VERSION, "seed": truth["seed"], "day": partition.day}
-                yield about | {"cpu_s": round(spent_s, 1)} | row_of(pose, truth["T_base_sensor"])
+                yield about | {"cpu_s": round(spent_s, 1)} | row_of(pose, true_poses(truth))
 
 
-def row_of(pose: PoseRow, T_base_sensor: Mapping[str, Any]) -> dict[str, Any]:
-    """What a pose says beside the truth; without numbers where nothing was computed."""
+def true_poses(truth: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """T_base_sensor by name at the end of a day; a radar's is that of its detections, which all point up or down."""
+    found = {"base": np.eye(4)}
+    for name, T in truth["at_end_of_day"]["T_base_sensor"].items():
+        bias_rad = truth["radars"].get(name, {}).get("elevation_bias_rad", 0.0)
+        found[name] = np.array(T) @ from_rotation_translation(
+            exp_so3(np.array([0.0, bias_rad, 0.0])), np.zeros(3)
+        )
+    return found
+
+
+def row_of(pose: PoseRow, base: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What a pose says beside the truth, which `true_poses` has; without numbers where nothing was computed."""
     told = {"sensor": pose.sensor, "kind": pose.kind, "status": pose.status, "reason": pose.reason}
     T, covariance = transform_of(pose), pose.covariance
     if T is None or covariance is None or pose.azimuth_sigma_rad is None or pose.elevation_sigma_rad is None:
         return told
-    base = {name: np.array(T_base) for name, T_base in T_base_sensor.items()} | {"base": np.eye(4)}
     true = inverse(base[pose.reference]) @ base[pose.sensor]
     points = transform_points(true, _AHEAD @ _OPTICAL if pose.kind == "camera" else _AHEAD)
     angles = camera_direction_angles if pose.kind == "camera" else to_spherical
