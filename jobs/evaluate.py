@@ -55,7 +55,7 @@ def evaluate(
     from pipeline.evaluate.runs import compare_runs
     from pipeline.evaluate.table import as_markdown, table_rows
     from pipeline.store.partitions import Lake
-    from pipeline.store.tables import read_records
+    from pipeline.store.records import read_records
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
     _check(truth, reflectors, recording_lake or recording_day, out)

@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from schemas.columns import Posed, array, column, row, table_of
+from schemas.columns import Posed, TableSchema, array, column, row
 
 __all__ = [
     "ASKS_FOR_FRAMES",
@@ -181,7 +181,7 @@ class CalibrationRecord(Posed):
     inputs: list[str] = column("work keys or paths of what was read", default_factory=list)
 
 
-CALIBRATIONS = table_of(
+CALIBRATIONS = TableSchema(
     CalibrationRecord,
     "calibrations",
     5,

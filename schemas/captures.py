@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float32
 
-from schemas.columns import array, column, row, table_of
+from schemas.columns import TableSchema, array, column, row
 
 __all__ = [
     "CAPTURES",
@@ -120,14 +120,14 @@ class Scan(ScanColumns, Capture):
 
 
 _ONE = "of one {}, in order of stamp; a file per {}. Moments say which rows belong together."
-IMAGES = table_of(
+IMAGES = TableSchema(
     Image, "images", 1, "Images " + _ONE.format("camera", "camera"), made_by="ingest", of_sensor=True
 )
-SWEEPS = table_of(
+SWEEPS = TableSchema(
     Sweep, "sweeps", 1, "Sweeps " + _ONE.format("lidar", "lidar") + " x forward, y left, z up.",
     made_by="ingest", of_sensor=True,
 )  # fmt: skip
-SCANS = table_of(
+SCANS = TableSchema(
     Scan, "scans", 1, "Scans " + _ONE.format("radar", "radar") + " x forward, y left, z up.",
     made_by="ingest", of_sensor=True,
 )  # fmt: skip

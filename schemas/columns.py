@@ -1,6 +1,6 @@
 """How a table is described once, by the dataclass of its rows, and what follows: Arrow schema and JSON Schema.
 
-A row's fields are the table's columns (`column`, `array`); `table_of` makes the table of them.
+A row's fields are the table's columns (`column`, `array`); `TableSchema` is the table of them.
 
 Arrays travel as `binary` blobs, one per attribute, little-endian and C-ordered
 (Parquet reads them 4-10x faster than list columns); the column's Arrow field metadata says dtype and shape, so any
@@ -17,25 +17,32 @@ from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_typ
 import numpy as np
 import pyarrow as pa
 
-__all__ = ["Column", "Posed", "Recorded", "TableSchema", "array", "column", "row", "table_of"]
+__all__ = ["Column", "Posed", "Recorded", "TableSchema", "array", "column", "row"]
 
 Row = TypeVar("Row")
 
 ScalarKind = Literal["int64", "int32", "float64", "string", "bool", "binary", "list<string>", "list<float64>",
                      "list<bool>", "map<string,float64>", "map<string,int64>"]  # fmt: skip
 
-_ARROW: dict[str, pa.DataType] = {
-    "int64": pa.int64(),
-    "int32": pa.int32(),
-    "float64": pa.float64(),
-    "string": pa.string(),
-    "bool": pa.bool_(),
-    "binary": pa.binary(),
-    "list<string>": pa.list_(pa.string()),
-    "list<float64>": pa.list_(pa.float64()),
-    "list<bool>": pa.list_(pa.bool_()),
-    "map<string,float64>": pa.map_(pa.string(), pa.float64()),
-    "map<string,int64>": pa.map_(pa.string(), pa.int64()),
+# Of each kind: the type in Arrow, and in JSON Schema.
+_TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
+    "int64": (pa.int64(), {"type": "integer"}),
+    "int32": (pa.int32(), {"type": "integer"}),
+    "float64": (pa.float64(), {"type": "number"}),
+    "string": (pa.string(), {"type": "string"}),
+    "bool": (pa.bool_(), {"type": "boolean"}),
+    "binary": (pa.binary(), {"type": "string", "contentEncoding": "base64"}),
+    "list<string>": (pa.list_(pa.string()), {"type": "array", "items": {"type": "string"}}),
+    "list<float64>": (pa.list_(pa.float64()), {"type": "array", "items": {"type": "number"}}),
+    "list<bool>": (pa.list_(pa.bool_()), {"type": "array", "items": {"type": "boolean"}}),
+    "map<string,float64>": (
+        pa.map_(pa.string(), pa.float64()),
+        {"type": "object", "additionalProperties": {"type": "number"}},
+    ),
+    "map<string,int64>": (
+        pa.map_(pa.string(), pa.int64()),
+        {"type": "object", "additionalProperties": {"type": "integer"}},
+    ),
 }
 _KINDS: dict[Any, ScalarKind] = {
     int: "int64",
@@ -48,19 +55,6 @@ _KINDS: dict[Any, ScalarKind] = {
     list[bool]: "list<bool>",
     dict[str, float]: "map<string,float64>",
     dict[str, int]: "map<string,int64>",
-}
-_JSON: dict[str, dict[str, Any]] = {
-    "int64": {"type": "integer"},
-    "int32": {"type": "integer"},
-    "float64": {"type": "number"},
-    "string": {"type": "string"},
-    "bool": {"type": "boolean"},
-    "binary": {"type": "string", "contentEncoding": "base64"},
-    "list<string>": {"type": "array", "items": {"type": "string"}},
-    "list<float64>": {"type": "array", "items": {"type": "number"}},
-    "list<bool>": {"type": "array", "items": {"type": "boolean"}},
-    "map<string,float64>": {"type": "object", "additionalProperties": {"type": "number"}},
-    "map<string,int64>": {"type": "object", "additionalProperties": {"type": "integer"}},
 }
 
 
@@ -85,11 +79,11 @@ class Column:
         metadata = {"doc": self.doc}
         if self.dtype is not None:
             metadata |= {"dtype": self.dtype, "shape": ",".join(map(str, self.shape))}
-        return pa.field(self.name, _ARROW[self.kind], nullable=self.nullable, metadata=metadata)
+        return pa.field(self.name, _TYPES[self.kind][0], nullable=self.nullable, metadata=metadata)
 
     def json_schema(self) -> dict[str, Any]:
         """The JSON Schema of one value of this column."""
-        value = dict(_JSON[self.kind]) | {"description": self.doc}
+        value = _TYPES[self.kind][1] | {"description": self.doc}
         if self.dtype is not None:
             value |= {"x-dtype": self.dtype, "x-shape": list(self.shape)}
         return {"anyOf": [value, {"type": "null"}]} if self.nullable else value
@@ -97,11 +91,11 @@ class Column:
 
 @dataclass(frozen=True)
 class TableSchema:
-    """A table's name, version and columns. The version grows with every change that a reader can notice."""
+    """A table: a column for each field of its rows. The version grows with every change that a reader can notice."""
 
+    row_type: type = field(compare=False, repr=False)
     name: str
     version: int
-    columns: tuple[Column, ...]
     doc: str = ""
     made_by: str = ""  # stage, and command, that writes it
     # Older versions whose rows are read too: what they lack has a default in the row's dataclass.
@@ -113,7 +107,16 @@ class TableSchema:
     follows: Mapping[str, tuple[str, Mapping[str, str]]] = field(default_factory=dict, hash=False)
     of_sensor: bool = False  # a partition has a file per sensor, joined by another table
     before: str = ""  # the table that stood in its place before 0.11
-    row_type: type | None = field(default=None, compare=False, repr=False)
+    columns: tuple[Column, ...] = ()  # left out: of its fields, in their order, inherited ones after its own
+
+    def __post_init__(self) -> None:
+        if self.columns:
+            return
+        bases = reversed([*enumerate(self.row_type.__mro__)])
+        of_base = {name: k for k, base in bases for name in vars(base).get("__annotations__", ())}
+        types = get_type_hints(self.row_type)
+        ordered = sorted(fields(self.row_type), key=lambda f: of_base[f.name])
+        object.__setattr__(self, "columns", tuple(_column(f, types[f.name]) for f in ordered))
 
     @property
     def is_record_table(self) -> bool:
@@ -222,31 +225,6 @@ class Posed(Recorded):
     )
     azimuth_sigma_rad: float | None = column("sigma of a target's azimuth, from the covariance", default=None)
     elevation_sigma_rad: float | None = column("sigma of its elevation", default=None)
-
-
-def table_of(
-    of: type,
-    name: str,
-    version: int,
-    doc: str = "",
-    *,
-    made_by: str = "",
-    reads_versions: tuple[int, ...] = (),
-    about: tuple[str, ...] = (),
-    follows: Mapping[str, tuple[str, Mapping[str, str]]] | None = None,
-    of_sensor: bool = False,
-    before: str = "",
-) -> TableSchema:
-    """The table whose rows are `of`: a column for each field, in their order, inherited ones after its own."""
-    from_ = {
-        name: k
-        for k, base in reversed([*enumerate(of.__mro__)])
-        for name in vars(base).get("__annotations__", ())
-    }
-    types = get_type_hints(of)
-    columns = [_column(f, types[f.name]) for f in sorted(fields(of), key=lambda f: from_[f.name])]
-    read = doc, made_by, reads_versions, about, follows or {}
-    return TableSchema(name, version, tuple(columns), *read, of_sensor, before, row_type=of)
 
 
 def _column(of: Field[Any], kind: Any) -> Column:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from shlex import quote
 
 from schemas.calibrations import FRAMES_OF_PAIR
-from schemas.columns import Recorded, column, row, table_of
+from schemas.columns import Recorded, TableSchema, column, row
 
 __all__ = [
     "DRIFT",
@@ -79,7 +79,7 @@ class DriftFinding(Recorded):
     vehicle_reason: str | None = column("why the vehicle has this status, in words", default=None)
 
 
-DRIFT = table_of(
+DRIFT = TableSchema(
     DriftFinding,
     "drift",
     3,

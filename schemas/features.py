@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from schemas.captures import CameraColumns, Capture
-from schemas.columns import array, column, row, table_of
+from schemas.columns import TableSchema, array, column, row
 
 __all__ = [
     "FEATURES",
@@ -151,15 +151,15 @@ class ScanFeatures(ScanFeatureColumns, Capture):
 
 
 _ONE = "; a file per {}, joined by the table perceived."
-IMAGE_FEATURES = table_of(
+IMAGE_FEATURES = TableSchema(
     ImageFeatures, "image_features", 1, "What a camera's images show" + _ONE.format("camera"),
     made_by="perceive", of_sensor=True,
 )  # fmt: skip
-SWEEP_FEATURES = table_of(
+SWEEP_FEATURES = TableSchema(
     SweepFeatures, "sweep_features", 1, "What a lidar's sweeps show" + _ONE.format("lidar"),
     made_by="perceive", of_sensor=True,
 )  # fmt: skip
-SCAN_FEATURES = table_of(
+SCAN_FEATURES = TableSchema(
     ScanFeatures, "scan_features", 1, "What a radar's scans show" + _ONE.format("radar"),
     made_by="perceive", of_sensor=True,
 )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from schemas.columns import column, row, table_of
+from schemas.columns import TableSchema, column, row
 
 __all__ = [
     "FILES",
@@ -85,11 +85,11 @@ class Perceived(Joined):
     ego_yaw_rate_radps: float | None = column("from odometry, else null")
 
 
-MOMENTS = table_of(
+MOMENTS = TableSchema(
     Moment, "moments", 1, "When the rig was looked at: which rows of images, sweeps and scans belong together.",
     made_by="ingest", before="frames",
 )  # fmt: skip
-PERCEIVED = table_of(
+PERCEIVED = TableSchema(
     Perceived, "perceived", 1, "Moments that perception saw something of, and the rows of its sensors' features.",
     made_by="perceive", before="observations",
 )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from schemas.columns import Recorded, column, row, table_of
+from schemas.columns import Recorded, TableSchema, column, row
 
 __all__ = ["OUTCOMES", "OUTCOME_STATUSES", "OutcomeRow"]
 
@@ -37,7 +37,7 @@ class OutcomeRow(Recorded):
     inputs: list[str] = column("work keys or names and hashes of what was read", default_factory=list)
 
 
-OUTCOMES = table_of(
+OUTCOMES = TableSchema(
     OutcomeRow,
     "outcomes",
     3,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.columns import Posed, array, column, row, table_of
+from schemas.columns import Posed, TableSchema, array, column, row
 
 __all__ = ["POSES", "PoseRow"]
 
@@ -52,7 +52,7 @@ class PoseRow(Posed):
     inputs: list[str] = column("work keys or paths of what was read", default_factory=list)
 
 
-POSES = table_of(
+POSES = TableSchema(
     PoseRow,
     "poses",
     2,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from schemas.columns import Recorded, column, row, table_of
+from schemas.columns import Recorded, TableSchema, column, row
 
 __all__ = ["SERVICE_EVENTS", "ServiceEvent"]
 
@@ -19,7 +19,7 @@ class ServiceEvent(Recorded):
     withdrawn: bool = column("it was noted by mistake: it counts no more", default=False)
 
 
-SERVICE_EVENTS = table_of(
+SERVICE_EVENTS = TableSchema(
     ServiceEvent,
     "service_events",
     3,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.columns import Posed, array, column, row, table_of
+from schemas.columns import Posed, TableSchema, array, column, row
 
 __all__ = ["STATES", "StateRow"]
 
@@ -72,7 +72,7 @@ class StateRow(Posed):
     )
 
 
-STATES = table_of(
+STATES = TableSchema(
     StateRow,
     "states",
     5,

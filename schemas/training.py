@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.columns import array, column, row, table_of
+from schemas.columns import TableSchema, array, column, row
 
 __all__ = [
     "CLASS_OF_LABEL",
@@ -194,7 +194,7 @@ class TrainingRow:
     prior_lidar_radar_tz_m: float = column(_PRIOR_LIDAR_RADAR)
 
 
-TRAINING = table_of(
+TRAINING = TableSchema(
     TrainingRow,
     "training",
     3,

@@ -22,7 +22,8 @@ from pipeline.results import Outcome
 from pipeline.runner import Stage, try_stage, why_to_run
 from pipeline.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_manifest, read_records
+from pipeline.store.records import read_records
+from pipeline.store.tables import read_manifest
 from pipeline.store.views import observations_of, perceived
 from pipeline.work import NothingUsable, Records, Run, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord

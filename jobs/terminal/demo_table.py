@@ -123,7 +123,7 @@ def _true(truth: Truth, record: CalibrationRecord) -> np.ndarray:
 
 def _current(lake: Lake, method: str, day: str) -> list[CalibrationRecord]:
     from pipeline.store.current import current_records
-    from pipeline.store.tables import read_records
+    from pipeline.store.records import read_records
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
     found = read_records(lake, CALIBRATIONS, CalibrationRecord, day=day)

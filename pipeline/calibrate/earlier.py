@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from pipeline.store.current import current_records, transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
 __all__ = ["accepted_before"]

@@ -9,10 +9,10 @@ import pyarrow as pa
 
 from pipeline.errors import DamagedLogError
 from pipeline.store.delta import LiveFile, live_files, open_table, spans_of_file
-from pipeline.store.partitions import Lake, LostRows
+from pipeline.store.partitions import Lake
 from schemas.columns import TableSchema
 
-__all__ = ["data_files", "files_there", "note_lost", "once"]
+__all__ = ["data_files", "files_there", "once"]
 
 
 def data_files(lake: Lake, schema: TableSchema) -> list[LiveFile]:
@@ -49,8 +49,3 @@ def once(rows: pa.Table, schema: TableSchema) -> pa.Table:
     for at, (*key, asserted) in enumerate(zip(*(rows[n].to_pylist() for n in names), strict=True)):
         last[tuple(key)] = max(last.get(tuple(key), ("", -1)), (asserted, at))
     return rows.take(pa.array(sorted(at for _, at in last.values()), pa.int64()))
-
-
-def note_lost(lake: Lake, schema: TableSchema, file: LiveFile) -> None:
-    """Remember of which vehicles and days rows cannot be read."""
-    lake.lost.append(LostRows(schema.name, file.days, file.vehicles))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import BinaryIO, Protocol, runtime_checkable
 
@@ -58,6 +59,7 @@ class Files(Protocol):
         ...
 
 
+@dataclass(frozen=True)
 class LocalFiles:
     """Files of this machine, or of a mounted disk."""
 
@@ -110,12 +112,3 @@ class LocalFiles:
     def delta_options(self) -> dict[str, str]:
         """Nothing."""
         return {}
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, LocalFiles)
-
-    def __hash__(self) -> int:
-        return hash(LocalFiles)
-
-    def __repr__(self) -> str:
-        return "LocalFiles()"

@@ -197,7 +197,6 @@ def joined(
         DamagedError: a file cannot be read.
         CollectedError: they left the lake after their time.
     """
-    assert schema.row_type is not None, "a joining table is made of a row type"
     wanted = None if moments is None else set(moments)
     rows: list[Any] = read_rows(lake, schema, partition, schema.row_type)
     index = [m for m in rows if wanted is None or m.moment in wanted]
@@ -225,7 +224,6 @@ def _rows_of(
     """
     if not rows:
         return
-    assert schema.row_type is not None, "a sensor's table is made of a row type"
     found = read_manifest(lake, schema, partition, sensor)
     if found is None or found.work_key != index.work_key:
         problem = f"is not what {index.table} refer to: run `boresight {schema.made_by}` again"

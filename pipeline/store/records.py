@@ -17,9 +17,9 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.store.data_files import data_files, note_lost, once
+from pipeline.store.data_files import data_files, once
 from pipeline.store.delta import Wanted, merge_rows, read_file, stored_schema
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake, LostRows
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
 
@@ -37,7 +37,6 @@ __all__ = [
     "read_last_columns",
     "read_latest",
     "read_records",
-    "write_records",
 ]
 
 Row = TypeVar("Row")
@@ -121,16 +120,6 @@ def assert_records(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
     if changed:
         merge_rows(lake, schema, _stored(schema, changed), insert=False)
     return len(changed)
-
-
-def write_records(
-    lake: Lake, schema: TableSchema, partition: Partition, rows: Sequence[Any], work_key: str, code_version: str,
-    inputs: Iterable[str] = (),
-) -> str:  # fmt: skip
-    """Commit the records of one vehicle-day under one work key; returns where the table is."""
-    del partition, code_version, inputs  # the rows say it themselves
-    commit_records(lake, schema, [replace(row, work_key=work_key) for row in rows])
-    return lake.table(schema.name)
 
 
 def read_records(
@@ -382,7 +371,7 @@ def _rows_of(lake: Lake, schema: TableSchema, columns: Sequence[str], wanted: Wa
     for file in files:
         part = read_file(lake, schema, file.name, columns, wanted)
         if part is None:
-            note_lost(lake, schema, file)
+            lake.lost.append(LostRows(schema.name, file.days, file.vehicles))
         else:
             parts.append(_chosen(part, wanted))
     parts = [p for p in parts if p.num_rows]

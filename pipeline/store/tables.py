@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 from pipeline.errors import CollectedError, ContractError, DamagedError
 from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import read_records, write_records
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
 
@@ -28,11 +27,9 @@ __all__ = [
     "naming_damage",
     "opened_for_writing",
     "read_manifest",
-    "read_records",
     "read_rows",
     "write_manifest",
     "write_partition",
-    "write_records",
 ]
 
 Row = TypeVar("Row")

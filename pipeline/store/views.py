@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +16,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import Manifest, read_manifest
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS
 from schemas.captures import ImageColumns, ScanColumns, SweepColumns
-from schemas.columns import TableSchema
+from schemas.columns import Column, TableSchema
 from schemas.features import ImageFeatureColumns, ScanFeatureColumns, SweepFeatureColumns
 from schemas.frames import Frame
 from schemas.moments import MOMENTS, PERCEIVED, PRIOR, EgoColumns, Moment
@@ -37,42 +38,10 @@ Chosen = Mapping[
     str, str
 ]  # names of the camera, lidar and radar that a view is of, by kind; some may be left out
 
-_EACH, _LABEL, _BYTE = np.zeros(0, np.float32), np.zeros(0, np.int32), np.zeros(0, np.uint8)
-_XYZ = np.zeros((0, 3), np.float32)
-_NO_CAMERA: Final[dict[str, Any]] = {
-    "image_width_px": 0, "image_height_px": 0, "camera_model": "", "camera_K": np.full((3, 3), np.nan),
-    "camera_D": np.zeros(0),
-}  # fmt: skip
-# What a view holds of a sensor that it goes without.
-_NOTHING: Final[dict[type, Any]] = {
-    ImageColumns: ImageColumns(
-        image=b"", image_format="", labels_png=None, detection_boxes_px=None, detection_classes=None,
-        detection_scores=None, **_NO_CAMERA,
-    ),
-    SweepColumns: SweepColumns(
-        lidar_x_m=_EACH, lidar_y_m=_EACH, lidar_z_m=_EACH, lidar_intensity=None, lidar_ring=None, lidar_time_s=None,
-        lidar_deskewed=False,
-    ),
-    ScanColumns: ScanColumns(
-        radar_x_m=_EACH, radar_y_m=_EACH, radar_z_m=_EACH, radar_range_rate_mps=_EACH, radar_power_db=None,
-        radar_has_elevation=False, doppler_period_mps=None,
-    ),
-    ImageFeatureColumns: ImageFeatureColumns(
-        labels_png=b"", label_scale=1.0, sky_fraction=0.0, drivable_fraction=0.0, road_contrast_png=None,
-        road_user_boxes_px=np.zeros((0, 4), np.float32), road_user_classes=[], road_user_scores=_EACH, **_NO_CAMERA,
-    ),
-    SweepFeatureColumns: SweepFeatureColumns(
-        lidar_map_xyz_m=_XYZ, lidar_map_is_ground=_BYTE, lidar_map_cluster=_LABEL, lidar_cluster_centre_m=_XYZ,
-        lidar_cluster_min_m=_XYZ, lidar_cluster_max_m=_XYZ, lidar_edge_xyz_m=_XYZ, lidar_edge_side=_BYTE,
-        lidar_edge_jump_m=_EACH, lidar_edge_gap_rad=_EACH, lidar_edge_points=_LABEL, marking_xyz_m=_XYZ,
-        marking_z=_EACH, ground_plane=None, lidar_drivable_xyz_m=_XYZ,
-    ),
-    ScanFeatureColumns: ScanFeatureColumns(
-        radar_xyz_m=_XYZ, radar_power_db=None, radar_residual_mps=_EACH, radar_motion=_BYTE, radar_cluster=_LABEL,
-        radar_has_elevation=False, radar_velocity_mps=None, radar_velocity_cov=None, radar_track_xyz_m=_XYZ,
-        radar_track_velocity_mps=_XYZ, radar_track_id=_LABEL, radar_track_age=_LABEL, radar_track_points=_LABEL,
-        radar_drivable_azimuth_rad=_EACH, radar_drivable_range_m=_EACH,
-    ),
+# Of a sensor that is not there: the value of a column by its name, else by its kind.
+_EMPTY: Final[Mapping[str, Any]] = {
+    "camera_K": np.full((3, 3), np.nan), "label_scale": 1.0,
+    "binary": b"", "string": "", "int32": 0, "float64": 0.0, "bool": False, "list<string>": [],
 }  # fmt: skip
 _MEASURED = {"camera": ImageColumns, "lidar": SweepColumns, "radar": ScanColumns}
 _FOUND = {"camera": ImageFeatureColumns, "lidar": SweepFeatureColumns, "radar": ScanFeatureColumns}
@@ -218,9 +187,23 @@ def _stamp(moment: Any, rows: Mapping[str, Any], kind: str) -> int:
 def _columns(rows: Mapping[str, Any], of_kind: Mapping[str, type]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for kind, columns in of_kind.items():
-        values |= _values(rows.get(kind, _NOTHING[columns]), columns)
+        values |= _values(rows.get(kind) or _nothing(columns), columns)
     return values
 
 
 def _values(row: Any, columns: type) -> dict[str, Any]:
     return {f.name: getattr(row, f.name) for f in fields(columns)}
+
+
+@cache
+def _nothing(columns: type) -> Any:
+    """What a view holds of a sensor that it goes without: null, or no bytes, no rows of arrays, 0, no camera matrix."""
+    return columns(**{c.name: _empty(c) for c in TableSchema(columns, "", 0).columns})
+
+
+def _empty(column: Column) -> Any:
+    if column.nullable:
+        return None
+    if column.is_array and column.name not in _EMPTY:
+        return np.zeros([0 if size == "N" else size for size in column.shape], column.dtype)
+    return _EMPTY.get(column.name, _EMPTY.get(column.kind))

@@ -15,12 +15,13 @@ from pipeline.geometry.changes import change_between
 from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation, to_quaternion
 from pipeline.stages import AUDIT
 from pipeline.store.current import current_drift
-from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records, read_records, write_records
+from pipeline.store.partitions import Lake
+from pipeline.store.records import commit_records, read_records
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from tests.makers.lakes import write_records
 from tests.makers.stages import audit_fleet
 
 NOTHING = np.zeros(6)
@@ -204,7 +205,7 @@ def _service(lake: Lake, day: int, sensor: str = "radar", vehicle: str = "v") ->
         note="",
         work_key=f"{vehicle}-{day}-{sensor}",
     )
-    write_records(lake, SERVICE_EVENTS, Partition(vehicle, _day(day)), [event], event.work_key, "0.6.0")
+    write_records(lake, SERVICE_EVENTS, [event], event.work_key)
 
 
 def test_a_vehicle_that_was_never_repaired_stays_red_when_its_window_holds_nothing_else(

@@ -15,12 +15,13 @@ from pipeline.audit.state import DayEstimate, fuse
 from pipeline.config import FleetConfig
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.stages import AUDIT, STATE
-from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records, write_records
+from pipeline.store.partitions import Lake
+from pipeline.store.records import commit_records
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import StateRow
+from tests.makers.lakes import write_records
 
 VARYING = np.diag([1e-3, 2e-3, 5e-4, 0.01, 0.02, 0.03]) ** 2
 COMMON = np.diag([5e-4, 4e-3, 1e-4, 0.02, 0.01, 0.05]) ** 2
@@ -127,7 +128,7 @@ def test_a_state_rests_on_the_accepted_days_since_the_last_change(tmp_path: Path
     assert states["camera_lidar"].since is None
     assert states["camera_lidar"].determined == ["azimuth", "elevation"]
     event = ServiceEvent(vehicle="v", day=_day(21), sensor="all", kind="repair", note="", work_key="k")
-    write_records(lake, SERVICE_EVENTS, Partition("v", _day(21)), [event], "k", "0.6.0")
+    write_records(lake, SERVICE_EVENTS, [event], "k")
     states = _states(lake)
     assert {(s.status, tuple(s.days)) for s in states.values()} == {("none", ())}
     assert "no accepted day after the repair of all sensors on 2026-03-22" in states["lidar_radar"].reason

@@ -11,7 +11,7 @@ from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion, rotation_angle_rad
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.makers.lakes import write_observations
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day

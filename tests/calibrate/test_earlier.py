@@ -6,8 +6,8 @@ import pytest
 from pipeline.calibrate.earlier import accepted_before
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import write_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from tests.makers.lakes import write_records
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 
@@ -32,7 +32,7 @@ def lake(tmp_path):
         record("2026-03-05", 0.5),
     ]
     for row in rows:
-        write_records(lake, CALIBRATIONS, Partition("v", row.day), [row], row.work_key, "0")
+        write_records(lake, CALIBRATIONS, [row], row.work_key)
     return lake
 
 

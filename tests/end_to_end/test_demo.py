@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.store.partitions import Lake
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from schemas.drift import DRIFT, DriftFinding
 from tests.makers.loaded_libraries import foreign, loaded, tracing
 

@@ -11,9 +11,9 @@ import pytest
 from pipeline.geometry.se3 import exp_so3, to_quaternion
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.simulate.reflectors import simulate_reflectors
-from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import write_records
+from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from tests.makers.lakes import write_records
 
 BORESIGHT = f"{sys.prefix}/bin/boresight"
 VEHICLE, DAY = "vehicle-1", "2026-03-02"
@@ -57,7 +57,7 @@ def folder(tmp_path_factory):
     T["camera_lidar"] = T["camera_lidar"] @ turn
     for day in (DAY, "2026-03-09"):  # nobody recorded reflectors on the second one
         rows = [record(pair, T[pair], day=day) for pair in PAIRS]
-        write_records(Lake.at(out / "lake"), CALIBRATIONS, Partition(VEHICLE, day), rows, "key", "0")
+        write_records(Lake.at(out / "lake"), CALIBRATIONS, rows, "key")
     return out
 
 

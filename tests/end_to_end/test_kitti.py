@@ -16,7 +16,7 @@ from pipeline.rig.topics import TOPICS
 from pipeline.simulate.logs.messages import Messages
 from pipeline.store.current import targets_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.benchmarks.studies.metrics import transform_of

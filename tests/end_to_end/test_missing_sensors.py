@@ -12,7 +12,7 @@ from jobs.cli import main
 from pipeline.geometry.se3 import from_quaternion, log_so3
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding

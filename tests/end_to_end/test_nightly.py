@@ -15,7 +15,7 @@ import pytest
 
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from pipeline.store.views import ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.makers.ray_clusters import two_nodes

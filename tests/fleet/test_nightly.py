@@ -15,9 +15,10 @@ from pipeline.fleet.status import day_statuses
 from pipeline.results import Outcome
 from pipeline.runner import Stage
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records, write_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.outcomes import OUTCOMES, OutcomeRow
+from tests.makers.lakes import write_records
 
 DAY = "2026-03-02"
 FLEET = FleetConfig.model_validate(
@@ -87,7 +88,7 @@ class StagesThatSay:
             )
             for pair, status in zip(PAIRS, statuses.get(answer, ["accepted"] * 3), strict=True)
         ]
-        write_records(self.lake, CALIBRATIONS, partition, rows, "key", "0")
+        write_records(self.lake, CALIBRATIONS, rows, "key")
         return rows
 
 

@@ -1,18 +1,25 @@
 """Lakes that hold given frames and observations, as ingest and perceive would have written them."""
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 from pipeline.rig.prior import to_rows
 from pipeline.store.moments import write_moments
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import commit_records
 from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.captures import CAPTURES
+from schemas.columns import TableSchema
 from schemas.features import FEATURES
 from schemas.frames import Frame
 from schemas.moments import MOMENTS, PERCEIVED, PRIOR, Moment, Perceived
 from schemas.observations import Observation
+
+
+def write_records(lake: Lake, schema: TableSchema, rows: Sequence[Any], work_key: str) -> None:
+    """Commit records under one work key."""
+    commit_records(lake, schema, [replace(row, work_key=work_key) for row in rows])
 
 
 def write_frames(

@@ -1,7 +1,7 @@
 """Two tables of wide rows with a file per partition, for the tests of what reads and writes any such table."""
 
 from schemas.captures import ImageColumns, ScanColumns, SweepColumns
-from schemas.columns import column, row, table_of
+from schemas.columns import TableSchema, column, row
 from schemas.features import ImageFeatureColumns, ScanFeatureColumns, SweepFeatureColumns
 from schemas.moments import EgoColumns
 
@@ -24,5 +24,5 @@ class WholeObservation(ImageFeatureColumns, SweepFeatureColumns, ScanFeatureColu
     stamp_ns: int = column("when")
 
 
-FRAMES = table_of(WholeFrame, "frames", 2, made_by="ingest")
-OBSERVATIONS = table_of(WholeObservation, "observations", 2, made_by="perceive")
+FRAMES = TableSchema(WholeFrame, "frames", 2, made_by="ingest")
+OBSERVATIONS = TableSchema(WholeObservation, "observations", 2, made_by="perceive")

@@ -18,8 +18,8 @@ from pipeline.report.stage import Pages, write_day_page, write_fleet_page, write
 from pipeline.report.truth import read_truth
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records, read_records
-from pipeline.store.tables import write_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from tests.makers.lakes import write_records
 from tests.makers.stages import audit_fleet
 
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])
@@ -38,7 +38,7 @@ def _config() -> FleetConfig:
 def _store(lake: Lake, records: list[CalibrationRecord]) -> None:
     for vehicle, day in sorted({(r.vehicle, r.day) for r in records}):
         rows = [r for r in records if (r.vehicle, r.day) == (vehicle, day)]
-        write_records(lake, CALIBRATIONS, Partition(vehicle, day), rows, rows[0].work_key, "0.1.0")
+        write_records(lake, CALIBRATIONS, rows, rows[0].work_key)
 
 
 @pytest.fixture(scope="module")

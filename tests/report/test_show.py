@@ -10,9 +10,9 @@ import pytest
 from jobs.show import show
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion
-from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import write_records
+from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
+from tests.makers.lakes import write_records
 
 
 @pytest.fixture
@@ -21,11 +21,11 @@ def lake(tmp_path: Path, maker: ModuleType) -> Path:
     rng = np.random.default_rng(1)
     for key in ("first", "second"):
         rows = maker.vehicle_records("v", 1, rng)
-        write_records(Lake.at(tmp_path), CALIBRATIONS, Partition("v", rows[0].day), rows, key, "0.1.0")
+        write_records(Lake.at(tmp_path), CALIBRATIONS, rows, key)
     rows = [
         r for r in maker.vehicle_records("v", 2, rng, status=lambda _: "refused") if r.day == "2026-03-02"
     ]
-    write_records(Lake.at(tmp_path), CALIBRATIONS, Partition("v", "2026-03-02"), rows, "third", "0.1.0")
+    write_records(Lake.at(tmp_path), CALIBRATIONS, rows, "third")
     return tmp_path
 
 

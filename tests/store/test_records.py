@@ -29,10 +29,10 @@ from pipeline.store.records import (
     read_columns,
     read_latest,
     read_records,
-    write_records,
 )
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
+from tests.makers.lakes import write_records
 from tests.makers.table_rows import ROW_TYPES, make_row, same
 
 REPO = Path(__file__).resolve().parents[2]
@@ -93,7 +93,7 @@ def test_the_same_work_never_doubles_and_changes_no_byte(lake, rng):
 
 def test_records_say_when_they_were_written_and_file_times_say_nothing(lake, rng):
     for seed, key in ((3, "c"), (1, "a"), (2, "b")):
-        write_records(lake, CALIBRATIONS, DAY, [record(rng, "", seed=seed)], key, "0")
+        write_records(lake, CALIBRATIONS, [record(rng, "", seed=seed)], key)
     for age, path in enumerate(data_files(lake)):
         os.utime(path, ns=(0, 10**18 + age * 10**9))
     found = read(lake)

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
@@ -18,17 +19,15 @@ import pytest
 
 from pipeline.errors import ContractError, DamagedError
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records
+from pipeline.store.records import commit_records, read_records
 from pipeline.store.tables import (
     iterate_rows,
     read_manifest,
-    read_records,
     read_rows,
     write_partition,
 )
 from pipeline.store.views import perceived_days
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from schemas.columns import TableSchema
 from schemas.versions import TABLES
 from tests.makers.table_rows import ROW_TYPES, make_row, same
 from tests.makers.whole_tables import FRAMES, OBSERVATIONS, WholeFrame
@@ -136,7 +135,7 @@ def test_days_that_an_older_release_perceived_are_said_to_be_its_and_none(lake, 
 def test_another_version_a_foreign_file_and_a_damaged_one_are_named(lake, rng):
     write(lake, [make_row("frames", rng)])
     path = lake.folder("frames", DAY) / "part-0.parquet"
-    newer = TableSchema("frames", FRAMES.version + 1, FRAMES.columns)
+    newer = replace(FRAMES, version=FRAMES.version + 1)
     with pytest.raises(ContractError, match=rf"part-0\.parquet.*frames/{FRAMES.version}.*anew"):
         read_rows(lake, newer, DAY, WholeFrame)
     whole = path.read_bytes()

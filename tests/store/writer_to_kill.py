@@ -8,8 +8,9 @@ import time
 import numpy as np
 
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import write_partition, write_records
+from pipeline.store.tables import write_partition
 from schemas.calibrations import CALIBRATIONS, PAIRS
+from tests.makers.lakes import write_records
 from tests.makers.table_rows import make_row
 from tests.makers.whole_tables import FRAMES
 
@@ -29,7 +30,7 @@ def write_generation(lake, generation, rows, records):
             for row in rows:
                 object.__setattr__(row, "drive", generation)
             writer.append(rows[first : first + 3])
-    write_records(lake, CALIBRATIONS, partition, records, f"key-{generation}", "0")
+    write_records(lake, CALIBRATIONS, records, f"key-{generation}")
 
 
 def write_for_ever(lake, generation, rows, records):

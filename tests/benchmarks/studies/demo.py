@@ -24,7 +24,7 @@ from pipeline.geometry.targets import errors_at_targets
 from pipeline.report.truth import Truth, read_truth, true_transform
 from pipeline.store.current import current_drift, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from tests.benchmarks.studies.commits import commit_now

@@ -36,7 +36,7 @@ from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.observations import Observation

@@ -30,7 +30,7 @@ from pipeline.report.above import top_view
 from pipeline.report.encode import jpeg_uri
 from pipeline.report.overlays import Extrinsics, Scene, front_view, whole_view
 from pipeline.store.current import current_records, prior_of, transform_of
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from pipeline.store.views import frames_of
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.benchmarks.studies.days import DATE, VEHICLE

@@ -20,7 +20,7 @@ from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.makers import training_lakes
 from tests.makers.fleet_files import fleet_toml

@@ -18,7 +18,7 @@ from pipeline.learn.perception.lidar_semantics.samples import (
 )
 from pipeline.store.current import current_records, transform_of
 from pipeline.store.partitions import Lake
-from pipeline.store.tables import read_records
+from pipeline.store.records import read_records
 from pipeline.store.views import frames_of, observations_of
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
