@@ -58,14 +58,13 @@ def read_calibration(
     from schemas.words import day_word
 
     lake = Lake.existing(location)
-    # A day whose rig was adjusted as a whole says it by sensor, others by edge.
-    poses = {} if day is None else pairs_of_poses(lake, vehicle, day, method)
-    if day is None:
-        found, source = pairs_of_state(lake, vehicle, method), "state"
-    else:
-        source = f"record of {day}"
-        by_sensor = {words_of(edge): pair for edge, pair in poses.items()}
-        found = by_sensor or pairs_of_day(lake, vehicle, day, method)
+    # A rig that was adjusted as a whole says it by sensor, others by edge.
+    by_edge = (
+        pairs_of_state(lake, vehicle, method) if day is None else pairs_of_day(lake, vehicle, day, method)
+    )
+    poses = pairs_of_poses(lake, vehicle, day, method)
+    found = {words_of(edge): pair for edge, pair in poses.items()} or by_edge
+    source = f"record of {day}"
     # What has no transform was refused, or of a state is not there.
     word = day_word("refused" if isinstance(p, str) else p.status for p in found.values())
     pairs, without = choose_pairs(found, force=force)

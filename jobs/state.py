@@ -10,6 +10,8 @@ __all__ = ["state"]
 def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json: bool = False) -> int:
     """Show what each vehicle should load tonight: its accepted days since the last change, fused, with sigma.
 
+    Of a rig that is adjusted as a whole a line per sensor, its pose to the reference; of others one per pair.
+
     The night and `boresight audit` write it (table states); this prints the latest.
 
     Args:
@@ -17,7 +19,8 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
         vehicle: only this vehicle.
         method: of the calibrations.
         json: print a JSON list and nothing else: names as the columns of table states, and "T" and "T_prior", the
-            4x4 row-major T_parent_child and what it was before the last day (null where there is none).
+            4x4 row-major T_parent_child and what it was before the last day (null where there is none). Rows of
+            sensors (`sensor` is not null) beside those of pairs, which the poses rest on.
     """
     from jobs.terminal.state_rows import state_rows
     from jobs.terminal.summary import left_out, print_json
@@ -34,7 +37,8 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
     elif rows:
         from jobs.terminal.record_tables import print_table
 
-        print_table("states", rows)
+        by_sensor = {row["vehicle"] for row in rows if row["sensor"] is not None}
+        print_table("states", [r for r in rows if r["sensor"] is not None or r["vehicle"] not in by_sensor])
     else:
         sys.stdout.write(f"states: none in {lake}; boresight nightly and boresight audit write them\n")
     return 3 if left_out(tables) else 0

@@ -32,7 +32,7 @@ CALIBRATE = Stage(
 )
 AUDIT = Stage("audit", (CALIBRATIONS,), (DRIFT,), "pipeline.audit.stage:work", per_vehicle_day=False)
 STATE = Stage(
-    "state", (CALIBRATIONS, DRIFT), (STATES,), "pipeline.audit.state_stage:work", per_vehicle_day=False
+    "state", (CALIBRATIONS, POSES, DRIFT), (STATES,), "pipeline.audit.state_stage:work", per_vehicle_day=False
 )
 REPORT = Stage(
     "report",

@@ -146,7 +146,7 @@ def _state_cells(row: dict[str, Any]) -> dict[str, str]:
     days = row["days"]
     return {
         "vehicle": row["vehicle"],
-        "pair": _edge(row),
+        "pair": _edge(row) if row["sensor"] is None else f"{row['sensor']} in {row['parent_frame']}",
         "state": row["status"],
         **_pose_cells(row["T"], row["T_prior"]),
         "sigma azimuth [deg]": degrees(row["azimuth_sigma_rad"]),

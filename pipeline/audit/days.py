@@ -23,6 +23,7 @@ __all__ = [
     "charts_of_fleet",
     "clipped_days",
     "edges_of_fleet",
+    "last_level",
     "pair_days",
     "reference_of",
     "with_reference",
@@ -137,7 +138,8 @@ def pair_days(
 def reference_of(days: PairDays, count: int) -> Reference | None:
     """The first accepted days as one; None where there are fewer than two."""
     rows = np.flatnonzero(days.accepted)[:count]
-    first = _first_level(days.at(rows))
+    first = days.at(rows)
+    first = first.at(slice(0, _step(first, np.ones(DOFS))))  # before something moved among these already
     if len(first.day) < 2:
         return None
     value, seen = _clipped(first), first.observable
@@ -150,14 +152,25 @@ def reference_of(days: PairDays, count: int) -> Reference | None:
     )
 
 
-def _first_level(days: PairDays) -> PairDays:
-    """The days before something moved, where it did so among these already."""
+def last_level(days: PairDays, scale: Float[np.ndarray, " 6"]) -> PairDays:
+    """The days since something last moved, as far as they themselves show it: of too few days for a chart.
+
+    Args:
+        days: accepted ones.
+        scale: by DoF, how much more the vehicle's days scatter than they say.
+    """
+    while (step := _step(days, scale)) is not None:
+        days = days.at(slice(step, None))
+    return days
+
+
+def _step(days: PairDays, scale: Float[np.ndarray, " 6"]) -> int | None:
+    """How many days lie before the clearest step; None where there is none."""
     if len(days.day) < 4:
-        return days
-    ones = np.ones(DOFS)
-    found = scan(_as_charts(days), _clipped(days).T, ones, _ALIKE * ones)
+        return None
+    found = scan(_as_charts(days), _clipped(days).T, scale, _ALIKE * np.ones(DOFS))
     z = np.abs(found.z).max(axis=0)
-    return days.at(slice(0, int(np.argmax(z)) + 1)) if z.max() > _MOVED_SIGMAS else days
+    return int(np.argmax(z)) + 1 if z.max() > _MOVED_SIGMAS else None
 
 
 def _as_charts(days: PairDays) -> Charts:

@@ -22,7 +22,16 @@ from pipeline.store.columns import matrices, observable_dofs, ordinals, places, 
 from pipeline.store.current import current_rows
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, STATUSES
 
-__all__ = ["COLUMNS", "Estimates", "day_name", "days_of", "estimates_of", "faults_of", "joined"]
+__all__ = [
+    "COLUMNS",
+    "Estimates",
+    "day_name",
+    "days_of",
+    "estimates_at",
+    "estimates_of",
+    "faults_of",
+    "joined",
+]
 
 _ROUNDING = 1e-3  # of what should be 1
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -151,9 +160,19 @@ def estimates_of(table: pa.Table | None) -> Estimates:
         for name in (_DISPROVED, *_SHIFTS, *_UNCHECKED):
             table = table.append_column(name, pa.array([], pa.float64()))
     found = current_rows(table, CALIBRATIONS)
+    return estimates_at(found, *edges_of_rows(found))
+
+
+def estimates_at(found: pa.Table, edges: tuple[Edge, ...], edge: Int[np.ndarray, " N"]) -> Estimates:
+    """Current rows as columns.
+
+    Args:
+        found: rows in order of vehicle, with COLUMNS.
+        edges: that they are of, in order.
+        edge: which of them each row is of; -1: none.
+    """
     names = found["vehicle"].combine_chunks().dictionary_encode()
     owner, day = np.asarray(names.indices).astype(np.int64), ordinals(found["day"])
-    edges, edge = edges_of_rows(found)
     order = np.lexsort((edge, day, owner))  # edges of a day side by side
     found = found.take(pa.array(order))
     pose = np.stack([found[name].to_numpy() for name in _POSE], axis=1)

@@ -68,7 +68,7 @@ def read_kept(
     eve = (dt.date.fromisoformat(first) - dt.timedelta(days=1)).isoformat()
     rows = read_latest(lake, STATES, StateRow, first=eve, last=last, columns=_COLUMNS)
     # Of a night that was run again the last one counts.
-    last_said = {(s.vehicle, _edge(s)): s for s in rows if s.method == method}
+    last_said = {(s.vehicle, _edge(s)): s for s in rows if s.method == method and s.pair != "pose"}
     states = {key: s for key, s in last_said.items() if s.reference_days is not None}
     changed = _changed_since(lake, last, {s.vehicle: s.recorded_at for s in states.values()})
     kept = {}

@@ -8,24 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import ndtri
 
 from pipeline.audit.days import DOFS, charts_of_fleet, edges_of_fleet
-from pipeline.audit.estimates import Estimates, day_name, days_of, estimates_of, joined
+from pipeline.audit.estimates import Estimates, days_of, estimates_of, joined
 from pipeline.audit.history import History
 from pipeline.audit.noise import estimate_noise
+from pipeline.audit.pose_states import pose_states, read_poses
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
 from pipeline.audit.service import events_until, restart_of, what_was_done
-from pipeline.audit.state import DayEstimate, State, fuse
-from pipeline.config import AuditConfig, FleetConfig, VerifyConfig, config_hash
-from pipeline.geometry.se3 import to_quaternion
-from pipeline.geometry.target_sigmas import target_sigmas
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.audit.state_rows import fused, with_state
+from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Partition, content_hash, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
 from pipeline.work import Records, Run, Task, Told, Window, Work
-from schemas.calibrations import CALIBRATIONS, DOF_NAMES
+from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
@@ -35,16 +32,12 @@ __all__ = ["work"]
 
 # Days that a state looks back: beyond, its common part is nearly all of it, and seasons and tyres are others.
 _DAYS_BACK = 60
-# Of successive accepted days: the most that the charts' budget is proved for. A state promises no more than such days
-# can give.
-_AUTOCORRELATION = 0.6
 _END = dt.date.max.toordinal()
-_OFTEN = 0.5  # share of a state's days: one day in 300 lies that far from the prior by chance
-_CHANGE = ("start_day", "start_day_latest")  # what is asked of the audit's rows
+_CHANGE = ("start_day", "start_day_latest", "moved_sensor")  # what is asked of the audit's rows
 
 
 def work(task: Task) -> Work:
-    """The state of every vehicle that has a record in the window, one row per edge.
+    """The state of every vehicle that has a record in the window: a row per edge, and per sensor of an adjusted rig.
 
     A state rests on the accepted days since the last of: the vehicle's first day, a service event, a change that the
     latest audit found. The window ends as the audit's does.
@@ -59,13 +52,15 @@ def work(task: Task) -> Work:
     history = History(task.lake, method, last)
     records = history.read(first, last) if last else estimates_of(None)
     events = events_until(task.lake, last or None)
+    poses = read_poses(task.lake, method, first, last)
     changes: dict[str, list[DriftFinding]] = {}
     for finding in read_last(task.lake, DRIFT, DriftFinding, method, columns=_CHANGE):
         changes.setdefault(finding.vehicle, []).append(finding)
     references = _references(history, records, (first, last), events, fleet.audit) if last else {}
 
     def rows(run: Run) -> Generator[Records, None, None]:
-        scales = _scales(records, fleet.audit)
+        scales, of_poses = _scales(records, fleet.audit), _scales(poses.estimates, fleet.audit)
+        own_scales = dict(zip(poses.estimates.vehicles, of_poses, strict=True))
         for done, vehicle in enumerate(records.vehicles):
             run.progress(done, len(records.vehicles), vehicle)
             of_vehicle = records.of(vehicle)
@@ -75,13 +70,18 @@ def work(task: Task) -> Work:
             kept = [references[vehicle, edge] for edge in edges]
             count = fleet.audit.reference_days
             whole = [replace(r, **kept_columns(k, count)) for r, k in zip(own.rows, kept, strict=True)]
+            known = events.get(vehicle, ()), changes.get(vehicle, ())
+            about = vehicle, last, method
+            whole += pose_states(about, poses, known, own_scales.get(vehicle, {}), fleet.verify)
             begun = {edge.name: first for edge, first in since.items()}
             config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method, "since": begun})
-            key = work_key("state", CODE_VERSION, config, [*(own.inputs or ()), content_hash(whole)])
-            yield replace(own, rows=[replace(r, work_key=key) for r in whole], work_key=key)
+            inputs = sorted({*(own.inputs or ()), *(key for row in whole for key in row.inputs)})
+            key = work_key("state", CODE_VERSION, config, [*inputs, content_hash(whole)])
+            yield replace(own, rows=[replace(r, work_key=key) for r in whole], work_key=key, inputs=inputs)
 
     settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
-    return Work(settings, rows, inputs=tuple(records.keys()), tell=_told, again=True)
+    read = tuple(sorted({*records.keys(), *poses.estimates.keys()}))
+    return Work(settings, rows, inputs=read, tell=_told, again=True)
 
 
 def _references(
@@ -152,8 +152,7 @@ def _states(
         begin = dt.date.fromisoformat(first).toordinal() if first else 0
         usable = records.accepted & records.has_estimate & (records.day >= begin)
         own = records.at(np.flatnonzero(usable & records.is_of(edge)))
-        found = fuse(_days(own), scale=scales.get(edge), autocorrelation=_AUTOCORRELATION)
-        words = _words(why, found)
+        found = fused(own, scales.get(edge))
         base = StateRow(
             vehicle=vehicle,
             day=last,
@@ -162,70 +161,13 @@ def _states(
             parent_frame=edge.parent.name,
             child_frame=edge.child.name,
             status="none",
-            reason=words,
+            reason=f"no accepted day {why}".rstrip() if found is None else why,
             since=first or None,
         )
-        rows.append(base if found is None else _with_state(base, found, own, fleet.verify))
+        if found is not None:
+            base = with_state(base, found, own, (edge.kind, found.T, found.covariance), fleet.verify)
+        rows.append(base)
     return Records(rows, Partition(vehicle, last), inputs=inputs)
-
-
-def _words(why: str, found: State | None) -> str:
-    """Why the state rests on the days that it rests on."""
-    if found is None:
-        return f"no accepted day {why}".rstrip()
-    left = f"left out, far from the others: {', '.join(found.left_out)}" if found.left_out else ""
-    return "; ".join(text for text in (why, left) if text)
-
-
-def _days(records: Estimates) -> list[DayEstimate]:
-    """Accepted records of an edge as days to fuse."""
-    return [
-        DayEstimate(day_name(day), T, covariance, common if has_common else None, observable)
-        for day, T, covariance, common, has_common, observable in zip(
-            records.day.tolist(), records.transforms(), records.covariance, records.common,
-            records.has_common.tolist(), records.observable, strict=True,
-        )
-    ]  # fmt: skip
-
-
-def _with_state(base: StateRow, found: State, records: Estimates, verify: VerifyConfig) -> StateRow:
-    own = records.at(np.flatnonzero([day_name(day) in found.days for day in records.day.tolist()]))
-    sigma = target_sigmas(base.pair, found.T, found.covariance, _targets(own))
-    azimuth, elevation = (
-        (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
-        if "radar" not in base.pair
-        else (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
-    )
-    reach = float(ndtri(0.5 + verify.confidence / 2)) * np.degrees(sigma)
-    names = ("azimuth", "elevation")
-    T, q = found.T, to_quaternion(found.T)
-    return replace(
-        base,
-        status="current",
-        qw=float(q[0]), qx=float(q[1]), qy=float(q[2]), qz=float(q[3]),
-        tx_m=float(T[0, 3]), ty_m=float(T[1, 3]), tz_m=float(T[2, 3]),
-        covariance=found.covariance,
-        common_covariance=found.common,
-        observable=[bool(v) for v in found.observable],
-        determined=[n for n, r, limit in zip(names, reach, (azimuth, elevation), strict=True) if r <= limit],
-        azimuth_sigma_rad=float(sigma[0]),
-        elevation_sigma_rad=float(sigma[1]),
-        days=list(found.days),
-        unchecked=_unchecked(own),
-        inputs=own.keys(),
-    )  # fmt: skip
-
-
-def _targets(days: Estimates) -> Float[np.ndarray, "N 3"]:
-    """Where the sensors look, as the last of the days that says it has it."""
-    known = np.flatnonzero(np.isfinite(days.targets).all(axis=(1, 2)))
-    return days.targets[known[-1]] if len(known) else DEFAULT_TARGETS
-
-
-def _unchecked(days: Estimates) -> dict[str, float]:
-    """DoF that at least half of the days found far from the prior, with nothing to check them: the most sigmas."""
-    often = np.mean(days.unchecked_sigmas > 0, axis=0) >= _OFTEN
-    return {dof: float(days.unchecked_sigmas[:, k].max()) for k, dof in enumerate(DOF_NAMES) if often[k]}
 
 
 def _told(rows: Sequence[StateRow]) -> Told:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import cast
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from pipeline.export.calibration import USABLE, ExportedPair, is_frame
 from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.edges import edge_named, edge_order, words_of
-from pipeline.rig.graph import Edge, edge_between
+from pipeline.rig.graph import Edge, Kind, Sensor, tie
 from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
@@ -35,7 +36,7 @@ __all__ = [
 # What a record or state says of itself beside its numbers, as far as it has it.
 _DETAILS = (
     *("day", "days", "since", "work_key", "recorded_at", "inputs", "notes", "assumptions"),
-    *("time_offset_s", "time_offset_sigma_s", "azimuth_sigma_rad", "elevation_sigma_rad"),
+    *("edges", "dt_s", "time_offset_s", "time_offset_sigma_s", "azimuth_sigma_rad", "elevation_sigma_rad"),
     *("mounting_determined", "mounting_azimuth_sigma_rad", "mounting_elevation_sigma_rad"),
 )
 
@@ -49,45 +50,52 @@ def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, E
     return _pairs(_records(lake, vehicle, day, method))
 
 
-def pairs_of_poses(lake: Lake, vehicle: str, day: str, method: str) -> dict[Edge, ExportedPair | str]:
-    """Each sensor against the reference as the day's adjusted rig has it, by the edge between them.
+def pairs_of_poses(lake: Lake, vehicle: str, day: str | None, method: str) -> dict[Edge, ExportedPair | str]:
+    """Each sensor against the reference as the day's adjusted rig, or without a day the vehicle's state, has it.
+
+    By the tie between them; none of a vehicle whose rig is not adjusted as a whole.
 
     Raises:
-        ConfigError: as `pairs_of_day`.
+        ConfigError: as `pairs_of_day`, or no state of that vehicle and method is stored.
     """
+    own: list[tuple[str, str, str, PoseRow | StateRow]]
+    if day is None:
+        states = current_states(read_records(lake, STATES, StateRow, vehicle=vehicle))
+        own = [(s.sensor, s.kind or "", s.parent_frame, s) for s in states if s.sensor and s.method == method]
+    else:
+        poses = current_poses(read_records(lake, POSES, PoseRow, vehicle=vehicle, day=day))
+        own = [(p.sensor, p.kind, p.reference, p) for p in poses if p.method == method]
     nodes = {s.name: s for edge in edges_of_vehicle(lake, vehicle, day, method) for s in edge.sensors}
-    rows = current_poses(read_records(lake, POSES, PoseRow, vehicle=vehicle, day=day))
-    found: dict[Edge, ExportedPair | str] = {}
-    for row in rows:
-        if (
-            row.method == method
-            and row.sensor != row.reference
-            and {row.sensor, row.reference} <= nodes.keys()
-        ):
-            edge = edge_between(nodes[row.sensor], nodes[row.reference])
-            found[edge] = _pair_of_pose(row, edge)
-    return {edge: found[edge] for edge in sorted(found, key=edge_order)}
+    nodes |= {name: Sensor(name, cast("Kind", kind)) for name, kind, *_ in own}
+    ties = {tie(nodes[n], nodes[r]): (n, row) for n, _, r, row in own if n != r and r in nodes}
+    return {edge: _pair_of_pose(ties[edge][1], ties[edge][0], edge) for edge in sorted(ties, key=edge_order)}
 
 
-def _pair_of_pose(row: PoseRow, edge: Edge) -> ExportedPair | str:
-    """A sensor's pose as the edge between it and the reference, whichever is the parent."""
+def _pair_of_pose(row: PoseRow | StateRow, sensor: str, edge: Edge) -> ExportedPair | str:
+    """A sensor's pose as its tie to the reference, whichever is the parent."""
     T, covariance, common = transform_of(row), row.covariance, row.common_covariance
     if T is None or covariance is None:
         return f"{row.status}: {row.reason}"
     seen, reason = tuple(row.observable or [True] * 6), row.reason
-    if edge.parent.name == row.sensor:
+    if edge.parent.name == sensor:
         T = inverse(T)
         A = adjoint(T)
         covariance, common = A @ covariance @ A.T, None if common is None else A @ common @ A.T
         unseen = ", ".join(dof for dof, is_seen in zip(DOF_NAMES, seen, strict=True) if not is_seen)
         # Degrees of freedom are those of the reference's axes: in the sensor's own they are mixed.
-        own = f"{unseen} along the axes of {row.reference} kept at the prior" if unseen else ""
+        own = f"{unseen} along the axes of {edge.child.name} kept at the prior" if unseen else ""
         seen, reason = (True,) * 6, "; ".join(words for words in (reason, own) if words)
-    details = {"day": row.day, "work_key": row.work_key, "edges": row.edges, "dt_s": row.dt_s}
-    told = {name: value for name, value in details.items() if value not in (None, "", [])}
-    certified = tuple(row.determined)
     return ExportedPair(
-        words_of(edge), T, covariance, row.status, reason, seen, certified, common, told, of=edge
+        words_of(edge),
+        T,
+        covariance,
+        row.status,
+        reason,
+        seen,
+        tuple(row.determined),
+        common,
+        _details(row),
+        of=edge,
     )
 
 
@@ -142,7 +150,7 @@ def pairs_of_state(lake: Lake, vehicle: str, method: str) -> dict[str, ExportedP
 
 def _states(lake: Lake, vehicle: str, method: str) -> list[StateRow]:
     rows = current_states(read_records(lake, STATES, StateRow, vehicle=vehicle))
-    found = [r for r in rows if r.method == method]
+    found = [r for r in rows if r.method == method and r.sensor is None]
     if not found:
         problem = f"the lake has no state of {vehicle} by {method}: run `boresight audit`, or give --day"
         raise ConfigError("command line", "vehicle", problem)
@@ -162,7 +170,6 @@ def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
     T = transform_of(row)
     if T is None:
         return f"{row.status}: {row.reason}"
-    details = {name: value for name in _DETAILS if (value := getattr(row, name, None)) not in (None, "", [])}
     edge = _edge(row)
     return ExportedPair(
         words_of(edge),
@@ -173,10 +180,14 @@ def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
         tuple(row.observable or [True] * 6),
         tuple(row.determined),
         row.common_covariance,
-        details,
+        _details(row),
         _unchecked(row),
         of=edge,
     )
+
+
+def _details(row: CalibrationRecord | StateRow | PoseRow) -> dict[str, object]:
+    return {name: value for name in _DETAILS if (value := getattr(row, name, None)) not in (None, "", [])}
 
 
 def _unchecked(row: CalibrationRecord | StateRow) -> dict[str, float]:

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Int
 
-from pipeline.rig.graph import EDGE_KINDS, Edge, Kind, Sensor
+from pipeline.rig.graph import EDGE_KINDS, TIE_KINDS, Edge, Kind, Sensor
 from schemas.calibrations import FRAMES_OF_PAIR
 
 __all__ = ["EDGE_OF_PAIR", "edge_named", "edge_order", "edges_of_rows", "words_of"]
@@ -42,8 +42,8 @@ EDGE_OF_PAIR: Final[Mapping[str, Edge]] = {
 
 
 def edge_order(edge: Edge) -> tuple[int, str, str]:
-    """Key to sort edges by: kinds in the order of EDGE_KINDS, then names."""
-    return EDGE_KINDS.index(edge.kind), edge.parent.name, edge.child.name
+    """Key to sort edges by: kinds in the order of TIE_KINDS, then names."""
+    return TIE_KINDS.index(edge.kind), edge.parent.name, edge.child.name
 
 
 def words_of(edge: Edge) -> str:

@@ -15,12 +15,14 @@ __all__ = [
     "BASE",
     "EDGE_KINDS",
     "KINDS",
+    "TIE_KINDS",
     "Edge",
     "Kind",
     "RigGraph",
     "Sensor",
     "edge_between",
     "possible_edges",
+    "tie",
 ]
 
 Kind = Literal["camera", "lidar", "radar", "base"]
@@ -29,6 +31,8 @@ KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 EDGE_KINDS: Final = (
     "camera_lidar", "camera_radar", "lidar_radar", "lidar_lidar", "lidar_base", "radar_base",
 )  # fmt: skip
+# Also of two nodes that others tie to each other: where one is to the reference follows from a rig that was adjusted.
+TIE_KINDS: Final = (*EDGE_KINDS, "camera_camera", "radar_radar", "camera_base")
 
 
 @dataclass(frozen=True, order=True)
@@ -53,10 +57,10 @@ BASE: Final = Sensor("base", "base")
 
 @dataclass(frozen=True, order=True)
 class Edge:
-    """Two nodes that can be calibrated against each other: it estimates T_parent_child.
+    """Two nodes of which T_parent_child is known: calibrated against each other, or by way of others (`tie`).
 
     Raises:
-        ValueError: a sensor and itself, or two kinds that share nothing; both in the wrong order.
+        ValueError: a sensor and itself; both in the wrong order.
     """
 
     parent: Sensor
@@ -65,11 +69,8 @@ class Edge:
     def __post_init__(self) -> None:
         if self.parent.name == self.child.name:
             raise ValueError(f"an edge joins two sensors, not {self.parent.name} and itself")
-        if self.kind not in EDGE_KINDS:
-            raise ValueError(
-                f"{self.parent.name} ({self.parent.kind}) and {self.child.name} ({self.child.kind}) cannot be "
-                f"calibrated against each other: edges are of kinds {', '.join(EDGE_KINDS)}"
-            )
+        if self.kind not in TIE_KINDS:
+            raise ValueError(_no_edge(self.parent, self.child))
 
     @property
     def kind(self) -> str:
@@ -103,8 +104,26 @@ def edge_between(a: Sensor, b: Sensor) -> Edge:
     Raises:
         ValueError: they cannot be calibrated against each other.
     """
-    parent, child = sorted((a, b), key=lambda s: (KINDS.index(s.kind), s.name))
-    return Edge(parent, child)
+    found = tie(a, b)
+    if found.kind not in EDGE_KINDS:
+        raise ValueError(_no_edge(*found.sensors))
+    return found
+
+
+def tie(a: Sensor, b: Sensor) -> Edge:
+    """Two nodes of any kinds as an edge, whichever is given first: what a rig's pose is known by, not how.
+
+    Raises:
+        ValueError: a sensor and itself.
+    """
+    return Edge(*sorted((a, b), key=lambda s: (KINDS.index(s.kind), s.name)))
+
+
+def _no_edge(a: Sensor, b: Sensor) -> str:
+    return (
+        f"{a.name} ({a.kind}) and {b.name} ({b.kind}) cannot be calibrated against each other: edges are of kinds "
+        f"{', '.join(EDGE_KINDS)}"
+    )
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 from pipeline.geometry.se3 import exp_se3, from_rotation_translation, inverse, to_quaternion
 from pipeline.rig.edges import edge_named
 from schemas.calibrations import CalibrationRecord
+from schemas.poses import PoseRow
 
 FIRST_DAY = dt.date(2026, 3, 1)
 EDGES = (
@@ -73,3 +74,33 @@ def record_of(vehicle, day, edge, T):
 
 def _noise(edge, rng):
     return rng.multivariate_normal(np.zeros(6), covariance_of(edge))
+
+
+KIND_OF = {s.name: s.kind for e in EDGES for s in e.sensors}
+POSE_SIGMA = np.r_[np.radians([0.05, 0.05, 0.05]), 0.02, 0.02, 0.02]  # one day's, in the reference's axes
+
+
+def pose_rows(vehicle, days, rng, *, motion=lambda _day: {}, reference="top", **columns):
+    """A row per sensor of every day, all accepted; a tenth of the variance is common and left out of the errors.
+
+    `motion(day)`: each sensor's motion so far, own axes; `columns`: of every row, or by (day, sensor) of one.
+    """
+    rows, of_one = [], columns.pop("of", {})
+    for day in range(days):
+        moved = {n: T_TOP[n] @ exp_se3(motion(day).get(n, np.zeros(6))) for n in T_TOP}
+        for name, kind in KIND_OF.items():
+            T = inverse(moved[reference]) @ moved[name]
+            if name != reference:
+                T = exp_se3(np.sqrt(0.9) * POSE_SIGMA * rng.normal(size=6)) @ T
+            names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+            is_other = float(name != reference)
+            own = {
+                "vehicle": vehicle, "day": (FIRST_DAY + dt.timedelta(days=day)).isoformat(), "method": "joint",
+                "sensor": name, "kind": kind, "reference": reference, "status": "accepted", "reason": "",
+                "code_version": "0.11.0", "work_key": f"{vehicle}-{day}", "observable": [True] * 6,
+                "determined": ["azimuth", "elevation"], "covariance": is_other * np.diag(POSE_SIGMA**2),
+                "common_covariance": is_other * 0.1 * np.diag(POSE_SIGMA**2),
+                **dict(zip(names, (*to_quaternion(T).tolist(), *T[:3, 3].tolist()), strict=True)),
+            }  # fmt: skip
+            rows.append(PoseRow(**own | columns | of_one.get((day, name), {})))
+    return rows

@@ -1,0 +1,107 @@
+"""Rows of table states from the estimates of accepted days."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtri
+
+from pipeline.audit.estimates import Estimates, day_name
+from pipeline.audit.state import DayEstimate, State, fuse
+from pipeline.config import VerifyConfig
+from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.target_sigmas import target_sigmas
+from pipeline.geometry.targets import DEFAULT_TARGETS
+from schemas.calibrations import DOF_NAMES
+from schemas.states import StateRow
+
+__all__ = ["fused", "pose_columns", "with_state"]
+
+# Of successive accepted days: the most that the charts' budget is proved for. A state promises no more than such days
+# can give.
+_AUTOCORRELATION = 0.6
+_OFTEN = 0.5  # share of a state's days: one day in 300 lies that far from the prior by chance
+
+
+def fused(own: Estimates, scale: Float[np.ndarray, " 6"] | None) -> State | None:
+    """Accepted records about the same as one estimate; None where there is none.
+
+    Args:
+        own: the records, rising in days.
+        scale: by DoF, how much more the vehicle's days scatter than they say.
+    """
+    days = [
+        DayEstimate(day_name(day), T, covariance, common if has_common else None, observable)
+        for day, T, covariance, common, has_common, observable in zip(
+            own.day.tolist(), own.transforms(), own.covariance, own.common,
+            own.has_common.tolist(), own.observable, strict=True,
+        )
+    ]  # fmt: skip
+    return fuse(days, scale=scale, autocorrelation=_AUTOCORRELATION)
+
+
+def with_state(
+    base: StateRow,
+    found: State,
+    records: Estimates,
+    seen: tuple[str, Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]],
+    verify: VerifyConfig,
+) -> StateRow:
+    """The row with its estimate.
+
+    Args:
+        base: what it is about, and why it rests on these days.
+        found: the days as one.
+        records: that were fused.
+        seen: kinds of two sensors, as camera_lidar, and T of the second in the first with its covariance, as which the
+            sigmas of targets are stated.
+        verify: limits.
+    """
+    own = records.at(np.flatnonzero([day_name(day) in found.days for day in records.day.tolist()]))
+    sigma = target_sigmas(*seen, _targets(own))
+    has_radar = "radar" in (seen[0] if base.sensor is None else base.kind or "")
+    azimuth, elevation = (
+        (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
+        if has_radar
+        else (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
+    )
+    reach = float(ndtri(0.5 + verify.confidence / 2)) * np.degrees(sigma)
+    names = ("azimuth", "elevation")
+    left = f"left out, far from the others: {', '.join(found.left_out)}" if found.left_out else ""
+    return replace(
+        base,
+        **pose_columns(found.T),
+        status="current",
+        reason="; ".join(text for text in (base.reason, left) if text),
+        covariance=found.covariance,
+        common_covariance=found.common,
+        observable=[bool(v) for v in found.observable],
+        determined=[n for n, r, limit in zip(names, reach, (azimuth, elevation), strict=True) if r <= limit],
+        azimuth_sigma_rad=float(sigma[0]),
+        elevation_sigma_rad=float(sigma[1]),
+        days=list(found.days),
+        unchecked=_unchecked(own),
+        inputs=own.keys(),
+    )
+
+
+def pose_columns(T: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    """A pose as columns of a row."""
+    names: Sequence[str] = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    return dict(zip(names, (*to_quaternion(T).tolist(), *T[:3, 3].tolist()), strict=True))
+
+
+def _targets(days: Estimates) -> Float[np.ndarray, "N 3"]:
+    """Where the sensors look, as the last of the days that says it has it."""
+    known = np.flatnonzero(np.isfinite(days.targets).all(axis=(1, 2)))
+    return days.targets[known[-1]] if len(known) else DEFAULT_TARGETS
+
+
+def _unchecked(days: Estimates) -> dict[str, float]:
+    """DoF that at least half of the days found far from the prior, with nothing to check them: the most sigmas."""
+    often = np.mean(days.unchecked_sigmas > 0, axis=0) >= _OFTEN
+    return {dof: float(days.unchecked_sigmas[:, k].max()) for k, dof in enumerate(DOF_NAMES) if often[k]}
