@@ -13,6 +13,7 @@ from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.config import VerifyConfig
+from pipeline.extrinsics.checks import faults_of
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.spherical import from_spherical
 from pipeline.geometry.targets import DEFAULT_TARGETS
@@ -79,7 +80,9 @@ def _row(
         return PoseRow(**told, status="refused", reason=why)
     if found.untied:
         why = f" ({about.absent[sensor.name]})" if sensor.name in about.absent else ""
-        return PoseRow(**told, status="refused", reason=found.untied + why)
+        failed = [c for edge, e in adjusted.edges.items() if sensor in edge.sensors for c in e.failed]
+        said = "".join(f"; {c.sentence}" for c in failed[:1])
+        return PoseRow(**told, status="refused", reason=found.untied + why + said, faults=faults_of(failed))
     poses, reference = adjusted.poses, graph.reference.name
     targets = _targets(sensor, poses, views)
     claims = _claims(sensor, poses, targets, verify)

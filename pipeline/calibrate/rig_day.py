@@ -15,10 +15,11 @@ from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.base_edges import BaseEdges
 from pipeline.calibrate.edge_records import record_of_evidence, refused_edge
 from pipeline.calibrate.records import Inputs, SolvedDay
+from pipeline.calibrate.verify.constancy import moved_failures
 from pipeline.config import FleetConfig
 from pipeline.errors import SolveError
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import Prior
+from pipeline.extrinsics.checks import FailedCheck, faults_of
+from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.extrinsics.prior import no_prior, trio_prior
 from pipeline.results import Progress
 from pipeline.rig.evidence import EdgeEvidence
@@ -81,6 +82,7 @@ def calibrate_rig(
         progress: told about each edge.
     """
     records, evidence, clocks = list[CalibrationRecord](), list[EdgeEvidence](), dict[Edge, float]()
+    estimates = dict[Edge, PairEstimate]()
     edges, others = (
         day.graph.edges,
         BaseEdges(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows),
@@ -110,12 +112,16 @@ def calibrate_rig(
         records += found
         if solved is not None:
             estimate = solved.solution.pairs[edge.kind]
+            estimates[edge] = estimate
             evidence.append(
                 evidence_of(estimate, edge, prior, fleet.solve.time_offset_sigma_s, _checks(solved, edge))
             )
             if estimate.time_offset_prior_s is not None:
                 clocks[edge] = estimate.time_offset_prior_s
     progress(len(edges), len(edges) + 1, "adjust the rig")
+    moved = moved_failures(estimates, edges)
+    records = [_without_moved(r, moved.get(_edge_of(r, day.graph), ())) for r in records]
+    evidence = [replace(e, checks=e.checks or tuple(moved.get(e.edge, ()))) for e in evidence]
     adjusted = _adjusted(day, evidence, clocks, fleet)
     return CalibratedRig([_with_innovation(r, day.graph, adjusted) for r in records], adjusted)
 
@@ -160,12 +166,24 @@ def _checks(solved: SolvedDay, edge: Edge) -> list[FailedCheck]:
     return [FailedCheck(verdict.reason, verdict.faults[0] if verdict.faults else "")]
 
 
+def _without_moved(record: CalibrationRecord, moved: Sequence[FailedCheck]) -> CalibrationRecord:
+    """The record, held where a sensor of its edge moved during the day: as other edges show, it may not show it."""
+    if not moved or record.status == "refused" or "moved_in_day" in record.faults:
+        return record
+    reason = "; ".join([*(check.sentence for check in moved), *([record.reason] if record.reason else [])])
+    faults = [*record.faults, *faults_of(moved)]
+    return replace(record, status="held", reason=reason, faults=faults, determined=[], mounting_determined=[])
+
+
+def _edge_of(record: CalibrationRecord, graph: RigGraph) -> Edge:
+    return Edge(graph[record.parent_frame], graph[record.child_frame])
+
+
 def _with_innovation(
     record: CalibrationRecord, graph: RigGraph, adjusted: AdjustedRig | None
 ) -> CalibrationRecord:
     """The record with how far its edge is from what the others show, and whether the rig rests on it."""
-    edge = Edge(graph[record.parent_frame], graph[record.child_frame])
-    found = None if adjusted is None else adjusted.edges.get(edge)
+    found = None if adjusted is None else adjusted.edges.get(_edge_of(record, graph))
     if found is None:
         return record
     return replace(record, innovation_sigmas=found.innovation_sigmas, believed=found.used)

@@ -7,7 +7,7 @@ the day as well (`numerics/change_point`). Two pairs that shift and one that sta
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
 
 import numpy as np
@@ -17,8 +17,9 @@ from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import DayParts, PairEstimate
 from pipeline.geometry.changes import change_jacobian
 from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.rig.graph import Edge
 
-__all__ = ["MOVED_SIGMAS", "PART_FLOOR_RAD", "constancy_failures"]
+__all__ = ["MOVED_SIGMAS", "PART_FLOOR_RAD", "constancy_failures", "moved_failures"]
 
 # Of a step between two parts of a day that are cut where they differ most.
 MOVED_SIGMAS = 4.0
@@ -34,37 +35,47 @@ _AXES = {
 
 
 def constancy_failures(estimates: Mapping[str, PairEstimate]) -> dict[str, list[FailedCheck]]:
-    """Pairs whose parts contradict each other, and the other pairs of the sensors that may have moved.
+    """`moved_failures` of the pairs of three sensors, by pair."""
+    of_edge = {EDGE_OF_PAIR[pair]: estimate for pair, estimate in estimates.items()}
+    return {edge.kind: checks for edge, checks in moved_failures(of_edge, of_edge).items()}
+
+
+def moved_failures(
+    estimates: Mapping[Edge, PairEstimate], edges: Collection[Edge]
+) -> dict[Edge, list[FailedCheck]]:
+    """Edges whose parts contradict each other, and the other edges of the sensors that may have moved.
 
     Args:
-        estimates: by pair; those without parts say nothing.
+        estimates: by edge; those without parts say nothing.
+        edges: all that the rig has.
     """
-    parts = {pair: e.parts for pair, e in estimates.items() if e.parts is not None and e.observable.any()}
-    size = {pair: float(np.abs(p.sigmas(PART_FLOOR_RAD)).max()) for pair, p in parts.items()}
-    moved = [pair for pair in parts if size[pair] > MOVED_SIGMAS]
+    parts = {edge: e.parts for edge, e in estimates.items() if e.parts is not None and e.observable.any()}
+    size = {edge: float(np.abs(p.sigmas(PART_FLOOR_RAD)).max()) for edge, p in parts.items()}
+    moved = [edge for edge in parts if size[edge] > MOVED_SIGMAS]
     if not moved:
         return {}
     surest = max(moved, key=size.__getitem__)
     found = attribute(
-        {EDGE_OF_PAIR[pair]: _shift(p, pair in moved or pair == "camera_lidar") for pair, p in parts.items()}
+        {edge: _shift(p, edge in moved or edge.kind == "camera_lidar") for edge, p in parts.items()}
     )
-    rivals = [s for s, share in found.probability.items() if share > 0.05] or surest.split("_")
-    sensors = [found.sensor] if found.sensor else [s for s in surest.split("_") if s in rivals]
-    failed = {pair: [_failure(pair, parts[pair], size[pair], sensors)] for pair in moved}
-    # Which of two moved may stay open, as with a tilt that the radar hardly sees: then no pair of either is sure.
-    for pair in estimates:
-        if pair not in failed and set(sensors) & set(pair.split("_")):
-            who, shown = " or ".join(sensors), surest.replace("_", "-")
-            sentence = f"the {who} moved during the day, as {shown} shows"
-            failed[pair] = [FailedCheck(sentence, "moved_in_day")]
+    ends = [s.name for s in surest.sensors]
+    rivals = [s for s, share in found.probability.items() if share > 0.05] or ends
+    sensors = [found.sensor] if found.sensor else [s for s in ends if s in rivals]
+    failed = {edge: [_failure(edge, parts[edge], size[edge], sensors)] for edge in moved}
+    # Which of two moved may stay open, as with a tilt that the radar hardly sees: then no edge of either is sure.
+    for edge in edges:
+        if edge not in failed and {s.name for s in edge.sensors} & set(sensors):
+            sentence = f"the {' or '.join(sensors)} moved during the day, as {surest.name} shows"
+            failed[edge] = [FailedCheck(sentence, "moved_in_day")]
     return failed
 
 
-def _failure(pair: str, parts: DayParts, sigmas: float, sensors: list[str]) -> FailedCheck:
+def _failure(edge: Edge, parts: DayParts, sigmas: float, sensors: list[str]) -> FailedCheck:
     axis = int(np.argmax(np.abs(parts.sigmas(PART_FLOOR_RAD))))
     first, last = (datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S") for ns in parts.cut_ns)
-    size = f"{_AXES[pair][axis]} turned by about {np.degrees(parts.step[axis]):+.2f} deg ({sigmas:.1f} sigma)"
-    who = " or ".join(s for s in pair.split("_") if s in sensors) or " or ".join(pair.split("_"))
+    size = f"{_AXES[edge.kind][axis]} turned by about {np.degrees(parts.step[axis]):+.2f} deg ({sigmas:.1f} sigma)"
+    ends = [s.name for s in edge.sensors]
+    who = " or ".join([s for s in ends if s in sensors] or ends)
     return FailedCheck(
         f"{size} within the day, between {first} and {last} UTC: the {who} moved", "moved_in_day"
     )

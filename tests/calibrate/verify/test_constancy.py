@@ -7,9 +7,10 @@ import pytest
 
 from pipeline.calibrate.half_days import half_days_of
 from pipeline.calibrate.numerics.change_point import with_parts
-from pipeline.calibrate.verify.constancy import constancy_failures
+from pipeline.calibrate.verify.constancy import constancy_failures, moved_failures
 from pipeline.extrinsics.estimates import DayParts, PairEstimate
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.edges import edge_named
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
 
 CUT_NS = (1772447400 * 10**9, 1772447700 * 10**9)  # 10:30:00 and 10:35:00 UTC
@@ -95,6 +96,25 @@ def test_a_tilt_that_the_radar_shows_in_part_does_not_blame_the_camera():
     failed = constancy_failures(found | {"lidar_radar": replace(radar, parts=parts)})
     assert "the camera or lidar moved" in failed["camera_lidar"][0].sentence
     assert failed["lidar_radar"]
+
+
+def test_the_one_sensor_of_a_rig_that_moved_loses_edges_that_do_not_show_it():
+    def parts(edge, share_deg):
+        T, M = T_LIDAR_RADAR, from_rotation_translation(exp_so3(np.radians([0, 0, share_deg])), np.zeros(3))
+        # The grille is the parent of its pairs with radars: what it sees turns the other way.
+        last = inverse(M) @ T if edge.parent.name == "grille" else T
+        spread = np.diag(np.radians([20.0, 20.0, 0.06]) ** 2)
+        own = PairEstimate("lidar_radar", T, np.eye(6) * 1e-6, np.ones(6), np.ones(6, bool), 40)
+        return replace(own, parts=DayParts((T, last), (spread, spread), CUT_NS, (2,)))
+
+    pairs = [edge_named("lidar_radar", a, b) for a in ("grille", "top") for b in ("nose", "corner")]
+    others = [edge_named("lidar_lidar", "grille", "top"), edge_named("lidar_base", "grille", "base"),
+              edge_named("lidar_base", "top", "base")]  # fmt: skip
+    failed = moved_failures({edge: parts(edge, 1.0) for edge in pairs}, [*pairs, *others])
+    assert {edge.name for edge in failed} == {"grille-nose", "grille-corner", "grille-top", "grille-base"}
+    assert "the grille moved during the day" in failed[others[0]][0].sentence
+    assert {c.fault for checks in failed.values() for c in checks} == {"moved_in_day"}
+    assert moved_failures({edge: parts(edge, 0.1) for edge in pairs}, [*pairs, *others]) == {}
 
 
 def test_half_days_lead_from_the_record_to_where_the_sensor_was_and_is():
