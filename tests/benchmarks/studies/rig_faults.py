@@ -23,7 +23,7 @@ import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -120,17 +120,10 @@ def main() -> None:
         if is_accepted(r["commit"], now, args.accept_commits)
     }
     _remember()
-    for number, seed in enumerate(args.seeds):
-        Remembered.kept.clear()
-        for case in CASES:
-            sensor = OF_KIND[case.kind][number % len(OF_KIND[case.kind])] if case.kind else ""
-            if (not args.only or any(o in case.name for o in args.only)) and (
-                seed,
-                case.name,
-                sensor,
-            ) not in done:
-                _write(args.out, {"seed": seed, "case": case.name, "sensor": sensor, "commit": now},
-                       partial(run_case, case, sensor, seed, args.root))  # fmt: skip
+    for case, sensor, seed in _in_turn(args.seeds, args.only):
+        if (seed, case.name, sensor) not in done:
+            _write(args.out, {"seed": seed, "case": case.name, "sensor": sensor, "commit": now},
+                   partial(run_case, case, sensor, seed, args.root))  # fmt: skip
     for asked in args.nights:
         seed, sensor, day = asked.split(":")
         if (int(seed), "night", sensor) not in done:
@@ -140,6 +133,18 @@ def main() -> None:
     text = f"{look('rig_faults', [{**r, 'day': {'seed': r['seed']}} for r in lines])}\n\n{summary(lines)}\n"
     args.out.with_suffix(".md").write_text(text)
     print(text)
+
+
+def _in_turn(seeds: Sequence[int], only: Sequence[str]) -> Iterator[tuple[Case, str, int]]:
+    """Days without a fault, then every case on one day, on the next one and so on, each of its kind's next sensor."""
+    cases = [c for c in CASES if not only or any(word in c.name for word in only)]
+    for turn in range(len(seeds)):
+        for number, case in enumerate(cases):
+            if not case.kind:
+                yield case, "", seeds[turn]
+                continue
+            day = (number + turn) % len(seeds)
+            yield case, OF_KIND[case.kind][(number + turn) % len(OF_KIND[case.kind])], seeds[day]
 
 
 def _write(out: Path, about: dict[str, Any], run: Callable[[], dict[str, Any]]) -> None:
