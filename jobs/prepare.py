@@ -104,6 +104,8 @@ def _days(
         raise ConfigError(
             "command line", "--lake", f"{lake.root} has no observations of these vehicles and days"
         )
+    for vehicle in {day.vehicle for day in days}:
+        config.rig_of(vehicle).one_of_each("training")
     return days
 
 

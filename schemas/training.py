@@ -26,6 +26,7 @@ __all__ = [
     "NO_EDGE",
     "POINT_IS_EDGE",
     "POINT_IS_GROUND",
+    "SAMPLED",
     "SPLITS",
     "TRAINING",
     "UNKNOWN_CLASS",
@@ -33,6 +34,8 @@ __all__ = [
 ]
 
 SPLITS = ("train", "val", "test")
+# Among the manifest's extra: names by kind of the camera, lidar and radar that samples are of.
+SAMPLED = "sensors"
 # Classes of the grid: Cityscapes train ids folded by what they look like to a lidar.
 _LABELS_OF_CLASS = {
     "road": (0,),

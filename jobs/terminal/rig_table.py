@@ -32,7 +32,8 @@ def print_rig(console: Console, rig: RigFinding) -> None:
         table.add_row(name, *(_cell(pairs.get((row, column))) for column in columns))
     console.print(table)
     console.print(
-        "share of the smaller view, moments with both; below, of edges, DoF that they give + in part"
+        "share of the smaller view as logged (before perception), moments with both; "
+        "below, of edges, DoF that they give + in part"
     )
     console.print(f"poses refer to {rig.reference} (*); what has no second line is not calibrated")
     for (verdict, reason, edges), dofs in _reasons(rig).items():

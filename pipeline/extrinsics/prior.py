@@ -33,7 +33,7 @@ __all__ = [
 
 
 def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle: str) -> Prior:
-    """The prior of a vehicle with one sensor of each kind as its rig says: logged, or from a file.
+    """The prior of one sensor of each kind (`Rig.one_of_each`) as the vehicle's rig says: logged, or from a file.
 
     Raises:
         SolveError: no frame carries a tf_static prior, or it changes over the day.
@@ -178,7 +178,6 @@ def _sigmas(prior: SensorPrior) -> tuple[float, float]:
 
 
 def _only(rig: Rig) -> tuple[str | None, str | None, str | None]:
-    """Names of the only sensor of each kind; ConfigError where there are several."""
-    _ = rig.camera, rig.lidar, rig.radar
-    camera, lidar, radar = (next(iter(of), None) for of in (rig.cameras, rig.lidars, rig.radars))
-    return camera, lidar, radar
+    """Names of the only sensor of each kind, or of the three that the rig names; ConfigError where neither is."""
+    names = rig.one_of_each("this")
+    return names.get("camera"), names.get("lidar"), names.get("radar")

@@ -85,6 +85,26 @@ class Rig(Section):
         nodes = {node.name: node for node in self.nodes}
         return tuple(edge_between(nodes[a], nodes[b]) for a, b in self.edges)
 
+    def one_of_each(self, what: str) -> dict[str, str]:
+        """Names by kind of the sensors for something that knows one camera, one lidar and one radar.
+
+        Args:
+            what: that is, for the error.
+
+        Raises:
+            ConfigError: the rig has several of a kind, and `three` names none of them.
+        """
+        if self.three is not None:
+            return dict(zip(self._of_kind, self.three, strict=True))
+        if any(len(of) > 1 for of in self._of_kind.values()):
+            problem = (
+                f"{what} takes one camera, one lidar and one radar, and the rig has {_listed(self.sensors)}"
+            )
+            raise ConfigError(
+                "fleet.toml", "rigs.*.three", f"{problem}: name which, three = [CAMERA, LIDAR, RADAR]"
+            )
+        return {kind: name for kind, of in self._of_kind.items() for name in of}
+
     @property
     def camera(self) -> CameraTopics | None:
         """The only camera; None where there is none, ConfigError where there are several."""

@@ -101,6 +101,12 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
     rig = load(tmp_path, VAN).rigs["van"]
     with pytest.raises(ConfigError, match=r"cameras: .*front, left"):
         _ = rig.camera
+    with pytest.raises(
+        ConfigError, match=r"rigs\.\*\.three: training takes one camera.*front, left, top.*three ="
+    ):
+        rig.one_of_each("training")
+    named = rig.model_copy(update={"three": ("left", "top", "corner_fl")})
+    assert named.one_of_each("training") == {"camera": "left", "lidar": "top", "radar": "corner_fl"}
 
 
 @pytest.mark.parametrize(

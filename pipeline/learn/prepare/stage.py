@@ -21,12 +21,12 @@ from pipeline.learn.prepare.survey import Survey, survey_day
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
 from pipeline.store.partitions import Lake
 from pipeline.store.tables import read_manifest
-from pipeline.store.views import frames_of, observations_of
+from pipeline.store.views import Chosen, frames_of, observations_of
 from pipeline.work import Run, Task, Work
 from schemas.calibrations import PAIRS, SENSORS
 from schemas.frames import Frame
 from schemas.observations import Observation
-from schemas.training import TRAINING, TrainingRow
+from schemas.training import SAMPLED, TRAINING, TrainingRow
 
 __all__ = ["decided_sides", "work"]
 
@@ -51,24 +51,27 @@ def work(task: Task) -> Work:
     """The samples of a vehicle-day, divided as the plan says that the task is given (`SplitPlan`).
 
     Raises:
-        ConfigError: the vehicle or its prior file is not as fleet.toml says.
+        ConfigError: the vehicle or its prior file is not as fleet.toml says, or of several sensors it names no three.
     """
     config, plan, vehicle = task.fleet.prepare, task.given, task.partition.vehicle
-    prior = task.fleet.rig_of(vehicle).prior
+    rig = task.fleet.rig_of(vehicle)
+    prior, chosen = rig.prior, rig.one_of_each("training")
     survey = survey_day(task.partition, task.lake, config)
     sides, rejected = frame_sides(survey, plan, config)
     settings = {"prior_file": prior_key(task.fleet, vehicle), "sides": [s or "" for s in sides]}
+    settings |= {} if rig.three is None else {"three": rig.three}
     about = _about(survey, task.fleet.vehicle(vehicle).rig, sides)
     extra = {
         "split_rule": _split_rule(config),
         "sides": _sides_given(survey, plan),
         "grid": {"step_deg": config.grid_step_deg, "shape": list(config.grid_shape)},
+        SAMPLED: chosen,
     }
 
     def rows(run: Run) -> Generator[TrainingRow, None, None]:
         run.rejected.update(rejected)
         run.extra |= extra
-        for seen, row in enumerate(_samples(task, about, run.rejected), 1):
+        for seen, row in enumerate(_samples(task, about, chosen, run.rejected), 1):
             run.progress(seen, len(about), "prepare")
             if row is not None:
                 run.kept.update((row.split, f"{row.split} {row.environment}"))
@@ -88,13 +91,15 @@ def _about(survey: Survey, rig: str, sides: Sequence[str | None]) -> dict[int, A
     }
 
 
-def _samples(task: Task, about: Mapping[int, About], rejected: Counter[str]) -> Iterator[TrainingRow | None]:
+def _samples(
+    task: Task, about: Mapping[int, About], chosen: Chosen, rejected: Counter[str]
+) -> Iterator[TrainingRow | None]:
     """The row of each wanted frame in order, None (counted in `rejected`) where it is no sample."""
     if not about:
         return
     lake, partition, fleet = task.lake, task.partition, task.fleet
-    frames = frames_of(lake, partition, sorted(about))
-    whole = (o for o in observations_of(lake, partition) if len(o.sensors) == len(SENSORS))
+    frames = frames_of(lake, partition, sorted(about), chosen)
+    whole = (o for o in observations_of(lake, partition, chosen=chosen) if len(o.sensors) == len(SENSORS))
     observation = next(whole, None)
     if observation is None:
         rejected[SampleReason.SENSOR_MISSING.value] += len(about)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,18 +53,22 @@ def labelled_sweeps(
         ContractError: fewer than two vehicle-days of vehicles in fleet.toml.
     """
     days = vehicle_days(fleet, lake, least=2)
+    chosen = {day.vehicle: fleet.rig_of(day.vehicle).one_of_each("training") for day in days}
     accepted = {
         (r.vehicle, r.day): transform_of(r)
         for r in current_records(read_records(lake, CALIBRATIONS, CalibrationRecord))
-        if r.pair == "camera_lidar" and r.status == "accepted"
+        if r.status == "accepted" and _is_of(r, chosen)
     }
-    layout = layout_of((next(frames_of(lake, day)) for day in days), *size)
+    layout = layout_of((next(frames_of(lake, day, chosen=chosen[day.vehicle])) for day in days), *size)
     sides: tuple[list[tuple[np.ndarray, np.ndarray]], ...] = ([], [])
     for number, day in enumerate(days):
-        rows = list(observations_of(lake, day))
+        names = chosen[day.vehicle]
+        rows = list(observations_of(lake, day, chosen=names))
         known = accepted.get((day.vehicle, day.day))
         T = read_prior(rows, fleet, day.vehicle).T_camera_lidar if known is None else known
-        sides[is_held_out(number)].extend(day_images(frames_of(lake, day), rows, T, layout, frames_per_day))
+        sides[is_held_out(number)].extend(
+            day_images(frames_of(lake, day, chosen=names), rows, T, layout, frames_per_day)
+        )
     train, held_out = cut(*sides)
     numbers = {
         "vehicle_days": len(days),
@@ -72,3 +77,9 @@ def labelled_sweeps(
         "held_out_samples": len(held_out),
     }
     return SweepSamples(train, held_out, layout, numbers)
+
+
+def _is_of(record: CalibrationRecord, chosen: Mapping[str, Mapping[str, str]]) -> bool:
+    """Whether a record is of its vehicle's chosen camera and lidar."""
+    names = chosen.get(record.vehicle, {})
+    return (record.parent_frame, record.child_frame) == (names.get("camera"), names.get("lidar"))

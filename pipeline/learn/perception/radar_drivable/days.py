@@ -43,5 +43,5 @@ def drivable_samples(
 
 def samples_of_day(fleet: FleetConfig, lake: Lake, day: Partition, frames_per_day: int) -> DrivableSamples:
     """At most `frames_per_day` samples of a vehicle-day, evenly spread, labelled through its prior."""
-    rows = list(observations_of(lake, day))
+    rows = list(observations_of(lake, day, chosen=fleet.rig_of(day.vehicle).one_of_each("training")))
     return day_samples(rows, read_prior(rows, fleet, day.vehicle).T_lidar_radar, frames_per_day)
