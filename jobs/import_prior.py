@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jobs.frame_options import FrameOptions
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 __all__ = ["import_prior"]
 
@@ -16,15 +20,19 @@ def import_prior(
     *,
     out: Path,
     also: Path | None = None,
+    fleet: Path | None = None,
+    rig: str | None = None,
     frames: FrameOptions | None = None,
 ) -> int:
-    """Make a prior file of what another program wrote.
+    """Make a prior file of what another program wrote: of a camera, a lidar and a radar, or of all sensors of a rig.
 
     Args:
         form: one of the formats of `boresight export`, or vod: View-of-Delft, the lidar's file and the radar's.
         files: all files of the calibration.
         out: prior file to write; fleet.toml takes it as [rigs.*.prior] source = "file", file = "...".
-        also: prior file that has the transform which the files lack, where they have no radar.
+        also: prior file that has what the files lack, as those of cameras alone lack radars.
+        fleet: fleet.toml whose rig's sensors are looked for, each by its name or by what --frame calls it.
+        rig: which of its rigs; default: the only one.
         frames: what the frames are called in the files.
     """
     from jobs.terminal.summary import print_summary
@@ -34,6 +42,10 @@ def import_prior(
     from pipeline.extrinsics.prior_file import read_transforms
 
     read = read_files(files)
+    if fleet is not None:
+        taken = _of_rig(form, read, out, also, (fleet, rig), frames or FrameOptions())
+        print_summary("import", "done", format=form, files=list(read), sensors=taken, outputs=[out])
+        return 0
     pairs = format_named(form).pairs(read, (frames or FrameOptions()).names_in(files))
     taken = sorted(pairs)
     if also is not None:
@@ -42,3 +54,41 @@ def import_prior(
     write_files({out: prior_text(pairs, form, list(read))})
     print_summary("import", "done", format=form, files=list(read), pairs=taken, outputs=[out])
     return 0
+
+
+def _of_rig(
+    form: str,
+    read: Mapping[str, bytes],
+    out: Path,
+    also: Path | None,
+    of: tuple[Path, str | None],
+    frames: FrameOptions,
+) -> list[str]:
+    """Write the prior file of all sensors of a rig; the sensors that the files have.
+
+    Raises:
+        ConfigError: a sensor is missing, or twice, or the fleet has no such rig.
+    """
+    from pipeline.config import load_fleet
+    from pipeline.errors import ConfigError
+    from pipeline.export.files import noted_frames, write_files
+    from pipeline.export.formats import format_named
+    from pipeline.export.rig_poses import reference_of_rig, require_all, rig_poses, star_text
+    from pipeline.extrinsics.prior_file import read_star
+    from pipeline.rig.prior import between
+
+    rigs, name = load_fleet(of[0]).rigs, of[1]
+    name = next(iter(rigs)) if name is None and len(rigs) == 1 else name
+    if name not in rigs:
+        raise ConfigError("command line", "rig", f"name one of {', '.join(rigs)} with --rig")
+    rig = rigs[name]
+    base = {} if rig.base is None else {"base": rig.base}
+    names = frames.names(base | noted_frames([Path(file) for file in read]))
+    poses = rig_poses(format_named(form), read, names, rig)
+    taken = [n.name for n in rig.nodes if n.name in poses]
+    if also is not None:
+        star, reference = read_star(also, rig), reference_of_rig(rig).name
+        of_star = {n.name: between(star, reference, n.name) for n in rig.nodes if n.name != reference}
+        poses = {n: T for n, T in of_star.items() if T is not None} | poses
+    write_files({out: star_text(require_all(poses, list(read), names, rig), rig, form, list(read))})
+    return taken

@@ -42,7 +42,7 @@ class Format:
     name: str
     write: Callable[[ExportedCalibration], dict[str, bytes]] | None = None
     tree: Callable[[Files], TransformTree] | None = None
-    read: Callable[[Files, Sequence[Edge]], dict[str, np.ndarray]] | None = None
+    read: Callable[[Files, Sequence[Edge], FrameNames], dict[str, np.ndarray]] | None = None
     update: Callable[[str, bytes, ExportedCalibration], tuple[bytes, list[str]]] | None = None
     T_frame_camera: np.ndarray | None = None
     holds_provenance: bool = False
@@ -62,12 +62,13 @@ class Format:
             ConfigError: none, or the files cannot be read; it names file and field.
         """
         if self.read is not None:
-            return self.read(files, edges)
+            return self.read(files, edges, names)
         assert self.tree is not None, "a format names frames or pairs"
         found = pairs_of_tree(", ".join(files), self.tree(files), names, edges)
-        for edge in edges:
-            if self.T_frame_camera is not None and edge.parent.kind == "camera" and words_of(edge) in found:
-                found[words_of(edge)] = inverse(self.T_frame_camera) @ found[words_of(edge)]
+        if self.T_frame_camera is not None:
+            for edge in (e for e in edges if words_of(e) in found):
+                a, b = (self.T_frame_camera if s.kind == "camera" else np.eye(4) for s in edge.sensors)
+                found[words_of(edge)] = inverse(a) @ found[words_of(edge)] @ b
         return found
 
 

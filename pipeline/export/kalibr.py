@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, cameras_of, needed_camera
+from pipeline.export.calibration import ExportedCalibration, FrameNames, cameras_of, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import field_of, load_yaml, matrix_of, to_yaml
@@ -71,18 +71,21 @@ def _distortion(camera: Camera) -> tuple[str, list[float]]:
     return "radtan", [*D[:_RADTAN], *[0.0] * (_RADTAN - len(D))]
 
 
-def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
-    """Transforms from the first lidar's of an edge; cameras are in the order of their names, as they are written."""
-    cameras = sorted({edge.parent.name for edge in edges if edge.parent.kind == "camera"})
+def _read(files: Files, edges: Sequence[Edge], names: FrameNames) -> dict[str, np.ndarray]:
+    """Transforms from the first lidar's of an edge; cameras are told by their topics, else by the order of their names.
+
+    Raises:
+        ConfigError: the chain's topics name none of the cameras, and there are more or fewer of them.
+    """
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
         chain = load_yaml(file, content)
+        keys = _cameras_in(file, chain, edges, names)
         for edge in edges:
             is_camera = edge.parent.kind == "camera"
-            key = f"cam{cameras.index(edge.parent.name)}" if is_camera else "cam0"
-            cam = field_of(file, chain, key)
+            key = keys.get(edge.parent.name) if is_camera else next(iter(keys.values()), "cam0")
             child = f"T_cam_{edge.child.name}"
-            if edge.child.kind == "radar" and child not in cam:
+            if key is None or (edge.child.kind != "lidar" and child not in field_of(file, chain, key)):
                 continue
             T = matrix_of(file, f"{key}.{child}", field_of(file, chain, key, child))
             if not is_camera:
@@ -90,6 +93,21 @@ def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
                 T = inverse(matrix_of(file, f"{key}.{parent}", field_of(file, chain, key, parent))) @ T
             found[words_of(edge)] = T
     return found
+
+
+def _cameras_in(file: str, chain: Any, edges: Sequence[Edge], names: FrameNames) -> dict[str, str]:
+    """Key in the chain of each camera by name, those that it has."""
+    cameras = sorted({edge.parent.name for edge in edges if edge.parent.kind == "camera"})
+    held = chain if isinstance(chain, dict) else {}
+    topics = {key: str(cam.get("rostopic")) for key, cam in held.items() if isinstance(cam, dict)}
+    known = {f"/{names.of(name)}/image_raw": name for name in cameras}
+    found = {known[topic]: key for key, topic in topics.items() if topic in known}
+    if found and len(found) < sum(topic in known for topic in topics.values()):
+        raise ConfigError(file, "rostopic", "two cameras have the same topic: one sensor stands there twice")
+    if not found and len(cameras) not in (0, 1, len(topics)):
+        problem = f"names none of {', '.join(known)}, and there are {len(topics)} cameras: which is which is not said"
+        raise ConfigError(file, "rostopic", problem)
+    return found or {name: f"cam{k}" for k, name in enumerate(cameras)}
 
 
 KALIBR = Format("kalibr", _write, read=_read)

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration, cameras_of, needed_camera
+from pipeline.export.calibration import ExportedCalibration, FrameNames, cameras_of, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.texts import matrix_of, text_of
 from pipeline.geometry.se3 import inverse
@@ -35,11 +35,9 @@ _NOTES = (
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
+    only = sum(s.kind == "camera" for s in calibration.sensors) == 1
     cameras = cameras_of(calibration, "kitti")
-    return {
-        "calib.txt" if len(cameras) == 1 else f"calib_{name}.txt": _of_camera(calibration, name)
-        for name in cameras
-    }
+    return {"calib.txt" if only else f"calib_{name}.txt": _of_camera(calibration, name) for name in cameras}
 
 
 def _of_camera(calibration: ExportedCalibration, name: str) -> bytes:
@@ -66,7 +64,7 @@ def _pose(calibration: ExportedCalibration, a: str, b: str) -> np.ndarray:
     return found[0]
 
 
-def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
+def _read(files: Files, edges: Sequence[Edge], _names: FrameNames) -> dict[str, np.ndarray]:
     cameras = {edge.parent.name for edge in edges if edge.parent.kind == "camera"}
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
@@ -75,15 +73,17 @@ def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
             of_file = len(cameras) == 1 or file.endswith(f"calib_{edge.parent.name}.txt")
             if edge.kind == "camera_lidar" and _CAMERA in lines and of_file:
                 found[words_of(edge)] = _rectified(file, lines) @ matrix_of(file, _CAMERA, lines[_CAMERA])
-            name = f"Tr_{edge.child.name}{_TO_LIDAR}"
-            if edge.kind in ("lidar_radar", "lidar_lidar") and name in lines:
-                found[words_of(edge)] = matrix_of(file, name, lines[name])
+            if edge.kind in ("lidar_radar", "lidar_lidar"):  # one of them may be KITTI's velo
+                keys = [f"Tr_{sensor.name}{_TO_LIDAR}" for sensor in edge.sensors]
+                a, b = (matrix_of(file, k, lines[k]) if k in lines else np.eye(4) for k in keys)
+                if lines.keys() & set(keys):
+                    found[words_of(edge)] = inverse(a) @ b
     if not found:
         raise ConfigError(", ".join(files), _CAMERA, "missing")
     return found
 
 
-def _read_vod(files: Files, _edges: Sequence[Edge]) -> dict[str, np.ndarray]:
+def _read_vod(files: Files, _edges: Sequence[Edge], _names: FrameNames) -> dict[str, np.ndarray]:
     """View-of-Delft has a file per sensor, and calls either one's transform into the camera Tr_velo_to_cam."""
     if len(files) != 2:
         problem = (

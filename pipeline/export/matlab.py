@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration
+from pipeline.export.calibration import ExportedCalibration, FrameNames
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import provenance_of
 from pipeline.export.texts import load_json, matrix_of, to_json
@@ -42,7 +42,7 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     return {"calibration.json": to_json(content)}
 
 
-def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
+def _read(files: Files, edges: Sequence[Edge], _names: FrameNames) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
         held = load_json(file, content)

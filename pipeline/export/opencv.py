@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration
+from pipeline.export.calibration import ExportedCalibration, FrameNames
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import matrix_of, text_of
@@ -45,7 +45,7 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     return {"calibration.yaml": storage.releaseAndGetString().encode()}
 
 
-def _read(files: Files, edges: Sequence[Edge]) -> dict[str, np.ndarray]:
+def _read(files: Files, edges: Sequence[Edge], _names: FrameNames) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
         try:

@@ -26,8 +26,11 @@ def pairs_of_tree(
     """T_parent_child of edges by their words, those of them that the tree joins.
 
     Raises:
-        ConfigError: none; it names the frames that the file holds.
+        ConfigError: none, with the frames that the file holds; or one stands there twice.
     """
+    twice = sorted(tree.twice & {names.of(s.name) for edge in edges for s in edge.sensors})
+    if twice:
+        raise ConfigError(file, twice[0], "stands there twice, with different poses: give one calibration")
     found = {}
     for edge in edges:
         T = tree.lookup(names.of(edge.parent.name), names.of(edge.child.name))

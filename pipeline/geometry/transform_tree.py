@@ -12,6 +12,7 @@ from pipeline.geometry.se3 import from_quaternion, inverse
 
 __all__ = ["TransformTree"]
 
+_SAME = 1e-9  # of two copies of one transform
 _UNIT_TOLERANCE = 0.01  # a quaternion farther from unit length is damaged or no rotation at all
 
 
@@ -20,6 +21,7 @@ class TransformTree:
 
     def __init__(self) -> None:
         self._parent_of: dict[str, tuple[str, np.ndarray]] = {}
+        self.twice: set[str] = set()  # children that stand there more than once, not alike
 
     @property
     def edges(self) -> dict[str, str]:
@@ -53,6 +55,9 @@ class TransformTree:
 
     def add_transform(self, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]) -> None:
         """One edge, known to be rigid and between two frames."""
+        known = self._parent_of.get(child)
+        if known is not None and (known[0] != parent or np.abs(known[1] - T_parent_child).max() > _SAME):
+            self.twice.add(child)
         self._parent_of[child] = (parent, T_parent_child)
 
     def fill_from(self, other: TransformTree) -> None:

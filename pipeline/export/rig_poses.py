@@ -1,0 +1,72 @@
+"""Where all sensors of a rig are, out of files of any format, each by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.errors import ConfigError
+from pipeline.export.calibration import FrameNames
+from pipeline.export.formats import Files, Format
+from pipeline.export.texts import to_json
+from pipeline.geometry.se3 import inverse
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import Edge, Sensor, tie
+from pipeline.rig.prior import middle_of
+from pipeline.rig.rig import Rig
+
+__all__ = ["from_ties", "reference_of_rig", "require_all", "rig_poses", "star_text"]
+
+
+def reference_of_rig(rig: Rig) -> Sensor:
+    """The sensor that poses in files are said to: as fleet.toml has it, else the first lidar, radar or camera."""
+    return next((n for n in rig.nodes if n.name == rig.reference), None) or middle_of(rig.nodes)
+
+
+def rig_poses(form: Format, files: Files, names: FrameNames, rig: Rig) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """T_reference_sensor by name, of those of the rig's nodes that the files hold.
+
+    Raises:
+        ConfigError: they hold none, or one twice; it names file and field.
+    """
+    reference = reference_of_rig(rig)
+    ties = {words_of(edge): edge for n in rig.nodes if n != reference for edge in (tie(n, reference),)}
+    found = form.pairs(files, names, list(ties.values()))
+    return from_ties({ties[words]: T for words, T in found.items()}, reference)
+
+
+def from_ties(ties: Mapping[Edge, np.ndarray], reference: Sensor) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """T_reference_sensor by name of the sensor, from T_parent_child of ties to the reference."""
+    return {
+        edge.other(reference.name).name: T if edge.parent == reference else inverse(T)
+        for edge, T in ties.items()
+    }
+
+
+def require_all(
+    poses: Mapping[str, np.ndarray], files: Sequence[str], names: FrameNames, rig: Rig
+) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """The poses in the rig's order.
+
+    Raises:
+        ConfigError: sensors that are missing, by name, with the frames that were looked for.
+    """
+    reference = reference_of_rig(rig)
+    missing = [n.name for n in rig.nodes if n != reference and n.name not in poses]
+    if missing:
+        frames = ", ".join(f"{n} (frame {names.of(n)})" if names.of(n) != n else n for n in missing)
+        problem = (
+            f"missing: {frames}; name their frames with --frame SENSOR=NAME, or give a prior file that has them with "
+            "--also"
+        )
+        raise ConfigError(", ".join(files), "sensors", problem)
+    return {n.name: poses[n.name] for n in rig.nodes if n != reference}
+
+
+def star_text(poses: Mapping[str, np.ndarray], rig: Rig, form: str, files: Sequence[str]) -> bytes:
+    """A prior file (`[rigs.*.prior] source = "file"`) of these poses."""
+    T = {name: np.asarray(pose).tolist() for name, pose in poses.items()}
+    origin = {"format": form, "files": list(files)}
+    return to_json({"reference": reference_of_rig(rig).name, "T": T, "imported_from": origin})

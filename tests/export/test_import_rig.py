@@ -1,0 +1,148 @@
+"""Files of other programs as the prior of a whole rig: each sensor by its name, and what is missing or twice named."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from jobs.cli import main
+from pipeline.config import load_fleet
+from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
+from pipeline.export.files import write_files, written_files
+from pipeline.export.formats import FORMATS, format_named
+from pipeline.extrinsics.prior_file import read_star
+from pipeline.geometry.se3 import inverse
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import Sensor, tie
+from tests.makers.calibrations import CAMERA, random_transform
+
+TOP = Sensor("top", "lidar")
+OTHERS = (
+    Sensor("front", "camera"), Sensor("left", "camera"), Sensor("side", "lidar"),
+    Sensor("bumper", "radar"), Sensor("corner", "radar"),
+)  # fmt: skip
+FLEET = """
+[fleet]
+name = "vans"
+[rigs.van]
+reference = "top"
+[rigs.van.cameras]
+front = { image = "/f", info = "/fi" }
+left = { image = "/l", info = "/li" }
+[rigs.van.lidars]
+side = { points = "/side" }
+top = { points = "/top" }
+[rigs.van.radars]
+bumper = { points = "/bumper" }
+corner = { points = "/corner" }
+[vehicles."*"]
+rig = "van"
+"""
+T_TOP = dict(
+    zip((s.name for s in OTHERS), (random_transform(np.random.default_rng(k)) for k in range(5)), strict=True)
+)
+NAMES = {"front": "cam_front_optical", "corner": "ars548_fl", "side": "lidar_right"}
+
+
+def exported(folder, form, sensors=OTHERS):
+    ties = {s: tie(s, TOP) for s in OTHERS}
+    pairs = {}
+    for sensor, edge in ((s, ties[s]) for s in sensors):
+        T = T_TOP[sensor.name] if edge.parent == TOP else inverse(T_TOP[sensor.name])
+        pairs[words_of(edge)] = ExportedPair(words_of(edge), T, of=edge)
+    calibration = ExportedCalibration(
+        "van-1", "record", "joint", "0.11.0", pairs, known=tuple(ties.values()), names=FrameNames.named(NAMES),
+        cameras={"front": CAMERA, "left": CAMERA},
+    )  # fmt: skip
+    files = written_files(format_named(form), calibration, folder / form)
+    write_files(files)
+    return [str(f) for f in files]
+
+
+@pytest.fixture
+def fleet(tmp_path):
+    (tmp_path / "fleet.toml").write_text(FLEET)
+    return tmp_path / "fleet.toml"
+
+
+def imported(capsys, form, files, fleet, out, *more):
+    code = main(["import", form, *files, "--fleet", str(fleet), "--out", str(out), *map(str, more)])
+    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+@pytest.mark.parametrize("form", [f for f in FORMATS if format_named(f).write is not None])
+def test_every_format_comes_back_as_the_prior_of_all_sensors(form, fleet, tmp_path, capsys):
+    files = [
+        f
+        for f in exported(tmp_path, form)
+        if not f.endswith((".xacro", "_intrinsics.yaml")) or form == "xacro"
+    ]
+    files = [f for f in files if not f.endswith("launch.py")]
+    # A log has no side file that says what its frames are called.
+    names = (
+        [word for n, f in NAMES.items() for word in ("--frame", f"{n}={f}")] if form == "tf-static" else []
+    )
+    code, summary = imported(capsys, form, files, fleet, tmp_path / "prior.json", *names)
+    assert (code, summary.get("sensors", summary)) == (0, ["front", "left", "side", "bumper", "corner"])
+    star = read_star(tmp_path / "prior.json", load_fleet(fleet).rigs["van"])
+    for name, T in T_TOP.items():
+        np.testing.assert_allclose(star["top", name], T, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["urdf", "kalibr", "kitti", "opencv", "nuscenes"])
+def test_a_sensor_that_the_files_lack_is_named_and_taken_from_another_prior_where_one_is_given(
+    form, fleet, tmp_path, capsys
+):
+    files = exported(tmp_path, form, [s for s in OTHERS if s.name not in ("left", "corner")])
+    code, summary = imported(
+        capsys, form, files, fleet, tmp_path / "prior.json", "--frame", "corner=ars548_fl"
+    )
+    assert code == 2
+    assert "missing: left, corner (frame ars548_fl)" in summary["reason"]
+    assert form in summary["reason"]
+    assert not (tmp_path / "prior.json").exists()
+    T = {n: np.eye(4).tolist() for n in T_TOP}
+    (tmp_path / "old.json").write_text(json.dumps({"reference": "top", "T": T}))
+    out = tmp_path / "prior.json"
+    assert imported(capsys, form, files, fleet, out, "--also", tmp_path / "old.json")[0] == 0
+    star = read_star(out, load_fleet(fleet).rigs["van"])
+    np.testing.assert_array_equal(star["top", "corner"], np.eye(4))
+    np.testing.assert_allclose(star["top", "side"], T_TOP["side"], atol=1e-9)
+
+
+def test_a_sensor_that_stands_twice_is_named(fleet, tmp_path, capsys):
+    [first, *_] = exported(tmp_path, "urdf")
+    text = (tmp_path / "urdf" / "sensors.urdf").read_text()
+    other = tmp_path / "other.urdf"
+    other.write_text(re.sub(r'xyz="[^"]*"', 'xyz="0 0 0"', text, count=1))
+    code, summary = imported(capsys, "urdf", [first, str(other)], fleet, tmp_path / "prior.json")
+    assert code == 2
+    assert "cam_front_optical: stands there twice" in summary["reason"]
+    assert str(other) in summary["reason"]
+    chain = tmp_path / "kalibr" / "camchain.yaml"
+    exported(tmp_path, "kalibr")
+    chain.write_text(chain.read_text().replace("/left/image_raw", "/cam_front_optical/image_raw"))
+    code, summary = imported(capsys, "kalibr", [str(chain)], fleet, tmp_path / "prior.json")
+    assert code == 2
+    assert "one sensor stands there twice" in summary["reason"]
+
+
+def test_a_chain_whose_topics_name_no_camera_is_not_guessed_at(fleet, tmp_path, capsys):
+    exported(tmp_path, "kalibr", [s for s in OTHERS if s.name != "left"])
+    chain = tmp_path / "kalibr" / "camchain.yaml"
+    chain.write_text(chain.read_text().replace("/cam_front_optical/image_raw", "/cam0/image_raw"))
+    code, summary = imported(capsys, "kalibr", [str(chain)], fleet, tmp_path / "prior.json")
+    assert code == 2
+    assert "which is which is not said" in summary["reason"]
+
+
+def test_a_rig_is_named_where_the_fleet_has_several(fleet, tmp_path, capsys):
+    fleet.write_text(
+        FLEET + FLEET[FLEET.index("[rigs.van]") : FLEET.index("[vehicles")].replace("van", "bus")
+    )
+    files = exported(tmp_path, "matlab")
+    code, summary = imported(capsys, "matlab", files, fleet, tmp_path / "prior.json")
+    assert code == 2
+    assert "name one of van, bus with --rig" in summary["reason"]
+    assert imported(capsys, "matlab", files, fleet, tmp_path / "prior.json", "--rig", "bus")[0] == 0
