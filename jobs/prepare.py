@@ -87,7 +87,7 @@ def _days(
 ) -> list[Partition]:
     """Vehicle-days with observations, as wanted."""
     from pipeline.errors import ConfigError
-    from pipeline.fleet.pattern import check_day
+    from pipeline.store.partitions import check_day
     from pipeline.store.views import perceived_days
 
     for name, day in (("--from", from_day), ("--to", to_day)):

@@ -73,27 +73,20 @@ def _records(
         transform_of,
     )
     from pipeline.store.records import Assertion, last_assertion, read_records
-    from schemas.calibrations import CalibrationRecord
-    from schemas.drift import DriftFinding
-    from schemas.outcomes import OutcomeRow
-    from schemas.poses import PoseRow
-    from schemas.service_events import ServiceEvent
-    from schemas.states import StateRow
     from schemas.versions import TABLES
 
-    kinds: dict[str, tuple[type[Any], Callable[[list[Any]], list[Any]]]] = {
-        "calibrations": (CalibrationRecord, current_records),
-        "poses": (PoseRow, current_poses),
-        "drift": (DriftFinding, current_drift),
-        "states": (StateRow, current_states),
-        "outcomes": (OutcomeRow, list),
-        "service_events": (ServiceEvent, current_events),
+    kinds: dict[str, Callable[[list[Any]], list[Any]]] = {
+        "calibrations": current_records,
+        "poses": current_poses,
+        "drift": current_drift,
+        "states": current_states,
+        "outcomes": list,
+        "service_events": current_events,
     }
-    kind, current_of = kinds[table]
-    rows = read_records(lake, TABLES[table], kind, vehicle=vehicle, day=day)
+    rows: list[Any] = read_records(lake, TABLES[table], TABLES[table].row_type, vehicle=vehicle, day=day)
     rows = [r for r in rows if method in (None, getattr(r, "method", None))]
     names = [c.name for c in TABLES[table].columns]
-    chosen = current_of(rows) if current else rows
+    chosen = kinds[table](rows) if current else rows
     if current and table == "drift":  # vehicles that the last audit did not look at are none of what it said
         last = {last_assertion(lake, TABLES[table], m) for m in {r.method for r in chosen}}
         chosen = [r for r in chosen if Assertion(r.asserted_at, r.day, r.method) in last]

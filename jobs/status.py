@@ -42,19 +42,20 @@ def status(
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
     from pipeline.fleet.status import day_statuses
     from pipeline.store.data_files import data_files
-    from pipeline.store.partitions import Lake
+    from pipeline.store.partitions import Lake, check_day, days_after
     from pipeline.store.records import last_day, read_last, read_records
     from schemas.calibrations import CALIBRATIONS
     from schemas.drift import DRIFT, DriftFinding
     from schemas.outcomes import OUTCOMES, OutcomeRow
     from schemas.words import DAY_WORDS
 
+    check_day("to", to_day)
     tables = Lake.existing(lake)
     data_files(
         tables, CALIBRATIONS
     )  # records that a release before 0.6 wrote are named, and how to move them
     last = to_day or last_day(tables, OUTCOMES)
-    first = from_day or (None if last is None else _month_before(last))
+    first = from_day or (None if last is None else days_after(last, -30))
     rows = read_records(tables, OUTCOMES, OutcomeRow, first=first, last=last)
     method = method or _audited_method(tables, {r.method for r in rows if r.method})
     found = [s for s in day_statuses(rows, method) if vehicle in (None, s.vehicle)]
@@ -90,17 +91,6 @@ def _audited_method(lake: Lake, others: set[str]) -> str:
     if last is not None:
         return last.method
     return "joint" if "joint" in others or not others else min(others)
-
-
-def _month_before(day: str) -> str:
-    import datetime as dt
-
-    from pipeline.errors import ConfigError
-
-    try:
-        return (dt.date.fromisoformat(day) - dt.timedelta(days=30)).isoformat()
-    except ValueError as err:
-        raise ConfigError("command line", "to", f"{day!r} is no day of the form YYYY-MM-DD") from err
 
 
 def _print_table(days: Sequence[DayStatus], vehicles: Sequence[str]) -> None:

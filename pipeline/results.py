@@ -4,17 +4,43 @@ from __future__ import annotations
 
 import datetime as dt
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
-__all__ = ["Effort", "Outcome", "Progress", "measured", "silent"]
+__all__ = ["Effort", "MadeWhenAsked", "Outcome", "Progress", "measured", "silent"]
 
 _COUNTERS = Path("/proc/self/io")  # Linux: every read and write of the process, from the page cache too
 # progress(done, total, what): total 0 = unknown. Stages call it often; the job decides what a person sees.
 Progress = Callable[[int, int, str], None]
+
+
+Item = TypeVar("Item")
+
+
+class MadeWhenAsked(Sequence[Item]):
+    """Items that are put together when their turn comes: thousands wait, and a few are in work.
+
+    Args:
+        count: of the items.
+        make: puts one together, from its index.
+    """
+
+    def __init__(self, count: int, make: Callable[[int], Item]) -> None:
+        self._count, self._make = count, make
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> Item: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Item]: ...
+    def __getitem__(self, index: int | slice) -> Item | list[Item]:
+        places = range(self._count)[index]
+        return self._make(places) if isinstance(places, int) else [self._make(i) for i in places]
 
 
 def silent(done: int, total: int, what: str) -> None:

@@ -6,7 +6,6 @@ stand in table states, and so does the first accepted day of those that are not:
 
 from __future__ import annotations
 
-import datetime as dt
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
@@ -21,7 +20,7 @@ from pipeline.audit.references import first_accepted, read_kept
 from pipeline.audit.service import restart_of
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Edge
-from pipeline.store.partitions import Lake
+from pipeline.store.partitions import Lake, days_after, months_before
 from pipeline.store.records import first_day, last_day, read_columns
 from schemas.calibrations import CALIBRATIONS
 from schemas.service_events import ServiceEvent
@@ -77,7 +76,7 @@ class History:
         parts = [self.read(first, last)]
         driven = Counter(dict.fromkeys(asked, 0)) + _days_driven(parts[0])
         begin = dict.fromkeys({*asked, *parts[0].vehicles}, first)
-        for month, end in _months_before(first, _MONTHS_BACK):
+        for month, end in months_before(first, _MONTHS_BACK):
             sparse = {v for v in begin if driven[v] < fewest}
             if not sparse:
                 break
@@ -118,7 +117,7 @@ class History:
         until, last = window
         restart = {key: restart_of(events.get(key[0], ()), key[1], last) for key in asked}
         since = {
-            key: max(start, "" if (event := restart[key]) is None else _day_after(event.day))
+            key: max(start, "" if (event := restart[key]) is None else days_after(event.day, 1))
             for key, start in asked.items()
             if start is not None
         }
@@ -162,10 +161,6 @@ class History:
         return joined([records.at(kept)]) if faults else records
 
 
-def _day_after(day: str) -> str:
-    return (dt.date.fromisoformat(day) + dt.timedelta(days=1)).isoformat()
-
-
 def _edges(records: Estimates) -> list[tuple[str, Edge]]:
     """Vehicle and edge of each record."""
     names, edges = records.vehicles, records.edges
@@ -180,21 +175,13 @@ def _days_driven(records: Estimates) -> Counter[str]:
     )
 
 
-def _months_before(day: str, count: int) -> Iterator[tuple[str, str]]:
-    """First and last day of what lies before a day, by month, the latest first."""
-    end = dt.date.fromisoformat(day) - dt.timedelta(days=1)
-    for _ in range(count):
-        yield end.replace(day=1).isoformat(), end.isoformat()
-        end = end.replace(day=1) - dt.timedelta(days=1)
-
-
 def _months_until(lake: Lake, day: str) -> Iterator[tuple[str, str]]:
-    """The same, the earliest first, from the lake's first days on: in them lie most vehicles' references."""
-    months = list(_months_before(day, 12 * _YEARS_BACK))
+    """Months before a day, the earliest first, from the lake's first days on: in them lie most vehicles' references."""
+    months = list(months_before(day, 12 * _YEARS_BACK))
     begun = first_day(lake, CALIBRATIONS) or day
     for month, end in reversed([m for m in months if m[1] >= begun]):
-        until = min(end, (dt.date.fromisoformat(begun) + dt.timedelta(days=_FIRST_DAYS - 1)).isoformat())
+        until = min(end, days_after(begun, _FIRST_DAYS - 1))
         if month <= begun < end and until < end:
             yield begun, until
-            month = (dt.date.fromisoformat(until) + dt.timedelta(days=1)).isoformat()  # noqa: PLW2901
+            month = days_after(until, 1)  # noqa: PLW2901
         yield month, end

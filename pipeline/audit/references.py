@@ -19,7 +19,7 @@ from pipeline.audit.service import restart_of
 from pipeline.geometry.se3 import from_quaternion, to_quaternion
 from pipeline.rig.edges import edge_named
 from pipeline.rig.graph import Edge
-from pipeline.store.partitions import Lake
+from pipeline.store.partitions import Lake, days_after
 from pipeline.store.records import read_columns, read_latest
 from schemas.calibrations import CALIBRATIONS
 from schemas.service_events import ServiceEvent
@@ -65,7 +65,7 @@ def read_kept(
         count: accepted days that a reference takes.
     """
     first, last = window
-    eve = (dt.date.fromisoformat(first) - dt.timedelta(days=1)).isoformat()
+    eve = days_after(first, -1)
     rows = read_latest(lake, STATES, StateRow, first=eve, last=last, columns=_COLUMNS)
     # Of a night that was run again the last one counts.
     last_said = {(s.vehicle, _edge(s)): s for s in rows if s.method == method and s.pair != "pose"}

@@ -23,7 +23,15 @@ from pipeline.errors import ConfigError
 from pipeline.results import Progress
 from pipeline.rig.edges import edge_named
 from pipeline.rig.graph import EDGE_KINDS, KINDS, Edge, edge_between
-from pipeline.store.partitions import Lake, Partition, content_hash, last_possible_day, work_key
+from pipeline.store.partitions import (
+    Lake,
+    Partition,
+    check_day,
+    content_hash,
+    days_after,
+    last_possible_day,
+    work_key,
+)
 from pipeline.store.records import read_last
 from pipeline.work import Records, Task, Told, Window, Work
 from schemas.calibrations import DOF_NAMES
@@ -65,7 +73,7 @@ def work(task: Task) -> Work:
     latest = max(last_possible_day(), task.of.last or "")
     first, last = _window(task, last_audited_day(task.lake, latest))
     history = History(task.lake, method, latest)
-    history.read(_after(latest), None)  # days to come are named
+    history.read(days_after(latest, 1), None)  # days to come are named
     events = events_until(task.lake, last)
     enough = (FEWEST_DAYS, fleet.audit.reference_days)
     records, references = history.window((first, last), events, enough, fleet.named_vehicles)
@@ -132,21 +140,13 @@ def _window(task: Task, audited: str | None) -> tuple[str, str]:
     """First and last day; `audited` is the last one that has a record."""
     assert isinstance(task.of, Window), "an audit looks at all vehicles"
     for name, day in (("from", task.of.first), ("to", task.of.last)):
-        if day is not None:
-            try:
-                dt.date.fromisoformat(day)
-            except ValueError as err:
-                raise ConfigError("command line", name, f"{day!r} is no day of the form YYYY-MM-DD") from err
+        check_day(name, day)
     last = task.of.last or audited or "9999-12-31"
     days = task.fleet.audit.window_days
-    first = task.of.first or (dt.date.fromisoformat(last) - dt.timedelta(days=days - 1)).isoformat()
+    first = task.of.first or days_after(last, 1 - days)
     if first > last:
         raise ConfigError("command line", "from", f"{first} lies after the window's last day {last}")
     return first, last
-
-
-def _after(day: str) -> str:
-    return (dt.date.fromisoformat(day) + dt.timedelta(days=1)).isoformat()
 
 
 def _findings(

@@ -19,7 +19,7 @@ from pipeline.audit.service import events_until, restart_of, what_was_done
 from pipeline.audit.state_rows import fused, with_state
 from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.rig.graph import Edge
-from pipeline.store.partitions import Partition, content_hash, last_possible_day, work_key
+from pipeline.store.partitions import Partition, content_hash, days_after, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
 from pipeline.work import Records, Run, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS
@@ -48,7 +48,7 @@ def work(task: Task) -> Work:
     assert isinstance(task.of, Window), "states are of all vehicles"
     fleet, method = task.fleet, task.method or task.fleet.audit.method
     last = task.of.last or min(last_day(task.lake, CALIBRATIONS) or "", last_possible_day())
-    first = (dt.date.fromisoformat(last) - dt.timedelta(days=_DAYS_BACK - 1)).isoformat() if last else ""
+    first = days_after(last, 1 - _DAYS_BACK) if last else ""
     history = History(task.lake, method, last)
     records = history.read(first, last) if last else estimates_of(None)
     events = events_until(task.lake, last or None)
@@ -127,7 +127,7 @@ def _since(
     first, why = "", ""
     event = restart_of(events, edge, last)
     if event is not None:
-        first = (dt.date.fromisoformat(event.day) + dt.timedelta(days=1)).isoformat()
+        first = days_after(event.day, 1)
         why = f"after the {what_was_done(event)}"
     for finding in findings:
         is_own = (finding.parent_frame, finding.child_frame) == (edge.parent.name, edge.child.name)

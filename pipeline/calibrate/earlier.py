@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import datetime as dt
-
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.store.current import current_records, transform_of
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake, Partition, days_after
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
@@ -32,8 +30,8 @@ def accepted_before(lake: Lake, partition: Partition, method: str) -> Float[np.n
         CALIBRATIONS,
         CalibrationRecord,
         vehicle=partition.vehicle,
-        first=_days_before(partition.day, _CALENDAR_DAYS_BACK),
-        last=_days_before(partition.day, 1),
+        first=days_after(partition.day, -_CALENDAR_DAYS_BACK),
+        last=days_after(partition.day, -1),
         columns=_TRANSFORM,
     )
     wanted = ("camera_lidar", method, "accepted")
@@ -43,7 +41,3 @@ def accepted_before(lake: Lake, partition: Partition, method: str) -> Float[np.n
         if record.day in days and (record.pair, record.method, record.status) == wanted:
             return transform_of(record)
     return None
-
-
-def _days_before(day: str, days: int) -> str:
-    return (dt.date.fromisoformat(day) - dt.timedelta(days=days)).isoformat()

@@ -15,14 +15,14 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 from pipeline.config import FleetConfig
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
 from pipeline.fleet.ledger import Known, Ledger
 from pipeline.fleet.more_frames import MOST_TIMES_MORE, asks_for_more, spent_before, with_more_sweeps
 from pipeline.fleet.pattern import VehicleDay
-from pipeline.results import Outcome, Progress, silent
+from pipeline.results import MadeWhenAsked, Outcome, Progress, silent
 from pipeline.rig.edges import edge_named, words_of
 from pipeline.runner import Stage, try_stage
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
@@ -88,7 +88,7 @@ def run_night(
         else:
             known.append(day)
     ledger = Ledger(night.lake, [d.partition for d in known])
-    jobs, run = _Jobs(night, known, ledger), partial(_run_job, _shared(night))
+    jobs, run = _jobs(night, known, ledger), partial(_run_job, _shared(night))
     try:
         with closing(EXECUTORS[executor](run, jobs, workers, watch)) as results:
             for finished in results:
@@ -162,28 +162,18 @@ def _through_stages(task: Task, progress: Progress) -> DayOutcome:
     return replace(_summarise(partition, done), results=tuple(done))
 
 
-class _Jobs(Sequence[_Job]):
-    """What the workers are sent, each put together when its turn comes: thousands wait, and a few are in work."""
+def _jobs(night: Night, days: Sequence[VehicleDay], ledger: Ledger) -> Sequence[_Job]:
+    """What the workers are sent."""
 
-    def __init__(self, night: Night, days: Sequence[VehicleDay], ledger: Ledger) -> None:
-        self._night, self._days, self._ledger = night, days, ledger
-
-    def __len__(self) -> int:
-        return len(self._days)
-
-    @overload
-    def __getitem__(self, index: int) -> _Job: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[_Job]: ...
-    def __getitem__(self, index: int | slice) -> _Job | list[_Job]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        day, fleet = self._days[index], self._night.fleet
+    def job(index: int) -> _Job:
+        day, fleet = days[index], night.fleet
         vehicle = fleet.vehicle(day.partition.vehicle)
         own = {"vehicles": {day.partition.vehicle: vehicle}, "rigs": {vehicle.rig: fleet.rigs[vehicle.rig]}}
         # As in `_shared`; what lies in a bucket is there from everywhere.
         logs = tuple(Path(os.path.abspath(g)) if isinstance(g, Path) else g for g in day.logs)
-        return own, replace(day, logs=logs), self._ledger.known(day.partition)
+        return own, replace(day, logs=logs), ledger.known(day.partition)
+
+    return MadeWhenAsked(len(days), job)
 
 
 def _shared(night: Night) -> Night:

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from pipeline.store.partitions import Partition, is_day
+from pipeline.store.partitions import Partition, check_day, is_day
 from pipeline.store.remote_logs import LogPath, find_remote_logs
 
-__all__ = ["VehicleDay", "check_day", "find_vehicle_days"]
+__all__ = ["VehicleDay", "find_vehicle_days"]
 
 _SUFFIXES = (".mcap", ".bag", ".db3", ".zstd")
 _ROS2_FILES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")  # as `ingest` reads them from a folder
@@ -78,12 +78,6 @@ def _found(pattern: str) -> Mapping[_Owner, Iterable[LogPath]]:
         if match and is_day(match["day"]) and log.name.endswith(_SUFFIXES):
             found[match["day"], match["vehicle"]].append(log)
     return found
-
-
-def check_day(name: str, day: str | None) -> None:
-    """Raise ConfigError, naming the option, where a day is given that is no YYYY-MM-DD."""
-    if day is not None and not is_day(day):
-        raise ConfigError("command line", name, f"{day!r} is no day of the form YYYY-MM-DD")
 
 
 def _matcher(pattern: str) -> re.Pattern[str]:

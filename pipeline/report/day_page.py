@@ -11,8 +11,6 @@ from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, DamagedError
 from pipeline.report.day import PairView, answer_for, answered, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import SigmaPanel, residual_figure, sigma_figure
-from pipeline.report.in_use import InUseView
-from pipeline.report.overlays import Extrinsics
 from pipeline.report.page import render, write_page
 from pipeline.report.picture_file import write_picture
 from pipeline.report.pictures import scene_pictures
@@ -60,7 +58,7 @@ def write_day_page(
     fleet_link: str = "",
     pictures: bool = True,
     read: DayRead | None = None,
-    in_use: InUseView | None = None,
+    in_use: Mapping[str, Any] | None = None,
     files: Files | None = None,
 ) -> P:
     """Write the page of one vehicle-day.
@@ -134,12 +132,9 @@ def _content(
     records, findings = read.records, read.findings
     poses = day_poses(lake, partition, records)
     views = [pair_view(record) for record in records.values()]
-    of_three = drawn_records(records)
-    before, after = states_of(of_three) or (None, None)
-    labels = ("prior", _after_label(views))
-    offsets = time_offsets_of(of_three)
+    of_three, labels = drawn_records(records), ("prior", _after_label(views))
     drawn, residual_svg, no_pictures = (
-        _pictures(lake, partition, before, after, labels, offsets, pictures)
+        _pictures(lake, partition, of_three, labels, pictures)
         if pictures is not None
         else ([], "", "this page was asked for without pictures")
     )
@@ -151,7 +146,7 @@ def _content(
         "labels": labels,
         "scenes": drawn,
         "no_pictures": no_pictures,
-        "offsets": offsets.in_words(),
+        "offsets": time_offsets_of(of_three).in_words(),
         "rig_svg": rig_of_day(poses, records.values()),
         "sigma_svg": _sigma_svg(records),
         "residual_svg": residual_svg,
@@ -173,48 +168,29 @@ def _after_label(views: Sequence[PairView]) -> str:
 def _pictures(
     lake: Lake,
     partition: Partition,
-    before: Extrinsics | None,
-    after: Extrinsics | None,
+    records: Mapping[str, CalibrationRecord],
     labels: tuple[str, str],
-    offsets: TimeOffsets,
     config: ReportConfig,
 ) -> tuple[list[Any], Any, str]:
-    """Pictures, residuals, and why there are none; `after` is drawn with the day's time offsets, `before` had none."""
-    if before is None or after is None:
+    """Pictures, residuals, and why there are none; the result is drawn with its time offsets, the prior without."""
+    states, offsets = states_of(records), time_offsets_of(records)
+    if states is None:
         return [], "", "the records carry no prior"
+    before, after = states
     try:
-        return _drawn(lake, partition, before, after, labels, offsets, config)
+        if not has_frames(lake, partition):
+            return [], "", "the lake no longer has the day's frames and observations"
+        spread = spread_observations(lake, partition)
+        if not spread:
+            return [], "", "no frame of the day could be used"
+        at_prior, at_result = frame_residuals(spread, states, (TimeOffsets(), offsets))
+        there = [pair for pair in PAIRS if any(pair in pairs_of(o.sensors) for o in spread)]
+        residuals = residual_figure(at_prior, at_result, there)
+        scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, _SCENES, config)
     except DamagedError as err:
         lake.damage.append(str(err))
         return [], "", "the day's frames or observations cannot be read"
-
-
-def _drawn(
-    lake: Lake,
-    partition: Partition,
-    before: Extrinsics,
-    after: Extrinsics,
-    labels: tuple[str, str],
-    offsets: TimeOffsets,
-    config: ReportConfig,
-) -> tuple[list[Any], Any, str]:
-    """Pictures, residuals, and why there are none.
-
-    Raises:
-        DamagedError: a file cannot be read.
-    """
-    if not has_frames(lake, partition):
-        return [], "", "the lake no longer has the day's frames and observations"
-    spread = spread_observations(lake, partition)
-    if not spread:
-        return [], "", "no frame of the day could be used"
-    at_prior, at_result = frame_residuals(spread, (before, after), (TimeOffsets(), offsets))
-    there = [pair for pair in PAIRS if any(pair in pairs_of(o.sensors) for o in spread)]
-    residuals = residual_figure(at_prior, at_result, there)
-    scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, _SCENES, config)
-    pictures = [
-        scene_pictures([s], before, as_stamped(after, s.observation, offsets), labels)[0] for s in scenes
-    ]
+    pictures = [scene_pictures(s, before, as_stamped(after, s.observation, offsets), labels) for s in scenes]
     return pictures, residuals, "no frame of the day could be drawn"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,16 +38,7 @@ class ScenePictures:
     front: str
     shown: str  # in the front view, in words
     top: str
-    close_ups: list[tuple[str, str]]
-    zoom: int
-    window_deg: str
-
-
-def scene_pictures(
-    scenes: Sequence[Scene], before: Extrinsics, after: Extrinsics, labels: tuple[str, str]
-) -> list[ScenePictures]:
-    """Draw and encode all pictures of the chosen frames."""
-    return [_pictures(scene, before, after, labels) for scene in scenes]
+    close_ups: CloseUps | None
 
 
 def close_ups_of(scene: Scene, before: Extrinsics, after: Extrinsics) -> CloseUps:
@@ -64,9 +54,11 @@ def close_ups_of(scene: Scene, before: Extrinsics, after: Extrinsics) -> CloseUp
     return CloseUps(close_ups, zoom, f"{angle:.1f}")
 
 
-def _pictures(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> ScenePictures:
+def scene_pictures(
+    scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]
+) -> ScenePictures:
+    """Draw and encode all pictures of a chosen frame."""
     camera, lidar, radar = (sensor in scene.observation.sensors for sensor in SENSORS)
-    enlarged = close_ups_of(scene, before, after) if camera and lidar else CloseUps([], 1, "")
     kinds = ["lidar by range"] * lidar + ["moving radar clusters as white +"] * radar
     return ScenePictures(
         scene.frame.frame_index,
@@ -75,7 +67,5 @@ def _pictures(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple
         jpeg_uri(front_view(scene, before, after, labels)) if camera else "",
         ", ".join([*kinds, "detected road users as boxes"]).capitalize(),
         top_view(scene, before, after, labels) if lidar and radar else "",
-        enlarged.pairs,
-        enlarged.zoom,
-        enlarged.window_deg,
+        close_ups_of(scene, before, after) if camera and lidar else None,
     )

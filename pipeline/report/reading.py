@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -14,7 +13,7 @@ from pipeline.report.scenes import choose_frames
 from pipeline.rig.edges import edge_named, edge_order, words_of
 from pipeline.sections import ReportConfig
 from pipeline.store.current import current_poses, current_records, prior_of, transform_of
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake, Partition, days_after
 from pipeline.store.records import last_day, read_last, read_records
 from pipeline.store.tables import COLLECTED
 from pipeline.store.views import frames_of, ingested, observations_of, perceived
@@ -80,8 +79,8 @@ def fleet_records(lake: Lake, method: str, window_days: int) -> list[Calibration
         return [r for r in found if r.method == method]
 
     # Another method's records may be newer by more than a window.
-    records = records_from(_days_before(last, window_days - 1)) or records_from(None)
-    first = _days_before(max((r.day for r in records), default=last), window_days - 1)
+    records = records_from(days_after(last, 1 - window_days)) or records_from(None)
+    first = days_after(max((r.day for r in records), default=last), 1 - window_days)
     return current_records([r for r in records if r.day >= first])
 
 
@@ -122,10 +121,6 @@ def drawn_records(records: Mapping[str, CalibrationRecord]) -> dict[str, Calibra
 def drift_of(lake: Lake, method: str, vehicle: str) -> list[DriftFinding]:
     """What the last audit said of a vehicle."""
     return read_last(lake, DRIFT, DriftFinding, method, vehicle=vehicle)
-
-
-def _days_before(day: str, days: int) -> str:
-    return (dt.date.fromisoformat(day) - dt.timedelta(days=days)).isoformat()
 
 
 def states_of(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics, Extrinsics] | None:

@@ -6,17 +6,17 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path, PurePath
-from typing import Any, Protocol, overload, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 from urllib.parse import quote
 
 from pipeline.config import FleetConfig, config_hash
 from pipeline.report.day_page import DayRead, write_day_page
 from pipeline.report.names import page_name
 from pipeline.report.reading import records_of_day
-from pipeline.results import Progress, silent
+from pipeline.results import MadeWhenAsked, Progress, silent
 from pipeline.store.files import Files
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CalibrationRecord
@@ -119,7 +119,7 @@ def draw_days(
         if drawn[day].get(album.path(vehicle, day).name) != stamp
     ]
     open_pages = Counter(day for _, day in stale)
-    jobs = _Jobs(album, stale, findings)
+    jobs = _jobs(album, stale, findings)
     for job, found, error in fan_out(_draw, jobs, progress):
         vehicle, day = job.partition.vehicle, job.partition.day
         album.lake.damage.extend([f"page of {job}: {error}"] if error else found)
@@ -174,38 +174,23 @@ def _draw(job: DayJob, progress: Progress) -> list[str]:
     return found
 
 
-class _Jobs(Sequence[DayJob]):
-    """Pages to draw, each put together when its turn comes; records are read a day at a time."""
+def _jobs(
+    album: Album, vehicle_days: Sequence[tuple[str, str]], findings: Mapping[str, Sequence[DriftFinding]]
+) -> Sequence[DayJob]:
+    """Pages to draw; records are read a day at a time."""
+    # A worker is sent no vehicle's configuration: a page needs the fleet's name. It may be elsewhere, too.
+    fleet = album.fleet.model_copy(update={"vehicles": {}, "rigs": {}})
+    page = album.page.absolute() if isinstance(album.page, Path) else album.page
+    sent = replace(album, lake=album.lake.absolute(), fleet=fleet, page=page)
 
-    def __init__(
-        self,
-        album: Album,
-        vehicle_days: Sequence[tuple[str, str]],
-        findings: Mapping[str, Sequence[DriftFinding]],
-    ) -> None:
-        # A worker is sent no vehicle's configuration: a page needs the fleet's name.
-        fleet = album.fleet.model_copy(update={"vehicles": {}, "rigs": {}})
-        # A worker may be elsewhere.
-        page = album.page.absolute() if isinstance(album.page, Path) else album.page
-        lake = album.lake.absolute()
-        self._album = Album(lake, fleet, album.method, page, album.files, album.pictures)
-        self._days, self._findings = vehicle_days, findings
-        self._records = lru_cache(maxsize=2)(self._read)  # workers end a day while others begin the next
+    @lru_cache(maxsize=2)  # workers end a day while others begin the next
+    def records(day: str) -> dict[str, dict[str, CalibrationRecord]]:
+        among = {vehicle for vehicle, of in vehicle_days if of == day}
+        return records_of_day(sent.lake, sent.method, day, among)
 
-    def _read(self, day: str) -> dict[str, dict[str, CalibrationRecord]]:
-        among = {vehicle for vehicle, of in self._days if of == day}
-        return records_of_day(self._album.lake, self._album.method, day, among)
+    def job(index: int) -> DayJob:
+        vehicle, day = vehicle_days[index]
+        read = DayRead(records(day).get(vehicle, {}), findings.get(vehicle, ()))
+        return DayJob(sent, Partition(vehicle, day), read)
 
-    def __len__(self) -> int:
-        return len(self._days)
-
-    @overload
-    def __getitem__(self, index: int) -> DayJob: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[DayJob]: ...
-    def __getitem__(self, index: int | slice) -> DayJob | list[DayJob]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        vehicle, day = self._days[index]
-        read = DayRead(self._records(day).get(vehicle, {}), self._findings.get(vehicle, ()))
-        return DayJob(self._album, Partition(vehicle, day), read)
+    return MadeWhenAsked(len(vehicle_days), job)

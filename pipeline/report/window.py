@@ -7,7 +7,7 @@ hundred megabytes.
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,7 @@ from pipeline.rig.edges import edges_of_rows
 from pipeline.rig.graph import EDGE_KINDS, Edge
 from pipeline.store.columns import known_rows, matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
-from pipeline.store.partitions import Lake
+from pipeline.store.partitions import Lake, days_after, months_before
 from pipeline.store.records import first_day, last_day, read_columns
 from schemas.calibrations import CALIBRATIONS, STATUSES
 
@@ -85,16 +85,16 @@ def read_window(lake: Lake, method: str, window_days: int, latest: str) -> Fleet
     last = last_day(lake, CALIBRATIONS)
     if last is None:
         return _window_of(None)
-    first = _days_before(min(last, latest), window_days - 1)
+    first = days_after(min(last, latest), 1 - window_days)
     found = _read(lake, method, first, latest)
     if found is None:  # another method's records are newer by more than a window, or all of them are to come
         found = _read(lake, method, None, latest)
         if found is None:
             return _window_of(None)
-        first = _days_before(pc.max(found["day"]).as_py(), window_days - 1)
+        first = days_after(pc.max(found["day"]).as_py(), 1 - window_days)
         found = found.filter(pc.greater_equal(found["day"], first))
     parts, begun = [found], first_day(lake, CALIBRATIONS) or first
-    for month, end in _months_before(first):
+    for month, end in months_before(first, _MONTHS_BACK):
         rare = _rare(parts)
         if not rare or end < begun:
             break
@@ -161,15 +161,3 @@ def _estimates(found: pa.Table) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.nd
         of_change = change_covariance(T[is_there], covariance[is_there])
         sigma[is_there] = np.sqrt(np.maximum(np.diagonal(of_change, axis1=1, axis2=2), 0.0))
     return T, sigma
-
-
-def _months_before(day: str) -> Iterator[tuple[str, str]]:
-    """First and last day of what lies before a day, by month, the latest first."""
-    end = dt.date.fromisoformat(day) - dt.timedelta(days=1)
-    for _ in range(_MONTHS_BACK):
-        yield end.replace(day=1).isoformat(), end.isoformat()
-        end = end.replace(day=1) - dt.timedelta(days=1)
-
-
-def _days_before(day: str, days: int) -> str:
-    return (dt.date.fromisoformat(day) - dt.timedelta(days=days)).isoformat()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
@@ -18,7 +18,10 @@ from pipeline.names import is_vehicle
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.object_store import Bucket
 
-__all__ = ["Lake", "LostRows", "Partition", "content_hash", "is_day", "last_possible_day", "work_key"]
+__all__ = [
+    "Lake", "LostRows", "Partition", "check_day", "content_hash", "days_after", "is_day", "last_possible_day",
+    "months_before", "work_key",
+]  # fmt: skip
 
 
 def is_day(text: str) -> bool:
@@ -29,9 +32,28 @@ def is_day(text: str) -> bool:
         return False
 
 
+def check_day(name: str, day: str | None) -> None:
+    """Raise ConfigError, naming the option, where a day is given that is no YYYY-MM-DD."""
+    if day is not None and not is_day(day):
+        raise ConfigError("command line", name, f"{day!r} is no day of the form YYYY-MM-DD")
+
+
 def last_possible_day() -> str:
     """Tomorrow: elsewhere on earth it has begun; a drive of a later day cannot be."""
     return (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
+
+
+def days_after(day: str, days: int) -> str:
+    """The day of the calendar so many days later; earlier where `days` is negative."""
+    return (dt.date.fromisoformat(day) + dt.timedelta(days=days)).isoformat()
+
+
+def months_before(day: str, count: int) -> Iterator[tuple[str, str]]:
+    """First and last day of what lies before a day, by month, the latest first."""
+    for _ in range(count):
+        end = days_after(day, -1)
+        day = f"{end[:-2]}01"
+        yield day, end
 
 
 @dataclass(frozen=True, order=True)

@@ -204,7 +204,7 @@ def test_a_hostile_name_cannot_leave_its_place(tmp_path: Path, maker: ModuleType
     with pytest.raises(ConfigError):
         Partition("a/b", "2026-03-01")
     with pytest.raises(ConfigError):
-        _store(lake, records)
+        Partition(records[0].vehicle, records[0].day)
     hostile = "</script><script>alert(1)</script>"
     records = [replace(r, vehicle="v", work_key="k", reason=hostile, notes=[hostile]) for r in records]
     _store(lake, records)
