@@ -34,7 +34,7 @@ from pipeline.audit.state_rows import fused, pose_columns, with_state
 from pipeline.config import VerifyConfig
 from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.edges import edge_order
-from pipeline.rig.graph import Edge, Sensor, tie
+from pipeline.rig.graph import Edge, Sensor, is_one_of_each, tie
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_columns
@@ -85,7 +85,13 @@ def read_poses(lake: Lake, method: str, first: str, last: str) -> Poses:
     rows = list(zip(*(found[name].to_pylist() for name in names), strict=True))
     kinds = {(vehicle, sensor): kind for vehicle, _, sensor, kind, *_ in rows}
     referred = {vehicle: reference for vehicle, _, _, _, reference, *_ in rows}
-    references = {v: Sensor(r, kinds[v, r]) for v, r in referred.items() if (v, r) in kinds}
+    # Records of a rig with one sensor of each kind are of the adjusted poses: their states are its own.
+    of_vehicle = {v: [Sensor(s, kind) for (w, s), kind in kinds.items() if w == v] for v in referred}
+    references = {
+        v: Sensor(r, kinds[v, r])
+        for v, r in referred.items()
+        if (v, r) in kinds and not is_one_of_each(of_vehicle[v])
+    }
     ties = [
         tie(Sensor(sensor, kind), references[vehicle])
         if vehicle in references and sensor != reference == references[vehicle].name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.rig.graph import Edge
 from pipeline.store.current import current_records, transform_of
 from pipeline.store.partitions import Lake, Partition, days_after
 from pipeline.store.records import read_records
@@ -19,8 +20,10 @@ _CALENDAR_DAYS_BACK = 92
 _TRANSFORM = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
-def accepted_before(lake: Lake, partition: Partition, method: str) -> Float[np.ndarray, "4 4"] | None:
-    """T_camera_lidar of the vehicle's latest earlier day on which it was accepted; None where there is none.
+def accepted_before(
+    lake: Lake, partition: Partition, method: str, edge: Edge
+) -> Float[np.ndarray, "4 4"] | None:
+    """T_parent_child of an edge on the vehicle's latest earlier day on which it was accepted; None where there is none.
 
     No information about today's pose, so no part of the work key: the search looks there only where its other origins
     do not agree, and what it finds there is judged like anything else.
@@ -34,10 +37,13 @@ def accepted_before(lake: Lake, partition: Partition, method: str) -> Float[np.n
         last=days_after(partition.day, -1),
         columns=_TRANSFORM,
     )
-    wanted = ("camera_lidar", method, "accepted")
+    wanted = (edge.parent.name, edge.child.name, method, "accepted")
     records = current_records(found)
     days = sorted({r.day for r in records}, reverse=True)[:_DAYS_BACK]
     for record in reversed(records):
-        if record.day in days and (record.pair, record.method, record.status) == wanted:
+        if (
+            record.day in days
+            and (record.parent_frame, record.child_frame, record.method, record.status) == wanted
+        ):
             return transform_of(record)
     return None

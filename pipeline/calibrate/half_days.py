@@ -9,11 +9,12 @@ from jaxtyping import Float
 
 from pipeline.extrinsics.estimates import PairEstimate
 from pipeline.geometry.changes import change_between
+from pipeline.geometry.se3 import inverse
 from schemas.calibrations import PAIRS
 
 __all__ = ["half_days_of"]
 
-_SAME_M = 1e-6  # of a composed pose and the product of its factors
+_SAME = 1e-9  # rad and m: products of the same poses
 
 
 def half_days_of(
@@ -22,7 +23,7 @@ def half_days_of(
     """Changes of a pair from its estimate to its first and its last part, and their sigmas; None where it stayed.
 
     Args:
-        pair: which one; camera_radar composed of the other two changes as they do.
+        pair: which one; camera_radar changes as the other two do.
         estimates: by pair.
         faults: that the verdict of each pair names.
     """
@@ -33,11 +34,11 @@ def half_days_of(
     poses, sigmas = parts[pair]
     if pair == "camera_radar" and own.parts is None and len(parts) == len(PAIRS):
         (T_cl, s_cl), (T_lr, s_lr) = parts["camera_lidar"], parts["lidar_radar"]
-        product = estimates["camera_lidar"].T @ estimates["lidar_radar"].T
-        if np.abs(product - own.T).max() < _SAME_M:
-            poses, sigmas = [a @ b for a, b in zip(T_cl, T_lr, strict=True)], np.hypot(s_cl, s_lr)
+        # From where the other two have it, for its own pose is of all three.
+        back = inverse(estimates["camera_lidar"].T @ estimates["lidar_radar"].T) @ own.T
+        poses, sigmas = [a @ b @ back for a, b in zip(T_cl, T_lr, strict=True)], np.hypot(s_cl, s_lr)
     change = np.array([change_between(own.T, T) for T in poses])
-    if not change.any():
+    if np.abs(change).max() < _SAME:
         return None
     # A turn of the parent carries the child's origin along.
     shift = np.where(np.abs(change[:, 3:]).max() > 0, sigmas.max(axis=1) * np.linalg.norm(own.T[:3, 3]), 0.0)

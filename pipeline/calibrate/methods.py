@@ -86,7 +86,7 @@ class Method:
 
 _NETWORKS, _FILES = "pipeline.calibrate.networks:ssl_solver", "pipeline.calibrate.networks:ssl_settings"
 METHODS = (
-    Method("joint", "pipeline.calibrate.joint.solve:solve_joint", composed=("camera_radar",)),
+    Method("joint", "pipeline.calibrate.joint.solve:solve_joint"),
     Method(
         "tracking",
         "pipeline.calibrate.tracking.solve:solve_tracking",

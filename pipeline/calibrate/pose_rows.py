@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor
 from pipeline.rig.views import View
+from schemas.calibrations import CalibrationRecord
 from schemas.poses import PoseRow
 from schemas.versions import CODE_VERSION
 
@@ -35,6 +37,7 @@ def pose_rows(
     adjusted: AdjustedRig | None,
     views: Mapping[str, View],
     verify: VerifyConfig,
+    judged: Mapping[str, CalibrationRecord] | None = None,
 ) -> list[PoseRow]:
     """A row for each sensor; the reference's says that poses refer to it.
 
@@ -44,8 +47,25 @@ def pose_rows(
         adjusted: its poses; None where no edge had evidence.
         views: what each sensor sees, by name: a pose is certified where its sensor looks.
         verify: limits.
+        judged: by sensor, the record of its edge to the reference where that was judged at the adjusted pose, on
+            held-out frames too: what it says of the pose holds.
     """
-    return [_row(about, graph, sensor, adjusted, views, verify) for sensor in graph.sensors]
+    rows = [_row(about, graph, sensor, adjusted, views, verify) for sensor in graph.sensors]
+    return [_as_judged(row, (judged or {}).get(row.sensor)) for row in rows]
+
+
+def _as_judged(row: PoseRow, record: CalibrationRecord | None) -> PoseRow:
+    if record is None or record.status == "refused" or row.status == "refused":
+        return row
+    return replace(
+        row,
+        status=record.status,
+        reason=record.reason,
+        faults=record.faults,
+        determined=record.determined or [],
+        azimuth_sigma_rad=record.azimuth_sigma_rad,
+        elevation_sigma_rad=record.elevation_sigma_rad,
+    )
 
 
 def _row(

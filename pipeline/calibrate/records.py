@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 
 from pipeline.calibrate.half_days import half_days_of
-from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.judging import Judged
+from pipeline.calibrate.select.triggers import trigger_metrics
+from pipeline.calibrate.solved import SolvedDay
 from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
 from pipeline.calibrate.verify.failed_checks import loop_sigmas
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
-from pipeline.calibrate.verify.target_accuracy import Claim
-from pipeline.calibrate.verify.verdict import Verdict
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.spherical import camera_direction_angles
-from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.observations import Observation
@@ -28,8 +27,6 @@ from schemas.versions import CODE_VERSION
 
 __all__ = [
     "Inputs",
-    "Judged",
-    "SolvedDay",
     "environment_of",
     "record_of",
     "refused_record",
@@ -58,36 +55,11 @@ class Inputs:
     chosen: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Judged:
-    """The verdict on one pair and the evidence behind it."""
-
-    verdict: Verdict
-    test: HeldOutTest | None
-    claims: Mapping[str, Claim]
-    mounting_covariance: np.ndarray | None = None  # 6 6; None where nothing says how the camera hangs
-    targets: np.ndarray = field(default_factory=lambda: DEFAULT_TARGETS)  # 3 3, in the child's frame
-
-
-@dataclass(frozen=True)
-class SolvedDay:
-    """A day that was computed: what went in, what came out, and how each pair was judged."""
-
-    observations: Sequence[Observation]
-    selection: Selection
-    prior: Prior
-    solution: Solution
-    judged: Mapping[str, Judged]
-    trigger_before: Mapping[str, Mapping[str, float]]  # metrics of each pair at the prior
-    trigger_after: Mapping[str, Mapping[str, float]]  # and at the result
-    triggered: Mapping[str, bool]  # pairs with a metric beyond its threshold at the prior
-    numbers: Mapping[str, float] = field(default_factory=dict)  # of checks of the day, for every record
-
-
 def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
     """The record of one pair that was computed."""
     estimate, judged, selection = day.solution.pairs[pair], day.judged[pair], day.selection
     verdict, test = judged.verdict, judged.test
+    trigger_after = trigger_metrics(day.trigger_sample, {pair: estimate.T})[pair]
     return CalibrationRecord(
         **_identity(about, pair, len(day.observations), day.prior),
         **(
@@ -108,7 +80,7 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         environment=environment_of(day.observations),
         triggered=day.triggered[pair],
         trigger_before=dict(day.trigger_before[pair]),
-        trigger_after=dict(day.trigger_after[pair]),
+        trigger_after=dict(trigger_after),
         alignment_before=test.before if test else None,
         alignment_after=test.after if test else None,
         time_offset_s=estimate.time_offset_s,

@@ -1,20 +1,24 @@
-"""A day of a rig of any number of sensors: each edge by its own frames, then one adjustment over all of them.
+"""A day of a rig: each edge by its own frames, then one adjustment over all of them.
 
 An edge of two sensors is solved and judged as any pair is. What it finds enters the adjustment without its prior; an
-edge that failed a check of its own is left out. The adjusted poses are the answer, the edges' records their evidence.
+edge that failed a check of its own is left out. The adjusted poses are the answer. Of a rig with one sensor of each
+kind, whose frames are at hand together, records are of the adjusted poses too; else they are the edges' own evidence.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
-from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustmentLimits
-from pipeline.calibrate.adjust.evidence import evidence_of
-from pipeline.calibrate.adjust.rig import adjust
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.calibrate.adjust.adjusted import AdjustedRig
+from pipeline.calibrate.adjusted_day import adjusted_rig, clocks_of, evidence_of_day, judged_together
 from pipeline.calibrate.base_edges import BaseEdges
+from pipeline.calibrate.day import DayOfPairs, records_of, solve_day
 from pipeline.calibrate.edge_records import record_of_evidence, refused_edge
-from pipeline.calibrate.records import Inputs, SolvedDay
+from pipeline.calibrate.records import Inputs, refused_record
 from pipeline.calibrate.verify.constancy import moved_failures
 from pipeline.config import FleetConfig
 from pipeline.errors import SolveError
@@ -23,23 +27,17 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.extrinsics.prior import no_prior, trio_prior
 from pipeline.results import Progress
 from pipeline.rig.evidence import EdgeEvidence
-from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge, RigGraph
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import View
 from pipeline.store.views import Chosen
-from schemas.calibrations import CalibrationRecord
+from schemas.calibrations import SENSORS, CalibrationRecord
 from schemas.observations import Observation
 
 __all__ = ["CalibratedRig", "RigDay", "calibrate_rig"]
 
 PAIR_KINDS = ("camera_lidar", "camera_radar", "lidar_radar")  # estimated as pairs of three kinds of sensors
-
-# Of one pair's frames: its records, and the day where it was computed.
-_SolvePair = Callable[
-    [Sequence[Observation], Prior, Inputs], tuple[list[CalibrationRecord], SolvedDay | None]
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +50,7 @@ class RigDay:
         prior: of all sensors.
         views: what each sensor sees, by name.
         rows: observations of chosen sensors, in order of time; read when an edge is solved, and let go after it.
+        before: T_parent_child of an edge as an earlier day found it; None where none did.
     """
 
     rig: Rig
@@ -59,111 +58,128 @@ class RigDay:
     prior: RigPrior
     views: Mapping[str, View]
     rows: Callable[[Chosen], list[Observation]]
+    before: Callable[[Edge], Float[np.ndarray, "4 4"] | None] = lambda _: None
+
+    def prior_of(self, chosen: Chosen, edges: Sequence[Edge]) -> Prior:
+        """Of up to one camera, one lidar and one radar."""
+        prior = trio_prior(self.prior, self.rig, *(chosen.get(kind) for kind in SENSORS))
+        at = next((e for e in edges if e.kind == "camera_lidar"), None)
+        return replace(prior, T_camera_lidar_before=None if at is None else self.before(at))
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedRig:
-    """Records of all edges, and the adjusted rig; None where no edge has evidence."""
+    """Records of all edges, and the adjusted rig.
+
+    Args:
+        records: of every edge.
+        adjusted: None where no edge has evidence.
+        judged: records that were judged at the adjusted poses, by their sensor, of edges to the reference.
+    """
 
     records: list[CalibrationRecord]
     adjusted: AdjustedRig | None
+    judged: Mapping[str, CalibrationRecord]
 
 
-def calibrate_rig(
-    day: RigDay, fleet: FleetConfig, about: Inputs, solve_pair: _SolvePair, progress: Progress
-) -> CalibratedRig:
+def calibrate_rig(day: RigDay, fleet: FleetConfig, about: Inputs, progress: Progress) -> CalibratedRig:
     """Solve and judge each edge, then adjust poses and clocks of all sensors.
 
     Args:
         day: of the rig.
         fleet: limits and effort.
         about: what identifies the records.
-        solve_pair: selects, solves and judges one pair.
         progress: told about each edge.
     """
-    records, evidence, clocks = list[CalibrationRecord](), list[EdgeEvidence](), dict[Edge, float]()
-    estimates = dict[Edge, PairEstimate]()
-    edges, others = (
-        day.graph.edges,
-        BaseEdges(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows),
-    )
-    for done, edge in enumerate(edges):
-        progress(done, len(edges) + 1, f"calibrate {edge.name}")
-        if day.prior.between(edge.parent.name, edge.child.name) is None:
-            records.append(refused_edge(about, edge, no_prior(edge.name), 0))
-            continue
-        if edge.kind not in PAIR_KINDS:
-            try:
-                shown, frames = others.solve(edge)
-            except SolveError as err:
-                records.append(refused_edge(about, edge, err.reason, 0, err.fault))
-                continue
-            records.append(record_of_evidence(about, shown, day.prior, day.views, fleet, frames))
-            evidence.append(shown)
-            continue
-        chosen: Chosen = {s.kind: s.name for s in edge.sensors}
-        of_three = (chosen.get(kind) for kind in ("camera", "lidar", "radar"))
-        prior = trio_prior(day.prior, day.rig, *of_three)
-        absent: dict[str, str] = {
-            s.kind: about.absent[s.name] for s in edge.sensors if s.name in about.absent
-        }
-        of_pair = replace(about, pairs=(edge.kind,), chosen=chosen, absent=absent)
-        found, solved = solve_pair(day.rows(chosen), prior, of_pair)
-        records += found
-        if solved is not None:
-            estimate = solved.solution.pairs[edge.kind]
-            estimates[edge] = estimate
-            evidence.append(
-                evidence_of(estimate, edge, prior, fleet.solve.time_offset_sigma_s, _checks(solved, edge))
-            )
-            if estimate.time_offset_prior_s is not None:
-                clocks[edge] = estimate.time_offset_prior_s
-    progress(len(edges), len(edges) + 1, "adjust the rig")
-    moved = moved_failures(estimates, edges)
-    records = [_without_moved(r, moved.get(_edge_of(r, day.graph), ())) for r in records]
-    evidence = [replace(e, checks=e.checks or tuple(moved.get(e.edge, ()))) for e in evidence]
-    adjusted = _adjusted(day, evidence, clocks, fleet)
-    return CalibratedRig([_with_innovation(r, day.graph, adjusted) for r in records], adjusted)
-
-
-def _adjusted(
-    day: RigDay, evidence: Sequence[EdgeEvidence], clocks: Mapping[Edge, float], fleet: FleetConfig
-) -> AdjustedRig | None:
-    if not evidence:
-        return None
+    others = BaseEdges(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows)
+    found, done = _Found(), 0
+    for group in _groups(day.graph):
+        progress(done, len(day.graph.edges) + 1, f"calibrate {', '.join(edge.name for edge in group)}")
+        done += len(group)
+        if len(group) == 1 and day.prior.between(*(s.name for s in group[0].sensors)) is None:
+            found.records.append(refused_edge(about, group[0], no_prior(group[0].name), 0))
+        elif group[0].kind in PAIR_KINDS:
+            _solve_pairs(day, fleet, about, group, found)
+        else:
+            _solve_other(day, fleet, about, others, group[0], found)
+    progress(done, done + 1, "adjust the rig")
     prior = replace(day.prior, reference=day.graph.reference).extrinsics()
-    known = [e for e in evidence if {s.name for s in e.edge.sensors} <= set(prior.T)]
-    graph = _of_known(day.graph, prior)
-    limits = AdjustmentLimits(fleet.solve.time_offset_sigma_s)
-    return adjust(graph, replace(prior, dt_s=_expected_clocks(graph, clocks)), known, limits)
+    sigma_s = fleet.solve.time_offset_sigma_s
+    moved = moved_failures(found.estimates, day.graph.edges)
+    records = [_without_moved(r, moved.get(_edge_of(r, day.graph), ())) for r in found.records]
+    evidence = [replace(e, checks=e.checks or tuple(moved.get(e.edge, ()))) for e in found.evidence]
+    rig = adjusted_rig(day.graph, prior, evidence, found.clocks, sigma_s)
+    judged = list[CalibrationRecord]()
+    for of_pairs, solved, edges in found.together:
+        assert solved.solved is not None
+        again = judged_together(solved.solved, rig, edges)
+        judged += records_of(of_pairs, replace(solved, solved=again))
+    records += judged
+    order = {(e.parent.name, e.child.name): k for k, e in enumerate(day.graph.edges)}
+    records.sort(key=lambda r: order[r.parent_frame, r.child_frame])
+    ends = {frozenset((r.parent_frame, r.child_frame)): r for r in judged}
+    middle = day.graph.reference.name
+    to_middle = {s.name: ends[key] for s in day.graph.sensors if (key := frozenset((s.name, middle))) in ends}
+    records = [_with_innovation(r, day.graph, rig) for r in records]
+    return CalibratedRig(records, rig, to_middle)
 
 
-def _of_known(graph: RigGraph, prior: Extrinsics) -> RigGraph:
-    """The graph of the sensors whose prior pose is known; without one nobody knows where to begin."""
-    sensors = tuple(s for s in graph.sensors if s.name in prior.T)
-    return RigGraph(sensors, tuple(e for e in graph.edges if set(e.sensors) <= set(sensors)), graph.reference)
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What edges gave so far: records that are concluded, evidence, and days to be judged at the adjusted poses."""
+
+    records: list[CalibrationRecord] = field(default_factory=list)
+    evidence: list[EdgeEvidence] = field(default_factory=list)
+    clocks: dict[Edge, float] = field(default_factory=dict)
+    estimates: dict[Edge, PairEstimate] = field(default_factory=dict)
+    together: list[tuple[Inputs, DayOfPairs, Mapping[str, Edge]]] = field(default_factory=list)
 
 
-def _expected_clocks(graph: RigGraph, clocks: Mapping[Edge, float]) -> dict[str, float]:
-    """What is expected of each clock against the reference's, along the edges that time a sensor."""
-    timed = graph.with_edges(clocks)
-    found = {graph.reference.name: 0.0}
-    for sensor in graph.sensors:
-        at, offset_s = graph.reference, 0.0
-        for edge in timed.path(graph.reference, sensor) or ():
-            forward = edge.parent == at
-            offset_s += clocks[edge] if forward else -clocks[edge]
-            at = edge.other(at.name)
-        found[sensor.name] = offset_s
-    return found
+def _groups(graph: RigGraph) -> list[tuple[Edge, ...]]:
+    """Edges that are solved from one reading: all pairs of a rig with one sensor of each kind, else each alone."""
+    pairs = [edge for edge in graph.edges if edge.kind in PAIR_KINDS]
+    sensors = {sensor for edge in pairs for sensor in edge.sensors}
+    if not pairs or len({sensor.kind for sensor in sensors}) < len(sensors):
+        return [(edge,) for edge in graph.edges]
+    return [tuple(pairs), *((edge,) for edge in graph.edges if edge not in pairs)]
 
 
-def _checks(solved: SolvedDay, edge: Edge) -> list[FailedCheck]:
-    """Why an edge's evidence is not to be used: its verdict, unless nothing but a wide sigma held it."""
-    verdict = solved.judged[edge.kind].verdict
-    if verdict.status == "accepted" or (verdict.status == "held" and verdict.unsure_only):
-        return []
-    return [FailedCheck(verdict.reason, verdict.faults[0] if verdict.faults else "")]
+def _solve_pairs(
+    day: RigDay, fleet: FleetConfig, about: Inputs, group: Sequence[Edge], found: _Found
+) -> None:
+    chosen: Chosen = {sensor.kind: sensor.name for edge in group for sensor in edge.sensors}
+    absent: dict[str, str] = {kind: about.absent[n] for kind, n in chosen.items() if n in about.absent}
+    about = replace(about, pairs=tuple(edge.kind for edge in group), chosen=chosen, absent=absent)
+    rows, prior = day.rows(chosen), day.prior_of(chosen, group)
+    try:
+        solved = solve_day(rows, prior, fleet, about)
+    except SolveError as err:
+        found.records.extend(refused_record(about, pair, err, rows, prior, {}) for pair in about.pairs)
+        return
+    if solved.solved is None:
+        found.records.extend(records_of(about, solved))
+        return
+    edges = {edge.kind: edge for edge in group if edge.kind in solved.solved.solution.pairs}
+    found.evidence.extend(evidence_of_day(solved.solved, edges, fleet))
+    found.clocks.update(clocks_of(solved.solved, edges))
+    found.estimates.update({edges[pair]: e for pair, e in solved.solved.solution.pairs.items()})
+    if len(group) > 1:
+        found.together.append((about, solved, edges))
+    else:
+        found.records.extend(records_of(about, solved))
+
+
+def _solve_other(
+    day: RigDay, fleet: FleetConfig, about: Inputs, others: BaseEdges, edge: Edge, found: _Found
+) -> None:
+    """An edge that is no pair of camera, lidar and radar."""
+    try:
+        shown, frames = others.solve(edge)
+    except SolveError as err:
+        found.records.append(refused_edge(about, edge, err.reason, 0, err.fault))
+        return
+    found.records.append(record_of_evidence(about, shown, day.prior, day.views, fleet, frames))
+    found.evidence.append(shown)
 
 
 def _without_moved(record: CalibrationRecord, moved: Sequence[FailedCheck]) -> CalibrationRecord:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
+from pipeline.calibrate.day import calibrate_observations
+from pipeline.calibrate.earlier import accepted_before
 from pipeline.calibrate.edge_records import refused_edge
-from pipeline.calibrate.methods import Method
+from pipeline.calibrate.methods import method_named
 from pipeline.calibrate.pose_rows import pose_rows
-from pipeline.calibrate.records import Inputs, SolvedDay, refused_record, refused_records
+from pipeline.calibrate.records import Inputs, refused_records
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
-from pipeline.calibrate.stage import calibrate_day, calibrate_observations
 from pipeline.calibrate.three_sensors import three_sensors
 from pipeline.calibrate.verify.seen_targets import views_of
 from pipeline.errors import SolveError
@@ -21,7 +23,7 @@ from pipeline.extrinsics.prior import rig_prior, trio_prior
 from pipeline.results import Progress
 from pipeline.rig.graph import Edge, edge_between
 from pipeline.rig.overlap import find_edges, overlaps_of
-from pipeline.rig.prior import RigPrior, moved
+from pipeline.rig.prior import RigPrior, middle_of, moved
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import FRAMES, View
 from pipeline.store.moments import sensors_of
@@ -43,20 +45,14 @@ def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationR
     """
     fleet, rig = task.fleet, task.fleet.rig_of(task.partition.vehicle)
     day = _read(task, rig, about.seed)
-
-    def solve_pair(
-        rows: Sequence[Observation], prior: Prior, of_pair: Inputs
-    ) -> tuple[list[CalibrationRecord], SolvedDay | None]:
-        try:
-            return calibrate_day(rows, prior, fleet, of_pair)
-        except SolveError as err:
-            return [refused_record(of_pair, p, err, rows, prior, {}) for p in of_pair.pairs], None
-
-    found = calibrate_rig(day, fleet, about, solve_pair, progress)
-    return [*found.records, *pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify)]
+    found = calibrate_rig(day, fleet, about, progress)
+    return [
+        *found.records,
+        *pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify, found.judged),
+    ]
 
 
-def three_rows(task: Task, method: Method, about: Inputs, progress: Progress) -> list[CalibrationRecord]:
+def three_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord]:
     """Records of three sensors of the rig, by a method that knows one of each kind.
 
     Raises:
@@ -65,7 +61,7 @@ def three_rows(task: Task, method: Method, about: Inputs, progress: Progress) ->
     chosen, prior = three_of_day(task, about.seed)
     rows, of_three = _rows(task, chosen), replace(about, chosen=chosen, pairs=pairs_of(chosen))
     try:
-        solver = method.solver_of(task, chosen)
+        solver = method_named(about.method).solver_of(task, chosen)
         return calibrate_observations(rows, prior, task.fleet, of_three, progress, solver)
     except SolveError as err:
         return refused_records(of_three, err.reason, len(rows), prior, err.fault)
@@ -93,11 +89,10 @@ def _expected_edges(rig: Rig) -> tuple[Edge, ...]:
     if named:
         return named
     nodes = [node for node in rig.nodes if node.kind != "base"]
-    middle = next((n for n in nodes if n.name == rig.reference), nodes[0])
-    if rig.reference is None:
-        middle = min(nodes, key=lambda n: ("lidar", "radar", "camera").index(n.kind))
-    pairs = [(n, middle) for n in nodes if n != middle and n.kind != middle.kind]
-    return tuple(edge_between(a, b) for a, b in pairs)
+    if len({n.kind for n in nodes}) == len(nodes):
+        return tuple(edge_between(a, b) for a, b in combinations(nodes, 2))
+    middle = next((n for n in nodes if n.name == rig.reference), middle_of(nodes))
+    return tuple(edge_between(n, middle) for n in nodes if n.kind != middle.kind)
 
 
 def _read(task: Task, rig: Rig, seed: int) -> RigDay:
@@ -110,7 +105,15 @@ def _read(task: Task, rig: Rig, seed: int) -> RigDay:
         named=rig.named_edges,
         reference=None if rig.reference is None else nodes[rig.reference],
     )
-    return RigDay(rig, graph, prior, views, lambda chosen: _rows(task, chosen))
+    method = task.method or "joint"
+    return RigDay(
+        rig,
+        graph,
+        prior,
+        views,
+        lambda chosen: _rows(task, chosen),
+        lambda edge: accepted_before(task.lake, task.partition, method, edge),
+    )
 
 
 def _known(task: Task, rig: Rig, seed: int) -> tuple[RigPrior, dict[str, View]]:

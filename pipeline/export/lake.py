@@ -12,7 +12,7 @@ from pipeline.export.calibration import USABLE, ExportedPair, is_frame
 from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.edges import edge_named, edge_order, words_of
-from pipeline.rig.graph import Edge, Kind, Sensor, tie
+from pipeline.rig.graph import Edge, Kind, Sensor, is_one_of_each, tie
 from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
@@ -53,7 +53,8 @@ def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, E
 def pairs_of_poses(lake: Lake, vehicle: str, day: str | None, method: str) -> dict[Edge, ExportedPair | str]:
     """Each sensor against the reference as the day's adjusted rig, or without a day the vehicle's state, has it.
 
-    By the tie between them; none of a vehicle whose rig is not adjusted as a whole.
+    By the tie between them; none of a vehicle whose rig is not adjusted as a whole, nor of one with one sensor of each
+    kind, whose records are of the adjusted poses.
 
     Raises:
         ConfigError: as `pairs_of_day`, or no state of that vehicle and method is stored.
@@ -66,6 +67,8 @@ def pairs_of_poses(lake: Lake, vehicle: str, day: str | None, method: str) -> di
         poses = current_poses(read_records(lake, POSES, PoseRow, vehicle=vehicle, day=day))
         own = [(p.sensor, p.kind, p.reference, p) for p in poses if p.method == method]
     nodes = {s.name: s for edge in edges_of_vehicle(lake, vehicle, day, method) for s in edge.sensors}
+    if is_one_of_each(nodes.values()):
+        return {}
     nodes |= {name: Sensor(name, cast("Kind", kind)) for name, kind, *_ in own}
     ties = {tie(nodes[n], nodes[r]): (n, row) for n, _, r, row in own if n != r and r in nodes}
     return {edge: _pair_of_pose(ties[edge][1], ties[edge][0], edge) for edge in sorted(ties, key=edge_order)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -138,5 +137,6 @@ class Solution:
     loop_translation_m: float | None = None
     # By pair, checks that failed while solving: restarts or halves disagree, camera contradicts radar.
     failed_checks: dict[str, list[FailedCheck]] = field(default_factory=dict)
-    # Solves again whatever rests on the pairs named, without them; None where no pair rests on another.
-    without: Callable[[frozenset[str]], Solution] | None = None
+    apart: bool = (
+        False  # no pair rests on another's data: the adjustment of the rig says what they show together
+    )

@@ -21,6 +21,7 @@ __all__ = [
     "RigGraph",
     "Sensor",
     "edge_between",
+    "is_one_of_each",
     "possible_edges",
     "tie",
 ]
@@ -117,6 +118,11 @@ def tie(a: Sensor, b: Sensor) -> Edge:
         ValueError: a sensor and itself.
     """
     return Edge(*sorted((a, b), key=lambda s: (KINDS.index(s.kind), s.name)))
+
+
+def is_one_of_each(sensors: Collection[Sensor]) -> bool:
+    """At most one camera, one lidar and one radar, and no vehicle frame: a rig whose records are of adjusted poses."""
+    return BASE not in sensors and len({s.kind for s in sensors}) == len(sensors)
 
 
 def _no_edge(a: Sensor, b: Sensor) -> str:

@@ -31,8 +31,8 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import load_fleet
 from pipeline.errors import SolveError
 from pipeline.extrinsics.prior import perturbed, read_prior

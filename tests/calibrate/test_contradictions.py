@@ -5,10 +5,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import FleetConfig
-from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, perturb_exactly
 from pipeline.geometry.targets import errors_at_targets
@@ -82,7 +81,7 @@ def test_a_radar_that_repeats_one_scan_certifies_nothing_however_sure_held_out_f
 def test_a_registration_that_the_camera_contradicts_is_not_accepted(street):
     records = records_of(street)
     fine = records["lidar_radar"]
-    assert "without the lidar" not in fine.reason
+    assert "contradict" not in fine.reason
     assert fine.status == "accepted"
     assert fine.determined == ["azimuth"]
     assert any("intrinsics as logged" in a and "0.1 %" in a for a in records["camera_radar"].assumptions)
@@ -91,7 +90,8 @@ def test_a_registration_that_the_camera_contradicts_is_not_accepted(street):
     turned = records_of(with_turned_statics(street, 3.0))
     for pair in ("lidar_radar", "camera_radar"):
         assert turned[pair].status == "held"
-        assert "without the lidar yaw turns by" in turned[pair].reason
+        assert "contradict" in turned[pair].reason
+        assert turned[pair].faults == ["witnesses_disagree"]
         assert turned[pair].score < 0
         assert turned[pair].determined == []
 
@@ -168,27 +168,6 @@ def test_frames_that_ingest_was_told_to_pair_are_not_thrown_away_by_another_gate
         assert found["camera_lidar"].frames_used >= 12
 
 
-def test_what_rests_on_a_pair_that_is_not_accepted_is_solved_again_until_nothing_does(street):
-    asked = []
-
-    def at_prior(pair, T):
-        unknown = np.zeros(6, bool)
-        return PairEstimate(pair, T, PRIOR.covariance(pair), np.zeros(6), unknown, 40)
-
-    def solution(disbelieved):
-        asked.append(disbelieved)
-        pairs = {pair: at_prior(pair, PRIOR.of(pair)) for pair in PAIRS}
-        checks = {} if disbelieved else {"camera_lidar": [FailedCheck("lost")]}
-        return Solution("joint", pairs, None, None, checks, solution)
-
-    records = records_of(street, solver=lambda *_, **__: solution(frozenset()))
-    # Nothing here determines anything, so both are held in the end, and each was taken out once.
-    assert asked[0] == frozenset()
-    assert asked[-1] == frozenset({"camera_lidar", "lidar_radar"})
-    assert len(asked) <= 3
-    assert {r.status for r in records.values()} == {"held"}
-
-
 def test_a_pose_beyond_the_search_range_is_disproved_and_one_that_is_only_unsure_is_not(street):
     def solved(metres):
         T = PRIOR.T_lidar_radar.copy()
@@ -203,5 +182,4 @@ def test_a_pose_beyond_the_search_range_is_disproved_and_one_that_is_only_unsure
         return records_of(street, solver=lambda *_, **__: Solution("joint", estimates))
 
     assert solved(0.75)["lidar_radar"].diagnostics["disproved"] == 1.0
-    assert solved(0.75)["camera_radar"].diagnostics["disproved"] == 1.0  # composed of it
     assert solved(0.02)["lidar_radar"].diagnostics["disproved"] == 0.0

@@ -5,17 +5,21 @@ import pytest
 
 from pipeline.calibrate.earlier import accepted_before
 from pipeline.geometry.se3 import to_quaternion
+from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.makers.lakes import write_records
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
+CAMERA_LIDAR = EDGE_OF_PAIR["camera_lidar"]
+
 
 def record(day, shift_m, status="accepted", method="joint", pair="camera_lidar"):
     qw, qx, qy, qz = (float(v) for v in to_quaternion(T_CAMERA_LIDAR))
+    parent, child = pair.split("_")
     tx, ty, tz = (float(v) for v in T_CAMERA_LIDAR[:3, 3] + [shift_m, 0, 0])
     return CalibrationRecord(
-        vehicle="v", day=day, method=method, pair=pair, parent_frame="camera", child_frame="lidar",
+        vehicle="v", day=day, method=method, pair=pair, parent_frame=parent, child_frame=child,
         status=status, reason="", work_key=f"{day}{method}{pair}{status}", code_version="0", seed=0,
         qw=qw, qx=qx, qy=qy, qz=qz, tx_m=tx, ty_m=ty, tz_m=tz,
     )  # fmt: skip
@@ -37,7 +41,7 @@ def lake(tmp_path):
 
 
 def shift_of(lake, day, method="joint"):
-    found = accepted_before(lake, Partition("v", day), method)
+    found = accepted_before(lake, Partition("v", day), method, CAMERA_LIDAR)
     return None if found is None else round(float(found[0, 3] - T_CAMERA_LIDAR[0, 3]), 6)
 
 
@@ -50,7 +54,7 @@ def test_the_last_accepted_camera_lidar_before_the_day_is_taken(lake):
 
 def test_a_vehicle_without_an_accepted_day_has_none(lake):
     assert shift_of(lake, "2026-03-01") is None
-    assert accepted_before(lake, Partition("w", "2026-03-06"), "joint") is None
+    assert accepted_before(lake, Partition("w", "2026-03-06"), "joint", CAMERA_LIDAR) is None
 
 
 def test_a_damaged_record_of_another_day_costs_that_day_only(lake):

@@ -7,8 +7,8 @@ import pytest
 from mcap.reader import make_reader
 
 from jobs.cli import main
+from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import load_fleet
 from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.targets import errors_at_targets

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import load_fleet
 from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import perturbed, read_prior

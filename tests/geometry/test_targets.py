@@ -8,10 +8,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.calibrate.records import Inputs, Judged, SolvedDay, record_of
+from pipeline.calibrate.judging import Judged, Judging
+from pipeline.calibrate.records import Inputs, record_of
 from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.solved import SolvedDay
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.calibrate.verify.verdict import Verdict
+from pipeline.config import FleetConfig
 from pipeline.evaluate.comparison import compare, current_runs
 from pipeline.evaluate.table import as_markdown, as_parquet, table_rows
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
@@ -111,7 +114,9 @@ def make_run(method="joint", seed=0, key="k1", off_deg=0.2, speed=10.0):
     claims = dict.fromkeys(("azimuth", "elevation"), Claim(0.003, 0.0, 0.003, 0.002, 0.007, 0.995))
     judged = dict.fromkeys(PAIRS, Judged(Verdict("accepted", ""), None, claims))
     metrics, fired = {p: {} for p in PAIRS}, dict.fromkeys(PAIRS, True)
-    solved = SolvedDay(day, selection, prior, Solution(method, pairs), judged, metrics, metrics, fired)
+    solution = Solution(method, pairs)
+    judging = Judging(day, selection, prior, FleetConfig.model_construct(), PAIRS, None)
+    solved = SolvedDay(day, selection, prior, solution, judged, empty, judging, [], metrics, fired)
     return [record_of(about, p, solved) for p in PAIRS]
 
 

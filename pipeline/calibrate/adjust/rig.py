@@ -63,7 +63,7 @@ def adjust(
         used = [e for e in evidence if e.edge not in failed]
         rig, equations = _solved(Rig.at(prior, limits.clock_sigma_s, evidence), used)
         found = _innovations(graph, rig, equations, [e for e in evidence if e.edge in failed])
-        worst = _worst(equations, found, limits)
+        worst = _worst(graph, equations, found, limits)
         if worst is None:
             break
         wrong, rivals, sigmas = worst
@@ -120,14 +120,17 @@ def _innovations(
 
 
 def _worst(
-    equations: Equations, found: Mapping[Edge, tuple[float, float]], limits: AdjustmentLimits
+    graph: RigGraph, equations: Equations, found: Mapping[Edge, tuple[float, float]], limits: AdjustmentLimits
 ) -> tuple[Edge, tuple[Edge, ...], float] | None:
     """The edge to leave out, those that it cannot be told from, and its sigmas; None where none contradicts."""
     tested = {e.evidence.edge: e for e in equations.edges if e.evidence.edge in found}
     if not tested:
         return None
-    # One false alarm a rig, not an edge: the limit's probability is shared among all that are tested.
-    limit = float(norm.isf(norm.sf(limits.innovation_sigmas) / len(tested)))
+    # One false alarm a rig, not an edge: the limit's probability is shared among the cycles, for the edges of one cycle
+    # are all as far from the others.
+    limit = float(
+        norm.isf(norm.sf(limits.innovation_sigmas) / max(len(graph.with_edges(tested).cycles()), 1))
+    )
     beyond = {edge: found[edge][0] for edge in tested if found[edge][1] > limit}
     if not beyond:
         return None

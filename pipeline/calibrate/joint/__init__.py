@@ -1,1 +1,1 @@
-"""Method `joint`: camera-lidar and lidar-radar by direct optimisation, camera-radar composed of them."""
+"""Method `joint`: camera-lidar, lidar-radar and camera-radar by direct optimisation, each by its own data."""

@@ -1,8 +1,7 @@
 """Camera-radar without the lidar: moving clusters against boxes in azimuth, detections in boxes in elevation.
 
-Its translation stays at the prior (angles of far objects hardly depend on it). Method `joint` composes camera-radar
-from the other two pairs; this independent estimate is what that composition is checked against, and the result where a
-rig or a day has no lidar.
+Its translation stays at the prior (angles of far objects hardly depend on it), and its azimuth is known to a quarter of
+a degree: alone it is held, in the adjustment it checks the lidar's pairs and gives a radar its roll.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Checks of method `joint` on its own estimates: origins of the search, halves, the camera, the loop.
+"""Checks of method `joint` on its own estimates: origins of the search, halves, elevations.
 
 Each returns one value per failed check; none where all is well.
 """
@@ -6,14 +6,13 @@ Each returns one value per failed check; none where all is well.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin
 from pipeline.calibrate.joint.lidar_radar.tilt_floors import radar_tilt_axes
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate
 
-__all__ = ["lidar_radar_failures", "open_loop", "unvouched_basin"]
+__all__ = ["lidar_radar_failures", "unvouched_basin"]
 
 _SIGMAS = 3.0
 # Restarts end before the last steps: only what would be another basin counts, and only in what is claimed.
@@ -60,27 +59,6 @@ def lidar_radar_failures(estimate: PairEstimate) -> list[FailedCheck]:
                 f"the registration would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
             )
     return [FailedCheck(sentence, "witnesses_disagree") for sentence in failed]
-
-
-def open_loop(
-    difference: Float[np.ndarray, " 3"], sigma: Float[np.ndarray, " 3"], known: Bool[np.ndarray, " 3"]
-) -> list[FailedCheck]:
-    """Camera-radar without the lidar contradicts the composed one.
-
-    Args:
-        difference: rotation vector from the estimate without the lidar to the composed one, camera axes [rad].
-        sigma: of it.
-        known: axes that the estimate without the lidar determined.
-    """
-    return [
-        FailedCheck(
-            f"without the lidar {name} turns by {np.degrees(d):+.2f} deg against the loop, "
-            f"sigma {np.degrees(s):.2f} deg",
-            "witnesses_disagree",
-        )
-        for name, d, s, k in zip(("pitch", "yaw", "roll"), -difference, sigma, known, strict=True)
-        if k and abs(d) > _SIGMAS * s
-    ]
 
 
 def _size(k: int, value: float) -> str:

@@ -34,7 +34,6 @@ class FoundDay:
     selection: Selection
     prior: Prior
     solution: Solution
-    composed: Sequence[str]  # pairs that the method composes of the others
     fleet: FleetConfig
     limits: VerdictLimits
     motion: MotionFindings
@@ -51,17 +50,6 @@ def _motion(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
 def _solver(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
     """What the solver's own checks found."""
     return day.solution.failed_checks
-
-
-def _contradictions(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
-    """Checks that only a composed pair failed speak against a factor: two sensors contradict the third's registration.
-
-    Camera and lidar know their pose ten times better than either knows the radar's, so lidar-radar is held.
-    """
-    of_pair = day.solution.failed_checks
-    known = {check for p in PAIRS if p not in day.composed for check in of_pair.get(p, [])}
-    own = [check for p in day.composed for check in of_pair.get(p, []) if check not in known]
-    return {"lidar_radar": own}
 
 
 def _heading(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
@@ -99,7 +87,6 @@ def _alarms(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
 DAY_CHECKS: tuple[DayCheck, ...] = (
     _motion,
     _solver,
-    _contradictions,
     _heading,
     _loop,
     _scenes,

@@ -88,13 +88,12 @@ def with_label_offset(solution: Solution, observations: Sequence[Observation]) -
 
 
 def _applied(solution: Solution, offset: LabelOffset, focal_px: Float[np.ndarray, " 2"]) -> Solution:
-    failed, without = dict(solution.failed_checks), solution.without
+    failed = dict(solution.failed_checks)
     if offset.is_beside:
         found = FailedCheck(offset.sentence, "labels_offset")
         failed["camera_lidar"] = [*failed.get("camera_lidar", []), found]
     pairs = solution.pairs | {"camera_lidar": _widened(solution.pairs["camera_lidar"], offset, focal_px)}
-    again = None if without is None else lambda named: _applied(without(named), offset, focal_px)
-    return replace(solution, pairs=pairs, failed_checks=failed, without=again)
+    return replace(solution, pairs=pairs, failed_checks=failed)
 
 
 def _widened(estimate: PairEstimate, offset: LabelOffset, focal_px: Float[np.ndarray, " 2"]) -> PairEstimate:

@@ -92,7 +92,7 @@ def judge(
     limits: VerdictLimits,
     *,
     triggered: bool = True,
-    factors: Sequence[Verdict] = (),
+    together: bool = False,
 ) -> Verdict:
     """Decide on one pair.
 
@@ -103,16 +103,13 @@ def judge(
         search: how far from the prior the solver looked.
         limits: thresholds.
         triggered: False where no trigger asked for this pair, so that it was not estimated.
-        factors: verdicts of the pairs that this one is composed of; empty where it was estimated. A composed pair is as
-            good as its factors: how far it moved is checked there, and it need not align better on its own held-out
-            frames, but it may not align worse, nor may they contradict it.
+        together: whether other pairs have a say in the pose. How far the pair moved is checked where each of them was
+            judged apart, and it need not align better on its own held-out frames; but it may not align worse, nor may
+            they contradict it.
     """
     if not triggered:
         return Verdict("held", "not triggered: the prior stays", _FAILED)
-    held_factors = [f for f in factors if f.status != "accepted"]
-    faults = dict.fromkeys(
-        [*faults_of(evidence.failed_checks), *(name for f in held_factors for name in f.faults)]
-    )
+    faults = dict.fromkeys(faults_of(evidence.failed_checks))
     if estimate.frames_used < limits.min_fit_frames:
         few = f"too few frames: {estimate.frames_used}, needs {limits.min_fit_frames}"
         sentences = [check.sentence for check in evidence.failed_checks]
@@ -120,10 +117,7 @@ def judge(
     checks = [_Check(_FAILED, check.sentence, check.disproves) for check in evidence.failed_checks]
     if estimate.disproved:
         checks.append(_Check(_FAILED, estimate.disproved, disproves=True))
-    if factors:
-        margin = _FAILED if held_factors else min(f.score for f in factors)
-        of_sigma = all(f.unsure_only for f in held_factors)
-        checks.append(_Check(margin, "composed of a pair that is not accepted", of_sigma=of_sigma))
+    if together:
         checks += _aligns_no_worse(estimate, prior, evidence.held_out, limits)
     else:
         checks += _moves_little(estimate, prior, search, limits)
@@ -134,7 +128,7 @@ def judge(
     score = min(1.0, *(c.margin for c in checks))
     failed = [c for c in checks if c.margin < 0]
     if failed:
-        disproved = any(c.disproves for c in failed) or any(f.disproved for f in factors)
+        disproved = any(c.disproves for c in failed)
         unsure_only = all(c.of_sigma for c in failed)
         reasons = "; ".join(c.reason for c in failed)
         named = tuple(faults | dict.fromkeys(c.fault for c in failed if c.fault))
@@ -204,7 +198,7 @@ def _aligns_better(
 def _aligns_no_worse(
     estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: VerdictLimits
 ) -> list[_Check]:
-    """Of a composed pair: no worse than a prior that the result, by its own sigma, contradicts."""
+    """Where others have a say in the pose: no worse than a prior that the result, by its sigma, contradicts."""
     if test is None:
         return []
     _, ratio = _largest_move(estimate, prior)

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.audit.days import PairDays, pair_days
+from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import AuditConfig, FleetConfig, load_fleet
 from pipeline.errors import SolveError
 from pipeline.extrinsics.prior import read_prior

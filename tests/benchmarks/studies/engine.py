@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.stage import calibrate_observations
 from pipeline.config import FleetConfig, SolveConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.networks import ssl_solver
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.stage import calibrate_observations
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between

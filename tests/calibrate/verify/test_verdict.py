@@ -96,12 +96,6 @@ def test_the_faults_that_failed_checks_name_reach_the_verdict_each_once():
     assert verdict(estimate(1.5), BETTER).faults == ()
 
 
-def test_a_composed_pair_names_the_faults_of_the_factor_that_is_held():
-    bad = verdict(estimate(1.5), BETTER, failed=[FailedCheck("turned at noon", "moved_in_day")])
-    good = verdict(estimate(1.5), BETTER)
-    assert verdict(estimate(1.0), BETTER, factors=[good, bad]).faults == ("moved_in_day",)
-
-
 def test_a_pose_far_from_its_prior_names_the_prior():
     assert verdict(estimate(8.5), BETTER).faults == ("prior",)
     assert verdict(estimate(0.5, 0.31), BETTER).faults == ("prior",)
@@ -130,24 +124,18 @@ def test_a_day_that_determines_nothing_is_held():
     assert "no degree of freedom" in verdict(estimate(0.0, observable=[0] * 6), SAME).reason
 
 
-def test_a_composed_pair_moves_as_far_as_its_factors_do():
+def test_a_pair_whose_pose_others_have_a_say_in_may_move_as_far_as_they_do():
     """Two turns within the search range, or one shift of a lever arm, may add up to more than one range."""
-    good = verdict(estimate(1.5), BETTER)
     far = estimate(12.0, 0.4)
     assert verdict(far, BETTER).status == "held"
-    assert verdict(far, BETTER, factors=[good, good]).status == "accepted"
+    assert verdict(far, BETTER, together=True).status == "accepted"
 
 
-def test_a_composed_pair_is_as_good_as_its_factors():
-    good, bad = verdict(estimate(1.5), BETTER), verdict(estimate(1.5), WORSE)
-    assert verdict(estimate(1.0), SAME, factors=[good, good]).status == "accepted"
-    assert (
-        verdict(estimate(1.0), BETTER, factors=[good, bad]).reason
-        == "composed of a pair that is not accepted"
-    )
-    assert "align worse" in verdict(estimate(1.0), WORSE, factors=[good, good]).reason
-    # The composed prior may by chance be better; within the result's sigma that contradicts nothing.
-    assert verdict(estimate(0.2), WORSE, factors=[good, good]).status == "accepted"
+def test_a_pair_whose_pose_others_have_a_say_in_need_not_align_better_but_no_worse():
+    assert verdict(estimate(1.0), SAME, together=True).status == "accepted"
+    assert "align worse" in verdict(estimate(1.0), WORSE, together=True).reason
+    # The prior may by chance be better; within the result's sigma that contradicts nothing.
+    assert verdict(estimate(0.2), WORSE, together=True).status == "accepted"
 
 
 def test_a_radar_answers_only_for_the_moves_that_held_out_frames_score():
@@ -214,9 +202,6 @@ def test_the_score_is_the_smallest_margin_and_ranks():
     assert scores == sorted(scores, reverse=True)
     assert scores[1] > 0 > scores[2]
     assert verdict(estimate(1.5), BETTER, failed=["x"]).score < 0
-    weak = verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(0.06)})
-    strong = verdict(estimate(1.0), BETTER)
-    assert verdict(estimate(1.0), BETTER, factors=[weak, strong]).score == weak.score
 
 
 def test_too_few_frames_are_refused():

@@ -1,0 +1,168 @@
+"""What the pairs of a day show together: one adjustment over their evidence, and each pair judged again where it ends.
+
+An edge that failed a check is left out and keeps its own pose and verdict. One that shows too little to be judged by
+itself, as camera and radar mostly do, is certified by what the adjustment makes of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustmentLimits
+from pipeline.calibrate.adjust.evidence import evidence_of
+from pipeline.calibrate.adjust.rig import adjust
+from pipeline.calibrate.judging import Judged
+from pipeline.calibrate.numerics.covariance import OBSERVABLE
+from pipeline.calibrate.solved import SolvedDay
+from pipeline.config import FleetConfig
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.estimates import PairEstimate, Solution
+from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.graph import Edge, RigGraph
+
+__all__ = ["adjusted_rig", "clocks_of", "evidence_of_day", "judged_together"]
+
+_SIGMAS = 3.0  # by which an edge that is left out contradicts the rest
+
+
+def evidence_of_day(day: SolvedDay, edges: Mapping[str, Edge], fleet: FleetConfig) -> list[EdgeEvidence]:
+    """What pairs hand over: their evidence, and why not to use it where one was held for more than a wide sigma.
+
+    Args:
+        day: solved.
+        edges: of the rig, by pair.
+        fleet: sigma of clocks.
+    """
+    return [
+        evidence_of(
+            estimate, edges[pair], day.prior, fleet.solve.time_offset_sigma_s, _checks(day.judged[pair])
+        )
+        for pair, estimate in day.solution.pairs.items()
+    ]
+
+
+def _checks(judged: Judged) -> list[FailedCheck]:
+    verdict = judged.verdict
+    if verdict.status == "accepted" or (verdict.status == "held" and verdict.unsure_only):
+        return []
+    fault = verdict.faults[0] if verdict.faults else ""
+    return [FailedCheck(verdict.reason, fault, disproves=verdict.disproved)]
+
+
+def clocks_of(day: SolvedDay, edges: Mapping[str, Edge]) -> dict[Edge, float]:
+    """What was expected of the time offset of pairs that time a sensor."""
+    expected = {edges[p]: e.time_offset_prior_s for p, e in day.solution.pairs.items()}
+    return {edge: dt_s for edge, dt_s in expected.items() if dt_s is not None}
+
+
+def adjusted_rig(
+    graph: RigGraph,
+    prior: Extrinsics,
+    evidence: Sequence[EdgeEvidence],
+    clocks: Mapping[Edge, float],
+    clock_sigma_s: float,
+) -> AdjustedRig | None:
+    """The rig adjusted over evidence; None where there is none.
+
+    Args:
+        graph: of it; sensors without a prior pose are left out, for nobody knows where to begin.
+        prior: of all sensors that have one.
+        evidence: of its edges.
+        clocks: what is expected of the time offset of edges that time a sensor.
+        clock_sigma_s: of that.
+    """
+    known = [e for e in evidence if {s.name for s in e.edge.sensors} <= set(prior.T)]
+    if not known:
+        return None
+    sensors = tuple(s for s in graph.sensors if s.name in prior.T)
+    edges = tuple(e for e in graph.edges if set(e.sensors) <= set(sensors))
+    graph = RigGraph(sensors, edges, graph.reference)
+    prior = replace(prior, dt_s=_expected_clocks(graph, clocks))
+    return adjust(graph, prior, known, AdjustmentLimits(clock_sigma_s))
+
+
+def judged_together(day: SolvedDay, rig: AdjustedRig | None, edges: Mapping[str, Edge]) -> SolvedDay:
+    """The day at the adjusted poses.
+
+    Args:
+        day: pairs estimated and judged apart.
+        rig: adjusted over their evidence.
+        edges: of the rig, by pair.
+    """
+    if rig is None:
+        return day
+    pairs, verdicts = dict(day.solution.pairs), dict(day.judged)
+    for pair, own in day.solution.pairs.items():
+        if (
+            day.failed[pair]
+            or own.disproved
+            or pair not in day.judging.active
+            or edges[pair] not in rig.edges
+        ):
+            continue
+        against = _contradictions(edges[pair], rig, day.judged[pair])
+        estimate = _of_rig(own, edges[pair], rig, day.solution)
+        again = day.judging.pair(estimate, against, together=True)
+        if edges[pair] not in rig.left_out or again.verdict.status == "accepted":
+            pairs[pair], verdicts[pair] = estimate, again
+        elif against:
+            verdicts[pair] = day.judging.pair(own, against, together=False)
+    return replace(day, solution=replace(day.solution, pairs=pairs), judged=verdicts)
+
+
+def _contradictions(edge: Edge, rig: AdjustedRig, own: Judged) -> list[FailedCheck]:
+    """What other edges have against this one, those that were left out too, unless they are known to be wrong.
+
+    Camera-lidar is not asked: its own held-out frames would show an error of the size that a radar's edges can show.
+    """
+    if edge.kind == "camera_lidar" and own.verdict.status == "accepted":
+        return []
+    doubts = rig.edges[edge].doubts
+    names = [", ".join(e.name for e in doubts)] if doubts else []
+    for other, at in rig.edges.items():
+        if other == edge or at.used or other in doubts or any(c.disproves for c in at.evidence.checks):
+            continue
+        if (at.innovation_sigmas or 0.0) > _SIGMAS:
+            names.append(f"{other.name} and the other edges")
+    return [
+        FailedCheck(f"{who} contradict each other and nothing tells which is wrong", "witnesses_disagree")
+        for who in names
+    ]
+
+
+def _of_rig(own: PairEstimate, edge: Edge, rig: AdjustedRig, solution: Solution) -> PairEstimate:
+    """A pair's estimate with the adjusted pose; what its own frames tell beside it stays."""
+    parent, child = (s.name for s in edge.sensors)
+    observability = rig.observability(parent, child)
+    others = [e.frames_used for p, e in solution.pairs.items() if p != own.pair]
+    dt = {n: rig.poses.dt_s.get(n, 0.0) for n in (parent, child)}
+    sigmas = [rig.sensors[n].dt_sigma_s for n in (parent, child) if n in rig.sensors]
+    return replace(
+        own,
+        T=rig.poses.between(parent, child),
+        covariance=rig.poses.covariance_between(parent, child),
+        common_covariance=rig.poses.covariance_between(parent, child, common=True),
+        observability=observability,
+        observable=observability >= OBSERVABLE,
+        frames_used=max(own.frames_used, min(others, default=0)),
+        time_offset_s=dt[child] - dt[parent],
+        time_offset_sigma_s=float(np.hypot.reduce(sigmas)),
+    )
+
+
+def _expected_clocks(graph: RigGraph, clocks: Mapping[Edge, float]) -> dict[str, float]:
+    """What is expected of each clock against the reference's, along the edges that time a sensor."""
+    timed = graph.with_edges(clocks)
+    found = {graph.reference.name: 0.0}
+    for sensor in graph.sensors:
+        at, offset_s = graph.reference, 0.0
+        for edge in timed.path(graph.reference, sensor) or ():
+            forward = edge.parent == at
+            offset_s += clocks[edge] if forward else -clocks[edge]
+            at = edge.other(at.name)
+        found[sensor.name] = offset_s
+    return found

@@ -1,0 +1,255 @@
+"""A day of one camera, one lidar and one radar, or two of them: select, trigger, solve, judge on held-out frames."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.calibrate.adjust.three import EDGES, poses_of, three_sensors
+from pipeline.calibrate.adjusted_day import adjusted_rig, clocks_of, evidence_of_day, judged_together
+from pipeline.calibrate.judging import Judged, Judging, limits_of
+from pipeline.calibrate.methods import Method, Solver, method_named
+from pipeline.calibrate.records import Inputs, record_of, refused_record
+from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
+from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
+from pipeline.calibrate.solved import SolvedDay
+from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
+from pipeline.calibrate.verify.label_offset import with_label_offset
+from pipeline.calibrate.verify.motion_sources import MotionFindings, compared_sources
+from pipeline.calibrate.verify.mounting import camera_turn_sigma_rad
+from pipeline.config import FleetConfig
+from pipeline.errors import SolveError
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.estimates import Prior, Solution
+from pipeline.extrinsics.prior import no_prior
+from pipeline.results import Progress, silent
+from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
+from schemas.observations import Observation
+
+__all__ = ["DayOfPairs", "calibrate_observations", "records_of", "solve_day"]
+
+_TRIGGER_FRAMES = 40  # metrics are means over frames: more of them only cost time
+
+
+def calibrate_observations(
+    observations: Sequence[Observation],
+    prior: Prior,
+    fleet: FleetConfig,
+    about: Inputs,
+    progress: Progress = silent,
+    solver: Solver | None = None,
+) -> list[CalibrationRecord]:
+    """The records of one day of one camera, one lidar and one radar, without writing anything.
+
+    `solver` is for methods that need more than observations (`Method.needs_images`); None = the method's own.
+
+    Raises:
+        SolveError: the day cannot be calibrated.
+    """
+    day = solve_day(observations, prior, fleet, about, progress, solver)
+    if day.solved is None or not day.solved.solution.apart:
+        return records_of(about, day)
+    edges = {pair: EDGES[pair] for pair in day.solved.solution.pairs}
+    evidence = evidence_of_day(day.solved, edges, fleet)
+    graph, sigma_s = three_sensors(edges), fleet.solve.time_offset_sigma_s
+    if not all(prior.knows(pair) for pair in ("camera_lidar", "lidar_radar")):
+        return records_of(about, day)
+    rig = adjusted_rig(graph, poses_of(prior, {}), evidence, clocks_of(day.solved, edges), sigma_s)
+    return records_of(about, replace(day, solved=judged_together(day.solved, rig, edges)))
+
+
+def records_of(about: Inputs, day: DayOfPairs) -> list[CalibrationRecord]:
+    """One record per pair, whatever the verdict."""
+    return [
+        day.refused[pair] if day.solved is None or pair in day.refused else record_of(about, pair, day.solved)
+        for pair in about.pairs
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class DayOfPairs:
+    """A day whose pairs were each solved and judged: records of those that were refused, and what there is of others.
+
+    `solved` is None where every pair was refused.
+    """
+
+    refused: Mapping[str, CalibrationRecord]
+    solved: SolvedDay | None
+
+
+def solve_day(
+    observations: Sequence[Observation],
+    prior: Prior,
+    fleet: FleetConfig,
+    about: Inputs,
+    progress: Progress = silent,
+    solver: Solver | None = None,
+) -> DayOfPairs:
+    """Select, trigger, solve, judge; each pair by its own frames. Arguments as of `calibrate_observations`.
+
+    Raises:
+        SolveError: the day cannot be calibrated.
+    """
+    motion = compared_sources(observations, prior.T_lidar_radar)
+    try:
+        return _solved(observations, prior, fleet, about, motion, progress, solver)
+    except SolveError as err:
+        raise _named(err, motion.wrong) from err
+
+
+def _named(refusal: SolveError, wrong: Sequence[FailedCheck]) -> SolveError:
+    """A refusal that says first which source of motion is wrong, where one is."""
+    if not wrong:
+        return refusal
+    return SolveError("; ".join([*(check.sentence for check in wrong), refusal.reason]), wrong[0].fault)
+
+
+def _solved(
+    observations: Sequence[Observation],
+    prior: Prior,
+    fleet: FleetConfig,
+    about: Inputs,
+    motion: MotionFindings,
+    progress: Progress,
+    solver: Solver | None,
+) -> DayOfPairs:
+    """A day whose sources of motion were compared."""
+    progress(0, 4, "select frames")
+    method, select = method_named(about.method), fleet.select
+    if method.frames == "all":
+        select = select.model_copy(update={"frames": max(len(observations), 1)})
+    sync_gate_s, by_motion = _sync_gate_s(method, fleet), fleet.ingest
+    selection = select_frames(
+        observations,
+        select,
+        paper=method.paper_selection,
+        sync_gate_s=sync_gate_s,
+        motion_gate=None
+        if sync_gate_s
+        else (by_motion.sync_gate_m, float(np.radians(by_motion.sync_gate_deg))),
+        pairs=about.pairs,
+        absent=about.absent,
+    )
+    refused = {p: _named(e, motion.of(p)) for p, e in _refused(method, about.pairs, selection, prior).items()}
+    pairs = [pair for pair in about.pairs if pair not in refused]
+    refusals = {
+        pair: refused_record(about, pair, why, observations, prior, selection.rejected[pair])
+        for pair, why in refused.items()
+    }
+    if not pairs:
+        return DayOfPairs(refusals, None)
+    frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in pairs}
+    sample = _spread(observations, frames)
+    before = trigger_metrics(sample, {pair: prior.of(pair) for pair in pairs})
+    fired = {pair: exceeded(before[pair], fleet.trigger) for pair in pairs}
+    active = _to_calibrate(method, fired, fleet.trigger.when)
+    progress(1, 4, f"solve by {about.method}")
+    solution = (solver or method.solver())(
+        frames,
+        prior,
+        fleet.solve,
+        seed=about.seed,
+        triggered=active,
+        progress=lambda done, total, what: progress(1, 4, f"{what} ({done}/{total})"),
+    )
+    if "camera_lidar" in active:
+        solution = with_label_offset(solution, observations)
+    progress(2, 4, "judge on held-out frames")
+    failed, judging = _judging(observations, selection, prior, solution, fleet, active, motion)
+    day = SolvedDay(
+        observations,
+        selection,
+        prior,
+        solution,
+        _judged(solution, failed, judging, _composed_of(method, pairs)),
+        failed,
+        judging,
+        sample,
+        before,
+        {pair: bool(fired[pair]) for pair in pairs},
+        motion.numbers,
+    )
+    progress(4, 4, "done")
+    return DayOfPairs(refusals, day)
+
+
+def _judging(
+    observations: Sequence[Observation],
+    selection: Selection,
+    prior: Prior,
+    solution: Solution,
+    fleet: FleetConfig,
+    active: Sequence[str],
+    motion: MotionFindings,
+) -> tuple[Mapping[str, Sequence[FailedCheck]], Judging]:
+    """Failed checks of all pairs, and what they are judged by."""
+    seen_by = next((o for o in observations if "camera" in o.sensors), None)
+    turn = None if seen_by is None else camera_turn_sigma_rad(solution, prior.camera, seen_by.camera_K)
+    about = FoundDay(observations, selection, prior, solution, fleet, limits_of(fleet), motion)
+    return checks_of_day(about), Judging(observations, selection, prior, fleet, active, turn)
+
+
+def _judged(
+    solution: Solution,
+    failed: Mapping[str, Sequence[FailedCheck]],
+    judging: Judging,
+    composed: Collection[str],
+) -> dict[str, Judged]:
+    """Verdicts of all pairs; those that the method composes after their factors, which they are as good as."""
+    judged: dict[str, Judged] = {}
+    for pair in sorted(solution.pairs, key=lambda p: p in composed):
+        checks = list(failed[pair])
+        held = [j.verdict for j in judged.values() if j.verdict.status != "accepted"]
+        if pair in composed and held:
+            disproved = any(v.disproved for v in held)
+            checks.append(FailedCheck("composed of a pair that is not accepted", disproves=disproved))
+        judged[pair] = judging.pair(solution.pairs[pair], checks, together=pair in composed)
+    return judged
+
+
+def _refused(
+    method: Method, pairs: Sequence[str], selection: Selection, prior: Prior
+) -> dict[str, SolveError]:
+    """Pairs that the day cannot calibrate: too few frames, no prior, or a method that needs what is missing."""
+    refused = dict(selection.refused)
+    refused |= {p: SolveError(no_prior(p)) for p in pairs if p not in refused and not prior.knows(p)}
+    if method.needs_all and (refused or len(pairs) < len(PAIRS)):
+        missing = [s for s in SENSORS if not any(s in FRAMES_OF_PAIR[p] for p in pairs)]
+        why = f"the rig has no {missing[0]}" if missing else next(iter(refused.values())).reason
+        alone = SolveError(f"method {method.name} needs camera, lidar and radar: {why}")
+        refused = {pair: refused.get(pair, alone) for pair in pairs}
+    return {pair: refused[pair] for pair in pairs if pair in refused}
+
+
+def _sync_gate_s(method: Method, fleet: FleetConfig) -> float | None:
+    """The gate of ingest; where that is by motion, the paper's methods, which know of none, keep the paper's."""
+    gate_s = fleet.ingest.sync_gate_s
+    return PAPER_SYNC_GATE_S if gate_s is None and method.paper_selection else gate_s
+
+
+def _to_calibrate(method: Method, fired: Mapping[str, Sequence[str]], when: str) -> list[str]:
+    """Pairs to estimate and to judge: all, or those with a metric beyond its threshold.
+
+    Camera and radar hardly know their pose but by the other two: where it is asked for, so are they.
+    """
+    wanted = {p for p in fired if fired[p] or when == "always"}
+    if "camera_radar" in wanted and (method.composed or method.name == "joint"):
+        wanted = set(fired)
+    return [p for p in fired if p in wanted]
+
+
+def _composed_of(method: Method, pairs: Collection[str]) -> tuple[str, ...]:
+    """Pairs that the method composes of the others: none where one of these is missing."""
+    return method.composed if len(pairs) == len(PAIRS) else ()
+
+
+def _spread(
+    observations: Sequence[Observation], frames: Mapping[str, Sequence[Observation]]
+) -> list[Observation]:
+    """Frames that the triggers look at: those of the fit of all pairs, thinned."""
+    used = {id(o) for own in frames.values() for o in own}
+    rows = [o for o in observations if id(o) in used]
+    picked = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _TRIGGER_FRAMES)).astype(int))
+    return [rows[i] for i in picked]

@@ -1,0 +1,134 @@
+"""Verdict and evidence of each pair of a solved day: its held-out frames, what it claims, the checks that it failed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.calibrate.numerics.frame_blocks import scene_blocks
+from pipeline.calibrate.numerics.search_range import search_range
+from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.verify.held_out_score import held_out_score
+from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
+from pipeline.calibrate.verify.held_out_update import held_out_update
+from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.calibrate.verify.mounting import mounting_covariance
+from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure, views_of
+from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
+from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge
+from pipeline.config import FleetConfig
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.estimates import PairEstimate, Prior
+from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.rig.views import View
+from schemas.observations import Observation
+
+__all__ = ["Judged", "Judging", "limits_of"]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The verdict on one pair and the evidence behind it."""
+
+    verdict: Verdict
+    test: HeldOutTest | None
+    claims: Mapping[str, Claim]
+    mounting_covariance: np.ndarray | None = None  # 6 6; None where nothing says how the camera hangs
+    targets: np.ndarray = field(default_factory=lambda: DEFAULT_TARGETS)  # 3 3, in the child's frame
+
+
+@dataclass(frozen=True, eq=False)
+class Judging:
+    """What the pairs of a day are judged by.
+
+    Args:
+        observations: of the day.
+        selection: frames that took no part in the fit.
+        prior: what stays current.
+        fleet: limits.
+        active: pairs that were to be calibrated.
+        camera_turn_sigma_rad: of the camera's pitch and yaw, by its principal point.
+    """
+
+    observations: Sequence[Observation]
+    selection: Selection
+    prior: Prior
+    fleet: FleetConfig
+    active: Collection[str]
+    camera_turn_sigma_rad: np.ndarray | None
+
+    @cached_property
+    def _views(self) -> dict[str, View]:
+        return views_of(self.observations)
+
+    def pair(self, estimate: PairEstimate, failed: Sequence[FailedCheck], *, together: bool) -> Judged:
+        """Judge one pair.
+
+        Args:
+            estimate: of it.
+            failed: checks.
+            together: whether other pairs have a say in its pose; see `judge`.
+        """
+        pair, limits = estimate.pair, limits_of(self.fleet)
+        active = pair in self.active
+        held_out = [self.observations[i] for i in self.selection.holdout[pair]] if active else []
+        mounting = mounting_covariance(pair, estimate.T, estimate.covariance, self.camera_turn_sigma_rad)
+        targets = seen_targets(pair, self.prior, self._views)
+        unseen = [] if targets is not None else [unseen_failure(pair)]
+        targets = DEFAULT_TARGETS if targets is None else targets
+        test, claims = self._held_out(estimate, held_out, limits, mounting, targets)
+        verdict = judge(
+            estimate,
+            self.prior,
+            Evidence(test, claims, [*failed, *unseen]),
+            search_range(self.prior, self.fleet.solve),
+            limits,
+            triggered=active,
+            together=together,
+        )
+        return Judged(verdict, test, claims, mounting, targets)
+
+    def _held_out(
+        self,
+        estimate: PairEstimate,
+        held_out: Sequence[Observation],
+        limits: VerdictLimits,
+        mounting: np.ndarray | None,
+        targets: np.ndarray,
+    ) -> tuple[HeldOutTest | None, Mapping[str, Claim]]:
+        """Held-out frames at the prior and at the result, and what they leave to claim."""
+        pair, verify, prior = estimate.pair, self.fleet.verify, self.prior
+        azimuth_deg, elevation_deg = (
+            (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
+            if pair == "camera_lidar"
+            else (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
+        )
+        test = update = None
+        if held_out:
+            score = held_out_score(estimate, held_out, prior, self.fleet.solve)
+            blocks = scene_blocks(held_out)
+            test = paired_test(score.cost(prior.of(pair)), score.cost(estimate.T), blocks)
+            covariance = np.diag([*np.zeros(6), *score.extra_variance])
+            covariance[:6, :6] = estimate.covariance
+            update = held_out_update(score.derivatives, covariance, score.bias, blocks, limits)
+        claims = claims_of(
+            pair,
+            estimate.T,
+            estimate.covariance,
+            update,
+            float(np.radians(azimuth_deg)),
+            verify.confidence,
+            limits.held_out_contradiction_sigmas,
+            float(np.radians(elevation_deg)),
+            mounting,
+            targets,
+        )
+        return test, claims
+
+
+def limits_of(fleet: FleetConfig) -> VerdictLimits:
+    """The thresholds that `[verify]` of fleet.toml names as the verdict does."""
+    return VerdictLimits(**{f.name: getattr(fleet.verify, f.name) for f in fields(VerdictLimits)})

@@ -1,0 +1,45 @@
+"""A day whose pairs were solved and judged: what its records are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from pipeline.calibrate.judging import Judged, Judging
+from pipeline.calibrate.select.frames import Selection
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.estimates import Prior, Solution
+from schemas.observations import Observation
+
+__all__ = ["SolvedDay"]
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedDay:
+    """What went in, what came out, and how each pair was judged.
+
+    Args:
+        observations: of the day.
+        selection: frames of each pair.
+        prior: that it began with.
+        solution: of the pairs that were not refused.
+        judged: verdicts by pair.
+        failed: checks of the day that each pair failed.
+        judging: what verdicts rest on.
+        trigger_sample: frames that triggers look at.
+        trigger_before: metrics of each pair at the prior.
+        triggered: by pair, whether one of them is beyond its threshold.
+        numbers: of checks of the day, for every record.
+    """
+
+    observations: Sequence[Observation]
+    selection: Selection
+    prior: Prior
+    solution: Solution
+    judged: Mapping[str, Judged]
+    failed: Mapping[str, Sequence[FailedCheck]]
+    judging: Judging
+    trigger_sample: Sequence[Observation]
+    trigger_before: Mapping[str, Mapping[str, float]]
+    triggered: Mapping[str, bool]
+    numbers: Mapping[str, float] = field(default_factory=dict)
