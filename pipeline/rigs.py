@@ -161,6 +161,15 @@ class LidarTopics(_Sensor):
     points: Topic
     # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
     semantics: OnnxPointSemantics | None = Field(default=None, exclude=True)
+    # Over the road, as somebody measured it, and how well: for the edge to the vehicle frame.
+    height_m: Positive | None = Field(default=None, exclude=True)
+    height_sigma_m: Positive | None = Field(default=None, exclude=True)
+
+    @model_validator(mode="after")
+    def _height_has_a_sigma(self) -> LidarTopics:
+        if (self.height_m is None) != (self.height_sigma_m is None):
+            raise ValueError("height_m and height_sigma_m go together: say both, or neither")
+        return self
 
     def named_models(self) -> Iterator[tuple[str, str]]:
         """Files of models that it names, by key."""

@@ -5,8 +5,8 @@ Their estimators take plain arrays; this is where a day's rows become those, and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -42,12 +42,16 @@ class BaseEdges:
         lidars: names of all of them.
         radars: likewise.
         rows: observations of chosen sensors.
+        road_z_m: where the road lies in axes of the base.
+        heights: of lidars over the road by name, as somebody measured them, with sigmas [m].
     """
 
     prior: RigPrior
     lidars: tuple[str, ...]
     radars: tuple[str, ...]
     rows: Callable[[Chosen], list[Observation]]
+    road_z_m: float = 0.0
+    heights: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def solve(self, edge: Edge) -> tuple[EdgeEvidence, int]:
         """What the day shows of an edge, and of how many frames.
@@ -66,7 +70,16 @@ class BaseEdges:
         rows = self._sweeps(edge.parent.name)
         scenes = Scenes(scenes_of(rows), blocks_of(rows))
         T = self._on_base(edge.parent.name)
-        return estimate_lidar_base(edge, sweeps_of(rows), self._ego_at(rows), T, scenes), len(rows)
+        found = estimate_lidar_base(
+            edge,
+            sweeps_of(rows),
+            self._ego_at(rows),
+            T,
+            scenes,
+            road_z_m=self.road_z_m,
+            height_m=self.heights.get(edge.parent.name),
+        )
+        return found, len(rows)
 
     def _lidar_lidar(self, edge: Edge) -> tuple[EdgeEvidence, int]:
         parents = self._sweeps(edge.parent.name)

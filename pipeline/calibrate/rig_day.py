@@ -91,7 +91,8 @@ def calibrate_rig(day: RigDay, fleet: FleetConfig, about: Inputs, progress: Prog
         about: what identifies the records.
         progress: told about each edge.
     """
-    others = BaseEdges(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows)
+    measured = day.rig.road_z_m, day.rig.measured_heights
+    others = BaseEdges(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows, *measured)
     found, done = _Found(), 0
     for group in _groups(day.graph):
         progress(done, len(day.graph.edges) + 1, f"calibrate {', '.join(edge.name for edge in group)}")

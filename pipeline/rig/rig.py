@@ -51,6 +51,8 @@ class Rig(Section):
     base: str | None = Field(
         default=None, min_length=1
     )  # the vehicle frame as transforms call it; None = no edges to it
+    # Where the road lies in axes of the base, as below an axle's middle. Left out of dumps, like what follows.
+    road_z_m: float = Field(default=0.0, exclude=True)
     # Pairs of sensors; None = found from overlap. Left out of dumps: no reason to ingest a rig's logs again.
     edges: tuple[tuple[str, str], ...] | None = Field(default=None, exclude=True)
     # Camera, lidar and radar for methods that work on three; None = those that share most. Likewise.
@@ -135,7 +137,16 @@ class Rig(Section):
             for name in of
             if "prior" in of[name].model_fields_set
         }
+        told |= {"road_z_m": self.road_z_m, "heights": self.measured_heights}
         return {key: value for key, value in told.items() if value}
+
+    @property
+    def measured_heights(self) -> dict[str, tuple[float, float]]:
+        """Of lidars over the road, as somebody measured them: metres, and the sigma of that."""
+        found = ((name, of.height_m, of.height_sigma_m) for name, of in self.lidars.items())
+        return {
+            name: (height, sigma) for name, height, sigma in found if height is not None and sigma is not None
+        }
 
     def prior_of(self, name: str) -> SensorPrior:
         """How far a sensor's prior is to be trusted: what it is told itself, else the rig's."""
@@ -239,6 +250,13 @@ class Rig(Section):
                 edge_between(nodes[a], nodes[b])
             except ValueError as err:
                 raise ValueError(f"edge [{a}, {b}]: {err}") from err
+        return self
+
+    @model_validator(mode="after")
+    def _heights_are_over_the_road_under_base(self) -> Rig:
+        if self.base is None and (self.measured_heights or self.road_z_m):
+            key = "road_z_m" if self.road_z_m else f"lidars.{next(iter(self.measured_heights))}.height_m"
+            raise ValueError(f"{key} is of the vehicle's frame: name that, base = ...")
         return self
 
     @model_validator(mode="after")

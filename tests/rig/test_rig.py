@@ -141,6 +141,11 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
         ),
         (('base = "base_link"', 'three = ["front", "top"]'), "van.three"),
         (('base = "base_link"', 'base = ""'), "van.base"),
+        (('base = "base_link"', "road_z_m = -0.3"), "road_z_m is of the vehicle's frame"),
+        (
+            ('points = "/top/points"', 'points = "/top/points"\nheight_m = 1.8'),
+            "height_m and height_sigma_m go",
+        ),
         (('"/nose/points"', '"points"'), "rigs.van.lidars.nose.points"),
     ],
 )
