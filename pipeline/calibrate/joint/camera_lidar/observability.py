@@ -23,6 +23,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
+from pipeline.calibrate.joint.camera_lidar.side_bias import side_biases
 from pipeline.calibrate.joint.camera_lidar.time_offset import (
     DT,
     FOCAL,
@@ -42,6 +43,7 @@ __all__ = [
     "IS_TZ",
     "CameraLidarProblem",
     "ObservabilityAnalysis",
+    "along_the_way",
     "analyse_observability",
     "day_covariance",
     "time_offset_variance",
@@ -121,9 +123,29 @@ def analyse_observability(
         state = state.stepped(follow * (tz_m - state.T_camera_lidar[2, 3]))
         timed = _timed(problem, state, kernel, rng)
     analysis = _fix_unobservable(problem, timed.state, kernel, profile, rng)
+    along = CAMERA_LIDAR_DT_FLOOR_S * along_the_way(
+        analysis.state.T_camera_lidar, problem.terms.velocity_lidar, analysis.fixed
+    )
+    for covariance in (analysis.covariance, analysis.common, analysis.floors):
+        covariance[:] += np.outer(along, along)
     analysis.covariance[DT, DT] = time_offset_variance(problem, analysis.state, analysis.kernel, timed)
     analysis.observability[TZ] = max(tz_observability, 0.0)
     return analysis
+
+
+def along_the_way(
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    velocity_lidar: Float[np.ndarray, "F 3"],
+    fixed: Bool[np.ndarray, " 8"],
+) -> Float[np.ndarray, " 8"]:
+    """How the lidar's origin moves along the car's way as the time offset shrinks by 1 s: at one speed nothing tells.
+
+    A camera that looks ahead has that in its tz, which is at its prior or as its profile has it; one that looks aside
+    has it in its x.
+    """
+    out = np.zeros(8)
+    out[3:6] = T_camera_lidar[:3, :3] @ velocity_lidar.mean(0)
+    return np.where(fixed, 0.0, out)
 
 
 def _fix_unobservable(
@@ -215,8 +237,9 @@ def day_covariance(
     )
     floor = np.where(fixed, 0.0, np.append(CAMERA_LIDAR_BIAS, [CAMERA_LIDAR_DT_FLOOR_S, 0.0]))
     motion = motion_biases(terms, state, kernel, curvature, fixed, problem.motion)
+    sides = side_biases(terms, state, kernel, curvature, fixed)
     # Masks, intrinsics and the lidar's mounting are the same every day.
-    floors = np.diag(floor**2) + motion.T @ motion
+    floors = np.diag(floor**2) + motion.T @ motion + sides.T @ sides
     prior_information = np.diag(problem.common_share / prior_variance)
     common = floors + prior_share(covariance, prior_information)
     covariance = covariance + floors

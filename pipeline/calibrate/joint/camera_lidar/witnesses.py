@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from pipeline.calibrate.joint.camera_lidar.boxes import box_offsets
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
+from pipeline.calibrate.joint.camera_lidar.side_bias import most_offset_rad
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
@@ -30,9 +31,7 @@ _RESAMPLES = 64
 _FEWEST_BLOCKS = 8  # with fewer, frames are resampled: two blocks know no scatter
 _FEWEST = 100  # edges, or markings, of a kind
 _WIDENING_SIGMAS, _SIGMAS = 2.0, 3.0
-# Labels too wide, and edges anywhere between two beams, move opposite sides apart. On 34 good days of thirteen rigs a
-# side is off by up to half its beams' gap, or by 2.5 label pixels where that is small; paint by 0.4.
-_FLOOR_PX, _FLOOR_OF_GAP, _PAINT_FLOOR_PX = 1.0, 0.4, 0.5
+_PAINT_FLOOR_PX = 0.5  # on 34 good days of thirteen rigs paint is off by up to 0.4
 # Medians over the boxes of eight good days of five rigs, at the true pose: pitch -.12 to -.30 deg, as the ground takes
 # the objects' feet, yaw -.25 to +.02; the real car -.10 and .00, KITTI -.17 and .02.
 _BOX_PITCH_RAD, _BOX_FLOOR_RAD, _FEWEST_BOXES = float(np.radians(-0.18)), float(np.radians(0.15)), 20
@@ -96,7 +95,7 @@ def ask_witnesses(
         for name, side in sides:
             edges = terms.edges.chosen(terms.edges.side == side)
             if kernel.edge_weight > 0 and len(edges.xyz_m) >= _FEWEST:
-                floor_rad = float(np.hypot(_FLOOR_PX * px_rad, _FLOOR_OF_GAP * np.median(edges.gap_rad)))
+                floor_rad = most_offset_rad(edges, px_rad)
                 ask(name, axis, replace(terms, edges=edges).edge_score(at, kernel), floor_rad)
         if kernel.marking_weight > 0 and len(terms.markings.xyz_m) >= _FEWEST:
             ask("paint", axis, terms.marking_score(at, kernel), _PAINT_FLOOR_PX * px_rad)

@@ -1,0 +1,89 @@
+"""How far boundaries that lie beside what the lidar sees bias T_camera_lidar: an error that more frames do not lower.
+
+Labels are wider than what they show, and a jump lies anywhere between two beams: at the true pose the boundaries of
+one side lie a pixel or two beside its jumps. Where both sides are alike and equally far away that cancels. A camera
+that looks aside sees the feet of near things and the tops of far ones: then it is a height, and a pitch.
+
+Source: Schmidt 1966 (parameters that are considered, not solved for).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
+from pipeline.calibrate.numerics.bias_floors import EDGE_SIDE_MOST_OF_GAP, EDGE_SIDE_MOST_PX
+from pipeline.geometry.changes import change_jacobian
+from pipeline.objective.camera_lidar.points import Points
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms
+from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
+
+__all__ = ["most_offset_rad", "side_biases"]
+
+_AXIS = {
+    EDGE_LEFT: 0,
+    EDGE_RIGHT: 0,
+    EDGE_ABOVE: 1,
+    EDGE_BELOW: 1,
+}  # of the image, across a side's boundaries
+
+
+def side_biases(
+    terms: Terms,
+    state: AlignmentState,
+    kernel: KernelSettings,
+    curvature: Float[np.ndarray, "8 8"],
+    fixed: Bool[np.ndarray, " 8"],
+) -> Float[np.ndarray, "_ 8"]:
+    """How far each group's own offset, half of what it is at most, moves the solution (coordinates of `changed`).
+
+    Args:
+        terms: points, of which edges count.
+        state: the solution.
+        kernel: of the gradients.
+        curvature: of the cost, in the coordinates of `changed`.
+        fixed: unknowns that do not follow.
+    """
+    to_left = np.eye(8)
+    to_left[:6, :6] = np.linalg.inv(change_jacobian(state.T_camera_lidar))
+    only_edges, free = replace(kernel, marking_weight=0.0), ~fixed
+    out = []
+    for edges, axis in _groups(terms.edges):
+        focal_px = float(terms.camera[1])
+        off_px = most_offset_rad(edges, 1 / focal_px) * focal_px / 2
+        # Boundaries that lie elsewhere pull like a principal point that does.
+        there, back = (
+            _seen_off(replace(terms, edges=edges), axis, sign * off_px).gradient(state.alone, only_edges)[0]
+            for sign in (1, -1)
+        )
+        row, pull = np.zeros(8), to_left.T @ (there - back).sum(0) / 2
+        row[free] = np.linalg.solve(curvature[np.ix_(free, free)], pull[free])
+        out.append(row)
+    return np.array(out).reshape(-1, 8)
+
+
+def most_offset_rad(edges: Points, px_rad: float) -> float:
+    """How far boundaries of one side lie beside its jumps at most; `px_rad` is the angle of a label pixel."""
+    return float(np.hypot(EDGE_SIDE_MOST_PX * px_rad, EDGE_SIDE_MOST_OF_GAP * np.median(edges.gap_rad)))
+
+
+def _groups(edges: Points) -> Iterator[tuple[Points, int]]:
+    """Edges of each side, near ones and far ones, and the image's axis across which their boundaries lie."""
+    range_m = np.linalg.norm(edges.xyz_m, axis=1)
+    is_near = range_m < np.median(range_m) if len(range_m) else np.zeros(0, bool)
+    for side, axis in _AXIS.items():
+        for part in (is_near, ~is_near):
+            some = edges.chosen((edges.side == side) & part)
+            if len(some.xyz_m):
+                yield some, axis
+
+
+def _seen_off(terms: Terms, axis: int, off_px: float) -> Terms:
+    """With the principal point moved along one axis of the image."""
+    camera = terms.camera.copy()
+    camera[3 + axis] += np.float32(off_px)
+    return replace(terms, camera=camera)
