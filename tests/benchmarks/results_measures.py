@@ -18,6 +18,7 @@ from tests.benchmarks.studies.in_use import answer_of_log
 from tests.benchmarks.studies.metrics import within
 from tests.benchmarks.studies.priors import LIMIT_DEG
 from tests.benchmarks.studies.rates import interval, rate
+from tests.benchmarks.studies.rig_faults import is_on_base
 
 __all__ = ["MEASURES", "interval", "rate"]
 
@@ -198,6 +199,26 @@ def stopped_good(lines: Lines, _row: Row) -> str:
     return rate(sum(map(any, days)), len(days))
 
 
+def rig_wrong(lines: Lines, _row: Row) -> str:
+    """Of poses of the study `rig_faults` that were accepted, those that are wrong; sensor-days in brackets."""
+    poses = [pose for r in lines for pose in r.get("poses", {}).values()]
+    wrong = [pose["wrong"] for pose in poses if pose["status"] == "accepted"]
+    return f"{sum(wrong)} of {len(wrong)} accepted ({len(poses)} sensor-days)"
+
+
+def rig_base(lines: Lines, _row: Row) -> str:
+    """Of accepted poses of the reference lidar on the vehicle frame, those right in roll, pitch, yaw and height."""
+    off = [r["poses"]["base"]["off"] for r in lines if r["poses"]["base"]["status"] == "accepted"]
+    return rate(sum(is_on_base(v) for v in off), len(off))
+
+
+def rig_knocks(lines: Lines, row: Row) -> str:
+    """Of knocked vehicles of the study `rig_drift` those with a share of theirs, and where another sensor is named."""
+    vehicles = sum(r["vehicles"] for r in lines)
+    hits, wrong = (round(sum(r[name] * r["vehicles"] for r in lines)) for name in (row["field"], "wrong"))
+    return f"{rate(hits, vehicles)}; another named: {wrong}"
+
+
 def power(lines: Lines, row: Row) -> str:
     """Study drift_power: RED with the right sensor within `nights`, by whose days; the interval is of the rarer."""
     found = {r["records"]: (r[f"right_within_{row['nights']}"], r["movers"]) for r in lines}
@@ -215,6 +236,7 @@ MEASURES: dict[str, Callable[[Lines, Row], str]] = {
     f.__name__: f
     for f in (
         accepted_days, by_noise, clocks, efficiency, errors, faulty, found, given_inside, inside, knocked, last,
-        mounting, named, power, shown, starts, stopped_good, total, value, verified, wrong_days,
+        mounting, named, power, rig_base, rig_knocks, rig_wrong, shown, starts, stopped_good, total,
+        value, verified, wrong_days,
     )
 }  # fmt: skip

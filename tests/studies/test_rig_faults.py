@@ -49,7 +49,7 @@ def test_a_function_that_remembers_draws_and_fails_as_it_does_itself():
 
 def test_a_table_counts_sensor_days_and_what_is_wrong():
     poses = {"left": row(), "base": row(kind="base", az_deg=0.1, off=[0.001, 0, 0, 0, 0, 0.01])}
-    poses = {name: {**p, "wrong": is_wrong(p)} for name, p in poses.items()}
+    poses = {name: {**p, "edges": ["left-top"], "wrong": is_wrong(p)} for name, p in poses.items()}
     line = {
         "seed": 1,
         "case": "good",
@@ -59,7 +59,7 @@ def test_a_table_counts_sensor_days_and_what_is_wrong():
         "memory_gb": 1.0,
     }
     text = summary([line])
-    assert "3 sensor-days of 1 van-days" in text
+    assert "2 sensor-days of 1 van-days" in text
     assert "wrong **1 of 2" in text
     assert "| good | 1 |  | 2 | 1 | 1 | 1 |" in text
 

@@ -5,7 +5,9 @@ themselves and, in part, by what their sensors share: `shared` times .03 deg and
 in all edges of that sensor alike. Every night the audit's functions judge the window of that night.
 
     python -m tests.benchmarks.studies.rig_drift [--vehicles 100] [--days 60] [--seed 9200] [--shared 1] [--knock]
+        [--records LAKE]
 
+With --records the rig is that of a lake's day: its edges err as their records say and hold as theirs do.
 Prints a line of JSON: false alarms per 1,000 vehicle-nights, or with --knock (half a degree of a sensor with three
 edges or more, from half of the days on) how often it is named three nights later, and with the right day.
 """
@@ -17,6 +19,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -24,7 +27,14 @@ from pipeline.audit.days import PairDays, pair_days
 from pipeline.audit.vehicle import VehicleVerdict, judge_fleet
 from pipeline.config import AuditConfig
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse
+from pipeline.rig.edges import edge_named
 from pipeline.rig.graph import Edge
+from pipeline.store.current import current_poses, current_records, transform_of
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_records
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.poses import POSES, PoseRow
+from tests.benchmarks.studies.commits import commit_now
 from tests.makers.random_rigs import SHIFT_SIGMAS, UNSURE_DEG, UNSURE_M, Rig, knock
 
 _OWN = np.r_[np.full(3, np.radians(0.03)), np.full(3, 0.02)]  # of a sensor's daily error, times `shared`
@@ -39,9 +49,54 @@ class Vehicle:
     knocked: str = ""
 
 
-def vehicle(rng: np.random.Generator, days: int, shared: float, *, knocked: bool) -> Vehicle:
-    """Days of a random rig; the knock comes after half of them."""
-    rig, name = Rig(rng), ""
+@dataclass(frozen=True, eq=False)
+class Own:
+    """How an edge errs by itself (6 6), which of its degrees of freedom a day shows, and whether it is accepted."""
+
+    covariance: np.ndarray
+    seen: np.ndarray
+    accepted: bool = True
+
+    @classmethod
+    def of_kind(cls, kind: str) -> Own:
+        """Of an edge of a random rig."""
+        rotation, shift = (np.array(part) for part in SHIFT_SIGMAS[kind])
+        return cls(
+            np.diag(np.r_[np.radians(rotation), shift] ** 2), np.r_[rotation < UNSURE_DEG, shift < UNSURE_M]
+        )
+
+
+class RecordedRig:
+    """The rig of the first day of a lake: its edges with an estimate, as their records say."""
+
+    def __init__(self, lake: Lake) -> None:
+        records = current_records(read_records(lake, CALIBRATIONS, CalibrationRecord))
+        poses = current_poses(read_records(lake, POSES, PoseRow))
+        self.T = {p.sensor: T for p in poses if p.day == poses[0].day and (T := transform_of(p)) is not None}
+        self.own = dict[Edge, Own]()
+        for r in records:
+            if (
+                r.day != poses[0].day
+                or r.covariance is None
+                or not {r.parent_frame, r.child_frame} <= set(self.T)
+            ):
+                continue
+            common = 0.0 if r.common_covariance is None else r.common_covariance
+            edge = edge_named(r.pair, r.parent_frame, r.child_frame)
+            self.own[edge] = Own(r.covariance - common, np.array(r.observable), r.status == "accepted")
+        self.edges = list(self.own)
+        self.sensors = sorted({s for edge in self.edges for s in edge.sensors}, key=lambda s: s.name)
+
+    def degree(self, name: str) -> int:
+        """Number of edges of a sensor."""
+        return sum(name in (s.name for s in edge.sensors) for edge in self.edges)
+
+
+def vehicle(
+    rng: np.random.Generator, days: int, shared: float, *, knocked: bool, recorded: RecordedRig | None = None
+) -> Vehicle:
+    """Days of a random rig, or of a recorded one; the knock comes after half of them."""
+    rig, name = recorded or Rig(rng), ""
     error = {s.name: rng.normal(size=(days, 6)) * _OWN * shared for s in rig.sensors}
     if knocked:
         able = [s for s in rig.sensors if rig.degree(s.name) >= 3]
@@ -52,18 +107,21 @@ def vehicle(rng: np.random.Generator, days: int, shared: float, *, knocked: bool
 
 
 def _edge_days(
-    rng: np.random.Generator, rig: Rig, edge: Edge, error: Mapping[str, np.ndarray], shared: float
+    rng: np.random.Generator,
+    rig: Rig | RecordedRig,
+    edge: Edge,
+    error: Mapping[str, np.ndarray],
+    shared: float,
 ) -> PairDays:
     T = inverse(rig.T[edge.parent.name]) @ rig.T[edge.child.name]
-    rotation, shift = (np.array(part) for part in SHIFT_SIGMAS[edge.kind])
-    own, A = np.diag(np.r_[np.radians(rotation), shift] ** 2), adjoint(T)
+    of_edge = rig.own[edge] if isinstance(rig, RecordedRig) else Own.of_kind(edge.kind)
+    own, A = of_edge.covariance, adjoint(T)
     D = len(error[edge.parent.name])
     xi = rng.multivariate_normal(np.zeros(6), own, size=D)
     xi += error[edge.child.name] @ A.T - error[edge.parent.name]
     sensor = np.diag((_OWN * shared) ** 2)
     covariance = np.tile(own + sensor + A @ sensor @ A.T, (D, 1, 1))
-    seen = np.tile(np.r_[rotation < UNSURE_DEG, shift < UNSURE_M], (D, 1))
-    every = np.ones(D, bool)
+    seen, every = np.tile(of_edge.seen, (D, 1)), np.full(D, of_edge.accepted)
     return pair_days(np.arange(D) + 1, exp_se3(xi) @ T, covariance, np.zeros((D, 6, 6)), seen, every)
 
 
@@ -104,11 +162,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=9200)
     parser.add_argument("--shared", type=float, default=1.0)
     parser.add_argument("--knock", action="store_true")
+    parser.add_argument("--records", type=Path)
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
-    fleet = [vehicle(rng, args.days, args.shared, knocked=args.knock) for _ in range(args.vehicles)]
+    recorded = None if args.records is None else RecordedRig(Lake.at(args.records))
+    fleet = [
+        vehicle(rng, args.days, args.shared, knocked=args.knock, recorded=recorded)
+        for _ in range(args.vehicles)
+    ]
     found = named(fleet, args.days) if args.knock else false_alarms(fleet, args.days)
-    print(json.dumps(vars(args) | found))
+    rig = "random" if recorded is None else args.records.name
+    print(json.dumps({"commit": commit_now()} | vars(args) | {"records": rig} | found))
 
 
 if __name__ == "__main__":
