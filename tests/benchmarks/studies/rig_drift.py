@@ -149,9 +149,9 @@ def named(fleet: Sequence[Vehicle], days: int) -> dict[str, float]:
         red = [c.change.day for c in verdict.charts.values() if c.status == "RED" and c.change]
         found.update(
             red=bool(red), right=sensor == own.knocked, wrong=sensor not in (own.knocked, None),
-            day=bool(red) and max(Counter(red).items(), key=lambda kv: kv[1])[0] == start,
+            dated=bool(red) and max(Counter(red).items(), key=lambda kv: kv[1])[0] == start,
         )  # fmt: skip
-    return {"vehicles": len(fleet), **{k: found[k] / len(fleet) for k in ("red", "right", "wrong", "day")}}
+    return {"vehicles": len(fleet), **{k: found[k] / len(fleet) for k in ("red", "right", "wrong", "dated")}}
 
 
 def main() -> None:
