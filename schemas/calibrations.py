@@ -153,7 +153,7 @@ class CalibrationRecord(Posed):
         "sensors, and in rows before version 5",
         default=None,
     )
-    believed: bool | None = column(
+    used: bool | None = column(
         "whether the adjustment of the whole rig rests on this edge too; null in rows before version 5",
         default=None,
     )

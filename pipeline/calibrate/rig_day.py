@@ -203,4 +203,4 @@ def _with_innovation(
     found = None if adjusted is None else adjusted.edges.get(_edge_of(record, graph))
     if found is None:
         return record
-    return replace(record, innovation_sigmas=found.innovation_sigmas, believed=found.used)
+    return replace(record, innovation_sigmas=found.innovation_sigmas, used=found.used)

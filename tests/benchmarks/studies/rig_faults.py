@@ -310,7 +310,7 @@ def _of_edge(
 ) -> dict[str, Any]:
     row: dict[str, Any] = {
         "kind": record.pair, "status": record.status, "reason": record.reason, "faults": record.faults,
-        "determined": record.determined, "believed": record.believed,
+        "determined": record.determined, "used": record.used,
     }  # fmt: skip
     if record.innovation_sigmas is not None:
         row["innovation_sigmas"] = round(record.innovation_sigmas, 2)
