@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from pipeline.export.compare import Side
     from pipeline.geometry.transform_tree import TransformTree
     from pipeline.rig.graph import Edge
+    from pipeline.rig.rig import Rig
 
-__all__ = ["mounting", "read_calibration", "read_sides"]
+__all__ = ["mounting", "poses_in_use", "read_calibration", "read_sides"]
 
 
 def read_calibration(
@@ -162,6 +163,45 @@ def read_sides(
             names = frames.names_in(files.split(","))
             sides[k] = _side_of_files(text, forms[k], files, names, known)
     return [sides[k] for k in range(len(texts))]
+
+
+def poses_in_use(
+    text: str, location: str | None, vehicle: str, rig: Rig, frames: FrameOptions
+) -> tuple[dict[str, np.ndarray], FrameNames]:
+    """T_reference_sensor of a rig of many sensors, those that FORMAT:FILE[,FILE] or [VEHICLE@]DAY of a lake has.
+
+    Returns:
+        The poses by name, and what the frames are called.
+
+    Raises:
+        ConfigError: it is neither, or there is none.
+    """
+    from pipeline.export.files import noted_frames, read_files
+    from pipeline.export.formats import FORMATS, format_named
+    from pipeline.export.lake import pairs_of_poses
+    from pipeline.export.rig_poses import from_ties, reference_of_rig, rig_poses
+    from pipeline.rig.graph import tie
+    from pipeline.store.partitions import Lake
+
+    form, _, listed = text.partition(":")
+    base = {} if rig.base is None else {"base": rig.base}
+    if form in FORMATS:
+        files = [Path(file) for file in listed.split(",")]
+        names = frames.names(base | noted_frames(files))
+        return rig_poses(format_named(form), read_files(files), names, rig), names
+    owner, _, day = text.rpartition("@")
+    if location is None:
+        problem = f'{text!r} is no FORMAT:FILE and no .json; a day of a lake, or "state", needs --lake'
+        raise ConfigError("command line", "--calibration", problem)
+    found = pairs_of_poses(
+        Lake.existing(location), owner or vehicle, None if day == "state" else day, "joint"
+    )
+    reference = reference_of_rig(rig)
+    wanted = {tie(n, reference) for n in rig.nodes if n != reference}
+    if not found.keys() & wanted:
+        raise ConfigError("command line", "--calibration", f"{text}: no poses that refer to {reference.name}")
+    known = {edge: pair.T for edge, pair in found.items() if edge in wanted and not isinstance(pair, str)}
+    return from_ties(known, reference), frames.names(base)
 
 
 def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: tuple[Edge, ...]) -> Side:

@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Any
 from jobs.frame_options import FrameOptions
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from pipeline.config import FleetConfig
     from pipeline.in_use.axes import AxisCheck
     from pipeline.results import Progress
+    from pipeline.rig.graph import Sensor
+    from pipeline.rig.prior import RigPrior
     from pipeline.store.partitions import Lake, Partition
-    from schemas.calibrations import CalibrationRecord
 
 __all__ = ["verify"]
 
@@ -38,15 +41,16 @@ def verify(
 ) -> int:
     """Check the calibration in use against one log: per pair and axis pass, warn, fail or inconclusive.
 
-    Exit 0: all that the pairs are good for passes or warns; 3: something fails, or the log cannot tell.
+    Of a rig of many sensors per sensor and axis, and right, wrong or undecided for each. Exit 0: all that the pairs are
+    good for passes or warns; 3: something fails, or the log cannot tell.
 
     Args:
         logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of one drive.
         fleet: fleet.toml: topics, and from where on an error matters ([verify]).
         calibration: what the car uses: JSON {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}, FORMAT:FILE[,FILE] of
             `boresight export`, or of a lake [VEHICLE@]DAY or state; of a rig with more sensors JSON {"reference":
-            "top", "T": {"front": 4x4, ...}}; default: the prior that fleet.toml names (tf_static of the log, or
-            its file).
+            "top", "T": {"front": 4x4, ...}}, of the other two as many sensors as they have; default: the prior that
+            fleet.toml names (tf_static of the log, or its file).
         lake: folder of the tables, where the calibration is one of its days or a state.
         vehicle: whose rig the log is of; default: the only one of fleet.toml.
         camera_lidar_deg: an error of this size must not go unseen: a pass says that it would have failed.
@@ -62,7 +66,7 @@ def verify(
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.extrinsics.prior import require_named_files
-    from pipeline.in_use.axes import answer_of
+    from pipeline.in_use.axes import answer_of, answer_of_sensors, answers_by_sensor
     from pipeline.store.partitions import Lake
 
     if not logs:
@@ -70,26 +74,32 @@ def verify(
     config = load_fleet(fleet)
     name = _vehicle(config, vehicle)
     with TemporaryDirectory(prefix="boresight-verify-") as folder:
-        config = _for_one_look(config, frames)
-        if calibration is not None:
-            if config.rig_of(name).is_one_of_each:
-                in_use = _as_prior(Path(folder), calibration, lake, name, named or FrameOptions())
-            else:
-                in_use = _of_poses(calibration)
-            config = config.with_prior_file(name, in_use)
+        config, of_sensors = _for_one_look(config, frames), not config.rig_of(name).is_one_of_each
+        lacking: tuple[Sensor, ...] = ()
+        if calibration is not None and of_sensors:
+            config, lacking = _of_poses(
+                Path(folder), config, name, calibration, lake, named or FrameOptions()
+            )
+        elif calibration is not None:
+            file = _as_prior(Path(folder), calibration, lake, name, named or FrameOptions())
+            config = config.with_prior_file(name, file)
         require_named_files(config)
         tables = Lake.at(Path(folder) / "lake")
         with progress_reporter(f"verify {name}") as progress:
             checks, reason = _checked(
-                config, tables, name, logs, (camera_lidar_deg, radar_deg), page, progress
-            )
-    answer = answer_of(checks)
-    told = [_told(c) for c in checks]
+                config, tables, (name, lacking if of_sensors else None), logs, (camera_lidar_deg, radar_deg), page,
+                progress,
+            )  # fmt: skip
+    sensors = answers_by_sensor(checks) if of_sensors else {}
+    answer = answer_of_sensors(sensors) if of_sensors else answer_of(checks)
+    told: dict[str, Any] = {"vehicle": name, "reason": reason, "page": page}
+    told |= {"sensors": sensors} if of_sensors else {}
+    told |= {"axes": [_told(c) for c in checks]}
     if json:
-        print_json({"answer": answer, "reason": reason, "vehicle": name, "page": page, "axes": told})
+        print_json({"answer": answer, **told})
     else:
-        _print_table(checks, answer)
-        print_summary("verify", answer, vehicle=name, reason=reason, page=page, axes=told)
+        _print_table(checks, answer, sensors)
+        print_summary("verify", answer, **told)
     return 0 if answer == "right" else 3
 
 
@@ -125,54 +135,122 @@ def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, na
     return file
 
 
-def _of_poses(calibration: str) -> Path:
-    """The prior file that `--calibration` names, of a rig with more than one sensor of a kind."""
-    from pipeline.errors import ConfigError
+def _of_poses(
+    folder: Path, config: FleetConfig, vehicle: str, calibration: str, lake: str | None, named: FrameOptions
+) -> tuple[FleetConfig, tuple[Sensor, ...]]:
+    """The configuration with the calibration in use, of a rig of many sensors, and the sensors that it has none of.
 
-    if not calibration.endswith(".json"):
-        problem = 'of this rig give a file .json: {"reference": "top", "T": {"front": 4x4, ...}}'
-        raise ConfigError("command line", "--calibration", problem)
-    return Path(calibration)
+    Raises:
+        ConfigError: it is no file or lake, or has less than two sensors; before the first log is opened.
+    """
+    from jobs.calibration_sources import poses_in_use
+    from pipeline.errors import ConfigError
+    from pipeline.export.rig_poses import reference_of_rig, require_all, star_text
+
+    if calibration.endswith(".json") and ":" not in calibration:
+        return config.with_prior_file(vehicle, Path(calibration)), ()
+    rig = config.rig_of(vehicle)
+    poses, names = poses_in_use(calibration, lake, vehicle, rig, named)
+    kept = {*poses, reference_of_rig(rig).name}
+    if len(kept) < 2:
+        raise ConfigError(calibration, "sensors", f"has none of {', '.join(n.name for n in rig.nodes)}")
+    lacking = tuple(n for n in rig.nodes if n.name not in kept)
+    part = rig.of_sensors(kept)
+    file = folder / "in_use.json"
+    file.write_bytes(star_text(require_all(poses, [calibration], names, part), part, "verify", [calibration]))
+    return config.with_rig(vehicle, part).with_prior_file(vehicle, file), lacking
 
 
 def _checked(
     config: FleetConfig,
     lake: Lake,
-    vehicle: str,
+    of: tuple[str, tuple[Sensor, ...] | None],
     logs: tuple[Path, ...],
     asked_deg: tuple[float, float],
     page: Path | None,
     progress: Progress,
 ) -> tuple[list[AxisCheck], str]:
-    """Every axis of every pair, and why there is none where the log could not be used at all."""
+    """Every axis, and why there is none where the log could not be used at all.
+
+    `of`: the vehicle, and of a rig of many sensors those that the calibration in use has no pose of.
+    """
     from pipeline.in_use.axes import check_axes, limits_of
     from pipeline.store.partitions import Partition
+    from pipeline.store.records import read_records
+    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
+    vehicle, lacking = of
     partition = Partition(vehicle, _DAY)
-    records = _records(config, lake, partition, logs, progress)
-    checks = [c for r in records for c in check_axes(r, limits_of(r.pair, config.verify, asked_deg))]
+    _calibrate(config, lake, partition, logs, progress)
+    records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle)
+    if lacking is None:
+        checks = [c for r in records for c in check_axes(r, limits_of(r.pair, config.verify, asked_deg))]
+    else:
+        checks = _checked_poses(config, lake, partition, lacking, asked_deg)
     if page is not None:
         _write_page(config, lake, partition, checks, page)
     reasons = {r.reason for r in records if r.status == "refused"}
     return checks, "; ".join(sorted(reasons))
 
 
-def _records(
+def _checked_poses(
+    config: FleetConfig,
+    lake: Lake,
+    partition: Partition,
+    lacking: Sequence[Sensor],
+    asked_deg: tuple[float, float],
+) -> list[AxisCheck]:
+    """Every axis of every sensor but the reference, which poses are said to."""
+    from pipeline.in_use.axes import check_pose, kind_of_pose, limits_of, shared_sigmas
+    from pipeline.store.records import read_records
+    from schemas.poses import POSES, PoseRow
+
+    rows = [
+        r for r in read_records(lake, POSES, PoseRow, vehicle=partition.vehicle) if r.sensor != r.reference
+    ]
+    prior = _prior(config, lake, partition)
+    known = {row.sensor: None if prior is None else prior.between(row.reference, row.sensor) for row in rows}
+    rows += [
+        PoseRow(
+            vehicle=partition.vehicle, day=partition.day, method="joint", sensor=n.name, kind=n.kind, reference="",
+            status="refused", reason="", code_version="",
+        )
+        for n in lacking
+    ]  # fmt: skip
+    limits = {row.sensor: limits_of(kind_of_pose(row.kind), config.verify, asked_deg) for row in rows}
+    beyond = shared_sigmas(sum(len(limits[sensor]) for sensor in known))
+    return [c for row in rows for c in check_pose(row, known.get(row.sensor), limits[row.sensor], beyond)]
+
+
+def _calibrate(
     config: FleetConfig, lake: Lake, partition: Partition, logs: tuple[Path, ...], progress: Progress
-) -> list[CalibrationRecord]:
+) -> None:
     """The log's own calibration, from the one in use."""
     from dataclasses import replace
 
     from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
-    from pipeline.store.records import read_records
     from pipeline.work import Task
-    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
     task = Task(config, lake, partition, method="joint", logs=logs, progress=progress)
     for stage in (INGEST, PERCEIVE):
         stage.run(task)
     CALIBRATE.run(replace(task, fleet=_spelled_alike(config, lake, partition)))
-    return read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle)
+
+
+def _prior(config: FleetConfig, lake: Lake, partition: Partition) -> RigPrior | None:
+    """The calibration in use; None where there is none: calibrate refuses the log and says why."""
+    from pipeline.errors import SolveError
+    from pipeline.extrinsics.prior import rig_prior
+    from pipeline.store.views import perceived
+    from schemas.moments import PRIOR
+
+    manifest = perceived(lake, partition)
+    if manifest is None:
+        return None
+    try:
+        return rig_prior(manifest.extra.get(PRIOR, ()), config, config.rig_of(partition.vehicle))
+    except SolveError:
+        return None
 
 
 def _spelled_alike(config: FleetConfig, lake: Lake, partition: Partition) -> FleetConfig:
@@ -181,22 +259,12 @@ def _spelled_alike(config: FleetConfig, lake: Lake, partition: Partition) -> Fle
     Digits beyond a measurement's make searches take other ways: the same calibration, 3e-8 apart, was .14 and .09 deg
     off.
     """
-    from pipeline.errors import SolveError
     from pipeline.export.texts import to_json
-    from pipeline.extrinsics.prior import rig_prior
     from pipeline.in_use.spelling import on_grid
-    from pipeline.store.views import perceived
     from schemas.calibrations import FRAMES_OF_PAIR
-    from schemas.moments import PRIOR
 
-    manifest, rig = perceived(lake, partition), config.rig_of(partition.vehicle)
-    if manifest is None:
-        return config
-    try:
-        prior = rig_prior(manifest.extra.get(PRIOR, ()), config, rig)
-    except SolveError:  # no prior: calibrate refuses the log and says why
-        return config
-    if prior.untied:  # a sensor is silent: its prior stays as logged
+    prior, rig = _prior(config, lake, partition), config.rig_of(partition.vehicle)
+    if prior is None or prior.untied:  # a sensor is silent: its prior stays as logged
         return config
     if rig.is_one_of_each:
         kinds = {node.name: node.kind for node in rig.nodes}
@@ -232,14 +300,21 @@ def _told(check: AxisCheck) -> dict[str, Any]:
     return asdict(check)
 
 
-def _print_table(checks: list[AxisCheck], answer: str) -> None:
+def _print_table(checks: list[AxisCheck], answer: str, sensors: Mapping[str, str]) -> None:
     from numpy import degrees
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     table = Table(title="The calibration in use", title_justify="left")
-    for heading in ("pair", "axis", "", "off [deg]", "sigma [deg]", "shows from [deg]"):
+    for heading in (
+        "sensor" if sensors else "pair",
+        "axis",
+        "",
+        "off [deg]",
+        "sigma [deg]",
+        "shows from [deg]",
+    ):
         # Text: rich reads square brackets as styles.
         table.add_column(Text(heading), justify="right" if "deg" in heading else "left")
     for c in checks:
@@ -250,4 +325,7 @@ def _print_table(checks: list[AxisCheck], answer: str) -> None:
     for c in checks:
         if c.status == "inconclusive":
             console.print(f"  - {c.pair} {c.axis}: {c.reason}", markup=False, highlight=False)
+    for said in ("right", "wrong", "undecided"):
+        if own := [sensor for sensor, is_said in sensors.items() if is_said == said]:
+            console.print(f"{said}: {', '.join(own)}", markup=False, highlight=False)
     console.print(f"Is the calibration in use right: [bold]{answer}[/]")

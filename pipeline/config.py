@@ -191,10 +191,13 @@ class FleetConfig(Section):
 
     def with_prior_file(self, vehicle: str, file: Path) -> FleetConfig:
         """The same configuration, with the prior of a vehicle's rig from a file, as far to be trusted as before."""
-        name = self.vehicle(vehicle).rig
-        rig = self.rigs[name]
+        rig = self.rig_of(vehicle)
         prior = rig.prior.model_copy(update={"source": "file", "file": str(file.resolve())})
-        return self.model_copy(update={"rigs": self.rigs | {name: rig.model_copy(update={"prior": prior})}})
+        return self.with_rig(vehicle, rig.model_copy(update={"prior": prior}))
+
+    def with_rig(self, vehicle: str, rig: Rig) -> FleetConfig:
+        """The same configuration, with another rig in place of a vehicle's."""
+        return self.model_copy(update={"rigs": self.rigs | {self.vehicle(vehicle).rig: rig}})
 
 
 def load_fleet(path: Path) -> FleetConfig:

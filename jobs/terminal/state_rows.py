@@ -14,6 +14,7 @@ __all__ = ["state_rows"]
 
 def state_rows(lake: Lake, states: Sequence[StateRow]) -> list[dict[str, Any]]:
     """Each state by the names of its columns, with "T", and "T_prior" of its last day (4x4 or None)."""
+    from pipeline.geometry.se3 import inverse
     from pipeline.store.current import current_records, prior_of, transform_of
     from pipeline.store.records import read_records
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
@@ -27,9 +28,10 @@ def state_rows(lake: Lake, states: Sequence[StateRow]) -> list[dict[str, Any]]:
             lake, CALIBRATIONS, CalibrationRecord, day=day, vehicle=among, columns=prior_columns
         )
         for record in current_records(rows):
-            priors[record.vehicle, record.method, record.parent_frame, record.child_frame, day] = prior_of(
-                record
-            )
+            T, ends = prior_of(record), (record.parent_frame, record.child_frame)
+            of = record.vehicle, record.method
+            priors[*of, *ends, day] = T
+            priors[*of, *ends[::-1], day] = None if T is None else inverse(T)  # of a pose
     return [
         {c.name: getattr(s, c.name) for c in STATES.columns}
         | {

@@ -6,6 +6,9 @@ right calibrations by chance) and of a size that matters (beyond the limit of `[
 detection power: the probability with which an error of the size asked for would have failed. An axis without it is
 inconclusive, however small its distance.
 
+Of a rig of many sensors the log's poses answer, a sensor at a time: all its edges speak in them. So many axes would
+make false alarms frequent, so their probability is shared: three sigmas for one axis are 3.9 for 25.
+
 Azimuth and elevation are those of targets 15 to 40 m away (root mean square); roll is the camera's about its own axis,
 which turns pictures without moving their middle. Everything else of a pose is told by the record, not judged here.
 """
@@ -18,16 +21,31 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr, ndtri
+from scipy.stats import norm
 
 from pipeline.config import VerifyConfig
 from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.geometry.se3 import adjoint, inverse, log_se3
 from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
+from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.edges import edge_named, words_of
 from pipeline.store.current import prior_of, targets_of, transform_of
 from schemas.calibrations import CalibrationRecord
+from schemas.poses import PoseRow
 
-__all__ = ["NEEDED_AXES", "AxisCheck", "AxisLimits", "answer_of", "check_axes", "limits_of"]
+__all__ = [
+    "NEEDED_AXES",
+    "AxisCheck",
+    "AxisLimits",
+    "answer_of",
+    "answer_of_sensors",
+    "answers_by_sensor",
+    "check_axes",
+    "check_pose",
+    "kind_of_pose",
+    "limits_of",
+    "shared_sigmas",
+]
 
 # Once in 370 right calibrations by chance; rarer where the limit, which has to be passed too, is the larger one.
 CONTRADICTION_SIGMAS = 3.0
@@ -63,7 +81,8 @@ class AxisLimits:
 class AxisCheck:
     """One axis of one pair; angles [rad] are nan where the log gives no estimate.
 
-    `pair` is the pair's kind, or names of its sensors where they are called otherwise.
+    `pair` is the pair's kind, or names of its sensors where they are called otherwise; of a rig of many sensors the
+    sensor's own name.
     """
 
     pair: str
@@ -104,9 +123,65 @@ def check_axes(record: CalibrationRecord, limits: Mapping[str, AxisLimits]) -> l
     in_use, found = prior_of(record), transform_of(record)
     blocked = _why_not(record)
     if in_use is None or found is None or record.covariance is None:
-        return [_silent(record, axis, of, blocked or record.reason) for axis, of in limits.items()]
+        pair = _pair(record), record.pair
+        return [_silent(pair, axis, of, blocked or record.reason) for axis, of in limits.items()]
     off = _off(record.pair, in_use, found, np.asarray(record.covariance), targets_of(record))
-    return [_checked(record, axis, limits[axis], *off[axis], blocked) for axis in limits if axis in off]
+    of = _pair(record), record.pair
+    return [
+        _checked(of, axis, limits[axis], off[axis], blocked, CONTRADICTION_SIGMAS)
+        for axis in limits
+        if axis in off
+    ]
+
+
+def kind_of_pose(kind: str) -> str:
+    """As which kind of pair a sensor's pose to the reference is judged."""
+    return {"camera": "camera_lidar", "radar": "lidar_radar", "base": "lidar_base"}.get(kind, "lidar_lidar")
+
+
+def shared_sigmas(axes: int) -> float:
+    """Sigmas beyond which one of so many axes contradicts: together as rare by chance as three of one alone."""
+    return float(norm.isf(norm.sf(CONTRADICTION_SIGMAS) / max(axes, 1)))
+
+
+def check_pose(
+    row: PoseRow, in_use: Float[np.ndarray, "4 4"] | None, limits: Mapping[str, AxisLimits], beyond: float
+) -> list[AxisCheck]:
+    """Every axis that `limits` names of one sensor, from its pose by the log.
+
+    Args:
+        row: the pose.
+        in_use: T_reference_sensor as the car uses it; None where it has none.
+        limits: of the axes.
+        beyond: sigmas from which on an axis contradicts, `shared_sigmas`.
+    """
+    of, found = (row.sensor, kind_of_pose(row.kind)), transform_of(row)
+    why = f"the log gives no answer of its own: {row.reason}" if row.faults or found is None else ""
+    why = why if in_use is not None else "the calibration in use has no pose of it"
+    if in_use is None or found is None or row.covariance is None:
+        return [_silent(of, axis, limit, why) for axis, limit in limits.items()]
+    T = inverse(found)  # what the sensor's directions are stated by
+    A = adjoint(T)
+    targets = DEFAULT_TARGETS if row.targets_m is None else np.asarray(row.targets_m)
+    off = _off(f"{row.kind}_of", inverse(in_use), T, A @ np.asarray(row.covariance) @ A.T, targets)
+    return [_checked(of, axis, limits[axis], off[axis], why, beyond) for axis in limits if axis in off]
+
+
+def answers_by_sensor(checks: Sequence[AxisCheck]) -> dict[str, str]:
+    """right, wrong or undecided, by sensor: right where all that its kind is good for passes or warns."""
+    answers: dict[str, str] = {}
+    for sensor in dict.fromkeys(c.pair for c in checks):
+        own = [c for c in checks if c.pair == sensor]
+        needed = [c.status in {"pass", "warn"} for c in own if c.axis in NEEDED_AXES[c.kind]]
+        is_wrong = any(c.status == "fail" for c in own)
+        answers[sensor] = "wrong" if is_wrong else "right" if needed and all(needed) else "undecided"
+    return answers
+
+
+def answer_of_sensors(answers: Mapping[str, str]) -> str:
+    """Of the whole rig: wrong where a sensor is, right where all are."""
+    said = set(answers.values())
+    return "wrong" if "wrong" in said else "right" if said == {"right"} else "inconclusive"
 
 
 def answer_of(checks: Sequence[AxisCheck]) -> str:
@@ -149,24 +224,26 @@ def _off(
 
 
 def _checked(
-    record: CalibrationRecord, axis: str, limits: AxisLimits, off_rad: float, sigma_rad: float, blocked: str
+    of: tuple[str, str], axis: str, limits: AxisLimits, off: tuple[float, float], blocked: str, beyond: float
 ) -> AxisCheck:
-    threshold = max(limits.limit_rad, CONTRADICTION_SIGMAS * sigma_rad)
+    """One axis of a pair or sensor: its words and its kind; `off` is the distance and its sigma."""
+    off_rad, sigma_rad = off
+    threshold = max(limits.limit_rad, beyond * sigma_rad)
     power = float(ndtr((limits.asked_rad - threshold) / sigma_rad))
     shown = threshold + _SHOWN_SIGMAS * sigma_rad
-    status, reason = _status(off_rad, sigma_rad, limits, power, blocked)
-    numbers = (off_rad, sigma_rad, limits.limit_rad, limits.asked_rad)
-    return AxisCheck(
-        _pair(record), record.pair, axis, status, reason, *numbers, 0.0 if blocked else power, shown
+    measured = off_rad > beyond * sigma_rad
+    status, reason = (
+        ("inconclusive", blocked)
+        if blocked
+        else _status(off_rad, sigma_rad, limits, power, measured=measured)
     )
+    numbers = (off_rad, sigma_rad, limits.limit_rad, limits.asked_rad)
+    return AxisCheck(*of, axis, status, reason, *numbers, 0.0 if blocked else power, shown)
 
 
 def _status(
-    off_rad: float, sigma_rad: float, limits: AxisLimits, power: float, blocked: str
+    off_rad: float, sigma_rad: float, limits: AxisLimits, power: float, *, measured: bool
 ) -> tuple[str, str]:
-    if blocked:
-        return "inconclusive", blocked
-    measured = off_rad > CONTRADICTION_SIGMAS * sigma_rad
     distance = f"{_deg(off_rad)} off, known to {_deg(sigma_rad)}"
     if measured and off_rad > limits.limit_rad:
         return "fail", f"{distance}: beyond {_deg(limits.limit_rad)} and beyond chance"
@@ -179,10 +256,10 @@ def _status(
     return "pass", distance
 
 
-def _silent(record: CalibrationRecord, axis: str, limits: AxisLimits, reason: str) -> AxisCheck:
+def _silent(of: tuple[str, str], axis: str, limits: AxisLimits, reason: str) -> AxisCheck:
     nan = float("nan")
     return AxisCheck(
-        _pair(record), record.pair, axis, "inconclusive", reason, nan, nan, limits.limit_rad, limits.asked_rad,
+        *of, axis, "inconclusive", reason, nan, nan, limits.limit_rad, limits.asked_rad,
         0.0, nan,
     )  # fmt: skip
 

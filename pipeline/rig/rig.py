@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final, TypeVar
 
 from pydantic import (
@@ -73,6 +73,17 @@ class Rig(Section):
     def kinds(self) -> tuple[str, ...]:
         """Which of camera, lidar and radar it has."""
         return tuple(kind for kind, of in self._of_kind.items() if of)
+
+    def of_sensors(self, names: Collection[str]) -> Rig:
+        """The same rig with some of its sensors, and the vehicle frame where `base` is among the names."""
+        kept = {
+            section: {name: topics for name, topics in self._of_kind[kind].items() if name in names}
+            for kind, section in SECTIONS.items()
+        }
+        edges = None if self.edges is None else tuple(e for e in self.edges if set(e) <= set(names))
+        base = self.base if BASE.name in names else None
+        three = self.three if self.three is not None and set(self.three) <= set(names) else None
+        return self.model_copy(update={**kept, "edges": edges, "base": base, "three": three})
 
     @property
     def is_one_of_each(self) -> bool:
