@@ -1,31 +1,44 @@
-"""ROS messages filled from plain arrays: what the simulator, `convert` and `export` write into logs."""
+"""ROS messages filled from plain arrays, and MCAP of them: what the simulator, `convert` and `export` write."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Final
+from functools import lru_cache
+from io import BufferedIOBase
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from jaxtyping import Float
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import to_quaternion
+from pipeline.rig.topics import frame_of
+from pipeline.ros_definitions import register
 
-__all__ = ["RosMessages"]
+__all__ = ["McapLog", "RosMessages"]
 
 _DATATYPES: Final = {"f4": 7, "u2": 4, "u1": 2}  # sensor_msgs/PointField
 
 
+@lru_cache(maxsize=2)
+def _typestore(ros_version: int) -> Typestore:
+    """All types that are written; compiled once per process."""
+    store = get_typestore(Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_HUMBLE)
+    register(store, "vision_msgs/msg/Detection2DArray")
+    if ros_version == 1:
+        text = "geometry_msgs/TransformStamped[] transforms"
+        store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+    return store
+
+
 class RosMessages:
-    """Makes messages of one typestore of rosbags, and their wire bytes.
+    """Makes messages of ROS version 1 or 2 (Humble), and their wire bytes; headers by `header` or `at`."""
 
-    Args:
-        typestore: of ROS 1 or ROS 2; it holds tf2_msgs where transforms are made.
-        ros_version: 1 or 2.
-    """
-
-    def __init__(self, typestore: Any, ros_version: int) -> None:
-        self.typestore, self.ros_version = typestore, ros_version
+    def __init__(self, ros_version: int) -> None:
+        self.typestore, self.ros_version = _typestore(ros_version), ros_version
 
     def make(self, name: str, /, **fields: Any) -> Any:
         """A message of a type; name as "sensor_msgs/PointCloud2"."""
@@ -42,6 +55,10 @@ class RosMessages:
         time = self.make("builtin_interfaces/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         seq = {"seq": 0} if self.ros_version == 1 else {}
         return self.make("std_msgs/Header", stamp=time, frame_id=frame_id, **seq)
+
+    def at(self, stamp_ns: int, sensor: str) -> Any:
+        """Header of a sensor's message, or the vehicle's ("base"), in the frame that logs written here give it."""
+        return self.header(stamp_ns, frame_of(sensor))
 
     def image(self, header: Any, data: bytes, encoding: str) -> Any:
         """CompressedImage."""
@@ -117,23 +134,23 @@ class RosMessages:
             )
         return self.make("tf2_msgs/TFMessage", transforms=items)
 
+    def sensor_poses(self, stamp_ns: int, T_vehicle_sensor: Mapping[str, Float[np.ndarray, "4 4"]]) -> Any:
+        """TFMessage with the vehicle as parent of every sensor, by name."""
+        poses = T_vehicle_sensor.items()
+        return self.transforms((self.at(stamp_ns, "base"), frame_of(name), T) for name, T in poses)
+
     def odometry(
-        self,
-        header: Any,
-        child: str,
-        T_odom_vehicle: Float[np.ndarray, "4 4"],
-        speed_mps: float,
-        yaw_rate_radps: float,
+        self, stamp_ns: int, T_odom_vehicle: Float[np.ndarray, "4 4"], speed_mps: float, yaw_rate_radps: float
     ) -> Any:
-        """Odometry: pose in the header's frame, twist (forward speed and yaw rate) in the child's."""
+        """Odometry: pose in odom, twist (forward speed and yaw rate) in the vehicle's frame."""
         zero = {"x": 0.0, "y": 0.0, "z": 0.0}
         linear = self.make("geometry_msgs/Vector3", **(zero | {"x": speed_mps}))
         angular = self.make("geometry_msgs/Vector3", **(zero | {"z": yaw_rate_radps}))
         twist = self.make("geometry_msgs/Twist", linear=linear, angular=angular)
         return self.make(
             "nav_msgs/Odometry",
-            header=header,
-            child_frame_id=child,
+            header=self.header(stamp_ns, "odom"),
+            child_frame_id=frame_of("base"),
             pose=self.pose(T_odom_vehicle, with_covariance=True),
             twist=self.make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
         )
@@ -150,3 +167,36 @@ class RosMessages:
     def _quaternion(self, T: np.ndarray) -> Any:
         w, x, y, z = (float(q) for q in to_quaternion(T))
         return self.make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
+
+
+class McapLog:
+    """A ROS 2 MCAP open for writing.
+
+    Args:
+        stream: takes the bytes; stays open.
+        library: what writes, for the file's header.
+        compression: of the chunks.
+    """
+
+    def __init__(
+        self,
+        stream: BinaryIO | BufferedIOBase,
+        library: str,
+        compression: CompressionType = CompressionType.ZSTD,
+    ) -> None:
+        self.messages = RosMessages(2)
+        self.writer = Writer(stream, chunk_size=4 << 20, compression=compression)
+        self.writer.start(profile="ros2", library=library)
+        self._channels: dict[str, int] = {}
+
+    def put(self, topic: str, stamp_ns: int, message: Any, **metadata: str) -> None:
+        """Write a message; metadata is that of a topic's first."""
+        if topic not in self._channels:
+            kind = message.__msgtype__
+            text = self.messages.typestore.generate_msgdef(kind, ros_version=2)[0]
+            schema = self.writer.register_schema(name=kind, encoding="ros2msg", data=text.encode())
+            self._channels[topic] = self.writer.register_channel(
+                topic=topic, message_encoding="cdr", schema_id=schema, metadata=metadata
+            )
+        data = self.messages.serialised(message)
+        self.writer.add_message(self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=data)

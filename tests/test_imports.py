@@ -28,6 +28,7 @@ FOUNDATIONS = {
     "extrinsics",
     "rig",
     "rigs",
+    "ros_definitions",
     "ros_messages",
     "rows",
     "shipped_models",

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-from mcap.writer import CompressionType, Writer
-from rosbags.typesys import Stores, get_typestore
-
-from pipeline.convert.recording import EgoMotion, Event, Recording, image_format
+from pipeline.convert.recording import Event, Recording, image_format
 from pipeline.rig.graph import Kind
 from pipeline.rig.topics import TOPICS, frame_of, topics_of
-from pipeline.ros_messages import RosMessages
+from pipeline.ros_messages import McapLog, RosMessages
 from pipeline.store.atomic_write import atomic_write
 
 __all__ = ["fleet_text", "write_log"]
@@ -28,28 +24,30 @@ def write_log(path: Path, recording: Recording) -> int:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as stream:
-        log = _Log(Writer(stream, chunk_size=4 << 20, compression=CompressionType.ZSTD))
-        if recording.events:
-            first_ns = recording.events[0].stamp_ns
-            poses = ((_at(first_ns, "base"), frame_of(s), T) for s, T in recording.T_base.items())
-            log.put(TOPICS["tf"], first_ns, _ros().transforms(poses))
+        log, count = McapLog(stream, "boresight-convert"), 0
         for event in recording.events:
-            for topic, message in _messages(recording, event):
+            messages = _messages(log.messages, recording, event)
+            if not count:
+                poses = log.messages.sensor_poses(event.stamp_ns, recording.T_base)
+                messages = [(TOPICS["tf"], poses), *messages]
+            for topic, message in messages:
                 log.put(topic, event.stamp_ns, message)
-        return log.finish()
+            count += len(messages)
+        log.writer.finish()
+        return count
 
 
-def _messages(recording: Recording, event: Event) -> list[tuple[str, Any]]:
+def _messages(ros: RosMessages, recording: Recording, event: Event) -> list[tuple[str, Any]]:
     """(topic, message) of what one sensor saw."""
     held, name, at_ns = event.load(), event.sensor, event.stamp_ns
     if name == "ego":
-        return [(TOPICS["odometry"], _odometry(at_ns, held))]
-    topics = topics_of(name, recording.kinds[name])
+        return [(TOPICS["odometry"], ros.odometry(at_ns, *held))]
+    topics, header = topics_of(name, recording.kinds[name]), ros.at(at_ns, name)
     if name not in recording.cameras:
-        return [(topics["points"], _ros().cloud(_at(at_ns, name), held))]
+        return [(topics["points"], ros.cloud(header, held))]
     return [
-        (topics["image"], _ros().image(_at(at_ns, name), held, image_format(held))),
-        (topics["info"], _ros().camera_info(_at(at_ns, name), recording.cameras[name])),
+        (topics["image"], ros.image(header, held, image_format(held))),
+        (topics["info"], ros.camera_info(header, recording.cameras[name])),
     ]
 
 
@@ -97,41 +95,3 @@ def _section(sensor: str, kind: Kind, models: tuple[str, str] | None) -> str:
         return f'{head}\nimage = "{image}"\ninfo = "{info}"\nsemantics = {{ {inline} }}'
     doppler = '\ndoppler_field = "doppler"\ndoppler_positive = "receding"' if kind == "radar" else ""
     return f'{head}\npoints = "{topics["points"]}"{doppler}'
-
-
-@cache
-def _ros() -> RosMessages:
-    return RosMessages(get_typestore(Stores.ROS2_HUMBLE), 2)
-
-
-class _Log:
-    """An open MCAP that knows its channels."""
-
-    def __init__(self, writer: Writer) -> None:
-        self._writer, self._channels, self._count = writer, dict[str, int](), 0
-        writer.start(profile="ros2", library="boresight-convert")
-
-    def put(self, topic: str, stamp_ns: int, message: Any) -> None:
-        kind = message.__msgtype__
-        if topic not in self._channels:
-            text = _ros().typestore.generate_msgdef(kind, ros_version=2)[0]
-            schema = self._writer.register_schema(name=kind, encoding="ros2msg", data=text.encode())
-            self._channels[topic] = self._writer.register_channel(
-                topic=topic, message_encoding="cdr", schema_id=schema
-            )
-        data = _ros().serialised(message)
-        self._writer.add_message(self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=data)
-        self._count += 1
-
-    def finish(self) -> int:
-        self._writer.finish()
-        return self._count
-
-
-def _at(stamp_ns: int, frame: str) -> Any:
-    return _ros().header(stamp_ns, frame_of(frame))
-
-
-def _odometry(stamp_ns: int, motion: EgoMotion) -> Any:
-    header, child = _ros().header(stamp_ns, "odom"), frame_of("base")
-    return _ros().odometry(header, child, motion.T_odom_base, motion.speed_mps, motion.yaw_rate_radps)

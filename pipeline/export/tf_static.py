@@ -11,7 +11,7 @@ import struct
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 from rosbags.typesys import Stores, get_typestore
 
 from pipeline.errors import ConfigError
@@ -19,7 +19,7 @@ from pipeline.export.calibration import ExportedCalibration, poses_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import provenance_of
 from pipeline.geometry.transform_tree import TransformTree
-from pipeline.ros_messages import RosMessages
+from pipeline.ros_messages import McapLog
 
 __all__ = ["TF_STATIC"]
 
@@ -36,23 +36,13 @@ _MOST_BYTES = 1 << 30  # /tf_static comes first in a log; of a larger one, give 
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
-    ros = RosMessages(get_typestore(Stores.ROS2_HUMBLE), 2)
-    edges = poses_of(calibration)
-    message = ros.transforms((ros.header(0, edge.parent), edge.child, edge.T) for edge in edges)
     stream = io.BytesIO()
-    writer = Writer(stream, compression=CompressionType.NONE)
-    writer.start(profile="ros2", library=f"boresight {calibration.code_version}")
-    text = ros.typestore.generate_msgdef(_TYPE, ros_version=2)[0]
-    schema = writer.register_schema(name=_TYPE, encoding="ros2msg", data=text.encode())
-    channel = writer.register_channel(
-        topic=_TOPIC,
-        message_encoding="cdr",
-        schema_id=schema,
-        metadata={"offered_qos_profiles": _QOS},
-    )
-    writer.add_message(channel, log_time=0, publish_time=0, data=ros.serialised(message))
-    writer.add_metadata("boresight", {"provenance": json.dumps(provenance_of(calibration))})
-    writer.finish()
+    log = McapLog(stream, f"boresight {calibration.code_version}", CompressionType.NONE)
+    header, edges = log.messages.header, poses_of(calibration)
+    message = log.messages.transforms((header(0, edge.parent), edge.child, edge.T) for edge in edges)
+    log.put(_TOPIC, 0, message, offered_qos_profiles=_QOS)
+    log.writer.add_metadata("boresight", {"provenance": json.dumps(provenance_of(calibration))})
+    log.writer.finish()
     return {"tf_static.mcap": stream.getvalue()}
 
 

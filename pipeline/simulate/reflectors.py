@@ -63,7 +63,7 @@ def simulate_reflectors(
 
     setup = Setup(rig, mounting, spec.semantics)
     with open_log(folder / f"{day_name}.mcap", "mcap") as log:
-        log.put(TOPICS["tf"], at(0.0), log.messages.transforms(at(0.0), nominal_poses(mounting)))
+        log.put(TOPICS["tf"], at(0.0), log.messages.sensor_poses(at(0.0), nominal_poses(mounting)))
         for k in range(frames):
             stamps = triggered_stamps(rig, mounting, 1.0 + k / _RATE_HZ, rng)
             frame = frame_of(Seat(moment, scene, rig, mounting), stamps, rng, spec.semantics)

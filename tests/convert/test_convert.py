@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from jobs.cli import main
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import from_quaternion
-from pipeline.simulate.logs.messages import Messages
+from pipeline.ros_messages import RosMessages
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of
 from tests.makers import data_sets
@@ -171,7 +171,7 @@ def test_a_broken_file_is_named_and_leaves_no_log(name, file, content, words, tm
 
 def topics_and_frames(path):
     """Of a log, by another reader than the pipeline's: messages by topic, child frames of /tf_static."""
-    store, found = Messages(2).typestore, {}
+    store, found = RosMessages(2).typestore, {}
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             found.setdefault(channel.topic, []).append(store.deserialize_cdr(message.data, schema.name))

@@ -13,7 +13,7 @@ from pipeline.config import load_fleet
 from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.rig.topics import TOPICS
-from pipeline.simulate.logs.messages import Messages
+from pipeline.ros_messages import RosMessages
 from pipeline.store.current import targets_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
@@ -30,7 +30,7 @@ REFERENCE_DEG = 0.1  # how well the given calibration is known
 
 def kitti_folder(log, given, folder):
     """The frames of a log as KITTI's object kit lays them out, named by their number at 10 Hz."""
-    store, first = Messages(2).typestore, None
+    store, first = RosMessages(2).typestore, None
     for path in ("image_2", "velodyne", "calib"):
         (folder / path).mkdir(parents=True)
     with log.open("rb") as stream:

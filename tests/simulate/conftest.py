@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag1 import Reader as Bag1
 from rosbags.rosbag2 import Reader as Bag2
 
-from pipeline.simulate.logs.messages import Messages
+from pipeline.ros_messages import RosMessages
 from pipeline.simulate.sensors.lidar import Sweep
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
 from pipeline.simulate.sensors.radar import Scan
@@ -106,7 +106,7 @@ def shots_of_rig():
 
 
 def messages_of(path):
-    one, two = Messages(1).typestore, Messages(2).typestore
+    one, two = RosMessages(1).typestore, RosMessages(2).typestore
     if path.suffix == ".mcap":
         with path.open("rb") as file:
             found = make_reader(file).iter_messages()

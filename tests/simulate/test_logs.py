@@ -137,14 +137,14 @@ def test_a_log_that_is_broken_off_leaves_the_old_one_and_nothing_else(container,
     path = tmp_path / log_name("drive", container)
     nominal = {"lidar": np.eye(4)}
     with open_log(path, container) as (messages, put):
-        put(TOPICS["tf"], 5, messages.transforms(5, nominal))
+        put(TOPICS["tf"], 5, messages.sensor_poses(5, nominal))
     before = sorted(p for p in tmp_path.rglob("*"))
 
     class StopError(Exception):
         pass
 
     with pytest.raises(StopError), open_log(path, container) as (messages, put):
-        put(TOPICS["tf"], 7, messages.transforms(7, nominal))
+        put(TOPICS["tf"], 7, messages.sensor_poses(7, nominal))
         raise StopError
     assert sorted(p for p in tmp_path.rglob("*")) == before
     assert [stamp for _, stamp, _ in read(path)] == [5]

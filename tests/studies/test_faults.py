@@ -11,7 +11,7 @@ from tests.benchmarks.studies.fault_logs import EDITS, Place
 from tests.benchmarks.studies.faults import CASES, is_right, outcome_of, runs_of
 
 LATE, EARLY = Place(9, 0.9, "radar_front"), Place(0, 0.0, "radar_front")
-ROS = RosMessages(fault_logs._STORE, 2)
+ROS = RosMessages(2)
 XYZ = np.array([[10.0, 2.0, 1.0], [20.0, -4.0, 0.5]], np.float32)
 
 

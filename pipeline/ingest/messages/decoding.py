@@ -13,8 +13,8 @@ from rosbags.typesys.store import Typestore
 from pipeline.errors import LogError
 from pipeline.ingest.containers.reader import PROTOBUF, READ_ERRORS, Channel
 from pipeline.ingest.messages import protobuf
-from pipeline.ingest.messages.definitions import DEFINITIONS
 from pipeline.ingest.messages.foxglove import as_ros
+from pipeline.ros_definitions import DEFINITIONS, register
 
 __all__ = ["DECODE_ERRORS", "content_without_stamp", "decode", "header_frame_id", "header_stamp_ns"]
 
@@ -110,8 +110,7 @@ def _fallback(msgtype: str) -> Typestore:
     """For bags up to ROS 2 Humble, which carry no definitions: that distribution's own."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     if msgtype in DEFINITIONS:
-        for name in (*DEFINITIONS[msgtype][0], msgtype):
-            store.register(get_types_from_msg(DEFINITIONS[name][1], name))
+        register(store, msgtype)
     elif msgtype not in store.fielddefs:
         raise ValueError(
             "the log carries no definition of it: record with ROS 2 Iron or newer, or convert the bag to MCAP"

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 
 from pipeline.rig.topics import topics_of
+from pipeline.ros_messages import RosMessages
 from pipeline.simulate.faults import DayFaults, misread, swapped_with
-from pipeline.simulate.logs.messages import Messages
 from pipeline.simulate.sensors.data_sheets import LidarSpec, RadarSpec
 from pipeline.simulate.sensors.lidar import Sweep
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
-from pipeline.simulate.sensors.semantics import SemanticsSpec, encode_png
+from pipeline.simulate.sensors.semantics import Box, SemanticsSpec, encode_png
 from pipeline.simulate.sensors.simulated_frame import Image, SimulatedFrame
 
 __all__ = ["At", "Sent", "Setup", "messages_of"]
@@ -37,7 +37,7 @@ class Setup:
 
 
 def messages_of(
-    messages: Messages, frame: SimulatedFrame, setup: Setup, at: At, rng: np.random.Generator
+    messages: RosMessages, frame: SimulatedFrame, setup: Setup, at: At, rng: np.random.Generator
 ) -> list[Sent]:
     """The messages of one frame; none of a sensor that is missing.
 
@@ -66,7 +66,7 @@ def messages_of(
             # A reader takes the frame of a mistaken cable from the driver behind it.
             owner = plug if plug.kind == sensor.kind else sensor
             topic = topics_of(plug.name, plug.kind)["points"]
-            sent.append((stamp, topic, messages.cloud(stamp, owner.name, columns)))
+            sent.append((stamp, topic, messages.cloud(messages.at(stamp, owner.name), columns)))
     return sent
 
 
@@ -82,7 +82,7 @@ def _plugged(sensor: SensorSpec, setup: Setup) -> SensorSpec:
 
 
 def _of_camera(
-    messages: Messages,
+    messages: RosMessages,
     image: Image,
     setup: Setup,
     sensor: SensorSpec,
@@ -93,14 +93,31 @@ def _of_camera(
     today, name = setup.faults, sensor.name
     info = misread(setup.mounting.camera(name)[1], today, name)
     labels = _permuted(image.labels_png, rng) if today.has("labels", name) else image.labels_png
+    header = messages.at(stamp, name)
     made = {
-        "info": messages.camera_info(stamp, name, info),
-        "image": messages.image(stamp, name, image.jpeg, "jpeg"),
-        "labels": messages.image(stamp, name, labels, "mono8; png compressed"),
-        "detections": messages.detections(stamp, name, image.boxes),
+        "info": messages.camera_info(header, info),
+        "image": messages.image(header, image.jpeg, "jpeg"),
+        "labels": messages.image(header, labels, "mono8; png compressed"),
+        "detections": _detections(messages, header, image.boxes),
     }
     topics = topics_of(name, "camera")
     return [(stamp, topics[what], message) for what, message in made.items()]
+
+
+def _detections(ros: RosMessages, header: Any, boxes: list[Box]) -> Any:
+    """Detection2DArray; boxes in full-image pixels."""
+    pose, items = ros.pose(np.eye(4), with_covariance=True), []
+    for i, box in enumerate(boxes):
+        hypothesis = ros.make("vision_msgs/ObjectHypothesis", class_id=box.name, score=box.score)
+        result = ros.make("vision_msgs/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=pose)
+        middle = ros.make("vision_msgs/Point2D", x=(box.x0 + box.x1) / 2, y=(box.y0 + box.y1) / 2)
+        centre = ros.make("vision_msgs/Pose2D", position=middle, theta=0.0)
+        size = {"size_x": box.x1 - box.x0, "size_y": box.y1 - box.y0}
+        bbox = ros.make("vision_msgs/BoundingBox2D", center=centre, **size)
+        items.append(
+            ros.make("vision_msgs/Detection2D", header=header, results=[result], bbox=bbox, id=str(i))
+        )
+    return ros.make("vision_msgs/Detection2DArray", header=header, detections=items)
 
 
 def _of_lidar(sweep: Sweep, sensor: SensorSpec) -> dict[str, np.ndarray]:

@@ -62,7 +62,7 @@ def record_drive(
         return drive.start_ns + round(t_s * 1e9)
 
     odometry = _odometry(drive, rng)
-    log.put(TOPICS["tf"], at(0.0), messages.transforms(at(0.0), nominal_poses(setups[0].mounting)))
+    log.put(TOPICS["tf"], at(0.0), messages.sensor_poses(at(0.0), nominal_poses(setups[0].mounting)))
     scene = scene_of(drive)
     clocks = free_clocks(rig, np.random.default_rng([drive.seed, 53]))
     first: dict[str, SimulatedFrame] = {}

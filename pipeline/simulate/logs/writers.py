@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as Bag2Writer
 
 from pipeline.rig.topics import TOPICS
-from pipeline.simulate.logs.messages import Messages
+from pipeline.ros_messages import McapLog, RosMessages
 
 __all__ = ["CONTAINERS", "OpenLog", "log_name", "open_log"]
 
@@ -24,7 +22,7 @@ CONTAINERS: Final = ("mcap", "ros1", "db3")
 class OpenLog(NamedTuple):
     """A log open for writing: makes its messages, and writes them by put(topic, stamp_ns, message)."""
 
-    messages: Messages
+    messages: RosMessages
     put: Callable[[str, int, Any], None]
 
 
@@ -52,57 +50,31 @@ def open_log(path: Path, container: str) -> Iterator[OpenLog]:
 
 @contextmanager
 def _mcap(path: Path) -> Iterator[OpenLog]:
-    messages = Messages(2)
-    channels: dict[str, int] = {}
     with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=4 << 20, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2", library="boresight-simulate")
+        log = McapLog(file, "boresight-simulate")
+        yield OpenLog(log.messages, log.put)
+        log.writer.finish()
 
-        def put(topic: str, stamp_ns: int, message: Any) -> None:
-            if topic not in channels:
-                name = message.__msgtype__
-                text = messages.typestore.generate_msgdef(name, ros_version=2)[0]
-                schema = writer.register_schema(name=name, encoding="ros2msg", data=text.encode())
-                channels[topic] = writer.register_channel(
-                    topic=topic, message_encoding="cdr", schema_id=schema
-                )
-            writer.add_message(
-                channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=messages.serialised(message)
-            )
 
-        yield OpenLog(messages, put)
-        writer.finish()
+def _ros1(path: Path) -> AbstractContextManager[OpenLog]:
+    writer = Bag1Writer(path)
+    writer.set_compression(Bag1Writer.CompressionFormat.LZ4)
+    return _bag(writer, RosMessages(1), latched={TOPICS["tf"]: {"latching": 1}})
+
+
+def _db3(path: Path) -> AbstractContextManager[OpenLog]:
+    return _bag(Bag2Writer(path, version=9), RosMessages(2), latched={})
 
 
 @contextmanager
-def _ros1(path: Path) -> Iterator[OpenLog]:
-    messages = Messages(1)
+def _bag(writer: Any, messages: RosMessages, latched: dict[str, dict[str, int]]) -> Iterator[OpenLog]:
     connections: dict[str, Any] = {}
-    writer = Bag1Writer(path)
-    writer.set_compression(Bag1Writer.CompressionFormat.LZ4)
     with writer:
 
         def put(topic: str, stamp_ns: int, message: Any) -> None:
             if topic not in connections:
-                latch = 1 if topic == TOPICS["tf"] else None
                 connections[topic] = writer.add_connection(
-                    topic, message.__msgtype__, typestore=messages.typestore, latching=latch
-                )
-            writer.write(connections[topic], stamp_ns, messages.serialised(message))
-
-        yield OpenLog(messages, put)
-
-
-@contextmanager
-def _db3(path: Path) -> Iterator[OpenLog]:
-    messages = Messages(2)
-    connections: dict[str, Any] = {}
-    with Bag2Writer(path, version=9) as writer:
-
-        def put(topic: str, stamp_ns: int, message: Any) -> None:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(
-                    topic, message.__msgtype__, typestore=messages.typestore
+                    topic, message.__msgtype__, typestore=messages.typestore, **latched.get(topic, {})
                 )
             writer.write(connections[topic], stamp_ns, messages.serialised(message))
 

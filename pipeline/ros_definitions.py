@@ -1,12 +1,16 @@
 """Message definitions for bags that carry none (ROS 2 Humble and older) and that rosbags does not bundle.
 
-Used only where the log itself has no definition; a message that does not fit byte for byte is refused.
+Of logs that are read, used only where the log itself has no definition; a message that does not fit byte for byte is
+refused. What is written here has the same.
 Source: vision_msgs 4.1 (Humble); radar_msgs 0.2 (Humble).
 """
 
 from __future__ import annotations
 
-__all__ = ["DEFINITIONS"]
+from rosbags.typesys import get_types_from_msg
+from rosbags.typesys.store import Typestore
+
+__all__ = ["DEFINITIONS", "register"]
 
 # type -> (types it needs first, text)
 DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
@@ -60,3 +64,9 @@ DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
         "std_msgs/Header header\nradar_msgs/RadarTrack[] tracks\n",
     ),
 }
+
+
+def register(store: Typestore, msgtype: str) -> None:
+    """Add one of the types of DEFINITIONS, and those it needs."""
+    for name in (*DEFINITIONS[msgtype][0], msgtype):
+        store.register(get_types_from_msg(DEFINITIONS[name][1], name))
