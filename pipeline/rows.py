@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-__all__ = ["join_rows", "take_rows"]
+__all__ = ["columns_of", "join_rows", "take_rows"]
 
 _Table = TypeVar("_Table")
 
@@ -22,6 +22,12 @@ def join_rows(parts: Sequence[_Table]) -> _Table:
     """The rows of all parts, one after another; what is no array is the first one's."""
     columns = [_arrays(part) for part in parts]
     return _changed(parts[0], {name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
+
+
+def columns_of(rows: Sequence[tuple[Any, ...]], dtype: np.dtype) -> dict[str, np.ndarray]:
+    """The fields of a structured dtype as arrays with an entry per row, also where there is none."""
+    table = np.array(rows, dtype)
+    return {name: np.ascontiguousarray(table[name]) for name in dtype.names or ()}
 
 
 def _arrays(table: Any) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ from bounces off the ground.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,9 +18,10 @@ from scipy.spatial import cKDTree
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, wrap_angle
+from pipeline.objective.radar.frame_equations import robust_equations, rows_of_frames
 from pipeline.objective.radar.medians import median_of_rows
-from pipeline.objective.radar.vehicle_boxes import select_frames
 from pipeline.objective.stamp_gaps import radar_gaps_s, scan_to_image_s
+from pipeline.rows import columns_of
 from schemas.observations import Observation
 
 __all__ = [
@@ -45,7 +46,9 @@ _HEIGHT_M = {
     "bus": 3.0,
     "train": 3.5,
 }
-_LEAST_SIGMA_RAD = np.radians(0.3)
+_CLUSTER = np.dtype(
+    [("point_radar_m", "f8", 3), ("relative_mps", "f8", 3), ("frame", "i8")]
+)  # of MovingClusters
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,16 +83,10 @@ class MovingClusters:
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> MovingClusters:
         """Those of some observations, which are numbered anew in the order given."""
-        index, number = select_frames(self.frame, frames)
-        return MovingClusters(
-            self.point_radar_m[index],
-            self.relative_mps[index],
-            self.stamp_gap_s[index],
-            self.after_image_s[index],
-            self.yaw_rate_radps[index],
-            number,
-            [self.lidar_centres_m[f] for f in frames],
-            [self.box_azimuths[f] for f in frames],
+        return replace(
+            rows_of_frames(self, frames),
+            lidar_centres_m=[self.lidar_centres_m[f] for f in frames],
+            box_azimuths=[self.box_azimuths[f] for f in frames],
         )
 
     def at_lidar_time(self, dt_s: float) -> Float[np.ndarray, "B 3"]:
@@ -112,7 +109,7 @@ def moving_clusters(
     observations: Sequence[Observation], least_detections: int = 2, with_boxes: bool = True
 ) -> MovingClusters:
     """Moving clusters between 3 and 60 m; without boxes it is cheaper, and enough against the lidar."""
-    points, speeds, frames = [], [], []
+    rows = []
     for index, o in enumerate(observations):
         for label in range(int(o.radar_cluster.max(initial=-1)) + 1):
             member = o.radar_cluster == label
@@ -125,19 +122,16 @@ def moving_clusters(
             u = centre / distance
             own = np.zeros(3) if o.radar_velocity_mps is None else o.radar_velocity_mps
             rate = float(median_of_rows(o.radar_residual_mps[member])) - u @ own
-            points.append(centre)
-            speeds.append(rate * u)
-            frames.append(index)
-    frame = np.array(frames, np.int64)
+            rows.append((centre, rate * u, index))
+    clusters = columns_of(rows, _CLUSTER)
+    frame = clusters["frame"]
     return MovingClusters(
-        np.array(points).reshape(-1, 3),
-        np.array(speeds).reshape(-1, 3),
-        radar_gaps_s(observations)[frame],
-        scan_to_image_s(observations)[frame],
-        np.array([o.ego_yaw_rate_radps or 0.0 for o in observations], np.float64)[frame],
-        frame,
-        [_object_centres(o) for o in observations],
-        [_box_azimuths(o) if with_boxes else (np.zeros(0), np.zeros(0)) for o in observations],
+        **clusters,
+        stamp_gap_s=radar_gaps_s(observations)[frame],
+        after_image_s=scan_to_image_s(observations)[frame],
+        yaw_rate_radps=np.array([o.ego_yaw_rate_radps or 0.0 for o in observations], np.float64)[frame],
+        lidar_centres_m=[_object_centres(o) for o in observations],
+        box_azimuths=[_box_azimuths(o) if with_boxes else (np.zeros(0),) * 2 for o in observations],
     )
 
 
@@ -217,7 +211,7 @@ def azimuth_equations_lidar(
     dt_s: float,
 ) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
     """Per frame, information and gradient of the robust azimuth cost of moving clusters against the lidar."""
-    return _robust(*lidar_azimuth_residuals(clusters, T_lidar_radar, dt_s), clusters.observations)
+    return robust_equations(*lidar_azimuth_residuals(clusters, T_lidar_radar, dt_s), clusters.observations)
 
 
 def azimuth_equations_camera(
@@ -226,21 +220,9 @@ def azimuth_equations_camera(
     gate_rad: float,
 ) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
     """The same against camera boxes; unknowns are the left twist of T_camera_radar."""
-    return _robust(*camera_azimuth_residuals(clusters, T_camera_radar, gate_rad), clusters.observations)
-
-
-def _robust(
-    residual: np.ndarray, J: np.ndarray, frame: np.ndarray, frames: int
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Cauchy-weighted normal equations by frame with the residuals' own spread."""
-    H, g = np.zeros((frames, 6, 6)), np.zeros((frames, 6))
-    if len(residual) < 5:  # no spread to weigh them by
-        return H, g, float("nan")
-    sigma = max(float(1.4826 * np.median(np.abs(residual - np.median(residual)))), _LEAST_SIGMA_RAD)
-    weight = 1 / (1 + (residual / (2 * sigma)) ** 2) / sigma**2
-    np.add.at(H, frame, weight[:, None, None] * J[:, :, None] * J[:, None, :])
-    np.add.at(g, frame, (weight * residual)[:, None] * J)
-    return H, g, sigma
+    return robust_equations(
+        *camera_azimuth_residuals(clusters, T_camera_radar, gate_rad), clusters.observations
+    )
 
 
 def _box_azimuths(o: Observation) -> tuple[np.ndarray, np.ndarray]:

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int64
 
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.objective.radar.registration_loops import STATS, accumulate_frames
+from pipeline.rows import columns_of
 from schemas.observations import Observation
 
 __all__ = [
@@ -50,6 +51,18 @@ _RADAR_POINTS = 500  # per frame; more say the same again
 SIDE_RAD = 1.25
 STRAY = 200  # one in so many lidar points may lie outside the lidar's view
 VIEW_MARGIN_RAD = np.radians(1.0)  # about half the elevation cell of a wide-angle radar
+_FRAME = np.dtype(  # what RegistrationFrames holds of a frame beside its points
+    [
+        ("plane", "f8", 4),
+        ("has_plane", "?"),
+        ("has_elevation", "?"),
+        ("velocity_mps", "f8", 3),
+        ("yaw_rate_radps", "f8"),
+        ("stamp_gap_s", "f8"),
+        ("block", "i8"),
+        ("frame", "i8"),
+    ]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,23 +95,8 @@ class RegistrationFrames:
         (radar, r_first), (lidar, l_first) = (
             _pack([points[first[f] : first[f + 1]] for f in frames]) for points, first in pieces
         )
-        rest = (
-            a[frames]
-            for a in (
-                self.plane,
-                self.has_plane,
-                self.has_elevation,
-                self.velocity_mps,
-                self.yaw_rate_radps,
-                self.stamp_gap_s,
-                self.block,
-                self.frame,
-            )
-        )
-        return replace(
-            RegistrationFrames(radar, r_first, lidar, l_first, *rest),
-            lidar_elevation_rad=self.lidar_elevation_rad,
-        )
+        rest = {name: getattr(self, name)[frames] for name in _FRAME.names or ()}
+        return replace(self, radar_m=radar, radar_first=r_first, lidar_m=lidar, lidar_first=l_first, **rest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,22 +140,14 @@ def registration_frames(
         radar.append(static)
         lidar.append(near)
         rows.append(_frame_columns(o, index))
-    columns = list(zip(*rows, strict=True)) if rows else [()] * 8
     (radar_m, radar_first), (lidar_m, lidar_first) = _pack(radar), _pack(lidar)
     return RegistrationFrames(
         radar_m,
         radar_first,
         lidar_m,
         lidar_first,
-        np.array(columns[0], np.float64).reshape(-1, 4),
-        np.array(columns[1], bool),
-        np.array(columns[2], bool),
-        np.array(columns[3], np.float64).reshape(-1, 3),
-        np.array(columns[4], np.float64),
-        np.array(columns[5], np.float64),
-        np.array(columns[6], np.int64),
-        np.array(columns[7], np.int64),
-        _elevation_limits(observations),
+        **columns_of(rows, _FRAME),
+        lidar_elevation_rad=_elevation_limits(observations),
     )
 
 
@@ -269,7 +259,7 @@ def updated_sigma(
 
 
 def _frame_columns(o: Observation, index: int) -> tuple[object, ...]:
-    """What `RegistrationFrames` holds of one frame beside its points, in its order: plane to frame."""
+    """A row of _FRAME."""
     return (
         o.ground_plane if o.ground_plane is not None else np.zeros(4),
         o.ground_plane is not None,

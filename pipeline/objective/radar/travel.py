@@ -29,8 +29,9 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.geometry.se3 import hat, inverse, transform_points
+from pipeline.objective.radar.frame_equations import equations_by_frame, rows_of_frames, spread_of
 from pipeline.objective.radar.registration import RANGE_M, SIDE_RAD
-from pipeline.objective.radar.vehicle_boxes import select_frames
+from pipeline.rows import columns_of
 from schemas.observations import Observation
 
 __all__ = [
@@ -57,6 +58,7 @@ _FLAT_M = 0.01
 _PASSES = 6
 _LEAST_FRAMES = 5  # fewer show no scatter
 _LEAST_SCATTER_RAD = np.radians(0.1)  # springs and road
+_ROW = np.dtype([("velocity_mps", "f8", 3), ("sigma_rad", "f8"), ("slope", "f8"), ("frame", "i8")])
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +77,7 @@ class TravelDirections:
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> TravelDirections:
         """Those of some observations, which are numbered anew in the order given."""
-        index, number = select_frames(self.frame, frames)
-        return TravelDirections(self.velocity_mps[index], self.sigma_rad[index], self.slope[index], number)
+        return rows_of_frames(self, frames)
 
 
 def travel_directions(
@@ -104,12 +105,7 @@ def travel_directions(
             up = T_lidar_radar[2, :3]
             sigma = float(np.sqrt(up @ covariance @ up) / np.linalg.norm(velocity))
             rows.append((velocity, sigma, slope, index))
-    if not rows:
-        return TravelDirections(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
-    velocities, sigmas, slopes, frames = zip(*rows, strict=True)
-    return TravelDirections(
-        np.array(velocities), np.array(sigmas), np.array(slopes), np.array(frames, np.int64)
-    )
+    return TravelDirections(**columns_of(rows, _ROW))
 
 
 def pitch_residuals(
@@ -132,16 +128,13 @@ def pitch_equations(
     That is what frames differ by beyond their own sigmas, and it is added to these. NaN, and nothing said, where they
     are too few.
     """
-    H, g = np.zeros((frames, 2, 2)), np.zeros((frames, 2))
     if travel.count < _LEAST_FRAMES:
-        return H, g, float("nan")
+        return np.zeros((frames, 2, 2)), np.zeros((frames, 2)), float("nan")
     residual, J = pitch_residuals(travel, T_lidar_radar)
-    spread = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
-    common = max(spread**2 - float(np.median(travel.sigma_rad)) ** 2, _LEAST_SCATTER_RAD**2)
+    common = max(spread_of(residual) ** 2 - float(np.median(travel.sigma_rad)) ** 2, _LEAST_SCATTER_RAD**2)
     variance = travel.sigma_rad**2 + common
     weight = 1 / (variance + residual**2 / 4)
-    np.add.at(H, travel.frame, weight[:, None, None] * J[:, :2, None] * J[:, None, :2])
-    np.add.at(g, travel.frame, (weight * residual)[:, None] * J[:, :2])
+    H, g = equations_by_frame(weight, residual, J[:, :2], travel.frame, frames)
     return H, g, float(np.sqrt(common))
 
 

@@ -16,8 +16,10 @@ from jaxtyping import Float, Int64
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import hat, transform_points
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical, to_spherical
+from pipeline.objective.radar.frame_equations import robust_equations, rows_of_frames
 from pipeline.objective.radar.medians import median_of_rows
 from pipeline.objective.stamp_gaps import scan_to_image_s
+from pipeline.rows import columns_of
 from schemas.observations import Observation
 
 __all__ = [
@@ -27,7 +29,6 @@ __all__ = [
     "box_equations",
     "box_pairs",
     "elevation_residuals",
-    "select_frames",
     "vehicle_boxes",
 ]
 
@@ -39,7 +40,16 @@ _RANGE_FACTOR = 1.8  # box height to range: vans to low cars, poor boxes
 _RANGE_M = (3.0, 60.0)
 _DEPTH_M = 3.5  # detections of one vehicle lie within this range interval
 _LEAST_HEIGHT_PX = 12.0
-_LEAST_SIGMA_RAD = np.radians(0.3)  # box edges are no better
+_PAIR = np.dtype(  # of BoxPairs
+    [
+        ("point_radar_m", "f8", 3),
+        ("azimuth_rad", "f8"),
+        ("elevation_rad", "f8"),
+        ("detections", "i8"),
+        ("kind", "i8"),
+        ("frame", "i8"),
+    ]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,16 +66,7 @@ class VehicleBoxes:
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> VehicleBoxes:
         """Those of some observations, which are numbered anew in the order given."""
-        index, number = select_frames(self.frame, frames)
-        return VehicleBoxes(
-            self.kind[index],
-            self.azimuth_rad[index],
-            self.elevation_rad[index],
-            self.left_rad[index],
-            self.right_rad[index],
-            self.expected_m[index],
-            number,
-        )
+        return rows_of_frames(self, frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,16 +84,6 @@ class BoxPairs:
     def count(self) -> int:
         """Number of boxes."""
         return len(self.kind)
-
-
-def select_frames(
-    frame: Int64[np.ndarray, " B"], frames: Int64[np.ndarray, " S"]
-) -> tuple[Int64[np.ndarray, " C"], Int64[np.ndarray, " C"]]:
-    """Rows that belong to the given frames, and the place of their frame among these."""
-    place = np.full(int(max(frame.max(initial=-1), frames.max(initial=-1))) + 1, -1, np.int64)
-    place[frames] = np.arange(len(frames))
-    index = np.flatnonzero(place[frame] >= 0)
-    return index.astype(np.int64), place[frame[index]]
 
 
 def vehicle_boxes(observations: Sequence[Observation]) -> VehicleBoxes:
@@ -125,7 +116,7 @@ def box_pairs(
         elevation_gate_rad: detections farther from the box's centre belong to something else.
         least_detections: fewer tell nothing.
     """
-    rows: list[tuple[np.ndarray, float, float, int, int, int]] = []
+    rows = []
     turns = scan_to_image_s(observations) * [o.ego_yaw_rate_radps or 0.0 for o in observations]
     for index in np.unique(boxes.frame):
         # Where they were when the image was taken; what they moved along the line of sight changes no direction.
@@ -138,13 +129,8 @@ def box_pairs(
             if len(chosen) >= least_detections:
                 middle = from_spherical(median_of_rows(to_spherical(radar[chosen])))
                 centre = boxes.azimuth_rad[b], boxes.elevation_rad[b]
-                rows.append((middle, *centre, len(chosen), int(boxes.kind[b]), int(index)))
-    if not rows:
-        none = np.zeros(0)
-        return BoxPairs(np.zeros((0, 3)), none, none, *(np.zeros(0, np.int64) for _ in range(3)))
-    points, azimuth, elevation, number, kinds, frames = zip(*rows, strict=True)
-    integers = (np.array(v, np.int64) for v in (number, kinds, frames))
-    return BoxPairs(np.array(points), np.array(azimuth), np.array(elevation), *integers)
+                rows.append((middle, *centre, len(chosen), boxes.kind[b], index))
+    return BoxPairs(**columns_of(rows, _PAIR))
 
 
 def elevation_residuals(
@@ -183,17 +169,8 @@ def box_equations(
 
     The spread of the residuals themselves is taken as the precision of this radar's elevations.
     """
-    residual, J = elevation_residuals(pairs, T_camera_lidar, T_lidar_radar, bias_rad)
-    P = J.shape[1]
-    H, g = np.zeros((frames, P, P)), np.zeros((frames, P))
-    if pairs.count < 5:  # no spread to weigh them by
-        return H, g, float("nan")
-    spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
-    sigma = max(float(spread), _LEAST_SIGMA_RAD)
-    weight = 1 / (1 + (residual / (2 * sigma)) ** 2) / sigma**2
-    np.add.at(H, pairs.frame, weight[:, None, None] * J[:, :, None] * J[:, None, :])
-    np.add.at(g, pairs.frame, (weight * residual)[:, None] * J)
-    return H, g, sigma
+    found = elevation_residuals(pairs, T_camera_lidar, T_lidar_radar, bias_rad)
+    return robust_equations(*found, pairs.frame, frames)
 
 
 def _turned(points: np.ndarray, yaw_rad: float) -> np.ndarray:

@@ -84,3 +84,9 @@ class RadarSpec:
     doppler_positive: str = "receding"
     has_elevation: bool = True
     rays: int = 9000
+
+    @property
+    def cell(self) -> np.ndarray:
+        """Resolution in azimuth [rad], elevation [rad] and range [m]."""
+        angles = np.radians([self.azimuth_resolution_deg, self.elevation_resolution_deg])
+        return np.append(angles, self.range_resolution_m)

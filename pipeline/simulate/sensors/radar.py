@@ -5,7 +5,7 @@ Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Lo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, no_type_check
 
 import numba
@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.rows import join_rows, take_rows
 from pipeline.simulate.sensors.data_sheets import RadarSpec
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Motion
@@ -92,15 +93,9 @@ def scan_radar(
         echoes = _with_beacons(echoes, transform_points(inverse(T_map_radar), beacons_map))
     cells = _bounced(_merged(echoes, spec, rng), T_vehicle_radar, spec, rng)
     ghosts, clutter = _ghosts(cells, mirrors_m, T_vehicle_radar, rng), _clutter(spec, rng)
-    origin = [
-        cells.moving.astype(np.uint8),
-        np.full(len(ghosts.snr), 2, np.uint8),
-        np.full(len(clutter.snr), 3, np.uint8),
-    ]
-    parts = (cells, ghosts, clutter)
-    snr = np.concatenate([c.snr for c in parts])
-    rates = np.concatenate([c.rate for c in parts])
-    aer, rate = _measured(np.concatenate([c.aer for c in parts]), rates, snr, spec, errors, rng)
+    origin = np.append(cells.moving, np.repeat([2, 3], [len(ghosts.snr), len(clutter.snr)]))
+    seen = join_rows([cells, ghosts, clutter])
+    aer, rate = _measured(seen, spec, errors, rng)
     a, e, r = aer.T
     inside = (np.abs(a) < np.radians(spec.azimuth_deg)) & (np.abs(e) < np.radians(spec.elevation_deg) * 1.1)
     inside &= (r > spec.min_range_m) & (r < spec.max_range_m)
@@ -110,8 +105,8 @@ def scan_radar(
     return Scan(
         xyz,
         rate[inside].astype(np.float32),
-        (30 + 10 * np.log10(snr[inside])).astype(np.float32),
-        np.concatenate(origin)[inside],
+        (30 + 10 * np.log10(seen.snr[inside])).astype(np.float32),
+        origin[inside].astype(np.uint8),
     )
 
 
@@ -161,13 +156,7 @@ def _scatterers(
 
 def _merged(echoes: _Cells, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
     """One detection per resolution cell whose echoes together exceed the threshold, at their power-weighted mean."""
-    size = np.array(
-        [
-            np.radians(spec.azimuth_resolution_deg),
-            np.radians(spec.elevation_resolution_deg),
-            spec.range_resolution_m,
-        ]
-    )
+    size = spec.cell
     index = np.floor(
         np.concatenate([echoes.aer / size, echoes.rate[:, None] / spec.doppler_resolution_mps], 1)
     ).astype(np.int64)
@@ -198,7 +187,7 @@ def _peaks(cells: _Cells, size: np.ndarray) -> _Cells:
     strongest = np.argsort(-cells.snr)
     x = (np.concatenate([cells.aer, cells.rate[:, None]], 1) / size)[strongest]
     keep = strongest[_unsuppressed(x)]
-    return _Cells(cells.aer[keep], cells.rate[keep], cells.snr[keep], cells.ground[keep], cells.moving[keep])
+    return take_rows(cells, keep)
 
 
 @no_type_check
@@ -236,27 +225,15 @@ def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: n
     aer[:, 2] += np.where(
         resolved, 0.0, np.abs(mirror) ** 2 * np.maximum(height, 0) * radar_height / np.maximum(aer[:, 2], 5.0)
     )
-    second = resolved & (np.abs(mirror) ** 4 * cells.snr > _THRESHOLD)
-    copy = aer_image[second]
-    copy[:, 2] = aer[second, 2] + 2 * height[second] * radar_height / aer[second, 2]
-    return _Cells(
-        np.concatenate([aer, copy]),
-        np.concatenate([cells.rate, cells.rate[second]]),
-        np.concatenate([cells.snr, np.abs(mirror[second]) ** 4 * cells.snr[second]]),
-        np.concatenate([cells.ground, cells.ground[second]]),
-        np.concatenate([cells.moving, cells.moving[second]]),
-    )
+    aer_image[:, 2] = aer[:, 2] + 2 * height * radar_height / aer[:, 2]
+    images = replace(cells, aer=aer_image, snr=np.abs(mirror) ** 4 * cells.snr)
+    second = resolved & (images.snr > _THRESHOLD)
+    return join_rows([replace(cells, aer=aer), take_rows(images, second)])
 
 
 def _with_beacons(echoes: _Cells, xyz_radar: np.ndarray) -> _Cells:
     n, no = len(xyz_radar), np.zeros(len(xyz_radar), bool)
-    return _Cells(
-        np.concatenate([echoes.aer, to_spherical(xyz_radar)]),
-        np.concatenate([echoes.rate, np.zeros(n)]),
-        np.concatenate([echoes.snr, np.full(n, 3e4)]),
-        np.concatenate([echoes.ground, no]),
-        np.concatenate([echoes.moving, no]),
-    )
+    return join_rows([echoes, _Cells(to_spherical(xyz_radar), np.zeros(n), np.full(n, 3e4), no, no)])
 
 
 def _ghosts(
@@ -264,19 +241,18 @@ def _ghosts(
 ) -> _Cells:
     """Mirror images behind rails and walls, and second trips between a target and ourselves."""
     strong = cells.moving & (cells.snr > 60)
-    mirrored = strong & (rng.random(len(strong)) < (0.12 if mirrors_m else 0.0))
-    doubled = strong & (rng.random(len(strong)) < 0.03)
+    mirrored = take_rows(cells, strong & (rng.random(len(strong)) < (0.12 if mirrors_m else 0.0)))
+    doubled = take_rows(cells, strong & (rng.random(len(strong)) < 0.03))
     side = mirrors_m[int(rng.integers(len(mirrors_m)))] if mirrors_m else 0.0
-    image = transform_points(T_vehicle_radar, from_spherical(cells.aer[mirrored]))
+    image = transform_points(T_vehicle_radar, from_spherical(mirrored.aer))
     image[:, 1] = 2 * side - image[:, 1]
     first = to_spherical(transform_points(inverse(T_vehicle_radar), image))
-    second = cells.aer[doubled] * [1.0, 1.0, 2.0]
-    return _Cells(
-        np.concatenate([first, second]),
-        np.concatenate([cells.rate[mirrored], 2 * cells.rate[doubled]]),
-        np.concatenate([cells.snr[mirrored] / 4, cells.snr[doubled] / 5]),
-        np.zeros(int(mirrored.sum() + doubled.sum()), bool),
-        np.ones(int(mirrored.sum() + doubled.sum()), bool),
+    second = doubled.aer * [1.0, 1.0, 2.0]
+    return join_rows(
+        [
+            replace(mirrored, aer=first, snr=mirrored.snr / 4),
+            replace(doubled, aer=second, rate=2 * doubled.rate, snr=doubled.snr / 5),
+        ]
     )
 
 
@@ -297,28 +273,20 @@ def _clutter(spec: RadarSpec, rng: np.random.Generator) -> _Cells:
 
 
 def _measured(
-    aer: np.ndarray,
-    rate: np.ndarray,
-    snr: np.ndarray,
-    spec: RadarSpec,
-    errors: RadarErrors,
-    rng: np.random.Generator,
+    seen: _Cells, spec: RadarSpec, errors: RadarErrors, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Noise by signal strength, constant errors, grids of the transforms, Doppler aliasing."""
-    size = np.array(
-        [
-            np.radians(spec.azimuth_resolution_deg),
-            np.radians(spec.elevation_resolution_deg),
-            spec.range_resolution_m,
-        ]
-    )
+    """Azimuth, elevation, range and range rate: noise by signal strength, constant errors, grids, Doppler aliasing."""
     # Single-target accuracy: resolution / (1.6 sqrt(2 snr)) (Skolnik, ch. 9), never better than a tenth: the array's
     # own calibration leaves that much.
-    sigma = size * np.maximum(1 / (1.6 * np.sqrt(2 * snr)), 0.1)[:, None]
-    aer = aer + sigma * rng.standard_normal(aer.shape) + [0.0, errors.elevation_bias_rad, errors.range_bias_m]
-    grid = size / [8, 8, 8]
+    sigma = spec.cell * np.maximum(1 / (1.6 * np.sqrt(2 * seen.snr)), 0.1)[:, None]
+    aer = (
+        seen.aer
+        + sigma * rng.standard_normal(sigma.shape)
+        + [0.0, errors.elevation_bias_rad, errors.range_bias_m]
+    )
+    grid = spec.cell / 8
     aer = np.round(aer / grid) * grid
-    rate = rate + 0.35 * spec.doppler_resolution_mps * rng.standard_normal(len(rate))
+    rate = seen.rate + 0.35 * spec.doppler_resolution_mps * rng.standard_normal(len(sigma))
     if spec.doppler_period_mps is not None:
         half = spec.doppler_period_mps / 2
         rate = (rate + half) % spec.doppler_period_mps - half

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.rows import columns_of, join_rows, take_rows
 from pipeline.simulate.world.materials import material
 
 __all__ = ["Colour", "Mesh", "MeshBuilder", "Number", "join", "placed"]
@@ -27,6 +28,17 @@ _FACES = {
 }
 
 
+_TRIANGLE = np.dtype(
+    [
+        ("corners", "f4", (3, 3)),
+        ("material", "u1"),
+        ("tint", "f4", 3),
+        ("uv", "f4", (3, 2)),
+        ("instance", "i4"),
+    ]
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """T triangles; all arrays have T rows."""
@@ -44,39 +56,21 @@ class Mesh:
 
 def join(meshes: list[Mesh]) -> Mesh:
     """All triangles of some meshes."""
-    if not meshes:
-        o = np.zeros
-        return Mesh(
-            o((0, 3, 3), np.float32),
-            o(0, np.uint8),
-            o((0, 3), np.float32),
-            o((0, 3, 2), np.float32),
-            o(0, np.int32),
-        )
-    return Mesh(
-        np.concatenate([m.corners for m in meshes]),
-        np.concatenate([m.material for m in meshes]),
-        np.concatenate([m.tint for m in meshes]),
-        np.concatenate([m.uv for m in meshes]),
-        np.concatenate([m.instance for m in meshes]),
-    )
+    return join_rows(meshes or [Mesh(**columns_of([], _TRIANGLE))])
 
 
 def placed(mesh: Mesh, T_map_mesh: Float[np.ndarray, "4 4"], instance: int | None = None) -> Mesh:
     """The mesh moved rigidly, as one instance where a number is given."""
     corners = mesh.corners @ T_map_mesh[:3, :3].T.astype(np.float32) + T_map_mesh[:3, 3].astype(np.float32)
     ids = mesh.instance if instance is None else np.full(len(mesh), instance, np.int32)
-    return Mesh(corners, mesh.material, mesh.tint, mesh.uv, ids)
+    return replace(mesh, corners=corners, instance=ids)
 
 
 @dataclass
 class MeshBuilder:
     """Collects quads; everything else is made of them."""
 
-    _corners: list[np.ndarray] = field(default_factory=list)
-    _material: list[np.ndarray] = field(default_factory=list)
-    _tint: list[np.ndarray] = field(default_factory=list)
-    _uv: list[np.ndarray] = field(default_factory=list)
+    _parts: list[Mesh] = field(default_factory=list)
 
     def quads(
         self,
@@ -102,10 +96,15 @@ class MeshBuilder:
             )
         w = np.asarray(uv, np.float32).reshape(-1, 4, 2)
         n = 2 * len(c)
-        self._corners.append(np.concatenate([c[:, [0, 1, 2]], c[:, [0, 2, 3]]]))
-        self._uv.append(np.concatenate([w[:, [0, 1, 2]], w[:, [0, 2, 3]]]))
-        self._material.append(np.full(n, material(name), np.uint8))
-        self._tint.append(np.broadcast_to(np.asarray(tint, np.float32), (n, 3)))
+        self._parts.append(
+            Mesh(
+                np.concatenate([c[:, [0, 1, 2]], c[:, [0, 2, 3]]]),
+                np.full(n, material(name), np.uint8),
+                np.broadcast_to(np.asarray(tint, np.float32), (n, 3)),
+                np.concatenate([w[:, [0, 1, 2]], w[:, [0, 2, 3]]]),
+                np.zeros(n, np.int32),
+            )
+        )
 
     def hexahedron(self, corners: np.ndarray, faces: dict[str, str], tint: Colour = _WHITE) -> None:
         """Add the named faces (face name -> material) of 8 corners in the order of _FACES."""
@@ -188,15 +187,7 @@ class MeshBuilder:
 
     def mesh(self, instance: int = 0) -> Mesh:
         """The triangles so far, degenerate ones left out."""
-        if not self._corners:
-            return join([])
-        corners, uv = np.concatenate(self._corners), np.concatenate(self._uv)
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        keep = area > 1e-8
-        return Mesh(
-            corners[keep],
-            np.concatenate(self._material)[keep],
-            np.concatenate(self._tint)[keep].astype(np.float32),
-            uv[keep],
-            np.full(int(keep.sum()), instance, np.int32),
-        )
+        every = join(self._parts)
+        a, b, c = every.corners.swapaxes(0, 1)
+        kept = take_rows(every, np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-8)
+        return replace(kept, instance=np.full(len(kept), instance, np.int32))
