@@ -13,7 +13,7 @@ from jaxtyping import Float, Int32
 from pipeline.geometry.cameras import Camera
 from pipeline.simulate.sensors.pixels import upsampled
 from pipeline.simulate.sensors.rolling_shutter import RollingShutter
-from pipeline.simulate.sensors.shading import Light, Materials, Shadows, Sight, Surfaces, developed, shade
+from pipeline.simulate.sensors.shading import Light, Sight, Surfaces, developed, shade
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.materials import TABLE
 
@@ -128,16 +128,17 @@ def _lit_in_bands(moment: Moment, view: View, shutter: RollingShutter, light: Li
 
 
 def _lit(moment: Moment, sight: Sight, light: Light) -> np.ndarray:
-    mesh, shadows = moment.mesh, moment.standing.shadows
+    mesh = moment.mesh
     patches = np.array(
         [_footprint(a.T_map_actor, moment.standing.origin, a.kind) for a in moment.actors], np.float32
     ).reshape(-1, 8)
     return shade(
         sight,
         Surfaces(mesh.corners, moment.normals, mesh.material, mesh.tint, mesh.uv),
-        Materials(TABLE.albedo, TABLE.texture, TABLE.glass, TABLE.glow, TABLE.label),
+        TABLE,
         light,
-        Shadows(shadows.light, shadows.s0, shadows.d0, shadows.cell_m, patches),
+        moment.standing.shadows,
+        patches,
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.simulate.world.textures import texture, value_noise
 
-__all__ = ["Light", "Materials", "Shadows", "Sight", "Surfaces", "developed", "shade"]
+__all__ = ["Light", "Sight", "Surfaces", "developed", "shade"]
 
 _fast = numba.njit(cache=True, fastmath=True)
 
@@ -35,16 +35,6 @@ class Surfaces(NamedTuple):
     uv: np.ndarray
 
 
-class Materials(NamedTuple):
-    """Columns of the table of materials that the eye sees."""
-
-    albedo: np.ndarray
-    texture: np.ndarray
-    glass: np.ndarray
-    glow: np.ndarray
-    label: np.ndarray
-
-
 class Light(NamedTuple):
     """Direction to the sun in the map; irradiance of a surface that faces it, of the sky; brightness of the sky."""
 
@@ -52,19 +42,6 @@ class Light(NamedTuple):
     sun_light: float
     sky_light: float
     sky_gain: float
-
-
-class Shadows(NamedTuple):
-    """Sunlight on the ground by arc length and offset (0 = shadow), and the patches under road users, B 8.
-
-    A patch: x, y [m], cosine and sine of its heading, half length, half width, height of the ground [m], unused.
-    """
-
-    sunlit: np.ndarray
-    s0_m: float
-    d0_m: float
-    cell_m: float
-    patches: np.ndarray
 
 
 @no_type_check
@@ -89,14 +66,24 @@ def _sky(x, y, z, sx, sy, sz):
 
 @no_type_check
 @_fast
-def shade(sight, surfaces, materials, light, shadows):
-    """Linear RGB of each pixel, float32, H W 3."""
+def shade(sight, surfaces, materials, light, shadows, blobs):
+    """Linear RGB of each pixel, float32, H W 3.
+
+    Args:
+        sight: what each pixel sees.
+        surfaces: the triangles.
+        materials: a MaterialTable.
+        light: of sun and sky.
+        shadows: a ShadowMap.
+        blobs: the patches under road users, B 8: x, y [m], cosine and sine of the heading, half length, half width,
+            height of the ground [m], unused.
+    """
     # One long body, for some thirty scalars of a pixel pass from each of its steps to the next.
     seen, rays, origin = sight
     corners, normals, material, tint, uv = surfaces
-    albedo, kind, glass, glow, label = materials
+    label, albedo, _, _, kind, glass, glow = materials
     sun, sun_light, sky_light, sky_gain = light
-    sunlit, s0, d0, cell, blobs = shadows
+    sunlit, s0, d0, cell = shadows
     height, width = seen.shape
     out = np.empty((height, width, 3), np.float32)
     for i in range(height):

@@ -7,9 +7,9 @@ each of them where it was when the beam came by, and no mesh is ever rebuilt for
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -19,7 +19,7 @@ from jaxtyping import Float
 from pipeline.simulate.world.actors import VARIANTS, actor_mesh
 from pipeline.simulate.world.chunk import CHUNK_M
 from pipeline.simulate.world.drives import Drive
-from pipeline.simulate.world.meshes import Mesh, join
+from pipeline.simulate.world.meshes import Mesh, join, placed
 from pipeline.simulate.world.ray_selection import rays_near
 from pipeline.simulate.world.scenery import chunk_mesh
 from pipeline.simulate.world.traffic import Actor, actors_at
@@ -41,8 +41,7 @@ class Hits:
     barycentric: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class ShadowMap:
+class ShadowMap(NamedTuple):
     """Sunlight (0 = shadow) on the ground by arc length and offset."""
 
     light: np.ndarray
@@ -109,10 +108,9 @@ class Moment:
         """All triangles, in map coordinates less the window's origin: the standing ones, then actor by actor."""
         parts = [self.standing.mesh]
         for actor in self.actors:
-            proto, R = actor_mesh(actor.kind, actor.variant), actor.T_map_actor[:3, :3].astype(np.float32)
-            corners = proto.corners @ R.T + self._place(actor)
-            ids = np.full(len(proto), actor.key, np.int32)
-            parts.append(Mesh(corners, proto.material, proto.tint, proto.uv, ids))
+            T = actor.T_map_actor.copy()
+            T[:3, 3] -= self.standing.origin
+            parts.append(placed(actor_mesh(actor.kind, actor.variant), T, actor.key))
         return join(parts)
 
     @cached_property
@@ -259,7 +257,7 @@ def standing_of(
 ) -> Standing:
     """A standing world of a mesh given in the map."""
     corners = (mesh.corners - origin.astype(np.float32)).astype(np.float32)
-    local = Mesh(corners, mesh.material, mesh.tint, mesh.uv, mesh.instance)
+    local = replace(mesh, corners=corners)
     scene = _scene(local)
     return Standing(
         origin, local, scene, shadow_map(scene, origin, sun, to_map, s_m, shadows_behind_m), _normals(corners)

@@ -7,9 +7,11 @@ hit; retro-reflectors exceed 1 (asphalt 0.1-0.2, concrete 0.3, grass 0.4-0.6 in 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple, get_args
 
 import numpy as np
+
+from pipeline.rigs import StreetClass
 
 __all__ = [
     "LABELS",
@@ -20,10 +22,7 @@ __all__ = [
     "material",
 ]
 
-LABELS: Final = (
-    "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation", "terrain",
-    "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle",
-)  # fmt: skip
+LABELS: Final[tuple[str, ...]] = get_args(StreetClass)
 _PLAIN, _ASPHALT, _GRASS, _FOLIAGE, _FACADE, _PAVING, _SLATS, _CONCRETE, _WORN = range(9)
 
 
@@ -91,8 +90,7 @@ MATERIALS: Final = (
 _INDEX = {m.name: i for i, m in enumerate(MATERIALS)}
 
 
-@dataclass(frozen=True, eq=False)
-class MaterialTable:
+class MaterialTable(NamedTuple):
     """MATERIALS as arrays, row = material index."""
 
     label: np.ndarray

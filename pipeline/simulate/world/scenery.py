@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from pipeline.simulate.world.chunk import Chunk
@@ -24,4 +26,4 @@ def chunk_mesh(drive: Drive, index: int) -> Mesh:
         add_street(chunk)
     flat = chunk.along.mesh()
     bent = drive.road.to_map(flat.corners.astype(np.float64)).astype(np.float32)
-    return join([Mesh(bent, flat.material, flat.tint, flat.uv, flat.instance), *chunk.rigid])
+    return join([replace(flat, corners=bent), *chunk.rigid])
