@@ -24,6 +24,7 @@ Echoes = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]  # points [m],
 
 _CLIP_SIGMAS: Final = 3.5
 _FEWEST_FRAMES: Final = 8  # fewer give no standard error worth its name
+_RADAR_REACH_M, _LIDAR_REACH_M = 1.5, 1.0  # of the guess: in top view, and in space
 _BRIGHT: Final = 0.5  # of the brightest echo near the guess
 # Bare metal against the median echo of a lot, asphalt; a tripod reaches half of that.
 _OVER_MEDIAN: Final = 4.0
@@ -60,9 +61,7 @@ def robust_mean(
     return kept.mean(axis=0), kept.std(axis=0, ddof=1), len(kept)
 
 
-def find_in_radar(
-    frames: Sequence[Echoes], guess_m: Float[np.ndarray, " 3"], radius_m: float = 1.5
-) -> Found | None:
+def find_in_radar(frames: Sequence[Echoes], guess_m: Float[np.ndarray, " 3"]) -> Found | None:
     """Robust mean of the strongest detection of every frame that lies near the guess in top view.
 
     Top view, because a radar's elevation is off by metres where the ground reflects too. At one range the
@@ -70,7 +69,7 @@ def find_in_radar(
     """
     strongest = []
     for points, power_db in frames:
-        near = np.flatnonzero(np.linalg.norm(points[:, :2] - guess_m[:2], axis=1) < radius_m)
+        near = np.flatnonzero(np.linalg.norm(points[:, :2] - guess_m[:2], axis=1) < _RADAR_REACH_M)
         if near.size:
             strongest.append(points[near[np.argmax(power_db[near])]])
     if len(strongest) < _FEWEST_FRAMES:
@@ -83,7 +82,6 @@ def find_in_lidar(
     frames: Sequence[Echoes],
     guess_m: Float[np.ndarray, " 3"],
     edge_m: float | None = None,
-    radius_m: float = 1.0,
 ) -> Found | None:
     """Apex of a trihedral from the bright echoes near the guess; their plain centre where its edge is unknown.
 
@@ -92,14 +90,13 @@ def find_in_lidar(
         guess_m: where it stands, roughly.
         edge_m: length of the edges that meet in the apex. The reflector opens towards the sensor with one edge
             upright, to 2 deg per axis, and the fit may turn it within that.
-        radius_m: of the ball about the guess.
 
     Returns:
         None where fewer than 8 frames hold a bright echo, or where its beams leave the apex open by more than a
         quarter of an edge (one sigma). sigma_m holds the scatter between frames and what the
         few standing beams leave open; without edge_m, the apex lies deeper than the returned centre.
     """
-    bright = [b for points, intensity in frames if len(b := _bright(points, intensity, guess_m, radius_m))]
+    bright = [b for points, intensity in frames if len(b := _bright(points, intensity, guess_m))]
     if len(bright) < _FEWEST_FRAMES:
         return None
     centres = np.array([b.mean(axis=0) for b in bright])
@@ -118,8 +115,8 @@ def find_in_lidar(
     return Found(apex, np.hypot(sigma, between), spread, len(bright))
 
 
-def _bright(points: np.ndarray, intensity: np.ndarray, guess_m: np.ndarray, radius_m: float) -> np.ndarray:
-    near = np.linalg.norm(points - guess_m, axis=1) < radius_m
+def _bright(points: np.ndarray, intensity: np.ndarray, guess_m: np.ndarray) -> np.ndarray:
+    near = np.linalg.norm(points - guess_m, axis=1) < _LIDAR_REACH_M
     p, v = points[near].astype(np.float64), intensity[near]
     return p[v > max(_BRIGHT * v.max(), _OVER_MEDIAN * np.median(intensity))] if len(p) else p
 

@@ -8,6 +8,8 @@ from scipy.sparse.csgraph import connected_components
 
 __all__ = ["cluster_moving", "wrapped"]
 
+_CORE_POINTS = 2  # detections (with itself) that make a core; far cars give a scanning radar two
+
 
 def cluster_moving(
     xyz_m: Float32[np.ndarray, "M 3"],
@@ -15,7 +17,6 @@ def cluster_moving(
     is_moving: np.ndarray,
     period_mps: float,
     eps_m: float,
-    min_points: int = 2,
 ) -> Int32[np.ndarray, " M"]:
     """Density clusters (DBSCAN) of moving detections in x, y and Doppler; -1 = none.
 
@@ -27,7 +28,6 @@ def cluster_moving(
         is_moving: which detections take part.
         period_mps: 0 = unambiguous.
         eps_m: neighbourhood near the car.
-        min_points: detections (with itself) that make a core; far cars give a scanning radar two.
 
     Source: Ester et al. 1996.
     """
@@ -40,7 +40,7 @@ def cluster_moving(
     distance = np.linalg.norm(xy[:, None] - xy[None], axis=-1) / np.minimum(scale[:, None], scale[None])
     doppler = np.abs(wrapped(residual_mps[index][:, None] - residual_mps[index][None], period_mps))
     near = np.hypot(distance, doppler) <= 1.0
-    core = near.sum(1) >= min_points
+    core = near.sum(1) >= _CORE_POINTS
     # Cores are numbered by their first detection; what is no core joins the first of the clusters that reach it.
     of_core = connected_components(near[core][:, core], directed=False)[1] if core.any() else np.zeros(0, int)
     reached = np.where(near[:, core], of_core, len(index)).min(axis=1, initial=len(index))

@@ -15,6 +15,7 @@ from pipeline.objective.differentiable.poses import exp_so3, inverse, pose
 __all__ = ["DayMeans", "twist_between", "uncertainty_loss"]
 
 _LOG_VARIANCE = (-18.0, 2.0)  # sigmas of 0.1 mrad to 3 m: what lies beyond has no gradient
+_LEAST_ANSWERS = 8  # of a day that is known
 _LEAST_SHARE = 0.02  # of the newest frame in the mean: networks change while they learn
 
 
@@ -67,9 +68,9 @@ class DayMeans:
             self._count[day] = count
         return out.to(answers.device)
 
-    def known(self, days: list[str], least: int = 8) -> list[bool]:
-        """Whether each day's mean rests on at least `least` answers."""
-        return [self._count.get(day, 0) >= least for day in days]
+    def known(self, days: list[str]) -> list[bool]:
+        """Whether each day's mean rests on enough answers."""
+        return [self._count.get(day, 0) >= _LEAST_ANSWERS for day in days]
 
     def pose(self, days: list[str], pair: int, references: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
         """Each day's mean answer for a pair; its reference where no answer is known."""

@@ -11,6 +11,7 @@ from pipeline.errors import BoresightError
 
 __all__ = ["DivergedError", "DivergenceGuard", "cosine_rate"]
 
+_PATIENCE = 20  # reports before any is judged
 _SMOOTHING = 0.05  # of the loss: about the last twenty reports count
 
 
@@ -31,8 +32,8 @@ def cosine_rate(progress: float, first: float, last: float) -> float:
 class DivergenceGuard:
     """Watches the loss: raises where it is no number, or grows to a multiple of its smallest smoothed value."""
 
-    def __init__(self, factor: float, patience: int = 20) -> None:
-        self._factor, self._patience = factor, patience
+    def __init__(self, factor: float) -> None:
+        self._factor = factor
         self._smooth: float | None = None
         self._least = math.inf
         self._seen = 0
@@ -52,7 +53,7 @@ class DivergenceGuard:
         self._least = min(self._least, self._smooth)
         # Likelihood terms may take the sum below zero: a loss near zero has no useful multiple.
         limit = self._factor * max(abs(self._least), 1.0)
-        if self._seen > self._patience and self._smooth > limit:
+        if self._seen > _PATIENCE and self._smooth > limit:
             told = f"is more than {self._factor:g} times its least, {self._least:.3g}"
             raise DivergedError(step, f"the smoothed loss {self._smooth:.3g} {told}")
 

@@ -50,7 +50,6 @@ def static_cost(
     T_lidar_radar: Float[Tensor, "*batch #F 4 4"],
     frames: StaticFrames,
     *,
-    widen: float = 1.0,
     outlier: float = 1.0,
     bounce_prior: float = BOUNCE_PRIOR,
     detections: int = _DETECTIONS,
@@ -61,7 +60,6 @@ def static_cost(
     Args:
         T_lidar_radar: poses.
         frames: detections and points.
-        widen: factor of the sigmas; wider ones make a wider basin.
         outlier: weight of "no lidar point", in units of one lidar point at distance 0.
         bounce_prior: prior probability of a detection by way of the ground.
         detections: most detections of a frame; more are strided.
@@ -72,7 +70,7 @@ def static_cost(
     radar, radar_present = frames.radar[:, ::thin], frames.radar_present[:, ::thin]
     tells = frames.tells[..., ::thin, None]
     lidar, lidar_present = frames.lidar[:, ::sparse], frames.lidar_present[:, ::sparse]
-    sigma = torch.tensor(SIGMA_START * widen, dtype=radar.dtype, device=radar.device)
+    sigma = torch.tensor(SIGMA_START, dtype=radar.dtype, device=radar.device)
     T_radar_lidar = inverse(T_lidar_radar)
     measured = _spherical(radar) / sigma
     seen = _spherical(transform_points(T_radar_lidar, lidar)) / sigma
@@ -98,8 +96,6 @@ def tells_elevation(
     radar: Float[Tensor, "F M 3"],
     has_elevation: Bool[Tensor, " F"],
     limits_rad: Float[Tensor, "F 2"],
-    *,
-    widen: float = 1.0,
 ) -> Bool[Tensor, "*batch F M"]:
     """Detections whose elevation can be compared with the lidar's: others would be matched to the edge of its view.
 
@@ -111,10 +107,9 @@ def tells_elevation(
         radar: detections, radar frame.
         has_elevation: whether the radar measures it.
         limits_rad: lowest and highest elevation that the lidar sees.
-        widen: factor of the sigmas, as for the cost.
     """
     limits_rad = limits_rad.to(radar.dtype)
-    reach = (0.25 * (limits_rad[:, 1] - limits_rad[:, 0])).clamp_max(2 * widen * float(SIGMA_START[1]))
+    reach = (0.25 * (limits_rad[:, 1] - limits_rad[:, 0])).clamp_max(2 * float(SIGMA_START[1]))
     inner = limits_rad + torch.stack([VIEW_MARGIN_RAD + reach, -VIEW_MARGIN_RAD - reach], -1)
     slope = torch.tan(inner.clamp(-_STEEPEST_RAD, _STEEPEST_RAD))[:, None]
     points = transform_points(T_lidar_radar, radar)

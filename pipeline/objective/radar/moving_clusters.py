@@ -35,6 +35,7 @@ __all__ = [
 
 _GATE_M = 2.5  # lidar cluster centre to radar cluster centre: half a car, twice
 _APART_M = 1e3
+_LEAST_DETECTIONS = 2
 _LARGEST_M = 12.0  # lidar clusters longer than a lorry are walls
 _RANGE_FACTOR = 1.8
 _HEIGHT_M = {
@@ -105,15 +106,13 @@ class MovingClusters:
         return np.stack([c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1], p[:, 2]], -1)
 
 
-def moving_clusters(
-    observations: Sequence[Observation], least_detections: int = 2, with_boxes: bool = True
-) -> MovingClusters:
+def moving_clusters(observations: Sequence[Observation], with_boxes: bool = True) -> MovingClusters:
     """Moving clusters between 3 and 60 m; without boxes it is cheaper, and enough against the lidar."""
     rows = []
     for index, o in enumerate(observations):
         for label in range(int(o.radar_cluster.max(initial=-1)) + 1):
             member = o.radar_cluster == label
-            if member.sum() < least_detections:
+            if member.sum() < _LEAST_DETECTIONS:
                 continue
             centre = median_of_rows(o.radar_xyz_m[member]).astype(np.float64)
             distance = float(np.linalg.norm(centre))
@@ -139,12 +138,11 @@ def lidar_azimuth_residuals(
     clusters: MovingClusters,
     T_lidar_radar: Float[np.ndarray, "4 4"],
     dt_s: float,
-    gate_m: float = _GATE_M,
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
     """Azimuth of the nearest lidar cluster minus the radar cluster's, seen from the radar, and its Jacobian.
 
     Returns:
-        Residuals [rad] of the clusters that found a partner within `gate_m` in the plane, d/d(left twist of
+        Residuals [rad] of the clusters that found a partner within a gate in the plane, d/d(left twist of
         T_lidar_radar), and the frames that they belong to.
     """
     points = clusters.at_lidar_time(dt_s)
@@ -152,7 +150,7 @@ def lidar_azimuth_residuals(
     if not clusters.count or clusters.centres.n == 0:
         return np.zeros(0), np.zeros((0, 6)), np.zeros(0, np.int64)
     where = np.column_stack([in_lidar[:, :2], _APART_M * clusters.frame])
-    _, partner = clusters.centres.query(where, distance_upper_bound=gate_m)
+    _, partner = clusters.centres.query(where, distance_upper_bound=_GATE_M)
     chosen = np.flatnonzero(partner < clusters.centres.n)
     p = np.concatenate(clusters.lidar_centres_m)[partner[chosen]]
     q = transform_points(inverse(T_lidar_radar), p)

@@ -40,6 +40,7 @@ _RANGE_FACTOR = 1.8  # box height to range: vans to low cars, poor boxes
 _RANGE_M = (3.0, 60.0)
 _DEPTH_M = 3.5  # detections of one vehicle lie within this range interval
 _LEAST_HEIGHT_PX = 12.0
+_LEAST_DETECTIONS = 2  # fewer tell nothing
 _PAIR = np.dtype(  # of BoxPairs
     [
         ("point_radar_m", "f8", 3),
@@ -105,7 +106,6 @@ def box_pairs(
     boxes: VehicleBoxes,
     T_camera_radar: Float[np.ndarray, "4 4"],
     elevation_gate_rad: float,
-    least_detections: int = 2,
 ) -> BoxPairs:
     """Find the detections of each unoccluded vehicle box.
 
@@ -114,7 +114,6 @@ def box_pairs(
         boxes: from `vehicle_boxes` of the same frames.
         T_camera_radar: a pose whose azimuth is right to about a box's width.
         elevation_gate_rad: detections farther from the box's centre belong to something else.
-        least_detections: fewer tell nothing.
     """
     rows = []
     turns = scan_to_image_s(observations) * [o.ego_yaw_rate_radps or 0.0 for o in observations]
@@ -126,7 +125,7 @@ def box_pairs(
         distance = np.linalg.norm(in_camera, axis=1)
         for b in np.flatnonzero(boxes.frame == index):
             chosen = _detections_of(angles, distance, boxes, int(b), elevation_gate_rad)
-            if len(chosen) >= least_detections:
+            if len(chosen) >= _LEAST_DETECTIONS:
                 middle = from_spherical(median_of_rows(to_spherical(radar[chosen])))
                 centre = boxes.azimuth_rad[b], boxes.elevation_rad[b]
                 rows.append((middle, *centre, len(chosen), boxes.kind[b], index))

@@ -31,9 +31,9 @@ class Chunk:
         """Where the chunk begins."""
         return self.index * CHUNK_M
 
-    def strip(self, d: Span, h: Span, name: str, step: float = 5.0, tint: Colour = (1, 1, 1)) -> None:
+    def strip(self, d: Span, h: Span, name: str, step: float = 5.0) -> None:
         """Add a band along the whole chunk, d rising."""
-        self.band((self.s0, self.s0 + CHUNK_M), d, h, name, step, tint)
+        self.band((self.s0, self.s0 + CHUNK_M), d, h, name, step)
 
     def band(self, s: Span, d: Span, h: Span, name: str, step: float = 5.0, tint: Colour = (1, 1, 1)) -> None:
         """Add a band of a material along the road, in pieces of about `step` [m] that bend with it.

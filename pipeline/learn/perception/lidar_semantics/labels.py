@@ -35,6 +35,7 @@ _OF_CITYSCAPES = (
     "terrain", "unlabeled", "person", "bicyclist", "car", "truck", "other-vehicle", "other-vehicle", "motorcycle",
     "bicycle",
 )  # fmt: skip
+_MARGIN_DEG = 0.25  # how far around a point's pixel the image must be of one class
 _TABLE = np.zeros(256, np.uint8)
 _TABLE[: len(_OF_CITYSCAPES)] = [LABELS.index(name) for name in _OF_CITYSCAPES]
 
@@ -43,7 +44,6 @@ def project_labels(
     observation: Observation,
     T_camera_lidar: Float[np.ndarray, "4 4"],
     xyz_m: Float32[np.ndarray, "N 3"],
-    margin_deg: float = 0.25,
 ) -> UInt8[np.ndarray, " N"]:
     """Label of each point of the frame's sweep (lidar frame), UNLABELLED where the camera does not say.
 
@@ -51,12 +51,11 @@ def project_labels(
         observation: holds the label image and the camera.
         T_camera_lidar: the current calibration, never a truth.
         xyz_m: finite points.
-        margin_deg: how far around a point's pixel the image must be of one class.
     """
     png = np.frombuffer(observation.labels_png, np.uint8)
     image = np.asarray(cv2.imdecode(png, cv2.IMREAD_GRAYSCALE), np.uint8)
     camera = camera_of(observation).scaled(observation.label_scale)
-    half = max(1, round(np.radians(margin_deg) * camera.focal_px[0]))
+    half = max(1, round(np.radians(_MARGIN_DEG) * camera.focal_px[0]))
     window = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
     agreed = cv2.erode(image, window) == cv2.dilate(image, window)
     uv, valid = camera.project(transform_points(T_camera_lidar, xyz_m.astype(np.float64)))
