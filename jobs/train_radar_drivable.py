@@ -45,8 +45,8 @@ def train_radar_drivable(  # options of the command: as many as a user may set
     from jobs.terminal.summary import progress_reporter
     from jobs.train import parse_duration, report_training
     from pipeline.config import load_fleet
-    from pipeline.learn.perception.radar_drivable.days import drivable_samples
-    from pipeline.learn.perception.radar_drivable.export import export_drivable
+    from pipeline.learn.perception.radar_drivable.network import export_drivable
+    from pipeline.learn.perception.radar_drivable.samples import drivable_samples
     from pipeline.learn.perception.radar_drivable.training import DrivableTraining, train_drivable
     from pipeline.store.partitions import Lake
 

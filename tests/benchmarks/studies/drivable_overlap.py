@@ -19,8 +19,7 @@ import numpy as np
 
 from pipeline.config import load_fleet
 from pipeline.geometry.radar_grid import sector_mask, sector_of
-from pipeline.learn.perception.radar_drivable.days import samples_of_day
-from pipeline.learn.perception.radar_drivable.samples import DrivableSamples
+from pipeline.learn.perception.radar_drivable.samples import DrivableSamples, samples_of_day
 from pipeline.learn.perception.radar_drivable.training import area_iou
 from pipeline.perceive.models.session import open_session
 from pipeline.shipped_models import shipped_manifest

@@ -11,7 +11,6 @@ import torch
 
 from pipeline.errors import ConfigError, ContractError
 from pipeline.geometry.range_image import EMPTY
-from pipeline.learn.perception.lidar_semantics.export import export_sweeps
 from pipeline.learn.perception.lidar_semantics.labels import (
     KIND_OF_LABEL,
     KINDS,
@@ -19,12 +18,17 @@ from pipeline.learn.perception.lidar_semantics.labels import (
     UNLABELLED,
     project_labels,
 )
-from pipeline.learn.perception.lidar_semantics.network import build_sweep_network
-from pipeline.learn.perception.lidar_semantics.samples import SweepLayout, cut, day_images, layout_of
+from pipeline.learn.perception.lidar_semantics.network import build_sweep_network, export_sweeps
+from pipeline.learn.perception.lidar_semantics.samples import (
+    SweepLayout,
+    cut,
+    day_images,
+    layout_of,
+    normal_of,
+)
 from pipeline.learn.perception.lidar_semantics.training import (
     SweepTraining,
     kind_scores,
-    normal_of,
     train_sweeps,
 )
 from pipeline.learn.train.checkpoints import load_checkpoint

@@ -1,16 +1,29 @@
-"""The network: a few convolutions over the range image, wide along the rings."""
+"""The network: a few convolutions over the range image, wide along the rings; its export in RangeNet++'s convention."""
 
 from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from pipeline.learn.perception.exporter import export_model
 from pipeline.learn.perception.lidar_semantics.labels import LABELS
+from pipeline.learn.perception.lidar_semantics.samples import Normal, SweepLayout
 
-__all__ = ["SweepNetwork", "build_sweep_network"]
+__all__ = ["LIMITS", "NAME", "SweepNetwork", "build_sweep_network", "export_sweeps"]
 
+NAME = "lidar_semantics"
+PURPOSE = "classes of lidar points (paper, section 4.2): lidar.semantics of a rig"
+LIMITS = (
+    "Learned from the camera's classes through a calibration: it is wrong where either is.",
+    "Thin things are taught by their middles only; what the camera never saw, by nothing.",
+    "Knows no more lidars, roads and weathers than its samples show; remission is taken as these lidars log it.",
+)
 _CHANNELS = 5
 _DILATIONS = ((1, 1), (1, 2), (2, 4), (1, 1))  # rows, columns
 
@@ -44,3 +57,26 @@ def build_sweep_network(width: int, seed: int) -> SweepNetwork:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return SweepNetwork(width)
+
+
+def export_sweeps(
+    network: SweepNetwork, layout: SweepLayout, normal: Normal, folder: Path, card: dict[str, Any]
+) -> Path:
+    """Write lidar_semantics.onnx, .toml (the manifest), .json and .md (the card) into a folder.
+
+    Returns:
+        The manifest.
+    """
+    about = {"purpose": PURPOSE, "command": "boresight train-lidar-semantics", **card, "limits": LIMITS}
+    example, names = torch.zeros(1, 5, *layout.size), ("points", "logits")
+    return export_model(network.eval(), example, names, folder, NAME, _manifest(layout, normal), about)
+
+
+def _manifest(layout: SweepLayout, normal: Normal) -> str:
+    image = {
+        "size": list(layout.size), "fov_up_deg": layout.fov_up_deg, "fov_down_deg": layout.fov_down_deg,
+        "mean": list(normal.mean), "std": list(normal.std), "empty": "zero",
+    }  # fmt: skip
+    lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in image.items())
+    output = '[output]\nlayout = "logits"\nlabel_set = "semantickitti"\n'
+    return f'task = "segment_points"\n\n[input]\n{lines}\n{output}'

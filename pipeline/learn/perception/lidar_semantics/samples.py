@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float16, UInt8
+from jaxtyping import Float, Float16, Float32, UInt8
 
+from pipeline.config import FleetConfig
+from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry.range_image import EMPTY, channels_of, project
+from pipeline.learn.perception.days import is_held_out, vehicle_days
 from pipeline.learn.perception.lidar_semantics.labels import UNLABELLED, project_labels
+from pipeline.store.current import current_records, transform_of
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_records
+from pipeline.store.views import frames_of, observations_of
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = ["SweepImages", "SweepLayout", "cut", "day_images", "layout_of", "sweep_of"]
+__all__ = [
+    "Normal",
+    "SweepImages",
+    "SweepLayout",
+    "SweepSamples",
+    "cut",
+    "day_images",
+    "labelled_sweeps",
+    "layout_of",
+    "normal_of",
+]
 
 _BRIGHTEST = 60_000.0  # in sixteen bits
 _EDGE_PX = 8  # beyond the labels: what their pixels' neighbourhoods show
@@ -43,6 +61,88 @@ class SweepImages:
 
     def __len__(self) -> int:
         return len(self.label)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Mean and deviation of the five channels where points are, as in the manifest."""
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    def apply(self, channels: np.ndarray) -> Float32[np.ndarray, "N 5 H W"]:
+        """Normalised channels, 0 where no point is."""
+        mean, std = (np.array(v, np.float32)[:, None, None] for v in (self.mean, self.std))
+        filled = channels[:, :1] != EMPTY
+        return np.where(filled, (channels.astype(np.float32) - mean) / std, 0).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class SweepSamples:
+    """What a lake teaches: sweeps to learn from, held-out sweeps, their layout, and their numbers for the card."""
+
+    train: SweepImages
+    held_out: SweepImages
+    layout: SweepLayout
+    numbers: dict[str, int]
+
+
+def labelled_sweeps(
+    fleet: FleetConfig, lake: Lake, size: tuple[int, int], frames_per_day: int
+) -> SweepSamples:
+    """Sweeps of all vehicle-days with observations; every fifth day is held out.
+
+    Each day by its accepted camera-lidar calibration where the lake has one, else by its prior.
+
+    Args:
+        fleet: says where each vehicle's prior comes from.
+        lake: with frames and observations, and perhaps calibrations.
+        size: rows and columns of the range image.
+        frames_per_day: at most, evenly spread.
+
+    Raises:
+        ContractError: fewer than two vehicle-days of vehicles in fleet.toml.
+    """
+    days = vehicle_days(fleet, lake, least=2)
+    chosen = {day.vehicle: fleet.rig_of(day.vehicle).one_of_each("training") for day in days}
+    accepted = {
+        (r.vehicle, r.day): transform_of(r)
+        for r in current_records(read_records(lake, CALIBRATIONS, CalibrationRecord))
+        if r.status == "accepted" and _is_of(r, chosen)
+    }
+    layout = layout_of((next(frames_of(lake, day, chosen=chosen[day.vehicle])) for day in days), *size)
+    sides: tuple[list[tuple[np.ndarray, np.ndarray]], ...] = ([], [])
+    for number, day in enumerate(days):
+        names = chosen[day.vehicle]
+        rows = list(observations_of(lake, day, chosen=names))
+        known = accepted.get((day.vehicle, day.day))
+        T = read_prior(rows, fleet, day.vehicle).T_camera_lidar if known is None else known
+        sides[is_held_out(number)].extend(
+            day_images(frames_of(lake, day, chosen=names), rows, T, layout, frames_per_day)
+        )
+    train, held_out = cut(*sides)
+    numbers = {
+        "vehicle_days": len(days),
+        "calibrated_days": sum((day.vehicle, day.day) in accepted for day in days),
+        "samples": len(train),
+        "held_out_samples": len(held_out),
+    }
+    return SweepSamples(train, held_out, layout, numbers)
+
+
+def _is_of(record: CalibrationRecord, chosen: Mapping[str, Mapping[str, str]]) -> bool:
+    """Whether a record is of its vehicle's chosen camera and lidar."""
+    names = chosen.get(record.vehicle, {})
+    return (record.parent_frame, record.child_frame) == (names.get("camera"), names.get("lidar"))
+
+
+def normal_of(images: SweepImages) -> Normal:
+    """Statistics of the channels where points are; a channel that never changes is left as it is."""
+    values = images.channels.transpose(1, 0, 2, 3)[:, images.channels[:, 0] != EMPTY].astype(np.float64)
+    std = values.std(axis=1)
+    return Normal(
+        tuple(float(v) for v in values.mean(axis=1)), tuple(float(s) if s > 0 else 1.0 for s in std)
+    )
 
 
 def sweep_of(frame: Frame) -> tuple[np.ndarray, np.ndarray]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -15,7 +14,7 @@ from pipeline.errors import ContractError
 from pipeline.geometry.range_image import EMPTY
 from pipeline.learn.perception.lidar_semantics.labels import GROUND, KIND_OF_LABEL, KINDS, LABELS, UNLABELLED
 from pipeline.learn.perception.lidar_semantics.network import SweepNetwork, build_sweep_network
-from pipeline.learn.perception.lidar_semantics.samples import SweepImages
+from pipeline.learn.perception.lidar_semantics.samples import Normal, SweepImages, normal_of
 from pipeline.learn.perception.trainer import (
     Task,
     TrainingConfig,
@@ -26,7 +25,7 @@ from pipeline.learn.train.loop import TrainResult
 from pipeline.results import Progress, silent
 from pipeline.rows import take_rows
 
-__all__ = ["Normal", "SweepTraining", "held_out_scores", "kind_scores", "normal_of", "train_sweeps"]
+__all__ = ["SweepTraining", "held_out_scores", "kind_scores", "train_sweeps"]
 
 _BRIGHTNESS = 0.2  # remission of lidars of one make differs by as much
 
@@ -38,20 +37,6 @@ class SweepTraining(TrainingConfig):
     batch_size: int = 4
     learning_rate: float = 4e-3
     width: int = 16
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Mean and deviation of the five channels where points are, as in the manifest."""
-
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-
-    def apply(self, channels: np.ndarray) -> Float32[np.ndarray, "N 5 H W"]:
-        """Normalised channels, 0 where no point is."""
-        mean, std = (np.array(v, np.float32)[:, None, None] for v in (self.mean, self.std))
-        filled = channels[:, :1] != EMPTY
-        return np.where(filled, (channels.astype(np.float32) - mean) / std, 0).astype(np.float32)
 
 
 def train_sweeps(
@@ -84,15 +69,6 @@ def train_sweeps(
         lambda: held_out_scores(network, held_out, normal),
     )
     return network, run_training(task, out, config, time_limit_s, progress)
-
-
-def normal_of(images: SweepImages) -> Normal:
-    """Statistics of the channels where points are; a channel that never changes is left as it is."""
-    values = images.channels.transpose(1, 0, 2, 3)[:, images.channels[:, 0] != EMPTY].astype(np.float64)
-    std = values.std(axis=1)
-    return Normal(
-        tuple(float(v) for v in values.mean(axis=1)), tuple(float(s) if s > 0 else 1.0 for s in std)
-    )
 
 
 def held_out_scores(network: SweepNetwork, images: SweepImages, normal: Normal) -> dict[str, float]:

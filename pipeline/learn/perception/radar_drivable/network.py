@@ -1,15 +1,27 @@
-"""The network: convolutions over the polar grid that see far along a direction, and little to its sides."""
+"""The network: convolutions over the polar grid that see far along a direction, and little to its sides; its export."""
 
 from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.geometry.radar_grid import CHANNELS
+from pipeline.geometry.radar_grid import CHANNELS, SHAPE, grid_layout
+from pipeline.learn.perception.exporter import export_model
 
-__all__ = ["DrivableNetwork", "build_drivable_network"]
+__all__ = ["LIMITS", "NAME", "DrivableNetwork", "build_drivable_network", "export_drivable"]
 
+NAME = "radar_drivable"
+PURPOSE = "drivable area of a radar's scan (paper, section 4.2): radar.drivable of a rig"
+LIMITS = (
+    "Learned from the lidar's drivable ground through each day's prior: it is wrong where lidar and prior are.",
+    "Knows no more radars, roads and weathers than its samples show.",
+    "Cells that no lidar saw taught nothing: free ranges far out are extrapolated.",
+)
 _DILATIONS = ((1, 1), (1, 2), (2, 4), (2, 8), (1, 1))  # directions, ranges
 
 
@@ -36,3 +48,27 @@ def build_drivable_network(width: int, seed: int) -> DrivableNetwork:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return DrivableNetwork(width)
+
+
+class _Graph(nn.Module):
+    """The network with probabilities in place of logits."""
+
+    def __init__(self, network: DrivableNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, features: Tensor) -> Tensor:
+        return torch.sigmoid(self.network(features))
+
+
+def export_drivable(network: DrivableNetwork, folder: Path, card: dict[str, Any]) -> Path:
+    """Write radar_drivable.onnx, .toml (the manifest), .json and .md (the card) into a folder.
+
+    Returns:
+        The manifest.
+    """
+    about = {"purpose": PURPOSE, "command": "boresight train-radar-drivable", **card, "limits": LIMITS}
+    example, names = torch.zeros(1, len(CHANNELS), *SHAPE), ("features", "drivable")
+    layout = "".join(f"{key} = {json.dumps(value)}\n" for key, value in grid_layout().items())
+    manifest = f'task = "{NAME}"\n\n[grid]\n{layout}'
+    return export_model(_Graph(network.eval()), example, names, folder, NAME, manifest, about)

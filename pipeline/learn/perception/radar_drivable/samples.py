@@ -15,13 +15,32 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float16, UInt8
 
+from pipeline.config import FleetConfig
+from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, cell_centres, sector_mask
 from pipeline.geometry.se3 import transform_points
+from pipeline.learn.perception.days import is_held_out, vehicle_days
+from pipeline.rows import columns_of, join_rows, take_rows
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import observations_of
 from schemas.observations import Observation
 
-__all__ = ["BLOCKED", "FREE", "UNKNOWN", "DrivableSamples", "day_samples", "label_grid", "scan_of"]
+__all__ = [
+    "BLOCKED",
+    "FREE",
+    "UNKNOWN",
+    "DrivableSamples",
+    "day_samples",
+    "drivable_samples",
+    "label_grid",
+    "samples_of_day",
+    "scan_of",
+]
 
 BLOCKED, FREE, UNKNOWN = 0, 1, 255
+_SAMPLE = np.dtype(
+    [("features", "f2", (len(CHANNELS), *SHAPE)), ("label", "u1", SHAPE), ("geometric", "?", SHAPE)]
+)
 _HALF_M = 64  # the lidar's grid of 1 m cells covers the radar's reach around it
 
 
@@ -37,6 +56,38 @@ class DrivableSamples:
         return len(self.label)
 
 
+def drivable_samples(
+    fleet: FleetConfig, lake: Lake, frames_per_day: int
+) -> tuple[DrivableSamples, DrivableSamples, dict[str, int]]:
+    """Samples to learn from, held-out samples (every fifth vehicle-day), and their numbers for the card.
+
+    A single day is cut in time: its first 0.7 teach, its last 0.2 are held out.
+
+    Raises:
+        ContractError: no observations of a vehicle in fleet.toml.
+    """
+    days = vehicle_days(fleet, lake, least=1)
+    parts = [samples_of_day(fleet, lake, day, frames_per_day) for day in days]
+    if len(parts) == 1:
+        # Neighbouring scans are alike: a tenth between the two sides belongs to neither.
+        rows, total = np.arange(len(parts[0])), len(parts[0])
+        train, held_out = (
+            take_rows(parts[0], r) for r in (rows[: int(0.7 * total)], rows[int(0.8 * total) :])
+        )
+    else:
+        train, held_out = (
+            join_rows([p for i, p in enumerate(parts) if is_held_out(i) == side]) for side in (False, True)
+        )
+    numbers = {"vehicle_days": len(days), "samples": len(train), "held_out_samples": len(held_out)}
+    return train, held_out, numbers
+
+
+def samples_of_day(fleet: FleetConfig, lake: Lake, day: Partition, frames_per_day: int) -> DrivableSamples:
+    """At most `frames_per_day` samples of a vehicle-day, evenly spread, labelled through its prior."""
+    rows = list(observations_of(lake, day, chosen=fleet.rig_of(day.vehicle).one_of_each("training")))
+    return day_samples(rows, read_prior(rows, fleet, day.vehicle).T_lidar_radar, frames_per_day)
+
+
 def day_samples(
     observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"], limit: int
 ) -> DrivableSamples:
@@ -49,15 +100,7 @@ def day_samples(
     """
     usable = [i for i, o in enumerate(observations) if len(o.lidar_drivable_xyz_m)]
     kept = {usable[k] for k in np.linspace(0, len(usable) - 1, min(limit, len(usable))).astype(int)}
-    rows = list(_rows(observations, T_lidar_radar, kept))
-    if not rows:
-        return DrivableSamples(
-            np.zeros((0, len(CHANNELS), *SHAPE), np.float16),
-            np.zeros((0, *SHAPE), np.uint8),
-            np.zeros((0, *SHAPE), bool),
-        )
-    features, labels, geometric = zip(*rows, strict=True)
-    return DrivableSamples(np.stack(features), np.stack(labels), np.stack(geometric))
+    return DrivableSamples(**columns_of(list(_rows(observations, T_lidar_radar, kept)), _SAMPLE))
 
 
 def scan_of(observation: Observation) -> Scan:
