@@ -33,7 +33,6 @@ def train(  # options of the command: as many as a user may set
     time_limit: str | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     compiled: bool = False,
-    resident: bool = False,
     ray_workers: int | None = None,
 ) -> int:
     """Train on the table that `boresight prepare` made, or go on with the run in OUT.
@@ -54,7 +53,6 @@ def train(  # options of the command: as many as a user may set
         time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
         device: cpu, cuda, or whatever is there.
         compiled: compile the encoders (minutes at first, faster afterwards).
-        resident: hold all training data on the device.
         ray_workers: train on a Ray cluster with so many workers; needs the extra [train-ray].
     """
     from pipeline.learn.train.run import TrainRequest
@@ -71,7 +69,7 @@ def train(  # options of the command: as many as a user may set
     }
     settings = load_train_config(config, options)
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
-    request = TrainRequest(data, out, device, limit, compiled, resident, start_from)
+    request = TrainRequest(data, out, device, limit, compiled, start_from)
     return _run(request, settings, ray_workers)
 
 

@@ -153,7 +153,7 @@ class TrainingLoader:
 
 
 def load_split(lake: Lake, split: str, *, limit: int | None = None) -> TrainingBatch:
-    """All frames of a split (at most `limit`, evenly spread) as one batch: to stay on a GPU, or for tests."""
+    """All frames of a split (at most `limit`, evenly spread) as one batch."""
     chunks, _ = _find_chunks(lake, split)
     frames = [(chunk.group, row) for chunk in chunks for row in chunk.rows]
     if limit is not None and len(frames) > limit:

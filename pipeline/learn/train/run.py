@@ -31,7 +31,6 @@ class TrainRequest:
         device: cpu, cuda or auto.
         time_limit_s: stop with a checkpoint after so long in this call; None = no limit.
         compiled: compile the encoders.
-        resident: hold the whole split on the device.
         start: run or exported file whose weights a fresh run begins with; a run that goes on has its own.
     """
 
@@ -40,7 +39,6 @@ class TrainRequest:
     device: str = "auto"
     time_limit_s: float | None = None
     compiled: bool = False
-    resident: bool = False
     start: Path | None = None
 
 
@@ -58,10 +56,7 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
     with ExitStack() as stack:
         processes = stack.enter_context(joined(request.device))
         stops = stack.enter_context(stop_signals())
-        run = begin_run(
-            request.data, out, config, processes,
-            compiled=request.compiled, resident=request.resident, start=request.start,
-        )  # fmt: skip
+        run = begin_run(request.data, out, config, processes, compiled=request.compiled, start=request.start)
         stack.callback(run.stream.close)
         log: MetricsLog | None = None
         if processes.leads:

@@ -20,7 +20,7 @@ from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.acceleration import accelerate
 from pipeline.learn.train.batch_loss import Passes, batch_loss
-from pipeline.learn.train.batch_stream import BatchStream, batch_stream
+from pipeline.learn.train.batch_stream import BatchStream
 from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
 from pipeline.learn.train.loop import Run
 from pipeline.learn.train.metrics import MetricsLog
@@ -73,7 +73,7 @@ class RunState(Run):
     def losses(self) -> dict[str, Tensor]:
         """Of the step's batch, from random guesses."""
         found = batch_loss(
-            self.passes, self.stream.batch(self.step), self.config, self.day_means,
+            self.passes, self.stream.batch(), self.config, self.day_means,
             _generator(self.config.seed, self.step, self.processes.rank), self.network,
             matched=self.comparable(), paper=self.paper,
         )  # fmt: skip
@@ -137,11 +137,10 @@ def begin_run(
     processes: Processes,
     *,
     compiled: bool,
-    resident: bool,
     start: Path | None = None,
 ) -> RunState:
     """A fresh run, or the one in the folder where its last checkpoint left it; arguments and errors as of `train`."""
-    stream = batch_stream(data, config, processes, resident=resident)
+    stream = BatchStream(data, config, processes)
     try:
         run = RunState(data, config, processes, stream, compiled=compiled)
         if (folder / LAST).exists():
