@@ -36,6 +36,7 @@ def export(
     frames: FrameOptions | None = None,
     generic_frames: bool = False,
     most_frames: Annotated[int, Parameter(validator=Number(gte=1))] = 100,
+    sensor: Annotated[tuple[str, ...], Parameter(negative=())] = (),
     run: Path | None = None,
     notes: Path | None = None,
 ) -> int:
@@ -62,6 +63,7 @@ def export(
         generic_frames: call them as the sensors (camera, lidar and radar), not as the car's own logs do (autoware
             always does).
         most_frames: of "foxglove", which shows the drive of --day: so many frames, evenly spread.
+        sensor: of "foxglove": only sensors of these names; again for each; default: all.
         run: folder of `boresight train`; needed for "onnx".
         notes: JSON object for the card: what was measured, what the data was.
     """
@@ -87,7 +89,7 @@ def export(
         own_frames=own_frames, mount=mount,
     )  # fmt: skip
     if what == "foxglove":
-        return _export_drive(out, calibration, lake, day, most_frames)
+        return _export_drive(out, calibration, lake, day, most_frames, sensor)
     return _export_calibration(what, out, calibration, update)
 
 
@@ -106,7 +108,12 @@ def _export_calibration(what: str, out: Path, calibration: ExportedCalibration, 
 
 
 def _export_drive(
-    out: Path, calibration: ExportedCalibration, lake: str | None, day: str | None, most_frames: int
+    out: Path,
+    calibration: ExportedCalibration,
+    lake: str | None,
+    day: str | None,
+    most_frames: int,
+    sensors: tuple[str, ...],
 ) -> int:
     from jobs.export_drive import export_foxglove
     from pipeline.errors import ConfigError
@@ -114,7 +121,7 @@ def _export_drive(
     if lake is None or day is None:
         raise ConfigError("command line", "day", "foxglove shows a day's drive: give --day")
     wanted = bool(_written(calibration))
-    outputs = export_foxglove(calibration, lake, day, out, most_frames) if wanted else []
+    outputs = export_foxglove(calibration, lake, day, out, most_frames, sensors) if wanted else []
     return _tell("foxglove", calibration, outputs)
 
 

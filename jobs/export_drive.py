@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.export.calibration import ExportedCalibration
+    from pipeline.rig.graph import Sensor
 
 __all__ = ["export_foxglove"]
 
 
 def export_foxglove(
-    calibration: ExportedCalibration, location: str, day: str, out: Path, most_frames: int
+    calibration: ExportedCalibration,
+    location: str,
+    day: str,
+    out: Path,
+    most_frames: int,
+    sensors: Sequence[str],
 ) -> list[Path]:
     """Write the MCAP `out` and the layout beside it.
 
+    Args:
+        calibration: of the day.
+        location: of the lake.
+        day: whose drive it is.
+        out: the file.
+        most_frames: evenly spread.
+        sensors: names of those that are shown; empty = all.
+
     Raises:
         MissingExtraError: foxglove-sdk is not installed.
-        ConfigError: no file name, or the lake has no frames of that day.
+        ConfigError: no file name, no sensor of a name, or the lake has no frames of that day.
     """
     from jobs.extras import require
 
@@ -36,12 +53,45 @@ def export_foxglove(
 
     lake = Lake.existing(location)
     found = priors_of_day(lake, calibration.vehicle, day, calibration.method)
-    priors = {name: pair.T for name, pair in found.items() if not isinstance(pair, str)}
-    scenes = read_scenes(lake, Partition(calibration.vehicle, day), most_frames)
-    layout = out.with_suffix(".layout.json")
+    known = {name: pair for name, pair in found.items() if not isinstance(pair, str)}
+    partition, layout = Partition(calibration.vehicle, day), out.with_suffix(".layout.json")
+    shown = _shown(calibration, sensors)
     out.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(out) as stream:
-        write_foxglove(stream, calibration, priors, scenes)
+    if sensors or any(s.name != s.kind for s in shown):
+        from pipeline.export.foxglove_rig import layout_of_rig, write_foxglove_rig
+
+        reference = calibration.reference
+        before = replace(calibration, pairs=known, known=tuple(pair.edge for pair in known.values()))
+        beside = {"lidar": reference.name} if reference.kind == "lidar" else {}
+        of_rig = {
+            s: read_scenes(
+                lake, partition, most_frames, {s.kind: s.name} | (beside if s.kind == "camera" else {})
+            )
+            for s in shown
+        }
+        with atomic_write(out) as stream:
+            write_foxglove_rig(stream, calibration, before, of_rig)
+        text = layout_of_rig(shown, reference.name, calibration.names.of(reference.name))
+    else:
+        priors = {name: pair.T for name, pair in known.items()}
+        with atomic_write(out) as stream:
+            write_foxglove(stream, calibration, priors, read_scenes(lake, partition, most_frames))
+        text = layout_of(TOPICS, calibration.names)
     with atomic_write(layout) as stream:
-        stream.write(layout_of(TOPICS, calibration.names))
+        stream.write(text)
     return [out, layout]
+
+
+def _shown(calibration: ExportedCalibration, sensors: Sequence[str]) -> list[Sensor]:
+    """The sensors of these names, or all.
+
+    Raises:
+        ConfigError: there is none of a name.
+    """
+    there = {s.name: s for s in calibration.sensors}
+    unknown = [name for name in sensors if name not in there]
+    if unknown:
+        raise ConfigError(
+            "command line", "sensor", f"no {', '.join(unknown)}: the rig has {', '.join(there)}"
+        )
+    return [there[name] for name in sensors] if sensors else list(there.values())

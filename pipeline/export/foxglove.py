@@ -25,7 +25,21 @@ from pipeline.geometry.se3 import to_quaternion, transform_points
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = ["TOPICS", "Scene", "write_foxglove"]
+__all__ = [
+    "CALIBRATED",
+    "PRIOR",
+    "TOPICS",
+    "Scene",
+    "boxes_message",
+    "cloud_columns",
+    "cloud_message",
+    "clusters_message",
+    "edges_message",
+    "intrinsics_message",
+    "time_message",
+    "transform_message",
+    "write_foxglove",
+]
 
 Scene = tuple[Frame, Observation | None]
 TOPICS = {
@@ -45,7 +59,7 @@ TOPICS = {
 _MODELS = {"equidistant": "kannala_brandt"}  # Foxglove does not know ROS's name
 _COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 _FLOAT32 = fg.PackedElementFieldNumericType.Float32
-_CALIBRATED, _PRIOR, _BOX = (0.2, 0.9, 0.4), (1.0, 0.45, 0.1), (0.3, 0.85, 1.0)  # red, green, blue
+CALIBRATED, PRIOR, _BOX = (0.2, 0.9, 0.4), (1.0, 0.45, 0.1), (0.3, 0.85, 1.0)  # red, green, blue
 _PIXEL_CENTRE = 0.5  # Foxglove counts from the corner of the first pixel, the house from its centre
 
 
@@ -114,33 +128,33 @@ def _log_scene(
 ) -> None:
     now, names = frame.stamp_ns, calibration.names
     topics.tf.log(fg.FrameTransforms(transforms=_transforms(calibration, priors, now)), log_time=now)
-    at, has_image = _time(frame.camera_stamp_ns), "camera" in frame.sensors
+    at, has_image = time_message(frame.camera_stamp_ns), "camera" in frame.sensors
     if has_image:
         picture = fg.CompressedImage(
             timestamp=at, frame_id=names.camera, data=frame.image, format=frame.image_format
         )
         topics.image.log(picture, log_time=now)
-        topics.camera.log(_intrinsics(camera_of(frame), names.camera, at), log_time=now)
-    lidar, radar = _lidar_columns(frame), _radar_columns(frame)
-    clouds = {"lidar": (lidar, names.lidar, now), "radar": (radar, names.radar, frame.radar_stamp_ns)}
+        topics.camera.log(intrinsics_message(camera_of(frame), names.camera, at), log_time=now)
     for sensor, pair in (("lidar", "camera_lidar"), ("radar", "lidar_radar")):
         if sensor not in frame.sensors:
             continue
-        columns, frame_id, stamp_ns = clouds[sensor]
-        topics.cloud[sensor].log(_cloud(columns, frame_id, stamp_ns), log_time=now)
+        (columns, stamp_ns), frame_id = cloud_columns(frame, sensor), names.of(sensor)
+        topics.cloud[sensor].log(cloud_message(columns, frame_id, stamp_ns), log_time=now)
         if pair in priors:
-            topics.cloud[f"{sensor}_prior"].log(_cloud(columns, f"{frame_id}_prior", stamp_ns), log_time=now)
+            topics.cloud[f"{sensor}_prior"].log(
+                cloud_message(columns, f"{frame_id}_prior", stamp_ns), log_time=now
+            )
     if observation is not None and has_image and "camera" in observation.sensors:
-        topics.drawn["boxes"].log(_boxes(observation, at), log_time=now)
+        topics.drawn["boxes"].log(boxes_message(observation, at), log_time=now)
     if observation is not None:
-        topics.clusters.log(_clusters(observation, names.lidar, now), log_time=now)
+        topics.clusters.log(clusters_message(observation, names.lidar, now), log_time=now)
         estimate = calibration.pairs.get("camera_lidar")
         for name, T, colour in (
-            ("overlay", None if estimate is None else estimate.T, _CALIBRATED),
-            ("overlay_prior", priors.get("camera_lidar"), _PRIOR),
+            ("overlay", None if estimate is None else estimate.T, CALIBRATED),
+            ("overlay_prior", priors.get("camera_lidar"), PRIOR),
         ):
             if T is not None and has_image and "camera" in observation.sensors:
-                topics.drawn[name].log(_edges(observation, T, colour, at), log_time=now)
+                topics.drawn[name].log(edges_message(observation, T, colour, at), log_time=now)
 
 
 # -- poses ------------------------------------------------------------------
@@ -156,13 +170,16 @@ def _transforms(
         edges.append((names.camera, f"{names.lidar}_prior", priors["camera_lidar"]))
     if "lidar_radar" in priors:
         edges.append((names.lidar, f"{names.radar}_prior", priors["lidar_radar"]))
-    return [_transform(parent, child, T, stamp_ns) for parent, child, T in edges]
+    return [transform_message(parent, child, T, stamp_ns) for parent, child, T in edges]
 
 
-def _transform(parent: str, child: str, T: Float[np.ndarray, "4 4"], stamp_ns: int) -> fg.FrameTransform:
+def transform_message(
+    parent: str, child: str, T: Float[np.ndarray, "4 4"], stamp_ns: int
+) -> fg.FrameTransform:
+    """A pose of child in parent."""
     w, x, y, z = (float(v) for v in to_quaternion(T))
     return fg.FrameTransform(
-        timestamp=_time(stamp_ns),
+        timestamp=time_message(stamp_ns),
         parent_frame_id=parent,
         child_frame_id=child,
         translation=fg.Vector3(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3])),
@@ -170,14 +187,16 @@ def _transform(parent: str, child: str, T: Float[np.ndarray, "4 4"], stamp_ns: i
     )
 
 
-def _time(stamp_ns: int) -> fg.Timestamp:
+def time_message(stamp_ns: int) -> fg.Timestamp:
+    """A stamp."""
     return fg.Timestamp(sec=stamp_ns // 10**9, nsec=stamp_ns % 10**9)
 
 
 # -- sensors ----------------------------------------------------------------
 
 
-def _intrinsics(camera: Camera, frame_id: str, at: fg.Timestamp) -> fg.CameraCalibration:
+def intrinsics_message(camera: Camera, frame_id: str, at: fg.Timestamp) -> fg.CameraCalibration:
+    """A camera's intrinsics, by Foxglove's names of models."""
     D = np.zeros(_COEFFICIENTS[camera.model])
     D[: len(camera.D)] = camera.D
     P = np.hstack([camera.K, np.zeros((3, 1))])
@@ -194,25 +213,25 @@ def _intrinsics(camera: Camera, frame_id: str, at: fg.Timestamp) -> fg.CameraCal
     )
 
 
-def _lidar_columns(frame: Frame) -> dict[str, np.ndarray]:
-    columns = {"x": frame.lidar_x_m, "y": frame.lidar_y_m, "z": frame.lidar_z_m}
-    return columns if frame.lidar_intensity is None else columns | {"intensity": frame.lidar_intensity}
+def cloud_columns(frame: Frame, kind: str) -> tuple[dict[str, np.ndarray], int]:
+    """Points of the frame's lidar or radar by field, and their stamp [ns]; a range rate is positive = receding."""
+    columns = {axis: getattr(frame, f"{kind}_{axis}_m") for axis in "xyz"}
+    if kind == "lidar":
+        more = {"intensity": frame.lidar_intensity}
+        return columns | {n: c for n, c in more.items() if c is not None}, frame.stamp_ns
+    more = {"range_rate_mps": frame.radar_range_rate_mps, "power_db": frame.radar_power_db}
+    return columns | {n: c for n, c in more.items() if c is not None}, frame.radar_stamp_ns
 
 
-def _radar_columns(frame: Frame) -> dict[str, np.ndarray]:
-    columns = {"x": frame.radar_x_m, "y": frame.radar_y_m, "z": frame.radar_z_m}
-    columns["range_rate_mps"] = frame.radar_range_rate_mps  # positive = receding
-    return columns if frame.radar_power_db is None else columns | {"power_db": frame.radar_power_db}
-
-
-def _cloud(columns: Mapping[str, np.ndarray], frame_id: str, stamp_ns: int) -> fg.PointCloud:
+def cloud_message(columns: Mapping[str, np.ndarray], frame_id: str, stamp_ns: int) -> fg.PointCloud:
+    """Points of equal columns in a frame."""
     points = np.stack([np.asarray(c, "<f4") for c in columns.values()], axis=1)
     fields = [fg.PackedElementField(name=n, offset=4 * i, type=_FLOAT32) for i, n in enumerate(columns)]
     origin = fg.Pose(
         position=fg.Vector3(x=0.0, y=0.0, z=0.0), orientation=fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
     )
     return fg.PointCloud(
-        timestamp=_time(stamp_ns),
+        timestamp=time_message(stamp_ns),
         frame_id=frame_id,
         pose=origin,
         point_stride=4 * len(columns),
@@ -224,7 +243,7 @@ def _cloud(columns: Mapping[str, np.ndarray], frame_id: str, stamp_ns: int) -> f
 # -- drawings ---------------------------------------------------------------
 
 
-def _boxes(observation: Observation, at: fg.Timestamp) -> fg.ImageAnnotations:
+def boxes_message(observation: Observation, at: fg.Timestamp) -> fg.ImageAnnotations:
     """Road users that the camera saw, named."""
     points, texts = [], []
     boxes = observation.road_user_boxes_px.astype(np.float64) + _PIXEL_CENTRE
@@ -245,7 +264,7 @@ def _boxes(observation: Observation, at: fg.Timestamp) -> fg.ImageAnnotations:
     return fg.ImageAnnotations(timestamp=at, points=points, texts=texts)
 
 
-def _edges(
+def edges_message(
     observation: Observation,
     T_camera_lidar: Float[np.ndarray, "4 4"],
     colour: tuple[float, ...],
@@ -267,7 +286,7 @@ def _edges(
     return fg.ImageAnnotations(timestamp=at, points=[dots])
 
 
-def _clusters(observation: Observation, frame_id: str, stamp_ns: int) -> fg.SceneUpdate:
+def clusters_message(observation: Observation, frame_id: str, stamp_ns: int) -> fg.SceneUpdate:
     """Objects that the lidar saw, as boxes along its axes."""
     low, high = observation.lidar_cluster_min_m.astype(float), observation.lidar_cluster_max_m.astype(float)
     cubes = [
@@ -280,7 +299,7 @@ def _clusters(observation: Observation, frame_id: str, stamp_ns: int) -> fg.Scen
         )
         for c, s in zip(((low + high) / 2).tolist(), (high - low).tolist(), strict=True)
     ]
-    entity = fg.SceneEntity(timestamp=_time(stamp_ns), frame_id=frame_id, id="clusters", cubes=cubes)
+    entity = fg.SceneEntity(timestamp=time_message(stamp_ns), frame_id=frame_id, id="clusters", cubes=cubes)
     return fg.SceneUpdate(entities=[entity])
 
 

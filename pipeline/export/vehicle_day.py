@@ -8,15 +8,19 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.views import frames_of, ingested, observations_of, perceived
+from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
 from schemas.frames import Frame
 from schemas.observations import Observation
 
 __all__ = ["read_scenes"]
 
 
-def read_scenes(lake: Lake, partition: Partition, most: int) -> Iterator[tuple[Frame, Observation | None]]:
+def read_scenes(
+    lake: Lake, partition: Partition, most: int, chosen: Chosen | None = None
+) -> Iterator[tuple[Frame, Observation | None]]:
     """At most so many frames, evenly spread, in order of stamp; None beside those that perception left out.
+
+    `chosen`: whose frames; None = the first camera, lidar and radar of the day.
 
     Raises:
         ConfigError: the lake has no frames of that day.
@@ -29,9 +33,9 @@ def read_scenes(lake: Lake, partition: Partition, most: int) -> Iterator[tuple[F
         raise ConfigError("command line", "day", problem)
     picked = np.unique(np.linspace(0, max(manifest.rows - 1, 0), most).round().astype(int)).tolist()
     # None of a day that was not perceived.
-    seen = iter(()) if perceived(lake, partition) is None else observations_of(lake, partition)
+    seen = iter(()) if perceived(lake, partition) is None else observations_of(lake, partition, None, chosen)
     observation = next(seen, None)
-    for frame in frames_of(lake, partition, picked):
+    for frame in frames_of(lake, partition, picked, chosen):
         while observation is not None and observation.frame_index < frame.frame_index:
             observation = next(seen, None)
         is_its = observation is not None and observation.frame_index == frame.frame_index

@@ -1,0 +1,213 @@
+"""A vehicle-day of a rig of many sensors as a Foxglove MCAP: channels for every sensor, called as the sensor.
+
+As `foxglove.py` has it for one of each: images pass byte for byte, clouds are each in the frame of its sensor, the
+lidar's depth jumps lie in every image. The reference is the root (or base, where its pose is known); what the prior
+would show of a lidar or radar hangs on the reference as `NAME_prior`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from heapq import merge
+from typing import Any, BinaryIO
+
+import foxglove
+import numpy as np
+from foxglove import channels, layouts
+from foxglove import messages as fg
+from jaxtyping import Float
+
+from pipeline.export import foxglove as one_of_each
+from pipeline.export.calibration import ExportedCalibration, poses_of
+from pipeline.export.foxglove import TOPICS, Scene
+from pipeline.export.foxglove_table import TABLE_SCHEMA, table_of
+from pipeline.export.provenance import provenance_of
+from pipeline.export.texts import to_json
+from pipeline.geometry.cameras import camera_of
+from pipeline.rig.graph import Sensor
+from schemas.frames import Frame
+from schemas.observations import Observation
+
+__all__ = ["layout_of_rig", "write_foxglove_rig"]
+
+_IN_A_ROW = 3  # pictures of the layout
+
+
+@dataclass(frozen=True, eq=False)
+class _Drive:
+    """What is drawn: the calibration, and the same of what was known before the day."""
+
+    now: ExportedCalibration
+    before: ExportedCalibration
+    lidar: str | None  # whose depth jumps lie in the images
+
+    def frame(self, sensor: str) -> str:
+        return self.now.names.of(sensor)
+
+
+class _Channels:
+    """Channels by topic, made when they have something to say."""
+
+    def __init__(self, context: foxglove.Context) -> None:
+        self._context, self._made = context, dict[str, Any]()
+
+    def add(self, kind: Any, topic: str, message: Any, now: int) -> None:
+        if topic not in self._made:
+            self._made[topic] = kind(topic, context=self._context)
+        self._made[topic].log(message, log_time=now)
+
+
+def write_foxglove_rig(
+    stream: BinaryIO,
+    calibration: ExportedCalibration,
+    before: ExportedCalibration,
+    scenes: Mapping[Sensor, Iterable[Scene]],
+) -> int:
+    """Write the scenes of all sensors as an MCAP.
+
+    Args:
+        stream: seekable.
+        calibration: what is drawn as calibrated; a sensor that it lacks is drawn at the prior alone.
+        before: the same edges as they were before the day, those that are known.
+        scenes: of each sensor that is shown, in order of moments; of a camera with the reference lidar beside it.
+
+    Returns:
+        Scenes written.
+    """
+    context = foxglove.Context()
+    logged, count, moment = _Channels(context), 0, -1
+    table = foxglove.Channel(TOPICS["table"], schema=TABLE_SCHEMA, context=context)
+    reference = calibration.reference
+    drive = _Drive(calibration, before, reference.name if reference.kind == "lidar" else None)
+    streams = [_in_order(place, *of_sensor) for place, of_sensor in enumerate(scenes.items())]
+    stamp_ns, provenance = 0, provenance_of(calibration)
+    with foxglove.open_mcap(stream, context=context) as writer:
+        for index, _, sensor, frame, seen in merge(*streams, key=lambda row: row[:2]):
+            stamp_ns = frame.stamp_ns
+            if not count:
+                table.log(table_of(calibration, _priors(drive)), log_time=stamp_ns)
+            if index != moment:
+                moment = index
+                tree = fg.FrameTransforms(transforms=_transforms(drive, stamp_ns))
+                logged.add(channels.FrameTransformsChannel, TOPICS["tf"], tree, stamp_ns)
+            (_log_camera if sensor.kind == "camera" else _log_cloud)(logged, drive, sensor, (frame, seen))
+            count += 1
+        told = {name: str(provenance[name]) for name in ("written_by", "vehicle", "source", "method")}
+        writer.write_metadata("boresight", told)
+        times = {"log_time": stamp_ns, "create_time": stamp_ns}
+        writer.attach(
+            **times, name="calibration.json", media_type="application/json", data=to_json(provenance)
+        )
+    return count
+
+
+def _in_order(
+    place: int, sensor: Sensor, scenes: Iterable[Scene]
+) -> Iterator[tuple[int, int, Sensor, Frame, Observation | None]]:
+    """Scenes with what they are merged by: moment, then place of the sensor."""
+    for frame, seen in scenes:
+        yield frame.frame_index, place, sensor, frame, seen
+
+
+def _priors(drive: _Drive) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """What was known before the day of the pairs that are calibrated, by their words."""
+    ends = {words: (pair.edge.parent.name, pair.edge.child.name) for words, pair in drive.now.pairs.items()}
+    found = {words: drive.before.between(*two) for words, two in ends.items()}
+    return {words: known[0] for words, known in found.items() if known is not None}
+
+
+def _transforms(drive: _Drive, stamp_ns: int) -> list[fg.FrameTransform]:
+    edges = [(pose.parent, pose.child, pose.T) for pose in poses_of(drive.now)]
+    reference = drive.now.reference.name
+    for sensor in drive.now.sensors:
+        known = drive.before.between(reference, sensor.name) if sensor.kind != "camera" else None
+        if known is not None and sensor.name != reference:
+            edges.append((drive.frame(reference), f"{drive.frame(sensor.name)}_prior", known[0]))
+    return [one_of_each.transform_message(*edge, stamp_ns) for edge in edges]
+
+
+def _log_camera(logged: _Channels, drive: _Drive, sensor: Sensor, scene: Scene) -> None:
+    frame, seen = scene
+    name, now, frame_id = sensor.name, frame.stamp_ns, drive.frame(sensor.name)
+    if "camera" not in frame.sensors:
+        return
+    at = one_of_each.time_message(frame.camera_stamp_ns)
+    picture = fg.CompressedImage(timestamp=at, frame_id=frame_id, data=frame.image, format=frame.image_format)
+    logged.add(channels.CompressedImageChannel, f"/{name}/image", picture, now)
+    intrinsics = one_of_each.intrinsics_message(camera_of(frame), frame_id, at)
+    logged.add(channels.CameraCalibrationChannel, f"/{name}/calibration", intrinsics, now)
+    if seen is None or "camera" not in seen.sensors:
+        return
+    drawn = channels.ImageAnnotationsChannel
+    logged.add(drawn, f"/{name}/boxes", one_of_each.boxes_message(seen, at), now)
+    if drive.lidar is None or "lidar" not in seen.sensors:
+        return
+    for topic, of, colour in (
+        ("overlay", drive.now, one_of_each.CALIBRATED), ("overlay_prior", drive.before, one_of_each.PRIOR),
+    ):  # fmt: skip
+        known = of.between(name, drive.lidar)
+        if known is not None:
+            edges = one_of_each.edges_message(seen, known[0], colour, at)
+            logged.add(drawn, f"/{name}/{topic}", edges, now)
+
+
+def _log_cloud(logged: _Channels, drive: _Drive, sensor: Sensor, scene: Scene) -> None:
+    frame, seen = scene
+    name, now, frame_id, kind = sensor.name, frame.stamp_ns, drive.frame(sensor.name), sensor.kind
+    if kind not in frame.sensors:
+        return
+    columns, stamp_ns = one_of_each.cloud_columns(frame, kind)
+    for topic, where in (("points", frame_id), ("points_prior", f"{frame_id}_prior")):
+        if topic == "points" or name != drive.now.reference.name:
+            cloud = one_of_each.cloud_message(columns, where, stamp_ns)
+            logged.add(channels.PointCloudChannel, f"/{name}/{topic}", cloud, now)
+    if kind == "lidar" and seen is not None and kind in seen.sensors:
+        objects = one_of_each.clusters_message(seen, frame_id, now)
+        logged.add(channels.SceneUpdateChannel, f"/{name}/boxes", objects, now)
+
+
+def layout_of_rig(sensors: Sequence[Sensor], reference: str, follow: str) -> bytes:
+    """A layout of Foxglove's: a picture of every camera with the lidar's edges, the scene from above, the sigmas.
+
+    Args:
+        sensors: that the file shows.
+        reference: the sensor that poses refer to.
+        follow: frame that the scene follows.
+    """
+    pictures = [_picture(sensor.name, reference) for sensor in sensors if sensor.kind == "camera"]
+    clouds = {
+        f"/{s.name}/{topic}": layouts.BaseRendererPointCloudTopicSettings(
+            visible=topic == "points", color_mode="colormap", color_map="turbo", point_size=2.0,
+            color_field="z" if s.kind == "lidar" else "range_rate_mps",
+        )
+        for s in sensors
+        if s.kind != "camera"
+        for topic in ("points", "points_prior")
+    }  # fmt: skip
+    scene = layouts.ThreeDeePanel(
+        title="From above", config=layouts.ThreeDeeConfig(follow_tf=follow, topics=clouds)
+    )
+    table = layouts.TablePanel(config=layouts.TableConfig(topic_path=f"{TOPICS['table']}.rows"))
+    rows = [_split("row", pictures[k : k + _IN_A_ROW]) for k in range(0, len(pictures), _IN_A_ROW)]
+    return layouts.Layout(content=_split("column", [*rows, _split("row", [scene, table])])).to_json().encode()
+
+
+def _split(direction: Any, contents: Sequence[Any]) -> Any:
+    items = [layouts.SplitItem(content=content) for content in contents]
+    return contents[0] if len(items) == 1 else layouts.SplitContainer(direction=direction, items=items)
+
+
+def _picture(name: str, lidar: str) -> Any:
+    annotations = {
+        f"/{name}/{topic}": layouts.ImageAnnotationSettings(visible=topic != "overlay_prior")
+        for topic in ("boxes", "overlay", "overlay_prior")
+    }
+    mode = layouts.ImageModeConfig(
+        image_topic=f"/{name}/image", calibration_topic=f"/{name}/calibration", annotations=annotations
+    )
+    points = layouts.BaseRendererPointCloudTopicSettings(
+        visible=False, color_mode="colormap", color_field="x", color_map="turbo", point_size=2.0
+    )
+    config = layouts.ImageConfig(image_mode=mode, topics={f"/{lidar}/points": points})
+    return layouts.ImagePanel(title=f"{name}: the lidar's edges as calibrated", config=config)

@@ -1,0 +1,134 @@
+"""The drive of a rig of many sensors: channels for every sensor, in frames that hang where the calibration has them."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from jobs.cli import main
+from pipeline.geometry.se3 import from_quaternion, inverse, transform_points
+from pipeline.store.moments import write_moments
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import commit_records
+from schemas.calibrations import CALIBRATIONS
+from schemas.moments import MOMENTS, PERCEIVED
+from tests.export.test_foxglove import CAMERA, frame, observation
+from tests.makers.foxglove_logs import schema
+from tests.makers.lakes import joined_of
+from tests.makers.rig_records import T_TOP, rig_records
+
+pytest.importorskip("foxglove")
+DAY, COUNT = Partition("van", "2026-03-01"), 3
+# By sensor, the kind of the row that it has, and whose of another day.
+SENSORS = {
+    "front": ("camera", 0),
+    "left": ("camera", 10),
+    "top": ("lidar", 0),
+    "bumper": ("radar", 0),
+    "corner": ("radar", 10),
+}
+AROUND = np.random.default_rng(7).uniform((-30, -30, -1), (30, 30, 2), (60, 3)).astype(np.float32)
+
+
+def write(lake, table, made):
+    with write_moments(lake, table, DAY, "key", "test") as writer:
+        for k in range(COUNT):
+            moment, _ = joined_of(made(k))
+            rows = {
+                name: replace(joined_of(made(k + more))[1][kind], moment=k)
+                for name, (kind, more) in SENSORS.items()
+            }
+            if table is PERCEIVED:
+                rows["top"] = replace(rows["top"], lidar_edge_xyz_m=AROUND)
+            writer.append(moment, rows)
+        writer.describe(kept={"frames": COUNT}, rejected={})
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory):
+    lake = Lake.at(tmp_path_factory.mktemp("rig") / "lake")
+    write(lake, MOMENTS, frame)
+    write(lake, PERCEIVED, observation)
+    records = rig_records("van", 1, np.random.default_rng(4))
+    held = {"status": "held", "reason": "too few frames"}
+    commit_records(
+        lake, CALIBRATIONS, [replace(r, **held) if r.child_frame == "corner" else r for r in records]
+    )
+    return lake.root
+
+
+def exported(lake, out, *more):
+    call = ["export", "foxglove", "--lake", lake, "--vehicle", "van", "--day", DAY.day, "--out", out, *more]
+    code, found = main([str(a) for a in call]), {}
+    if not out.exists():
+        return code, found
+    with out.open("rb") as stream:
+        for its, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            if its.encoding == "protobuf":  # by the official class, not the file's own schema
+                told = schema(its.name.removeprefix("foxglove.")).FromString(message.data)
+            else:
+                told = json.loads(message.data)
+            found.setdefault(channel.topic, []).append(told)
+    return code, found
+
+
+def poses(message):
+    by_child = {}
+    for t in message.transforms:
+        q, p = t.rotation, t.translation
+        T = from_quaternion(np.array([q.w, q.x, q.y, q.z]), np.array([p.x, p.y, p.z]))
+        by_child[t.child_frame_id] = (t.parent_frame_id, T)
+    return by_child
+
+
+def test_every_sensor_has_channels_of_its_own(lake, tmp_path):
+    code, found = exported(lake, tmp_path / "drive.mcap")
+    assert code == 3  # the corner's edge is held
+    of_camera = ("image", "calibration", "boxes", "overlay", "overlay_prior")
+    wanted = {f"/{c}/{topic}" for c in ("front", "left") for topic in of_camera}
+    wanted |= {"/top/points", "/top/boxes", "/tf", "/boresight/calibration"}
+    wanted |= {f"/{r}/{topic}" for r in ("bumper", "corner") for topic in ("points", "points_prior")}
+    assert found.keys() == wanted
+    assert {len(own) for topic, own in found.items() if topic != "/boresight/calibration"} == {COUNT}
+    for k in range(COUNT):
+        assert found["/front/image"][k].data == frame(k).image
+        assert found["/left/image"][k].data == frame(k + 10).image
+        points = np.frombuffer(found["/corner/points"][k].data, "<f4").reshape(
+            len(frame(k + 10).radar_x_m), -1
+        )
+        np.testing.assert_array_equal(points[:, 0], frame(k + 10).radar_x_m)
+        assert found["/corner/points"][k].frame_id == "corner"
+    layout = json.loads((tmp_path / "drive.layout.json").read_text())
+    assert "/left/overlay" in json.dumps(layout)
+
+
+def test_frames_hang_where_the_day_and_the_prior_have_them(lake, tmp_path):
+    _, found = exported(lake, tmp_path / "drive.mcap")
+    tree = poses(found["/tf"][0])
+    assert tree.keys() == {"front", "left", "bumper", "bumper_prior", "corner_prior"}  # the corner is held
+    assert {parent for parent, _ in tree.values()} == {"top"}
+    for name in ("bumper", "corner"):
+        np.testing.assert_allclose(tree[f"{name}_prior"][1], T_TOP[name], atol=1e-9)
+    assert 1e-6 < np.abs(tree["bumper"][1] - T_TOP["bumper"]).max() < 0.3
+
+
+def test_the_reference_lidar_s_edges_lie_in_every_camera_s_image(lake, tmp_path):
+    _, found = exported(lake, tmp_path / "drive.mcap")
+    for name in ("front", "left"):
+        drawn = found[f"/{name}/overlay_prior"][1]
+        points = transform_points(inverse(T_TOP[name]), AROUND.astype(float))
+        uv, valid = CAMERA.project(points)
+        wanted = uv[valid & CAMERA.contains(uv)] + 0.5
+        assert len(wanted) > 3
+        np.testing.assert_allclose([[p.x, p.y] for p in drawn.points[0].points], wanted, atol=1e-6)
+
+
+def test_only_the_sensors_that_are_named_are_shown_and_an_unknown_one_is_refused(lake, tmp_path, capsys):
+    _, found = exported(lake, tmp_path / "drive.mcap", "--sensor", "left", "--sensor", "corner")
+    topics = {topic.split("/")[1] for topic in found}
+    assert topics == {"left", "corner", "tf", "boresight"}
+    code, found = exported(lake, tmp_path / "other.mcap", "--sensor", "rear")
+    assert (code, found) == (2, {})
+    assert "no rear: the rig has front, left, top, bumper, corner" in capsys.readouterr().out
