@@ -13,13 +13,15 @@ from pipeline.report.day import PairView, answer_for, answered, pair_view, sigma
 from pipeline.report.figures import SigmaPanel, residual_figure, sigma_figure
 from pipeline.report.page import render, write_page
 from pipeline.report.picture_file import write_picture
-from pipeline.report.pictures import scene_pictures
+from pipeline.report.pictures import ScenePictures, scene_pictures
 from pipeline.report.reading import (
     day_poses,
     day_records,
     drawn_records,
     drift_of,
     has_frames,
+    names_drawn,
+    other_cameras,
     scenes_among,
     spread_observations,
     states_of,
@@ -113,13 +115,14 @@ def write_day_picture(
     records = day_records(lake, partition, method or fleet.audit.method)
     drawn = drawn_records(records)
     states = states_of(drawn)
-    spread = spread_observations(lake, partition) if has_frames(lake, partition) else []
+    chosen = names_drawn(drawn)
+    spread = spread_observations(lake, partition, chosen) if has_frames(lake, partition) else []
     if states is None or not any("camera" in o.sensors for o in spread):
         problem = f"{partition.vehicle} has no image with a prior on {partition.day}"
         raise ConfigError("command line", "picture", problem)
     before, after = states
     seen = [o for o in spread if "camera" in o.sensors]
-    scene = scenes_among(lake, partition, seen, after.T_camera_lidar, 1, fleet.report)[0]
+    scene = scenes_among(lake, partition, seen, after.T_camera_lidar, 1, fleet.report, chosen)[0]
     stamped = as_stamped(after, scene.observation, time_offsets_of(drawn))
     labels = ("prior", _after_label([pair_view(r) for r in records.values()]))
     return write_picture(out, scene, before, stamped, labels)
@@ -138,6 +141,9 @@ def _content(
         if pictures is not None
         else ([], "", "this page was asked for without pictures")
     )
+    if pictures is not None:
+        for camera in other_cameras(records, of_three):
+            drawn += _pictures(lake, partition, drawn_records(records, camera), labels, pictures, 1)[0]
     return {
         "environment": next(iter(records.values())).environment,
         "answer": answer_for(answered(views, poses), partition.day, findings),
@@ -171,26 +177,29 @@ def _pictures(
     records: Mapping[str, CalibrationRecord],
     labels: tuple[str, str],
     config: ReportConfig,
-) -> tuple[list[Any], Any, str]:
+    count: int = _SCENES,
+) -> tuple[list[ScenePictures], Any, str]:
     """Pictures, residuals, and why there are none; the result is drawn with its time offsets, the prior without."""
     states, offsets = states_of(records), time_offsets_of(records)
     if states is None:
         return [], "", "the records carry no prior"
-    before, after = states
+    (before, after), chosen = states, names_drawn(records)
     try:
         if not has_frames(lake, partition):
             return [], "", "the lake no longer has the day's frames and observations"
-        spread = spread_observations(lake, partition)
+        spread = spread_observations(lake, partition, chosen)
         if not spread:
             return [], "", "no frame of the day could be used"
         at_prior, at_result = frame_residuals(spread, states, (TimeOffsets(), offsets))
         there = [pair for pair in PAIRS if any(pair in pairs_of(o.sensors) for o in spread)]
         residuals = residual_figure(at_prior, at_result, there)
-        scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, _SCENES, config)
+        scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, count, config, chosen)
     except DamagedError as err:
         lake.damage.append(str(err))
         return [], "", "the day's frames or observations cannot be read"
-    pictures = [scene_pictures(s, before, as_stamped(after, s.observation, offsets), labels) for s in scenes]
+    camera = "" if chosen is None else chosen.get("camera", "")
+    at_stamp = [(s, before, as_stamped(after, s.observation, offsets)) for s in scenes]
+    pictures = [scene_pictures(*of, labels, camera) for of in at_stamp]
     return pictures, residuals, "no frame of the day could be drawn"
 
 

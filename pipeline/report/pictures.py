@@ -39,6 +39,7 @@ class ScenePictures:
     shown: str  # in the front view, in words
     top: str
     close_ups: CloseUps | None
+    camera: str = ""  # which one, where the rig has several
 
 
 def close_ups_of(scene: Scene, before: Extrinsics, after: Extrinsics) -> CloseUps:
@@ -55,7 +56,7 @@ def close_ups_of(scene: Scene, before: Extrinsics, after: Extrinsics) -> CloseUp
 
 
 def scene_pictures(
-    scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]
+    scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str], camera_name: str = ""
 ) -> ScenePictures:
     """Draw and encode all pictures of a chosen frame."""
     camera, lidar, radar = (sensor in scene.observation.sensors for sensor in SENSORS)
@@ -68,4 +69,5 @@ def scene_pictures(
         ", ".join([*kinds, "detected road users as boxes"]).capitalize(),
         top_view(scene, before, after, labels) if lidar and radar else "",
         close_ups_of(scene, before, after) if camera and lidar else None,
+        camera_name,
     )

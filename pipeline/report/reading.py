@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import cast
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from pipeline.store.current import current_poses, current_records, prior_of, tra
 from pipeline.store.partitions import Lake, Partition, days_after
 from pipeline.store.records import last_day, read_last, read_records
 from pipeline.store.tables import COLLECTED
-from pipeline.store.views import frames_of, ingested, observations_of, perceived
+from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, PAIRS, SENSORS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import Frame
@@ -30,6 +31,8 @@ __all__ = [
     "drift_of",
     "fleet_records",
     "has_frames",
+    "names_drawn",
+    "other_cameras",
     "records_of_day",
     "scene_of",
     "scenes_among",
@@ -102,20 +105,43 @@ def _by_edge(records: Iterable[CalibrationRecord]) -> dict[str, CalibrationRecor
     return {words_of(edge): edges[edge] for edge in sorted(edges, key=edge_order)}
 
 
-def drawn_records(records: Mapping[str, CalibrationRecord]) -> dict[str, CalibrationRecord]:
+def drawn_records(
+    records: Mapping[str, CalibrationRecord], camera: str | None = None
+) -> dict[str, CalibrationRecord]:
     """By pair, the records that pictures of one camera, one lidar and one radar are drawn from: the first of each kind.
 
     Args:
         records: of a vehicle-day, as `day_records` gives them.
+        camera: which one, and its lidar alone; None = the first, and a radar.
     """
     chosen: dict[str, CalibrationRecord] = {}
-    names: dict[str, str] = {}  # of each kind the sensor that is drawn
+    # Of each kind the sensor that is drawn.
+    names: dict[str, str] = {} if camera is None else {"camera": camera, "radar": ""}
     for record in records.values():
         ends = dict(zip(record.pair.split("_"), (record.parent_frame, record.child_frame), strict=True))
         if record.pair in PAIRS and all(names.get(kind, name) == name for kind, name in ends.items()):
             chosen[record.pair] = record
             names |= ends
     return chosen
+
+
+def names_drawn(drawn: Mapping[str, CalibrationRecord]) -> Chosen | None:
+    """The sensors of such records by kind; None of a vehicle whose sensors are called by their kinds."""
+    names = {
+        kind: name
+        for record in drawn.values()
+        for kind, name in zip(record.pair.split("_"), (record.parent_frame, record.child_frame), strict=True)
+    }
+    return None if all(kind == name for kind, name in names.items()) else cast("Chosen", names)
+
+
+def other_cameras(
+    records: Mapping[str, CalibrationRecord], drawn: Mapping[str, CalibrationRecord]
+) -> list[str]:
+    """Cameras beside the one that is drawn already, that have an edge with a lidar."""
+    named = [r.parent_frame for r in records.values() if r.pair == "camera_lidar"]
+    done = {r.parent_frame for r in drawn.values() if r.pair.startswith("camera")}
+    return [name for name in dict.fromkeys(named) if name not in done]
 
 
 def drift_of(lake: Lake, method: str, vehicle: str) -> list[DriftFinding]:
@@ -143,9 +169,9 @@ def has_frames(lake: Lake, partition: Partition) -> bool:
     return all(manifest is not None and COLLECTED not in manifest.extra for manifest in found)
 
 
-def spread_observations(lake: Lake, partition: Partition) -> list[Observation]:
-    """Up to 60 observations, evenly spread over the day."""
-    found = list(observations_of(lake, partition))
+def spread_observations(lake: Lake, partition: Partition, chosen: Chosen | None = None) -> list[Observation]:
+    """Up to 60 observations of chosen sensors (None = the first of each kind), evenly spread over the day."""
+    found = list(observations_of(lake, partition, None, chosen))
     if not found:
         return []
     some = np.unique(np.linspace(0, len(found) - 1, _FRAMES_LOOKED_AT).astype(int))
@@ -165,13 +191,14 @@ def scenes_among(
     T_camera_lidar: np.ndarray,
     count: int,
     config: ReportConfig,
+    sensors: Chosen | None = None,
 ) -> list[Scene]:
     """Frames with much to see, spread over the given observations with most sensors, read from the lake."""
     most = max((len(o.sensors) for o in observations), default=0)
     observations = [o for o in observations if len(o.sensors) == most]
     chosen = [observations[i] for i in choose_frames(observations, T_camera_lidar, count)]
     rows = [o.frame_index for o in chosen]
-    frames = {f.frame_index: f for f in frames_of(lake, partition, rows)}
+    frames = {f.frame_index: f for f in frames_of(lake, partition, rows, sensors)}
     there = [(frames[o.frame_index], o) for o in chosen if o.frame_index in frames]
     return [scene_of(f, o, config) for f, o in there]
 

@@ -41,7 +41,8 @@ def write(lake, table, made):
                 for name, (kind, more) in SENSORS.items()
             }
             if table is PERCEIVED:
-                rows["top"] = replace(rows["top"], lidar_edge_xyz_m=AROUND)
+                side = np.resize(rows["top"].lidar_edge_side, len(AROUND))
+                rows["top"] = replace(rows["top"], lidar_edge_xyz_m=AROUND, lidar_edge_side=side)
             writer.append(moment, rows)
         writer.describe(kept={"frames": COUNT}, rejected={})
 
