@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -54,9 +55,14 @@ def test_every_sensor_has_a_file_and_what_it_lacks_is_counted_under_its_name(day
     assert "corner_fl" in ingested(lake, DAY).extra[SENSORS_ABSENT]
 
 
-def test_damaged_images_of_one_camera_cost_that_camera_alone(day, tmp_path, monkeypatch):
-    lake, fleet, _, (before, _) = day
-    topic, whole, seen = fleet.rig_of(DAY.vehicle).cameras["left"].image, DayIndex.read, []
+@pytest.mark.parametrize(
+    ("of_camera", "counts"),
+    [(attrgetter("image"), (4, 0)), (attrgetter("semantics.labels"), (0, 4))],
+    ids=["images", "labels"],
+)
+def test_what_is_damaged_of_one_camera_costs_that_camera_alone(day, tmp_path, monkeypatch, of_camera, counts):
+    lake, fleet, _, (before, perceived_before) = day
+    topic, whole, seen = of_camera(fleet.rig_of(DAY.vehicle).cameras["left"]), DayIndex.read, []
 
     def damaged(self, located):
         payload = whole(self, located)
@@ -66,9 +72,14 @@ def test_damaged_images_of_one_camera_cost_that_camera_alone(day, tmp_path, monk
 
     monkeypatch.setattr(DayIndex, "read", damaged)
     logs = sorted((lake.root.parent / "logs" / DAY.vehicle / DAY.day).iterdir())
-    found = ingest_day(logs, DAY, fleet, Lake.at(tmp_path / "lake"))
-    assert (found.status, found.rows) == ("done", before.rows)
-    assert found.rejected["without_left_image_damaged"] == MOMENTS // 2
+    copy = Lake.at(tmp_path / "lake")
+    found, shown = ingest_day(logs, DAY, fleet, copy), perceive_day(DAY, fleet, copy)
+    assert (found.status, found.rows, shown.rows) == ("done", before.rows, perceived_before.rows)
+    lost = (
+        found.rejected.get("without_left_image_damaged", 0),
+        shown.rejected.get("without_left_labels_missing", 0),
+    )
+    assert lost == counts
 
 
 def test_a_camera_without_semantics_is_counted_and_told_what_to_set_and_the_others_go_on(day, tmp_path):
