@@ -21,7 +21,6 @@ from schemas.calibrations import FRAMES_OF_PAIR, SENSORS, pairs_of
 from schemas.observations import Observation
 
 __all__ = [
-    "day_prior",
     "no_prior",
     "perturbed",
     "prior_key",
@@ -43,17 +42,6 @@ def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle:
     names = _only(rig)
     stars = _carried(observations, [name or kind for name, kind in zip(names, SENSORS, strict=True)])
     return trio_prior(_prior(lambda: agreed(stars), fleet, rig), rig, *names)
-
-
-def day_prior(rows: Iterable[Mapping[str, Any]], fleet: FleetConfig, vehicle: str) -> Prior:
-    """The same of what a manifest says of a whole day, under `schemas.moments.PRIOR`.
-
-    Raises:
-        SolveError: the logs carry no transform between any two sensors, or one changes over the day.
-        ConfigError: unknown vehicle, or the prior file cannot be read.
-    """
-    rig = fleet.rig_of(vehicle)
-    return trio_prior(rig_prior(rows, fleet, rig), rig, *_only(rig))
 
 
 def rig_prior(rows: Iterable[Mapping[str, Any]], fleet: FleetConfig, rig: Rig) -> RigPrior:
