@@ -101,7 +101,7 @@ def _row(
     if found.untied:
         why = f" ({about.absent[sensor.name]})" if sensor.name in about.absent else ""
         failed = [c for edge, e in adjusted.edges.items() if sensor in edge.sensors for c in e.failed]
-        said = "".join(f"; {c.sentence}" for c in failed[:1])
+        said = next((f"; {c.sentence}" for c in failed if c.fault), "")
         return PoseRow(**told, status="refused", reason=found.untied + why + said, faults=faults_of(failed))
     poses, reference = adjusted.poses, graph.reference.name
     targets = _targets(sensor, poses, views)

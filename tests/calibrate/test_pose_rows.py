@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustedSensor
+from pipeline.calibrate.adjust.adjusted import AdjustedEdge, AdjustedRig, AdjustedSensor
 from pipeline.calibrate.pose_rows import pose_rows
 from pipeline.calibrate.records import Inputs
 from pipeline.config import VerifyConfig
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor, edge_between
 from pipeline.store.partitions import Partition
@@ -25,3 +27,17 @@ def test_a_sure_prior_alone_certifies_nothing(seen, status):
     top, nose = pose_rows(ABOUT, graph, AdjustedRig(poses, tight, {"nose": found}, {}), {}, VerifyConfig())
     assert (top.status, nose.status) == ("accepted", status)
     assert seen or "no degree of freedom" in nose.reason
+
+
+def test_a_sensor_whose_edges_are_all_left_out_says_what_fault_they_name():
+    checks = (FailedCheck("too few held-out frames"), FailedCheck("the nose moved", "moved_in_day"))
+    evidence = EdgeEvidence(EDGE, np.eye(4), 0.0, np.eye(7), np.zeros(7), checks=checks)
+    poses = Extrinsics(TOP, {"top": np.eye(4), "nose": np.eye(4)}, ("nose",), np.eye(6), np.eye(6))
+    untied = AdjustedSensor(
+        np.zeros(6), np.zeros(6, bool), (), "no edge of it can be used: top-nose", (), 0.01
+    )
+    edges = {EDGE: AdjustedEdge(evidence, None, checks)}
+    found = AdjustedRig(poses, np.eye(6), {"nose": untied}, edges)
+    _, nose = pose_rows(ABOUT, RigGraph((TOP, NOSE), (EDGE,), TOP), found, {}, VerifyConfig())
+    assert (nose.status, nose.faults) == ("refused", ["moved_in_day"])
+    assert nose.reason.endswith("top-nose; the nose moved")
