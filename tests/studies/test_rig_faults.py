@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SolveError
-from tests.benchmarks.studies.rig_faults import CASES, OF_KIND, Remembered, is_wrong, summary
+from tests.benchmarks.studies.rig_faults import CASES, OF_KIND, REMEMBERED, Remembered, is_wrong, summary
 
 
 def row(**told):
@@ -67,3 +67,7 @@ def test_a_table_counts_sensor_days_and_what_is_wrong():
 def test_each_kind_of_sensor_has_each_kind_of_fault():
     for what in ("turned at noon", "turned before", "silent", "late", "prior of"):
         assert {case.kind for case in CASES if what in case.name} == set(OF_KIND)
+
+
+def test_what_is_remembered_is_what_stages_call():
+    assert all(callable(getattr(room, name)) for room, names in REMEMBERED.items() for name in names)

@@ -32,7 +32,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pipeline.calibrate import base_edges, rig_stage
+from pipeline.calibrate import base_edges, rig_day
 from pipeline.calibrate.records import Inputs
 from pipeline.config import FleetConfig, VerifyConfig, load_fleet
 from pipeline.errors import SolveError
@@ -60,7 +60,7 @@ from tests.benchmarks.studies.rates import rate
 from tests.benchmarks.studies.rig_days import row_of, true_poses
 from tests.makers.stages import audit_fleet, calibrate_day, ingest_day, perceive_day
 
-__all__ = ["CASES", "OF_KIND", "Remembered", "is_on_base", "is_wrong", "summary"]
+__all__ = ["CASES", "OF_KIND", "REMEMBERED", "Remembered", "is_on_base", "is_wrong", "summary"]
 
 VEHICLE, DATE, FRAMES = "vehicle-1", "2026-03-02", 60
 OF_KIND = {
@@ -70,6 +70,12 @@ OF_KIND = {
 }
 TURNED_DEG = 0.5  # of nights
 NOON = "turned at noon"  # of a camera: simulated, for its pictures change
+# What is run once for the same rows and priors.
+REMEMBERED = {
+    perceive_stage: ("perceive_image", "perceive_sweep", "perceive_scan", "motion_of"),
+    base_edges: ("estimate_lidar_base", "estimate_lidar_lidar", "estimate_radar_base"),
+    rig_day: ("solve_day",),
+}
 
 
 @dataclass(frozen=True)
@@ -120,7 +126,9 @@ def main() -> None:
         for r in read_results(args.out)
         if is_accepted(r["commit"], now, args.accept_commits)
     }
-    _remember()
+    for room, names in REMEMBERED.items():
+        for name in names:
+            Remembered(room, name)
     for case, sensor, seed in _in_turn(args.seeds, args.only):
         if (seed, case.name, sensor) not in done:
             _write(args.out, {"seed": seed, "case": case.name, "sensor": sensor, "commit": now},
@@ -197,16 +205,6 @@ def _without_place(argument: Any) -> Any:
     if isinstance(argument, Inputs):
         return replace(argument, work_key="", inputs=[])
     return "fleet" if isinstance(argument, FleetConfig) else argument
-
-
-def _remember() -> None:
-    for room, names in (
-        (perceive_stage, ("perceive_image", "perceive_sweep", "perceive_scan", "motion_of")),
-        (base_edges, ("estimate_lidar_base", "estimate_lidar_lidar", "estimate_radar_base")),
-        (rig_stage, ("calibrate_day",)),
-    ):
-        for name in names:
-            Remembered(room, name)
 
 
 def run_case(case: Case, sensor: str, seed: int, root: Path) -> dict[str, Any]:
