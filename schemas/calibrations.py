@@ -77,33 +77,25 @@ class CalibrationRecord(Posed):
         default=None,
     )
     limit_rad: float | None = column(
-        (
-            "the largest error that the calibration's use allows; elevation's own is diagnostics' "
-            "elevation_limit_rad"
-        ),
+        "the largest error that the calibration's use allows; elevation's own is diagnostics' "
+        "elevation_limit_rad",
         default=None,
     )
     targets_m: np.ndarray | None = array(
         "<f8",
         (3, 3),
-        (
-            "the targets, in child_frame: 15, 25 and 40 m away, where both sensors see; null where refused and in"
-            " rows of version 3, whose targets lie before the child at -10, 8 and 0 deg"
-        ),
+        "the targets, in child_frame: 15, 25 and 40 m away, where both sensors see; null where refused and in"
+        " rows of version 3, whose targets lie before the child at -10, 8 and 0 deg",
         default=None,
     )
     mounting_determined: list[str] = column(
-        (
-            "of `determined`, the directions in which the mounting is within the limit as well; the others hold "
-            "with this CameraInfo (and for the radar's detections) only"
-        ),
+        "of `determined`, the directions in which the mounting is within the limit as well; the others hold "
+        "with this CameraInfo (and for the radar's detections) only",
         default_factory=list,
     )
     mounting_azimuth_sigma_rad: float | None = column(
-        (
-            "sigma of a target's azimuth by the mounting: with what is not known of CameraInfo's principal point;"
-            " null where nothing says how well that is known"
-        ),
+        "sigma of a target's azimuth by the mounting: with what is not known of CameraInfo's principal point;"
+        " null where nothing says how well that is known",
         default=None,
     )
     mounting_elevation_sigma_rad: float | None = column(
@@ -141,11 +133,9 @@ class CalibrationRecord(Posed):
     half_days: np.ndarray | None = array(
         "<f8",
         (2, 2, 6),
-        (
-            "of a day in which a sensor moved: how its first and its last part change the estimate (rx ry rz "
-            "[rad], tx ty tz [m] of the child's origin, parent axes), and the sigmas of that; null on any other "
-            "day"
-        ),
+        "of a day in which a sensor moved: how its first and its last part change the estimate (rx ry rz "
+        "[rad], tx ty tz [m] of the child's origin, parent axes), and the sigmas of that; null on any other "
+        "day",
         default=None,
     )
     innovation_sigmas: float | None = column(
@@ -170,10 +160,8 @@ class CalibrationRecord(Posed):
         "what the day did not show: what to drive next time", default_factory=list
     )
     diagnostics: dict[str, float] = column(
-        (
-            "numbers behind the verdict (origins of the search, halves, biases), names with units; `disproved` is"
-            " 1 where a check shows that the pose is wrong"
-        ),
+        "numbers behind the verdict (origins of the search, halves, biases), names with units; `disproved` is"
+        " 1 where a check shows that the pose is wrong",
         default_factory=dict,
     )
     code_version: str = column("boresight version")

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float32
 
-from schemas.columns import TableSchema, array, column, row
+from schemas.columns import TableSchema, array, column, per_point, row
 
 __all__ = [
     "CAPTURES",
@@ -59,21 +59,19 @@ class ImageColumns(CameraColumns):
         "<f4", ("N", 4), "logged road users: x0 y0 x1 y1 in full-image pixels"
     )
     detection_classes: list[str] | None = column("their classes as logged")
-    detection_scores: np.ndarray | None = array("<f4", ("N",), "their scores, 0..1")
+    detection_scores: np.ndarray | None = per_point("their scores, 0..1")
 
 
 @row()
 class SweepColumns:
     """A sweep's points."""
 
-    lidar_x_m: np.ndarray = array(
-        "<f4", ("N",), "points in the lidar frame, de-skewed to stamp_ns where lidar_deskewed"
-    )
-    lidar_y_m: np.ndarray = array("<f4", ("N",), "see lidar_x_m")
-    lidar_z_m: np.ndarray = array("<f4", ("N",), "see lidar_x_m")
-    lidar_intensity: np.ndarray | None = array("<f4", ("N",), "reflectivity as logged")
-    lidar_ring: np.ndarray | None = array("<u2", ("N",), "beam number")
-    lidar_time_s: np.ndarray | None = array("<f4", ("N",), "time of each point relative to stamp_ns")
+    lidar_x_m: np.ndarray = per_point("points in the lidar frame, de-skewed to stamp_ns where lidar_deskewed")
+    lidar_y_m: np.ndarray = per_point("see lidar_x_m")
+    lidar_z_m: np.ndarray = per_point("see lidar_x_m")
+    lidar_intensity: np.ndarray | None = per_point("reflectivity as logged")
+    lidar_ring: np.ndarray | None = per_point("beam number", "<u2")
+    lidar_time_s: np.ndarray | None = per_point("time of each point relative to stamp_ns")
     lidar_deskewed: bool = column("points were moved to stamp_ns by the ego motion")
 
     @property
@@ -86,15 +84,15 @@ class SweepColumns:
 class ScanColumns:
     """A radar's detections."""
 
-    radar_x_m: np.ndarray = array("<f4", ("N",), "detections in the radar frame")
-    radar_y_m: np.ndarray = array("<f4", ("N",), "see radar_x_m")
-    radar_z_m: np.ndarray = array("<f4", ("N",), "see radar_x_m; 0 where the radar measures no elevation")
+    radar_x_m: np.ndarray = per_point("detections in the radar frame")
+    radar_y_m: np.ndarray = per_point("see radar_x_m")
+    radar_z_m: np.ndarray = per_point("see radar_x_m; 0 where the radar measures no elevation")
     radar_range_rate_mps: np.ndarray = array(
         "<f4",
         ("N",),
         "Doppler as range rate: positive = receding, whatever the log's sign; not ego-compensated",
     )
-    radar_power_db: np.ndarray | None = array("<f4", ("N",), "power or RCS as logged")
+    radar_power_db: np.ndarray | None = per_point("power or RCS as logged")
     radar_has_elevation: bool = column("False where all elevations are 0")
     doppler_period_mps: float | None = column("range rates are known modulo this; null = unambiguous")
 

@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_typ
 import numpy as np
 import pyarrow as pa
 
-__all__ = ["Column", "Posed", "Recorded", "TableSchema", "array", "column", "row"]
+__all__ = ["Column", "Posed", "Recorded", "TableSchema", "array", "column", "per_point", "points", "row"]
 
 Row = TypeVar("Row")
 
@@ -167,8 +167,21 @@ def array(dtype: str, shape: tuple[str | int, ...], doc: str, **default: Any) ->
     return field(**default, metadata={"doc": doc, "kind": "binary", "dtype": dtype, "shape": shape})
 
 
+def per_point(doc: str, dtype: str = "<f4", **default: Any) -> Any:
+    """A field that is a blob with a number for each point, cluster or detection."""
+    return array(dtype, ("N",), doc, **default)
+
+
+def points(doc: str, dtype: str = "<f4", **default: Any) -> Any:
+    """A field that is a blob with x, y and z of any number of points."""
+    return array(dtype, ("N", 3), doc, **default)
+
+
 @dataclass_transform(
-    kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(field, column, array)
+    kw_only_default=True,
+    frozen_default=True,
+    eq_default=False,
+    field_specifiers=(field, column, array, per_point, points),
 )
 def row(*, eq: bool = False) -> Callable[[type[Row]], type[Row]]:
     """A frozen dataclass of named fields only: a row of a table, whose columns its fields are."""

@@ -65,10 +65,8 @@ class DriftFinding(Recorded):
     moved_motion_sigma: list[float] | None = column("their sigmas", default=None)
     inputs: list[str] = column("work keys of the records on the chart", default_factory=list)
     vehicle_status: str | None = column(
-        (
-            "of the vehicle as a whole, the same in all its rows of one audit: RED or YELLOW where a chart is, "
-            "GREEN where a turn of any sensor would have shown, else UNKNOWN; null in rows of releases before 0.4"
-        ),
+        "of the vehicle as a whole, the same in all its rows of one audit: RED or YELLOW where a chart is, "
+        "GREEN where a turn of any sensor would have shown, else UNKNOWN; null in rows of releases before 0.4",
         default=None,
     )
     vehicle_sensor: str | None = column(

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from schemas.captures import CameraColumns, Capture
-from schemas.columns import TableSchema, array, column, row
+from schemas.columns import TableSchema, array, column, per_point, points, row
 
 __all__ = [
     "FEATURES",
@@ -40,17 +40,15 @@ class ImageFeatureColumns(CameraColumns):
         "<f4", ("N", 4), "detected road users: x0 y0 x1 y1 in full-image pixels"
     )
     road_user_classes: list[str] = column("person, rider, car, truck, bus, train, motorcycle, bicycle")
-    road_user_scores: np.ndarray = array("<f4", ("N",), "0..1")
+    road_user_scores: np.ndarray = per_point("0..1")
     road_contrast_png: bytes | None = column(
         "PNG mono8: top-hat contrast inside the road mask (0 outside), at label size; null without an image"
     )
     label_gradients: np.ndarray | None = array(
         "<f4",
         (4, 6, 33),
-        (
-            "image gradients across the labels' borders: by EDGE_* side, sixth of the image and distance from -16"
-            " to 16 label pixels; null without an image"
-        ),
+        "image gradients across the labels' borders: by EDGE_* side, sixth of the image and distance from -16"
+        " to 16 label pixels; null without an image",
         default=None,
     )
 
@@ -59,14 +57,12 @@ class ImageFeatureColumns(CameraColumns):
 class SweepFeatureColumns:
     """What a sweep shows."""
 
-    lidar_map_xyz_m: np.ndarray = array(
-        "<f4", ("N", 3), "the cloud, uniformly sampled (voxels), ground kept; lidar frame"
+    lidar_map_xyz_m: np.ndarray = points("the cloud, uniformly sampled (voxels), ground kept; lidar frame")
+    lidar_map_is_ground: np.ndarray = per_point(
+        "1 = on the drivable ground (RANSAC), for lidar_map_xyz_m", "|u1"
     )
-    lidar_map_is_ground: np.ndarray = array(
-        "|u1", ("N",), "1 = on the drivable ground (RANSAC), for lidar_map_xyz_m"
-    )
-    lidar_map_cluster: np.ndarray = array(
-        "<i4", ("N",), "DBSCAN object cluster of each point, -1 = none, for lidar_map_xyz_m"
+    lidar_map_cluster: np.ndarray = per_point(
+        "DBSCAN object cluster of each point, -1 = none, for lidar_map_xyz_m", "<i4"
     )
     lidar_map_time_s: np.ndarray | None = array(
         "<f4",
@@ -74,65 +70,53 @@ class SweepFeatureColumns:
         "when each point was measured, against stamp_ns, for lidar_map_xyz_m; null where not de-skewed here",
         default=None,
     )
-    lidar_cluster_centre_m: np.ndarray = array(
-        "<f4", ("N", 3), "centre (of the cluster's points) of each object cluster"
+    lidar_cluster_centre_m: np.ndarray = points("centre (of the cluster's points) of each object cluster")
+    lidar_cluster_min_m: np.ndarray = points("lower corner of its axis-aligned box")
+    lidar_cluster_max_m: np.ndarray = points("upper corner")
+    lidar_edge_xyz_m: np.ndarray = points("depth jumps: foreground range at the mid-beam direction")
+    lidar_edge_side: np.ndarray = per_point("EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies", "|u1")
+    lidar_edge_jump_m: np.ndarray = per_point("background range minus foreground range")
+    lidar_edge_gap_rad: np.ndarray = per_point(
+        "angle between the two beams: the edge lies within +- half of it"
     )
-    lidar_cluster_min_m: np.ndarray = array("<f4", ("N", 3), "lower corner of its axis-aligned box")
-    lidar_cluster_max_m: np.ndarray = array("<f4", ("N", 3), "upper corner")
-    lidar_edge_xyz_m: np.ndarray = array(
-        "<f4", ("N", 3), "depth jumps: foreground range at the mid-beam direction"
+    lidar_edge_points: np.ndarray = per_point(
+        "points of the foreground's object (its cluster), a weight; 1 where unknown", "<i4"
     )
-    lidar_edge_side: np.ndarray = array(
-        "|u1", ("N",), "EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies"
-    )
-    lidar_edge_jump_m: np.ndarray = array("<f4", ("N",), "background range minus foreground range")
-    lidar_edge_gap_rad: np.ndarray = array(
-        "<f4", ("N",), "angle between the two beams: the edge lies within +- half of it"
-    )
-    lidar_edge_points: np.ndarray = array(
-        "<i4", ("N",), "points of the foreground's object (its cluster), a weight; 1 where unknown"
-    )
-    marking_xyz_m: np.ndarray = array(
-        "<f4", ("N", 3), "ground points, for reflectivity against image brightness"
-    )
-    marking_z: np.ndarray = array(
-        "<f4", ("N",), "how far the reflectivity stands out of its ring or range band [robust sd]"
+    marking_xyz_m: np.ndarray = points("ground points, for reflectivity against image brightness")
+    marking_z: np.ndarray = per_point(
+        "how far the reflectivity stands out of its ring or range band [robust sd]"
     )
     ground_plane: np.ndarray | None = array(
         "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; null where no plane was found"
     )
-    lidar_drivable_xyz_m: np.ndarray = array("<f4", ("N", 3), "drivable ground on a 1 m grid, lidar frame")
+    lidar_drivable_xyz_m: np.ndarray = points("drivable ground on a 1 m grid, lidar frame")
 
 
 @row()
 class ScanFeatureColumns:
     """What a radar scan shows."""
 
-    radar_xyz_m: np.ndarray = array("<f4", ("N", 3), "all detections, radar frame")
-    radar_power_db: np.ndarray | None = array("<f4", ("N",), "power or RCS")
-    radar_residual_mps: np.ndarray = array(
-        "<f4", ("N",), "range rate minus what a static point would have (wrapped where Doppler is ambiguous)"
+    radar_xyz_m: np.ndarray = points("all detections, radar frame")
+    radar_power_db: np.ndarray | None = per_point("power or RCS")
+    radar_residual_mps: np.ndarray = per_point(
+        "range rate minus what a static point would have (wrapped where Doppler is ambiguous)"
     )
-    radar_motion: np.ndarray = array("|u1", ("N",), "0 static, 1 moving, 2 undecided")
-    radar_cluster: np.ndarray = array("<i4", ("N",), "cluster of moving detections, -1 = none")
+    radar_motion: np.ndarray = per_point("0 static, 1 moving, 2 undecided", "|u1")
+    radar_cluster: np.ndarray = per_point("cluster of moving detections, -1 = none", "<i4")
     radar_has_elevation: bool = column("as in scans")
     radar_velocity_mps: np.ndarray | None = array(
         "<f8", (3,), "the radar's own velocity in the radar frame, from the Doppler fit"
     )
     radar_velocity_cov: np.ndarray | None = array("<f8", (3, 3), "its covariance [m2/s2]")
-    radar_track_xyz_m: np.ndarray = array("<f4", ("N", 3), "centres of tracked moving clusters, radar frame")
-    radar_track_velocity_mps: np.ndarray = array(
-        "<f4", ("N", 3), "their velocity over ground, radar frame axes"
+    radar_track_xyz_m: np.ndarray = points("centres of tracked moving clusters, radar frame")
+    radar_track_velocity_mps: np.ndarray = points("their velocity over ground, radar frame axes")
+    radar_track_id: np.ndarray = per_point(
+        "identity within the drive; a single-frame cluster has an id of its own", "<i4"
     )
-    radar_track_id: np.ndarray = array(
-        "<i4", ("N",), "identity within the drive; a single-frame cluster has an id of its own"
-    )
-    radar_track_age: np.ndarray = array("<i4", ("N",), "frames in which the track was seen so far")
-    radar_track_points: np.ndarray = array("<i4", ("N",), "detections in the cluster")
-    radar_drivable_azimuth_rad: np.ndarray = array(
-        "<f4", ("N",), "bin centres of the free sector, radar frame"
-    )
-    radar_drivable_range_m: np.ndarray = array("<f4", ("N",), "drivable until this range in each bin")
+    radar_track_age: np.ndarray = per_point("frames in which the track was seen so far", "<i4")
+    radar_track_points: np.ndarray = per_point("detections in the cluster", "<i4")
+    radar_drivable_azimuth_rad: np.ndarray = per_point("bin centres of the free sector, radar frame")
+    radar_drivable_range_m: np.ndarray = per_point("drivable until this range in each bin")
 
 
 @row()

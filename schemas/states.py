@@ -41,10 +41,8 @@ class StateRow(Posed):
     days: list[str] = column("days that it rests on", default_factory=list)
     inputs: list[str] = column("work keys of their records", default_factory=list)
     reference_days: list[str] | None = column(
-        (
-            "the first accepted days since reference_since, audit.reference_days at most: what the charts' fixed "
-            "reference is made of; null in rows of version 1"
-        ),
+        "the first accepted days since reference_since, audit.reference_days at most: what the charts' fixed "
+        "reference is made of; null in rows of version 1",
         default=None,
     )
     reference_since: str | None = column("day of the service event before them; null = none", default=None)

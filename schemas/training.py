@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.columns import TableSchema, array, column, row
+from schemas.columns import TableSchema, array, column, per_point, points, row
 
 __all__ = [
     "CLASS_OF_LABEL",
@@ -95,55 +95,49 @@ class TrainingRow:
     image: np.ndarray = array(
         "|u1", (3, "N"), "red, green, blue; each H W row by row, area-averaged; 0 outside the image"
     )
-    grid_class: np.ndarray = array("|u1", ("N",), "H W: index into GRID_CLASSES, by majority; UNKNOWN_CLASS")
-    grid_seen: np.ndarray = array("|u1", ("N",), "H W: 1 where the image shows the whole cell")
+    grid_class: np.ndarray = per_point("H W: index into GRID_CLASSES, by majority; UNKNOWN_CLASS", "|u1")
+    grid_seen: np.ndarray = per_point("H W: 1 where the image shows the whole cell", "|u1")
     class_distance: np.ndarray = array(
         "|u1",
         (6, "N"),
-        (
-            "by DISTANCE_GROUPS, each H W: angle to the nearest pixel of the group [0.1 deg], 255 = 25.5 deg or "
-            "more"
-        ),
+        "by DISTANCE_GROUPS, each H W: angle to the nearest pixel of the group [0.1 deg], 255 = 25.5 deg or "
+        "more",
     )
     edge_offset: np.ndarray = array(
         "|i1",
         (4, "N"),
-        (
-            "by EDGE_LEFT/RIGHT/ABOVE/BELOW of observations, each H W: signed way from the cell's centre to the "
-            "nearest mask boundary of that direction, along the row (left, right; positive = to the right) or "
-            "column (above, below; positive = downwards) [0.05 deg]; NO_EDGE = none within 6.35 deg"
-        ),
+        "by EDGE_LEFT/RIGHT/ABOVE/BELOW of observations, each H W: signed way from the cell's centre to the "
+        "nearest mask boundary of that direction, along the row (left, right; positive = to the right) or "
+        "column (above, below; positive = downwards) [0.05 deg]; NO_EDGE = none within 6.35 deg",
     )
-    sky_depth: np.ndarray = array("|u1", ("N",), "H W: depth inside the sky [0.1 deg], 0 outside it")
+    sky_depth: np.ndarray = per_point("H W: depth inside the sky [0.1 deg], 0 outside it", "|u1")
     detection_box_rad: np.ndarray = array(
         "<f4",
         (24, 4),
-        (
-            "road users: azimuth left, elevation top, azimuth right, elevation bottom of the box (azimuth to the "
-            "left and elevation upwards are positive)"
-        ),
+        "road users: azimuth left, elevation top, azimuth right, elevation bottom of the box (azimuth to the "
+        "left and elevation upwards are positive)",
     )
     detection_count: int = column("road users among the 24 rows", kind="int32")
     # lidar
-    lidar_xyz_m: np.ndarray = array(
-        "<f4", ("N", 3), "sweep thinned evenly over directions, lidar frame; input of the network"
+    lidar_xyz_m: np.ndarray = points(
+        "sweep thinned evenly over directions, lidar frame; input of the network"
     )
-    lidar_intensity: np.ndarray = array(
-        "|u1", ("N",), "rank of the reflectivity in its sweep, 0..255; 0 where not logged"
+    lidar_intensity: np.ndarray = per_point(
+        "rank of the reflectivity in its sweep, 0..255; 0 where not logged", "|u1"
     )
-    lidar_flags: np.ndarray = array("|u1", ("N",), "POINT_IS_EDGE | POINT_IS_GROUND")
+    lidar_flags: np.ndarray = per_point("POINT_IS_EDGE | POINT_IS_GROUND", "|u1")
     lidar_count: int = column("points among the rows of lidar_*", kind="int32")
-    cluster_xyz_m: np.ndarray = array(
-        "<f4", ("N", 3), "uniform sample of the object clusters' points, lidar frame; for losses"
+    cluster_xyz_m: np.ndarray = points(
+        "uniform sample of the object clusters' points, lidar frame; for losses"
     )
-    cluster_id: np.ndarray = array("<i2", ("N",), "row of cluster_centre_m, -1 = beyond its rows")
+    cluster_id: np.ndarray = per_point("row of cluster_centre_m, -1 = beyond its rows", "<i2")
     cluster_point_count: int = column("points among the rows of cluster_xyz_m", kind="int32")
     cluster_centre_m: np.ndarray = array(
         "<f4", (48, 3), "centres of the largest object clusters, lidar frame"
     )
     cluster_count: int = column("clusters among the 48 rows", kind="int32")
-    edge_xyz_m: np.ndarray = array("<f4", ("N", 3), "depth jumps, lidar frame; for losses")
-    edge_side: np.ndarray = array("|u1", ("N",), "EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies")
+    edge_xyz_m: np.ndarray = points("depth jumps, lidar frame; for losses")
+    edge_side: np.ndarray = per_point("EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies", "|u1")
     edge_count: int = column("jumps among the rows of edge_*", kind="int32")
     drivable_xyz_m: np.ndarray = array(
         "<f4", (512, 3), "sample of the drivable ground's 1 m cells ahead, lidar frame"
@@ -167,10 +161,8 @@ class TrainingRow:
     radar_drivable: np.ndarray = array(
         "|u1",
         (80, 160),
-        (
-            "drivable by radar, soft, 255 = surely: x ahead by rows, y from right to left by columns, cells of 1 "
-            "m (row r, column c: x = r + 1/2, y = c - 79.5)"
-        ),
+        "drivable by radar, soft, 255 = surely: x ahead by rows, y from right to left by columns, cells of 1 "
+        "m (row r, column c: x = r + 1/2, y = c - 79.5)",
     )
     # the whole
     ego_speed_mps: float = column("as in observations; 0 where unknown")

@@ -35,6 +35,7 @@ _NEAR_M, _FAR_M = 4.0, 80.0  # ends of the colour scale; logarithmic between
 _MOVING = 1
 _WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
 _BOX = (80, 220, 255)
+_MARGIN = 0.08  # about what the lidar sees, a share of its size
 _CANVAS_PX = 1400  # as wide as a page on a laptop
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -114,8 +115,8 @@ def lidar_view(scene: Scene, state: Extrinsics, window: Window, label: str) -> I
     return part
 
 
-def lidar_window(scene: Scene, state: Extrinsics, margin: float = 0.08) -> Window:
-    """What the lidar sees of the image: all but its outermost hundredths, and a margin (a share of its size).
+def lidar_window(scene: Scene, state: Extrinsics) -> Window:
+    """What the lidar sees of the image: all but its outermost hundredths, and a margin.
 
     The whole image where the lidar sees none of it.
     """
@@ -124,7 +125,7 @@ def lidar_window(scene: Scene, state: Extrinsics, margin: float = 0.08) -> Windo
     if not len(uv):
         uv = np.array([[0.0, 0.0], [camera.width_px, camera.height_px]])
     low, high = np.percentile(uv, (1, 99), axis=0)
-    size = np.minimum((1 + 2 * margin) * (high - low), (camera.width_px, camera.height_px))
+    size = np.minimum((1 + 2 * _MARGIN) * (high - low), (camera.width_px, camera.height_px))
     centre = (low + high) / 2
     return Window((float(centre[0]), float(centre[1])), (max(1, round(size[0])), max(1, round(size[1]))))
 

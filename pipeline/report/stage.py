@@ -13,14 +13,14 @@ from pipeline.report.day_page import write_day_page, write_day_picture
 from pipeline.report.fleet_page import render_fleet_page
 from pipeline.report.reading import records_of_day
 from pipeline.report.upkeep import Album, FanOut, draw_days, one_by_one, stamp_of
-from pipeline.report.verdicts import FleetVerdicts, read_verdicts
-from pipeline.report.window import FleetWindow, read_window
+from pipeline.report.verdicts import read_verdicts
+from pipeline.report.window import read_window
 from pipeline.results import Progress, silent
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition, last_possible_day
 from pipeline.work import Run, Task, Work
 
-__all__ = ["Pages", "work", "write_day_page", "write_day_picture", "write_fleet_page", "write_fleet_report"]
+__all__ = ["Pages", "work", "write_day_page", "write_day_picture", "write_fleet_report"]
 
 
 @dataclass(frozen=True)
@@ -60,19 +60,6 @@ def work(task: Task) -> Work:
     return Work(settings, rows, inputs=())
 
 
-def write_fleet_page(lake: Lake, fleet: FleetConfig, out: PurePath, method: str | None = None) -> PurePath:
-    """Write the page of the whole fleet alone: findings first, then vehicles x days, then charts.
-
-    Args:
-        lake: holds calibrations and drift.
-        fleet: names the fleet and the default method.
-        out: the HTML file.
-        method: None = `fleet.audit.method`.
-    """
-    album = Album(lake, fleet, method or fleet.audit.method, out, LocalFiles())
-    return render_fleet_page(album, *_read(album), ())
-
-
 def write_fleet_report(
     lake: Lake, fleet: FleetConfig, pages: Pages, method: str | None = None, *, progress: Progress = silent
 ) -> list[PurePath]:
@@ -82,17 +69,13 @@ def write_fleet_report(
     `audit.window_days`, more of vehicles that drive rarely, and `pages.also`.
     """
     album = Album(lake, fleet, method or fleet.audit.method, pages.out, pages.files, pages.pictures)
-    window, verdicts = _read(album)
+    window = read_window(lake, album.method, fleet.audit.window_days, last_possible_day())
+    verdicts = read_verdicts(lake, album.method)
     keys = window.vehicle_days()
     keys |= _keys_of(album, [p for p in pages.also if (p.vehicle, p.day) not in keys])
     stamps = {of: stamp_of(album, own, verdicts.findings.get(of[0], ())) for of, own in keys.items()}
     there = draw_days(album, stamps, verdicts.findings, pages.fan_out, progress)
     return [render_fleet_page(album, window, verdicts, there, pages.truth), *there.values()]
-
-
-def _read(album: Album) -> tuple[FleetWindow, FleetVerdicts]:
-    window = read_window(album.lake, album.method, album.fleet.audit.window_days, last_possible_day())
-    return window, read_verdicts(album.lake, album.method)
 
 
 def _keys_of(album: Album, days: Iterable[Partition]) -> dict[tuple[str, str], list[str]]:

@@ -87,16 +87,13 @@ class Plot:
         tooltip: str,
         *,
         radius: Number = 3.0,
-        bar: Number = 0.0,
         opacity: Number = 1.0,
     ) -> None:
-        """A dot with an error bar of +-`bar` and a tooltip."""
+        """A dot with a tooltip."""
         u, v = self.at(x, y)
         title = f"<title>{escape(tooltip)}</title>" if tooltip else ""
-        self.parts.append(f'<g opacity="{opacity:g}">{title}')
-        if bar:
-            self.line((x, y - bar), (x, y + bar), colour, 1.4)
-        self.parts.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{radius:g}" fill="{colour}"/></g>')
+        circle = f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{radius:g}" fill="{colour}"/>'
+        self.parts.append(f'<g opacity="{opacity:g}">{title}{circle}</g>')
 
     def cross(self, x: Number, y: Number, tooltip: str) -> None:
         """A muted x, for what is missing."""
@@ -124,13 +121,7 @@ class Plot:
             f"{escape(text)}</text>"
         )
 
-    def frame(
-        self,
-        x_ticks: Sequence[tuple[Number, str]],
-        y_ticks: Sequence[tuple[Number, str]],
-        colour: str = MUTED,
-        width: Number = 1.0,
-    ) -> None:
+    def frame(self, x_ticks: Sequence[tuple[Number, str]], y_ticks: Sequence[tuple[Number, str]]) -> None:
         """Left and lower axis, light grid, tick labels."""
         for value, label in x_ticks:
             self.line((value, self.y[0]), (value, self.y[1]), MUTED, 0.3)
@@ -140,5 +131,5 @@ class Plot:
             self.line((self.x[0], value), (self.x[1], value), MUTED, 0.3)
             u, v = self.at(self.x[0], value)
             self.text(u - 5, v + 3.5, label, anchor="end", size=10.0)
-        self.line((self.x[0], self.y[0]), (self.x[1], self.y[0]), colour, width)
-        self.line((self.x[0], self.y[0]), (self.x[0], self.y[1]), colour, width)
+        self.line((self.x[0], self.y[0]), (self.x[1], self.y[0]), MUTED)
+        self.line((self.x[0], self.y[0]), (self.x[0], self.y[1]), MUTED)

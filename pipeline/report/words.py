@@ -35,11 +35,11 @@ def scaled(value: float, dof: str) -> float:
     return float(np.degrees(value)) if dof.startswith("r") else float(value)
 
 
-def with_sigma(value: float, sigma: float, dof: str, *, sign: bool = True) -> str:
+def with_sigma(value: float, sigma: float, dof: str) -> str:
     """As `+1.02 ± 0.05 deg`, with as many digits as the sigma deserves."""
     v, s = scaled(value, dof), scaled(sigma, dof)
     digits = int(np.clip(1 - np.floor(np.log10(max(s, 1e-9))), 1, 4))
-    return f"{v:{'+' if sign else ''}.{digits}f} ± {s:.{digits}f} {unit_of(dof)}"
+    return f"{v:+.{digits}f} ± {s:.{digits}f} {unit_of(dof)}"
 
 
 def dof_title(pair: str, dof: str) -> str:

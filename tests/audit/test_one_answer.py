@@ -14,13 +14,13 @@ from jobs.show import show
 from jobs.terminal.vehicle_status import count_statuses
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
-from pipeline.report.stage import write_fleet_page
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.partitions import Lake
 from pipeline.store.records import commit_records
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DriftFinding
+from tests.makers.fleet_pages import write_fleet_page
 
 KNOCK = {"radar": np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])}
 SEMANTICS = {"source": "topics", "labels": "/l", "detections": "/d"}
@@ -65,7 +65,7 @@ def said_everywhere(
     assert len(in_table) == len(rows)
     assert in_table == {(f.vehicle, f.pair, f.dof): (f.status, f.reason, f.day) for f in findings}
     assert {r["vehicle"]: r["vehicle_status"] for r in rows} == of_rows
-    page = write_fleet_page(lake, config, lake.root / "fleet.html").read_text()
+    page = write_fleet_page(lake, config, lake.root / "fleet.html")
     on_page = dict(re.findall(r'<tr><td><a href="#charts-\w+">(\w+)</a></td><td class="status (\w+)">', page))
     assert on_page == of_rows
     assert {s: list(of_rows.values()).count(s) for s in count_statuses(findings)} == count_statuses(findings)

@@ -13,7 +13,6 @@ from jobs.cli import main
 from jobs.terminal.night_view import _MARKS
 from jobs.terminal.record_tables import STATUS_STYLES
 from pipeline.fleet.ledger import Ledger
-from pipeline.report.stage import write_fleet_page
 from pipeline.results import Outcome
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records
@@ -24,6 +23,7 @@ from schemas.outcomes import OUTCOME_STATUSES
 from schemas.states import STATES
 from schemas.words import DAY_WORDS, day_word
 from tests.audit.fleet_records import vehicle_records
+from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.stages import audit_fleet
 from tests.report.test_pages import _config
 
@@ -96,7 +96,7 @@ def test_status_page_and_export_call_each_day_by_the_same_word(lake, tmp_path, c
     told = summary_of(capsys, "status", "--lake", lake.root, "--json")
     assert {d["day"]: d["status"] for d in told["days"]} == days
     assert [told[word] for word in DAYS] == [1, 1, 1, 1]
-    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
+    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html")
     chips = dict(re.findall(r'class="c \w+"[^>]* title="(\d{4}-\d\d-\d\d): (\w+)', page))
     assert chips == days
     of_v = ["--lake", lake.root, "--vehicle", "v", "--out", tmp_path / "out"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import load_fleet
-from pipeline.report.stage import write_day_page, write_fleet_page
+from pipeline.report.stage import write_day_page
 from pipeline.stages import AUDIT
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records
@@ -15,6 +15,7 @@ from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
 from tests.audit.test_many_sensors import RIGS, TURN
+from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.rig_records import EDGES, rig_records
 
 TITLES = [e.name for e in EDGES]
@@ -36,7 +37,7 @@ def lake(tmp_path_factory):
 
 
 def test_the_fleet_page_has_a_chart_of_every_edge_under_its_name(lake, tmp_path):
-    page = write_fleet_page(*lake, tmp_path / "fleet.html").read_text()
+    page = write_fleet_page(*lake, tmp_path / "fleet.html")
     index = json.loads(re.search(r'id="fleet">(.*?)</script>', page, re.DOTALL)[1])
     assert set(TITLES) < set(index["pairs"])
     charts = index["charts"]["inside"]

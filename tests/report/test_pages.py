@@ -14,11 +14,12 @@ import pytest
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
-from pipeline.report.stage import Pages, write_day_page, write_fleet_page, write_fleet_report
+from pipeline.report.stage import Pages, write_day_page, write_fleet_report
 from pipeline.report.truth import read_truth
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records, read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.lakes import write_records
 from tests.makers.stages import audit_fleet
 
@@ -214,7 +215,7 @@ def test_a_hostile_name_cannot_leave_its_place(tmp_path: Path, maker: ModuleType
 
 def test_an_empty_lake_gives_an_honest_fleet_page_and_no_day_page(tmp_path: Path) -> None:
     lake = Lake.at(tmp_path / "lake")
-    text = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
+    text = write_fleet_page(lake, _config(), tmp_path / "fleet.html")
     assert "No audit yet" in text
     with pytest.raises(ConfigError, match="no joint record"):
         write_day_page(lake, Partition("v", "2026-03-01"), _config(), tmp_path / "d.html")

@@ -15,11 +15,12 @@ from rich.text import Text
 from jobs.cli import main
 from jobs.show import show
 from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
-from pipeline.report.stage import write_day_page, write_fleet_page
+from pipeline.report.stage import write_day_page
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import commit_records, read_records
 from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding, status_of
+from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.stages import audit_fleet
 from tests.report.test_pages import KNOCK, _config, _store
 
@@ -64,7 +65,7 @@ def test_the_fleet_has_all_four_statuses_and_each_row_carries_its_vehicle_s(lake
 def test_terminal_page_and_show_say_of_every_vehicle_what_the_table_says(
     lake: Lake, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
+    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html")
     in_table = dict(
         re.findall(r'<tr><td><a href="#charts-\w+">(\w+)</a></td><td class="status (\w+)">', page)
     )
@@ -86,7 +87,7 @@ def test_terminal_page_and_show_say_of_every_vehicle_what_the_table_says(
 
 
 def test_page_and_terminal_give_the_stored_reason(lake: Lake, tmp_path: Path) -> None:
-    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
+    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html")
     rows = [f for own in stored(lake).values() for f in own]
     terminal = [Text.from_markup(line).plain for line in status_lines(rows)]
     for vehicle, own in stored(lake).items():
@@ -108,7 +109,7 @@ def test_a_red_vehicle_says_what_to_do_with_the_command_and_no_other_does(lake: 
     assert "how the radar is mounted" in step
     command = "--vehicle red --day YYYY-MM-DD --kind repair --sensor radar"
     assert f"boresight service --lake 'my lake' {command}" in step
-    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html").read_text()
+    page = write_fleet_page(lake, _config(), tmp_path / "fleet.html")
     assert f"boresight service --lake LAKE {command}" in page
     own = Lake.at(shutil.copytree(lake.root, tmp_path / "lake"))
     command = next_steps(rows, str(own.root))[0].split("`")[1].replace("YYYY-MM-DD", "2026-03-06")
