@@ -38,8 +38,8 @@ def service(
     from jobs.terminal.summary import exit_code, print_summary
     from pipeline.audit.service import events_until
     from pipeline.errors import ConfigError
+    from pipeline.store.commits import commit_records
     from pipeline.store.partitions import Lake, Partition, work_key
-    from pipeline.store.records import commit_records
     from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 
     tables, of = Lake.existing(lake), Partition(vehicle, day)

@@ -16,9 +16,10 @@ from pipeline.config import config_hash
 from pipeline.errors import BoresightError, ContractError, DamagedError, TooMuchMemoryError
 from pipeline.memory import at_most
 from pipeline.results import Outcome, Progress, measured
-from pipeline.store.moments import MomentWriter, groups, is_whole, write_moments
+from pipeline.store.commits import assert_records, commit_last, commit_records
+from pipeline.store.moments import MomentWriter, is_whole, write_moments
 from pipeline.store.partitions import Partition, work_key
-from pipeline.store.records import assert_records, commit_last, commit_records, read_records
+from pipeline.store.records import read_records
 from pipeline.store.tables import Manifest, PartitionWriter, absence, read_manifest, write_partition
 from pipeline.work import NothingUsable, Run, Task, Window, Work
 from schemas.columns import TableSchema
@@ -177,8 +178,8 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
                 for moment, captures in rows:
                     out.append(moment, captures)
             else:
-                for group in groups(rows):
-                    out.append(group)
+                for row in rows:
+                    out.add(row)
             counts = {"kept": {"frames": out.rows, **run.kept}, "rejected": dict(run.rejected)}
             out.describe(**counts, remarks=run.remarks, **run.extra)
     except (NothingUsable, TooMuchMemoryError) as refusal:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.results import Outcome
+from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.delta import open_table
 from pipeline.store.partitions import Lake, Partition, work_key
-from pipeline.store.records import RecordIndex, assert_records, commit_records
+from pipeline.store.records import RecordIndex
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.outcomes import OUTCOMES, OutcomeRow

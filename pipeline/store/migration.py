@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 
 from pipeline.errors import ContractError
 from pipeline.results import Progress
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
 from pipeline.store.rows import from_table, with_what_follows
 from schemas.columns import TableSchema
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import PurePath
-from typing import Any, TypeVar
+from typing import Any
 
 from pipeline.errors import ContractError
 from pipeline.store.partitions import Lake, Partition
@@ -30,7 +30,6 @@ from schemas.moments import FILES
 
 __all__ = [
     "MomentWriter",
-    "groups",
     "is_whole",
     "joined",
     "sensor_files",
@@ -39,48 +38,8 @@ __all__ = [
     "write_moments",
 ]
 
-Row = TypeVar("Row")
-# A row group: large enough to compress, small enough that a worker that holds one of each sensor stays far below 2 GB.
-_GROUP_ROWS = 16
-_GROUP_BYTES = 24 << 20
 _OF_SENSORS = {t.name: t for t in (*CAPTURES.values(), *FEATURES.values())}
 _KINDS = {t.name: kind for tables in (CAPTURES, FEATURES) for kind, t in tables.items()}
-
-
-def groups(rows: Iterable[Any]) -> Iterator[list[Any]]:
-    """Rows by the row group; no more than one is held."""
-    group: list[Any] = []
-    size = 0
-    for row in rows:
-        group.append(row)
-        size += _bytes_of(row)
-        if size >= _GROUP_BYTES or len(group) >= _GROUP_ROWS:
-            yield group
-            group, size = [], 0
-    yield group
-
-
-class _File:
-    """One sensor's file while it is written: what makes a row group is held."""
-
-    def __init__(self, writer: PartitionWriter) -> None:
-        self.writer, self.rows = writer, 0
-        self._held: list[Any] = []
-        self._size = 0
-
-    def add(self, row: Any) -> int:
-        """Take a row; returns its place in the file."""
-        self._held.append(row)
-        self._size += _bytes_of(row)
-        self.rows += 1
-        if self._size >= _GROUP_BYTES or len(self._held) >= _GROUP_ROWS:
-            self.flush()
-        return self.rows - 1
-
-    def flush(self) -> None:
-        """Write what is held."""
-        self.writer.append(self._held)
-        self._held, self._size = [], 0
 
 
 class MomentWriter:
@@ -89,7 +48,7 @@ class MomentWriter:
     def __init__(self, stack: ExitStack, lake: Lake, partition: Partition, index: PartitionWriter) -> None:
         self._stack, self._lake, self._partition, self._index = stack, lake, partition, index
         self._held: list[Any] = []
-        self.files: dict[str, _File] = {}
+        self.files: dict[str, PartitionWriter] = {}
 
     @property
     def rows(self) -> int:
@@ -103,22 +62,18 @@ class MomentWriter:
 
     def describe(self, **told: Any) -> None:
         """Counts and words for the manifest; see `PartitionWriter.describe`."""
-        files = {sensor: file.writer.schema.name for sensor, file in self.files.items()}
+        files = {sensor: file.schema.name for sensor, file in self.files.items()}
         self._index.describe(**told | {FILES: files})
 
     def finish(self) -> None:
-        """Write what is held."""
-        for file in self.files.values():
-            file.flush()
+        """Write the moments."""
         self._index.append(self._held)  # a kilobyte each
 
-    def _file(self, sensor: str, row: Any) -> _File:
+    def _file(self, sensor: str, row: Any) -> PartitionWriter:
         if sensor not in self.files:
             [schema] = [t for t in _OF_SENSORS.values() if t.row_type is type(row)]
             path = self._lake.file(schema.name, self._partition, sensor)
-            self.files[sensor] = _File(
-                self._stack.enter_context(opened_for_writing(self._lake, path, schema))
-            )
+            self.files[sensor] = self._stack.enter_context(opened_for_writing(self._lake, path, schema))
         return self.files[sensor]
 
 
@@ -143,7 +98,7 @@ def write_moments(
         yield writer
         writer.finish()
         for file in writer.files.values():
-            file.writer.close(work_key, code_version)
+            file.close(work_key, code_version)
         index.close(work_key, code_version, inputs)
         lake.files.delete(path)
     _tidy(lake, schema, partition, writer.files)
@@ -233,15 +188,11 @@ def _rows_of(
         yield from chunk
 
 
-def _tidy(lake: Lake, schema: TableSchema, partition: Partition, files: Mapping[str, _File]) -> None:
+def _tidy(
+    lake: Lake, schema: TableSchema, partition: Partition, files: Mapping[str, PartitionWriter]
+) -> None:
     """Take away files of sensors that the day has no longer."""
-    kept = {lake.file(f.writer.schema.name, partition, sensor) for sensor, f in files.items()}
+    kept = {lake.file(f.schema.name, partition, sensor) for sensor, f in files.items()}
     for path in sensor_files(lake, schema, partition):
         if path not in kept:
             lake.files.delete(path)
-
-
-def _bytes_of(row: Any) -> int:
-    """Memory of a row's arrays and blobs; the rest is small."""
-    values = (getattr(row, f.name) for f in fields(row))
-    return sum(len(v) if isinstance(v, bytes) else getattr(v, "nbytes", 0) for v in values)

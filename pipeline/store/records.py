@@ -1,13 +1,12 @@
-"""Records: rows that are added and never replaced, several about the same, one of them current.
+"""Records go out: of several rows about the same, one of them current, those that are asked for.
 
-Rows come in through `commit_records`, which knows the same work again and never doubles it; they go out through
-`read_records`, which reads the months, files and columns that are asked for and leaves damaged files out.
+Months, files and columns that nobody asks for are not read, and damaged files are left out.
 """
 
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import MISSING, fields, replace
 from itertools import groupby
@@ -18,17 +17,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.store.data_files import data_files, once
-from pipeline.store.delta import Wanted, merge_rows, read_file, stored_schema
+from pipeline.store.delta import Wanted, read_file
 from pipeline.store.partitions import Lake, LostRows
-from pipeline.store.rows import from_table, to_table
+from pipeline.store.rows import from_table
 from schemas.columns import TableSchema
 
 __all__ = [
     "Assertion",
     "RecordIndex",
-    "assert_records",
-    "commit_last",
-    "commit_records",
     "first_day",
     "last_assertion",
     "last_day",
@@ -50,76 +46,6 @@ class Assertion(NamedTuple):
     asserted_at: str
     day: str
     method: str = ""
-
-
-def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
-    """Add records as one commit, and make them the current ones about what they are about.
-
-    A row whose work is recorded already is not added again: where another row became current since, the recorded one
-    becomes current once more. `recorded_at` and `asserted_at` are set here, unless the row has them.
-
-    Returns:
-        How many rows were added or became current again.
-
-    Raises:
-        ContractError: the lake is of another release, or a row breaks its table's contract.
-        OSError: the storage does not answer.
-    """
-    unique = {_key(schema, row) + (row.work_key,): row for row in rows}
-    if not unique:
-        return 0
-    known = _known(lake, schema, unique.values())
-    now = dt.datetime.now(dt.UTC)
-    changed = []
-    for row in unique.values():
-        rivals = known.get(_key(schema, row), {})
-        latest = max(rivals.values(), default="")
-        given = row.asserted_at or row.recorded_at
-        if row.work_key in rivals and max(rivals[row.work_key], given) == latest:
-            continue
-        stamp = given or _after(now, latest)
-        changed.append(replace(row, recorded_at=row.recorded_at or stamp, asserted_at=stamp))
-    if changed:
-        merge_rows(lake, schema, _stored(schema, changed))
-    return len(changed)
-
-
-def commit_last(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
-    """Add what a stage says of the whole fleet, all rows under one later stamp than any before: `read_last` finds them.
-
-    Returns:
-        How many rows were added or became current again; 0 where the same rows were the last already.
-
-    Raises:
-        ContractError, OSError: as `commit_records`.
-    """
-    if not rows:
-        return 0
-    known = read_last_columns(lake, schema, rows[0].method, ())
-    keys = [] if known is None else known["work_key"].to_pylist()
-    if sorted(keys) == sorted(row.work_key for row in rows):
-        return 0
-    stamp = _after(dt.datetime.now(dt.UTC), "" if known is None else pc.max(known["asserted_at"]).as_py())
-    return commit_records(lake, schema, [replace(row, asserted_at=stamp) for row in rows])
-
-
-def assert_records(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
-    """Make recorded rows current again where others about the same became it since; adds nothing.
-
-    Returns:
-        How many became current again.
-    """
-    known = _known(lake, schema, rows)
-    now = dt.datetime.now(dt.UTC)
-    changed = []
-    for row in rows:
-        rivals = known.get(_key(schema, row), {})
-        latest = max(rivals.values(), default="")
-        if row.work_key in rivals and rivals[row.work_key] != latest:
-            changed.append(replace(row, asserted_at=_after(now, latest)))
-    if changed:
-        merge_rows(lake, schema, _stored(schema, changed), insert=False)
-    return len(changed)
 
 
 def read_records(
@@ -395,43 +321,3 @@ def _chosen(rows: pa.Table, wanted: Wanted) -> pa.Table:
     for condition in conditions[1:]:
         conditions[0] = pc.and_(conditions[0], condition)
     return rows.filter(conditions[0]) if conditions else rows
-
-
-def _key(schema: TableSchema, row: Any) -> tuple[str, ...]:
-    return tuple(getattr(row, name) for name in schema.about)
-
-
-def _known(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> Mapping[tuple[str, ...], dict[str, str]]:
-    """What is recorded about the same: work key to `asserted_at`."""
-    rows = list(rows)
-    days = sorted({row.day for row in rows})
-    vehicles = {row.vehicle for row in rows}
-    one = vehicles if len(vehicles) == 1 else None
-    columns = [*schema.about, "work_key", "asserted_at"]
-    found = _rows_of(lake, schema, columns, _wanted(one, days[0], days[-1])) if rows else None
-    known: dict[tuple[str, ...], dict[str, str]] = {}
-    if found is not None:
-        values = [found.column(name).to_pylist() for name in columns]
-        for *about, work_key, asserted_at in zip(*values, strict=True):
-            of_work = known.setdefault(tuple(about), {})
-            of_work[work_key] = max(of_work.get(work_key, ""), asserted_at)
-    return known
-
-
-def _after(now: dt.datetime, latest: str) -> str:
-    """Now, or a moment after `latest` where that lies in the future of this machine's clock."""
-    if latest >= _iso(now):
-        return _iso(dt.datetime.fromisoformat(latest) + dt.timedelta(microseconds=1))
-    return _iso(now)
-
-
-def _iso(stamp: dt.datetime) -> str:
-    return stamp.astimezone(dt.UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-
-
-def _stored(schema: TableSchema, rows: Sequence[Any]) -> pa.Table:
-    ordered = sorted(rows, key=lambda r: (r.vehicle, r.day))
-    table = to_table(ordered, schema).append_column(
-        "month", pa.array([r.day[:7] for r in ordered], pa.string())
-    )
-    return table.cast(stored_schema(schema))

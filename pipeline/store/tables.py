@@ -34,6 +34,9 @@ __all__ = [
 
 Row = TypeVar("Row")
 _KEY = b"boresight"
+# A row group: large enough to compress, small enough that a worker that holds one of each sensor stays far below 2 GB.
+_GROUP_ROWS = 16
+_GROUP_BYTES = 24 << 20
 COLLECTED = "collected"  # among a manifest's extra: the day on which the partition's rows left the lake
 
 
@@ -58,14 +61,33 @@ class PartitionWriter:
 
     def __init__(self, writer: pq.ParquetWriter, schema: TableSchema) -> None:
         self._writer, self.schema = writer, schema
-        self.rows = 0
+        self._held: list[Any] = []
+        self._held_bytes = self._written = 0
         self.manifest_fields: dict[str, Any] = {}
+
+    @property
+    def rows(self) -> int:
+        """Rows so far."""
+        return self._written + len(self._held)
+
+    def add(self, row: Any) -> int:
+        """Take a row, which is written with others as a row group; returns its place in the file."""
+        self._held.append(row)
+        self._held_bytes += _bytes_of(row)
+        place = self.rows - 1
+        if self._held_bytes >= _GROUP_BYTES or len(self._held) >= _GROUP_ROWS:
+            self._write_held()
+        return place
+
+    def _write_held(self) -> None:
+        rows, self._held, self._held_bytes = self._held, [], 0
+        self.append(rows)
 
     def append(self, rows: Sequence[Any]) -> None:
         """Write rows as one row group."""
         if rows:
             self._writer.write_table(to_table(rows, self.schema), row_group_size=len(rows))
-            self.rows += len(rows)
+            self._written += len(rows)
 
     def describe(
         self, *, kept: dict[str, int], rejected: dict[str, int], remarks: str = "", **extra: Any
@@ -74,11 +96,18 @@ class PartitionWriter:
         self.manifest_fields = {"kept": kept, "rejected": rejected, "remarks": remarks, "extra": extra}
 
     def close(self, work_key: str, code_version: str, inputs: Iterable[str] = ()) -> None:
-        """Write the manifest, as a file's last."""
+        """Write what is held, and the manifest as a file's last."""
+        self._write_held()
         of = self.schema.name, self.schema.version, work_key, code_version, list(inputs), self.rows
         manifest = Manifest(*of, **self.manifest_fields)
         self._writer.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
         self._writer.close()
+
+
+def _bytes_of(row: Any) -> int:
+    """Memory of a row's arrays and blobs; the rest is small."""
+    values = (getattr(row, f.name) for f in fields(row))
+    return sum(len(v) if isinstance(v, bytes) else getattr(v, "nbytes", 0) for v in values)
 
 
 @contextmanager

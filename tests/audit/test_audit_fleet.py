@@ -14,9 +14,10 @@ from pipeline.errors import ConfigError
 from pipeline.geometry.changes import change_between
 from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation, to_quaternion
 from pipeline.stages import AUDIT
+from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding

@@ -9,8 +9,9 @@ from jobs.service import service
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.stages import AUDIT, STATE
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DriftFinding

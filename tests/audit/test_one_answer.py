@@ -15,8 +15,8 @@ from jobs.terminal.vehicle_status import count_statuses
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.stages import AUDIT, STATE
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DriftFinding

@@ -6,9 +6,9 @@ import pytest
 from pipeline.audit.pose_states import pose_states, read_poses
 from pipeline.config import VerifyConfig
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
+from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
 from schemas.drift import DriftFinding
 from schemas.poses import POSES
 from schemas.service_events import ServiceEvent

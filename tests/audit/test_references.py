@@ -10,8 +10,9 @@ from pipeline.audit.estimates import day_name
 from pipeline.audit.references import read_kept
 from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.stages import AUDIT, STATE
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.service_events import ServiceEvent

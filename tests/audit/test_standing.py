@@ -13,9 +13,9 @@ from jobs.state import state
 from jobs.status import status
 from pipeline.errors import DamagedLogError
 from pipeline.fleet.ledger import Ledger
+from pipeline.store.commits import commit_records
 from pipeline.store.delta import live_files, open_table
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
 from pipeline.store.repair import repair_table
 from schemas.calibrations import CALIBRATIONS
 from tests.makers.fleet_files import fleet_toml

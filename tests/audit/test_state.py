@@ -15,8 +15,8 @@ from pipeline.audit.state import DayEstimate, fuse
 from pipeline.config import FleetConfig
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.stages import AUDIT, STATE
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.benchmarks.studies.soak import FAULTS, Soak, contents, differences, make_fleet, soak_round, storage
 from tests.benchmarks.studies.victims import CROWDS

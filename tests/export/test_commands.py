@@ -10,9 +10,10 @@ from jobs.cli import main
 from pipeline.export.calibration import FrameNames
 from pipeline.export.formats import format_named
 from pipeline.extrinsics.prior_file import read_transforms
+from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.states import STATES, StateRow
 from tests.audit.fleet_records import vehicle_records

@@ -12,8 +12,8 @@ from pipeline.export.compare import Side, compare, composed
 from pipeline.geometry.se3 import exp_se3, exp_so3
 from pipeline.report.comparison import PairView, comparison_page
 from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
 from tests.makers.calibrations import T_CAMERA_LIDAR, T_LIDAR_RADAR

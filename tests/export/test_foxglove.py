@@ -12,8 +12,8 @@ from jobs.cli import main
 from pipeline.export.foxglove import TOPICS
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_se3, from_quaternion, inverse, to_quaternion, transform_points
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records
 from pipeline.store.views import frames_of
 from schemas.calibrations import CALIBRATIONS
 from tests.makers.calibrations import SIGMA, T_CAMERA_LIDAR, T_LIDAR_RADAR

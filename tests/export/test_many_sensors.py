@@ -17,9 +17,10 @@ from pipeline.export.formats import FORMATS, format_named
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse, to_quaternion
 from pipeline.rig.edges import edge_named, words_of
 from pipeline.rig.graph import Sensor, tie
+from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.poses import POSES
 from schemas.states import STATES, StateRow

@@ -13,8 +13,8 @@ from pipeline.export.calibration import ExportedPair
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import exp_se3
 from pipeline.stages import AUDIT, STATE
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records
 from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import T_LIDAR_RADAR, vehicle_records

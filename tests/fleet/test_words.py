@@ -14,8 +14,8 @@ from jobs.terminal.night_view import _MARKS
 from jobs.terminal.record_tables import STATUS_STYLES
 from pipeline.fleet.ledger import Ledger
 from pipeline.results import Outcome
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS, PAIRS
 from schemas.calibrations import STATUSES as RECORD_WORDS
 from schemas.drift import DRIFT_STATUSES

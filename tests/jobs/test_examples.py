@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import log_so3, transform_points
+from pipeline.store.commits import commit_records
 from pipeline.store.current import prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
 from tests.conftest import REPO

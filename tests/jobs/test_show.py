@@ -9,8 +9,8 @@ import pytest
 from jobs.show import show
 from jobs.status import status
 from pipeline.errors import ContractError
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES

@@ -5,9 +5,9 @@ from dataclasses import fields, replace
 from typing import Any
 
 from pipeline.rig.prior import to_rows
+from pipeline.store.commits import commit_records
 from pipeline.store.moments import write_moments
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records
 from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.captures import CAPTURES
 from schemas.columns import TableSchema

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.report.verdicts import ChartVerdicts, FleetVerdicts, read_verdicts
 from pipeline.report.window import FleetWindow, read_window
-from pipeline.store.records import commit_records
+from pipeline.store.commits import commit_records
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
 from tests.makers.stages import audit_fleet

@@ -16,8 +16,9 @@ from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.report.stage import Pages, write_day_page, write_fleet_report
 from pipeline.report.truth import read_truth
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.lakes import write_records

@@ -10,10 +10,10 @@ from pipeline.fleet.pages import OnWorkers
 from pipeline.report import upkeep
 from pipeline.report.stage import Pages, write_fleet_report
 from pipeline.report.upkeep import one_by_one
+from pipeline.store.commits import commit_records
 from pipeline.store.files import LocalFiles
 from pipeline.store.object_store import Bucket
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
 from tests.makers.s3_server import BUCKET, running
 from tests.makers.stages import audit_fleet

@@ -28,8 +28,9 @@ from pipeline.errors import ContractError
 from pipeline.export.files import SIDE_FILE
 from pipeline.export.formats import format_named
 from pipeline.report.stage import write_day_page
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.states import STATES, StateRow

@@ -10,9 +10,10 @@ import pytest
 import pipeline.store.migration
 from jobs.migrate import migrate
 from pipeline.errors import ConfigError, ContractError
+from pipeline.store.commits import commit_records
 from pipeline.store.current import current_records
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from pipeline.store.rows import to_table
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import zstandard
 
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
 from tests.jobs.test_exit_codes import DAY, rig_of

@@ -13,10 +13,11 @@ from deltalake import DeltaTable
 
 import pipeline.store.object_store
 from pipeline.errors import ConfigError, DamagedError
+from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.current import current_records
 from pipeline.store.delta import tidy_table
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import assert_records, commit_records, last_day, read_records
+from pipeline.store.records import last_day, read_records
 from pipeline.store.row_groups import read_columns, read_group, row_groups
 from pipeline.store.tables import read_manifest, read_rows, write_partition
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
@@ -215,7 +216,7 @@ def test_a_bucket_of_the_same_name_in_another_store_is_another_one(lake, rng, mo
 _COMMITS = """
 import sys, numpy as np
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
+from pipeline.store.commits import commit_records
 from schemas.calibrations import CALIBRATIONS
 from tests.store.test_object_store import record
 lake, rng, name = Lake.at(sys.argv[1]), np.random.default_rng(0), sys.argv[2]

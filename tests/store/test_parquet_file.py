@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import pipeline.store.object_store
+from pipeline.store.commits import commit_records
 from pipeline.store.files import LocalFiles
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from pipeline.store.row_groups import read_columns, read_group, row_groups
 from pipeline.store.tables import read_rows, write_partition
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord

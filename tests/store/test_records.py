@@ -18,18 +18,11 @@ from deltalake import DeltaTable, WriterProperties
 import pipeline.store.delta
 from pipeline.errors import ContractError
 from pipeline.store import delta
+from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.current import current_records
 from pipeline.store.delta import Wanted, live_files, open_table, read_file, tidy_table
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import (
-    RecordIndex,
-    assert_records,
-    commit_records,
-    last_day,
-    read_columns,
-    read_latest,
-    read_records,
-)
+from pipeline.store.records import RecordIndex, last_day, read_columns, read_latest, read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from tests.makers.lakes import write_records
@@ -376,7 +369,7 @@ def test_two_writers_at_once_both_get_their_records_in(lake):
 _COMMITS = """
 import sys, numpy as np
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
+from pipeline.store.commits import commit_records
 from schemas.calibrations import CALIBRATIONS, PAIRS
 from tests.store.test_records import record
 lake, rng, turn = Lake.at(sys.argv[1]), np.random.default_rng(0), int(sys.argv[2])

@@ -8,9 +8,10 @@ import pytest
 
 import pipeline.store.object_store
 from pipeline.errors import DamagedLogError
+from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.delta import live_files, open_table, tidy_table
 from pipeline.store.partitions import Lake
-from pipeline.store.records import assert_records, commit_records, read_records
+from pipeline.store.records import read_records
 from pipeline.store.repair import repair_table
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.makers.s3_server import BUCKET, running

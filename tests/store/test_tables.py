@@ -18,8 +18,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.errors import ContractError, DamagedError
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records, read_records
+from pipeline.store.records import read_records
 from pipeline.store.tables import (
     iterate_rows,
     read_manifest,
