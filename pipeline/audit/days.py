@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.charts import Charts, clipped, scan
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, hat, log_so3
+from pipeline.geometry.changes import change_between, change_jacobian, changed
 from pipeline.rig.edges import edge_order
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
@@ -124,15 +124,14 @@ def pair_days(
         observable: what each day determined.
         accepted: False for held days.
     """
-    J = np.tile(np.eye(6), (len(T), 1, 1))
-    J[:, 3:, :3] = -hat(T[:, :3, 3])  # `change_jacobian` of each
+    J = change_jacobian(T)
     total = J @ covariance @ J.swapaxes(1, 2)
     spread = J @ (covariance - common) @ J.swapaxes(1, 2)
     varying, all_of_it = np.einsum("nii->ni", spread), np.einsum("nii->ni", total)
     # A day adds nothing to what it does not determine: there it is as unsure as it says in all.
     missing = np.where(observable, np.maximum(_LEAST_VARYING * all_of_it - varying, 0.0), all_of_it)
     spread[:, np.arange(6), np.arange(6)] += missing
-    return PairDays(day, T, _changes(T[0], T), spread, observable, accepted, T[0])
+    return PairDays(day, T, change_between(T[0], T), spread, observable, accepted, T[0])
 
 
 def reference_of(days: PairDays, count: int) -> Reference | None:
@@ -148,7 +147,7 @@ def reference_of(days: PairDays, count: int) -> Reference | None:
     information = np.linalg.inv(first.spread).sum(axis=0)
     spread = np.linalg.inv(information)
     return Reference(
-        tuple(int(d) for d in first.day), _moved(days.origin, mean), spread, np.asarray(seen.any(axis=0))
+        tuple(int(d) for d in first.day), changed(days.origin, mean), spread, np.asarray(seen.any(axis=0))
     )
 
 
@@ -226,7 +225,7 @@ def with_reference(days: PairDays, reference: Reference) -> PairDays:
     return PairDays(
         np.concatenate([[reference.days[-1]], own.day]),
         T,
-        _changes(reference.T, T),
+        change_between(reference.T, T),
         np.concatenate([reference.spread[None], own.spread]),
         np.concatenate([reference.observable[None], own.observable]),
         np.concatenate([[True], own.accepted]),
@@ -284,12 +283,3 @@ def charts_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]], edges: Sequence[Ed
     last = np.take_along_axis(charts.day, np.maximum(charts.count - 1, 0)[:, None], 1)
     beyond = np.arange(flat[1]) >= charts.count[:, None]
     return replace(charts, day=np.where(beyond, last, charts.day))
-
-
-def _changes(origin: Float[np.ndarray, "4 4"], T: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 6"]:
-    rotation = log_so3(T[:, :3, :3] @ origin[:3, :3].T)
-    return np.concatenate([rotation, T[:, :3, 3] - origin[:3, 3]], axis=1)
-
-
-def _moved(origin: Float[np.ndarray, "4 4"], change: Float[np.ndarray, " 6"]) -> Float[np.ndarray, "4 4"]:
-    return from_rotation_translation(exp_so3(change[:3]) @ origin[:3, :3], origin[:3, 3] + change[3:])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,8 +14,8 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.days import PairDays, pair_days
-from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation
+from pipeline.geometry.changes import change_jacobian, changed
+from pipeline.geometry.se3 import from_quaternion
 from pipeline.rig.edges import edge_order, edges_of_rows
 from pipeline.rig.graph import Edge
 from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
@@ -103,12 +103,7 @@ class Estimates:
     def at(self, rows: slice | np.ndarray) -> Estimates:
         """Some of the records, in their order."""
         keys = self.work_key[rows] if isinstance(rows, slice) else self.work_key.take(pa.array(rows))
-        return Estimates(
-            self.vehicles, self.edges, self.owner[rows], self.day[rows], self.edge[rows], self.status[rows],
-            self.pose[rows], self.has_estimate[rows], self.covariance[rows], self.common[rows], self.has_common[rows],
-            self.observable[rows], self.disproved[rows], self.shown_wrong_rad[rows],
-            self.unchecked_sigmas[rows], self.half_days[rows], self.targets[rows], keys,
-        )  # fmt: skip
+        return replace(self, work_key=keys, **{name: getattr(self, name)[rows] for name in _PER_RECORD})
 
     def of(self, vehicle: str) -> Estimates:
         """One vehicle's records."""
@@ -147,6 +142,9 @@ class Estimates:
     def keys(self) -> list[str]:
         """Work keys, each once, in order."""
         return sorted(set(self.work_key.to_pylist()))
+
+
+_PER_RECORD = [f.name for f in fields(Estimates) if f.name not in ("vehicles", "edges", "work_key")]
 
 
 def estimates_of(table: pa.Table | None) -> Estimates:
@@ -207,9 +205,9 @@ def joined(parts: Sequence[Estimates]) -> Estimates:
         [np.array([*(edges.index(e) for e in part.edges), -1], np.int64)[part.edge] for part in parts]
     )
     whole = {
-        f.name: np.concatenate([getattr(part, f.name) for part in parts])
-        for f in fields(Estimates)
-        if f.name not in ("vehicles", "edges", "owner", "edge", "work_key")
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in _PER_RECORD
+        if name not in ("owner", "edge")
     }
     keys = pa.concat_arrays([part.work_key for part in parts])
     found = Estimates(vehicles, edges, owner, edge=edge, work_key=keys, **whole)
@@ -250,7 +248,7 @@ def _since_it_moved(
     Days after it are held against that part, days before it against their own: so the day of the change is this one.
     """
     change, sigma = last[:, 0], last[:, 1]
-    there = from_rotation_translation(exp_so3(change[:, :3]) @ T[:, :3, :3], T[:, :3, 3] + change[:, 3:])
+    there = changed(T, change)
     to_twist = np.linalg.inv(change_jacobian(there))
     return there, covariance + to_twist @ (np.eye(6) * sigma[:, None] ** 2) @ to_twist.swapaxes(1, 2)
 

@@ -17,7 +17,7 @@ from pipeline.audit.days import PairDays, Reference, reference_of
 from pipeline.audit.estimates import day_name
 from pipeline.audit.service import restart_of
 from pipeline.geometry.se3 import from_quaternion, to_quaternion
-from pipeline.rig.edges import edge_named
+from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Lake, days_after
 from pipeline.store.records import read_columns, read_latest
@@ -68,7 +68,7 @@ def read_kept(
     eve = days_after(first, -1)
     rows = read_latest(lake, STATES, StateRow, first=eve, last=last, columns=_COLUMNS)
     # Of a night that was run again the last one counts.
-    last_said = {(s.vehicle, _edge(s)): s for s in rows if s.method == method and s.pair != "pose"}
+    last_said = {(s.vehicle, edge_of(s)): s for s in rows if s.method == method and s.pair != "pose"}
     states = {key: s for key, s in last_said.items() if s.reference_days is not None}
     changed = _changed_since(lake, last, {s.vehicle: s.recorded_at for s in states.values()})
     kept = {}
@@ -81,10 +81,6 @@ def read_kept(
             is_whole = not own.days or since > own.days[-1]
             kept[vehicle, edge] = own if is_whole else replace(own, reference=None)
     return kept
-
-
-def _edge(state: StateRow) -> Edge:
-    return edge_named(state.pair, state.parent_frame, state.child_frame)
 
 
 def first_accepted(kept: Kept | None) -> str | None:

@@ -21,7 +21,7 @@ from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.errors import ConfigError
 from pipeline.results import Progress
-from pipeline.rig.edges import edge_named
+from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import EDGE_KINDS, KINDS, Edge, edge_between
 from pipeline.store.partitions import (
     Lake,
@@ -199,7 +199,7 @@ def _found_before(
     before: dict[str, dict[tuple[Edge, str], DriftFinding]] = {}
     if asked:
         for finding in read_last(lake, DRIFT, DriftFinding, method, vehicle=asked, columns=_OF_BEFORE):
-            edge = edge_named(finding.pair, finding.parent_frame, finding.child_frame)
+            edge = edge_of(finding)
             before.setdefault(finding.vehicle, {})[edge, finding.dof] = finding
     return before
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from pipeline.rig.edges import EDGE_OF_PAIR, edge_named, edge_order, words_of
+from pipeline.rig.edges import EDGE_OF_PAIR, edge_of, edge_order, words_of
 from pipeline.rig.graph import KINDS, Edge
 from schemas.drift import DriftFinding, VehicleStatus
 
@@ -66,7 +66,7 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
         clearest = max(alarms, key=_clarity)
         reason = f"{_what_happened(clearest)}: {clearest.reason}"
         return VehicleStatus(clearest.status, reason, clearest.moved_sensor, clearest.start_day)
-    status = {(_edge(f), f.dof): f.status for f in findings}
+    status = {(edge_of(f), f.dof): f.status for f in findings}
     watched = _watched({edge for edge, _ in status} or EDGE_OF_PAIR.values())
     unwatched = [
         sensors
@@ -80,15 +80,11 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     if max((f.days_used for f in findings), default=0) > 1:
         hidden = " and of the ".join(unwatched)
         first = watched[unwatched[0]][0]  # where there is a choice
-        own = [f for f in findings if _edge(f) == first and f.dof in _WATCHED[first.kind]]
+        own = [f for f in findings if edge_of(f) == first and f.dof in _WATCHED[first.kind]]
         blind = [f for f in own if f.status != "GREEN"]
         why = "".join(f"; {words_of(first)} {f.dof}: {f.reason}" for f in blind[:1])
         return VehicleStatus("UNKNOWN", f"a turn of the {hidden} could hide ({count}){why}")
     return VehicleStatus("UNKNOWN", "too little data to say whether a sensor moved")
-
-
-def _edge(finding: DriftFinding) -> Edge:
-    return edge_named(finding.pair, finding.parent_frame, finding.child_frame)
 
 
 def _clarity(alarm: DriftFinding) -> tuple[bool, bool, float]:

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from pipeline.errors import ConfigError
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.changes import change_between, change_covariance, change_jacobian
-from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
+from pipeline.geometry.changes import change_between, change_covariance, change_jacobian, changed
+from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.edges import EDGE_OF_PAIR, edge_order, words_of
 from pipeline.rig.graph import BASE, KINDS, Edge, RigGraph, Sensor
 from schemas.calibrations import DOF_NAMES
@@ -152,7 +152,7 @@ class ExportedPair:
         change = change_between(T_prior, self.T)
         change = change - gain @ change[rows]
         C = C + gain @ (P - C)[np.ix_(rows, rows)] @ gain.T
-        T = from_rotation_translation(exp_so3(change[:3]) @ T_prior[:3, :3], T_prior[:3, 3] + change[3:])
+        T = changed(T_prior, change)
         K = np.linalg.inv(change_jacobian(T))
         return replace(self, T=T, covariance=K @ C @ K.T, resting=tuple(self.unchecked))
 

@@ -11,7 +11,7 @@ from pipeline.errors import ConfigError, ContractError
 from pipeline.export.calibration import USABLE, ExportedPair, is_frame
 from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.geometry.se3 import adjoint, inverse
-from pipeline.rig.edges import edge_named, edge_order, words_of
+from pipeline.rig.edges import edge_of, edge_order, words_of
 from pipeline.rig.graph import Edge, Kind, Sensor, is_one_of_each, tie
 from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
@@ -110,7 +110,7 @@ def priors_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, 
     """
     found: dict[str, ExportedPair | str] = {}
     for record in _records(lake, vehicle, day, method):
-        T, edge = prior_of(record), _edge(record)
+        T, edge = prior_of(record), edge_of(record)
         words = words_of(edge)
         found[words] = (
             "no prior was given"
@@ -126,7 +126,7 @@ def edges_of_vehicle(lake: Lake, vehicle: str, day: str | None, method: str) -> 
         rows: Sequence[CalibrationRecord | StateRow] = _states(lake, vehicle, method)
     else:
         rows = _records(lake, vehicle, day, method)
-    return tuple(_edge(row) for row in rows)
+    return tuple(edge_of(row) for row in rows)
 
 
 def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[CalibrationRecord]:
@@ -161,19 +161,15 @@ def _states(lake: Lake, vehicle: str, method: str) -> list[StateRow]:
 
 
 def _pairs(rows: Sequence[CalibrationRecord] | Sequence[StateRow]) -> dict[str, ExportedPair | str]:
-    by_edge = {_edge(row): _pair(row) for row in rows}
+    by_edge = {edge_of(row): _pair(row) for row in rows}
     return {words_of(edge): by_edge[edge] for edge in sorted(by_edge, key=edge_order)}
-
-
-def _edge(row: CalibrationRecord | StateRow) -> Edge:
-    return edge_named(row.pair, row.parent_frame, row.child_frame)
 
 
 def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
     T = transform_of(row)
     if T is None:
         return f"{row.status}: {row.reason}"
-    edge = _edge(row)
+    edge = edge_of(row)
     return ExportedPair(
         words_of(edge),
         T,
@@ -213,7 +209,7 @@ def _rested(lake: Lake, vehicle: str, method: str, pair: ExportedPair) -> Export
         return pair
     for record in _records(lake, vehicle, str(days[-1]), method):
         T = prior_of(record)
-        if _edge(record) == pair.edge and T is not None and record.prior_covariance is not None:
+        if edge_of(record) == pair.edge and T is not None and record.prior_covariance is not None:
             return pair.resting_at(T, record.prior_covariance)
     return pair
 

@@ -23,7 +23,7 @@ from pipeline.fleet.ledger import Known, Ledger
 from pipeline.fleet.more_frames import MOST_TIMES_MORE, asks_for_more, spent_before, with_more_sweeps
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import MadeWhenAsked, Outcome, Progress, silent
-from pipeline.rig.edges import edge_named, words_of
+from pipeline.rig.edges import edge_of, words_of
 from pipeline.runner import Stage, try_stage
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.store.partitions import Lake, Partition, last_possible_day
@@ -201,7 +201,7 @@ def _outcome(finished: Finished[_Job, DayOutcome]) -> DayOutcome:
 
 def _summarise(partition: Partition, results: Sequence[Outcome]) -> DayOutcome:
     records = [r for r in results[-1].records if isinstance(r, CalibrationRecord)]
-    pairs = {words_of(edge_named(r.pair, r.parent_frame, r.child_frame)): r.status for r in records}
+    pairs = {words_of(edge_of(r)): r.status for r in records}
     worst = next((r for r in results if r.status in ("failed", "refused")), None)
     status = worst.status if worst is not None else day_word(pairs.values()) if pairs else "done"
     if status == "done" and all(r.status == "cached" for r in results):

@@ -10,17 +10,25 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import hat, log_so3
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, hat, log_so3
 
-__all__ = ["change_between", "change_covariance", "change_jacobian"]
+__all__ = ["change_between", "change_covariance", "change_jacobian", "changed"]
 
 
 def change_between(
-    T_before: Float[np.ndarray, "*batch 4 4"], T_after: Float[np.ndarray, "*batch 4 4"]
+    T_before: Float[np.ndarray, "*#batch 4 4"], T_after: Float[np.ndarray, "*#batch 4 4"]
 ) -> Float[np.ndarray, "*batch 6"]:
     """Change (rx ry rz [rad], tx ty tz [m]) that leads from one estimate of T_parent_child to another."""
     rotation = log_so3(T_after[..., :3, :3] @ np.swapaxes(T_before[..., :3, :3], -1, -2))
     return np.concatenate([rotation, T_after[..., :3, 3] - T_before[..., :3, 3]], axis=-1)
+
+
+def changed(
+    T: Float[np.ndarray, "*#batch 4 4"], change: Float[np.ndarray, "*#batch 6"]
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """The estimate of T_parent_child that a change leads to: `change_between` of the two gives it back."""
+    R = exp_so3(change[..., :3]) @ T[..., :3, :3]
+    return from_rotation_translation(R, T[..., :3, 3] + change[..., 3:])
 
 
 def change_jacobian(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 6 6"]:

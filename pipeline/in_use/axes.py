@@ -28,7 +28,7 @@ from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import adjoint, inverse, log_se3
 from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
 from pipeline.geometry.targets import DEFAULT_TARGETS
-from pipeline.rig.edges import edge_named, words_of
+from pipeline.rig.edges import edge_of, words_of
 from pipeline.store.current import prior_of, targets_of, transform_of
 from schemas.calibrations import CalibrationRecord
 from schemas.poses import PoseRow
@@ -265,7 +265,7 @@ def _silent(of: tuple[str, str], axis: str, limits: AxisLimits, reason: str) -> 
 
 
 def _pair(record: CalibrationRecord) -> str:
-    return words_of(edge_named(record.pair, record.parent_frame, record.child_frame))
+    return words_of(edge_of(record))
 
 
 def _why_not(record: CalibrationRecord) -> str:

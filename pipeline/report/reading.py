@@ -11,7 +11,7 @@ from pipeline.errors import ConfigError
 from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.privacy import without_road_users
 from pipeline.report.scenes import choose_frames
-from pipeline.rig.edges import edge_named, edge_order, words_of
+from pipeline.rig.edges import edge_of, edge_order, words_of
 from pipeline.sections import ReportConfig
 from pipeline.store.current import current_poses, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition, days_after
@@ -101,7 +101,7 @@ def records_of_day(
 
 def _by_edge(records: Iterable[CalibrationRecord]) -> dict[str, CalibrationRecord]:
     """Current ones of a vehicle-day by the words of their edges: the kind of edge, or the names of its sensors."""
-    edges = {edge_named(r.pair, r.parent_frame, r.child_frame): r for r in current_records(list(records))}
+    edges = {edge_of(r): r for r in current_records(list(records))}
     return {words_of(edge): edges[edge] for edge in sorted(edges, key=edge_order)}
 
 

@@ -11,9 +11,11 @@ import pyarrow.compute as pc
 from jaxtyping import Int
 
 from pipeline.rig.graph import EDGE_KINDS, TIE_KINDS, Edge, Kind, Sensor
-from schemas.calibrations import FRAMES_OF_PAIR
+from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
+from schemas.drift import DriftFinding
+from schemas.states import StateRow
 
-__all__ = ["EDGE_OF_PAIR", "edge_named", "edge_order", "edges_of_rows", "words_of"]
+__all__ = ["EDGE_OF_PAIR", "edge_named", "edge_of", "edge_order", "edges_of_rows", "words_of"]
 
 _COLUMNS: Final = ("pair", "parent_frame", "child_frame")
 
@@ -33,6 +35,11 @@ def edge_named(pair: str, parent: str, child: str) -> Edge:
         raise ValueError(f"no edge is of the kind {pair!r}: there are {', '.join(EDGE_KINDS)}")
     kinds = [cast("Kind", kind) for kind in pair.split("_")]
     return Edge(Sensor(parent, kinds[0]), Sensor(child, kinds[1]))
+
+
+def edge_of(row: CalibrationRecord | StateRow | DriftFinding) -> Edge:
+    """The edge that a row is about."""
+    return edge_named(row.pair, row.parent_frame, row.child_frame)
 
 
 # Edges of a rig whose sensors are called by their kinds, as a short fleet.toml does and all records until 0.10 did.

@@ -10,7 +10,7 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, scales
 from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY
 from pipeline.calibrate.numerics.response_surface import DESIGN
-from pipeline.calibrate.paper.minimise import poses_about
+from pipeline.geometry.changes import changed
 from pipeline.objective.camera_lidar.score import KernelSettings, lidar_velocities, prepare_terms
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
@@ -96,7 +96,7 @@ def test_the_papers_losses_are_faster_than_numpy(day, losses, gate, pair):
     rows, truth = day
     loss, plain = losses[pair], numpy_objectives.paper_losses(rows, losses)[pair]
     x = np.random.default_rng(0).uniform(-1, 1, (CANDIDATES, 6)) * np.array([MARGIN_RAD] * 3 + [0.3] * 3)
-    poses = poses_about(truth[pair], x)
+    poses = changed(truth[pair], x)
     few = poses[:3]
     ours, theirs = loss.frame_losses(few), np.stack([plain(T) for T in few])
     assert np.abs(theirs).max() > 0.1

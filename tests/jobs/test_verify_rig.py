@@ -12,8 +12,8 @@ from jobs.verify import _of_poses
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.extrinsics.prior_file import read_star
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.poses import POSES
 from tests.export.test_import_rig import FLEET, OTHERS, T_TOP, exported

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.paper.minimise import at_border, half_widths, minimise, poses_about
+from pipeline.calibrate.paper.minimise import at_border, half_widths, minimise
 from pipeline.calibrate.paper.pairwise import (
     PairProblem,
     border_failures,
@@ -26,6 +26,7 @@ from pipeline.calibrate.paper.pairwise import (
 )
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior, Solution
+from pipeline.geometry.changes import changed
 from pipeline.objective.paper.loop import joint_objective, loop_loss, loop_transform
 from pipeline.results import Progress, silent
 from schemas.calibrations import PAIRS
@@ -68,7 +69,7 @@ def solve_joint_optimisation(
         )
         for pair, x in zip(active, found.x.reshape(-1, 6), strict=True):
             own = replace(found, x=x, at_border=at_border(x, half_widths(config, 1)))
-            pairs[pair] = estimate_of(problems[pair], poses_about(prior.of(pair), x[None])[0], prior, own)
+            pairs[pair] = estimate_of(problems[pair], changed(prior.of(pair), x), prior, own)
     return Solution("joint-optimisation", pairs, *loop_size(pairs), failed_checks=border_failures(pairs))
 
 
@@ -86,7 +87,7 @@ def joint_costs(
     """
     poses = {pair: np.broadcast_to(prior.of(pair), (len(x), 4, 4)) for pair in PAIRS}
     for k, pair in enumerate(scales):
-        poses[pair] = poses_about(prior.of(pair), x[:, 6 * k : 6 * k + 6])
+        poses[pair] = changed(prior.of(pair), x[:, 6 * k : 6 * k + 6])
     pairwise = sum(
         (problems[pair].loss(poses[pair]) / scale for pair, scale in scales.items()), np.zeros(len(x))
     )

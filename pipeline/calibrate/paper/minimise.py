@@ -14,9 +14,8 @@ from jaxtyping import Float
 from scipy.optimize import differential_evolution, minimize
 
 from pipeline.config import SolveConfig
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 
-__all__ = ["Minimum", "at_border", "half_widths", "minimise", "poses_about"]
+__all__ = ["Minimum", "at_border", "half_widths", "minimise"]
 
 # Costs of a batch of parameter vectors: (S, D) -> (S,)
 Objective = Callable[[np.ndarray], np.ndarray]
@@ -35,11 +34,6 @@ class Minimum:
     value: float
     evaluations: int
     at_border: bool  # within 2 % of the box: the true minimum may lie outside
-
-
-def poses_about(T_start: Float[np.ndarray, "4 4"], x: Float[np.ndarray, "S 6"]) -> Float[np.ndarray, "S 4 4"]:
-    """Poses of parameter vectors."""
-    return from_rotation_translation(exp_so3(x[:, :3]) @ T_start[:3, :3], T_start[:3, 3] + x[:, 3:])
 
 
 def half_widths(config: SolveConfig, poses: int) -> Float[np.ndarray, " D"]:

@@ -25,12 +25,13 @@ from jaxtyping import Float
 from pipeline.calibrate.numerics.bias_floors import PAPER_BIAS
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
-from pipeline.calibrate.paper.minimise import Minimum, minimise, poses_about
+from pipeline.calibrate.paper.minimise import Minimum, minimise
 from pipeline.calibrate.paper.sandwich import sandwich_covariance
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.common_share import common_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
+from pipeline.geometry.changes import changed
 from pipeline.geometry.se3 import rotation_angle_rad
 from pipeline.objective.paper.camera_lidar import CameraLidarLoss, camera_lidar_loss
 from pipeline.objective.paper.camera_radar import CameraRadarLoss, camera_radar_loss
@@ -112,7 +113,7 @@ def solve_pairwise(
         progress(k, len(PAIRS), f"{pair}: differential evolution")
         problem = pair_problem(pair, observations[pair], prior, config)
         minimum = solve_pair(problem, config, np.random.default_rng([seed, k])) if pair in triggered else None
-        T = prior.of(pair) if minimum is None else poses_about(problem.T_prior, minimum.x[None])[0]
+        T = prior.of(pair) if minimum is None else changed(problem.T_prior, minimum.x)
         pairs[pair] = estimate_of(problem, T, prior, minimum)
     progress(len(PAIRS), len(PAIRS), "done")
     return Solution("pairwise-optimisation", pairs, *loop_size(pairs), failed_checks=border_failures(pairs))
@@ -120,7 +121,7 @@ def solve_pairwise(
 
 def solve_pair(problem: PairProblem, config: SolveConfig, rng: np.random.Generator) -> Minimum:
     """Minimise one pair's loss about its prior."""
-    return minimise(lambda x: problem.loss(poses_about(problem.T_prior, x)), config, np.zeros(6), rng)
+    return minimise(lambda x: problem.loss(changed(problem.T_prior, x)), config, np.zeros(6), rng)
 
 
 def estimate_of(

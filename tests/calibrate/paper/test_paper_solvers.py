@@ -5,12 +5,13 @@ import pytest
 
 from pipeline.calibrate.methods import METHODS, method_named
 from pipeline.calibrate.paper.joint_optimisation import joint_costs, solve_joint_optimisation
-from pipeline.calibrate.paper.minimise import minimise, poses_about
+from pipeline.calibrate.paper.minimise import minimise
 from pipeline.calibrate.paper.pairwise import pair_problem, solve_pairwise
 from pipeline.calibrate.paper.sandwich import sandwich_covariance
 from pipeline.config import SolveConfig
 from pipeline.errors import ConfigError
 from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.changes import changed
 from pipeline.geometry.se3 import exp_so3, perturb_exactly, rotation_angle_rad
 from pipeline.geometry.targets import errors_at_targets
 from schemas.calibrations import METHODS as METHOD_NAMES
@@ -79,7 +80,7 @@ def test_minimise_says_when_the_minimum_lies_at_the_border():
 
 def test_poses_about_turn_and_shift_by_exactly_the_parameters():
     x = np.array([[0.01, -0.02, 0.03, 0.1, 0.2, -0.3]])
-    T = poses_about(T_CAMERA_LIDAR, x)[0]
+    T = changed(T_CAMERA_LIDAR, x)[0]
     np.testing.assert_allclose(T[:3, :3], exp_so3(x[0, :3]) @ T_CAMERA_LIDAR[:3, :3])
     np.testing.assert_allclose(T[:3, 3] - T_CAMERA_LIDAR[:3, 3], x[0, 3:])
 
@@ -138,8 +139,8 @@ def test_joint_objective_is_one_plus_losses_times_one_plus_loop(frames, prior):
     assert cost[0] == pytest.approx(
         1 + losses["camera_lidar"] / 0.5 + losses["lidar_radar"] / 2.0
     )  # the prior's loop is closed
-    moved = problems["camera_lidar"].loss(poses_about(prior.T_camera_lidar, x[1:, :6]))[0]
-    T_loop = poses_about(prior.T_camera_lidar, x[1:, :6])[0] @ np.linalg.inv(prior.T_camera_lidar)
+    moved = problems["camera_lidar"].loss(changed(prior.T_camera_lidar, x[1:, :6]))[0]
+    T_loop = changed(prior.T_camera_lidar, x[1:, :6])[0] @ np.linalg.inv(prior.T_camera_lidar)
     loop = 0.01 + np.abs(T_loop[:3, 3]).sum()
     assert cost[1] == pytest.approx((1 + moved / 0.5 + losses["lidar_radar"] / 2.0) * (1 + loop), rel=1e-9)
 

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from pipeline.calibrate.paper.joint_optimisation import joint_costs
-from pipeline.calibrate.paper.minimise import poses_about
 from pipeline.calibrate.paper.pairwise import pair_problem
 from pipeline.errors import ConfigError
 from pipeline.extrinsics.prior import read_prior
+from pipeline.geometry.changes import changed
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.metrics import read_metrics
@@ -61,9 +61,7 @@ def test_the_loss_that_trains_is_the_objective_of_joint_optimisation_on_the_same
     problems = {pair: pair_problem(pair, made.observations, prior, made.fleet.solve) for pair in PAIRS}
     letter = joint_costs(problems, prior, dict.fromkeys(PAIRS, 1.0), x)
     for k, moves in enumerate(x):
-        T = {
-            pair: poses_about(prior.of(pair), moves[None, 6 * i : 6 * i + 6]) for i, pair in enumerate(PAIRS)
-        }
+        T = {pair: changed(prior.of(pair), moves[None, 6 * i : 6 * i + 6]) for i, pair in enumerate(PAIRS)}
         given = [torch.tensor(np.repeat(T[pair], len(rows), 0), dtype=torch.float32) for pair in PAIRS]
         terms = frames.terms(batch, *given, PAIRS_OF["joint"])
         mean = {}
