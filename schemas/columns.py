@@ -123,6 +123,10 @@ class TableSchema:
         """True for a table of records, which are added; False for one of partitions, which are replaced."""
         return bool(self.about)
 
+    def about_of(self, row: Any) -> tuple[str, ...]:
+        """What a row of a record table is about: its values of those columns."""
+        return tuple(getattr(row, name) for name in self.about)
+
     def rows_among(self, rows: Iterable[Any]) -> list[Any]:
         """Of rows of several tables, this one's."""
         return [row for row in rows if type(row) is self.row_type]

@@ -55,9 +55,7 @@ def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
     degrees = " ".join(_sigma(s, o, 3) for s, o in zip(np.degrees(sigma[:3]), seen[:3], strict=True))
     metres = " ".join(_sigma(s, o, 3) for s, o in zip(sigma[3:], seen[3:], strict=True))
     return {
-        "vehicle": row["vehicle"],
-        "day": row["day"],
-        "method": row["method"],
+        **_named(row, "vehicle", "day", "method"),
         "pair": _edge(row),
         "status": row["status"],
         **_pose_cells(row["T"], _prior_of(row)),
@@ -70,17 +68,23 @@ def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
 
 
 def _pose_row_cells(row: dict[str, Any]) -> dict[str, str]:
-    def degrees(sigma_rad: float | None) -> str:
-        return "" if sigma_rad is None else f"{sigma_rad * 180 / math.pi:.3f}"
-
     return {
-        **{name: row[name] for name in ("vehicle", "day", "method", "sensor", "reference", "status")},
+        **_named(row, "vehicle", "day", "method", "sensor", "reference", "status"),
         **_pose_cells(row["T"], None, with_change=False),
-        "sigma azimuth [deg]": degrees(row["azimuth_sigma_rad"]),
-        "elevation [deg]": degrees(row["elevation_sigma_rad"]),
-        "certified": ", ".join(row["determined"]),
+        **_sure_cells(row),
         "edges": ", ".join(row["edges"]),
         "reason": "; ".join(text for text in (in_words(row["faults"] or ()), row["reason"]) if text),
+    }
+
+
+def _sure_cells(row: dict[str, Any]) -> dict[str, str]:
+    """Sigmas of azimuth and elevation, and which of them are certified."""
+    sigmas = (row["azimuth_sigma_rad"], row["elevation_sigma_rad"])
+    azimuth, elevation = ("" if s is None else f"{s * 180 / math.pi:.3f}" for s in sigmas)
+    return {
+        "sigma azimuth [deg]": azimuth,
+        "elevation [deg]": elevation,
+        "certified": ", ".join(row["determined"]),
     }
 
 
@@ -138,20 +142,13 @@ def _drift_cells(row: dict[str, Any]) -> dict[str, str]:
 
 
 def _state_cells(row: dict[str, Any]) -> dict[str, str]:
-    import numpy as np
-
-    def degrees(sigma_rad: float | None) -> str:
-        return "" if sigma_rad is None else f"{np.degrees(sigma_rad):.3f}"
-
     days = row["days"]
     return {
         "vehicle": row["vehicle"],
         "pair": _edge(row) if row["sensor"] is None else f"{row['sensor']} in {row['parent_frame']}",
         "state": row["status"],
         **_pose_cells(row["T"], row["T_prior"]),
-        "sigma azimuth [deg]": degrees(row["azimuth_sigma_rad"]),
-        "elevation [deg]": degrees(row["elevation_sigma_rad"]),
-        "certified": ", ".join(row["determined"]),
+        **_sure_cells(row),
         "days": f"{len(days)}: {days[0]} to {days[-1]}" if days else "0",
         "reason": "; ".join(text for text in (row["reason"], _unchecked(row["unchecked"] or {})) if text),
     }
@@ -166,11 +163,7 @@ def _unchecked(sigmas: dict[str, float]) -> str:
 
 def _outcome_cells(row: dict[str, Any]) -> dict[str, str]:
     return {
-        "vehicle": row["vehicle"],
-        "day": row["day"],
-        "stage": row["stage"],
-        "method": row["method"],
-        "status": row["status"],
+        **_named(row, "vehicle", "day", "stage", "method", "status"),
         "began": row["began_at"],
         "seconds": f"{row['seconds']:.1f}",
         "rows": str(row["rows"]),
@@ -179,7 +172,7 @@ def _outcome_cells(row: dict[str, Any]) -> dict[str, str]:
 
 
 def _event_cells(row: dict[str, Any]) -> dict[str, str]:
-    told = {name: row[name] for name in ("vehicle", "day", "sensor", "kind", "note")}
+    told = _named(row, "vehicle", "day", "sensor", "kind", "note")
     return told | {"withdrawn": "yes" if row["withdrawn"] else ""}
 
 
@@ -192,6 +185,10 @@ def _partition_cells(row: dict[str, Any]) -> dict[str, str]:
         "work key": row["work_key"],
         "rejected": counts,
     }
+
+
+def _named(row: dict[str, Any], *names: str) -> dict[str, str]:
+    return {name: row[name] for name in names}
 
 
 def _edge(row: dict[str, Any]) -> str:

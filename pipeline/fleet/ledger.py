@@ -153,11 +153,11 @@ def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
 
 def _sort(waiting: _Waiting, rows: Sequence[Any], recorded: Sequence[Any]) -> None:
     """Rows that are not recorded are new; those that others about the same came after are to be current again."""
-    about = waiting.schema.about
-    last = {tuple(getattr(r, name) for name in about): r.work_key for r in recorded}
-    keys = {(tuple(getattr(r, name) for name in about), r.work_key) for r in recorded}
+    about_of = waiting.schema.about_of
+    last = {about_of(r): r.work_key for r in recorded}
+    keys = {(about_of(r), r.work_key) for r in recorded}
     for row in rows:
-        key = tuple(getattr(row, name) for name in about)
+        key = about_of(row)
         if (key, row.work_key) not in keys:
             waiting.new.append(row)
         elif last[key] != row.work_key:

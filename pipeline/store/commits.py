@@ -35,14 +35,14 @@ def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
         ContractError: the lake is of another release, or a row breaks its table's contract.
         OSError: the storage does not answer.
     """
-    unique = {_key(schema, row) + (row.work_key,): row for row in rows}
+    unique = {schema.about_of(row) + (row.work_key,): row for row in rows}
     if not unique:
         return 0
     known = _known(lake, schema, unique.values())
     now = dt.datetime.now(dt.UTC)
     changed = []
     for row in unique.values():
-        rivals = known.get(_key(schema, row), {})
+        rivals = known.get(schema.about_of(row), {})
         latest = max(rivals.values(), default="")
         given = row.asserted_at or row.recorded_at
         if row.work_key in rivals and max(rivals[row.work_key], given) == latest:
@@ -83,17 +83,13 @@ def assert_records(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
     now = dt.datetime.now(dt.UTC)
     changed = []
     for row in rows:
-        rivals = known.get(_key(schema, row), {})
+        rivals = known.get(schema.about_of(row), {})
         latest = max(rivals.values(), default="")
         if row.work_key in rivals and rivals[row.work_key] != latest:
             changed.append(replace(row, asserted_at=_after(now, latest)))
     if changed:
         merge_rows(lake, schema, _stored(schema, changed), insert=False)
     return len(changed)
-
-
-def _key(schema: TableSchema, row: Any) -> tuple[str, ...]:
-    return tuple(getattr(row, name) for name in schema.about)
 
 
 def _known(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> Mapping[tuple[str, ...], dict[str, str]]:

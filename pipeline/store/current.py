@@ -12,10 +12,10 @@ from jaxtyping import Float
 
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.geometry.targets import DEFAULT_TARGETS
-from schemas.calibrations import CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DriftFinding
-from schemas.poses import PoseRow
+from schemas.poses import POSES, PoseRow
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
 
@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 
+_Row = TypeVar("_Row")
 _Said = TypeVar("_Said", DriftFinding, StateRow)
 
 
@@ -41,8 +42,7 @@ def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRec
     Args:
         records: as `read_records` returns them, the last asserted last.
     """
-    last = {(r.vehicle, r.day, r.method, r.pair, r.parent_frame, r.child_frame): r for r in records}
-    return [last[key] for key in sorted(last)]
+    return _last_of_each(records, CALIBRATIONS)
 
 
 def current_poses(poses: Sequence[PoseRow]) -> list[PoseRow]:
@@ -51,8 +51,12 @@ def current_poses(poses: Sequence[PoseRow]) -> list[PoseRow]:
     Args:
         poses: as `read_records` returns them, the last asserted last.
     """
-    last = {(p.vehicle, p.day, p.method, p.sensor): p for p in poses}
-    return [last[key] for key in sorted(last)]
+    return _last_of_each(poses, POSES)
+
+
+def _last_of_each(rows: Sequence[_Row], schema: TableSchema) -> list[_Row]:
+    last = {schema.about_of(row): row for row in rows}
+    return [last[about] for about in sorted(last)]
 
 
 def current_rows(table: pa.Table, schema: TableSchema) -> pa.Table:
