@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import datetime as dt
+import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-__all__ = ["Effort", "MadeWhenAsked", "Outcome", "Progress", "measured", "silent"]
+__all__ = ["Effort", "MadeWhenAsked", "Outcome", "Progress", "measured", "plain", "silent"]
 
 _COUNTERS = Path("/proc/self/io")  # Linux: every read and write of the process, from the page cache too
 # progress(done, total, what): total 0 = unknown. Stages call it often; the job decides what a person sees.
@@ -110,3 +111,20 @@ def _bytes() -> tuple[int | None, int | None]:
         counts = dict(line.split(": ") for line in _COUNTERS.read_text().splitlines())
         return int(counts["rchar"]), int(counts["wchar"])
     return None, None
+
+
+def plain(value: Any) -> Any:
+    """A value as strict JSON has it: NumPy's and paths too; null for what is not finite, as an unknown sigma."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(v) for v in value]
+    if isinstance(value, bool | int | str | None):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):  # numpy scalars and arrays, without importing numpy here
+        return plain(value.tolist())
+    raise TypeError(f"{type(value).__name__} has no place in a JSON summary")

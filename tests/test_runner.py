@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import pipeline.runner
-import pipeline.store.moments
+import pipeline.store.tables
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError, ContractError, LogError
 from pipeline.fleet.ledger import outcome_row
@@ -299,13 +299,13 @@ def test_a_damaged_partition_is_made_anew(damaged, task, stage):
 def test_row_groups_are_small_and_rows_are_asked_for_as_they_are_written(task, stage, monkeypatch):
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr(pipeline.store.moments, "_GROUP_ROWS", 4)
+    monkeypatch.setattr(pipeline.store.tables, "_GROUP_ROWS", 4)
     stage(some(10))[0].run(task)
     file = task.lake.file("sweep_features", DAY, "lidar")
     with pq.ParquetFile(file) as parquet:
         sizes = [parquet.metadata.row_group(g).num_rows for g in range(parquet.num_row_groups)]
     assert sizes == [4, 4, 2]
-    monkeypatch.setattr(pipeline.store.moments, "_GROUP_BYTES", 1)  # a row alone is more than that
+    monkeypatch.setattr(pipeline.store.tables, "_GROUP_BYTES", 1)  # a row alone is more than that
     stage(some(3), {"bytes": 1})[0].run(task)
     with pq.ParquetFile(file) as parquet:
         assert parquet.num_row_groups == 3

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.results import Progress
+from pipeline.results import Progress, plain
 
 if TYPE_CHECKING:
     from pipeline.store.partitions import Lake
@@ -29,7 +27,7 @@ def print_summary(command: str, status: str, **fields: Any) -> None:
 
 def print_json(value: Any, *, indent: int | None = None) -> None:
     """Print strict JSON (numpy values and paths included) on stdout, on one line unless indented."""
-    sys.stdout.write(json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n")
+    sys.stdout.write(json.dumps(plain(value), indent=indent, allow_nan=False) + "\n")
     sys.stdout.flush()
 
 
@@ -105,19 +103,3 @@ def _lines(title: str) -> Iterator[Progress]:
             logger().info("progress", job=title, done=done, total=total, what=what)
 
     yield report
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [_plain(v) for v in value]
-    if isinstance(value, bool | int | str | None):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "tolist"):  # numpy scalars and arrays, without importing numpy here
-        return _plain(value.tolist())
-    raise TypeError(f"{type(value).__name__} has no place in a JSON summary")

@@ -17,6 +17,7 @@ from ruamel.yaml.representer import RoundTripRepresenter
 
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion
+from pipeline.results import plain
 
 __all__ = [
     "edit_yaml",
@@ -50,7 +51,7 @@ def text_of(file: str, content: bytes) -> str:
 
 def to_json(value: Any) -> bytes:
     """Indented JSON; floats as Python prints them, so that reading gives the same bits; null for what is not finite."""
-    return (json.dumps(_finite(value), indent=2, allow_nan=False) + "\n").encode()
+    return (json.dumps(plain(value), indent=2, allow_nan=False) + "\n").encode()
 
 
 def load_json(file: str, content: bytes) -> Any:
@@ -190,15 +191,6 @@ def _float(representer: RoundTripRepresenter, value: float) -> ScalarNode:
 
 
 _Representer.add_representer(float, _float)
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no nan and no infinity: an unknown sigma is null."""
-    if isinstance(value, Mapping):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _styled(value: Any) -> Any:

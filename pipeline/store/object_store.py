@@ -62,13 +62,10 @@ class Bucket:
         """Keys below a folder that match a pattern of as many parts; all where the pattern begins with **."""
         parts = pattern.split("/")
         literal = list(takewhile(lambda part: not set(part) & set("*?["), parts))
-        prefix = folder.joinpath(*literal)
-        with self._as_os_errors(prefix):
-            for page in obstore.list(_store(self.name), f"{prefix}/", chunk_size=1000):
-                for item in page:
-                    below = PurePosixPath(str(item["path"])).relative_to(folder).parts
-                    if parts[0] == "**" or (len(below) == len(parts) and all(map(fnmatchcase, below, parts))):
-                        yield folder.joinpath(*below)
+        for key, _, _ in self.listed(folder.joinpath(*literal)):
+            below = PurePosixPath(key).relative_to(folder).parts
+            if parts[0] == "**" or (len(below) == len(parts) and all(map(fnmatchcase, below, parts))):
+                yield folder.joinpath(*below)
 
     @contextmanager
     def opened(self, key: PurePath) -> Iterator[BinaryIO]:
@@ -138,8 +135,8 @@ class Bucket:
 
     def size(self, key: PurePath) -> int:
         """Bytes of an object; 0 where there is none."""
-        with suppress(FileNotFoundError), self._as_os_errors(key):
-            return int(obstore.head(_store(self.name), str(key))["size"])
+        with suppress(FileNotFoundError):
+            return self.size_and_tag(key)[0]
         return 0
 
     def sizes(self, folder: PurePath) -> Iterator[tuple[str, int]]:
