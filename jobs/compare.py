@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from jobs.frame_options import FrameOptions
 
 if TYPE_CHECKING:
-    from pipeline.export.compare import PairDifference
+    from pipeline.extrinsics.differences import PairDifference
 
 __all__ = ["compare"]
 
@@ -99,8 +99,7 @@ def _plain(difference: PairDifference) -> dict[str, Any]:
 
 
 def _write_page(page: Path, titles: list[str], found: list[PairDifference], notes: list[str]) -> None:
-    from pipeline.report.comparison import PairView, comparison_page
+    from pipeline.report.comparison import comparison_page
     from pipeline.report.page import write_page
 
-    views = [PairView(d.edge, d.statuses, d.change, d.sigma, d.determined, d.targets_rad) for d in found]
-    write_page(page, comparison_page(titles[0], titles[1], views, notes))
+    write_page(page, comparison_page(titles[0], titles[1], found, notes))

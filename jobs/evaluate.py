@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.evaluate.runs import ComparedRun
+    from pipeline.extrinsics.differences import ComparedRun
     from pipeline.store.partitions import Lake
 
 __all__ = ["evaluate"]

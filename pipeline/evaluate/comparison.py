@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.extrinsics.differences import Comparison
 from pipeline.geometry.se3 import from_quaternion, inverse, log_se3
 from pipeline.geometry.targets import (
     Picks,
@@ -21,27 +21,7 @@ from pipeline.geometry.targets import (
 from pipeline.store.current import targets_of
 from schemas.calibrations import PAIRS, CalibrationRecord
 
-__all__ = ["Comparison", "compare", "current_runs"]
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """One run (all pairs of one work key) against the truth."""
-
-    method: str
-    environment: str
-    errors: dict[str, np.ndarray]  # pair or "loop" -> azimuth, elevation [rad], range [m]
-    prior_errors: dict[str, np.ndarray]
-    statuses: dict[str, str]
-    normalised: np.ndarray  # error / sigma of every observable DoF of every pair
-    # Angle [rad] and shift [m] of pairs estimated apart; the shift is None where they did not determine it.
-    independent_loop: tuple[float, float | None] | None = None
-    truth_spread: dict[str, np.ndarray] = field(
-        default_factory=dict
-    )  # like errors: spread of one frame's picks
-    truth_sigma: dict[str, np.ndarray] = field(
-        default_factory=dict
-    )  # and what is left of it in the truth, 1 sigma
+__all__ = ["compare", "current_runs"]
 
 
 def current_runs(records: Sequence[CalibrationRecord]) -> list[dict[str, CalibrationRecord]]:

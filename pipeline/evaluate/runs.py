@@ -4,26 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.evaluate.comparison import Comparison, compare, current_runs
+from pipeline.evaluate.comparison import compare, current_runs
 from pipeline.evaluate.recording import ReflectorFiles
+from pipeline.extrinsics.differences import ComparedRun
 from pipeline.extrinsics.prior_file import read_transforms
-from pipeline.geometry.targets import Picks
 from schemas.calibrations import CalibrationRecord
 
-__all__ = ["ComparedRun", "compare_runs"]
-
-
-class ComparedRun(NamedTuple):
-    """One run (records by pair), what it was compared with, and the result."""
-
-    run: dict[str, CalibrationRecord]
-    truth: dict[str, np.ndarray] | None
-    picks: Picks | None
-    comparison: Comparison
+__all__ = ["compare_runs"]
 
 
 def compare_runs(

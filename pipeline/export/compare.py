@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from pipeline.export.calibration import ExportedPair
 from pipeline.export.tree import ESTIMATED_PAIRS
+from pipeline.extrinsics.differences import PairDifference
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import inverse, log_se3
 from pipeline.geometry.target_sigmas import target_sigmas
-from pipeline.rig.edges import edge_order, words_of
-from pipeline.rig.graph import Edge
+from pipeline.rig.edges import edge_order
 
-__all__ = ["PairDifference", "Side", "compare", "composed"]
+__all__ = ["Side", "compare", "composed"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,37 +36,6 @@ class Side:
     vehicle: str = ""
     days: frozenset[str] = frozenset()
     missing: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class PairDifference:
-    """What leads from A's estimate of a pair to B's.
-
-    Args:
-        edge: of two sensors.
-        statuses: of A and B.
-        change: rotation vector [rad], shift of the child's origin [m], along the axes of the parent.
-        sigma: of it; None where neither side states any.
-        determined: per DoF, both sides' data did, or are taken as given.
-        targets_rad: how far azimuth and elevation of targets 15 to 40 m away move, root mean square.
-    """
-
-    edge: Edge
-    statuses: tuple[str, str]
-    change: Float[np.ndarray, " 6"]
-    sigma: Float[np.ndarray, " 6"] | None
-    determined: Bool[np.ndarray, " 6"]
-    targets_rad: Float[np.ndarray, " 2"]
-
-    @property
-    def pair(self) -> str:
-        """The edge in words."""
-        return words_of(self.edge)
-
-    @property
-    def z(self) -> Float[np.ndarray, " 6"] | None:
-        """The change in its sigmas."""
-        return None if self.sigma is None else self.change / self.sigma
 
 
 def compare(a: Side, b: Side) -> tuple[list[PairDifference], list[str]]:

@@ -3,37 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
 from markupsafe import Markup
 
+from pipeline.extrinsics.differences import PairDifference
 from pipeline.report.page import render
 from pipeline.report.words import dof_title, scaled, unit_of
-from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
 
-__all__ = ["PairView", "comparison_page"]
+__all__ = ["comparison_page"]
 
 _CLEAR_SIGMAS = 3.0
 _REACH = 6.0  # sigmas to either side that a bar has room for
 _WIDTH, _HEIGHT = 240, 18  # px of a bar
 
 
-@dataclass(frozen=True, eq=False)
-class PairView:
-    """An edge: statuses of A and B, change along the parent's axes [rad, m], its sigma, determined axes, targets."""
-
-    edge: Edge
-    statuses: tuple[str, str]
-    change: Float[np.ndarray, " 6"]
-    sigma: Float[np.ndarray, " 6"] | None
-    determined: Bool[np.ndarray, " 6"]
-    targets_rad: Float[np.ndarray, " 2"]
-
-
-def comparison_page(first: str, second: str, pairs: Sequence[PairView], notes: Sequence[str]) -> str:
+def comparison_page(first: str, second: str, pairs: Sequence[PairDifference], notes: Sequence[str]) -> str:
     """HTML of the change from one calibration to another."""
     clear = [
         f"{p.edge.name} {dof_title(p.edge.kind, dof)}"
@@ -53,11 +39,11 @@ def comparison_page(first: str, second: str, pairs: Sequence[PairView], notes: S
     )
 
 
-def _view(p: PairView) -> dict[str, object]:
+def _view(p: PairDifference) -> dict[str, object]:
     azimuth, elevation = np.degrees(p.targets_rad)
     axes = []
     for k, dof in enumerate(DOF_NAMES):
-        z = None if p.sigma is None else float(p.change[k] / p.sigma[k])
+        z = None if p.z is None else float(p.z[k])
         axes.append(
             {
                 "title": dof_title(p.edge.kind, dof),

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
 
+from pipeline.extrinsics.differences import ComparedRun
 from pipeline.geometry.se3 import transform_points
-from pipeline.geometry.targets import Picks
 from pipeline.report.evaluation import EvaluatedRun, TableView, View, evaluation_page
 from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.scenes import choose_frames
@@ -19,42 +17,12 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, ingested, observations_of, perceived
 from schemas.calibrations import PAIRS, CalibrationRecord
 
-__all__ = ["Compared", "Comparison", "page_of_runs"]
+__all__ = ["page_of_runs"]
 
 _FAVOURITES = ("joint", "joint-ssl", "joint-optimisation")  # whose pictures are worth a look, best first
 
 
-@runtime_checkable
-class Comparison(Protocol):
-    """Errors of one run, as `evaluate` measures them: by pair azimuth and elevation [rad] and range [m]."""
-
-    @property
-    def method(self) -> str: ...  # noqa: D102
-    @property
-    def environment(self) -> str: ...  # noqa: D102
-    @property
-    def errors(self) -> Mapping[str, np.ndarray]: ...  # noqa: D102
-    @property
-    def prior_errors(self) -> Mapping[str, np.ndarray]: ...  # noqa: D102
-    @property
-    def normalised(self) -> Float[np.ndarray, " N"]: ...  # noqa: D102
-
-
-@runtime_checkable
-class Compared(Protocol):
-    """A run (records by pair), what it was compared with (transforms by pair, or picks), and the result."""
-
-    @property
-    def run(self) -> Mapping[str, CalibrationRecord]: ...  # noqa: D102
-    @property
-    def truth(self) -> Mapping[str, np.ndarray] | None: ...  # noqa: D102
-    @property
-    def picks(self) -> Picks | None: ...  # noqa: D102
-    @property
-    def comparison(self) -> Comparison: ...  # noqa: D102
-
-
-def page_of_runs(lake: Lake, compared: Sequence[Compared], texts: Mapping[str, str]) -> str:
+def page_of_runs(lake: Lake, compared: Sequence[ComparedRun], texts: Mapping[str, str]) -> str:
     """HTML of the tables, of every run, and of a frame per environment where the lake still has frames.
 
     Args:
@@ -83,7 +51,7 @@ def _table(title: str, text: str) -> TableView:
     return TableView(title, cells[0], [(row[0].startswith("paper:"), row) for row in cells[2:]])
 
 
-def _evaluated(compared: Compared) -> EvaluatedRun:
+def _evaluated(compared: ComparedRun) -> EvaluatedRun:
     first = compared.run["lidar_radar"]
     T, T_prior = transform_of(first), prior_of(first)
     assert T is not None, "compared runs have a result"
@@ -108,7 +76,7 @@ def _in_degrees(errors: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {pair: np.array([*np.degrees(errors[pair][:2]), errors[pair][2]]) for pair in PAIRS}
 
 
-def _views(lake: Lake, compared: Sequence[Compared]) -> list[View]:
+def _views(lake: Lake, compared: Sequence[ComparedRun]) -> list[View]:
     """A day of each environment, split into both states; and the run that started furthest off, state by state."""
     best = [c for c in compared if _rank(c) == min(map(_rank, compared))] if compared else []
     wanted = {
@@ -127,12 +95,12 @@ def _views(lake: Lake, compared: Sequence[Compared]) -> list[View]:
     return views
 
 
-def _rank(compared: Compared) -> int:
+def _rank(compared: ComparedRun) -> int:
     method = compared.comparison.method
     return _FAVOURITES.index(method) if method in _FAVOURITES else len(_FAVOURITES)
 
 
-def _start_deg(compared: Compared) -> float:
+def _start_deg(compared: ComparedRun) -> float:
     """Largest error of the run's prior, azimuth or elevation of any pair."""
     return float(np.degrees(max(e[:2].max() for e in compared.comparison.prior_errors.values())))
 

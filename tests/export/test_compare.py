@@ -9,8 +9,9 @@ import pytest
 from jobs.cli import main
 from pipeline.export.calibration import ExportedPair
 from pipeline.export.compare import Side, compare, composed
+from pipeline.extrinsics.differences import PairDifference
 from pipeline.geometry.se3 import exp_se3, exp_so3
-from pipeline.report.comparison import PairView, comparison_page
+from pipeline.report.comparison import comparison_page
 from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
@@ -151,7 +152,7 @@ def test_what_cannot_be_compared_is_a_usage_error(lake, capsys, arguments, words
 
 
 def test_the_page_escapes_names_and_says_when_nobody_states_a_sigma():
-    view = PairView(
+    view = PairDifference(
         EDGE_OF_PAIR["camera_lidar"], ("given", "given"), np.zeros(6), None, np.ones(6, bool), np.zeros(2)
     )
     page = comparison_page("<b>a</b>", "b & c", [view], ["a < b"])
