@@ -18,17 +18,15 @@ def jpeg_uri(image_bgr: UInt8[np.ndarray, "H W 3"], width_px: int | None = None)
     if width_px is not None and image_bgr.shape[1] > width_px:
         height = round(image_bgr.shape[0] * width_px / image_bgr.shape[1])
         image_bgr = cv2.resize(image_bgr, (width_px, height), interpolation=cv2.INTER_AREA)
-    done, data = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    assert done, "OpenCV encodes every uint8 image"
-    return _uri("image/jpeg", data.tobytes())
+    return _uri("jpeg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
 
 
 def png_uri(image_bgr: UInt8[np.ndarray, "H W 3"]) -> str:
     """A bitmap with sharp dots."""
-    done, data = cv2.imencode(".png", image_bgr, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    return _uri("png", image_bgr, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+
+
+def _uri(kind: str, image_bgr: UInt8[np.ndarray, "H W 3"], options: list[int]) -> str:
+    done, data = cv2.imencode(f".{kind}", image_bgr, options)
     assert done, "OpenCV encodes every uint8 image"
-    return _uri("image/png", data.tobytes())
-
-
-def _uri(kind: str, data: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"

@@ -184,7 +184,6 @@ def read_latest(
     *,
     first: str,
     last: str | None = None,
-    vehicle: str | AbstractSet[str] | None = None,
     columns: Sequence[str] | None = None,
 ) -> list[Row]:
     """Records of the last day that each vehicle and method has any of, in order as `read_records` gives them.
@@ -197,10 +196,9 @@ def read_latest(
         row_type: its dataclass.
         first: days before this one are not looked at.
         last: nor are days after this one.
-        vehicle: only this vehicle's, or only these'.
         columns: see `read_records`.
     """
-    keys = _rows_of(lake, schema, ["vehicle", "method", "day"], _wanted(vehicle, first, last))
+    keys = _rows_of(lake, schema, ["vehicle", "method", "day"], _wanted(None, first, last))
     if keys is None:
         return []
     latest = keys.group_by(["vehicle", "method"]).aggregate([("day", "max")])
@@ -210,7 +208,7 @@ def read_latest(
     }
     found: list[Any] = []
     for day in sorted(set(day_of.values())):
-        of_day: list[Any] = read_records(lake, schema, row_type, vehicle=vehicle, day=day, columns=columns)
+        of_day: list[Any] = read_records(lake, schema, row_type, day=day, columns=columns)
         found += [row for row in of_day if day_of[row.vehicle, row.method] == day]
     return sorted(found, key=lambda row: row.vehicle)
 
