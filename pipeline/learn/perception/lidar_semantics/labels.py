@@ -14,6 +14,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import transform_points
+from pipeline.objective.paper.classes import labels_of
 from schemas.observations import Observation
 
 __all__ = ["GROUND", "KINDS", "KIND_OF_LABEL", "LABELS", "UNLABELLED", "project_labels"]
@@ -52,8 +53,7 @@ def project_labels(
         T_camera_lidar: the current calibration, never a truth.
         xyz_m: finite points.
     """
-    png = np.frombuffer(observation.labels_png, np.uint8)
-    image = np.asarray(cv2.imdecode(png, cv2.IMREAD_GRAYSCALE), np.uint8)
+    image = labels_of(observation)
     camera = camera_of(observation).scaled(observation.label_scale)
     half = max(1, round(np.radians(_MARGIN_DEG) * camera.focal_px[0]))
     window = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
