@@ -26,6 +26,8 @@ __all__ = [
     "DAY_CENTRE_SIGMAS",
     "DAY_FOCAL_FLOOR",
     "DAY_FOCAL_SIGMAS",
+    "EDGE_SIDE_ALIKE",
+    "EDGE_SIDE_APART",
     "EDGE_SIDE_MOST_OF_GAP",
     "EDGE_SIDE_MOST_PX",
     "FOCAL_SIGMA",
@@ -59,8 +61,11 @@ CAMERA_LIDAR_BIAS = np.array([np.radians(0.03)] * 3 + [0.01, 0.006, 0.01])
 CAMERA_LIDAR_DT_FLOOR_S = 0.004
 # How far boundaries of one side (left, right, feet, tops) lie beside its jumps: labels are too wide, and edges anywhere
 # between two beams. At most, on 34 good days of thirteen rigs: one label pixel and .4 of the angle between beams; what
-# the witnesses of one day are asked with. Half of that is a sigma.
+# the witnesses of one day are asked with.
 EDGE_SIDE_MOST_PX, EDGE_SIDE_MOST_OF_GAP = 1.0, 0.4
+# Of that one sigma of what near and far edges of a side have in common, and of what they lie apart from their mean: at
+# the true pose of six cameras on two days (seeds 701, 702) .6 to .9 of 1.1 px left and right, 1 of 2.2 feet and tops.
+EDGE_SIDE_ALIKE, EDGE_SIDE_APART = 0.2, 0.6
 # Relative sigma of the logged focal length. The solver leaves the focal length free within it, so that the position
 # along the optical axis is no surer than the intrinsics.
 FOCAL_SIGMA = CameraPrior.focal_sigma

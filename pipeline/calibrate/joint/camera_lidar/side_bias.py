@@ -16,7 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
-from pipeline.calibrate.numerics.bias_floors import EDGE_SIDE_MOST_OF_GAP, EDGE_SIDE_MOST_PX
+from pipeline.calibrate.numerics.bias_floors import (
+    EDGE_SIDE_ALIKE,
+    EDGE_SIDE_APART,
+    EDGE_SIDE_MOST_OF_GAP,
+    EDGE_SIDE_MOST_PX,
+)
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
@@ -24,12 +29,8 @@ from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
 __all__ = ["most_offset_rad", "side_biases"]
 
-_AXIS = {
-    EDGE_LEFT: 0,
-    EDGE_RIGHT: 0,
-    EDGE_ABOVE: 1,
-    EDGE_BELOW: 1,
-}  # of the image, across a side's boundaries
+# Of the image, across a side's boundaries.
+_AXIS = {EDGE_LEFT: 0, EDGE_RIGHT: 0, EDGE_ABOVE: 1, EDGE_BELOW: 1}
 
 
 def side_biases(
@@ -39,7 +40,7 @@ def side_biases(
     curvature: Float[np.ndarray, "8 8"],
     fixed: Bool[np.ndarray, " 8"],
 ) -> Float[np.ndarray, "_ 8"]:
-    """How far each group's own offset, half of what it is at most, moves the solution (coordinates of `changed`).
+    """How far one sigma of each side's offset, near and far alike and apart, moves the solution (as `changed` has it).
 
     Args:
         terms: points, of which edges count.
@@ -52,18 +53,28 @@ def side_biases(
     to_left[:6, :6] = np.linalg.inv(change_jacobian(state.T_camera_lidar))
     only_edges, free = replace(kernel, marking_weight=0.0), ~fixed
     out = []
-    for edges, axis in _groups(terms.edges):
-        focal_px = float(terms.camera[1])
-        off_px = most_offset_rad(edges, 1 / focal_px) * focal_px / 2
-        # Boundaries that lie elsewhere pull like a principal point that does.
-        there, back = (
-            _seen_off(replace(terms, edges=edges), axis, sign * off_px).gradient(state.alone, only_edges)[0]
-            for sign in (1, -1)
+    for near, far, axis in _sides(terms.edges):
+        by_near, by_far = (
+            to_left.T @ _pull(replace(terms, edges=edges), state, only_edges, axis) for edges in (near, far)
         )
-        row, pull = np.zeros(8), to_left.T @ (there - back).sum(0) / 2
-        row[free] = np.linalg.solve(curvature[np.ix_(free, free)], pull[free])
-        out.append(row)
+        for pull in (EDGE_SIDE_ALIKE * (by_near + by_far), EDGE_SIDE_APART * (by_near - by_far)):
+            row = np.zeros(8)
+            row[free] = np.linalg.solve(curvature[np.ix_(free, free)], pull[free])
+            out.append(row)
     return np.array(out).reshape(-1, 8)
+
+
+def _pull(terms: Terms, state: AlignmentState, kernel: KernelSettings, axis: int) -> Float[np.ndarray, " 8"]:
+    """Gradient by boundaries that lie as far aside as they ever do: they pull like a principal point that does.
+
+    Read off at half of that to both sides: of those far beside their jumps only chance is left.
+    """
+    focal_px = float(terms.camera[1])
+    half_px = most_offset_rad(terms.edges, 1 / focal_px) * focal_px / 2
+    there, back = (
+        _seen_off(terms, axis, sign * half_px).gradient(state.alone, kernel)[0].sum(0) for sign in (1, -1)
+    )
+    return np.asarray(there - back)
 
 
 def most_offset_rad(edges: Points, px_rad: float) -> float:
@@ -71,15 +82,14 @@ def most_offset_rad(edges: Points, px_rad: float) -> float:
     return float(np.hypot(EDGE_SIDE_MOST_PX * px_rad, EDGE_SIDE_MOST_OF_GAP * np.median(edges.gap_rad)))
 
 
-def _groups(edges: Points) -> Iterator[tuple[Points, int]]:
+def _sides(edges: Points) -> Iterator[tuple[Points, Points, int]]:
     """Edges of each side, near ones and far ones, and the image's axis across which their boundaries lie."""
     range_m = np.linalg.norm(edges.xyz_m, axis=1)
-    is_near = range_m < np.median(range_m) if len(range_m) else np.zeros(0, bool)
     for side, axis in _AXIS.items():
-        for part in (is_near, ~is_near):
-            some = edges.chosen((edges.side == side) & part)
-            if len(some.xyz_m):
-                yield some, axis
+        mine = edges.side == side
+        is_near = mine & (range_m < np.median(range_m[mine])) if mine.any() else mine
+        if is_near.any():
+            yield edges.chosen(is_near), edges.chosen(mine & ~is_near), axis
 
 
 def _seen_off(terms: Terms, axis: int, off_px: float) -> Terms:
