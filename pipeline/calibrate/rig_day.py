@@ -25,19 +25,27 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.checks import FailedCheck, faults_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.extrinsics.prior import no_prior, trio_prior
+from pipeline.objective.ego_motion import mean_heading, shown_heading
 from pipeline.results import Progress
 from pipeline.rig.evidence import EdgeEvidence
-from pipeline.rig.graph import Edge, RigGraph
+from pipeline.rig.graph import BASE, Edge, RigGraph
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import View
+from pipeline.store.current import transform_of
 from pipeline.store.views import Chosen
 from schemas.calibrations import SENSORS, CalibrationRecord
 from schemas.observations import Observation
 
 __all__ = ["CalibratedRig", "RigDay", "calibrate_rig"]
 
+# Camera-lidar needs the car's way in the lidar's axes, which the other edges of the lidar show.
+_ORDER = ("lidar_base", "radar_base", "lidar_lidar", "lidar_radar", "camera_lidar", "camera_radar")
 PAIR_KINDS = ("camera_lidar", "camera_radar", "lidar_radar")  # estimated as pairs of three kinds of sensors
+
+
+# By lidar, azimuths in its axes in which the car drives straight on, with sigmas [rad].
+Headings = Mapping[str, Sequence[tuple[float, float]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +68,22 @@ class RigDay:
     rows: Callable[[Chosen], list[Observation]]
     before: Callable[[Edge], Float[np.ndarray, "4 4"] | None] = lambda _: None
 
-    def prior_of(self, chosen: Chosen, edges: Sequence[Edge]) -> Prior:
-        """Of up to one camera, one lidar and one radar."""
+    def prior_of(self, chosen: Chosen, edges: Sequence[Edge], headings: Headings) -> Prior:
+        """Of up to one camera, one lidar and one radar, where the car is known to drive in the lidar's axes."""
         prior = trio_prior(self.prior, self.rig, *(chosen.get(kind) for kind in SENSORS))
         at = next((e for e in edges if e.kind == "camera_lidar"), None)
-        return replace(prior, T_camera_lidar_before=None if at is None else self.before(at))
+        if at is None:
+            return prior
+        heading = mean_heading(self._mounted(at.child.name, headings))
+        return replace(prior, T_camera_lidar_before=self.before(at), heading=heading)
+
+    def _mounted(self, lidar: str, headings: Headings) -> Sequence[tuple[float, float]]:
+        """Headings in a lidar's axes; by its mounting on the vehicle frame where the day shows none."""
+        found = headings.get(lidar, [])
+        T = self.prior.between(lidar, BASE.name) if BASE in self.graph.sensors else None
+        if found or T is None:
+            return found
+        return [(_azimuth(T), self.prior.sigmas_between(lidar, BASE.name)[0])]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +113,7 @@ def calibrate_rig(day: RigDay, fleet: FleetConfig, about: Inputs, progress: Prog
     measured = day.rig.road_z_m, day.rig.measured_heights
     others = BaseEdges(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows, *measured)
     found, done = _Found(), 0
-    for group in _groups(day.graph):
+    for group in sorted(_groups(day.graph), key=lambda g: _ORDER.index(g[0].kind)):
         progress(done, len(day.graph.edges) + 1, f"calibrate {', '.join(edge.name for edge in group)}")
         done += len(group)
         if len(group) == 1 and day.prior.between(*(s.name for s in group[0].sensors)) is None:
@@ -133,6 +152,7 @@ class _Found:
     evidence: list[EdgeEvidence] = field(default_factory=list)
     clocks: dict[Edge, float] = field(default_factory=dict)
     estimates: dict[Edge, PairEstimate] = field(default_factory=dict)
+    headings: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     together: list[tuple[Inputs, DayOfPairs, Mapping[str, Edge]]] = field(default_factory=list)
 
 
@@ -151,7 +171,7 @@ def _solve_pairs(
     chosen: Chosen = {sensor.kind: sensor.name for edge in group for sensor in edge.sensors}
     absent: dict[str, str] = {kind: about.absent[n] for kind, n in chosen.items() if n in about.absent}
     about = replace(about, pairs=tuple(edge.kind for edge in group), chosen=chosen, absent=absent)
-    rows, prior = day.rows(chosen), day.prior_of(chosen, group)
+    rows, prior = day.rows(chosen), day.prior_of(chosen, group, found.headings)
     try:
         solved = solve_day(rows, prior, fleet, about)
     except SolveError as err:
@@ -166,8 +186,20 @@ def _solve_pairs(
     found.estimates.update({edges[pair]: e for pair, e in solved.solved.solution.pairs.items()})
     if len(group) > 1:
         found.together.append((about, solved, edges))
-    else:
-        found.records.extend(records_of(about, solved))
+        return
+    found.records.extend(records_of(about, solved))
+    _add_heading(group[0], rows, found)
+
+
+def _add_heading(edge: Edge, rows: Sequence[Observation], found: _Found) -> None:
+    """What a radar's Doppler shows of the car's way in a lidar's axes, once the radar's turn in them is known."""
+    estimate, evidence = found.estimates[edge], found.evidence[-1]
+    if edge.kind != "lidar_radar" or evidence.checks or not estimate.observable[2]:
+        return
+    heading = shown_heading(rows, estimate.T)
+    if heading is not None:
+        sigma_rad = float(np.sqrt(estimate.covariance[2, 2]))
+        found.headings.setdefault(edge.parent.name, []).append((heading, sigma_rad))
 
 
 def _solve_other(
@@ -179,8 +211,18 @@ def _solve_other(
     except SolveError as err:
         found.records.append(refused_edge(about, edge, err.reason, 0, err.fault))
         return
-    found.records.append(record_of_evidence(about, shown, day.prior, day.views, fleet, frames))
+    record = record_of_evidence(about, shown, day.prior, day.views, fleet, frames)
+    found.records.append(record)
     found.evidence.append(shown)
+    if edge.kind == "lidar_base" and not shown.checks and record.covariance is not None:
+        T, sigma_rad = transform_of(record), float(np.sqrt(record.covariance[2, 2]))
+        assert T is not None
+        found.headings.setdefault(edge.parent.name, []).append((_azimuth(T), sigma_rad))
+
+
+def _azimuth(T_lidar_base: Float[np.ndarray, "4 4"]) -> float:
+    """Of the vehicle frame's x axis [rad]."""
+    return float(np.arctan2(T_lidar_base[1, 0], T_lidar_base[0, 0]))
 
 
 def _without_moved(record: CalibrationRecord, moved: Sequence[FailedCheck]) -> CalibrationRecord:

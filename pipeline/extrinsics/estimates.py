@@ -29,6 +29,8 @@ class Prior:
     # What an earlier day found, where one was accepted: a place to look at, no information.
     T_camera_lidar_before: np.ndarray | None = None
     camera: CameraPrior = field(default_factory=CameraPrior)
+    # Azimuth of the car's way in lidar axes and its sigma [rad], where more than the day's radar shows it.
+    heading: tuple[float, float] | None = None
     T_camera_radar_alone: np.ndarray | None = None  # of a rig, or a day, without a lidar
 
     @property

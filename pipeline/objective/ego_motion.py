@@ -13,6 +13,7 @@ Source: Kellner et al. 2014, "Instantaneous ego-motion estimation using multiple
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -29,7 +30,9 @@ __all__ = [
     "contradicting",
     "ego_motion",
     "is_same",
+    "mean_heading",
     "motion_of",
+    "shown_heading",
 ]
 
 # Speeds are the same within these. On 10 good days of seven rigs, the real car's too, odometry and lidar agreed in 89 %
@@ -37,7 +40,7 @@ __all__ = [
 # ambiguous), odometry and Doppler in 97 %; where one was wrong, in 17, 17 and 40 % at most.
 _SAME_MPS, _SAME_SHARE = 0.5, 0.2
 _MET, _AGREED = 0.4, 0.5
-_MOVING_MPS, _FEWEST = 3.0, 6
+_MOVING_MPS, _FEWEST, _FEWEST_FRAMES = 3.0, 6, 5
 _LEAST_SIGMA_MPS = 0.03  # Doppler's steps, a wheel's ticks
 _ODOMETRY_SIGMAS = (0.1, 0.003)  # of speed [m/s] and yaw rate [rad/s] where nothing else shows their scatter
 _ASIDE_SIGMA_MPS = 0.05  # slip of the rear axle, and a base that sways: .015 on 8 simulated days
@@ -171,6 +174,35 @@ def _fused(
             H, g = H + more[0], g + more[1]
         u = np.linalg.solve(H, g[..., None])[..., 0]
     return u, H
+
+
+def shown_heading(
+    observations: Sequence[Observation], T_base_radar: Float[np.ndarray, "4 4"]
+) -> float | None:
+    """Azimuth of the car's way in axes of the base, as a radar's Doppler shows it; None where it does not.
+
+    A single frame's is noisier than it varies, and the radar's vertical velocity is no measurement. Which way along it
+    is the speed's sign: the base's x axis points ahead, and a Doppler's sign may be wrong.
+    """
+    moving = [
+        o.radar_velocity_mps
+        for o in observations
+        if o.radar_velocity_mps is not None and (o.ego_speed_mps or 0.0) > _MOVING_MPS
+    ]
+    if len(moving) < _FEWEST_FRAMES or not np.isfinite(T_base_radar).all():
+        return None
+    v = np.stack(moving) @ T_base_radar[:3, :3].T
+    ahead = np.where(v[:, 0] < 0, -1.0, 1.0)
+    return float(np.median(np.arctan2(ahead * v[:, 1], ahead * v[:, 0])))
+
+
+def mean_heading(headings: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
+    """Weighted mean of azimuths with sigmas [rad]; None of none."""
+    if not headings:
+        return None
+    first = headings[0][0]
+    apart, sigma = _mean([math.remainder(a - first, math.tau) for a, _ in headings], [s for _, s in headings])
+    return first + apart, sigma
 
 
 def contradicting(speeds_mps: Mapping[str, Float[np.ndarray, " F"]]) -> dict[str, str]:

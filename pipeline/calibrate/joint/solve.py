@@ -25,6 +25,7 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import compose_covariance, inverse, log_so3
+from pipeline.objective.ego_motion import mean_heading, shown_heading
 from pipeline.results import Progress, silent
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
@@ -92,9 +93,8 @@ def _solved(
     if pair == "camera_radar":
         return estimate_camera_radar(observations, prior, config, rng), []
     aligned = align_camera_lidar(observations, prior, config, rng)
-    found = analyse_camera_lidar(
-        aligned, np.random.default_rng([seed, 3]), heading=_heading(before.get("lidar_radar"))
-    )
+    heading = _heading(observations, before.get("lidar_radar"), prior)
+    found = analyse_camera_lidar(aligned, np.random.default_rng([seed, 3]), heading=heading)
     found = replace(found, disproved=unvouched_basin(aligned.basin))
     # Of a basin that is lost, nobody knows what its intrinsics are worth.
     told = [] if found.disproved else contradictions(aligned.intrinsics, prior.camera)
@@ -126,8 +126,12 @@ def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfi
     return prior, config
 
 
-def _heading(lidar_radar: _Found | None) -> tuple[np.ndarray, float] | None:
-    """Radar pose and sigma of its yaw [rad], which give the car's heading in lidar axes; None where yaw is unknown."""
+def _heading(
+    observations: Sequence[Observation], lidar_radar: _Found | None, prior: Prior
+) -> tuple[float, float] | None:
+    """The car's way in lidar axes, as surely as the radar's own turn is known; else what the prior says of it."""
     if lidar_radar is None or lidar_radar[1] or not lidar_radar[0].observable[2]:
-        return None
-    return lidar_radar[0].T, float(np.sqrt(lidar_radar[0].covariance[2, 2]))
+        return prior.heading
+    shown = shown_heading(observations, lidar_radar[0].T)
+    own = [] if shown is None else [(shown, float(np.sqrt(lidar_radar[0].covariance[2, 2])))]
+    return mean_heading([*own, *([] if prior.heading is None else [prior.heading])])

@@ -100,7 +100,8 @@ def _camera_lidar(
     estimate: PairEstimate, observations: Sequence[Observation], prior: Prior
 ) -> tuple[_FrameCosts, FrameDerivatives, float]:
     apart = rotation_angle_rad(estimate.T @ np.linalg.inv(prior.T_camera_lidar))
-    velocity = lidar_velocities(observations, prior.T_lidar_radar)
+    heading_rad = None if prior.heading is None else prior.heading[0]
+    velocity = lidar_velocities(observations, prior.T_lidar_radar, heading_rad)
     reach = float(apart) + _REACH_RAD
     readout_s = prior.camera.readout_s
     terms = prepare_terms(observations, estimate.T, velocity, reach_rad=reach, readout_s=readout_s)

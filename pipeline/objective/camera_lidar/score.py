@@ -37,6 +37,7 @@ from pipeline.objective.camera_lidar.points import (
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, count_in_view
 from pipeline.objective.camera_lidar.reflectivity import marking_gradients, marking_scores
 from pipeline.objective.camera_lidar.rolling_shutter import exposed
+from pipeline.objective.ego_motion import shown_heading
 from pipeline.objective.stamp_gaps import camera_gaps_s
 from schemas.observations import Observation
 
@@ -313,25 +314,19 @@ def _weights(markings: Points, settings: KernelSettings) -> np.ndarray:
 
 
 def lidar_velocities(
-    observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]
+    observations: Sequence[Observation],
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    heading_rad: float | None = None,
 ) -> Float[np.ndarray, "F 3"]:
-    """Own velocity in lidar axes [m/s]: the speed along the heading that the radar's Doppler shows (0 where unknown).
+    """Own velocity in lidar axes [m/s]: the speed along one heading of the day, in the horizontal plane.
 
-    One heading for the day, in the horizontal plane: the mount's yaw; the lidar's x axis where no radar tells. A
-    single frame's heading is noisier than it varies, and the radar's vertical velocity is no measurement. Which way
-    along it is the speed's sign: the lidar's x axis points ahead, and a Doppler's sign may be wrong.
+    Args:
+        observations: whose speeds are taken, 0 where unknown.
+        T_lidar_radar: turns the radar's Doppler into the heading; where no radar shows it, it is the lidar's x axis.
+        heading_rad: azimuth of the heading where it is known otherwise.
     """
     speed = np.array([o.ego_speed_mps if o.ego_speed_mps is not None else 0.0 for o in observations])
-    moving = [
-        o.radar_velocity_mps
-        for o in observations
-        if o.radar_velocity_mps is not None and (o.ego_speed_mps or 0.0) > 3.0
-    ]
-    heading = 0.0
-    if len(moving) >= 5 and np.isfinite(T_lidar_radar).all():
-        v = np.stack(moving) @ T_lidar_radar[:3, :3].T
-        ahead = np.where(v[:, 0] < 0, -1.0, 1.0)
-        heading = float(np.median(np.arctan2(ahead * v[:, 1], ahead * v[:, 0])))
+    heading = (shown_heading(observations, T_lidar_radar) or 0.0) if heading_rad is None else heading_rad
     return speed[:, None] * np.array([np.cos(heading), np.sin(heading), 0.0])
 
 

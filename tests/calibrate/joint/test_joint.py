@@ -12,6 +12,7 @@ from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.se3 import exp_se3, log_se3, perturb_exactly
+from pipeline.objective.ego_motion import mean_heading, shown_heading
 from schemas.calibrations import PAIRS
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
@@ -60,7 +61,7 @@ def test_pairs_that_cannot_be_solved_keep_the_prior_and_fail_a_check():
     assert not solution.failed_checks.get("camera_radar")  # another pair's failure is none of its own
 
 
-def solved_with_camera(monkeypatch, day, vouched_by):
+def solved_with_camera(monkeypatch, day, vouched_by, prior=PRIOR):
     """The solution of a day whose camera-lidar is put in its place: at the truth, sure, and so vouched for."""
     basin = Basin(AlignmentState(T_CAMERA_LIDAR), None, "prior", 4, vouched_by, float(np.radians(2.6)), 0.1)
     aligned = object.__new__(Aligned)  # without the terms and frames that nothing here looks at
@@ -75,7 +76,7 @@ def solved_with_camera(monkeypatch, day, vouched_by):
         return estimate("camera_lidar", T_CAMERA_LIDAR)
 
     monkeypatch.setattr("pipeline.calibrate.joint.solve.analyse_camera_lidar", analysed)
-    return solve_joint(dict.fromkeys(PAIRS, day), PRIOR, SolveConfig(), seed=0), headings
+    return solve_joint(dict.fromkeys(PAIRS, day), prior, SolveConfig(), seed=0), headings
 
 
 def test_a_basin_that_no_other_origin_leads_to_disproves_its_own_pair_alone(monkeypatch):
@@ -93,9 +94,10 @@ def test_boxes_count_once_and_the_radar_s_turn_gives_the_heading(monkeypatch):
     found, headings = solved_with_camera(monkeypatch, street_day(12), ("evolution",))
     assert found.pairs["lidar_radar"].diagnostics["boxes"] == 0
     assert found.pairs["camera_radar"].diagnostics["boxes"] > 0
-    T_lidar_radar, sigma_rad = headings[-1]
-    assert np.array_equal(T_lidar_radar, found.pairs["lidar_radar"].T)
-    assert 0 < sigma_rad < np.radians(0.5)
+    heading_rad, sigma_rad = headings[-1]
+    turned = found.pairs["lidar_radar"]
+    assert heading_rad == pytest.approx(shown_heading(street_day(12), turned.T))
+    assert sigma_rad == pytest.approx(np.sqrt(turned.covariance[2, 2]))
 
 
 def test_an_untriggered_camera_lidar_stays_at_the_prior_and_its_boxes_are_not_trusted():
@@ -114,3 +116,11 @@ def test_an_untriggered_camera_lidar_stays_at_the_prior_and_its_boxes_are_not_tr
     error = log_se3(solution.pairs["lidar_radar"].T @ np.linalg.inv(T_LIDAR_RADAR))
     assert abs(error[2]) < np.radians(0.15)
     assert told[-1][0] == told[-1][1]
+
+
+def test_the_way_that_something_else_shows_counts_by_its_sigma(monkeypatch):
+    day = street_day(12)
+    known = replace(PRIOR, heading=(np.radians(1.0), 1e-6))
+    _, headings = solved_with_camera(monkeypatch, day, ("evolution",), known)
+    assert headings[-1] == pytest.approx(known.heading, rel=1e-3)
+    assert mean_heading([(np.pi - 0.01, 0.1), (0.01 - np.pi, 0.1)])[0] == pytest.approx(np.pi)

@@ -144,8 +144,9 @@ def align_camera_lidar(
     used, rejected = _usable(observations)
     heading_sigma = HEADING_SIGMA_RAD
     if velocity_lidar is None:
-        velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar)
-        heading_sigma = float(np.hypot(heading_sigma, prior.rotation_sigma_rad))
+        heading_rad, sigma_rad = prior.heading or (None, prior.rotation_sigma_rad)
+        velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar, heading_rad)
+        heading_sigma = float(np.hypot(heading_sigma, sigma_rad))
     if len(used) < _FEWEST_FRAMES:
         raise SolveError(f"camera-lidar needs {_FEWEST_FRAMES} frames of one camera, the day has {len(used)}")
     frames = [observations[i] for i in used]
@@ -191,19 +192,19 @@ def analyse_camera_lidar(
     aligned: Aligned,
     rng: np.random.Generator,
     *,
-    heading: tuple[Float[np.ndarray, "4 4"], float] | None = None,
+    heading: tuple[float, float] | None = None,
 ) -> PairEstimate:
     """The estimate: tz, the time offset, what the day determines and how surely.
 
     Args:
         aligned: where to begin.
         rng: of the chance densities and the points of the time offset's profile.
-        heading: T_lidar_radar that turns the radar's Doppler velocities into lidar axes, and its sigma of yaw [rad];
-            by default the velocities stay those of `aligned`.
+        heading: azimuth of the car's way in lidar axes, and its sigma [rad]; by default the velocities stay those of
+            `aligned`.
     """
     problem = aligned.problem
     if heading is not None:
-        velocity = lidar_velocities(aligned.frames, heading[0])
+        velocity = lidar_velocities(aligned.frames, problem.prior.T_lidar_radar, heading[0])
         sigma = float(np.hypot(HEADING_SIGMA_RAD, heading[1]))
         problem = replace(
             problem,
