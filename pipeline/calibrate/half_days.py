@@ -14,8 +14,6 @@ from schemas.calibrations import PAIRS
 
 __all__ = ["half_days_of"]
 
-_SAME = 1e-9  # rad and m: products of the same poses
-
 
 def half_days_of(
     pair: str, estimates: Mapping[str, PairEstimate], faults: Mapping[str, Sequence[str]]
@@ -38,7 +36,7 @@ def half_days_of(
         back = inverse(estimates["camera_lidar"].T @ estimates["lidar_radar"].T) @ own.T
         poses, sigmas = [a @ b @ back for a, b in zip(T_cl, T_lr, strict=True)], np.hypot(s_cl, s_lr)
     change = np.array([change_between(own.T, T) for T in poses])
-    if np.abs(change).max() < _SAME:
+    if not sigmas.any():
         return None
     # A turn of the parent carries the child's origin along.
     shift = np.where(np.abs(change[:, 3:]).max() > 0, sigmas.max(axis=1) * np.linalg.norm(own.T[:3, 3]), 0.0)
