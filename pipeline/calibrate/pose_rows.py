@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustedSensor
-from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.records import Inputs, transform_fields
 from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.config import VerifyConfig
 from pipeline.extrinsics.checks import faults_of
-from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.spherical import from_spherical
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.extrinsics import Extrinsics
@@ -89,7 +88,7 @@ def _row(
         "view_azimuth_rad": None if sensor.name not in views else _azimuth_seen(views[sensor.name], sensor),
     }
     if sensor == graph.reference:
-        where = _transform(np.eye(4)) | {
+        where = transform_fields("", np.eye(4)) | {
             "covariance": np.zeros((6, 6)),
             "common_covariance": np.zeros((6, 6)),
         }
@@ -110,7 +109,7 @@ def _row(
     status, reason = _verdict(sensor, found, claims, determined)
     return PoseRow(
         **told,
-        **_transform(poses.T[sensor.name]),
+        **transform_fields("", poses.T[sensor.name]),
         covariance=poses.covariance_between(reference, sensor.name),
         common_covariance=poses.covariance_between(reference, sensor.name, common=True),
         observability=[float(v) for v in found.observability],
@@ -188,8 +187,3 @@ def _azimuth_seen(view: View, sensor: Sensor) -> float:
     if sensor.kind == "camera":
         points = points @ _OPTICAL
     return float(2 * np.pi * view(points).any(axis=1).mean())
-
-
-def _transform(T: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    return {n: float(v) for n, v in zip(names, (*to_quaternion(T), *T[:3, 3]), strict=True)}

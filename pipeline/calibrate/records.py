@@ -222,13 +222,8 @@ def _parts_numbers(estimate: PairEstimate) -> dict[str, float]:
 
 
 def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
-    if test is None:
-        return {}
-    return {
-        "holdout_frames": float(test.frames),
-        "holdout_blocks": float(test.blocks),
-        "holdout_z": test.z,
-    }
+    frames = {} if test is None else {"frames": float(test.frames), "blocks": float(test.blocks), "z": test.z}
+    return {f"holdout_{name}": value for name, value in frames.items()}
 
 
 def _claim_numbers(judged: Judged) -> dict[str, float]:
