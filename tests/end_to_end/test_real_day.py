@@ -70,8 +70,11 @@ def test_the_radars_elevation_has_witnesses_that_agree_and_a_sigma_of_half_a_deg
     _, records = solved
     record = records["lidar_radar"]
     said = record.diagnostics
-    apart = said["doppler_pitch_offset_rad"] - said["boxes_pitch_offset_rad"]
-    assert abs(apart) <= 2 * np.hypot(said["doppler_pitch_sigma_rad"], said["boxes_pitch_sigma_rad"])
+    apart = said["doppler_pitch_offset_rad"] - said["registration_pitch_offset_rad"]
+    assert abs(apart) <= 2 * np.hypot(said["doppler_pitch_sigma_rad"], said["registration_pitch_sigma_rad"])
     assert said["doppler_frames"] >= 40
+    # The camera's boxes, which have a say in no other pair.
+    assert records["camera_radar"].diagnostics["boxes"] >= 40
+    assert record.loop_rotation_rad <= 3 * record.loop_rotation_sigma_rad
     assert errors["lidar_radar"][1] <= 0.6
     assert record.elevation_sigma_rad <= np.radians(0.5)
