@@ -16,7 +16,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
-from scipy.stats import chi2
 
 from pipeline.audit.days import DOFS, last_level
 from pipeline.audit.estimates import (
@@ -29,8 +28,7 @@ from pipeline.audit.estimates import (
     faults_of,
 )
 from pipeline.audit.service import restart_of, what_was_done
-from pipeline.audit.state import State
-from pipeline.audit.state_rows import fused, pose_columns, with_state
+from pipeline.audit.state_rows import fused_as_they_differ, pose_columns, with_state
 from pipeline.config import VerifyConfig
 from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.edges import edge_order
@@ -38,7 +36,6 @@ from pipeline.rig.graph import Edge, Sensor, is_one_of_each, tie
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_columns
-from schemas.calibrations import DOF_NAMES
 from schemas.drift import DriftFinding
 from schemas.poses import POSES
 from schemas.service_events import ServiceEvent
@@ -47,7 +44,6 @@ from schemas.states import StateRow
 __all__ = ["Poses", "pose_states", "read_poses"]
 
 _OF_POSES = {c.name for c in POSES.columns}
-_BY_CHANCE = 1e-3  # once in a thousand axes, days that differ as they say would be called too far apart
 _NO_VALUE = pa.float64()  # of what records of edges say besides
 
 
@@ -174,7 +170,7 @@ def _row(
     usable = records.is_of(edge) & records.accepted & records.has_estimate & (records.day >= begin)
     own, moved = _since_it_lies_here(records.at(np.flatnonzero(usable)), scale)
     first, why = moved or (first, why)
-    found, wider = _fused(own, scale)
+    found, wider = fused_as_they_differ(own, scale)
     why = "; ".join(text for text in (why, wider) if text)
     row = replace(
         empty, child_frame=sensor.name, sensor=sensor.name, kind=sensor.kind, since=first or None,
@@ -204,26 +200,6 @@ def _since_it_lies_here(
                 f"its days lie elsewhere since {day}, though there are too few yet for a chart",
             )
     return own, None
-
-
-def _fused(own: Estimates, scale: Float[np.ndarray, " 6"]) -> tuple[State | None, str]:
-    """The days as one, as unsure as they differ, and the words where that is more than they say."""
-    found = fused(own, scale)
-    if found is None or len(found.days) < 2:
-        return found, ""
-    kept = own.at(np.flatnonzero([day_name(day) in found.days for day in own.day.tolist()]))
-    [days] = days_of(kept, 1.0).values()
-    weight = np.where(days.observable, 1 / (scale * days.sigma) ** 2, 0.0)
-    total = np.maximum(weight.sum(axis=0), 1e-300)
-    off = days.change - (weight * days.change).sum(axis=0) / total
-    square, freedom = (weight * off**2).sum(axis=0), np.maximum(days.observable.sum(axis=0) - 1, 1)
-    wider = np.where(chi2.sf(square, freedom) < _BY_CHANCE, np.sqrt(square / freedom), 1.0)
-    if (wider == 1.0).all():
-        return found, ""
-    axes = ", ".join(f"{dof} {by:.1f}" for dof, by in zip(DOF_NAMES, wider, strict=True) if by > 1)
-    return fused(
-        kept, scale * wider
-    ), f"its days differ more than they say, so its sigma is wider: {axes} times"
 
 
 def _words(why: str, poses: Poses, of: tuple[str, str], is_none: bool) -> str:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtri
+from scipy.stats import chi2
 
-from pipeline.audit.estimates import Estimates, day_name
+from pipeline.audit.estimates import Estimates, day_name, days_of
 from pipeline.audit.state import DayEstimate, State, fuse
 from pipeline.config import VerifyConfig
 from pipeline.geometry.se3 import to_quaternion
@@ -19,11 +20,12 @@ from pipeline.geometry.targets import DEFAULT_TARGETS
 from schemas.calibrations import DOF_NAMES
 from schemas.states import StateRow
 
-__all__ = ["fused", "pose_columns", "with_state"]
+__all__ = ["fused", "fused_as_they_differ", "pose_columns", "with_state"]
 
 # Of successive accepted days: the most that the charts' budget is proved for. A state promises no more than such days
 # can give.
 _AUTOCORRELATION = 0.6
+_BY_CHANCE = 1e-3  # once in a thousand axes, days that differ as they say would be called too far apart
 _OFTEN = 0.5  # share of a state's days: one day in 300 lies that far from the prior by chance
 
 
@@ -42,6 +44,26 @@ def fused(own: Estimates, scale: Float[np.ndarray, " 6"] | None) -> State | None
         )
     ]  # fmt: skip
     return fuse(days, scale=scale, autocorrelation=_AUTOCORRELATION)
+
+
+def fused_as_they_differ(own: Estimates, scale: Float[np.ndarray, " 6"]) -> tuple[State | None, str]:
+    """Accepted records as one, as unsure as their days differ, and the words where that is more than they say."""
+    found = fused(own, scale)
+    if found is None or len(found.days) < 2:
+        return found, ""
+    kept = own.at(np.flatnonzero([day_name(day) in found.days for day in own.day.tolist()]))
+    [days] = days_of(kept, 1.0).values()
+    weight = np.where(days.observable, 1 / (scale * days.sigma) ** 2, 0.0)
+    total = np.maximum(weight.sum(axis=0), 1e-300)
+    off = days.change - (weight * days.change).sum(axis=0) / total
+    square, freedom = (weight * off**2).sum(axis=0), np.maximum(days.observable.sum(axis=0) - 1, 1)
+    wider = np.where(chi2.sf(square, freedom) < _BY_CHANCE, np.sqrt(square / freedom), 1.0)
+    if (wider == 1.0).all():
+        return found, ""
+    axes = ", ".join(f"{dof} {by:.1f}" for dof, by in zip(DOF_NAMES, wider, strict=True) if by > 1)
+    return fused(
+        kept, scale * wider
+    ), f"its days differ more than they say, so its sigma is wider: {axes} times"
 
 
 def with_state(
