@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,7 @@ def read_calibration(
     )
     from pipeline.rig.edges import words_of
     from pipeline.store.partitions import Lake
+    from schemas.calibrations import PAIRS
     from schemas.versions import CODE_VERSION
     from schemas.words import day_word
 
@@ -65,6 +67,13 @@ def read_calibration(
     )
     poses = pairs_of_poses(lake, vehicle, day, method)
     found = {words_of(edge): pair for edge, pair in poses.items()} or by_edge
+    if by_edge.keys() <= set(
+        PAIRS
+    ):  # of one of each its pairs say what nothing checks, and camera against radar
+        found, poses = (
+            by_edge | {words: _unchecked_as(pair, by_edge.get(words)) for words, pair in found.items()},
+            {},
+        )
     source = f"record of {day}"
     # What has no transform was refused, or of a state is not there.
     word = day_word("refused" if isinstance(p, str) else p.status for p in found.values())
@@ -84,6 +93,13 @@ def read_calibration(
         vehicle, source, method, CODE_VERSION, pairs, None, names, T_base_lidar, without, word,
         known=edges, cameras=cameras,
     )  # fmt: skip
+
+
+def _unchecked_as(pose: ExportedPair | str, pair: ExportedPair | str | None) -> ExportedPair | str:
+    """A pose with the axes that nothing checks, as the record or state of its pair has them."""
+    if isinstance(pose, str) or pair is None or isinstance(pair, str):
+        return pose
+    return replace(pose, unchecked=pair.unchecked)
 
 
 def _listed(value: object) -> list[object]:
@@ -223,8 +239,10 @@ def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: t
 
 def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: str) -> Side:
     from pipeline.export.compare import Side
-    from pipeline.export.lake import choose_pairs, pairs_of_day, pairs_of_state, priors_of_day
+    from pipeline.export.lake import choose_pairs, pairs_of_day, pairs_of_poses, pairs_of_state, priors_of_day
+    from pipeline.rig.edges import words_of
     from pipeline.store.partitions import Lake
+    from schemas.calibrations import PAIRS
 
     owner, at, rest = text.rpartition("@")
     owner = owner if at else (vehicle or "")
@@ -233,12 +251,13 @@ def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: 
         problem = f"{text!r} is no FORMAT:FILE and no .json; a day of a lake needs --lake and --vehicle"
         raise ConfigError("command line", "A, B", problem)
     lake = Lake.existing(location)
-    if day == "state":
-        found = pairs_of_state(lake, owner, named or method)
-    elif named == "prior":
+    by, of_day = named or method, None if day == "state" else day
+    if named == "prior":
         found = priors_of_day(lake, owner, day, method)
     else:
-        found = pairs_of_day(lake, owner, day, named or method)
+        found = pairs_of_state(lake, owner, by) if of_day is None else pairs_of_day(lake, owner, of_day, by)
+        if not found.keys() <= set(PAIRS):  # as `export` writes it
+            found = {words_of(e): p for e, p in pairs_of_poses(lake, owner, of_day, by).items()} or found
     pairs, missing = choose_pairs(found, force=True)
     days = frozenset[str]() if named == "prior" else _days(pairs, day)
     return Side(f"{owner} {rest}", pairs, owner, days, missing)

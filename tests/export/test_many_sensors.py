@@ -333,6 +333,15 @@ def test_a_state_is_exported_as_one_rig_in_every_format_and_what_it_lacks_is_nam
     assert not any("left" in p for p in found)
 
 
+def test_a_state_is_compared_with_the_file_that_was_written_of_it(with_state, tmp_path, capsys):
+    of_van = ("--lake", with_state, "--vehicle", "van")
+    said(capsys, "export", "urdf", "--out", tmp_path / "car.urdf", *of_van)
+    assert main([str(a) for a in ("compare", f"urdf:{tmp_path}/car.urdf", "state", *of_van, "--json")]) == 0
+    found = json.loads(capsys.readouterr().out)["pairs"]
+    assert {p["pair"] for p in found} == {"front-top", "top-bumper", "top-corner"}
+    assert max(abs(axis["change"]) for p in found for axis in p["axes"]) < 1e-9
+
+
 def test_the_state_of_a_rig_is_a_line_per_sensor(with_state, capsys):
     capsys.readouterr()
     assert main(["state", "--lake", str(with_state)]) == 0

@@ -1,6 +1,7 @@
 """Axes that lie far from the prior and that nothing checks: states carry them, exports leave them at the prior."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,21 +9,33 @@ import numpy as np
 import pytest
 
 from jobs.cli import main
+from pipeline.audit.state_rows import pose_columns
 from pipeline.config import FleetConfig
 from pipeline.export.calibration import ExportedPair
 from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import exp_se3
+from pipeline.geometry.se3 import exp_se3, inverse
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
+from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import read_records
 from pipeline.work import Task, Window
-from schemas.calibrations import CALIBRATIONS
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.poses import POSES, PoseRow
 from tests.audit.fleet_records import T_LIDAR_RADAR, vehicle_records
 from tests.makers.calibrations import T_CAMERA_LIDAR
 from tests.makers.lakes import write_frames
 
 FRAME_IDS = {"camera": ["front_optical"], "lidar": ["/top"], "radar": ["radar_front"]}
 ROLLED = {"radar": np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])}  # [rad]
+
+
+def _fleet() -> FleetConfig:
+    semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
+    rig = {"camera": {"image": "/i", "info": "/c", "semantics": semantics}}
+    rig |= {"lidar": {"points": "/p"}, "radar": {"points": "/r"}}
+    fleet = {"fleet": {"name": "test"}, "rigs": {"default": rig}, "vehicles": {"v": {}}}
+    return FleetConfig.model_validate(fleet)
 
 
 @pytest.fixture(scope="module")
@@ -36,11 +49,7 @@ def lake(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rows.append(replace(r, determined=certified, diagnostics=far))
     tables = Lake.at(folder)
     commit_records(tables, CALIBRATIONS, rows)
-    semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
-    rig = {"camera": {"image": "/i", "info": "/c", "semantics": semantics}}
-    rig |= {"lidar": {"points": "/p"}, "radar": {"points": "/r"}}
-    fleet = {"fleet": {"name": "test"}, "rigs": {"default": rig}, "vehicles": {"v": {}}}
-    task = Task(FleetConfig.model_validate(fleet), tables, Window())
+    task = Task(_fleet(), tables, Window())
     AUDIT.run(task)
     STATE.run(task)
     write_frames(tables, Partition("v", "2026-03-06"), [], frame_ids=FRAME_IDS)
@@ -66,6 +75,48 @@ def test_a_state_carries_what_most_of_its_days_call_unchecked(
     assert "sigma from the prior" in words
     assert f"{states['lidar_radar']['T'][0][3]:.3f}" in words
     assert "deg" in words
+
+
+@pytest.fixture(scope="module")
+def adjusted(lake: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same lake with a pose of each sensor beside the records of its pairs."""
+    folder = tmp_path_factory.mktemp("adjusted") / "lake"
+    shutil.copytree(lake, folder)
+    tables = Lake.at(folder)
+    rows = []
+    for record in read_records(tables, CALIBRATIONS, CalibrationRecord):
+        T = transform_of(record)
+        if T is None or record.pair == "camera_radar":
+            continue
+        sensor = "camera" if record.pair == "camera_lidar" else "radar"
+        pose = inverse(T) if sensor == "camera" else T
+        shared = {
+            n: getattr(record, n)
+            for n in ("vehicle", "day", "method", "work_key", "determined", "observable")
+        }
+        shared |= {"reference": "lidar", "status": "accepted", "reason": "", "code_version": "0.11.0"}
+        kept = {"covariance": record.covariance, "common_covariance": 0.1 * record.covariance}
+        rows.append(PoseRow(sensor=sensor, kind=sensor, **shared, **kept, **pose_columns(pose)))
+        if sensor == "camera":
+            at = {"covariance": np.zeros((6, 6)), **pose_columns(np.eye(4))}
+            rows.append(PoseRow(sensor="lidar", kind="lidar", **shared, **at))
+    commit_records(tables, POSES, rows)
+    STATE.run(Task(_fleet(), tables, Window()))
+    return folder
+
+
+@pytest.mark.parametrize("source", [[], ["--day", "2026-03-04"]])
+def test_poses_of_one_of_each_are_written_with_what_their_pairs_call_unchecked(
+    adjusted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], source: list[str]
+) -> None:
+    out = tmp_path / "car.urdf"
+    _, said, err = run(capsys, "export", "urdf", "--lake", adjusted, "--vehicle", "v", *source, "--out", out)
+    side = json.loads(out.with_suffix(".provenance.json").read_text())
+    assert set(side["pairs"]) == {"camera_lidar", "camera_radar", "lidar_radar"}
+    assert json.loads(said.splitlines()[-1])["pairs"] == ["camera_lidar", "lidar_radar"]
+    T = np.array(side["pairs"]["lidar_radar"]["T_lidar_radar"])
+    assert change_between(T_LIDAR_RADAR, T)[0] == pytest.approx(0.0, abs=1e-9)
+    assert "sigma from the prior and nothing checks it" in err
 
 
 @pytest.mark.parametrize("source", [[], ["--day", "2026-03-04"]])
