@@ -9,9 +9,9 @@ from mcap.reader import make_reader
 
 from jobs.cli import main
 from pipeline.geometry.se3 import from_quaternion, inverse, transform_points
+from pipeline.store.commits import commit_records
 from pipeline.store.moments import write_moments
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import commit_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.moments import MOMENTS, PERCEIVED
 from tests.export.test_foxglove import CAMERA, frame, observation
