@@ -114,7 +114,7 @@ def _told(records: Sequence[CalibrationRecord]) -> Told:
     return Told(
         counts,
         dict(records[0].frames_rejected) if records else {},
-        "; ".join(f"{r.pair}: {r.reason}" for r in records if r.reason),
+        "; ".join(dict.fromkeys(f"{r.pair}: {r.reason}" for r in records if r.reason)),
         refused=counts["refused"] == len(records),
         faults=tuple(dict.fromkeys(fault for r in records for fault in r.faults)),
     )

@@ -30,7 +30,8 @@ def test_the_three_that_share_most_are_taken_unless_the_rig_names_others():
 
 def test_three_that_share_nothing_are_refused_in_one_sentence():
     with pytest.raises(
-        SolveError, match=r"^method tracking works on .* share a view: left, top and rr share none$"
+        SolveError,
+        match=r"^method tracking works on .*: left, top and rr share none, name others as three of the rig$",
     ):
         three_sensors("tracking", config(three=["left", "top", "rr"]), overlaps_of(*rig()))
     blind = [s for s in VAN if s[1] != "camera"]
