@@ -87,10 +87,13 @@ def test_a_calibration_costs_no_more_than_the_baseline(measured, fixed):
 
 def test_the_real_radars_elevation_has_witnesses_that_agree(measured):
     [real] = [fixed for fixed in FIXED if fixed.name == "real car"]
-    radar = measured(real)[1]["pairs"]["lidar_radar"]
+    pairs = measured(real)[1]["pairs"]
+    radar, camera = pairs["lidar_radar"], pairs["camera_radar"]
     said = radar["diagnostics"]
-    apart = said["doppler_pitch_offset_rad"] - said["boxes_pitch_offset_rad"]
-    assert abs(apart) <= 2 * np.hypot(said["doppler_pitch_sigma_rad"], said["boxes_pitch_sigma_rad"])
+    apart = said["doppler_pitch_offset_rad"] - said["registration_pitch_offset_rad"]
+    assert abs(apart) <= 2 * np.hypot(said["doppler_pitch_sigma_rad"], said["registration_pitch_sigma_rad"])
+    # The camera's boxes, which have a say in no other pair.
+    assert camera["loop_rotation_rad"] <= 3 * camera["diagnostics"]["loop_rotation_sigma_rad"]
     assert said["doppler_frames"] >= 40
     assert radar["el_deg"] <= 0.6
     assert radar["sigma"][1] <= np.radians(0.5)

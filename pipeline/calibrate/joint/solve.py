@@ -91,7 +91,7 @@ def _solved(
         found = estimate_lidar_radar(observations, prior, None, config, rng)
         return found, lidar_radar_failures(found)
     if pair == "camera_radar":
-        return estimate_camera_radar(observations, prior, config, rng), []
+        return estimate_camera_radar(observations, prior, config, rng, boxes="boxes" in config.terms), []
     aligned = align_camera_lidar(observations, prior, config, rng)
     heading = _heading(observations, before.get("lidar_radar"), prior)
     found = analyse_camera_lidar(aligned, np.random.default_rng([seed, 3]), heading=heading)
