@@ -42,7 +42,7 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
 
 def _camera(calibration: ExportedCalibration, name: str) -> dict[str, Any]:
     camera = needed_camera(calibration, "kalibr", name)
-    model, coefficients = _distortion(camera)
+    model, coefficients = _distortion(name, camera)
     fx, fy = camera.focal_px
     cx, cy = camera.centre_px
     cam: dict[str, Any] = {
@@ -61,13 +61,13 @@ def _camera(calibration: ExportedCalibration, name: str) -> dict[str, Any]:
     return cam
 
 
-def _distortion(camera: Camera) -> tuple[str, list[float]]:
+def _distortion(name: str, camera: Camera) -> tuple[str, list[float]]:
     D = [float(v) for v in camera.D]
     if camera.model == "equidistant":
         return "equidistant", D or [0.0] * 4
     if any(D[_RADTAN:]):
         problem = f"{camera.model} with more than k1 k2 p1 p2 is none of Kalibr's models"
-        raise ConfigError("export kalibr", "distortion", problem)
+        raise ConfigError("export kalibr", f"{name}: distortion", problem)
     return "radtan", [*D[:_RADTAN], *[0.0] * (_RADTAN - len(D))]
 
 
