@@ -13,6 +13,7 @@ from pipeline.calibrate.earlier import accepted_before
 from pipeline.calibrate.edge_records import refused_edge
 from pipeline.calibrate.methods import method_named
 from pipeline.calibrate.pose_rows import pose_rows
+from pipeline.calibrate.prior_doubts import hold_doubted
 from pipeline.calibrate.records import Inputs, refused_records
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
 from pipeline.calibrate.three_sensors import three_sensors
@@ -46,10 +47,8 @@ def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationR
     fleet, rig = task.fleet, task.fleet.rig_of(task.partition.vehicle)
     day = _read(task, rig, about.seed)
     found = calibrate_rig(day, fleet, about, progress)
-    return [
-        *found.records,
-        *pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify, found.judged),
-    ]
+    poses = pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify, found.judged)
+    return [*found.records, *hold_doubted(poses, found.records)]
 
 
 def three_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord]:

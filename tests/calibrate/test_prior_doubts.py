@@ -1,0 +1,62 @@
+"""Edges far from the prior say whose prior is wrong: poses that rest on it are held, others stay."""
+
+import pytest
+
+from pipeline.calibrate.prior_doubts import hold_doubted
+from schemas.calibrations import CalibrationRecord
+from schemas.poses import PoseRow
+
+TOLD = {"vehicle": "v", "day": "2026-03-02", "method": "joint", "work_key": "w", "code_version": "t"}
+
+
+def pose(sensor):
+    return PoseRow(
+        **TOLD,
+        sensor=sensor,
+        kind="radar",
+        reference="top",
+        status="accepted",
+        reason="",
+        determined=["azimuth"],
+    )
+
+
+def against(*names):
+    """Records of edges, each far from its prior."""
+    edges = (name.split("-") for name in names)
+    return [
+        CalibrationRecord(
+            **TOLD,
+            pair="camera_lidar",
+            parent_frame=a,
+            child_frame=b,
+            status="held",
+            reason="tx moved",
+            faults=["prior"],
+            seed=0,
+        )
+        for a, b in edges
+    ]
+
+
+@pytest.mark.parametrize(
+    ("edges", "held"),
+    [
+        ((), []),
+        (("left-top", "top-nose"), ["left", "nose", "rear"]),  # the reference: every pose is told by it
+        (("left-top", "left-nose"), ["left"]),
+        (
+            ("left-top",),
+            ["left"],
+        ),  # one edge alone accuses the sensor, for the whole rig stands by the reference
+        (("left-top", "top-nose", "left-nose"), ["left", "nose"]),
+    ],
+)
+def test_poses_are_held_that_rest_on_a_prior_which_edges_contradict(edges, held):
+    rows = hold_doubted([pose(name) for name in ("top", "left", "nose", "rear")], against(*edges))
+    assert [row.sensor for row in rows if row.status == "held"] == held
+    for row in rows:
+        assert (row.faults, row.determined) == (
+            (["prior"], []) if row.status == "held" else ([], ["azimuth"])
+        )
+        assert row.status != "held" or all(edge in row.reason for edge in edges)
