@@ -10,22 +10,21 @@ from schemas.captures import ImageColumns, ScanColumns, SweepColumns
 from schemas.columns import row
 from schemas.moments import EgoColumns
 
-__all__ = ["Frame"]
+__all__ = ["Frame", "Seen"]
 
 
 @row()
-class Frame(ImageColumns, SweepColumns, ScanColumns, EgoColumns):
-    """A moment as one camera, one lidar and one radar saw it; each may be absent.
+class Seen:
+    """What a moment is, as one camera, one lidar and one radar saw it; each may be absent.
 
     Args:
         frame_index: row of `moments`.
         log: file name of the log that the moment came from.
-        drive: continuous stretch of driving.
+        drive: continuous stretch of driving: the block of the bootstrap.
         sensors: of camera, lidar and radar those that the moment has; of another one arrays and bytes are empty,
             camera_K is NaN and the stamp is the moment's.
         stamp_ns: the sweep's stamp; without one, the moment's.
         camera_stamp_ns: of the image.
-        lidar_stamp_ns: of the sweep; per-point times count from it.
         radar_stamp_ns: of the scan.
         priors: T_parent_child before the day, by pair; camera_radar only where the lidar does not tie the two.
     """
@@ -36,6 +35,12 @@ class Frame(ImageColumns, SweepColumns, ScanColumns, EgoColumns):
     sensors: list[str]
     stamp_ns: int
     camera_stamp_ns: int
-    lidar_stamp_ns: int
     radar_stamp_ns: int
     priors: Mapping[str, np.ndarray]
+
+
+@row()
+class Frame(ImageColumns, SweepColumns, ScanColumns, EgoColumns, Seen):
+    """What the three measured; `lidar_stamp_ns` is the sweep's, from which per-point times count."""
+
+    lidar_stamp_ns: int
