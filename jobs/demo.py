@@ -25,8 +25,8 @@ _NETWORK = "joint-ssl"
 # The radar of the second vehicle is knocked before the third day: 1.2 deg is what a kerb or a car wash does.
 _KNOCK = "vehicle-2:2:radar:yaw:1.2"
 # Vehicles that carry other sensors than the first: the rig `duo` has two cameras and two radars. More edges take more
-# time, and half of the moments give it back.
-_OWN_RIGS: tuple[tuple[str, str], ...] = ()
+# time, and fewer moments give it back.
+_OWN_RIGS = (("vehicle-3", "duo"),)
 _FEWEST = 12
 
 
@@ -46,7 +46,7 @@ def demo(
         out: folder for logs, truth, lake and report; what is up to date there is not made again.
         vehicles: how many; the radar of the second one is knocked.
         days: how many; the knock comes before the third.
-        frames: camera-lidar-radar trios per vehicle and day.
+        frames: moments per vehicle and day; three quarters of it of the third vehicle, which has more sensors.
         workers: processes at a time; default: one per CPU that this process may use.
         seed: another seed is another fleet.
     """
@@ -90,7 +90,13 @@ def _plan(vehicles: int, days: int, frames: int, seed: int) -> tuple[FleetSpec, 
     from pipeline.simulate.fleet import FleetSpec, day_names
 
     base = FleetSpec(
-        vehicles=vehicles, days=days, frames=frames, seed=seed, container="mixed", own_rigs=_OWN_RIGS
+        vehicles=vehicles,
+        days=days,
+        frames=frames,
+        seed=seed,
+        container="mixed",
+        own_rigs=_OWN_RIGS,
+        own_frames=max(frames * 3 // 4, _FEWEST),
     )
     dates = day_names(base.first_day, days)
     knocks = _KNOCK if vehicles > 1 and days > 2 else ""

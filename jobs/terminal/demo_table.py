@@ -61,7 +61,7 @@ def print_methods(
     truth: Truth,
     day: str,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Print a row per method: what its records of one day are off by, on average over vehicles.
+    """Print a row per method: what its records of one day are off by, averaged over vehicles that all were run on.
 
     Azimuth and elevation [deg] and range [m] at the paper's targets, the prior's first.
 
@@ -74,6 +74,8 @@ def print_methods(
     from schemas.calibrations import PAIRS
 
     records = {method: _current(lake, method, day) for method in methods}
+    shared = set.intersection(*({r.vehicle for r in own} for own in records.values()))
+    records = {method: [r for r in own if r.vehicle in shared] for method, own in records.items()}
     table = Table(
         title=f"Mean error by method, {day}: azimuth, elevation \\[deg], range \\[m]",
         title_style="bold",
