@@ -24,7 +24,7 @@ def test_a_sure_prior_alone_certifies_nothing(seen, status):
     poses = Extrinsics(TOP, {"top": np.eye(4), "nose": np.eye(4)}, ("nose",), tight, tight)
     found = AdjustedSensor(np.full(6, float(seen)), np.full(6, seen), (EDGE,), "", (), 0.01)
     graph = RigGraph((TOP, NOSE), (EDGE,), TOP)
-    top, nose = pose_rows(ABOUT, graph, AdjustedRig(poses, tight, {"nose": found}, {}), {}, VerifyConfig())
+    top, nose = pose_rows(ABOUT, graph, AdjustedRig(poses, tight, poses, {"nose": found}, {}), {}, VerifyConfig())
     assert (top.status, nose.status) == ("accepted", status)
     assert seen or "no degree of freedom" in nose.reason
 
@@ -37,7 +37,7 @@ def test_a_sensor_whose_edges_are_all_left_out_says_what_fault_they_name():
         np.zeros(6), np.zeros(6, bool), (), "no edge of it can be used: top-nose", (), 0.01
     )
     edges = {EDGE: AdjustedEdge(evidence, None, checks)}
-    found = AdjustedRig(poses, np.eye(6), {"nose": untied}, edges)
+    found = AdjustedRig(poses, np.eye(6), poses, {"nose": untied}, edges)
     _, nose = pose_rows(ABOUT, RigGraph((TOP, NOSE), (EDGE,), TOP), found, {}, VerifyConfig())
     assert (nose.status, nose.faults) == ("refused", ["moved_in_day"])
     assert nose.reason.endswith("top-nose; the nose moved")

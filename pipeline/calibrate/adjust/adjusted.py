@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.adjust.equations import inverse_of_information
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.geometry.changes import change_jacobian
 from pipeline.rig.evidence import EdgeEvidence
@@ -86,24 +87,38 @@ class AdjustedRig:
     Args:
         poses: with the covariance of all at once.
         of_prior: part of that covariance that is the error of the prior.
+        before: poses as the prior has them.
         sensors: by name, less the reference.
         edges: every edge that had evidence.
     """
 
     poses: Extrinsics
     of_prior: np.ndarray
+    before: Extrinsics
     sensors: Mapping[str, AdjustedSensor]
     edges: Mapping[Edge, AdjustedEdge]
 
     def observability(self, a: str, b: str) -> Float[np.ndarray, " 6"]:
-        """Share of each variance of T_a_b (rotation vector in a's axes, b's origin) that is not the prior's error.
+        """Share of each variance of T_a_b (rotation vector in a's axes, b's origin) that the day has removed.
 
-        1 - posterior/prior where a sensor has one unknown. Counted so, a position that the prior knows given its turn
-        is not called determined because the day found the turn.
+        Of a turn 1 - posterior/prior, the prior being what it is with all other sensors in place: that the reference
+        was found to be turned says nothing of another sensor's own turn. Of a position it is the share of the variance
+        that is not the prior's error: a position that the prior knows given its turn is not determined because the day
+        found the turn. The other way round a turn may be found to a hundredth of the prior and rest on a position.
         """
         J = change_jacobian(self.poses.between(a, b)) @ self.poses.jacobian_between(a, b)
-        share = np.diag(J @ self.of_prior @ J.T) / np.diag(J @ self.poses.covariance @ J.T)
-        return np.clip(1 - share, 0.0, 1.0)
+        variance = np.diag(J @ self.poses.covariance @ J.T)
+        share = 1 - np.diag(J @ self.of_prior @ J.T) / variance
+        share[:3] = 1 - variance[:3] / self._turns_before(a, b)
+        return np.clip(share, 0.0, 1.0)
+
+    def _turns_before(self, a: str, b: str) -> Float[np.ndarray, " 3"]:
+        """Variances of the turn between two sensors by the prior, the others in place [rad^2]."""
+        own = [6 * k + i for k, name in enumerate(self.before.order) if name in (a, b) for i in range(6)]
+        information = inverse_of_information(self.before.covariance)
+        given_others = inverse_of_information(information[np.ix_(own, own)])
+        J = self.before.jacobian_between(a, b)[:3, own]
+        return np.diag(J @ given_others @ J.T)
 
     @property
     def left_out(self) -> tuple[Edge, ...]:

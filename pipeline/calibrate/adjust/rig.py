@@ -165,7 +165,7 @@ def _concluded(
         covariance=C[:n, :n],
         common=common_part(equations.common(C, rig)[:n, :n], C[:n, :n]),
     )
-    found = AdjustedRig(poses, follow @ rig.prior.covariance @ follow.T, {}, edges)
+    found = AdjustedRig(poses, follow @ rig.prior.covariance @ follow.T, rig.prior, {}, edges)
     rests_on = _rests_on(equations, C, len(order))
     clock = np.sqrt(np.diag(C)[n : n + len(order)])
     used = [e.evidence.edge for e in equations.edges]

@@ -262,6 +262,36 @@ def test_x_and_y_to_the_base_stay_at_the_prior_and_the_rest_is_determined():
     assert {e.name for e in found.rests_on} == {"top-base"}
 
 
+def showing(scene, a, b, *directions):
+    """Evidence of an edge that shows nothing but these directions, each a row of seven for one sigma."""
+    rows = np.array(directions)
+    return replace(scene.edge(a, b), information=rows.T @ rows)
+
+
+def test_a_turn_that_is_found_as_well_as_the_position_is_known_is_determined_and_the_position_is_not():
+    scene = Scene(np.random.default_rng(15), "rad0")
+    scene.prior = replace(scene.prior, T={"top": np.eye(4), "rad0": np.eye(4)})
+    # Targets 20 m ahead: a radar that stands 5 cm aside and one that is turned by .14 deg look alike.
+    bearing = np.array([0, 0, 20.0, 0, 1.0, 0, 0]) / 0.005
+    found = scene.adjusted([replace(showing(scene, "top", "rad0", bearing), T=np.eye(4))])
+    of_radar = found.sensors["rad0"]
+    assert 0.1 < np.degrees(np.sqrt(found.poses.covariance_between("top", "rad0")[2, 2])) < 0.2
+    assert of_radar.determined.tolist() == [False, False, True, False, False, False]
+
+
+def test_that_the_reference_was_found_to_be_turned_determines_no_other_sensors_turn():
+    scene = Scene(np.random.default_rng(16), "base", "cam0")
+    mounted = np.tile(np.diag(PRIOR_SIGMA**2), (2, 2))  # the reference's own, which all poses in it share
+    own = np.diag(np.concatenate([np.full(6, 1e-12), PRIOR_SIGMA**2]))
+    scene.prior = replace(
+        scene.prior, covariance=mounted + own, common=mounted + own, T=dict.fromkeys(scene.prior.T, np.eye(4))
+    )
+    edges = [scene.edge("top", "base"), showing(scene, "cam0", "top", np.eye(7)[1] * 1e4)]
+    found = scene.adjusted([replace(e, T=np.eye(4)) for e in edges], innovation_sigmas=1e6)
+    assert found.sensors["base"].determined[:3].all()
+    assert found.sensors["cam0"].determined[:3].tolist() == [False, True, False]
+
+
 def test_a_sensor_rests_on_the_edges_without_which_it_is_less_sure():
     scene = Scene(np.random.default_rng(14), *EIGHT)
     found = scene.adjusted([scene.edge(*e) for e in CLOSED])
