@@ -185,6 +185,8 @@ def _parts(
     turns = np.flatnonzero(~fixed[:3])
     if not len(turns):
         return None
+    # What all frames of a day err by alike comes of where it was driven: the parts were driven elsewhere.
+    of_scenes = analysis.floors[:3, :3] + analysis.bias[:3, :3]
 
     def solve(rows: np.ndarray) -> tuple[RadarState, np.ndarray, np.ndarray]:
         part = about.of_frames(rows)
@@ -193,7 +195,7 @@ def _parts(
         block = blocks_of(part.observations, config.bootstrap_blocks)
         found = bootstrap_covariance(H[:, ~fixed], g, P[~fixed], block, rng)  # turns come first
         spread = np.eye(3) * _ANY_RAD**2
-        spread[np.ix_(turns, turns)] = found[: len(turns), : len(turns)]
+        spread[np.ix_(turns, turns)] = found[: len(turns), : len(turns)] + of_scenes[np.ix_(turns, turns)]
         return state, state.T_lidar_radar, spread
 
     stamps = [problem.observations[k].stamp_ns for k in frames]
