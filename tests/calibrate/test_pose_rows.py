@@ -24,7 +24,9 @@ def test_a_sure_prior_alone_certifies_nothing(seen, status):
     poses = Extrinsics(TOP, {"top": np.eye(4), "nose": np.eye(4)}, ("nose",), tight, tight)
     found = AdjustedSensor(np.full(6, float(seen)), np.full(6, seen), (EDGE,), "", (), 0.01)
     graph = RigGraph((TOP, NOSE), (EDGE,), TOP)
-    top, nose = pose_rows(ABOUT, graph, AdjustedRig(poses, tight, poses, {"nose": found}, {}), {}, VerifyConfig())
+    top, nose = pose_rows(
+        ABOUT, graph, AdjustedRig(poses, tight, poses, {"nose": found}, {}), {}, VerifyConfig()
+    )
     assert (top.status, nose.status) == ("accepted", status)
     assert seen or "no degree of freedom" in nose.reason
 
