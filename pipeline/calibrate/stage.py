@@ -14,6 +14,7 @@ from pipeline.calibrate.rig_stage import refused_edges, rig_rows, three_rows
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.prior import prior_key
 from pipeline.results import Outcome
+from pipeline.rig.edges import edge_of, words_of
 from pipeline.rig.rig import Rig
 from pipeline.store.moments import sensors_of
 from pipeline.store.partitions import Lake, Partition
@@ -114,7 +115,7 @@ def _told(records: Sequence[CalibrationRecord]) -> Told:
     return Told(
         counts,
         dict(records[0].frames_rejected) if records else {},
-        "; ".join(dict.fromkeys(f"{r.pair}: {r.reason}" for r in records if r.reason)),
+        "; ".join(dict.fromkeys(f"{words_of(edge_of(r))}: {r.reason}" for r in records if r.reason)),
         refused=counts["refused"] == len(records),
         faults=tuple(dict.fromkeys(fault for r in records for fault in r.faults)),
     )

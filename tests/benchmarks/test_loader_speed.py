@@ -25,7 +25,7 @@ def lake(tmp_path_factory):
     for vehicle in "ab":
         training_lakes.fill(lake, vehicle, "2026-01-01", DAY_FRAMES)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.store.moments._GROUP_ROWS", 4)  # more groups than a window holds
+        patch.setattr("pipeline.store.tables._GROUP_ROWS", 4)  # more groups than a window holds
         training_lakes.prepare_all(lake, usual_fleet())
     return lake
 

@@ -23,7 +23,7 @@ def lake(tmp_path_factory):
     """Six vehicles, 10 frames each in row groups of 4 (the writer's 16 would leave a group per vehicle)."""
     lake = training_lakes.fleet_lake(tmp_path_factory.mktemp("lake"), VEHICLES, frames=10)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.store.moments._GROUP_ROWS", 4)
+        patch.setattr("pipeline.store.tables._GROUP_ROWS", 4)
         training_lakes.prepare_all(lake, training_lakes.fleet_of(VEHICLES, split_by=["vehicle"]))
     return lake
 
