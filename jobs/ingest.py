@@ -8,7 +8,7 @@ __all__ = ["ingest"]
 
 
 def ingest(*logs: str, fleet: Path, lake: str, vehicle: str, day: str) -> int:
-    """Synchronise camera, lidar and radar of one vehicle-day and keep the trios.
+    """Synchronise camera, lidar and radar of one vehicle-day and keep the moments that they share.
 
     Args:
         logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of that day, in any order; also s3://BUCKET/KEY.

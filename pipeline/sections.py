@@ -42,9 +42,9 @@ MethodName = Annotated[str, AfterValidator(_known_method)]
 class IngestConfig(Section):
     """Synchronisation and what to keep."""
 
-    # Largest difference of a trio's raw stamps, 0.005 in the paper's section 4.5.1. None = by motion: how far the car
-    # may drive and turn between the stamps, beyond the day's constant gaps. Odometry knows that to 2 to 5 %, so these
-    # leave some 10 cm and 0.1 deg, of either sign.
+    # Largest difference of raw stamps within a moment, 0.005 in the paper's section 4.5.1. None = by motion: how far
+    # the car may drive and turn between the stamps, beyond the day's constant gaps. Odometry knows that to 2 to 5 %, so
+    # these leave some 10 cm and 0.1 deg, of either sign.
     sync_gate_s: Positive | None = None
     sync_gate_m: Positive = 2.5  # 45 ms at 55 m/s; 55 ms, the most that 30, 10 and 13 Hz leave, at 45 m/s
     sync_gate_deg: Positive = 2.0  # 55 ms at 36 deg/s

@@ -24,7 +24,7 @@ from pipeline.config import FleetConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.checks import FailedCheck, faults_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.extrinsics.prior import no_prior, trio_prior
+from pipeline.extrinsics.prior import no_prior, prior_of_three
 from pipeline.objective.ego_motion import mean_heading, shown_heading
 from pipeline.results import Progress
 from pipeline.rig.evidence import EdgeEvidence
@@ -70,7 +70,7 @@ class RigDay:
 
     def prior_of(self, chosen: Chosen, edges: Sequence[Edge], headings: Headings) -> Prior:
         """Of up to one camera, one lidar and one radar, where the car is known to drive in the lidar's axes."""
-        prior = trio_prior(self.prior, self.rig, *(chosen.get(kind) for kind in SENSORS))
+        prior = prior_of_three(self.prior, self.rig, *(chosen.get(kind) for kind in SENSORS))
         at = next((e for e in edges if e.kind == "camera_lidar"), None)
         if at is None:
             return prior

@@ -20,7 +20,7 @@ from pipeline.calibrate.three_sensors import three_sensors
 from pipeline.calibrate.verify.seen_targets import views_of
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
-from pipeline.extrinsics.prior import rig_prior, trio_prior
+from pipeline.extrinsics.prior import prior_of_three, rig_prior
 from pipeline.results import Progress
 from pipeline.rig.graph import Edge, edge_between
 from pipeline.rig.overlap import find_edges, overlaps_of
@@ -75,7 +75,7 @@ def three_of_day(task: Task, seed: int) -> tuple[Chosen, Prior]:
     rig = task.fleet.rig_of(task.partition.vehicle)
     prior, views = _known(task, rig, seed)
     chosen: Chosen = three_sensors(task.method or "joint", rig, overlaps_of(prior, views))
-    return chosen, trio_prior(prior, rig, *(chosen.get(kind) for kind in SENSORS))
+    return chosen, prior_of_three(prior, rig, *(chosen.get(kind) for kind in SENSORS))
 
 
 def refused_edges(about: Inputs, rig: Rig, why: str, *faults: str) -> list[CalibrationRecord]:

@@ -24,10 +24,10 @@ __all__ = [
     "no_prior",
     "perturbed",
     "prior_key",
+    "prior_of_three",
     "read_prior",
     "require_named_files",
     "rig_prior",
-    "trio_prior",
 ]
 
 
@@ -41,7 +41,7 @@ def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle:
     rig = fleet.rig_of(vehicle)
     names = _only(rig)
     stars = _carried(observations, [name or kind for name, kind in zip(names, SENSORS, strict=True)])
-    return trio_prior(_prior(lambda: agreed(stars), fleet, rig), rig, *names)
+    return prior_of_three(_prior(lambda: agreed(stars), fleet, rig), rig, *names)
 
 
 def rig_prior(rows: Iterable[Mapping[str, Any]], fleet: FleetConfig, rig: Rig) -> RigPrior:
@@ -70,7 +70,9 @@ def _prior(logged: Callable[[], Star], fleet: FleetConfig, rig: Rig) -> RigPrior
     return RigPrior(rig.nodes, reference, T, sigmas)
 
 
-def trio_prior(prior: RigPrior, rig: Rig, camera: str | None, lidar: str | None, radar: str | None) -> Prior:
+def prior_of_three(
+    prior: RigPrior, rig: Rig, camera: str | None, lidar: str | None, radar: str | None
+) -> Prior:
     """The prior of up to one sensor of each kind, for what thinks in a camera, a lidar and a radar; None = without it.
 
     Its sigmas are those of the transform that is known worst.

@@ -9,7 +9,7 @@ import pytest
 
 from jobs.cli import main
 from pipeline.config import load_fleet
-from pipeline.extrinsics.prior import rig_prior, trio_prior
+from pipeline.extrinsics.prior import prior_of_three, rig_prior
 from pipeline.geometry.se3 import inverse, log_se3
 from pipeline.ingest.index import DayIndex
 from pipeline.simulate.faults import parse_faults
@@ -131,7 +131,7 @@ def test_the_prior_is_kept_once_and_ties_every_sensor_to_the_lidar(day):
     for name in KINDS:
         T = prior.between("top", name)
         assert np.abs(log_se3(inverse(inverse(base["top"]) @ base[name]) @ T))[:3].max() < np.radians(12)
-    three = trio_prior(prior, rig, "left", "top", "nose")
+    three = prior_of_three(prior, rig, "left", "top", "nose")
     seen = next(observations_of(lake, DAY, chosen={"camera": "left", "lidar": "top", "radar": "nose"}))
     np.testing.assert_array_equal(three.T_camera_lidar, seen.priors["camera_lidar"])
     np.testing.assert_array_equal(three.T_lidar_radar, seen.priors["lidar_radar"])

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError, SolveError
-from pipeline.extrinsics.prior import perturbed, rig_prior, trio_prior
+from pipeline.extrinsics.prior import perturbed, prior_of_three, rig_prior
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse, log_so3
 from pipeline.rig.prior import RigPrior, from_rows, moved, star_of, to_rows
 from schemas.calibrations import pairs_of
@@ -122,8 +122,8 @@ def test_a_three_sensor_rig_is_moved_by_the_draws_that_it_always_had(missing, tm
         star = {ends: T for ends, T in star.items() if missing not in ends}
         prior = RigPrior(nodes, nodes[-1] if missing == "lidar" else prior.reference, star, prior.sigmas)
     names = [None if name == missing else name for name in ("camera", "lidar", "radar")]
-    then = perturbed(trio_prior(prior, rig, *names), (2.0, 0.1), 7)
-    now = trio_prior(moved(prior, np.radians(2.0), 0.1, 7), rig, *names)
+    then = perturbed(prior_of_three(prior, rig, *names), (2.0, 0.1), 7)
+    now = prior_of_three(moved(prior, np.radians(2.0), 0.1, 7), rig, *names)
     for pair in pairs_of([name for name in names if name is not None]):
         assert then.knows(pair)
         np.testing.assert_array_equal(now.of(pair), then.of(pair))
@@ -135,13 +135,13 @@ def test_a_three_sensor_rig_is_moved_by_the_draws_that_it_always_had(missing, tm
 
 def test_any_three_sensors_have_the_prior_of_a_three_sensor_rig(tmp_path):
     rig, prior, T = prior_of(tmp_path, VAN.replace('/left/info"', '/left/info"\nreadout_s = 0.02'))
-    found = trio_prior(prior, rig, "left", "nose", "corner_rr")
+    found = prior_of_three(prior, rig, "left", "nose", "corner_rr")
     np.testing.assert_allclose(found.T_camera_lidar, inverse(T["left"]) @ T["nose"], atol=1e-9)
     np.testing.assert_allclose(found.T_lidar_radar, inverse(T["nose"]) @ T["corner_rr"], atol=1e-9)
     assert found.camera.readout_s == 0.02
     # Neither is the reference: both may be off.
     assert found.rotation_sigma_rad == pytest.approx(np.radians(2) * np.sqrt(2))
-    pair = trio_prior(prior, rig, None, "top", "corner_fl")
+    pair = prior_of_three(prior, rig, None, "top", "corner_fl")
     assert pair.knows("lidar_radar")
     assert not pair.knows("camera_lidar")
     assert pair.rotation_sigma_rad == pytest.approx(np.radians(np.hypot(2, 4)))  # both are mounted on the car
