@@ -176,7 +176,7 @@ _UNSEEN = np.float32(1e6)  # px: no distance in an image
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, forceinline=True, fastmath=True, nogil=True, error_model="numpy")
 def _places(
     us: np.ndarray,
     vs: np.ndarray,
@@ -202,7 +202,7 @@ def _places(
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, forceinline=True, fastmath=True, nogil=True, error_model="numpy")
 def _ratios(
     found: np.ndarray,
     rest: np.ndarray,
@@ -225,7 +225,7 @@ def _ratios(
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, forceinline=True, fastmath=True, nogil=True, error_model="numpy")
 def _sum_of_logs(x: np.ndarray) -> float:
     """One logarithm for eight factors: each is above 1e-4 and below 1e4."""
     total, eighths = np.float32(0), x.shape[0] // 8

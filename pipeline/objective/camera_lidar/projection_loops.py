@@ -1,4 +1,8 @@
-"""Projection inside the compiled loops that look up images: one camera model as a flat parameter vector."""
+"""Projection inside the compiled loops that look up images: one camera model as a flat parameter vector.
+
+What a kernel calls with fast arithmetic is inlined (`forceinline`). Else each caller holds a copy that rounds in its
+own way, and which of them is linked differs between a process that compiles kernels and one that loads them.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +98,7 @@ def most_points(start: np.ndarray) -> int:
 
 
 @no_type_check
-@numba.njit(fastmath=True, nogil=True, cache=True, error_model="numpy")
+@numba.njit(fastmath=True, nogil=True, cache=True, forceinline=True, error_model="numpy")
 def project_points(
     c: np.ndarray,
     xyz: np.ndarray,

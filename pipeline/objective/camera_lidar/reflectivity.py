@@ -55,7 +55,7 @@ def marking_scores(
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, forceinline=True, fastmath=True, nogil=True, error_model="numpy")
 def _weighted_sum(
     map_: np.ndarray,
     us: np.ndarray,

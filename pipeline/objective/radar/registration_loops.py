@@ -24,6 +24,7 @@ __all__ = ["STATS", "accumulate_frames"]
 STATS = 12  # per frame: log likelihood, detections, assigned, bounced, sums of g r^2 (az, el, r), sums of g (3), spare
 
 _jit = numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+_called = numba.njit(cache=True, forceinline=True, fastmath=True, nogil=True, error_model="numpy")
 _inline = numba.njit(fastmath=True, nogil=True, error_model="numpy", inline="always")
 
 
@@ -44,7 +45,7 @@ def _exp(x):
 
 
 @no_type_check
-@_jit
+@_called
 def _likelihood(count, found, direct_prior, bounce_prior):
     """Sum of the neighbours' weights."""
     total = 0.0
@@ -61,7 +62,7 @@ def _likelihood(count, found, direct_prior, bounce_prior):
 
 
 @no_type_check
-@_jit
+@_called
 def _moments(count, found, direct_prior, bounce_prior, sums):
     """Sums of the neighbours' weights (direct, all), and of weight times distance and squared distance."""
     direct, total, m0, m1, m2, q0, q1, q2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -84,7 +85,7 @@ def _moments(count, found, direct_prior, bounce_prior, sums):
 
 
 @no_type_check
-@_jit
+@_called
 def _jacobian(J, x, y, z, R, t, v, w, tau):
     """d(azimuth, elevation, range of a static lidar point)/d(left twist of T_lidar_radar, tau, range bias).
 
@@ -121,7 +122,7 @@ def _jacobian(J, x, y, z, R, t, v, w, tau):
 
 
 @no_type_check
-@_jit
+@_called
 def _add_row(j, weight, mean, known, H, g, info):
     """Add one weighted residual, whose derivatives are j."""
     for p in range(8):
@@ -133,7 +134,7 @@ def _add_row(j, weight, mean, known, H, g, info):
 
 
 @no_type_check
-@_jit
+@_called
 def _linearise(sums, outlier, tells, J, sigma, H, g, info, stats):
     """Add a detection's rows (derivatives J) to its frame's equations, and what it shows of the radar's sigmas."""
     direct, total = sums[0], sums[1]

@@ -39,7 +39,7 @@ _ATAN = tuple(
     .coef
 )
 
-_jit = numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+_called = numba.njit(cache=True, forceinline=True, fastmath=True, nogil=True, error_model="numpy")
 _inline = numba.njit(fastmath=True, nogil=True, error_model="numpy", inline="always")
 
 
@@ -59,7 +59,7 @@ def _angle(y, x, length):
 
 
 @no_type_check
-@_jit
+@_called
 def seen_by_radar(xyz, R, t, motion, range_bias, inverse_cell, cells, seen, cell):
     """Azimuth, range and Cartesian radar coordinates (rows of `seen`) of lidar points, and the cell of each.
 
@@ -95,7 +95,7 @@ def seen_by_radar(xyz, R, t, motion, range_bias, inverse_cell, cells, seen, cell
 
 
 @no_type_check
-@_jit
+@_called
 def _along(xyz, t, a, b, c, shift, out):
     """Coordinate of points about t along an axis, less a shift."""
     shift += t[0] * a + t[1] * b + t[2] * c
@@ -104,7 +104,7 @@ def _along(xyz, t, a, b, c, shift, out):
 
 
 @no_type_check
-@_jit
+@_called
 def _reach(a, r, sigma, inverse_cell, cells):
     """First and last cell by azimuth, and by range, in which a detection may have neighbours."""
     i0 = int(max((a + _SIDE_RAD - _REACH * sigma[0]) * inverse_cell[0], 0.0))
@@ -115,7 +115,7 @@ def _reach(a, r, sigma, inverse_cell, cells):
 
 
 @no_type_check
-@_jit
+@_called
 def sort_reached(detections, sigma, inverse_cell, cells, cell, is_reached, start, order):
     """Sort the points of the cells that detections (azimuth, elevation, range) reach; `start` is where cells begin."""
     start[:] = 0
@@ -142,7 +142,7 @@ def sort_reached(detections, sigma, inverse_cell, cells, cell, is_reached, start
 
 
 @no_type_check
-@_jit
+@_called
 def elevations(xyz, seen, order, plane, mirror, mirrors, near):
     """First rows of `near`, in this order: azimuth, range, elevation, that of the mirror image below the ground."""
     count = order.shape[0]
@@ -169,7 +169,7 @@ def elevations(xyz, seen, order, plane, mirror, mirrors, near):
 
 
 @no_type_check
-@_jit
+@_called
 def _elevation(x, y, z, out):
     """Elevation of points."""
     for c in range(out.shape[0]):
@@ -178,7 +178,7 @@ def _elevation(x, y, z, out):
 
 
 @no_type_check
-@_jit
+@_called
 def distances_of_neighbours(a, e, r, tells, sigma, inverse_cell, cells, start, near, found):
     """Distances in sigmas (azimuth, range, elevation, of the mirror image) of a detection's neighbours, as rows."""
     i0, i1, j0, j1 = _reach(a, r, sigma, inverse_cell, cells)
@@ -196,7 +196,7 @@ def distances_of_neighbours(a, e, r, tells, sigma, inverse_cell, cells, start, n
 
 
 @no_type_check
-@_jit
+@_called
 def spherical(R, t, radar, limits, has_elevation, sph, tells):
     """Azimuth, elevation and range of detections, and whether their elevation can be compared with the lidar's."""
     for k in range(radar.shape[0]):
@@ -213,7 +213,7 @@ def spherical(R, t, radar, limits, has_elevation, sph, tells):
 
 
 @no_type_check
-@_jit
+@_called
 def cells_of(sigma, max_range):
     """Number of cells (by azimuth, by range) of the grid, and how many of them per radian and per metre."""
     cell_a = max(_CELL * sigma[0], 2 * _SIDE_RAD / _MOST_CELLS[0])
