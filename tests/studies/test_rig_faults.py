@@ -47,6 +47,13 @@ def test_a_function_that_remembers_draws_and_fails_as_it_does_itself():
     assert calls == [3, 2, -1]
 
 
+def test_a_function_that_remembers_tells_its_named_arguments_apart():
+    room = types.SimpleNamespace(height=lambda z_m, *, above_m, below_m=0.0: z_m + above_m - below_m)
+    Remembered(room, "height")
+    assert [room.height(1.0, above_m=2.0), room.height(1.0, above_m=3.0)] == [3.0, 4.0]
+    assert room.height(1.0, below_m=2.0, above_m=2.0) == room.height(1.0, above_m=2.0, below_m=2.0) == 1.0
+
+
 def test_a_table_counts_sensor_days_and_what_is_wrong():
     poses = {"left": row(), "base": row(kind="base", az_deg=0.1, off=[0.001, 0, 0, 0, 0, 0.01])}
     poses = {name: {**p, "edges": ["left-top"], "wrong": is_wrong(p)} for name, p in poses.items()}

@@ -183,12 +183,13 @@ class Remembered:
         self.name, self.run = name, getattr(room, name)
         setattr(room, name, self)
 
-    def __call__(self, *args: Any) -> Any:
-        key = hashlib.sha256(pickle.dumps((self.name, [_without_place(a) for a in args]))).digest()
+    def __call__(self, *args: Any, **named: Any) -> Any:
+        shown = [_without_place(a) for a in (*args, *(named[n] for n in sorted(named)))]
+        key = hashlib.sha256(pickle.dumps((self.name, sorted(named), shown))).digest()
         generators = [a.bit_generator for a in args if isinstance(a, np.random.Generator)]
         if key not in self.kept:
             try:
-                found = self.run(*args)
+                found = self.run(*args, **named)
             except (SolveError, FrameRejectedError) as err:
                 found = err
             self.kept[key] = found, [g.state for g in generators]
