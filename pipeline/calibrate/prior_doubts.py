@@ -18,8 +18,12 @@ __all__ = ["hold_doubted"]
 _FAULT = "prior"
 
 
-def hold_doubted(rows: Sequence[PoseRow], records: Sequence[CalibrationRecord]) -> list[PoseRow]:
+def hold_doubted(
+    rows: Sequence[PoseRow], records: Sequence[CalibrationRecord]
+) -> tuple[list[PoseRow], list[CalibrationRecord]]:
     """Poses, held where edges contradict the prior of their sensor, or of the reference that all are told by.
+
+    So are the records of such a sensor's edges whose own data do not show where it stands.
 
     Args:
         rows: of a vehicle-day.
@@ -28,16 +32,29 @@ def hold_doubted(rows: Sequence[PoseRow], records: Sequence[CalibrationRecord]) 
     against = [r for r in records if _FAULT in r.faults]
     ends = [{r.parent_frame, r.child_frame} for r in against]
     if not ends:
-        return list(rows)
+        return list(rows), list(records)
     shared = set.intersection(*ends) if len(ends) > 1 else set[str]()
     edges = ", ".join(f"{r.parent_frame}-{r.child_frame}" for r in against)
-    return [_held(row, shared or set.union(*ends) - {row.reference}, edges) for row in rows]
+    middle = {row.reference for row in rows}
+    doubted = shared or set.union(*ends) - middle
+    said = f"the prior pose of {' or '.join(sorted(doubted))}, on which it rests, is contradicted by {edges}"
+    return (
+        [_held(row, said) if {row.sensor, *middle} & doubted else row for row in rows],
+        [_held_record(r, said) if {r.parent_frame, r.child_frame} & doubted else r for r in records],
+    )
 
 
-def _held(row: PoseRow, doubted: set[str], edges: str) -> PoseRow:
-    if row.status != "accepted" or row.sensor == row.reference or not doubted & {row.sensor, row.reference}:
+def _held(row: PoseRow, said: str) -> PoseRow:
+    if row.status != "accepted" or row.sensor == row.reference:
         return row
-    whose = " or ".join(sorted(doubted))
-    said = f"the prior pose of {whose}, on which it rests, is contradicted by {edges}"
     reason = f"{said}; {row.reason}" if row.reason else said
     return replace(row, status="held", reason=reason, faults=[*row.faults, _FAULT], determined=[])
+
+
+def _held_record(record: CalibrationRecord, said: str) -> CalibrationRecord:
+    """Of an edge that knows x and y by itself the prior may be as wrong as it likes."""
+    if record.status != "accepted" or all((record.observable or [False] * 6)[3:5]):
+        return record
+    reason = f"{said}; {record.reason}" if record.reason else said
+    faults = [*record.faults, _FAULT]
+    return replace(record, status="held", reason=reason, faults=faults, determined=[], mounting_determined=[])

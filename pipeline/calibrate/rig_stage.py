@@ -48,7 +48,8 @@ def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationR
     day = _read(task, rig, about.seed)
     found = calibrate_rig(day, fleet, about, progress)
     poses = pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify, found.judged)
-    return [*found.records, *hold_doubted(poses, found.records)]
+    poses, records = hold_doubted(poses, found.records)
+    return [*records, *poses]
 
 
 def three_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord]:

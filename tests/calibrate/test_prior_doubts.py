@@ -1,5 +1,7 @@
 """Edges far from the prior say whose prior is wrong: poses that rest on it are held, others stay."""
 
+from dataclasses import replace
+
 import pytest
 
 from pipeline.calibrate.prior_doubts import hold_doubted
@@ -53,10 +55,36 @@ def against(*names):
     ],
 )
 def test_poses_are_held_that_rest_on_a_prior_which_edges_contradict(edges, held):
-    rows = hold_doubted([pose(name) for name in ("top", "left", "nose", "rear")], against(*edges))
+    rows, _ = hold_doubted([pose(name) for name in ("top", "left", "nose", "rear")], against(*edges))
     assert [row.sensor for row in rows if row.status == "held"] == held
     for row in rows:
         assert (row.faults, row.determined) == (
             (["prior"], []) if row.status == "held" else ([], ["azimuth"])
         )
         assert row.status != "held" or all(edge in row.reason for edge in edges)
+
+
+def test_edges_of_a_sensor_with_a_wrong_prior_are_held_unless_they_know_its_place_themselves():
+    def accepted(pair, parent, child, knows_place):
+        place = [True] * 3 + [knows_place] * 2 + [False]
+        own = {
+            "status": "accepted",
+            "reason": "",
+            "faults": [],
+            "determined": ["azimuth"],
+            "observable": place,
+        }
+        return replace(against(f"{parent}-{child}")[0], pair=pair, **own)
+
+    edges = [
+        accepted("radar_base", "nose", "base", False),
+        accepted("lidar_radar", "grille", "nose", True),
+        accepted("camera_radar", "left", "rear", False),
+    ]
+    _, records = hold_doubted([pose("top"), pose("nose")], [*against("top-nose"), *edges])
+    found = {f"{r.parent_frame}-{r.child_frame}": (r.status, r.determined) for r in records[1:]}
+    assert found == {
+        "nose-base": ("held", []),
+        "grille-nose": ("accepted", ["azimuth"]),
+        "left-rear": ("accepted", ["azimuth"]),
+    }
