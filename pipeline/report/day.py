@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.report.words import AXIS_NAMES, dof_title, motion_in_words, scaled, unit_of
+from pipeline.rig.graph import Kind, Sensor, is_one_of_each
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
 from schemas.drift import DriftFinding, kind_of_sensor, next_step, status_of
@@ -185,10 +187,24 @@ class Answered:
     unchecked: str = ""
 
 
-def answered(views: Sequence[PairView], poses: Sequence[PoseRow]) -> Sequence[PairView | Answered]:
-    """Sensors where the day has poses of them, the reference left out; else edges."""
-    told = [p for p in poses if p.sensor != p.reference]
-    return [Answered(p.sensor, p.status, (p.sensor,), ", ".join(p.determined)) for p in told] or views
+def answered(views: Sequence[PairView | Answered], poses: Sequence[PoseRow]) -> Sequence[PairView | Answered]:
+    """Sensors where the day has poses of them, the reference left out; else edges.
+
+    Of a rig with one sensor of each kind records are of the same poses: what nothing checks there, nothing checks here.
+    """
+    one_of_each = is_one_of_each([Sensor(p.sensor, cast("Kind", p.kind)) for p in poses])
+    unchecked = {frozenset(v.sensors): v.unchecked for v in views if one_of_each}
+    return [
+        Answered(
+            p.sensor,
+            p.status,
+            (p.sensor,),
+            ", ".join(p.determined),
+            unchecked.get(frozenset((p.sensor, p.reference)), ""),
+        )
+        for p in poses
+        if p.sensor != p.reference
+    ] or views
 
 
 def answer_for(
