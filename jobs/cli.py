@@ -28,6 +28,7 @@ _OUTPUTS = ("--out", "--page", "--report")
 # Command -> where its function is, and what `boresight --help` says of it.
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("jobs.demo:demo", "Synthetic fleet to HTML report, in minutes: what all of this does."),
+    "init": ("jobs.init:init", "A fleet.toml out of the logs themselves, with comments for what is missing."),
     "check": ("jobs.check:check", "Can these logs be calibrated, and which degrees of freedom?"),
     "verify": (
         "jobs.verify:verify",

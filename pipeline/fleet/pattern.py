@@ -25,7 +25,7 @@ _SUFFIXES = (".mcap", ".bag", ".db3", ".zstd")
 _ROS2_FILES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")  # as `ingest` reads them from a folder
 _Owner = tuple[str, str]  # day, vehicle
 _GROUPS = {"{vehicle}": "vehicle", "{day}": "day"}
-_GROUP_PATTERNS = {"vehicle": r"[^/=]+?", "day": r"\d{4}-\d{2}-\d{2}"}
+_GROUP_PATTERNS = {"vehicle": r"[^/=]+?", "day": r"\d{4}-\d{2}-\d{2}|\d{8}"}
 _TOKEN = re.compile(r"\{[^{}]*\}|\*\*/|\*\*|\*|\?|\[[^\]]+\]|[^{*?\[]+|.")
 
 
@@ -43,7 +43,7 @@ def find_vehicle_days(
     """Vehicle-days of all logs that match, in order of day and vehicle, so that a night ends day by day.
 
     Args:
-        pattern: a path with {vehicle} and {day} (YYYY-MM-DD), each as often as wanted, also inside file
+        pattern: a path with {vehicle} and {day} (YYYY-MM-DD or YYYYMMDD), each as often as wanted, also inside file
             names; besides *, ?, [abc] and ** as in a shell. A match is an .mcap, .bag or .db3 file, a ROS 2
             bag folder, or a folder of such logs; other files are passed over. Of a bucket
             ("s3://BUCKET/{vehicle}/{day}/*.mcap") each object that matches is a log. A bag folder is one log where all
@@ -75,8 +75,8 @@ def _found(pattern: str) -> Mapping[_Owner, Iterable[LogPath]]:
     # Listed is what lies below the last folder that the pattern names to the letter.
     for log in find_remote_logs(re.split(r"[{*?\[]", pattern)[0].rpartition("/")[0]):
         match = matcher.fullmatch(str(log))
-        if match and is_day(match["day"]) and log.name.endswith(_SUFFIXES):
-            found[match["day"], match["vehicle"]].append(log)
+        if match and is_day(_day(match)) and log.name.endswith(_SUFFIXES):
+            found[_day(match), match["vehicle"]].append(log)
     return found
 
 
@@ -97,6 +97,12 @@ def _matcher(pattern: str) -> re.Pattern[str]:
         if name not in seen:
             raise ConfigError("command line", "--logs", f"{pattern!r} lacks {{{name}}}")
     return re.compile("".join(parts))
+
+
+def _day(match: re.Match[str]) -> str:
+    """As YYYY-MM-DD; loggers also write YYYYMMDD."""
+    day = match["day"]
+    return day if "-" in day else f"{day[:4]}-{day[4:6]}-{day[6:]}"
 
 
 def _shell_token(token: str) -> str:
@@ -121,10 +127,10 @@ def _owned(pattern: str) -> dict[str, _Owner]:
     for name in sorted(glob.iglob(shell, recursive=True, include_hidden=False)):
         path = name.rstrip("/")
         match = matcher.fullmatch(path)
-        if not match or not is_day(match["day"]):
+        if not match or not is_day(_day(match)):
             continue
         for log in listings.logs_at(path):
-            about, own = os.stat(log), (match["day"], match["vehicle"])
+            about, own = os.stat(log), (_day(match), match["vehicle"])
             if seen.setdefault((own, about.st_dev, about.st_ino), log) == log:
                 owner[log] = own
     return owner

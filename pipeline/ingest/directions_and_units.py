@@ -17,7 +17,7 @@ from pipeline.rig.rig import Rig
 from pipeline.rigs import RadarTopics
 from schemas.frames import Frame
 
-__all__ = ["MOVING_MPS", "Motion", "motion_of", "prior_transform"]
+__all__ = ["MOVING_MPS", "Motion", "drives_ahead", "motion_of", "prior_transform"]
 
 MOVING_MPS = 1.0
 _BACKWARDS = "the car would drive backwards"
@@ -74,6 +74,18 @@ def motion_of(frames: Sequence[Frame], rig: Rig) -> Motion:
         problem, is_wrong = by_doppler, True
     wrong += [by_odometry] if by_odometry else []
     return Motion(moving, problem, is_wrong, tuple(wrong), _assumed_sign(rig.radar, sign))
+
+
+def drives_ahead(frames: Sequence[Frame], rig: Rig) -> int:
+    """1 = by its Doppler the car drives ahead, -1 = it would drive backwards, 0 = the frames do not tell.
+
+    With odometry the two are compared; without, a car is taken to drive ahead most of the time.
+    """
+    scanned = [f for f in frames if "radar" in f.sensors]
+    fits = [(f, *_fit(f, rig.radar)) for f in scanned]
+    moved = [(f, s) for f, s, share in fits if share > _EXPLAINED and abs(s) > MOVING_MPS]
+    both = [s * np.sign(f.ego_speed_mps) for f, s in moved if f.ego_speed_mps]
+    return _sign(np.array(both if len(both) >= _FEWEST else [s for _, s in moved]))
 
 
 def prior_transform(frame: Frame, pair: str) -> Float[np.ndarray, "4 4"]:

@@ -1,0 +1,49 @@
+"""`boresight init`: a fleet.toml out of the logs themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["init"]
+
+
+def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force: bool = False) -> int:
+    """Write a fleet.toml for logs: sensors, topics, what the radars' numbers mean; comments say what to enter.
+
+    Args:
+        logs: some MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of vehicles of one build.
+        out: file to write.
+        name: of the fleet.
+        force: replace the file where it exists.
+    """
+    from jobs.terminal.summary import print_summary, progress_reporter
+    from pipeline.errors import ConfigError
+    from pipeline.ingest.propose.propose import propose_fleet
+    from pipeline.store.atomic_write import atomic_write
+
+    if not logs:
+        raise ConfigError("command line", "LOG", "name at least one log")
+    missing = [str(p) for p in logs if not p.exists()]
+    if missing:
+        raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
+    if out.exists() and not force:
+        raise ConfigError(str(out), "--out", "exists already; --force replaces it")
+    with progress_reporter("init") as progress:
+        proposal = propose_fleet(logs, name, progress)
+    with atomic_write(out) as file:
+        file.write(proposal.text.encode())
+    some = " ".join(str(p) for p in logs[:2]) + (" ..." if len(logs) > 2 else "")
+    pattern = proposal.logs_pattern or "logs/{vehicle}/{day}/*"
+    print_summary(
+        "init",
+        "done",
+        written=str(out),
+        sensors=list(proposal.sensors),
+        to_enter=list(proposal.missing),
+        problems=list(proposal.problems),
+        next_steps=[
+            f"boresight check {out} {some}",
+            f'boresight nightly --fleet {out} --lake lake --logs "{pattern}"',
+        ],
+    )
+    return 0

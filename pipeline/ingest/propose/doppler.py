@@ -1,0 +1,66 @@
+"""What a radar's Doppler means, tried on the log: at which speed it wraps, and which sign says receding."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.ingest.directions_and_units import drives_ahead
+from pipeline.ingest.doppler_speed import doppler_speed
+from pipeline.rig.rig import Rig
+from schemas.frames import Frame
+
+__all__ = ["doppler_period", "doppler_sign"]
+
+_FEWEST_SCANS = 3  # that no speed explains without a period
+_HALF = 0.5  # of a scan's detections, explained by one speed: it needs no period
+_MORE, _MOST = 0.1, 2 / 3  # how much more of a scan a period must explain, and of how many scans
+_MOST_STEPS = 4096  # of a quantised Doppler, from end to end: finer ones are numbers without steps
+
+
+def doppler_period(frames: Sequence[Frame]) -> float | None:
+    """The period by which the Doppler is aliased [m/s]; None where it is not, or the log does not show it.
+
+    An aliased Doppler fills the span of one period, whatever the car does: the span is tried. It counts where the
+    static world explains more with it of most of those scans that it does not explain without.
+    """
+    scans = [(_directions(f), f.radar_range_rate_mps.astype(np.float64)) for f in frames if _has_scan(f)]
+    if len(scans) < _FEWEST_SCANS:
+        return None
+    values = np.unique(np.round(np.concatenate([rates for _, rates in scans]), 4))
+    steps = np.diff(values)
+    span = float(values[-1] - values[0])
+    step = float(np.median(steps)) if len(steps) else 0.0
+    if step <= 0:
+        return None
+    period = span + (step if span / step < _MOST_STEPS else 0.0)
+    plain = np.array([doppler_speed(d, r, None)[1] for d, r in scans])
+    wrapped = np.array([doppler_speed(d, r, period)[1] for d, r in scans])
+    gained = (wrapped > plain + _MORE)[plain < _HALF]
+    return period if len(gained) >= _FEWEST_SCANS and gained.mean() >= _MOST else None
+
+
+def doppler_sign(frames: Sequence[Frame], rig: Rig) -> str:
+    """The `doppler_positive` that the frames show, read as `rig` says; "" where they do not tell.
+
+    Args:
+        frames: with the radar's scans, and odometry where the log has it.
+        rig: of this radar, with a `doppler_positive` that is tried.
+    """
+    if rig.radar is None:
+        return ""
+    tried = rig.radar.doppler_positive
+    other = "approaching" if tried == "receding" else "receding"
+    return {1: tried, -1: other, 0: ""}[drives_ahead(frames, rig)]
+
+
+def _has_scan(frame: Frame) -> bool:
+    return "radar" in frame.sensors and len(frame.radar_xyz_m) > 0
+
+
+def _directions(frame: Frame) -> Float[np.ndarray, "N 3"]:
+    prior = frame.priors.get("lidar_radar", np.eye(4))[:3, :3]
+    xyz = frame.radar_xyz_m.astype(np.float64) @ prior.T
+    return np.asarray(xyz / np.linalg.norm(xyz, axis=1, keepdims=True))

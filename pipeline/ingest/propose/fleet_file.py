@@ -1,0 +1,173 @@
+"""The text of a fleet.toml for sensors that were found: every line one can trust, and comments for what one cannot."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors
+
+__all__ = ["Facts", "RadarMeaning", "fleet_text", "names_of"]
+
+_NO_NAME = re.compile(r"[^A-Za-z0-9_]+")
+_ENDINGS = ("_optical_frame", "_optical", "_frame", "_link")
+_COLUMN = 60  # where comments behind a line begin
+
+
+@dataclass(frozen=True)
+class RadarMeaning:
+    """What the log shows of a radar's Doppler: the sign ("" = nothing), the period of an aliased one [m/s]."""
+
+    positive: str = ""
+    period_mps: float | None = None
+    scans: int = 0
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the text says beside the sensors.
+
+    Args:
+        static_topic: of the static transforms, "" where the logs have none.
+        untied: sensors that no chain of transforms leads to, with their frame ids.
+        vehicle_frames: frames of the transforms that may be the vehicle's.
+        meanings: what the log shows of each radar's Doppler.
+    """
+
+    static_topic: str
+    untied: Mapping[str, str]
+    vehicle_frames: Sequence[str]
+    meanings: Mapping[str, RadarMeaning] = field(default_factory=dict)
+
+
+def names_of(found: FoundSensors) -> dict[str, FoundCamera | FoundCloud]:
+    """Sensors by the names that they get: their kind where there is one of each, else by frame ids."""
+    of_kind: dict[str, Sequence[FoundCamera | FoundCloud]] = {
+        "camera": found.cameras,
+        "lidar": found.lidars,
+        "radar": found.radars,
+    }
+    if all(len(sensors) <= 1 for sensors in of_kind.values()):
+        return {kind: sensors[0] for kind, sensors in of_kind.items() if sensors}
+    names: dict[str, FoundCamera | FoundCloud] = {}
+    for kind, sensors in of_kind.items():
+        for sensor in sensors:
+            name = own = _name(sensor.frame_id, kind)
+            number = 1
+            while name in names:
+                number += 1
+                name = f"{own}_{number}"
+            names[name] = sensor
+    return names
+
+
+def fleet_text(
+    fleet: str, found: FoundSensors, names: Mapping[str, FoundCamera | FoundCloud], facts: Facts
+) -> str:
+    """The whole file, for a fleet of that name."""
+    is_short = all(name in ("camera", "lidar", "radar") for name in names)
+    lines = ["[fleet]", f"name = {json.dumps(fleet)}", *_of_rig(facts, is_short=is_short)]
+    for name, sensor in names.items():
+        kind = "camera" if isinstance(sensor, FoundCamera) else "lidar" if sensor in found.lidars else "radar"
+        lines += ["", f"[rigs.default.{kind if is_short else f'{kind}s.{name}'}]"]
+        if isinstance(sensor, FoundCamera):
+            lines += _camera(sensor)
+        else:
+            lines += [f"points = {json.dumps(sensor.topic)}"]
+            lines += _radar(sensor, facts.meanings.get(name, RadarMeaning())) if kind == "radar" else []
+    if found.odometry:
+        lines += ["", "[rigs.default.ego]", f"odometry = {json.dumps(found.odometry)}"]
+    else:
+        lines += [
+            "",
+            "# [rigs.default.ego]",
+            '# odometry = "/..."     # none in these logs: speed comes from Doppler',
+        ]
+    lines += ["", *_prior(facts), "", '[vehicles."*"]', 'rig = "default"']
+    if found.passed_over:
+        lines += ["", "# Not used:", *(f"#   {what}" for what in sorted(found.passed_over))]
+    return "\n".join(lines) + "\n"
+
+
+def _of_rig(facts: Facts, *, is_short: bool) -> list[str]:
+    """The vehicle frame: named where it is logged on a rig of many sensors, offered on a small one."""
+    if not facts.vehicle_frames:
+        return []
+    line = f"base = {json.dumps(facts.vehicle_frames[0])}"
+    if is_short:
+        return ["", "# [rigs.default]", _with(f"# {line}", "for poses on the vehicle, too")]
+    return ["", "[rigs.default]", _with(line, "the vehicle's frame")]
+
+
+def _camera(camera: FoundCamera) -> Iterator[str]:
+    yield f"image = {json.dumps(camera.image)}"
+    yield f"info = {json.dumps(camera.info)}"
+    models = 'semantics = { source = "onnx", segmenter = "segmenter.toml", detector = "detector.toml" }'
+    if not (camera.labels and camera.detections):
+        has = "no" if not (camera.labels or camera.detections) else "only"
+        what = (
+            "label images or detections" if has == "no" else "label images" if camera.labels else "detections"
+        )
+        yield f"# The logs have {has} {what} of this camera, and it needs both. Log them, or name models:"
+        yield f"# {models}"
+        return
+    known = "" if camera.label_set in ("cityscapes", "") else f', label_set = "{camera.label_set}"'
+    topics = f"labels = {json.dumps(camera.labels)}, detections = {json.dumps(camera.detections)}"
+    meaning = "Cityscapes train ids" if camera.label_set == "cityscapes" else camera.label_set
+    if camera.label_set:
+        yield f"# {camera.labels_say}: taken for {meaning}. If yours differ: label_set = {{ road = [7], car = [26] }}"
+    else:
+        yield f"# {camera.labels_say}: no set that is known. Enter label_set = {{ road = [7], car = [26] }}, as yours."
+    yield f'semantics = {{ source = "topics", {topics}{known} }}'
+
+
+def _radar(radar: FoundCloud, meaning: RadarMeaning) -> Iterator[str]:
+    if len(radar.doppler) > 1:
+        yield _with(
+            f"velocity_fields = {json.dumps(list(radar.doppler))}", "relative to the radar, not over ground"
+        )
+        return
+    if radar.fields and not radar.doppler:
+        yield f'# doppler_field = "..."     # which of {", ".join(radar.fields)} is the speed along the line of sight?'
+    elif radar.doppler:
+        yield f"doppler_field = {json.dumps(radar.doppler[0])}"
+    if meaning.positive:
+        shown = f"by {meaning.scans} scans: else the car drives backwards"
+        yield _with(f'doppler_positive = "{meaning.positive}"', shown)
+    elif not radar.msgtype.endswith("RadarTracks"):
+        yield '# doppler_positive = "receding"     # or "approaching": these logs do not show it, the data sheet does'
+    if meaning.period_mps is not None:
+        shown = "the Doppler wraps at this"
+        yield _with(f"doppler_period_mps = {meaning.period_mps:.5g}", shown)
+
+
+def _prior(facts: Facts) -> Iterator[str]:
+    yield "[rigs.default.prior]"
+    if facts.untied or not facts.static_topic:
+        frames = ", ".join(f"{name} ({frame or 'no frame id'})" for name, frame in facts.untied.items())
+        why = (
+            f"No chain of transforms to {frames}."
+            if facts.static_topic
+            else "The logs have no static transforms."
+        )
+        yield f"# {why} Log them, or write them down:"
+        yield '# source = "file"'
+        yield '# file = "prior.json"     # {"reference": SENSOR, "T": {SENSOR: 4x4, ...}}, or by `boresight import`'
+    if facts.static_topic not in ("", "/tf_static"):
+        yield f"topic = {json.dumps(facts.static_topic)}"
+    yield _with("rotation_sigma_deg = 2.0", "how far off the prior may be (1 sigma)")
+    yield "translation_sigma_m = 0.05"
+
+
+def _with(line: str, comment: str) -> str:
+    return f"{line:<{_COLUMN}}# {comment}"
+
+
+def _name(frame_id: str, kind: str) -> str:
+    name = frame_id
+    for ending in _ENDINGS:
+        name = name.removesuffix(ending)
+    name = _NO_NAME.sub("_", name).strip("_").lower()[:60]
+    return name if name[:1].isalpha() else f"{kind}_{name}".rstrip("_")

@@ -1,0 +1,268 @@
+"""Which topics are which sensors: by types, frame ids, fields and sizes; names of topics decide last."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pipeline.ingest.messages.image import inspect_image, label_image, read_camera_info
+from pipeline.ingest.messages.point_cloud import cloud_columns
+from pipeline.ingest.messages.video import video_codec
+from pipeline.ingest.propose.survey import Survey, Topic
+
+__all__ = ["FoundCamera", "FoundCloud", "FoundSensors", "find_sensors"]
+
+# Names that drivers give to the speed along the line of sight; those with "comp" are over ground and say nothing.
+_DOPPLER = (
+    "doppler", "doppler_velocity", "dopplervelocity", "range_rate", "rangerate", "radial_velocity", "radial_speed",
+    "v_doppler", "v_radial", "v_r", "vr", "velocity", "speed",
+)  # fmt: skip
+_COMPONENTS = (("vx", "vy", "vz"), ("vx", "vy"), ("v_x", "v_y"), ("velocity_x", "velocity_y"))
+_MOST_DETECTIONS = 10_000  # a cloud of more is a lidar's, though it measures speeds
+_MOST_LABELS = 160  # distinct values of a label image; a grey picture has more
+_VOID = 255
+_VIDEO = (0, 0)  # the size of a video's pictures stands in none of its packets alone
+_SETS = (("cityscapes", 18), ("ade20k", 149))  # largest label but void
+
+
+@dataclass(frozen=True, eq=False)
+class FoundCamera:
+    """A camera's topics. `labels_say` is what their values look like, "" where there are none."""
+
+    frame_id: str
+    image: str
+    info: str
+    size_px: tuple[int, int]
+    labels: str = ""
+    label_set: str = ""
+    labels_say: str = ""
+    detections: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundCloud:
+    """A lidar or a radar. `doppler` is its field, or its fields where it logs components; () of messages of radars."""
+
+    frame_id: str
+    topic: str
+    msgtype: str
+    fields: tuple[str, ...] = ()
+    doppler: tuple[str, ...] = ()
+
+
+@dataclass(eq=False)
+class FoundSensors:
+    """All that was found, and in words what was passed over."""
+
+    cameras: list[FoundCamera] = field(default_factory=list)
+    lidars: list[FoundCloud] = field(default_factory=list)
+    radars: list[FoundCloud] = field(default_factory=list)
+    odometry: str = ""
+    passed_over: list[str] = field(default_factory=list)
+
+
+def find_sensors(survey: Survey) -> FoundSensors:
+    """Cameras, lidars and radars of the logs, one for each frame id and kind."""
+    found = FoundSensors()
+    _find_clouds(survey, found)
+    _find_cameras(survey, found)
+    odometry = sorted(survey.of("odometry"), key=lambda t: (not _moves(t), -t.messages))
+    if odometry:
+        found.odometry = odometry[0].name
+        found.passed_over += [f"{t.name} (odometry too)" for t in odometry[1:]]
+    return found
+
+
+# -- clouds ----------------------------------------------------------------------------------------------------------
+
+
+def _find_clouds(survey: Survey, found: FoundSensors) -> None:
+    best: dict[tuple[str, str], list[tuple[FoundCloud, float]]] = defaultdict(list)
+    for topic in survey.of("radar"):  # their types hold a lidar's
+        is_cloud = topic.is_a("lidar")
+        columns = [_columns(m) for m in topic.samples] if is_cloud else []
+        fields = max((c.dtype.names or () for c in columns), key=len, default=())
+        points = float(np.median([len(c) for c in columns])) if columns else 0.0
+        if is_cloud and not {"x", "y"} <= set(fields):
+            found.passed_over.append(f"{topic.name} (no fields x and y)")
+            continue
+        doppler = _doppler_of(fields)
+        is_radar = not is_cloud or (bool(doppler) and points <= _MOST_DETECTIONS and "ring" not in fields)
+        kind = "radar" if is_radar else "lidar"
+        cloud = FoundCloud(
+            topic.frame_id, topic.name, topic.msgtype, fields, doppler if is_radar and is_cloud else ()
+        )
+        # Of several clouds of one sensor the one that says most of its points: rings and times are in the raw one.
+        best[kind, topic.frame_id].append((cloud, len(fields) * 1e6 + points))
+    for (kind, _), clouds in best.items():
+        clouds.sort(key=lambda c: -c[1])
+        (found.radars if kind == "radar" else found.lidars).append(clouds[0][0])
+        found.passed_over += [f"{c.topic} ({kind} {c.frame_id} too)" for c, _ in clouds[1:]]
+
+
+def _columns(message: Any) -> np.ndarray:
+    try:
+        return cloud_columns(message)
+    except ValueError:
+        return np.zeros(0, [("unreadable", "u1")])
+
+
+def _doppler_of(fields: Sequence[str]) -> tuple[str, ...]:
+    by_lower = {name.lower(): name for name in reversed(fields)}
+    for name in _DOPPLER:
+        if name in by_lower:
+            return (by_lower[name],)
+    for names in _COMPONENTS:
+        if set(names) <= set(by_lower):
+            return tuple(by_lower[name] for name in names)
+    return ()
+
+
+# -- cameras ---------------------------------------------------------------------------------------------------------
+
+
+def _find_cameras(survey: Survey, found: FoundSensors) -> None:
+    pictures = dict[str, tuple[Topic, tuple[int, int]]]()
+    labels = dict[str, tuple[Topic, np.ndarray]]()
+    for topic in survey.of("image"):
+        values = _label_values(topic) if topic.is_a("labels") else None
+        if values is not None:
+            labels[topic.name] = topic, values
+        elif (size := _size_px(topic)) is not None:
+            pictures[topic.name] = topic, size
+        else:
+            found.passed_over.append(f"{topic.name} (no picture that can be read: depth, or damaged)")
+    for info in survey.of("info"):
+        camera = _camera(info, pictures)
+        if camera is None:
+            found.passed_over.append(f"{info.name} (no image of its size)")
+        elif all(camera.frame_id != other.frame_id for other in found.cameras):
+            found.cameras.append(camera)
+    used = {c.image for c in found.cameras}
+    why = "no CameraInfo, or of a camera that has an image"
+    found.passed_over += [f"{name} ({why})" for name in pictures if name not in used]
+    found.cameras = [
+        _with_semantics(c, found.cameras, labels, survey.of("detections")) for c in found.cameras
+    ]
+
+
+def _camera(info: Topic, pictures: dict[str, tuple[Topic, tuple[int, int]]]) -> FoundCamera | None:
+    """The camera that a CameraInfo is of: an image of its size and frame, whose name shares most with its own."""
+    camera = next((c for c in (_intrinsics(m) for m in info.samples) if c is not None), None)
+    if camera is None:
+        return None
+    size = (camera.width_px, camera.height_px)
+    fitting = [t for t, of_size in pictures.values() if of_size in (size, _VIDEO)]
+    same = [t for t in fitting if t.frame_id == info.frame_id]
+    same = same or [t for t in fitting if _shared(t.name, info.name) > 1]
+    if not same:
+        return None
+    is_straight = not np.any(camera.D)  # a rectified image has no distortion
+
+    def fit(topic: Topic) -> tuple[int, bool, bool]:
+        return (
+            _shared(topic.name, info.name),
+            ("rect" in topic.name) == is_straight,
+            "ompressed" in topic.msgtype,
+        )
+
+    image = max(same, key=fit)
+    return FoundCamera(image.frame_id, image.name, info.name, size)
+
+
+def _with_semantics(
+    camera: FoundCamera,
+    cameras: Sequence[FoundCamera],
+    labels: dict[str, tuple[Topic, np.ndarray]],
+    detections: Sequence[Topic],
+) -> FoundCamera:
+    def of(topics: Sequence[Topic]) -> Topic | None:
+        own = [t for t in topics if t.frame_id == camera.frame_id] or ([*topics] if len(cameras) == 1 else [])
+        return max(own, key=lambda t: _shared(t.name, camera.image), default=None)
+
+    label, detection = of([t for t, _ in labels.values()]), of(detections)
+    values = None if label is None else labels[label.name][1]
+    known, say = ("", "") if values is None else _label_set(values)
+    return FoundCamera(
+        camera.frame_id, camera.image, camera.info, camera.size_px,
+        "" if label is None else label.name, known, say, "" if detection is None else detection.name,
+    )  # fmt: skip
+
+
+def _label_set(values: np.ndarray) -> tuple[str, str]:
+    """The label set whose numbers these are, the smallest that has them all, and what was seen."""
+    seen = values[values != _VOID]
+    if not len(seen):
+        return "cityscapes", "void only"
+    name = next((name for name, largest in _SETS if seen.max() <= largest), "")
+    return name, f"{len(seen)} labels from {seen.min()} to {seen.max()}"
+
+
+def _label_values(topic: Topic) -> np.ndarray | None:
+    """Values of label images; None where they are pictures."""
+    values, areas = set[int](), []
+    for message in topic.samples:
+        try:
+            pixels = cv2.imdecode(np.frombuffer(label_image(message), np.uint8), cv2.IMREAD_UNCHANGED)
+        except ValueError:
+            return None
+        if pixels is None:
+            return None
+        values |= set(np.unique(pixels).tolist())
+        areas.append(_has_areas(pixels))
+    return np.array(sorted(values)) if areas and all(areas) and len(values) <= _MOST_LABELS else None
+
+
+def _has_areas(pixels: np.ndarray) -> bool:
+    """Whether most pixels equal their right neighbour, as in a map of areas; in a grey picture one in ten does."""
+    return bool(np.mean(pixels[:, 1:] == pixels[:, :-1]) > 0.8)
+
+
+def _size_px(topic: Topic) -> tuple[int, int] | None:
+    for message in topic.samples:
+        if hasattr(message, "width"):
+            is_depth = str(message.encoding).lower() in {"16uc1", "32fc1"}
+            return None if is_depth else (int(message.width), int(message.height))
+        if video_codec(str(message.format)) is not None:
+            return _VIDEO
+        if "compresseddepth" in str(message.format).lower().replace(" ", ""):
+            return None
+        try:
+            image = inspect_image(bytes(message.data))
+        except ValueError:
+            continue
+        return image.width_px, image.height_px
+    return None
+
+
+def _intrinsics(message: Any) -> Any:
+    try:
+        camera = read_camera_info(message)
+    except ValueError:
+        return None
+    return None if isinstance(camera, str) else camera
+
+
+def _moves(topic: Topic) -> bool:
+    """Whether an odometry's twist is ever filled in."""
+    return any(abs(m.twist.twist.linear.x) + abs(m.twist.twist.linear.y) > 0 for m in topic.samples)
+
+
+@cache
+def _shared(a: str, b: str) -> int:
+    """How many words from the left two topics have in common."""
+    return sum(1 for _ in _same(re.split(r"[/_]", a.strip("/")), re.split(r"[/_]", b.strip("/"))))
+
+
+def _same(a: Sequence[str], b: Sequence[str]) -> Iterator[str]:
+    for x, y in zip(a, b, strict=False):
+        if x != y:
+            return
+        yield x

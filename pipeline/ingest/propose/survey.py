@@ -1,0 +1,103 @@
+"""Every topic of some logs with a few of its messages decoded: what can be known before anybody names a sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import LogError
+from pipeline.geometry.transform_tree import TransformTree
+from pipeline.ingest.containers.reader import LogReader, RawMessage, open_log
+from pipeline.ingest.index import ACCEPTED_TYPES
+from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_frame_id
+from pipeline.results import Progress, silent
+
+__all__ = ["Survey", "Topic", "survey_logs"]
+
+_SAMPLES = 5  # messages of a topic that are decoded in each log: an empty scan or a dark image may come first
+# Of a log that is looked through. All sensors of a car speak within a second; transforms are logged at the start.
+_LONGEST_NS = 60 * 10**9
+_KNOWN = {kind for kinds in ACCEPTED_TYPES.values() for kind in kinds}
+
+
+@dataclass(eq=False)
+class Topic:
+    """A topic of a type that Boresight reads. `frame_id` is that of its last decoded message, "" where it has none."""
+
+    name: str
+    msgtype: str
+    messages: int = 0
+    frame_id: str = ""
+    samples: list[Any] = field(default_factory=list)
+
+    def is_a(self, role: str) -> bool:
+        """Whether its type can be what a rig calls image, info, labels, detections, lidar, radar, odometry."""
+        return self.msgtype in ACCEPTED_TYPES[role]
+
+
+@dataclass(eq=False)
+class Survey:
+    """What logs hold. `transforms` are of the topics that say where frames are, one tree a topic."""
+
+    topics: dict[str, Topic] = field(default_factory=dict)
+    transforms: dict[str, TransformTree] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+    def of(self, role: str) -> list[Topic]:
+        """Topics whose type fits a role, by name."""
+        return [self.topics[name] for name in sorted(self.topics) if self.topics[name].is_a(role)]
+
+
+def survey_logs(logs: Sequence[Path], progress: Progress = silent) -> Survey:
+    """Look through the first minute of each log.
+
+    Args:
+        logs: of one or several vehicles of the same build.
+        progress: told of each log.
+    """
+    survey = Survey()
+    for done, path in enumerate(logs):
+        progress(done, len(logs), f"looking through {path.name}")
+        try:
+            log = open_log(path)
+        except LogError as err:
+            survey.problems.append(str(err))
+            continue
+        try:
+            _look_through(log, survey)
+        finally:
+            log.close()
+    return survey
+
+
+def _look_through(log: LogReader, survey: Survey) -> None:
+    first_ns, taken = None, dict[str, int]()
+    for message in log.scan():
+        if message.channel.msgtype not in _KNOWN:
+            continue
+        first_ns = message.log_time_ns if first_ns is None else first_ns
+        if message.log_time_ns > first_ns + _LONGEST_NS:
+            break
+        name = message.channel.topic
+        topic = survey.topics.setdefault(name, Topic(name, message.channel.msgtype))
+        topic.messages += 1
+        if topic.is_a("tf_static") or taken.get(name, 0) < _SAMPLES:
+            taken[name] = taken.get(name, 0) + 1
+            _take(message, topic, survey)
+
+
+def _take(message: RawMessage, topic: Topic, survey: Survey) -> None:
+    try:
+        # A view of the log's chunk: what is kept is decoded from a copy.
+        decoded = decode(message.channel, memoryview(bytes(message.data)))
+        if topic.is_a("tf_static"):
+            survey.transforms.setdefault(topic.name, TransformTree()).add_message(decoded)
+            return
+        topic.samples.append(decoded)
+        topic.frame_id = header_frame_id(message.channel, message.data)
+    except (LogError, *DECODE_ERRORS) as err:
+        problem = f"topic {topic.name}: {err}"
+        if problem not in survey.problems:
+            survey.problems.append(problem)
