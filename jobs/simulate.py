@@ -42,7 +42,8 @@ def simulate(
         rate_hz: moments per second within a drive.
         rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128, rosette,
             fisheye, pinhole, rolling, truck, bumper, tilted, van (6 cameras, 2 lidars, 5 radars) or duo (2, 1, 2); each
-            with `-flat` behind it for radars without elevation. pipeline/simulate/README.md says what they are.
+            with `-flat` behind it for radars without elevation, or `-dirty` for such as see things between them and
+            their images in the road. pipeline/simulate/README.md says what they are.
         environments: what the drives lead through.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
         faults: vehicle:day:sensor:kind:amount, several with commas; kinds: yaw pitch roll [deg], x y z [m],

@@ -61,6 +61,7 @@ def test_random_rigs_are_of_all_kinds_and_a_seed_s_own():
     rigs = [rig_named(f"random-{seed}") for seed in range(40)]
     assert rigs[7] == rig_named("random-7")
     assert not rig_named("random-7-flat")["radar"].sheet.has_elevation
+    assert rig_named("random-7-dirty")["radar"].sheet.road_mirror > 0
     rows = [rig["lidar"].sheet.rows for rig in rigs]
     assert min(rows) == 16
     assert max(rows) >= 96

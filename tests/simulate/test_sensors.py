@@ -3,6 +3,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from pipeline.simulate.sensors.multipath import faded_by_road
 from pipeline.simulate.sensors.radar import RadarErrors, scan_radar
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.semantics import Box, SemanticsSpec, noisy_boxes, noisy_labels
@@ -45,6 +46,31 @@ def test_range_and_elevation_errors_are_what_was_asked_for(urban):
     shift = np.median(np.linalg.norm(off.xyz_m, axis=1)) - np.median(np.linalg.norm(plain.xyz_m, axis=1))
     assert n > 50
     assert abs(shift - 0.3) < 0.15
+
+
+def test_a_dirty_radar_sees_things_between_them_and_their_image_in_the_road(shots):
+    def below_road(rig):
+        found = []
+        for shot in shots:
+            T, sheet = shot.mounting["radar"].T_vehicle, rig_named(rig)["radar"].sheet
+            args = (shot.moment, shot.scene.ego, T, sheet, RadarErrors(), np.random.default_rng(3))
+            scan = scan_radar(*args)
+            found.append(scan.xyz_m[scan.origin == 0] @ T[2, :3] + T[2, 3] < -0.3)
+        return np.mean(np.concatenate(found))
+
+    assert below_road("demo-dirty") > 2 * below_road("demo")
+
+
+def test_only_what_stands_above_the_road_is_mirrored_in_it_and_strong_echoes_lie_lower():
+    high = np.repeat([0.0, 1.0], 4000)
+    power, share = faded_by_road(high, 0.5, np.random.default_rng(0))
+    on_road, above = share[:4000], share[4000:]
+    assert np.all(on_road == 0)
+    assert 0.2 < np.mean(above > 0) < 0.8
+    assert share.max() <= 1
+    assert abs(power[:4000].mean() - 1) < 0.1
+    none = faded_by_road(high, 0.0, np.random.default_rng(0))[1]
+    assert not none.any()
 
 
 def test_a_radar_without_elevation_reports_none(flat_shot):

@@ -69,7 +69,11 @@ class LidarSpec:
 
 @dataclass(frozen=True)
 class RadarSpec:
-    """An FMCW MIMO radar: resolution cells and what the estimator inside it makes of them."""
+    """An FMCW MIMO radar: resolution cells and what the estimator inside it makes of them.
+
+    `road_mirror` is the share of echoes that reach the radar by way of the road, too, and whose elevation lies between
+    the thing and its image (`multipath.py`); 0 is a road that bends elevations up as often as down.
+    """
 
     azimuth_deg: float = 30.0  # half field of view
     elevation_deg: float = 12.0
@@ -84,6 +88,8 @@ class RadarSpec:
     doppler_positive: str = "receding"
     has_elevation: bool = True
     rays: int = 9000
+    road_mirror: float = 0.0
+    elevation_noise: float = 1.0  # times what resolution and signal to noise leave of a single target
 
     @property
     def cell(self) -> np.ndarray:

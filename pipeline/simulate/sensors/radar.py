@@ -16,6 +16,7 @@ from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.geometry.spherical import from_spherical, to_spherical
 from pipeline.rows import join_rows, take_rows
 from pipeline.simulate.sensors.data_sheets import RadarSpec
+from pipeline.simulate.sensors.multipath import faded_by_road, image_in_road
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Motion
 from pipeline.simulate.world.materials import LABELS, TABLE, material
@@ -91,7 +92,9 @@ def scan_radar(
     echoes = _scatterers(moment, T_map_radar, velocity_radar, spec, rng)
     if beacons_map is not None:
         echoes = _with_beacons(echoes, transform_points(inverse(T_map_radar), beacons_map))
-    cells = _bounced(_merged(echoes, spec, rng), T_vehicle_radar, spec, rng)
+    cells = _merged(echoes, T_vehicle_radar, spec, rng)
+    if not spec.road_mirror:
+        cells = _bounced(cells, T_vehicle_radar, spec, rng)
     ghosts, clutter = _ghosts(cells, mirrors_m, T_vehicle_radar, rng), _clutter(spec, rng)
     origin = np.append(cells.moving, np.repeat([2, 3], [len(ghosts.snr), len(clutter.snr)]))
     seen = join_rows([cells, ghosts, clutter])
@@ -154,7 +157,7 @@ def _scatterers(
     return _Cells(aer, rate, snr, np.isin(label, _GROUND), moving)
 
 
-def _merged(echoes: _Cells, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
+def _merged(echoes: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
     """One detection per resolution cell whose echoes together exceed the threshold, at their power-weighted mean."""
     size = spec.cell
     index = np.floor(
@@ -173,12 +176,17 @@ def _merged(echoes: _Cells, spec: RadarSpec, rng: np.random.Generator) -> _Cells
         np.bincount(cell, echoes.snr * c, n) / np.maximum(total, 1e-12)
         for c in (*echoes.aer.T, echoes.rate, echoes.ground, echoes.moving)
     ]
+    aer = np.stack(mean[:3], 1)
     # Swerling I: the whole cell fades from scan to scan.
-    snr = total * rng.exponential(1.0, n) + 1.0
+    if spec.road_mirror:
+        height_m, image = image_in_road(aer, T_vehicle_radar)
+        fade, share = faded_by_road(height_m, spec.road_mirror, rng)
+        aer[:, 1] += share * (image[:, 1] - aer[:, 1])
+    else:
+        fade = rng.exponential(1.0, n)
+    snr = total * fade + 1.0
     keep = snr > _THRESHOLD
-    found = _Cells(
-        np.stack(mean[:3], 1)[keep], mean[3][keep], snr[keep], mean[4][keep] > 0.5, mean[5][keep] > 0.5
-    )
+    found = _Cells(aer[keep], mean[3][keep], snr[keep], mean[4][keep] > 0.5, mean[5][keep] > 0.5)
     return _peaks(found, np.append(size, spec.doppler_resolution_mps))
 
 
@@ -208,10 +216,8 @@ def _unsuppressed(x: np.ndarray) -> np.ndarray:
 
 def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
     """Let the road mirror targets: unresolved, the image bends the elevation; resolved, it is a second detection."""
-    xyz_vehicle = transform_points(T_vehicle_radar, from_spherical(cells.aer))
-    height, radar_height = xyz_vehicle[:, 2], T_vehicle_radar[2, 3]
-    image = xyz_vehicle * [1.0, 1.0, -1.0]
-    aer_image = to_spherical(transform_points(inverse(T_vehicle_radar), image))
+    height, aer_image = image_in_road(cells.aer, T_vehicle_radar)
+    radar_height = T_vehicle_radar[2, 3]
     n = len(cells.snr)
     mirror = (
         0.6 * rng.random(n) * np.exp(1j * rng.uniform(0, 2 * np.pi, n)) * (~cells.ground & (height > 0.15))
@@ -279,6 +285,7 @@ def _measured(
     # Single-target accuracy: resolution / (1.6 sqrt(2 snr)) (Skolnik, ch. 9), never better than a tenth: the array's
     # own calibration leaves that much.
     sigma = spec.cell * np.maximum(1 / (1.6 * np.sqrt(2 * seen.snr)), 0.1)[:, None]
+    sigma[:, 1] *= spec.elevation_noise
     aer = (
         seen.aer
         + sigma * rng.standard_normal(sigma.shape)

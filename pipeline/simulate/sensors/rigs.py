@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -99,25 +100,31 @@ _ALL: Final = (
     DUO,
 )  # fmt: skip
 RIGS: Final = {rig.name: rig for rig in _ALL}
+# How the radars of a rig are changed by what stands behind its name. Dirty ones: matched to two real-like days by
+# statistics that need no truth (tests/benchmarks/studies/radar_dirt.py).
+_RADARS: Final[dict[str, dict[str, Any]]] = {
+    "-flat": {"has_elevation": False},
+    "-dirty": {"road_mirror": 0.3, "elevation_noise": 2.0},
+}
 
 
 def rig_named(name: str) -> RigSpec:
-    """One of RIGS, or `random-SEED`; `-flat` behind the name takes the radars' elevation away.
+    """One of RIGS, or `random-SEED`; behind the name `-flat` takes the radars' elevation away, `-dirty` spoils it.
 
     Raises:
         ConfigError: no such rig.
     """
-    plain = name.removesuffix("-flat")
+    plain, change = name, None
+    for ending, spoil in _RADARS.items():
+        if name.endswith(ending):
+            plain, change = name.removesuffix(ending), spoil
     seed = plain.removeprefix(RANDOM)
     base = random_rig(int(seed)) if plain != seed and seed.isdecimal() else RIGS.get(plain)
     if base is None:
-        known = f"{', '.join(RIGS)}, {RANDOM}SEED, each with or without -flat"
+        known = f"{', '.join(RIGS)}, {RANDOM}SEED, each also with {' or '.join(_RADARS)} behind it"
         raise ConfigError("simulate", "rig", f"{name!r} is not one of {known}")
-    return replace(base.changed(_flat), name=name) if name.endswith("-flat") else base
+    return base if change is None else replace(base.changed(partial(_with_radar, change)), name=name)
 
 
-def _flat(sensor: SensorSpec) -> SensorSpec:
-    sheet = sensor.sheet
-    return (
-        replace(sensor, sheet=replace(sheet, has_elevation=False)) if isinstance(sheet, RadarSpec) else sensor
-    )
+def _with_radar(change: dict[str, Any], sensor: SensorSpec) -> SensorSpec:
+    return replace(sensor, sheet=replace(sensor.sheet, **change)) if sensor.kind == "radar" else sensor
