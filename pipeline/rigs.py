@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 __all__ = [
+    "AlignmentFields",
     "CameraPrior",
     "CameraTopics",
     "EgoTopics",
@@ -184,6 +185,26 @@ class OnnxDrivable(Section):
     model: str
 
 
+class AlignmentFields(Section):
+    """Where a message says how a radar is misaligned: paths as `packet.theta`, `-packet.theta` of the opposite sign.
+
+    Azimuth is positive to the left, elevation upwards. A message may hold one of the two.
+    """
+
+    azimuth: str | None = None
+    elevation: str | None = None
+    azimuth_variance: str | None = None
+    elevation_variance: str | None = None
+    status: str | None = None
+    unit: Literal["rad", "deg"] = "rad"  # of the angles; variances are in its square
+
+    @model_validator(mode="after")
+    def _states_an_angle(self) -> AlignmentFields:
+        if self.azimuth is None and self.elevation is None:
+            raise ValueError("name the field of the azimuth, of the elevation, or both")
+        return self
+
+
 class RadarTopics(_Sensor):
     """A radar's topic and what its Doppler means."""
 
@@ -197,6 +218,10 @@ class RadarTopics(_Sensor):
         default=None, exclude_if=lambda fields: fields is None
     )
     azimuth_positive: Literal["left", "right"] = "left"  # RadarScan drivers differ; PointCloud2 has x y z
+    # Messages of its own estimate of its misalignment; one topic may stand without brackets. Left out of dumps where
+    # there is none.
+    alignment: tuple[Topic, ...] = Field(default=(), exclude_if=lambda topics: not topics)
+    alignment_fields: AlignmentFields | None = Field(default=None, exclude_if=lambda fields: fields is None)
     # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
     drivable: OnnxDrivable | None = Field(default=None, exclude=True)
 
@@ -204,6 +229,17 @@ class RadarTopics(_Sensor):
         """Files of models that it names, by key."""
         if self.drivable is not None:
             yield "drivable.model", self.drivable.model
+
+    @field_validator("alignment", mode="before")
+    @classmethod
+    def _one_topic_is_a_list(cls, value: Any) -> Any:
+        return (value,) if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _fields_are_of_a_topic(self) -> RadarTopics:
+        if self.alignment_fields is not None and not self.alignment:
+            raise ValueError("alignment_fields are of a message: name its topic, alignment = ...")
+        return self
 
     @model_validator(mode="after")
     def _one_way_to_say_velocity(self) -> RadarTopics:

@@ -13,6 +13,7 @@ from schemas.drift import DRIFT
 from schemas.features import FEATURES
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.poses import POSES
+from schemas.radar_alignments import RADAR_ALIGNMENTS
 from schemas.states import STATES
 from schemas.training import TRAINING
 
@@ -26,7 +27,7 @@ PREPARE = Stage("prepare", (*_INGESTED, *_PERCEIVED), (TRAINING,), "pipeline.lea
 CALIBRATE = Stage(
     "calibrate",
     (*_INGESTED, *_PERCEIVED),
-    (CALIBRATIONS, POSES),
+    (CALIBRATIONS, POSES, RADAR_ALIGNMENTS),
     "pipeline.calibrate.stage:work",
     needs_inputs=False,
 )

@@ -11,6 +11,7 @@ __all__ = [
     "MOMENTS",
     "PERCEIVED",
     "PRIOR",
+    "RADAR_ALIGNMENT",
     "SAME_SCENE_NS",
     "SENSORS_ABSENT",
     "SWEEPS_LOGGED",
@@ -26,6 +27,8 @@ __all__ = [
 SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ = "sweeps_in_logs", "sweeps_planned", "sweeps_read"
 # Among the manifest's extra: why moments lack a sensor, in words by sensor.
 SENSORS_ABSENT = "sensors_absent"
+# What radars state of their own alignment: by radar, columns of table `radar_alignments`.
+RADAR_ALIGNMENT = "radar_alignment"
 # Likewise: the table that a sensor's file is in, by sensor; and the transforms that the logs carry, each with the log,
 # parent, child, q (w x y z) and t_m of T_parent_child.
 FILES: Final = "files"

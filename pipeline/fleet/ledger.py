@@ -16,6 +16,7 @@ from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
+from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
 from schemas.versions import CODE_VERSION, TABLES
 
 __all__ = ["Known", "Ledger", "outcome_row", "record_outcome"]
@@ -30,7 +31,7 @@ _ROWS = 3000
 class Known:
     """What the lake has of one vehicle-day: its records (without what outcomes do not say), and what became of it."""
 
-    records: tuple[CalibrationRecord | PoseRow, ...] = ()
+    records: tuple[CalibrationRecord | PoseRow | RadarAlignment, ...] = ()
     outcomes: tuple[OutcomeRow, ...] = ()
 
 
@@ -62,7 +63,7 @@ class Ledger:
                 )  # one that could not be written to after a night's work is named before it
         self._lake = lake
         # In the order of commits: where a calibration is, its poses are too, and no outcome tells of what is not there.
-        self._waiting = [_Waiting(POSES), _Waiting(CALIBRATIONS), _Waiting(OUTCOMES)]
+        self._waiting = [_Waiting(t) for t in (RADAR_ALIGNMENTS, POSES, CALIBRATIONS, OUTCOMES)]
         self._committed_at = time.monotonic()
         days = sorted({p.day for p in partitions})
         # A night without a vehicle-day asks for none.
@@ -71,6 +72,7 @@ class Ledger:
             lake, CALIBRATIONS, CalibrationRecord, *span, ("frames_rejected", "inputs")
         )
         self._poses = RecordIndex(lake, POSES, PoseRow, *span, ("inputs",))
+        self._alignments = RecordIndex(lake, RADAR_ALIGNMENTS, RadarAlignment, *span, ("inputs",))
         self._outcomes = RecordIndex(
             lake, OUTCOMES, OutcomeRow, *span, ("rows", "kept", "rejected", "faults")
         )
@@ -78,7 +80,8 @@ class Ledger:
     def known(self, partition: Partition) -> Known:
         """What the lake had of a vehicle-day when the night began; the current one of a kind comes last."""
         of = (partition.vehicle, partition.day)
-        return Known((*self._records.of(*of), *self._poses.of(*of)), tuple(self._outcomes.of(*of)))
+        found = self._records.of(*of), self._poses.of(*of), self._alignments.of(*of)
+        return Known((*found[0], *found[1], *found[2]), tuple(self._outcomes.of(*of)))
 
     def add(self, outcome: Outcome, method: str) -> None:
         """Take an outcome and its records; commit those that came together, if it is time.
@@ -86,9 +89,11 @@ class Ledger:
         Raises:
             OSError: the storage does not answer; the rows are kept, and the next commit has them too.
         """
-        poses, records, outcomes = self._waiting
+        alignments, poses, records, outcomes = self._waiting
         of = (outcome.vehicle, outcome.day)
         if outcome.records:
+            own = RADAR_ALIGNMENTS.rows_among(outcome.records)
+            _sort(alignments, own, self._alignments.of(*of))
             _sort(poses, POSES.rows_among(outcome.records), self._poses.of(*of))
             _sort(records, CALIBRATIONS.rows_among(outcome.records), self._records.of(*of))
         _sort(outcomes, [outcome_row(outcome, method)], self._outcomes.of(*of))

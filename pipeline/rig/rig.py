@@ -309,7 +309,9 @@ class Rig(Section):
                 yield f"labels of {name}", camera.semantics.labels
                 yield f"detections of {name}", camera.semantics.detections
         yield from ((f"points of {name}", lidar.points) for name, lidar in self.lidars.items())
-        yield from ((f"points of {name}", radar.points) for name, radar in self.radars.items())
+        for name, radar in self.radars.items():
+            yield f"points of {name}", radar.points
+            yield from ((f"alignment of {name}", topic) for topic in radar.alignment)
         yield "prior", self.prior.topic
         if self.ego is not None:
             yield "odometry", self.ego.odometry

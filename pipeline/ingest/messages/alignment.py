@@ -1,0 +1,115 @@
+"""What radars say of their own misalignment, by the fields of their messages; angles to radians, left and up positive.
+
+Sources: off_highway_premium_radar_msgs (angles in rad, left and up positive of a radar mounted upright, NaN where
+there is no estimate), continental_msgs of Nebula and ars548_messages (rad), delphi_esr_msgs, delphi_mrr_msgs and
+delphi_srr_msgs (deg, in steps of 0.0625).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pipeline.errors import LogError
+from pipeline.ingest.containers.reader import Channel
+from pipeline.ingest.messages.decoding import decode
+from pipeline.rigs import AlignmentFields
+
+__all__ = ["ALIGNMENT_MESSAGES", "Misalignment", "read_alignment"]
+
+_BOSCH: Final = "location_attributes_packet.misalignment."
+_OF_BOSCH: Final = AlignmentFields(
+    azimuth=f"{_BOSCH}theta",
+    azimuth_variance=f"{_BOSCH}theta_variance",
+    elevation=f"{_BOSCH}phi",
+    elevation_variance=f"{_BOSCH}phi_variance",
+    status=f"{_BOSCH}status",
+)
+# Types that are known; of others fleet.toml names the fields.
+ALIGNMENT_MESSAGES: Final = {
+    "off_highway_premium_radar_msgs/msg/LocationAttributes": _OF_BOSCH,
+    "off_highway_premium_radar_sample_msgs/msg/LocationAttributes": _OF_BOSCH,
+    "continental_msgs/msg/ContinentalArs548DetectionList": AlignmentFields(
+        azimuth="alignment_azimuth_correction",
+        elevation="alignment_elevation_correction",
+        status="alignment_status",
+    ),
+    "ars548_messages/msg/DetectionList": AlignmentFields(
+        azimuth="aln_azimuthcorrection", elevation="aln_elevationcorrection", status="aln_status"
+    ),
+    "delphi_esr_msgs/msg/EsrStatus4": AlignmentFields(azimuth="auto_align_angle", unit="deg"),
+    "delphi_esr_msgs/msg/EsrStatus6": AlignmentFields(elevation="vertical_misalignment", unit="deg"),
+    "delphi_mrr_msgs/msg/MrrHeaderAlignmentState": AlignmentFields(
+        azimuth="can_auto_align_hangle", status="can_alignment_status", unit="deg"
+    ),
+    "delphi_srr_msgs/msg/SrrStatus4": AlignmentFields(azimuth="can_tx_auto_align_angle", unit="deg"),
+}
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """One message: angles and sigmas [rad], None where it states none; status as logged."""
+
+    azimuth_rad: float | None = None
+    azimuth_sigma_rad: float | None = None
+    elevation_rad: float | None = None
+    elevation_sigma_rad: float | None = None
+    status: str = ""
+
+
+def read_alignment(channel: Channel, data: memoryview, fields: AlignmentFields | None = None) -> Misalignment:
+    """The misalignment that a message states.
+
+    Args:
+        channel: of the message.
+        data: its bytes.
+        fields: where it states what; None = as its type is known to.
+
+    Raises:
+        LogError: the type is not known and no fields are named, a field is not there or no number, or the bytes do not
+            fit the definition.
+    """
+    known = fields or ALIGNMENT_MESSAGES.get(channel.msgtype)
+    if known is None:
+        problem = (
+            f"{channel.msgtype} is no known alignment message: name its fields, alignment_fields = {{...}}"
+        )
+        raise LogError("", problem, topic=channel.topic)
+    message = decode(channel, data)
+    unit = 1.0 if known.unit == "rad" else math.pi / 180
+
+    def number(path: str | None) -> float | None:
+        value = None if path is None else _value(channel, message, path)
+        return value if value is not None and math.isfinite(value) else None
+
+    def angle(path: str | None, variance: str | None) -> tuple[float | None, float | None]:
+        value, spread = number(path), number(variance)
+        if value is None:
+            return None, None
+        return unit * value, unit * math.sqrt(spread) if spread is not None and spread > 0 else None
+
+    status = "" if known.status is None else f"{_value(channel, message, known.status):g}"
+    return Misalignment(
+        *angle(known.azimuth, known.azimuth_variance),
+        *angle(known.elevation, known.elevation_variance),
+        status,
+    )
+
+
+def _value(channel: Channel, message: Any, path: str) -> float:
+    """The number at a path of a message."""
+    value, sign = message, -1.0 if path.startswith("-") else 1.0
+    for name in path.lstrip("-").split("."):
+        if not hasattr(value, name):
+            has = ", ".join(n for n in getattr(value, "__dataclass_fields__", {}) if not n.startswith("__"))
+            problem = (
+                f"{channel.msgtype} has no {name} there, only {has or 'a number'}: mend alignment_fields"
+            )
+            raise LogError("", problem, topic=channel.topic, field=path.lstrip("-"))
+        value = getattr(value, name)
+    try:
+        return sign * float(value)
+    except (TypeError, ValueError) as err:
+        field = path.lstrip("-")
+        raise LogError("", f"{channel.msgtype}: this is no number", topic=channel.topic, field=field) from err
