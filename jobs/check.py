@@ -48,6 +48,7 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
         print_json(asdict(report))
     else:
         _print_report(report, name)
+        following = _following(report, fleet, logs)
         verdicts = {p: _worst(report, p) for p in dict.fromkeys(v.pair for v in report.verdicts)}
         print_summary(
             "check",
@@ -56,8 +57,19 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
             frames=report.evidence.frames,
             pairs=verdicts,
             problems=report.problems,
+            next_steps=following,
         )
     return _EXIT[report.answer]
+
+
+def _following(report: CheckReport, fleet: Path, logs: tuple[Path, ...]) -> list[str]:
+    """The command to type next; none where nothing can be calibrated."""
+    from pipeline.ingest.propose.logs_pattern import logs_pattern
+
+    if report.answer == "no":
+        return []
+    pattern = logs_pattern(logs) or "logs/{vehicle}/{day}/*"
+    return [f'boresight nightly --fleet {fleet} --lake lake --logs "{pattern}"']
 
 
 def _worst(report: CheckReport, pair: str) -> str:

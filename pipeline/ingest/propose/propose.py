@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from pipeline.ingest.index import index_logs
 from pipeline.ingest.moments import MomentBuilder
 from pipeline.ingest.propose.doppler import doppler_period, doppler_sign
 from pipeline.ingest.propose.fleet_file import Facts, RadarMeaning, fleet_text, names_of
+from pipeline.ingest.propose.logs_pattern import logs_pattern
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors, find_sensors
 from pipeline.ingest.propose.survey import Survey, survey_logs
 from pipeline.ingest.rig_sample import RigSample
@@ -31,7 +31,6 @@ __all__ = ["Proposal", "propose_fleet"]
 
 _SAMPLE = 30  # moments by which the Doppler is tried
 _VEHICLE_FRAMES = ("base_link", "base_footprint", "vehicle", "ego_vehicle", "rear_axle", "imu_link")
-_DAY = re.compile(r"\d{4}-?\d{2}-?\d{2}")
 
 
 @dataclass(frozen=True)
@@ -77,25 +76,6 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
     missing += ["prior: transforms between the sensors"] if untied or not static else []
     missing += [f"{n}: the Doppler's sign" for n, m in meanings.items() if not m.positive]
     return Proposal(text(meanings), tuple(names), tuple(missing), logs_pattern(logs), tuple(survey.problems))
-
-
-def logs_pattern(logs: Sequence[Path]) -> str:
-    """Where the logs are, as `boresight nightly --logs` wants it; "" where their names tell no vehicle or day."""
-    patterns = {_pattern(path) for path in logs}
-    return patterns.pop() if len(patterns) == 1 else ""
-
-
-def _pattern(path: Path) -> str:
-    """By folders VEHICLE/DAY, else by a file's name VEHICLE_DAY..."""
-    parts = path.parts
-    day = next((i for i, part in enumerate(parts[:-1]) if _DAY.fullmatch(part)), 0)
-    if day:
-        return str(Path(*parts[: day - 1], "{vehicle}", "{day}", *parts[day + 1 : -1], f"*{path.suffix}"))
-    in_name = _DAY.search(path.name)
-    vehicle = "" if in_name is None else path.name[: in_name.start()].rstrip("_-.")
-    if in_name is None or not vehicle:
-        return ""
-    return str(path.parent / f"{{vehicle}}{path.name[len(vehicle) : in_name.start()]}{{day}}*")
 
 
 def _static(survey: Survey) -> tuple[str, TransformTree]:

@@ -1,5 +1,6 @@
 """`boresight init`: logs alone give a fleet.toml that runs; what they do not show is a comment, never a guess."""
 
+import json
 import tomllib
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.fleet.pattern import find_vehicle_days
 from pipeline.ingest.propose.doppler import doppler_period
-from pipeline.ingest.propose.propose import logs_pattern, propose_fleet
+from pipeline.ingest.propose.logs_pattern import logs_pattern
+from pipeline.ingest.propose.propose import propose_fleet
 from pipeline.store.partitions import Partition
 from tests.makers.written_logs import (
     DETECTIONS,
@@ -178,6 +180,8 @@ def test_the_command_writes_once_and_says_what_to_type_next(tmp_path, capsys, mo
     assert main(["init", "logs/car-1/2023-11-14/a.mcap"]) == 2
     assert Path("fleet.toml").read_text() == before
     assert main(["check", "fleet.toml", "logs/car-1/2023-11-14/a.mcap"]) in (0, 1)
+    following = 'boresight nightly --fleet fleet.toml --lake lake --logs "logs/{vehicle}/{day}/*.mcap"'
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["next_steps"] == [following]
 
 
 def test_the_pattern_finds_logs_by_folders_and_by_names(tmp_path):

@@ -1,0 +1,30 @@
+"""The pattern by which a night finds logs, out of the paths of some of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["logs_pattern"]
+
+_DAY = re.compile(r"\d{4}-?\d{2}-?\d{2}")
+
+
+def logs_pattern(logs: Sequence[Path]) -> str:
+    """Where the logs are, as `boresight nightly --logs` wants it; "" where their names tell no vehicle or day."""
+    patterns = {_pattern(path) for path in logs}
+    return patterns.pop() if len(patterns) == 1 else ""
+
+
+def _pattern(path: Path) -> str:
+    """By folders VEHICLE/DAY, else by a file's name VEHICLE_DAY..."""
+    parts = path.parts
+    day = next((i for i, part in enumerate(parts[:-1]) if _DAY.fullmatch(part)), 0)
+    if day:
+        return str(Path(*parts[: day - 1], "{vehicle}", "{day}", *parts[day + 1 : -1], f"*{path.suffix}"))
+    in_name = _DAY.search(path.name)
+    vehicle = "" if in_name is None else path.name[: in_name.start()].rstrip("_-.")
+    if in_name is None or not vehicle:
+        return ""
+    return str(path.parent / f"{{vehicle}}{path.name[len(vehicle) : in_name.start()]}{{day}}*")
