@@ -23,7 +23,7 @@ def simulate(
     frames: int = 40,
     rate_hz: float = 2.0,
     rig: str = "demo",
-    environments: Literal["mixed", "urban", "highway"] = "mixed",
+    environments: str = "mixed",
     container: Literal["mcap", "ros1", "db3", "mixed"] = "mcap",
     faults: str = "",
     remount_deg: float | None = None,
@@ -41,10 +41,11 @@ def simulate(
         frames: moments per vehicle-day at which every sensor is logged, in three drives.
         rate_hz: moments per second within a drive.
         rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128, rosette,
-            fisheye, pinhole, rolling, truck, bumper, tilted, van (6 cameras, 2 lidars, 5 radars) or duo (2, 1, 2); each
-            with `-flat` behind it for radars without elevation, or `-dirty` for such as see things between them and
-            their images in the road. pipeline/simulate/README.md says what they are.
-        environments: what the drives lead through.
+            hdl64, fisheye, pinhole, rolling, truck, bumper, tilted, van (6 cameras, 2 lidars, 5 radars) or duo (2, 1,
+            2); each with `-flat` behind it for radars without elevation, or `-dirty` for such as see things between
+            them and their images in the road. pipeline/simulate/README.md says what they are.
+        environments: what the drives lead through: urban and highway in turn (mixed), one of them, suburb, jam, alley,
+            country, deck, tunnel, or world-SEED, drawn by SEED.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
         faults: vehicle:day:sensor:kind:amount, several with commas; kinds: yaw pitch roll [deg], x y z [m],
             drift-... per day, warm-... over the day, time and stamp [s] (0.5@0.6: after .6 of the day's frames),

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
 from multiprocessing import active_children, get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from pipeline.simulate.sensors.semantics import SemanticsSpec
 from pipeline.simulate.truth import truth_of
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.landscapes import landscape_named
 
 __all__ = [
     "FleetSpec",
@@ -41,6 +42,8 @@ __all__ = [
     "simulate_vehicle_day",
     "vehicle_names",
 ]
+
+_IN_TURN: Final = "mixed"
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class FleetSpec:
     rig: str = "demo"
     own_rigs: tuple[tuple[str, str], ...] = ()  # vehicles that have another rig, and which
     own_frames: int | None = None  # of those vehicles' days; None = as many as the others'
-    environments: str = "mixed"  # urban, highway, mixed
+    environments: str = "mixed"  # a landscape's name, or urban and highway in turn
     container: str = "mcap"  # mcap, ros1, db3, mixed
     faults: tuple[Fault, ...] = ()
     seed: int = 1
@@ -74,6 +77,8 @@ class FleetSpec:
         for name, value in counts.items():
             if value <= 0:
                 raise ConfigError("simulate", name, f"{value} is not positive")
+        if self.environments != _IN_TURN:
+            landscape_named(self.environments)
         names = vehicle_names(self)
         for fault in self.faults:
             if fault.vehicle not in names:
@@ -236,7 +241,7 @@ def _shares(frames: int, drives: int) -> list[int]:
 def drive_of(spec: FleetSpec, vehicle: int, day: int, number: int, frames: int) -> Drive:
     """One of a vehicle's drives of a day."""
     environment = spec.environments
-    if environment == "mixed":
+    if environment == _IN_TURN:
         environment = ("urban", "highway")[(vehicle + day + number) % 2]
     day_name = day_names(spec.first_day, spec.days)[day]
     start = datetime.fromisoformat(day_name).replace(tzinfo=UTC) + timedelta(

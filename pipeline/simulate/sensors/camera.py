@@ -105,7 +105,9 @@ def render(
 ) -> np.ndarray:
     """BGR image, uint8."""
     # Sun and sky add up to about 1 on a white surface facing the sun; at night only a street-lamp glow is left.
-    light = Light(sun.astype(np.float32), *((0.01, 0.06, 0.006) if night else (0.95, 0.42, 1.0)))
+    # Under a ceiling there are lamps for a sky.
+    day = (0.0, 0.5, 1.0) if moment.landscape.ceiling_m else (0.95, 0.42, 1.0)
+    light = Light(sun.astype(np.float32), *((0.01, 0.06, 0.006) if night else day))
     if view.shutter is None:
         image = _lit(moment, Sight(view.full, view.rays_map, view.origin), light)
     else:

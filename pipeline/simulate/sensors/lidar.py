@@ -13,14 +13,21 @@ from pipeline.simulate.sensors.beams import beams_of
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.world.casting import Hits, Moment
 from pipeline.simulate.world.drives import Motion
-from pipeline.simulate.world.materials import LABELS, TABLE
+from pipeline.simulate.world.materials import LABELS, TABLE, material
 from pipeline.simulate.world.textures import textures
 
 __all__ = ["Sweep", "sweep_lidar"]
 
 _VEGETATION: Final = LABELS.index("vegetation")
+_ROAD: Final = LABELS.index("road")
+# Where the infrared shows nothing that the eye sees: one reflectivity of all that is road, stains at other places.
+_UNTOLD: Final = 0.14
+_STAINS: Final = TABLE.texture[material("asphalt")]
+_ELSEWHERE_M: Final = 1000.0
 # Echo of a frontal white wall at 100 m is 1; what is weaker is lost (asphalt at about 50 m from 1.8 m height).
 _FAINTEST: Final = 0.018
+_MOST_PASSED: Final = 6  # panes and leaves that one beam passes
+_SKIN_M: Final = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +66,7 @@ def sweep_lidar(
         body = from_spherical(np.concatenate([a, np.ones((len(a), 1))], 1))
         rays = np.einsum("cij,crj->cri", R, body.reshape(spec.columns, spec.rows, 3)).reshape(-1, 3)
         origins = np.repeat(origin, spec.rows, axis=0)
-        parts.append((_echo(moment, moment.cast(origins, rays, delay), rays, spec, rng), rays))
+        parts.append((_echo(moment, _met(moment, origins, rays, delay, rng), rays, spec, rng), rays))
     (range_m, strength, label), seen = _mixed(parts[0][0], parts[1][0], rng)
     keep = seen & (rng.random(len(seen)) > 0.004)
     body = from_spherical(np.concatenate([angles[keep], range_m[keep, None]], 1))
@@ -77,6 +84,26 @@ def sweep_lidar(
     )
 
 
+def _met(
+    moment: Moment, origins: np.ndarray, rays: np.ndarray, delay: np.ndarray, rng: np.random.Generator
+) -> Hits:
+    """What the rays meet at last: through windows, wire and leaves some go on, fewer the more they graze."""
+    hits, on = moment.cast(origins, rays, delay), np.arange(len(rays))
+    for _ in range(_MOST_PASSED):
+        k = hits.triangle[on]
+        passes = np.where(k < 0, 0.0, TABLE.passes[moment.mesh.material[k]] * moment.mesh.tint[k].mean(1))
+        on, k, passes = on[passes > 0], k[passes > 0], passes[passes > 0]
+        facing = np.abs(np.einsum("ij,ij->i", moment.normals[k], rays[on]))
+        on = on[rng.random(on.size) < passes * (1 - (1 - facing) ** 4)]
+        if not on.size:
+            break
+        behind = hits.range_m[on] + _SKIN_M
+        beyond = moment.cast(origins[on] + behind[:, None] * rays[on], rays[on], delay[on])
+        hits.range_m[on], hits.triangle[on] = behind + beyond.range_m, beyond.triangle
+        hits.barycentric[on] = beyond.barycentric
+    return hits
+
+
 def _echo(
     moment: Moment, hits: Hits, rays: np.ndarray, spec: LidarSpec, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -88,13 +115,19 @@ def _echo(
     cosine = np.abs(np.einsum("ij,ij->i", moment.normals[k], rays[found].astype(np.float32)))
     # Dark paint and cloth are dark to the lidar too, though less so.
     reflectivity = TABLE.reflectivity[m] * (0.25 + 0.75 * np.minimum(moment.mesh.tint[k].mean(1), 1.0))
-    gain, glass = textures(TABLE.texture[m], _surface_coordinates(moment, k, hits.barycentric[found]))
+    at = _surface_coordinates(moment, k, hits.barycentric[found])
+    gain, glass = textures(TABLE.texture[m], at)
+    if not moment.landscape.infrared:
+        on_road = label == _ROAD
+        reflectivity[on_road] = _UNTOLD
+        gain[on_road] = textures(np.full(on_road.sum(), _STAINS), at[on_road] + _ELSEWHERE_M)[0]
     reflectivity = reflectivity * (0.4 + 0.6 * gain)  # what is worn for the eye is partly so in the infrared
     pane = rng.random(len(k)) < np.maximum(TABLE.glass[m], glass)
     r = np.where(
         label == _VEGETATION, r + rng.exponential(0.15, len(k)), r
     ) + spec.range_sigma_m * rng.standard_normal(len(k))
-    echo = reflectivity * cosine * (100.0 / np.maximum(r, 1.0)) ** 2
+    diffuse = np.where(TABLE.gloss[m], cosine**3, np.float32(1.0))
+    echo = reflectivity * cosine * diffuse * (100.0 / np.maximum(r, 1.0)) ** 2
     lost = (
         (echo < _FAINTEST * rng.uniform(0.6, 1.6, len(k))) | (r > spec.max_range_m) | (r < spec.min_range_m)
     )

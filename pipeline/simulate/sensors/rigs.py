@@ -74,6 +74,16 @@ _ALL: Final = (
             (-180.0, 180.0), (-25.0, 15.0), 1200, 128, 0.1, 0.8, 120.0, row_elevation_deg=_ROWS_128
         ),
     ),
+    # A narrow strip of an image under a lidar of 64 rows all around, 1/3 deg apart above and 1/2 deg below.
+    _demo(
+        "hdl64",
+        camera=CameraSpec(1242, 376, 81.4, 29.2, model="plumb_bob", distortion=(0.0,) * 5),
+        lidar=LidarSpec(
+            (-180.0, 180.0), (-24.3, 2.0), 1800, 64, 0.1, 0.9, 120.0,
+            row_elevation_deg=(*np.arange(-24.3, -8.5, 0.5).tolist(), *np.linspace(-8.33, 2.0, 32).tolist()),
+        ),
+        xyz_m=((1.62, 0.06, 1.65), (1.35, 0.0, 1.73), (3.60, 0.0, 0.60)),
+    ),
     # 240,000 beams a second over 82 x 25 deg, as Livox' Horizon has them; six lasers behind the same prisms.
     _demo(
         "rosette",

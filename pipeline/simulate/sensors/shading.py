@@ -81,7 +81,7 @@ def shade(sight, surfaces, materials, light, shadows, blobs):
     # One long body, for some thirty scalars of a pixel pass from each of its steps to the next.
     seen, rays, origin = sight
     corners, normals, material, tint, uv = surfaces
-    label, albedo, _, _, kind, glass, glow = materials
+    label, albedo, _, _, kind, glass, glow, _, _ = materials
     sun, sun_light, sky_light, sky_gain = light
     sunlit, s0, d0, cell = shadows
     height, width = seen.shape

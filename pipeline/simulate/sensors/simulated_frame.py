@@ -65,7 +65,7 @@ def scene_of(drive: Drive) -> Scene:
     """Scene of a drive; rails (highway) and house fronts (urban) mirror."""
     layout = drive.layout
     right = layout.right_edge - 0.8 - layout.lanes_own[0]
-    mirrors = (right, -layout.lanes_own[0]) if drive.environment == "highway" else (right - 3.0,)
+    mirrors = (right, -layout.lanes_own[0]) if drive.landscape.fast else (right - 3.0,)
     return Scene(drive.ego, drive.sun, drive.night, mirrors)
 
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
+from pipeline.simulate.world.cars import add_car, add_load, add_seats, add_wheels, glazed
 from pipeline.simulate.world.meshes import Colour, Mesh, MeshBuilder
 
-__all__ = ["ACTOR_KINDS", "CAR_COLOURS", "actor_mesh"]
+__all__ = ["ACTOR_KINDS", "CAR_COLOURS", "HOLLOW", "actor_mesh"]
 
 ACTOR_KINDS: Final = ("car", "van", "truck", "bus", "cyclist", "pedestrian")
 VARIANTS: Final = {"car": 24, "van": 6, "truck": 8, "bus": 3, "cyclist": 6, "pedestrian": 12}
+HOLLOW: Final = (
+    1000  # added to a variant: the same road user with windows that beams pass through, and open loads
+)
 CAR_COLOURS: Final = (
     (0.70, 0.70, 0.70),
     (0.45, 0.46, 0.48),
@@ -31,103 +34,28 @@ CAR_COLOURS: Final = (
 )
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=256)
 def actor_mesh(kind: str, variant: int) -> Mesh:
     """Mesh of one of ACTOR_KINDS; variants differ in size, shape and colour and repeat."""
-    variant %= VARIANTS[kind]
+    hollow, variant = variant >= HOLLOW, variant % HOLLOW % VARIANTS[kind]
     rng = np.random.default_rng([ACTOR_KINDS.index(kind), variant])
     colour = CAR_COLOURS[int(rng.integers(len(CAR_COLOURS)))]
     b = MeshBuilder()
     if kind == "car":
-        _car(b, rng, colour)
+        add_car(b, rng, colour, hollow=hollow)
     elif kind == "van":
         _van(b, rng, colour)
     elif kind == "truck":
-        _truck(b, rng, colour)
+        _truck(b, rng, colour, open_load=hollow and variant % 2 == 0)
     elif kind == "bus":
         _bus(b, colour)
+        for x in np.arange(-4.5, 4.5, 1.5) if hollow else ():
+            add_seats(b, float(x), 1.1, (1.3, 2.0), 0.7)
     elif kind == "cyclist":
         _cyclist(b, rng)
     else:
         _pedestrian(b, rng, variant)
-    return b.mesh(1)
-
-
-def _wheels(
-    b: MeshBuilder, xs: tuple[float, ...], half_width_m: float, radius_m: float, tyre: str, rim: str
-) -> None:
-    for x in xs:
-        for side in (-1, 1):
-            outer, inner = side * half_width_m, side * (half_width_m - 0.22)
-            b.tube(np.array([x, inner, radius_m]), np.array([x, outer, radius_m]), radius_m, tyre, sides=12)
-            b.tube(
-                np.array([x, outer, radius_m]),
-                np.array([x, outer + side * 0.01, radius_m]),
-                0.6 * radius_m,
-                rim,
-                sides=8,
-            )
-
-
-@dataclass(frozen=True)
-class _CarShape:
-    """Sizes of a car [m]: half length and width, heights of roof and belt line, x of the cabin's rear end."""
-
-    half: float
-    w: float
-    height: float
-    belt: float
-    bonnet: float
-    tail: float
-    estate: bool
-
-
-def _car_shape(rng: np.random.Generator) -> _CarShape:
-    length, width, height = rng.uniform(3.8, 4.9), rng.uniform(1.70, 1.90), rng.uniform(1.40, 1.66)
-    half, estate = length / 2, rng.random() < 0.5
-    bonnet = rng.uniform(0.85, 1.15)
-    tail = -half + (0.10 if estate else rng.uniform(0.45, 0.65))
-    return _CarShape(half, width / 2, height, 0.60 * height, bonnet, tail, estate)
-
-
-def _car(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
-    shape = _car_shape(rng)
-    half, w = shape.half, shape.w
-    low = (-half, half, -w, w, 0.20)
-    shoulder = (-half + 0.06, half - 0.12, -w + 0.02, w - 0.02, 0.44 * shape.height)
-    deck = (-half + 0.10, half - 0.35, -w + 0.06, w - 0.06, shape.belt)
-    b.frustum(low, shoulder, "car_paint", colour)
-    b.frustum(shoulder, deck, "car_paint", colour)
-    _car_cabin(b, shape, colour)
-    _wheels(b, (-half + 0.80, half - 0.82), w + 0.01, 0.32, "car_tyre", "car_rim")
-    _car_lamps(b, shape)
-
-
-def _car_cabin(b: MeshBuilder, shape: _CarShape, colour: Colour) -> None:
-    half, w, height, belt = shape.half, shape.w, shape.height, shape.belt
-    foot = (shape.tail, half - shape.bonnet, -w + 0.07, w - 0.07, belt)
-    rear, front = shape.tail + (0.25 if shape.estate else 0.45), half - shape.bonnet - 0.75
-    roof = (rear, front, -w + 0.24, w - 0.24, height)
-    faces = dict.fromkeys(("front", "rear", "left", "right"), "car_glass") | {"top": "car_paint"}
-    b.frustum(foot, roof, faces, colour)
-    for side in (-1, 1):  # pillars stand a little outside the glass
-        for x in (0.30, 0.62):
-            low = np.array([foot[0] + x * (foot[1] - foot[0]), side * (w - 0.07), belt])
-            high = np.array([roof[0] + x * (roof[1] - roof[0]), side * (w - 0.24), height])
-            b.tube(low, high, 0.045, "car_paint", 4, colour)
-        mirror = (half - shape.bonnet + 0.15, side * (w + 0.07), belt + 0.06)
-        b.box(mirror, (0.12, 0.16, 0.13), "car_paint", colour)
-
-
-def _car_lamps(b: MeshBuilder, shape: _CarShape) -> None:
-    """Lamps, number plates and the grille."""
-    half, w, height = shape.half, shape.w, shape.height
-    for side in (-1, 1):
-        b.box((half - 0.06, side * (w - 0.24), 0.40 * height), (0.14, 0.36, 0.14), "car_lamp")
-        b.box((-half + 0.05, side * (w - 0.20), 0.47 * height), (0.10, 0.34, 0.16), "car_tail")
-    b.box((-half + 0.02, 0, 0.36 * height), (0.06, 0.50, 0.11), "car_plate")
-    b.box((half - 0.01, 0, 0.24 * height), (0.06, 0.50, 0.11), "car_plate")
-    b.box((half - 0.03, 0, 0.31 * height), (0.08, 0.9, 0.14), "car_tyre")
+    return glazed(b.mesh(1), float(rng.uniform(0.5, 1.0))) if hollow else b.mesh(1)
 
 
 def _van(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
@@ -149,24 +77,23 @@ def _van(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
         colour,
     )
     b.box((-half + 0.05, 0, 1.55), (0.05, 1.2, 0.55), "car_glass")
-    _wheels(b, (-half + 1.0, half - 0.95), w + 0.01, 0.35, "car_tyre", "car_rim")
+    add_wheels(b, (-half + 1.0, half - 0.95), w + 0.01, 0.35, "car_tyre", "car_rim")
     for side in (-1, 1):
         b.box((half - 0.10, side * (w - 0.22), 0.75), (0.14, 0.30, 0.22), "car_lamp")
         b.box((-half + 0.03, side * (w - 0.10), 1.10), (0.08, 0.18, 0.45), "car_tail")
     b.box((-half, 0, 0.65), (0.05, 0.5, 0.11), "car_plate")
 
 
-def _truck(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
+def _truck(b: MeshBuilder, rng: np.random.Generator, colour: Colour, *, open_load: bool) -> None:
     cargo, w, height = rng.uniform(5.5, 12.0), 1.25, rng.uniform(3.2, 3.9)
     half = (cargo + 2.4) / 2
     cab_start = half - 2.1
     tarpaulin = CAR_COLOURS[int(rng.integers(len(CAR_COLOURS)))]
-    b.frustum(
-        (-half, cab_start - 0.3, -w, w, 1.0),
-        (-half, cab_start - 0.3, -w, w, height),
-        "truck_paint",
-        tarpaulin,
-    )
+    if open_load:
+        add_load(b, rng, (-half, cab_start - 0.3), w, tarpaulin)
+    else:
+        floor = (-half, cab_start - 0.3, -w, w)
+        b.frustum((*floor, 1.0), (*floor, height), "truck_paint", tarpaulin)
     b.box((0, 0, 0.85), (2 * half - 1.0, 1.0, 0.3), "truck_tyre")
     b.frustum((cab_start, half, -w, w, 0.5), (cab_start, half - 0.05, -w, w, 1.6), "truck_paint", colour)
     faces = {"front": "truck_glass", "left": "truck_glass", "right": "truck_glass", "rear": "truck_paint"}
@@ -180,7 +107,7 @@ def _truck(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
         colour,
     )
     axles = (-half + 1.0, -half + 2.2, half - 1.3) if cargo > 7.5 else (-half + 1.5, half - 1.3)
-    _wheels(b, axles, w + 0.03, 0.5, "truck_tyre", "truck_tyre")
+    add_wheels(b, axles, w + 0.03, 0.5, "truck_tyre", "truck_tyre")
     for side in (-1, 1):
         b.box((-half, side * (w - 0.25), 0.95), (0.08, 0.4, 0.18), "truck_tail")
     b.box((-half - 0.02, 0, 0.62), (0.10, 2.3, 0.14), "truck_paint", (0.3, 0.3, 0.3))
@@ -200,7 +127,7 @@ def _bus(b: MeshBuilder, colour: Colour) -> None:
     for x in np.linspace(-half + 1.4, half - 1.4, 7):
         for side in (-1, 1):
             b.box((float(x), side * (w - 0.01), 1.85), (0.12, 0.06, 1.2), "bus_paint", colour)
-    _wheels(b, (-half + 2.6, half - 2.6), w + 0.03, 0.48, "bus_tyre", "bus_tyre")
+    add_wheels(b, (-half + 2.6, half - 2.6), w + 0.03, 0.48, "bus_tyre", "bus_tyre")
 
 
 def _person(b: MeshBuilder, rng: np.random.Generator, cloth: str, stride_m: float, seated: bool) -> None:

@@ -16,9 +16,10 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float
 
-from pipeline.simulate.world.actors import VARIANTS, actor_mesh
+from pipeline.simulate.world.actors import actor_mesh
 from pipeline.simulate.world.chunk import CHUNK_M
 from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.landscapes import LANDSCAPES, Landscape
 from pipeline.simulate.world.meshes import Mesh, join, placed
 from pipeline.simulate.world.ray_selection import rays_near
 from pipeline.simulate.world.scenery import chunk_mesh
@@ -29,6 +30,7 @@ __all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "shadow_map", "st
 _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 60.0
 _SHADOWS_BEHIND_M: Final = 8.0  # of an ordinary window: who looks ahead sees no others
+_ONE_PLACE_M: Final = 6.0  # rays that begin further apart than a car moves in a sweep form no cone
 _POPULATED_M, _UNPOPULATED_M = 150.0, 15.0  # road users ahead; the last stretch behind that is empty
 
 
@@ -88,7 +90,7 @@ class World:
         """The world at a time of the drive."""
         standing = self.around(self.drive.ego.arc(t_s))
         within_m = self._behind_m - _UNPOPULATED_M, _POPULATED_M
-        return Moment(standing, actors_at(self.drive, t_s, within_m), t_s)
+        return Moment(standing, actors_at(self.drive, t_s, within_m), t_s, self.drive.landscape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +100,11 @@ class Moment:
     standing: Standing
     actors: list[Actor]
     t_s: float
+    landscape: Landscape = LANDSCAPES["urban"]
 
     def advanced(self, t_s: float) -> Moment:
         """The same world some milliseconds later or earlier."""
-        return Moment(self.standing, [a.advanced(t_s - self.t_s) for a in self.actors], t_s)
+        return replace(self, actors=[a.advanced(t_s - self.t_s) for a in self.actors], t_s=t_s)
 
     @cached_property
     def mesh(self) -> Mesh:
@@ -150,6 +153,8 @@ class Moment:
         delay = delay_s.astype(np.float32)
         range_m, triangle, barycentric = _cast(self.standing.scene, origins, directions)
         axis, cosine = _cone(directions)
+        if np.ptp(origins, axis=0).max() > _ONE_PLACE_M:
+            cosine = -1.0
         for actor, start in zip(self.actors, self._starts, strict=True):
             proto = _prototype(actor.kind, actor.variant)
             R, v = actor.T_map_actor[:3, :3].astype(np.float32), actor.velocity_map.astype(np.float32)
@@ -178,9 +183,9 @@ class _Prototype:
     centre: np.ndarray
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=256)
 def _prototype(kind: str, variant: int) -> _Prototype:
-    mesh = actor_mesh(kind, variant % VARIANTS[kind])
+    mesh = actor_mesh(kind, variant)
     points = mesh.corners.reshape(-1, 3)
     centre = (points.min(0) + points.max(0)) / 2
     reach = float(np.linalg.norm(points - centre, axis=1).max())

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.se3 import from_rotation_translation
+from pipeline.simulate.world.landscapes import Landscape, landscape_named
 
 __all__ = ["Drive", "EgoMotion", "Motion", "Parked", "Road", "RoadLayout", "layout_of"]
 
@@ -25,7 +26,7 @@ _STEP_S: Final = 0.02
 class RoadLayout:
     """Cross-section of a road; d is the lateral offset from its centre line, positive to the left [m]."""
 
-    environment: str
+    landscape: Landscape
     lane_m: float
     lanes_own: tuple[float, ...]  # lane centres in our direction, ours first
     lanes_oncoming: tuple[float, ...]
@@ -34,20 +35,25 @@ class RoadLayout:
     parking_m: float  # width of the parking strip inside each edge, 0 = none
 
 
-def layout_of(environment: str, seed: int) -> RoadLayout:
-    """Layout of an `urban` or `highway` road; right-hand traffic."""
+def layout_of(landscape: Landscape, seed: int) -> RoadLayout:
+    """Layout of a road; right-hand traffic."""
     rng = np.random.default_rng([seed, 11])
-    if environment == "highway":
+    if landscape.fast:
         lanes = 3 if rng.random() < 0.6 else 2
         own = tuple(-2.4 - 3.7 * (lanes - 1 - i) for i in range(lanes))
         order = own[1:] + own[:1] if lanes == 3 else own
         edge = 2.4 + 3.7 * (lanes - 0.5) + 2.6
-        return RoadLayout(environment, 3.7, order, tuple(-d for d in own), -edge, edge, 0.0)
-    parking = 2.3 if rng.random() < 0.75 else 0.0
-    lanes = 2 if rng.random() < 0.35 else 1
-    own = tuple(-1.7 - 3.3 * (lanes - 1 - i) for i in range(lanes))
-    edge = 1.7 + 3.3 * (lanes - 0.5) + 0.15 + parking
-    return RoadLayout("urban", 3.3, own, tuple(-d for d in own), -edge, edge, parking)
+        return RoadLayout(landscape, 3.7, order, tuple(-d for d in own), -edge, edge, 0.0)
+    parking = 2.3 if rng.random() < landscape.parking else 0.0
+    lanes = 2 if rng.random() < landscape.two_lanes else 1
+    lane = landscape.lane_m
+    if landscape.one_way:
+        edge = lane / 2 + parking
+        return RoadLayout(landscape, lane, (0.0,), (), -edge, edge, parking)
+    first = lane / 2 + 0.05
+    own = tuple(-first - lane * (lanes - 1 - i) for i in range(lanes))
+    edge = first + lane * (lanes - 0.5) + 0.15 + parking
+    return RoadLayout(landscape, lane, own, tuple(-d for d in own), -edge, edge, parking)
 
 
 @dataclass(frozen=True)
@@ -55,16 +61,14 @@ class Road:
     """Centre line in the map: x, y, z and heading over arc length, smooth and without end."""
 
     seed: int
-    environment: str
+    fast: bool
     length_m: float
 
     @cached_property
     def _table(self) -> tuple[np.ndarray, ...]:
         rng = np.random.default_rng([self.seed, 12])
         s = np.arange(-200.0, self.length_m + 400.0, _STEP_M)
-        waves = (
-            ((170, 0.0045), (90, 0.0030)) if self.environment == "urban" else ((600, 0.0009), (350, 0.0006))
-        )
+        waves = ((600, 0.0009), (350, 0.0006)) if self.fast else ((170, 0.0045), (90, 0.0030))
         curvature = np.zeros_like(s)
         for period, amplitude in waves:
             curvature += amplitude * np.sin(
@@ -74,9 +78,7 @@ class Road:
         heading -= heading[200]
         x, y = np.cumsum(np.cos(heading)) * _STEP_M, np.cumsum(np.sin(heading)) * _STEP_M
         z = np.zeros_like(s)
-        for period, amplitude in (
-            ((420, 1.6), (150, 0.35)) if self.environment == "urban" else ((900, 5.0), (400, 1.2))
-        ):
+        for period, amplitude in ((900, 5.0), (400, 1.2)) if self.fast else ((420, 1.6), (150, 0.35)):
             z += amplitude * np.sin(
                 2 * np.pi * s / (period * rng.uniform(0.8, 1.3)) + rng.uniform(0, 2 * np.pi)
             )
@@ -197,8 +199,8 @@ class EgoMotion:
 
     def _speed(self, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Speed [m/s] at times."""
-        urban = self.layout.environment == "urban"
-        mean, swing = (10.0, 2.6) if urban else (27.0, 3.0)
+        urban, pace = not self.layout.landscape.fast, self.layout.landscape.pace
+        mean, swing = (10.0 * pace, 2.6 * pace) if urban else (27.0 * pace, 3.0 * pace)
         speed = np.full_like(t, mean * rng.uniform(0.85, 1.15))
         for period in (23.0, 11.0):
             speed += (
@@ -243,7 +245,7 @@ class EgoMotion:
         heading = self.road.centre(s)[3] + np.arctan(slope)
         z = self.road.centre(np.stack([s - 1.3, s + 1.3]))[2]
         grade = np.arctan2(z[1] - z[0], 2.6)
-        rough = 0.0035 if self.layout.environment == "urban" else 0.0018
+        rough = 0.0018 if self.layout.landscape.fast else 0.0035
         pitch = -grade + rough * (
             np.sin(0.9 * s / 2.1) * np.sin(0.11 * s) + 0.4 * np.sin(1.7 * s / 2.1 + 1.0)
         )
@@ -286,18 +288,20 @@ class Drive:
     night: bool = False
 
     @cached_property
+    def landscape(self) -> Landscape:
+        """What the world along the road is like."""
+        return landscape_named(self.environment)
+
+    @cached_property
     def layout(self) -> RoadLayout:
         """Cross-section of the road."""
-        return layout_of(self.environment, self.seed)
+        return layout_of(self.landscape, self.seed)
 
     @cached_property
     def road(self) -> Road:
         """The road."""
-        return Road(
-            self.seed,
-            self.environment,
-            self.duration_s * (18.0 if self.environment == "urban" else 42.0) + 100.0,
-        )
+        fastest_mps = (42.0 if self.landscape.fast else 18.0) * max(self.landscape.pace, 1.0)
+        return Road(self.seed, self.landscape.fast, self.duration_s * fastest_mps + 100.0)
 
     @cached_property
     def ego(self) -> EgoMotion:
@@ -308,7 +312,9 @@ class Drive:
     def sun(self) -> Float[np.ndarray, " 3"]:
         """Direction to the sun in the map."""
         rng = np.random.default_rng([self.seed, 14])
-        azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(22, 58))
+        azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*self.landscape.sun_deg))
+        if self.landscape.side_light:  # within 30 deg of straight aside
+            azimuth = (azimuth % np.pi) / 3 + np.pi / 3 + (np.pi if azimuth > np.pi else 0.0)
         return np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
         )

@@ -23,12 +23,17 @@ __all__ = [
 ]
 
 LABELS: Final[tuple[str, ...]] = get_args(StreetClass)
-_PLAIN, _ASPHALT, _GRASS, _FOLIAGE, _FACADE, _PAVING, _SLATS, _CONCRETE, _WORN = range(9)
+_PLAIN, _ASPHALT, _GRASS, _FOLIAGE, _FACADE, _PAVING, _SLATS, _CONCRETE, _WORN, _COBBLES, _WIRE = range(11)
 
 
 @dataclass(frozen=True)
 class Material:
-    """One surface; `radar_gain`: radar echo per solid angle, `glass`: share of light it mirrors or lets through."""
+    """One surface.
+
+    `radar_gain`: radar echo per solid angle; `glass`: share of light that it mirrors or lets through; `passes`: share
+    of a lidar's beams that go on behind it, times the triangle's tint; `gloss`: lacquer, from which beams that graze it
+    do not come back.
+    """
 
     name: str
     label: str
@@ -38,6 +43,8 @@ class Material:
     texture: int = _PLAIN
     glass: float = 0.0
     glow: float = 0.0
+    passes: float = 0.0
+    gloss: bool = False
 
 
 MATERIALS: Final = (
@@ -86,6 +93,19 @@ MATERIALS: Final = (
     # All ways through a trihedral are as long as the one to its apex: its echo is a beacon there, not its plates.
     Material("corner_reflector", "pole", (0.65, 0.65, 0.66), 0.85, 0.0),
     Material("tripod", "pole", (0.05, 0.05, 0.05), 0.12, 0.3),
+    Material("car_window", "car", (0.03, 0.035, 0.04), 0.05, 2.0, glass=0.75, passes=0.85),
+    Material("truck_window", "truck", (0.03, 0.035, 0.04), 0.05, 2.0, glass=0.75, passes=0.85),
+    Material("bus_window", "bus", (0.03, 0.035, 0.04), 0.05, 2.0, glass=0.75, passes=0.85),
+    Material("car_lacquer", "car", (1.0, 1.0, 1.0), 0.35, 12.0, gloss=True),
+    Material("seat", "car", (0.05, 0.05, 0.055), 0.25, 0.5),
+    Material("load", "truck", (0.40, 0.30, 0.18), 0.35, 3.0, _SLATS),
+    Material("mesh", "fence", (0.20, 0.22, 0.20), 0.35, 1.0, _WIRE, passes=0.7),
+    Material("cobbles", "road", (0.16, 0.155, 0.15), 0.16, 0.1, _COBBLES),
+    Material("gravel", "road", (0.30, 0.27, 0.22), 0.24, 0.1, _GRASS),
+    Material("concrete", "wall", (0.34, 0.34, 0.33), 0.30, 0.9, _CONCRETE),
+    Material("ceiling", "building", (0.30, 0.30, 0.29), 0.30, 0.6, _CONCRETE),
+    Material("ceiling_lamp", "building", (0.9, 0.9, 0.85), 0.4, 0.5, glow=0.9),
+    Material("hedge", "vegetation", (0.08, 0.16, 0.05), 0.45, 0.3, _FOLIAGE, passes=0.35),
 )  # fmt: skip
 _INDEX = {m.name: i for i, m in enumerate(MATERIALS)}
 
@@ -100,6 +120,8 @@ class MaterialTable(NamedTuple):
     texture: np.ndarray
     glass: np.ndarray
     glow: np.ndarray
+    passes: np.ndarray
+    gloss: np.ndarray
 
 
 TABLE: Final = MaterialTable(
@@ -110,6 +132,8 @@ TABLE: Final = MaterialTable(
     texture=np.array([m.texture for m in MATERIALS], np.uint8),
     glass=np.array([m.glass for m in MATERIALS], np.float32),
     glow=np.array([m.glow for m in MATERIALS], np.float32),
+    passes=np.array([m.passes for m in MATERIALS], np.float32),
+    gloss=np.array([m.gloss for m in MATERIALS]),
 )
 
 

@@ -13,9 +13,12 @@ __all__ = ["add_asphalt"]
 def add_asphalt(c: Chunk) -> None:
     """Asphalt with repairs and manholes, lane markings, crossings with their signals."""
     layout, lift = c.drive.layout, 0.004
-    c.strip((layout.right_edge, layout.left_edge), (0.0, 0.0), "asphalt")
+    c.strip((layout.right_edge, layout.left_edge), (0.0, 0.0), c.drive.landscape.surface)
     for _ in range(int(c.rng.integers(0, 4))):  # repairs: dark to the eye, less so to the lidar
-        s, d = c.s0 + c.rng.uniform(2, 30), c.rng.uniform(layout.right_edge + 1, layout.left_edge - 3)
+        s, d = (
+            c.s0 + c.rng.uniform(2, 30),
+            c.rng.uniform(layout.right_edge + 1, max(layout.left_edge, 3.0) - 3),
+        )
         c.band(
             (s, s + c.rng.uniform(1.5, 9)),
             (d, d + c.rng.uniform(0.6, 2.4)),
@@ -25,7 +28,8 @@ def add_asphalt(c: Chunk) -> None:
     for _ in range(int(c.rng.integers(0, 3))):
         s, d = c.s0 + c.rng.uniform(0, 39), c.rng.uniform(layout.right_edge + 1, layout.left_edge - 1)
         c.band((s, s + 0.62), (d, d + 0.62), (lift, lift), "manhole")
-    _lanes(c)
+    if c.drive.landscape.markings:
+        _lanes(c)
 
 
 def _lanes(c: Chunk) -> None:
@@ -34,9 +38,9 @@ def _lanes(c: Chunk) -> None:
     half = layout.lane_m / 2
     inner = [d + half for d in own[:-1]] + [d + half for d in other[:-1]]
     for d in inner:
-        _dashes(c, d, 6.0, 12.0) if layout.environment == "highway" else _dashes(c, d, 3.0, 9.0)
-    w = 0.075 if layout.environment == "urban" else 0.10
-    if layout.environment == "highway":
+        _dashes(c, d, 6.0, 12.0) if layout.landscape.fast else _dashes(c, d, 3.0, 9.0)
+    w = 0.10 if layout.landscape.fast else 0.075
+    if layout.landscape.fast:
         for d in (own[-1] + half, own[0] - half, other[0] - half, other[-1] + half):
             c.strip((d - 1.5 * w, d + 1.5 * w), (lift, lift), "paint")
         return
@@ -55,7 +59,7 @@ def _lanes(c: Chunk) -> None:
                     (lift, lift),
                     "paint",
                 )
-    if c.index % 4 == 1:
+    if c.index % 4 == 1 and layout.lanes_oncoming and not c.drive.landscape.ceiling_m:
         _crossing(c, c.s0 + 20.0)
 
 

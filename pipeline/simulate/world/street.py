@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.simulate.world.actors import VARIANTS, actor_mesh
+from pipeline.simulate.world.actors import HOLLOW, VARIANTS, actor_mesh
 from pipeline.simulate.world.chunk import CHUNK_M, Chunk
 from pipeline.simulate.world.props import bollards, bush, lamp, litter_bin, sign, tree
 
-__all__ = ["add_street"]
+__all__ = ["add_house", "add_parked", "add_pavement", "add_street"]
 
 
 def add_street(c: Chunk) -> None:
@@ -17,16 +17,21 @@ def add_street(c: Chunk) -> None:
     style = np.random.default_rng([c.drive.seed, 32])
     walk = style.uniform(2.6, 4.2)
     for side in (-1, 1):
-        kerb = side * layout.left_edge
-        far = side * (layout.left_edge + walk)
-        c.band((c.s0, c.s0 + CHUNK_M), (kerb, kerb + side * 0.001), (0.0, 0.12), "kerb", 5.0)
-        c.strip((min(kerb, kerb + side * 0.15), max(kerb, kerb + side * 0.15)), (0.12, 0.12), "kerb")
-        c.strip((min(kerb + side * 0.15, far), max(kerb + side * 0.15, far)), (0.12, 0.12), "paving")
-        c.strip((min(far, side * 90.0), max(far, side * 90.0)), (0.10, 0.10), "grass", 10.0)
+        add_pavement(c, side, walk)
         _furniture(c, side, layout.left_edge, walk)
         _frontage(c, side, layout.left_edge + walk)
         if layout.parking_m:
-            _parked(c, side, layout.left_edge - layout.parking_m / 2)
+            add_parked(c, side, layout.left_edge - layout.parking_m / 2)
+
+
+def add_pavement(c: Chunk, side: int, walk: float) -> None:
+    """Kerb and pavement of one side, and grass behind them."""
+    kerb = side * c.drive.layout.left_edge
+    far = side * (c.drive.layout.left_edge + walk)
+    c.band((c.s0, c.s0 + CHUNK_M), (kerb, kerb + side * 0.001), (0.0, 0.12), "kerb", 5.0)
+    c.strip((min(kerb, kerb + side * 0.15), max(kerb, kerb + side * 0.15)), (0.12, 0.12), "kerb")
+    c.strip((min(kerb + side * 0.15, far), max(kerb + side * 0.15, far)), (0.12, 0.12), "paving")
+    c.strip((min(far, side * 90.0), max(far, side * 90.0)), (0.10, 0.10), "grass", 10.0)
 
 
 def _furniture(c: Chunk, side: int, edge: float, walk: float) -> None:
@@ -57,7 +62,7 @@ def _frontage(c: Chunk, side: int, d: float) -> None:
         width = min(float(rng.uniform(9, 18)), c.s0 + CHUNK_M - s)
         kind = rng.random()
         if kind < 0.50:
-            _house(c, side, s, width, d + float(rng.choice([0.2, 3.0, 5.0, 8.0])))
+            add_house(c, side, s, width, d + float(rng.choice([0.2, 3.0, 5.0, 8.0])))
         elif kind < 0.62:
             c.wall((s, s + width), side * (d + 0.1), (0.0, float(rng.uniform(1.2, 2.2))), "stone")
         elif kind < 0.76:
@@ -87,10 +92,16 @@ def _frontage(c: Chunk, side: int, d: float) -> None:
         s += width
 
 
-def _house(c: Chunk, side: int, s: float, width: float, d: float) -> None:
+def add_house(
+    c: Chunk, side: int, s: float, width: float, d: float, storeys: tuple[int, ...] = (1, 2, 2, 3, 4)
+) -> None:
+    """A house whose front stands `d` beside the centre line, with one of these numbers of storeys."""
     rng = c.rng
-    storeys = int(rng.choice([1, 2, 2, 3, 4]))
-    top, depth, gap = 3.0 * storeys + 0.6, float(rng.uniform(8, 12)), float(rng.choice([0.0, 0.0, 1.5]))
+    top, depth, gap = (
+        3.0 * int(rng.choice(storeys)) + 0.6,
+        float(rng.uniform(8, 12)),
+        float(rng.choice([0.0, 0.0, 1.5])),
+    )
     tone = rng.uniform(0.55, 1.35)
     tint = (
         float(tone * rng.uniform(0.9, 1.15)),
@@ -118,12 +129,13 @@ def _house(c: Chunk, side: int, s: float, width: float, d: float) -> None:
         )
 
 
-def _parked(c: Chunk, side: int, d: float) -> None:
+def add_parked(c: Chunk, side: int, d: float) -> None:
+    """Cars and vans parked along one side, in line."""
     for k, s in enumerate(c.every(6.5)):
         if c.rng.random() > 0.68 or (c.index % 4 == 1 and abs(s + 3.2 - c.s0 - 20.0) < 9.0):
             continue
         kind = "car" if c.rng.random() < 0.88 else "van"
         instance = 1_000_001 + ((c.index * 64 + k) * 2 + (side > 0)) % 1_000_000
         yaw = (0.0 if side < 0 else np.pi) + c.rng.normal(0, 0.02)
-        mesh = actor_mesh(kind, int(c.rng.integers(VARIANTS[kind])))
+        mesh = actor_mesh(kind, int(c.rng.integers(VARIANTS[kind])) + HOLLOW * c.drive.landscape.glass)
         c.put(mesh, s + 3.25 + c.rng.uniform(-0.3, 0.3), side * d + c.rng.normal(0, 0.08), 0.0, yaw, instance)

@@ -1,6 +1,6 @@
 """What surfaces look like near by: asphalt, grass, leaves, house fronts, paving, boards, worn paint; compiled."""
 # numba infers the types of the arguments; `no_type_check` keeps the tests' shape checks out of compiled code.
-# ruff: noqa: ANN001, ANN202, ANN201, PLR0911
+# ruff: noqa: ANN001, ANN202, ANN201, C901, PLR0911
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
 
 from __future__ import annotations
@@ -73,6 +73,15 @@ def texture(kind, u, v):
     if kind == 8:  # road paint: worn, tyre marks
         return 0.62 + 0.45 * value_noise(u * 1.1, v * 2.3) - 0.25 * (
             value_noise(u * 6.0, v * 6.0) > 0.78
+        ), 0.0
+    if kind == 9:  # cobbles of 12 cm, every other row shifted by half a stone
+        row = np.floor(v / 0.12)
+        x = u / 0.12 + 0.5 * (int(row) % 2)
+        a, b = x - np.floor(x), v / 0.12 - row
+        return (0.5 if a < 0.1 or b < 0.1 else 0.7 + 0.6 * _lattice(int(np.floor(x)), int(row))), 0.0
+    if kind == 10:  # wire in meshes of 6 cm, and the dark between
+        return (
+            1.6 if u / 0.06 - np.floor(u / 0.06) < 0.2 or v / 0.06 - np.floor(v / 0.06) < 0.2 else 0.6
         ), 0.0
     return 1.0, 0.0
 

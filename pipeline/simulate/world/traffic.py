@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.simulate.world.actors import VARIANTS
+from pipeline.simulate.world.actors import HOLLOW, VARIANTS
 from pipeline.simulate.world.drives import Drive, RoadLayout
+from pipeline.simulate.world.landscapes import Landscape
 
 __all__ = ["Actor", "actors_at"]
 
@@ -60,12 +61,25 @@ def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (45.0, 1
     actors = _leaders(drive, t_s, here, within_m)
     for stream in _streams(drive):
         actors += _members(drive, stream, t_s, here, within_m)
+    if drive.landscape.glass:
+        actors = [replace(a, variant=a.variant + HOLLOW) for a in actors]
     return _apart(actors, drive.ego.poses(np.array([t_s]))[0])
 
 
 def _streams(drive: Drive) -> list[_Stream]:
     rng = np.random.default_rng([drive.seed, 21])
-    return (_highway_streams if drive.environment == "highway" else _urban_streams)(drive.layout, rng)
+    streams = (_highway_streams if drive.landscape.fast else _urban_streams)(drive.layout, rng)
+    return [s if s.height_m else _dense(s, drive.landscape) for s in streams]
+
+
+def _dense(stream: _Stream, landscape: Landscape) -> _Stream:
+    """A stream on the road, as dense and as fast as the landscape has it; people on pavements stay as they are."""
+    return replace(
+        stream,
+        speed_mps=stream.speed_mps * landscape.pace,
+        spacing_m=stream.spacing_m * landscape.spacing,
+        occupancy=stream.occupancy * landscape.traffic,
+    )
 
 
 def _highway_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stream]:

@@ -1,0 +1,134 @@
+"""What lies beside roads as their landscape has it: plots with fences and houses, halls, rows of trees and poles."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from pipeline.simulate.world.actors import HOLLOW, VARIANTS, actor_mesh
+from pipeline.simulate.world.chunk import CHUNK_M, Chunk, Span
+from pipeline.simulate.world.landscapes import Fence
+from pipeline.simulate.world.meshes import Mesh, MeshBuilder
+from pipeline.simulate.world.props import bush, tree
+from pipeline.simulate.world.street import add_house, add_parked, add_pavement
+
+__all__ = ["add_halls", "add_plots", "add_rows"]
+
+
+def add_plots(c: Chunk) -> None:
+    """Both sides of a street or a country road: pavement or verge, parked cars, plots with what stands on them."""
+    layout, landscape = c.drive.layout, c.drive.landscape
+    style = np.random.default_rng([c.drive.seed, 35])
+    walk = float(style.uniform(*landscape.walk_m))
+    for side in (-1, 1):
+        if walk:
+            add_pavement(c, side, walk)
+        else:
+            near, far = sorted((side * layout.left_edge, side * 90.0))
+            c.strip((near, far), (0.0, 0.0), "soil" if style.random() < 0.3 else "grass", 10.0)
+        if layout.parking_m:
+            add_parked(c, side, layout.left_edge - layout.parking_m / 2)
+        _plots(c, side, layout.left_edge + max(walk, 0.0 if landscape.houses > 0.5 else 2.5))
+
+
+def _plots(c: Chunk, side: int, d: float) -> None:
+    """Plots of about 13 m: a fence, perhaps a house behind it, trees and bushes."""
+    rng, landscape, s = c.rng, c.drive.landscape, c.s0
+    kinds, weights = zip(*landscape.fences, strict=True)
+    while s < c.s0 + CHUNK_M - 4.0:
+        width = min(float(rng.uniform(9, 18)), c.s0 + CHUNK_M - s)
+        _fence(c, (s, s + width), side, d + 0.1, kinds[int(rng.choice(len(kinds), p=weights))])
+        back = d + float(rng.choice(landscape.setback_m))
+        if rng.random() < landscape.houses:
+            add_house(c, side, s, width, back, landscape.storeys)
+        for _ in range(int(rng.poisson(landscape.green))):
+            for plant, near, far in (
+                (tree(int(rng.integers(40))), 2.0, 14.0),
+                (bush(int(rng.integers(20))), 0.8, 3.0),
+            ):
+                c.put(
+                    plant,
+                    s + rng.uniform(1, width),
+                    side * (d + rng.uniform(near, far)),
+                    0.1,
+                    rng.uniform(0, 6),
+                )
+        s += width
+
+
+def _fence(c: Chunk, s: Span, side: int, d: float, kind: Fence) -> None:
+    """What stands between a plot and the pavement."""
+    rng = c.rng
+    height, thick = float(rng.uniform(1.0, 2.0)), float(rng.uniform(0.5, 1.0))
+    tint = tuple(rng.uniform(0.7, 1.2, 3).tolist())
+    if kind == "wall":
+        c.wall(s, side * d, (0.0, height), "stone")
+    elif kind == "slats":
+        c.wall(s, side * d, (0.0, height), "slats", tint)
+    elif kind == "mesh":
+        c.wall(s, side * d, (0.0, height), "mesh")
+        for post in np.arange(s[0] + 0.1, s[1], 2.5):
+            c.put(_post(height), float(post), side * d)
+    elif kind == "hedge":
+        near, far = side * d, side * (d + thick)
+        for at in (near, (near + far) / 2, far):
+            c.wall(s, at, (0.0, height), "hedge", tint)
+        c.band(s, (min(near, far), max(near, far)), (height, height), "hedge", 10.0, tint)
+
+
+@lru_cache(maxsize=64)
+def _post(height_m: float) -> Mesh:
+    b = MeshBuilder()
+    b.tube(np.zeros(3), np.array([0, 0, height_m + 0.1]), 0.03, "metal_pole", 5)
+    return b.mesh()
+
+
+def add_rows(c: Chunk) -> None:
+    """Trees and poles at even distances along both sides, nearer to the road than anything else."""
+    landscape = c.drive.landscape
+    beside = c.drive.layout.left_edge + (1.6 if landscape.fast else 0.6)
+    for side in (-1, 1):
+        for s in c.every(landscape.trees_m) if landscape.trees_m else ():
+            c.put(tree(int(c.rng.integers(40))), s, side * (beside + 1.0), 0.0, c.rng.uniform(0, 6.28))
+        for s in c.every(landscape.poles_m) if landscape.poles_m else ():
+            c.put(_pole(), s, side * beside)
+
+
+@lru_cache(maxsize=1)
+def _pole() -> Mesh:
+    b = MeshBuilder()
+    b.tube(np.zeros(3), np.array([0, 0, 6.0]), 0.09, "metal_pole", 7)
+    return b.mesh()
+
+
+def add_halls(c: Chunk) -> None:
+    """Walls and a ceiling with lamps, from the road's edge `inner_m` away; between columns stand cars, nose in."""
+    landscape, edge = c.drive.landscape, c.drive.layout.left_edge
+    wall, top, s = edge + landscape.inner_m, landscape.ceiling_m, (c.s0, c.s0 + CHUNK_M)
+    c.band(s, (-wall, wall), (top, top), "ceiling")
+    for lamp in c.every(8.0):
+        c.band((lamp, lamp + 1.2), (-0.15, 0.15), (top - 0.02, top - 0.02), "ceiling_lamp")
+    for side in (-1, 1):
+        near, far = sorted((side * edge, side * wall))
+        c.wall(s, side * wall, (0.0, top), "concrete")
+        c.strip((near, far), (0.0, 0.0), landscape.surface if landscape.columns_m else "paving")
+        for beam in c.every(landscape.columns_m) if landscape.columns_m else ():
+            c.put(_column(top), beam, side * (edge + 0.5))
+            _bays(c, side, beam + 0.5, edge + 3.2)
+
+
+@lru_cache(maxsize=8)
+def _column(top_m: float) -> Mesh:
+    b = MeshBuilder()
+    b.box((0, 0, top_m / 2), (0.5, 0.5, top_m), "concrete")
+    return b.mesh()
+
+
+def _bays(c: Chunk, side: int, s: float, d: float) -> None:
+    """Up to two cars beside each other, across the way."""
+    for k in range(2):
+        if c.rng.random() < 0.6:
+            mesh = actor_mesh("car", int(c.rng.integers(VARIANTS["car"])) + HOLLOW * c.drive.landscape.glass)
+            instance = 1_000_001 + (round(s * 4) * 4 + 2 * k + (side > 0)) % 1_000_000
+            c.put(mesh, s + 1.5 + 3.0 * k, side * d, 0.0, side * np.pi / 2, instance)

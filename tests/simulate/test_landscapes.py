@@ -1,0 +1,121 @@
+"""What differs between worlds: glass that beams pass, streets without markings, halls, worlds of a seed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.simulate.fleet import FleetSpec
+from pipeline.simulate.sensors.data_sheets import LidarSpec
+from pipeline.simulate.sensors.lidar import sweep_lidar
+from pipeline.simulate.world.actors import HOLLOW, actor_mesh
+from pipeline.simulate.world.casting import Moment, standing_of
+from pipeline.simulate.world.drives import Drive, Parked
+from pipeline.simulate.world.landscapes import LANDSCAPES, landscape_named
+from pipeline.simulate.world.materials import LABELS, MATERIALS
+from pipeline.simulate.world.meshes import MeshBuilder, join, placed
+from pipeline.simulate.world.scenery import chunk_mesh
+
+CAR_M = 9.0
+HIGH = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]])
+
+
+def sweep_of(*meshes, landscape=LANDSCAPES["suburb"]):
+    """A sweep over what stands on a lot, with a wall behind it."""
+    b = MeshBuilder()
+    b.quads(np.array([[[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]]]), "asphalt")
+    b.quads(np.array([[[20, -30, 0], [20, 30, 0], [20, 30, 8], [20, -30, 8]]]), "stone")
+    standing = standing_of(join([b.mesh(), *meshes]), np.zeros(3), np.array([0.0, 0, 1]), lambda p: p, 0.0)
+    spec = LidarSpec((-20.0, 20.0), (-12.0, 2.0), 160, 60, divergence_deg=0.01, min_range_m=1.0)
+    return sweep_lidar(
+        Moment(standing, [], 0.0, landscape), Parked(), HIGH, spec, 0.0, np.random.default_rng(1)
+    )
+
+
+def behind_windows(variant):
+    """Points whose beams crossed the car's cabin above its belt line, as shares: of the car, beyond it."""
+    at = np.eye(4)
+    at[0, 3] = CAR_M
+    car = placed(actor_mesh("car", variant), at)
+    panes = car.corners[[MATERIALS[m].name in {"car_glass", "car_window"} for m in car.material]]
+    sweep = sweep_of(car)
+    rear = panes[..., 0].min()
+    up = 1.73 + (sweep.xyz_m[:, 2]) / sweep.xyz_m[:, 0] * rear
+    across = sweep.xyz_m[:, 1] / sweep.xyz_m[:, 0] * rear
+    inside = (np.abs(across) < 0.5) & (up > panes[..., 2].min() + 0.05) & (up < panes[..., 2].max() - 0.2)
+    is_car = sweep.label[inside] == LABELS.index("car")
+    beyond = np.linalg.norm(sweep.xyz_m[inside], axis=1) > rear + 0.5
+    return int(is_car.sum()), int((is_car & beyond).sum()), int((~is_car).sum())
+
+
+def test_beams_pass_the_windows_of_hollow_cars_to_the_seats_and_to_what_stands_behind():
+    found, deep, through = np.sum([behind_windows(HOLLOW + v) for v in range(6)], axis=0)
+    assert deep > 0.5 * found
+    assert through > 0.03 * found
+    _, deep, through = np.sum([behind_windows(v) for v in range(6)], axis=0)
+    assert deep == through == 0
+
+
+@pytest.mark.parametrize(("name", "share"), [("mesh", 0.7), ("hedge", 0.35)])
+def test_a_share_of_the_beams_passes_wire_and_leaves(name, share):
+    b = MeshBuilder()
+    b.quads(np.array([[[8, -10, 0], [8, 10, 0], [8, 10, 8], [8, -10, 8]]]), name)
+    sweep = sweep_of(b.mesh())
+    ahead = sweep.xyz_m[:, 2] > np.tan(np.radians(-4.5)) * sweep.xyz_m[:, 0]  # not at the ground between
+    beyond = ahead & (sweep.xyz_m[:, 0] > 12)
+    assert abs(beyond.sum() / ahead.sum() - share) < 0.08
+
+
+def test_lacquer_seen_edge_on_gives_no_echo():
+    flat = {}
+    for name in ("car_paint", "car_lacquer"):
+        b = MeshBuilder()
+        b.quads(np.array([[[8, -2, 1.5], [11, -2, 1.5], [11, 2, 1.5], [8, 2, 1.5]]]), name)
+        flat[name] = int((sweep_of(b.mesh()).label == LABELS.index("car")).sum())
+    assert flat["car_paint"] > 50
+    assert flat["car_lacquer"] < 0.1 * flat["car_paint"]
+
+
+def test_where_the_infrared_is_blind_a_lidar_does_not_see_markings():
+    told = {}
+    for infrared in (True, False):
+        b = MeshBuilder()
+        b.quads(np.array([[[6, -1, 0.01], [12, -1, 0.01], [12, 1, 0.01], [6, 1, 0.01]]]), "paint")
+        sweep = sweep_of(b.mesh(), landscape=replace(LANDSCAPES["suburb"], infrared=infrared))
+        near = (sweep.label == LABELS.index("road")) & (np.abs(sweep.xyz_m[:, 0] - 10) < 1.5)
+        painted = np.abs(sweep.xyz_m[:, 1]) < 1
+        told[infrared] = sweep.intensity[near & painted].mean() / sweep.intensity[near & ~painted].mean()
+    assert told[True] > 2
+    assert told[False] == pytest.approx(1, abs=0.15)
+
+
+@pytest.mark.parametrize("name", [*LANDSCAPES, "world-1", "world-2", "world-3"])
+def test_every_world_has_a_road_and_can_be_driven_through(name):
+    drive = Drive(11, name, 12.0, 0)
+    mesh = chunk_mesh(drive, 1)
+    labels = {MATERIALS[m].label for m in np.unique(mesh.material)}
+    assert "road" in labels
+    assert len(labels) >= 3
+    assert drive.ego.arc(10.0) > drive.ego.arc(1.0)
+    # Nothing but gantries and ceilings hangs over our lane.
+    s = np.linspace(41.0, 79.0, 20)
+    way = drive.road.to_map(np.stack([s, np.full(20, drive.layout.lanes_own[0]), np.full(20, 1.0)], 1))
+    middle = mesh.corners.mean(1)
+    low = mesh.corners[..., 2].min(1) < way[:, 2].max() + 1.0
+    near = np.linalg.norm(middle[low, None, :2] - way[None, :, :2], axis=2).min(1) < 0.8
+    assert {MATERIALS[m].label for m in mesh.material[low][near]} <= {"road"}
+
+
+def test_a_world_of_a_seed_is_always_the_same_and_seeds_differ():
+    assert landscape_named("world-7") == landscape_named("world-7")
+    drawn = [landscape_named(f"world-{seed}") for seed in range(40)]
+    assert len({replace(world, name="") for world in drawn}) == 40
+    for what in ("fast", "markings", "infrared", "glass", "side_light", "surface"):
+        assert len({getattr(world, what) for world in drawn}) > 1, what
+
+
+@pytest.mark.parametrize("name", ["world-", "world-x", "moon", "random-1"])
+def test_an_unknown_world_is_refused_by_name(name):
+    with pytest.raises(ConfigError, match="world-SEED"):
+        FleetSpec(environments=name)
