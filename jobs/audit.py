@@ -36,7 +36,7 @@ def audit(
     from pipeline.stages import AUDIT, REPORT, STATE
     from pipeline.store.partitions import Lake
     from pipeline.work import Task, Window
-    from schemas.drift import DRIFT_STATUSES
+    from schemas.drift import DRIFT, DRIFT_STATUSES
 
     if method is not None:
         method_named(method)
@@ -46,7 +46,7 @@ def audit(
         task = Task(config, tables, Window(from_day, to_day), method, progress=progress)
         outcome = AUDIT.run(task)
         STATE.run(task)
-    findings = outcome.records
+    findings = DRIFT.rows_among(outcome.records)
     charts = [f.status for f in findings]
     outputs = []
     if report is not None:

@@ -223,13 +223,14 @@ def close_night(
     from pipeline.store.files import LocalFiles
     from pipeline.store.partitions import Partition
     from pipeline.work import Task, Window
+    from schemas.drift import DRIFT
 
     with progress_reporter("audit") as progress:
         task = Task(night.fleet, night.lake, Window(None, to_day), night.method, progress=progress)
         audit = AUDIT.run(task)
         told(audit)
         told(STATE.run(task))
-    findings = list(audit.records)
+    findings = DRIFT.rows_among(audit.records)
     if not findings:
         return [], []
     files = night.lake.files if drawing.report is None else LocalFiles()

@@ -16,7 +16,7 @@ def service(
     lake: str,
     vehicle: str,
     day: str,
-    kind: Literal["re-mount", "repair", "software release"],
+    kind: Literal["re-mount", "repair", "software release", "re-alignment"],
     sensor: str = "all",
     note: str = "",
     withdraw: bool = False,
@@ -30,7 +30,7 @@ def service(
         lake: folder of the tables.
         vehicle: id of the vehicle; call it once for each.
         day: on which it was done, YYYY-MM-DD.
-        kind: what was done.
+        kind: what was done; re-alignment is what the audit notes of a radar that its own software turned.
         sensor: name of the sensor, or base; all = the whole vehicle.
         note: for people.
         withdraw: this was noted by mistake: from the next audit on it counts no more.

@@ -251,9 +251,10 @@ def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
         for records in batches:
             written += records.rows
     if task.commit:
-        commit = commit_last if isinstance(task.of, Window) else commit_records
         # The first table last: where its rows are, those beside them are too.
         for schema in reversed(stage.writes):
+            is_said_of_all = isinstance(task.of, Window) and schema is stage.writes[0]
+            commit = commit_last if is_said_of_all else commit_records
             commit(task.lake, schema, schema.rows_among(written))
     outcome = _record_outcome(stage, task, work, "done", run.work_key, written)
     return replace(outcome, inputs=run.inputs)

@@ -14,6 +14,7 @@ from schemas.features import FEATURES
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.poses import POSES
 from schemas.radar_alignments import RADAR_ALIGNMENTS
+from schemas.service_events import SERVICE_EVENTS
 from schemas.states import STATES
 from schemas.training import TRAINING
 
@@ -31,7 +32,13 @@ CALIBRATE = Stage(
     "pipeline.calibrate.stage:work",
     needs_inputs=False,
 )
-AUDIT = Stage("audit", (CALIBRATIONS,), (DRIFT,), "pipeline.audit.stage:work", per_vehicle_day=False)
+AUDIT = Stage(
+    "audit",
+    (CALIBRATIONS, RADAR_ALIGNMENTS),
+    (DRIFT, SERVICE_EVENTS),
+    "pipeline.audit.stage:work",
+    per_vehicle_day=False,
+)
 STATE = Stage(
     "state", (CALIBRATIONS, POSES, DRIFT), (STATES,), "pipeline.audit.state_stage:work", per_vehicle_day=False
 )

@@ -23,6 +23,9 @@ class RadarAlignment(Recorded):
     method: str = column("one of METHODS: of the calibration beside it")
     sensor: str = column("name of the radar")
     topics: list[str] = column("topics of its messages")
+    sign_is_published: bool = column(
+        "whether the maker, or fleet.toml, says which way the angles count", default=False
+    )
     messages: int = column("messages that were read and state an angle")
     without_angle: int = column("messages that were read and state none", default=0)
     first_stamp_ns: int = column("stamp of the first of them")

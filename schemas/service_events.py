@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from schemas.columns import Recorded, TableSchema, column, row
 
-__all__ = ["SERVICE_EVENTS", "ServiceEvent"]
+__all__ = ["REALIGNED", "SERVICE_EVENTS", "ServiceEvent"]
+
+REALIGNED = "re-alignment"  # of a radar by its own software, as its messages say: noted by the audit
 
 
 @row(eq=True)
@@ -14,7 +16,7 @@ class ServiceEvent(Recorded):
     vehicle: str = column("vehicle id")
     day: str = column("YYYY-MM-DD; its own records count neither to before nor to after")
     sensor: str = column("name of the sensor, or all")
-    kind: str = column("re-mount, repair or software release")
+    kind: str = column("re-mount, repair, software release, or re-alignment of a radar by its own software")
     note: str = column("for people", default="")
     withdrawn: bool = column("it was noted by mistake: it counts no more", default=False)
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from pipeline.rig.graph import Edge
 from pipeline.store.current import current_events
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.service_events import REALIGNED, SERVICE_EVENTS, ServiceEvent
 
-__all__ = ["events_until", "restart_of", "what_was_done"]
+__all__ = ["events_until", "restart_of", "what_was_done", "with_events"]
 
 
 def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
@@ -24,6 +24,16 @@ def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
     for event in current_events(read_records(lake, SERVICE_EVENTS, ServiceEvent, last=last)):
         events.setdefault(event.vehicle, []).append(event)
     return events
+
+
+def with_events(
+    events: Mapping[str, Sequence[ServiceEvent]], more: Sequence[ServiceEvent]
+) -> dict[str, list[ServiceEvent]]:
+    """Events by vehicle, with some more."""
+    found = {vehicle: list(own) for vehicle, own in events.items()}
+    for event in more:
+        found.setdefault(event.vehicle, []).append(event)
+    return found
 
 
 def restart_of(events: Sequence[ServiceEvent], edge: Edge, last_day: str) -> ServiceEvent | None:
@@ -43,5 +53,7 @@ def restart_of(events: Sequence[ServiceEvent], edge: Edge, last_day: str) -> Ser
 
 def what_was_done(event: ServiceEvent) -> str:
     """The event in words."""
+    if event.kind == REALIGNED:
+        return f"re-alignment of the {event.sensor} by its own software ({event.note})"
     of = "all sensors" if event.sensor == "all" else f"the {event.sensor}"
     return f"{event.kind} of {of} on {event.day}"

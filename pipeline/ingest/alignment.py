@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64
 
 from pipeline.errors import LogError
 from pipeline.ingest.index import DayIndex
-from pipeline.ingest.messages.alignment import Misalignment, read_alignment
+from pipeline.ingest.messages.alignment import SIGNS_PUBLISHED, Misalignment, read_alignment
 from pipeline.ingest.messages.decoding import DECODE_ERRORS
 from pipeline.ingest.roles import ALIGNMENT, Role
 from pipeline.rig.rig import Rig
@@ -64,11 +64,13 @@ def _of_radar(index: DayIndex, name: str, radar: RadarTopics) -> dict[str, Any]:
     said = _messages(index, name, radar)
     stamps_ns = np.array([stamp for stamp, _ in said], np.int64)
     angles = [(m.azimuth_rad, m.elevation_rad) for _, m in said]
+    types = {at.channel.msgtype for at in index.stream(Role(ALIGNMENT, name)).located}
     without = sum(pair == (None, None) for pair in angles)
     columns: dict[str, Any] = {
         "topics": list(radar.alignment),
         "messages": len(said) - without,
         "without_angle": without,
+        "sign_is_published": radar.alignment_fields is not None or types <= SIGNS_PUBLISHED,
         "statuses": dict(Counter(m.status for _, m in said if m.status)),
     }
     if len(said) == without:

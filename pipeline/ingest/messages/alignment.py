@@ -16,7 +16,7 @@ from pipeline.ingest.containers.reader import Channel
 from pipeline.ingest.messages.decoding import decode
 from pipeline.rigs import AlignmentFields
 
-__all__ = ["ALIGNMENT_MESSAGES", "Misalignment", "read_alignment"]
+__all__ = ["ALIGNMENT_MESSAGES", "SIGNS_PUBLISHED", "Misalignment", "read_alignment"]
 
 _BOSCH: Final = "location_attributes_packet.misalignment."
 _OF_BOSCH: Final = AlignmentFields(
@@ -45,6 +45,8 @@ ALIGNMENT_MESSAGES: Final = {
     ),
     "delphi_srr_msgs/msg/SrrStatus4": AlignmentFields(azimuth="can_tx_auto_align_angle", unit="deg"),
 }
+# Of these the maker says which way angles count.
+SIGNS_PUBLISHED: Final = frozenset(name for name, fields in ALIGNMENT_MESSAGES.items() if fields is _OF_BOSCH)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,222 @@
+"""Radars that align themselves: a step of their own estimate turns their points, and moves no mount.
+
+Charts and states of such a radar begin anew, as after a service event, and the event names the radar's software. That
+is asked of the calibrations too: a step that does not fit how the radar's edges changed begins nothing anew, so that a
+knock is not taken for it.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Float
+
+from pipeline.audit.days import PairDays
+from pipeline.audit.estimates import Estimates, days_of
+from pipeline.config import AuditConfig
+from pipeline.extrinsics.radar_turn import turn_of_radar
+from pipeline.rig.graph import Edge
+from pipeline.store.current import current_rows
+from pipeline.store.partitions import Lake, work_key
+from pipeline.store.records import read_columns, read_records
+from schemas.radar_alignments import RADAR_ALIGNMENTS
+from schemas.service_events import REALIGNED, SERVICE_EVENTS, ServiceEvent
+
+__all__ = ["Realignments", "find_realignments"]
+
+_AXES = ("azimuth", "elevation")
+_COLUMNS = ("sign_is_published", *(f"{a}_{what}_rad" for a in _AXES for what in ("scatter", "step")))
+_BEST_FIRST = ("lidar_radar", "camera_radar", "radar_base")
+# A day's sigma errs by some tenths, and a step is asked once per radar and year: 4 sigmas are then rare enough.
+_SIGMAS = 4.0
+_DAYS_BEFORE = 14  # of the radar's edges, that a step is compared with
+
+
+@dataclass(frozen=True)
+class Realignments:
+    """What a window of days shows.
+
+    Args:
+        events: re-alignments that the table of service events does not have yet.
+        remarks: by vehicle and radar, the last step that does not fit how its edges changed, in words.
+    """
+
+    events: tuple[ServiceEvent, ...]
+    remarks: Mapping[tuple[str, str], str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A step of a radar's own estimate: the last day with the old one, the first with the new one, its size."""
+
+    last_old: str
+    first_new: str
+    size_rad: Float[np.ndarray, " 2"]  # NaN where the messages state no such angle
+    sign_is_published: bool
+
+
+def find_realignments(
+    lake: Lake,
+    method: str,
+    window: tuple[str, str],
+    events: Mapping[str, Sequence[ServiceEvent]],
+    records: Estimates,
+    config: AuditConfig,
+) -> Realignments:
+    """Steps of radars' own estimates within a window of days.
+
+    Args:
+        lake: where the tables are.
+        method: of the records.
+        window: first and last day.
+        events: noted ones, by vehicle: a radar's estimate is followed from the last one on.
+        records: of the window, what the calibrations found.
+        config: what size of change matters.
+    """
+    table = read_columns(
+        lake, RADAR_ALIGNMENTS, ("azimuth_rad", "elevation_rad", *_COLUMNS), first=window[0], last=window[1]
+    )
+    if table is None:
+        return Realignments((), {})
+    rows = current_rows(table.filter(pc.equal(table["method"], method)), RADAR_ALIGNMENTS)
+    noted = {
+        (e.vehicle, e.sensor, e.day)
+        for e in read_records(lake, SERVICE_EVENTS, ServiceEvent, last=window[1])
+        if e.kind == REALIGNED
+    }
+    found, remarks = list[ServiceEvent](), dict[tuple[str, str], str]()
+    for (vehicle, sensor), days in _by_radar(rows):
+        others = [
+            e.day for e in events.get(vehicle, ()) if e.sensor in ("all", sensor) and e.kind != REALIGNED
+        ]
+        steps = _steps([d for d in days if d["day"] > max(others, default="")], config)
+        if not steps:
+            continue
+        edges = days_of(records.of(vehicle), config.held_sigma_factor)
+        for step in (s for s in steps if (vehicle, sensor, s.last_old) not in noted):
+            turned = _turned(sensor, edges, step)
+            text = _in_words(step, turned)
+            if turned is None or _fits(step, *turned):
+                key = work_key(REALIGNED, "", f"{vehicle} {step.last_old} {sensor}", [text])
+                event = ServiceEvent(
+                    vehicle=vehicle, day=step.last_old, sensor=sensor, kind=REALIGNED, note=text, work_key=key
+                )
+                found.append(event)
+            else:
+                remarks[vehicle, sensor] = f"the {sensor}'s own estimate changed otherwise ({text})"
+    return Realignments(tuple(found), remarks)
+
+
+def _by_radar(rows: pa.Table) -> list[tuple[tuple[str, str], list[dict[str, Any]]]]:
+    """Rows of each vehicle and radar, in order of days."""
+    listed = sorted(rows.to_pylist(), key=lambda r: (r["vehicle"], r["sensor"], r["day"]))
+    return [(key, list(own)) for key, own in groupby(listed, key=lambda r: (r["vehicle"], r["sensor"]))]
+
+
+def _steps(days: Sequence[Mapping[str, Any]], config: AuditConfig) -> list[_Step]:
+    """Where the estimate left the level that it had since the window began or since the last step.
+
+    It counts from half of what matters on, so that what stays in the charts cannot alarm by itself, and beyond what
+    its days scatter by.
+    """
+    levels = np.array([_levels(day) for day in days]).reshape(-1, 2, 2)  # day, morning and evening, axis
+    least = np.maximum(
+        np.radians(config.radar_limit_deg) / 2, _SIGMAS * np.sqrt(2) * _day_sigma(days, levels)
+    )
+    steps, old = list[_Step](), np.full(2, np.nan)
+    for k, day in enumerate(days):
+        for part, level in enumerate(levels[k]):
+            old = np.where(np.isnan(old), level, old)
+            size = level - old
+            if (np.abs(size) > least).any():
+                last_old = day if part else days[k - 1]
+                steps.append(_Step(last_old["day"], day["day"], size, day["sign_is_published"]))
+                old = np.where(np.isnan(level), old, level)
+    return steps
+
+
+def _levels(day: Mapping[str, Any]) -> list[list[float]]:
+    """Azimuth and elevation before and after a step within the day; the same twice without one."""
+    evening = [_number(day[f"{axis}_rad"]) for axis in _AXES]
+    steps = [_number(day[f"{axis}_step_rad"]) for axis in _AXES]
+    return [[e - (0.0 if np.isnan(s) else s) for e, s in zip(evening, steps, strict=True)], evening]
+
+
+def _day_sigma(
+    days: Sequence[Mapping[str, Any]], levels: Float[np.ndarray, "N 2 2"]
+) -> Float[np.ndarray, " 2"]:
+    """By how much an axis scatters from day to day, robustly; of few days, by how much its messages do."""
+    jumps = np.abs(levels[1:, 0] - levels[:-1, 1])
+    if len(jumps) > 2:
+        return 1.4826 / np.sqrt(2) * _median(jumps)
+    return _median(np.array([[_number(day[f"{axis}_scatter_rad"]) for axis in _AXES] for day in days]))
+
+
+def _median(values: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " 2"]:
+    """Of each column, what is NaN left out; 0 of a column without a number."""
+    columns = [column[~np.isnan(column)] for column in values.T]
+    return np.array([np.median(column) if len(column) else 0.0 for column in columns])
+
+
+def _turned(
+    sensor: str, edges: Mapping[Edge, PairDays], step: _Step
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]] | None:
+    """Azimuth and elevation by which the radar seems turned since the step, by its best edge, and sigmas.
+
+    None where no edge has days on both sides.
+    """
+    first, last = (dt.date.fromisoformat(day).toordinal() for day in (step.first_new, step.last_old))
+    own = [e for e in edges if e.kind in _BEST_FIRST and sensor in (s.name for s in e.sensors)]
+    for edge in sorted(own, key=lambda e: (_BEST_FIRST.index(e.kind), e.name)):
+        days = edges[edge]
+        # A day within which it stepped belongs to neither side.
+        sides = [days.day <= last, days.day >= first] if first > last else [days.day < last, days.day > last]
+        sides[0] &= days.day > last - _DAYS_BEFORE
+        if not all(side.any() for side in sides):
+            continue
+        A = turn_of_radar(edge, days.origin)
+        (before, spread), (after, spread_after) = (_mean(days, A, side) for side in sides)
+        return after - before, np.sqrt(np.diag(spread + spread_after))
+    return None
+
+
+def _mean(
+    days: PairDays, A: Float[np.ndarray, "2 3"], side: np.ndarray
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, "2 2"]]:
+    """Weighted mean of a side's turns, and its covariance."""
+    information = np.linalg.inv(A @ days.spread[side, :3, :3] @ A.T)
+    covariance = np.linalg.inv(information.sum(axis=0))
+    return covariance @ np.einsum("nij,nj->i", information, days.change[side, :3] @ A.T), covariance
+
+
+def _fits(step: _Step, turned: Float[np.ndarray, " 2"], sigma: Float[np.ndarray, " 2"]) -> bool:
+    """Whether software that turned the points explains how the edges changed.
+
+    Points that turn to the left look as a radar does that was turned to the right. Of makers that publish no sign
+    either is allowed.
+    """
+    known = ~np.isnan(step.size_rad)
+    signs = (1.0,) if step.sign_is_published else (1.0, -1.0)
+    return any((np.abs(turned + sign * step.size_rad) < _SIGMAS * sigma)[known].all() for sign in signs)
+
+
+def _in_words(step: _Step, turned: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]] | None) -> str:
+    """As `2026-03-05: +0.30 deg in azimuth; its edges turned by -0.28 ± 0.08 deg in azimuth`."""
+    known = [k for k in range(2) if not np.isnan(step.size_rad[k])]
+    degrees = np.degrees(step.size_rad)
+    text = f"{step.first_new}: " + ", ".join(f"{degrees[k]:+.2f} deg in {_AXES[k]}" for k in known)
+    if turned is None:
+        return text
+    own = [f"{v:+.2f} ± {s:.2f} deg" for v, s in np.degrees(np.array(turned)).T]
+    return f"{text}; its edges turned by {' and '.join(f'{own[k]} in {_AXES[k]}' for k in known)}"
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
