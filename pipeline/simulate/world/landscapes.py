@@ -32,6 +32,7 @@ class Landscape:
         parking: share of drives with cars parked along the kerb.
         traffic: factor of how many places of a stream of road users are taken.
         spacing: factor of the distance between these places.
+        kinds: of vehicles on the road; none = as is usual there.
         walk_m: between these lies the width of the pavement; 0 = a verge of grass.
         fences: weights of what stands along a plot.
         houses: share of plots with a house.
@@ -61,6 +62,7 @@ class Landscape:
     parking: float = 0.75
     traffic: float = 1.0
     spacing: float = 1.0
+    kinds: tuple[str, ...] = ()
     walk_m: tuple[float, float] = (1.2, 3.0)
     fences: tuple[tuple[Fence, float], ...] = (("none", 1.0),)
     houses: float = 0.0
@@ -88,10 +90,12 @@ _ALL: Final = (
     Landscape("highway", fast=True, plain=True, glass=False),
     # As residential streets are: gardens, cars on both sides, few lanes.
     Landscape("suburb", two_lanes=0.0, parking=1.0, traffic=0.8, fences=_GARDENS, houses=0.8, green=2.0, poles_m=30.0),
-    # Cars, vans, buses and lorries close by, before and beside us, and little else.
+    # Cars and vans close by, before and beside us, hardly moving, and little else: all that stands before and behind
+    # one another has one label.
     Landscape(
-        "jam", pace=0.25, two_lanes=1.0, parking=1.0, traffic=1.3, spacing=0.4, walk_m=(2.0, 4.0), houses=0.3,
-        fences=(("none", 0.6), ("hedge", 0.2), ("mesh", 0.2)), green=0.5, poles_m=60.0,
+        "jam", pace=0.08, two_lanes=1.0, parking=1.0, traffic=1.4, spacing=0.38,
+        kinds=("car", "van", "car", "van", "van"), walk_m=(2.0, 4.0), houses=0.1,
+        fences=(("none", 0.8), ("hedge", 0.1), ("mesh", 0.1)), green=0.3, poles_m=60.0,
     ),
     Landscape(
         "alley", pace=0.5, lane_m=3.6, one_way=True, two_lanes=0.0, parking=0.0, walk_m=(0.4, 1.0), houses=0.95,

@@ -79,6 +79,7 @@ def _dense(stream: _Stream, landscape: Landscape) -> _Stream:
         speed_mps=stream.speed_mps * landscape.pace,
         spacing_m=stream.spacing_m * landscape.spacing,
         occupancy=stream.occupancy * landscape.traffic,
+        kinds=landscape.kinds or stream.kinds,
     )
 
 
@@ -157,7 +158,8 @@ def _leaders(drive: Drive, t_s: float, here_m: float, within_m: tuple[float, flo
         for i in range(5):
             headway += rng.uniform(1.1, 3.2)
             gap += rng.uniform(7.5, 10.0)
-            kind = ("car", "car", "van", "truck", "car")[int(rng.integers(5))]
+            kinds = drive.landscape.kinds or ("car", "car", "van", "truck", "car")
+            kind = kinds[int(rng.integers(len(kinds)))]
             variant = int(rng.integers(VARIANTS[kind]))
             t = t_s + sign * headway
             s = drive.ego.arc(t) + sign * gap
