@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 
-__all__ = ["LANDSCAPES", "Landscape", "landscape_named"]
+__all__ = ["LANDSCAPES", "WORLD", "Landscape", "landscape_named"]
 
 WORLD: Final = "world-"  # begins the names of worlds that a seed draws
 
@@ -23,6 +23,7 @@ class Landscape:
 
     Args:
         name: of the environment.
+        base: the named one that a seed changed.
         fast: a motorway's curves, speeds, traffic and banks; else a street's.
         plain: the sides of the street are those of `urban`, as it always was.
         pace: factor of the usual speed.
@@ -53,6 +54,7 @@ class Landscape:
     """
 
     name: str
+    base: str = ""
     fast: bool = False
     plain: bool = False
     pace: float = 1.0
@@ -146,6 +148,7 @@ def _drawn(seed: int) -> Landscape:
     drawn = replace(
         base,
         name=f"{WORLD}{seed}",
+        base=base.name,
         plain=False,
         pace=base.pace * float(rng.uniform(0.7, 1.2)),
         parking=float(often(0.5)) if base.parking else 0.0,

@@ -196,6 +196,11 @@ def _turned(first: int) -> list[DaySpec]:
     return [DaySpec(first + i, ("urban", "highway")[i % 2], fault=fault) for i, fault in enumerate(faults)]
 
 
+def _worlds(first: int, count: int) -> list[DaySpec]:
+    """Another world with another rig for every seed."""
+    return [DaySpec(seed, f"world-{seed}", 60, f"random-{seed}") for seed in range(first, first + count)]
+
+
 REAL = DaySpec(0, "real", 0, "real")
 
 # Seeds below 200 are for tuning. Seeds 200 to 804 were the test days of 0.3.0: the estimator was changed on what they
@@ -253,6 +258,8 @@ SETS: dict[str, list[DaySpec]] = {
             2 * ("ring16", "spin128", "demo", "fisheye", "pinhole", "rosette", "truck", "paper")
         )
     ],
+    "dev-worlds": _worlds(60, 16),
+    "worlds": _worlds(6400, 48),
     "table1": [DaySpec(4600 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
     "one-clock": [
         DaySpec(4620 + i, "urban" if i < 5 else "highway", 100, "paper-one-clock") for i in range(10)
