@@ -48,8 +48,9 @@ def simulate(
             country, deck, tunnel, or world-SEED, drawn by SEED.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
         faults: vehicle:day:sensor:kind:amount, several with commas; kinds: yaw pitch roll [deg], x y z [m],
-            drift-... per day, warm-... over the day, time and stamp [s] (0.5@0.6: after .6 of the day's frames),
-            missing, stuck, swap, intrinsics, centre, centre-v [px], labels, night, dusk, few.
+            drift-... per day, warm-... over the day, realign and realign-untold (by a radar's software) [deg],
+            time and stamp [s] (0.5@0.6: after .6 of the day's frames), missing, stuck, swap, intrinsics, centre,
+            centre-v [px], labels, night, dusk, few.
         remount_deg: sd per axis by which every day's mounting differs from the day before, as when a rig is taken off
             every evening; fixed sensors move by hundredths of a degree, which is the default.
         reflectors: also record three corner reflectors on every vehicle's last day, under OUT/reflectors.

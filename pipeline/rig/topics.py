@@ -28,12 +28,13 @@ _FRAMES: Final = {
 
 
 def topics_of(name: str, kind: Kind) -> dict[str, str]:
-    """Topics of a sensor: image, info, labels and detections of a camera, points of another."""
-    if name == kind:
-        cameras = ("info", "image", "labels", "detections")
-        return {n: TOPICS[n] for n in cameras} if kind == "camera" else {"points": TOPICS[kind]}
+    """Topics of a sensor: image, info, labels and detections of a camera, points of another, a radar's alignment."""
     if kind != "camera":
-        return {"points": f"/{kind}/{name}/points"}
+        points = TOPICS[kind] if name == kind else f"/{kind}/{name}/points"
+        alignment = points.replace("points", "location_attributes")
+        return {"points": points} | ({"alignment": alignment} if kind == "radar" else {})
+    if name == kind:
+        return {n: TOPICS[n] for n in ("info", "image", "labels", "detections")}
     return {
         "info": f"/camera/{name}/camera_info",
         "image": f"/camera/{name}/image/compressed",

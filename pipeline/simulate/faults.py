@@ -5,6 +5,8 @@ A sensor goes by its name in the rig.
 Kinds: yaw, pitch, roll [deg] and x, y, z [m] are knocks from that day on, about the vehicle's axes at the sensor; the
 same with `drift-` before it grow by the amount per day, starting that day. From that day on `time` [s] lets a sensor
 measure earlier than its stamps say, which stay with the others'; `stamp` [s] shifts its stamps, and nothing else.
+`realign` [deg] is a radar whose software turns its points to the left by so much, and states it; `realign-untold` one
+that does not state it.
 All of these may begin within their day: amount `0.5@0.6` comes after six tenths of its frames. With `warm-` before it a
 turn or shift grows from nothing to the amount from the first frame of that day to its last, and is gone the next day.
 Only on that day, and from within it too: `missing` (no data), `stuck` (the first data of each drive are sent again and
@@ -39,6 +41,7 @@ __all__ = [
     "misread",
     "parse_faults",
     "shaken",
+    "states_alignment",
     "swapped_with",
 ]
 
@@ -47,8 +50,15 @@ _CAMERA_ONLY: Final = ("intrinsics", "centre", "centre-v", "labels", "night", "d
 _SENT: Final = ("missing", "stuck")
 _DAY_ONLY: Final = (*_SENT, "swap", *_CAMERA_ONLY)
 _CLOCKS: Final = ("time", "stamp")
+_REALIGNED: Final = ("realign", "realign-untold")
 _WARM: Final = "warm-"
-KINDS: Final = (*_AXES, *(f"{how}-{a}" for how in ("drift", "warm") for a in _AXES), *_CLOCKS, *_DAY_ONLY)
+KINDS: Final = (
+    *_AXES,
+    *(f"{how}-{a}" for how in ("drift", "warm") for a in _AXES),
+    *_CLOCKS,
+    *_REALIGNED,
+    *_DAY_ONLY,
+)
 
 
 @dataclass(frozen=True)
@@ -119,9 +129,16 @@ def _sensors(kind: str, rig: RigSpec) -> list[str]:
     """Sensors of a rig that a kind of fault can happen to."""
     if kind in _CLOCKS:  # the reference lidar's clock is what the others are compared with
         return [s.name for s in rig.sensors if s != rig.reference]
+    if kind in _REALIGNED:
+        return [s.name for s in rig.of_kind("radar")]
     if kind == "swap":
         return [s.name for s in rig.sensors if s.kind != "camera" and swapped_with(s, rig) is not None]
     return [s.name for s in rig.sensors if kind not in _CAMERA_ONLY or s.kind == "camera"]
+
+
+def states_alignment(faults: tuple[Fault, ...]) -> bool:
+    """Whether radars of the fleet state their own alignment: where one of them is aligned anew."""
+    return any(fault.kind in _REALIGNED for fault in faults)
 
 
 def swapped_with(sensor: SensorSpec, rig: RigSpec) -> SensorSpec | None:
@@ -151,6 +168,10 @@ def _moved(mounted: Mounted, fault: Fault, day: int, share: float) -> Mounted:
         # A stamp that is late belongs to an event as much earlier: shifting both leaves the event where it was.
         phase_s = mounted.phase_s + (fault.amount if fault.kind == "stamp" else 0.0)
         return replace(mounted, delay_s=mounted.delay_s + fault.amount, phase_s=phase_s)
+    if fault.kind in _REALIGNED:
+        angle = float(np.radians(fault.amount))
+        stated = angle if fault.kind == "realign" else 0.0
+        return replace(mounted, turned_rad=mounted.turned_rad + angle, stated_rad=mounted.stated_rad + stated)
     how, _, kind = fault.kind.rpartition("-")
     amount = fault.amount * {"drift": day - fault.day + 1, "warm": share, "": 1}[how]
     T = mounted.T_vehicle.copy()

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.results import Progress, silent
-from pipeline.simulate.faults import Fault, faults_on, shaken
+from pipeline.simulate.faults import Fault, faults_on, shaken, states_alignment
 from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
 from pipeline.simulate.logs.frame_messages import Setup
 from pipeline.simulate.logs.recording import FIRST_FRAME_S, record_drive
@@ -127,7 +127,9 @@ def simulate_fleet(
     """
     vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "fleet.toml").write_text(mixed_fleet_toml("synthetic", rigs_of(spec)))
+    (out / "fleet.toml").write_text(
+        mixed_fleet_toml("synthetic", rigs_of(spec), states_alignment(spec.faults))
+    )
     work = [(v, d) for d in range(len(days)) for v in range(len(vehicles))]
     total, done, logs = len(work) * spec.frames, 0, 0
     if workers <= 1:
@@ -226,7 +228,13 @@ def mounting_on(spec: FleetSpec, vehicle: int, day: int, share: float = 0.0) -> 
 def _setup(spec: FleetSpec, vehicle: int, day: int, share: float) -> Setup:
     """The vehicle after a share of a day's frames."""
     today = faults_on(spec.faults, vehicle_names(spec)[vehicle], day, share)
-    return Setup(rig_of(spec, vehicle), mounting_on(spec, vehicle, day, share), spec.semantics, today)
+    return Setup(
+        rig_of(spec, vehicle),
+        mounting_on(spec, vehicle, day, share),
+        spec.semantics,
+        today,
+        states_alignment(spec.faults),
+    )
 
 
 def _frames(spec: FleetSpec, vehicle: str, day: int) -> int:

@@ -126,7 +126,7 @@ def _picks(
 ) -> dict[str, Any]:
     """What a patient person marks in each sensor's data, and what is true."""
     seen, lidar, radar = (
-        transform_points(inverse(m[n].T_vehicle), REFLECTORS_VEHICLE) for n in ("camera", "lidar", "radar")
+        transform_points(inverse(m[n].T_points), REFLECTORS_VEHICLE) for n in ("camera", "lidar", "radar")
     )
     camera, logged = m.camera("camera")
     pixels, _ = camera.project(seen)

@@ -33,6 +33,8 @@ class Mounted:
         camera: true intrinsics of a camera.
         nominal_camera: those that the log states.
         errors: constant errors of a radar.
+        turned_rad: by which a radar's software turns its points, positive to the left.
+        stated_rad: what a radar states of its own alignment in azimuth.
     """
 
     T_vehicle: np.ndarray
@@ -42,6 +44,20 @@ class Mounted:
     camera: Camera | None = None
     nominal_camera: Camera | None = None
     errors: RadarErrors | None = None
+    turned_rad: float = 0.0
+    stated_rad: float = 0.0
+
+    @property
+    def R_turned(self) -> Float[np.ndarray, "3 3"]:
+        """What a radar's software does to its points."""
+        return exp_so3(np.array([0.0, 0.0, self.turned_rad]))
+
+    @property
+    def T_points(self) -> Float[np.ndarray, "4 4"]:
+        """T_vehicle_points: of the axes that points are given in, which a radar's software may have turned."""
+        if not self.turned_rad:
+            return self.T_vehicle
+        return self.T_vehicle @ from_rotation_translation(self.R_turned.T, np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +71,8 @@ class Mounting:
         return self.sensors[name]
 
     def between(self, parent: str, child: str) -> Float[np.ndarray, "4 4"]:
-        """True T_parent_child of two sensors."""
-        return inverse(self[parent].T_vehicle) @ self[child].T_vehicle
+        """True T_parent_child of two sensors, of the axes that their points are given in."""
+        return inverse(self[parent].T_points) @ self[child].T_points
 
     def camera(self, name: str) -> tuple[Camera, Camera]:
         """Intrinsics of a camera: true, and as its log states them."""
