@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -55,6 +55,7 @@ class FoundCloud:
     msgtype: str
     fields: tuple[str, ...] = ()
     doppler: tuple[str, ...] = ()
+    alignment: tuple[str, ...] = ()  # topics on which a radar states its own
 
 
 @dataclass(eq=False)
@@ -72,6 +73,7 @@ def find_sensors(survey: Survey) -> FoundSensors:
     """Cameras, lidars and radars of the logs, one for each frame id and kind."""
     found = FoundSensors()
     _find_clouds(survey, found)
+    _find_alignments(survey, found)
     _find_cameras(survey, found)
     odometry = sorted(survey.of("odometry"), key=lambda t: (not _moves(t), -t.messages))
     if odometry:
@@ -105,6 +107,16 @@ def _find_clouds(survey: Survey, found: FoundSensors) -> None:
         clouds.sort(key=lambda c: -c[1])
         (found.radars if kind == "radar" else found.lidars).append(clouds[0][0])
         found.passed_over += [f"{c.topic} ({kind} {c.frame_id} too)" for c, _ in clouds[1:]]
+
+
+def _find_alignments(survey: Survey, found: FoundSensors) -> None:
+    """Messages of a radar about itself: of the only radar, or in the frame of its points."""
+    topics, radars = survey.of("alignment"), found.radars
+    for k, radar in enumerate(radars):
+        own = [t.name for t in topics if len(radars) == 1 or t.frame_id == radar.frame_id]
+        radars[k] = replace(radar, alignment=tuple(own))
+    named = {name for radar in radars for name in radar.alignment}
+    found.passed_over += [f"{t.name} (of which radar?)" for t in topics if t.name not in named]
 
 
 def _columns(message: Any) -> np.ndarray:
