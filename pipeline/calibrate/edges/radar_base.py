@@ -20,7 +20,7 @@ from pipeline.calibrate.edges.robust_regression import Regression, regress
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
-from pipeline.objective.radar.travel import DOPPLER_PITCH_FLOOR_RAD, TravelDirections
+from pipeline.objective.radar.travel import TravelDirections
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
 
@@ -83,7 +83,8 @@ def estimate_radar_base(
     moments = int(np.sum(_moving(radar, ego)))
     return EdgeEvidence(
         edge, inverse(T), 0.0 if clock is None else float(clock.value[0]), (J.T / variance) @ J, np.zeros(7),
-        _biases(T), frames_used=moments, diagnostics=_numbers(yaw, moments), notes=_notes(yaw, pitch, clock),
+        _biases(T, 0.0 if directions is None else directions.bias_rad),
+        frames_used=moments, diagnostics=_numbers(yaw, moments), notes=_notes(yaw, pitch, clock),
     )  # fmt: skip
 
 
@@ -147,11 +148,11 @@ def _accelerations(ego: EgoMotion, stamps: Stamps) -> Float[np.ndarray, " F"]:
     return found
 
 
-def _biases(T: np.ndarray) -> dict[str, np.ndarray]:
-    """The car's stance, and what the matching leaves: pitch by Doppler is good to 0.15 deg."""
+def _biases(T: np.ndarray, pitch_rad: float) -> dict[str, np.ndarray]:
+    """The car's stance, and what the matching leaves: of pitch, what detections seen too low do to the velocity."""
     axes = np.zeros((4, 6))
     axes[[0, 1, 2, 3], [0, 1, 2, 5]] = 1.0
-    floor = np.diag([0.0, DOPPLER_PITCH_FLOOR_RAD, _YAW_FLOOR_RAD, 0.0, 0.0, 0.0]) ** 2
+    floor = np.diag([0.0, pitch_rad, _YAW_FLOOR_RAD, 0.0, 0.0, 0.0]) ** 2
     to_radar = adjoint(inverse(T)) @ np.linalg.inv(change_jacobian(T))
     return {BASE.name: axes.T @ np.diag(STANCE**2) @ axes, EDGE: to_radar @ floor @ to_radar.T}
 

@@ -301,6 +301,14 @@ SETS: dict[str, list[DaySpec]] = {
         *_both(4004, 2, rig="ring16"),
         *_both(4008, 2, rig="ring16"),
     ],
+    "radar-dirty": [
+        DaySpec(5400 + i, ("urban", "highway")[i // 6 % 2], rig=f"{rig}-dirty")
+        for i, rig in enumerate(8 * ("paper", "ring16", "demo", "truck", "bumper", "spin128"))
+    ],
+    "dev-dirty": [
+        DaySpec(120 + i, ("urban", "highway")[i // 6 % 2], rig=f"{rig}-dirty")
+        for i, rig in enumerate(2 * ("paper", "ring16", "demo", "truck", "bumper", "spin128"))
+    ],
     "ablation": [
         DaySpec(3800, "urban", 100),
         DaySpec(3801, "highway", 100),

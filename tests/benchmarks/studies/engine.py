@@ -74,7 +74,7 @@ _DIAGNOSTICS = {
     "doppler_frames",
     *(
         f"{who}_pitch_{what}_rad"
-        for who in ("registration", "boxes", "doppler")
+        for who in ("registration", "boxes", "doppler", "heights")
         for what in ("offset", "sigma")
     ),
 }

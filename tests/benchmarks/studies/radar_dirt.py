@@ -151,8 +151,8 @@ def _ways(use: Sequence[Observation], T: Array, dt_s: float, *, by_instruments: 
     for o in use:
         assert o.radar_velocity_mps is not None
         ahead = (T[:3, :3] @ o.radar_velocity_mps)[:2]
-        slope = travel._road_slope(o, ahead / max(float(np.hypot(*ahead)), 1e-9))
-        if slope is None or np.hypot(*o.radar_velocity_mps[:2]) < _LEAST_SPEED_MPS:
+        road = travel._road(o, ahead / max(float(np.hypot(*ahead)), 1e-9))
+        if road is None or np.hypot(*o.radar_velocity_mps[:2]) < _LEAST_SPEED_MPS:
             continue
         lidar_rad = travel._lidar_elevation(o, T, dt_s, _static(o))
         above = _over_road(o, _in_lidar(o, T, dt_s)) > BELOW_M
@@ -160,7 +160,7 @@ def _ways(use: Sequence[Observation], T: Array, dt_s: float, *, by_instruments: 
             _pitch(o, T, np.isfinite(lidar_rad) & keep, lidar_rad if by_instruments else None)
             for keep in (np.ones_like(above), above)
         ]
-        found.append((pitches[0] - np.degrees(np.arctan(slope)), pitches[1] - pitches[0]))
+        found.append((pitches[0] - np.degrees(np.arctan(road[1])), pitches[1] - pitches[0]))
     mean, moved = np.nanmedian(np.array(found), axis=0)
     return float(mean), float(moved)
 

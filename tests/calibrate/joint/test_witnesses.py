@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, own_numbers, own_opinion
+from pipeline.calibrate.joint.lidar_radar.witnesses import (
+    Witness,
+    contradiction,
+    doubted,
+    own_numbers,
+    own_opinion,
+)
 
 
 def test_witnesses_that_agree_change_nothing():
@@ -55,3 +61,14 @@ def test_who_has_seen_nothing_has_no_opinion():
     assert own_opinion("doppler", np.zeros((1, 1)), np.zeros(1), 0.1) is None
     # Pitch and its constant cannot be told apart without a prior on the constant.
     assert own_opinion("boxes", np.ones((2, 2)), np.ones(2), 0.1) is None
+
+
+def test_who_turns_the_radar_further_up_than_displaced_heights_errs_by_that_and_nobody_else():
+    heights = Witness("heights", 0.01, 0.004)
+    up, down, near = (
+        Witness(n, o, 0.003) for n, o in (("boxes", -0.02), ("doppler", 0.04), ("registration", 0.008))
+    )
+    found = doubted([up, down, near, heights])
+    assert set(found) == {"boxes"}
+    assert np.hypot(found["boxes"], np.hypot(0.003, 0.004)) == pytest.approx(0.03)
+    assert doubted([up, down, near]) == {}

@@ -10,6 +10,7 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import DT, RANGE, Lin
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, own_numbers
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD, RANGE_BIAS_SIGMA_M
 from pipeline.geometry.changes import change_between
+from pipeline.objective.radar.heights import HEIGHTS_PITCH_FLOOR_RAD, Heights
 
 __all__ = ["ObservabilityAnalysis", "diagnostics_of", "notes_of"]
 
@@ -32,6 +33,7 @@ class ObservabilityAnalysis:
     fixed: np.ndarray  # P, bool
     observability: np.ndarray  # 7, of pose and dt
     witnesses: tuple[Witness, ...]  # of pitch, asked where the car's way had no say yet
+    heights: Heights | None
 
 
 def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[str]:
@@ -56,6 +58,12 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
     if linear.travel_frames:
         notes.append(
             "radar pitch assumes that the car drives along its road, as the lidar sees it under the car"
+        )
+    if analysis.heights is not None:
+        notes.append(
+            f"radar pitch allows for detections between things and their mirror images in the road: a share of "
+            f"{analysis.heights.displaced:.2f} of those of low things, which no day tells better than to "
+            f"{np.degrees(HEIGHTS_PITCH_FLOOR_RAD):.2f} deg of pitch"
         )
     disagreement = contradiction(analysis.witnesses)
     if disagreement is not None:
@@ -91,6 +99,7 @@ def diagnostics_of(
         "range_bias_m": state.range_bias_m,
         "range_bias_sigma_m": float(np.sqrt(analysis.covariance[RANGE, RANGE])),
         "bounce_share": state.bounce,
+        **({} if analysis.heights is None else {"displaced_share": analysis.heights.displaced}),
         "assigned_share": float(linear.registration.assigned.mean()),
         "boxes": float(linear.boxes),
         "box_sigma_rad": linear.box_sigma_rad,

@@ -24,6 +24,7 @@ from pipeline.calibrate.joint.lidar_radar.normal_equations import (
     Linear,
     RadarProblem,
     RadarState,
+    height_opinion,
     travel_opinion,
 )
 from pipeline.calibrate.joint.lidar_radar.own_position import own_position
@@ -36,7 +37,7 @@ from pipeline.calibrate.joint.lidar_radar.time_offset import (
     comparison_cost,
     far_time_offset,
 )
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction
+from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, doubted
 from pipeline.calibrate.numerics.bias_floors import (
     LIDAR_RADAR_BIAS,
     LIDAR_RADAR_DT_FLOOR_S,
@@ -55,6 +56,7 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.common_share import common_part, prior_share
 from pipeline.extrinsics.estimates import DayParts, PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_jacobian
+from pipeline.objective.radar.heights import displaced_heights
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
 from pipeline.objective.radar.travel import travel_directions
@@ -113,8 +115,8 @@ def estimate_lidar_radar(
     best = ends[int(np.argmin([c.mean() for c in costs]))]
     witnesses: tuple[Witness, ...] | None = None
     without_way = best
-    if "doppler" in config.terms:
-        problem, without_way, witnesses = _with_way(problem, best)
+    if {"doppler", "static"} & set(config.terms):
+        problem, without_way, witnesses = _with_way(problem, best, rng)
     analysis = _analyse_observability(problem, without_way, camera, config, rng)
     other = better_time_offset(problem, analysis.state)
     if other is not None:
@@ -213,18 +215,27 @@ def _start_of_part(part: RadarProblem, start: RadarState, unknowns: int) -> Rada
 
 
 def _with_way(
-    problem: RadarProblem, state: RadarState
+    problem: RadarProblem, state: RadarState, rng: np.random.Generator
 ) -> tuple[RadarProblem, RadarState, tuple[Witness, ...]]:
-    """The problem with the car's way, the solution without it, and what all witnesses say of that solution's pitch.
+    """The problem with the car's way and displaced heights, the solution without them, and what all say of its pitch.
 
     They are asked there, and the radar's sigmas are estimated there: a wrong way would draw the pose along, and the
     registration would then take what contradicts it for noise.
     """
     state, linear = finish(problem, state, sharpen=True)
-    dt_s = state.dt_s - problem.constant_gap_s
-    seeing = replace(problem, travel=travel_directions(problem.observations, state.T_lidar_radar, dt_s))
-    way = travel_opinion(seeing, state)
-    return seeing, state, linear.witnesses if way is None else (*linear.witnesses, way)
+    about = problem.observations, state.T_lidar_radar, state.dt_s - problem.constant_gap_s
+    seeing = replace(
+        problem,
+        travel=travel_directions(*about) if "doppler" in problem.terms else None,
+        heights=displaced_heights(*about, rng.spawn(1)[0]) if "static" in problem.terms else None,
+    )
+    added = travel_opinion(seeing, state), height_opinion(seeing, state)
+    witnesses = (*linear.witnesses, *(w for w in added if w is not None))
+    doubt_rad = doubted(witnesses)
+    wider = [
+        replace(w, sigma_rad=float(np.hypot(w.sigma_rad, doubt_rad.get(w.name, 0.0)))) for w in witnesses
+    ]
+    return replace(seeing, doubt_rad=doubt_rad), state, tuple(wider)
 
 
 def _with_witnesses(
@@ -289,7 +300,7 @@ def _analyse_observability(
             state = state.with_fixed(problem.prior, fixed)
             state = better_time_offset(problem, state) or state
         # Once the radar's sigmas are estimated they stay, so that solutions can be compared.
-        sharpen = problem.travel is None and not fixed.any()
+        sharpen = problem.travel is None and problem.heights is None and not fixed.any()
         state, linear = finish(problem, state, fixed, sharpen=sharpen)
         information = with_measured_curvature(problem, state, linear.information)
         curvature = information.sum(0) + linear.prior_information
@@ -316,7 +327,16 @@ def _analyse_observability(
     for covariance in (full, common):
         covariance[np.arange(DT + 1), np.arange(DT + 1)] += bias
     return ObservabilityAnalysis(
-        state, linear, full, common, np.diag(bias), floors, fixed, observability, linear.witnesses
+        state,
+        linear,
+        full,
+        common,
+        np.diag(bias),
+        floors,
+        fixed,
+        observability,
+        linear.witnesses,
+        problem.heights,
     )
 
 

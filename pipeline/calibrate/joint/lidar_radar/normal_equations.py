@@ -13,14 +13,20 @@ pitch: Doppler knows it in radar axes, the road in lidar axes. The prior keeps w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
-from pipeline.calibrate.joint.lidar_radar.tilt_floors import along_radar, floor_scatter, tempered, tilt_of
+from pipeline.calibrate.joint.lidar_radar.tilt_floors import (
+    along_radar,
+    floor_scatter,
+    radar_tilt_axes,
+    tempered,
+    tilt_of,
+)
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_opinion
 from pipeline.calibrate.numerics.bias_floors import (
     BOX_ROLL_FLOOR_LIDAR_RAD,
@@ -32,9 +38,10 @@ from pipeline.config import TERMS
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
+from pipeline.objective.radar.heights import HEIGHTS_PITCH_FLOOR_RAD, Heights
 from pipeline.objective.radar.moving_clusters import MovingClusters, azimuth_equations_lidar
 from pipeline.objective.radar.registration import NormalEquations, RegistrationFrames, normal_equations
-from pipeline.objective.radar.travel import DOPPLER_PITCH_FLOOR_RAD, TravelDirections, pitch_equations
+from pipeline.objective.radar.travel import TravelDirections, pitch_equations
 from pipeline.objective.radar.vehicle_boxes import (
     BIAS_SIGMA_RAD,
     BOX_CLASSES,
@@ -54,6 +61,7 @@ __all__ = [
     "Linear",
     "RadarProblem",
     "RadarState",
+    "height_opinion",
     "linearise",
     "travel_opinion",
 ]
@@ -120,6 +128,8 @@ class RadarProblem:
     # Of the stamps [s], taken out of all frames' gaps: the state's dt counts from minus it, as if the clocks were off.
     constant_gap_s: float = 0.0
     travel: TravelDirections | None = None  # None until the pose is near enough to measure them
+    heights: Heights | None = None  # likewise
+    doubt_rad: Mapping[str, float] = field(default_factory=dict)  # of pitch, beyond a witness's own sigma
 
     def of_frames(self, index: np.ndarray) -> RadarProblem:
         """The same with part of the registration's frames (and of the observations behind them)."""
@@ -133,6 +143,7 @@ class RadarProblem:
             movers=self.movers.of_frames(chosen),
             boxes=self.boxes.of_frames(chosen),
             travel=None if self.travel is None else self.travel.of_frames(chosen),
+            heights=None if self.heights is None else self.heights.of_frames(chosen),
         )
 
 
@@ -193,9 +204,11 @@ def linearise(
     equations = _registration(problem, state, widen, stride, about_radar)
     _add_azimuths_and_ranges(problem, equations, stride, sums)
     floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
+    floor[1] = np.hypot(floor[1], problem.doubt_rad.get("registration", 0.0))
     registration_step = _add_elevations(problem, state, equations, stride, floor, sums)
     box_sigma, box_witness = _add_boxes(problem, state, pairs, about_radar, sums)
     travel_scatter, travel_witness = _add_travel(problem, state, sums)
+    height_witness = _add_heights(problem, state, sums)
     own = Witness("registration", float(registration_step[1]), float(floor[1]))
     seen = own if problem.frames.has_elevation.any() and "static" in problem.terms else None
     mover_sigma = float("nan")
@@ -214,7 +227,7 @@ def linearise(
         mover_sigma,
         registration_step,
         floor,
-        tuple(w for w in (seen, box_witness, travel_witness) if w is not None),
+        tuple(w for w in (seen, box_witness, travel_witness, height_witness) if w is not None),
         0 if travel_witness is None or problem.travel is None else problem.travel.count,
         travel_scatter,
         sums.floors,
@@ -302,7 +315,8 @@ def _add_boxes(
     prior = np.diag([0.0, *[1 / BIAS_SIGMA_RAD**2] * len(BOX_CLASSES)])
     H_own, g_own = tilt_of(state.T_lidar_radar, Hb.sum(0), gb.sum(0))
     witness = own_opinion("boxes", H_own[1:, 1:] + prior, g_own[1:] + prior @ [0.0, *state.bias_rad], 0.0)
-    floor = along_radar(state.T_lidar_radar, _BOX_FLOOR)
+    doubt_rad = problem.doubt_rad.get("boxes", 0.0)
+    floor = along_radar(state.T_lidar_radar, _BOX_FLOOR + doubt_rad * (np.arange(len(_BOX_FLOOR)) == 1))
     Hb, gb = tempered(Hb, gb, floor)
     sums.floors[np.ix_(columns, columns)] += floor_scatter(Hb, floor)
     for array in (sums.H, sums.information):
@@ -317,7 +331,7 @@ def _add_travel(problem: RadarProblem, state: RadarState, sums: _Sums) -> tuple[
         return float("nan"), None
     H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
     witness = travel_opinion(problem, state)
-    floor = DOPPLER_PITCH_FLOOR_RAD**2 * np.eye(2)
+    floor = (problem.travel.bias_rad**2 + problem.doubt_rad.get("doppler", 0.0) ** 2) * np.eye(2)
     H, g = tempered(H, g, floor)
     sums.floors[:2, :2] += floor_scatter(H, floor)
     for array in (sums.H, sums.information):
@@ -332,7 +346,44 @@ def travel_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
         return None
     H, g, _ = pitch_equations(problem.travel, state.T_lidar_radar, len(problem.observations))
     H_own, g_own = tilt_of(state.T_lidar_radar, H.sum(0), g.sum(0))
-    return own_opinion("doppler", H_own[1:, 1:], g_own[1:], DOPPLER_PITCH_FLOOR_RAD)
+    return own_opinion("doppler", H_own[1:, 1:], g_own[1:], problem.travel.bias_rad)
+
+
+def _add_heights(problem: RadarProblem, state: RadarState, sums: _Sums) -> Witness | None:
+    """Add what static elevations say of pitch that may be displaced; returns what they say of it at this state."""
+    if problem.heights is None:
+        return None
+    H, g = _height_equations(problem.heights, state.T_lidar_radar, len(sums.g))
+    witness = height_opinion(problem, state)
+    floor = HEIGHTS_PITCH_FLOOR_RAD**2 * np.eye(2)
+    H, g = tempered(H, g, floor)
+    sums.floors[:2, :2] += floor_scatter(H, floor)
+    for array in (sums.H, sums.information):
+        array[:, :2, :2] += H
+    sums.g[:, :2] += g
+    return witness
+
+
+def height_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
+    """What displaced heights say of pitch at a state; None where they say nothing."""
+    if problem.heights is None:
+        return None
+    H, g = _height_equations(problem.heights, state.T_lidar_radar, len(problem.observations))
+    H_own, g_own = tilt_of(state.T_lidar_radar, H.sum(0), g.sum(0))
+    return own_opinion("heights", H_own[1:, 1:], g_own[1:], HEIGHTS_PITCH_FLOOR_RAD)
+
+
+def _height_equations(
+    heights: Heights, T_lidar_radar: np.ndarray, frames: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information (F 2 2) and gradient (F 2) of turns about the lidar's x and y."""
+    axis = radar_tilt_axes(T_lidar_radar)[:, 1]
+    turned = float(change_between(heights.T_lidar_radar, T_lidar_radar)[:2] @ axis)
+    H, g = np.zeros((frames, 2, 2)), np.zeros((frames, 2))
+    each = heights.frames
+    H[each.frame] = each.information[:, None, None] * np.outer(axis, axis)
+    g[each.frame] = (each.score + each.information * (turned - heights.turn_rad))[:, None] * axis
+    return H, g
 
 
 def _add_elevations(

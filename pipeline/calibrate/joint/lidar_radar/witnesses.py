@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Contradiction", "Witness", "contradiction", "own_numbers", "own_opinion"]
+__all__ = ["Contradiction", "Witness", "contradiction", "doubted", "own_numbers", "own_opinion"]
 
 _SIGMAS = 2.0  # from which two witnesses contradict each other
 _SINGULAR = 1e-9
@@ -48,6 +48,20 @@ def own_opinion(
     covariance = np.linalg.inv(H)
     sigma = float(np.hypot(np.sqrt(covariance[0, 0]), floor_rad))
     return Witness(name, float(-(covariance @ g)[0]), sigma)
+
+
+def doubted(witnesses: Sequence[Witness]) -> dict[str, float]:
+    """Sigmas beyond their own [rad] of witnesses that take things for seen where they are, where these are seen lower.
+
+    Such witnesses turn the radar up. Only `heights` knows of displaced detections: whoever turns it further up than
+    both sigmas allow errs by as much.
+    """
+    right = next((w for w in witnesses if w.name == "heights"), None)
+    if right is None:
+        return {}
+    apart = {w: w.offset_rad - right.offset_rad for w in witnesses if w is not right}
+    beyond = {w.name: a**2 - w.sigma_rad**2 - right.sigma_rad**2 for w, a in apart.items() if a < 0}
+    return {name: float(np.sqrt(variance)) for name, variance in beyond.items() if variance > 0}
 
 
 def contradiction(witnesses: Sequence[Witness]) -> Contradiction | None:

@@ -1,0 +1,96 @@
+"""Pitch by static elevations, a part of them displaced towards the mirror image in the road: streets of known truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.objective.radar.heights import displaced_heights
+from tests.makers.doppler_streets import GROUND_M, T_LIDAR_RADAR, turned
+from tests.makers.radar_scenes import DT_S, street_day
+from tests.makers.radar_scenes import T_LIDAR_RADAR as T_STREET
+
+
+def with_road(rows):
+    plane = np.array([0.0, 0.0, 1.0, -GROUND_M])
+    return [
+        replace(
+            o,
+            ground_plane=plane,
+            lidar_map_is_ground=(o.lidar_map_xyz_m[:, 2] < GROUND_M + 0.01).astype(np.uint8),
+        )
+        for o in rows
+    ]
+
+
+def kerbs_and_cars(rng, share, T=T_LIDAR_RADAR, noise_deg=1.0):
+    """A frame of low things; so large a share of the detections lies between the thing and its image in the road."""
+    [o] = with_road(street_day(1, int(rng.integers(1000)), dt_s=0.0))
+    foot = np.stack([rng.uniform(8, 45, 60), rng.uniform(-12, 12, 60)], 1)
+    top = rng.uniform(0.2, 2.2, 60)
+    heights = np.arange(0.05, 2.2, 0.15)
+    things = np.concatenate(
+        [
+            np.column_stack([np.tile(f, (len(heights), 1)), heights])[heights < t]
+            for f, t in zip(foot, top, strict=True)
+        ]
+    )
+    ground = np.column_stack([rng.uniform(3, 50, 1500), rng.uniform(-12, 12, 1500), np.zeros(1500)])
+    seen = things[rng.integers(0, len(things), 150)]
+    s = np.where(rng.random(150) < share, rng.random(150), 0.0)
+    seen[:, 2] *= 1 - 2 * s
+    for p in (things, ground, seen):
+        p[:, 2] += GROUND_M
+    noise = np.radians([0.2, noise_deg, 0.0]) * rng.standard_normal((150, 3))
+    radar = from_spherical(to_spherical(transform_points(inverse(T), seen)) + noise)
+    cloud = np.concatenate([things, ground]).astype(np.float32)
+    return replace(
+        o, radar_xyz_m=radar.astype(np.float32), radar_motion=np.zeros(150, np.uint8),
+        radar_velocity_mps=np.zeros(3), radar_stamp_ns=o.stamp_ns, lidar_map_xyz_m=cloud,
+        lidar_map_is_ground=np.r_[np.zeros(len(things)), np.ones(1500)].astype(np.uint8),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
+def test_displaced_detections_turn_nothing_and_their_share_is_found(share):
+    rng = np.random.default_rng(1)
+    rows = [kerbs_and_cars(rng, share) for _ in range(15)]
+    found = displaced_heights(rows, T_LIDAR_RADAR, 0.0, rng)
+    assert abs(np.degrees(found.turn_rad)) < 0.15
+    assert abs(found.displaced - share) < 0.15
+    assert abs(np.degrees(found.turn_rad)) < 4 * np.degrees(found.frames.information.sum() ** -0.5)
+
+
+def test_a_radar_that_points_down_is_turned_up_by_as_much():
+    rng = np.random.default_rng(2)
+    rows = [kerbs_and_cars(rng, 0.3) for _ in range(15)]
+    right, down = (
+        displaced_heights(rows, turned(T_LIDAR_RADAR, np.radians(d)), 0.0, np.random.default_rng(0))
+        for d in (0.0, 1.0)
+    )
+    assert np.degrees(down.turn_rad - right.turn_rad) == pytest.approx(-1.0, abs=0.15)
+
+
+def test_clutter_over_bare_road_and_tall_things_turn_little():
+    for seed in range(2):
+        found = displaced_heights(with_road(street_day(20, seed)), T_STREET, DT_S, np.random.default_rng(0))
+        assert abs(np.degrees(found.turn_rad)) < 0.3
+
+
+def test_parts_of_a_day_add_up_to_it():
+    rng = np.random.default_rng(3)
+    found = displaced_heights([kerbs_and_cars(rng, 0.3) for _ in range(12)], T_LIDAR_RADAR, 0.0, rng)
+    parts = [found.of_frames(np.arange(k, 12, 2)) for k in (0, 1)]
+    assert sum(p.frames.information.sum() for p in parts) == pytest.approx(found.frames.information.sum())
+    assert sum(p.frames.score.sum() for p in parts) == pytest.approx(
+        0.0, abs=1e-6 * found.frames.information.sum()
+    )
+
+
+def test_without_a_road_nothing_is_said():
+    rng = np.random.default_rng(4)
+    rows = [replace(kerbs_and_cars(rng, 0.3), ground_plane=None) for _ in range(8)]
+    assert displaced_heights(rows, T_LIDAR_RADAR, 0.0, rng) is None
+    assert displaced_heights([], T_LIDAR_RADAR, 0.0, rng) is None
