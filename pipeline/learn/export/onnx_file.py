@@ -22,6 +22,7 @@ from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.exported_weights import WEIGHTS, weight_places
 from pipeline.learn.network.views import RenderedView
 from pipeline.learn.sample.layout import (
+    EVIDENCE,
     GRAPH_INPUTS,
     LIDAR_CHANNELS,
     LIKELIHOOD,
@@ -48,9 +49,11 @@ class _Graph(nn.Module):
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         outputs = self.core(RenderedView(*tensors))
-        found = (outputs.corrections, outputs.log_variance)
-        likelihood = outputs.camera_log_likelihood
-        return found if likelihood is None else (likelihood, *found)
+        found: tuple[Tensor, ...] = (outputs.corrections, outputs.log_variance)
+        if outputs.camera_log_likelihood is not None:
+            found = (outputs.camera_log_likelihood, *found)
+        evidence = outputs.evidence
+        return found if evidence is None else (*found, evidence.maps, evidence.probability, evidence.worth)
 
 
 def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | None = None) -> Path:
@@ -66,9 +69,8 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
     graph = _Graph(network)
     with torch.no_grad():
         outputs = graph(*examples)
-    names = (
-        ["corrections", "log_variance"] if len(outputs) == 2 else [LIKELIHOOD, "corrections", "log_variance"]
-    )
+    answers = ["corrections", "log_variance"]
+    names = {2: answers, 3: [LIKELIHOOD, *answers], 6: [LIKELIHOOD, *answers, *EVIDENCE]}[len(outputs)]
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished = out.with_suffix(".part")
     model = trace_to_onnx(graph, examples, unfinished, GRAPH_INPUTS, names)

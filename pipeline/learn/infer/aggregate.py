@@ -29,7 +29,7 @@ from pipeline.extrinsics.estimates import PairEstimate
 from pipeline.geometry.se3 import exp_se3, hat, inverse, log_se3, transform_points
 from pipeline.geometry.spherical import from_spherical
 
-__all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "twists_about"]
+__all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "measured_estimate", "twists_about"]
 
 OBSERVABLE = 0.5  # the day at least halved the variance, as in all methods
 _RESAMPLES = 200
@@ -159,6 +159,54 @@ def day_estimate(
             prior_covariance,
             twist_of_bearing @ np.diag(np.square(_bias_sigma(pair, answers))) @ twist_of_bearing.T,
         ),
+    )
+
+
+def measured_estimate(
+    pair: str,
+    T: Float[np.ndarray, "4 4"],
+    information: Float[np.ndarray, "6 6"],
+    bias_sigma: Float[np.ndarray, " 6"],
+    T_prior: Float[np.ndarray, "4 4"],
+    prior_covariance: Float[np.ndarray, "6 6"],
+    frames: int,
+) -> PairEstimate:
+    """What a fit of all frames under the prior says, once frames may err alike.
+
+    Args:
+        pair: which.
+        T: the peak of frames and prior together.
+        information: of the frames alone, left twist; may be singular.
+        bias_sigma: of what frames err by alike, (bearing rotation [rad], translation [m]).
+        T_prior: the prior.
+        prior_covariance: of it.
+        frames: that the fit rests on.
+    """
+    S = _bearing_of_twist(T)
+    back = np.linalg.inv(S)
+    P, bias = S @ prior_covariance @ S.T, np.diag(np.square(bias_sigma))
+    precision, own = np.linalg.inv(P), back.T @ information @ back
+    m0 = S @ log_se3(T_prior @ inverse(T))
+    # (own^-1 + bias)^-1 and what it says, without the inverse of what may be flat; at the peak own z = -precision m0.
+    share = np.linalg.inv(np.eye(6) + own @ bias)
+    told, said = share @ own, share @ -precision @ m0
+    found = np.linalg.inv(told + precision)
+    observability = np.clip(1 - np.diag(back @ found @ back.T) / np.diag(prior_covariance), 0.0, 1.0)
+    observable = observability >= OBSERVABLE
+    # The others are considered, not updated (Schmidt-Kalman).
+    gain = np.where(observable[:, None], found, 0.0)
+    keep = np.eye(6) - gain @ told
+    x = back @ (m0 + gain @ (said - told @ m0))
+    covariance = back @ (keep @ P @ keep.T + gain @ told @ gain.T) @ back.T
+    covariance = (covariance + covariance.T) / 2
+    return PairEstimate(
+        pair,
+        exp_se3(x) @ T,
+        covariance,
+        observability,
+        observable,
+        frames,
+        common_covariance=common_of(covariance, prior_covariance, back @ bias @ back.T),
     )
 
 

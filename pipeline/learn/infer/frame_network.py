@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from pipeline.extrinsics.estimates import Prior
+from pipeline.learn.infer.class_evidence import FrameEvidence
 from schemas.frames import Frame
 from schemas.observations import Observation
 
@@ -47,6 +48,10 @@ class FrameNetwork(Protocol):
 
     def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> Any:
         """What `answer` needs of a frame; raises SampleRejectedError where the frame shows too little."""
+        ...
+
+    def evidence(self, sensors: Any, T_camera_lidar: np.ndarray) -> FrameEvidence | None:
+        """What camera and lidar are matched by, points chosen through a guess; None where the network does not say."""
         ...
 
     def answer(self, sensors: Any, guess: Mapping[str, np.ndarray]) -> FrameAnswer:

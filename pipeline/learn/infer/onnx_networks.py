@@ -16,6 +16,7 @@ from pipeline.config import FleetConfig, LearnConfig, PrepareConfig
 from pipeline.errors import ConfigError, ModelError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.cameras import camera_of
+from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.compiled_rendering import FrameSensors, frame_sensors
 from pipeline.learn.infer.frame_network import FrameAnswer
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
@@ -124,6 +125,10 @@ class OnnxNetwork:
             classes = class_likelihood(labels_of(observation), camera_of(observation), grid)
         sensors = frame_sensors(row, self._calibrator.grid, classes)
         return sensors if sees or classes is None else sensors.without_image()
+
+    def evidence(self, sensors: FrameSensors, T_camera_lidar: np.ndarray) -> FrameEvidence | None:
+        """What camera and lidar are matched by; None where the file does not say."""
+        return self._calibrator.evidence(sensors, T_camera_lidar)
 
     def answer(self, sensors: FrameSensors, guess: Mapping[str, np.ndarray]) -> FrameAnswer:
         """The last pass's transforms.

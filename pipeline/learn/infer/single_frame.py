@@ -13,14 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnx.shape_inference
+import onnx.utils
 import onnxruntime
 from jaxtyping import Float
 
 from pipeline.errors import ModelError
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.compiled_rendering import FrameSensors, render_frame
 from pipeline.learn.infer.split_graph import split_graph
 from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import PAIRS, NetworkConfig
+from pipeline.learn.sample.layout import EVIDENCE, PAIRS, NetworkConfig
 
 __all__ = ["FrameEstimate", "SingleFrameCalibrator", "config_from_metadata"]
 
@@ -71,6 +75,7 @@ class SingleFrameCalibrator:
         once, by_pass = split_graph(model, "camera", _ANSWERS)
         self._once = None if once is None else _session(once, threads)
         self._network = _session(by_pass, threads)
+        self._evidence = _evidence_session(model, threads)
         self._channels = self.config.camera_channels
         self._inputs = {i.name for i in self._network.get_inputs()}
 
@@ -111,6 +116,27 @@ class SingleFrameCalibrator:
             guess = self._corrected(step, guess)
         return found
 
+    def evidence(
+        self, sensors: FrameSensors, T_camera_lidar: Float[np.ndarray, "4 4"]
+    ) -> FrameEvidence | None:
+        """What the frame is matched by, its points chosen through a guess; None: the file does not put it out."""
+        if self._evidence is None:
+            return None
+        away = np.eye(4)  # of the radar, which has no part in it
+        view = render_frame(
+            sensors, T_camera_lidar, away, away, self.grid, self._channels, marks=self.config.marks
+        )
+        names = [i.name for i in self._evidence.get_inputs()]
+        maps, probability, worth = self._evidence.run(EVIDENCE, {name: view[name] for name in names})
+        points = np.concatenate([view["points_camera"][0], view["marks_camera"][0]])[: len(worth[0])]
+        return FrameEvidence(
+            self.grid,
+            np.ascontiguousarray(maps[0].transpose(1, 2, 0)),
+            transform_points(inverse(T_camera_lidar), points).astype(np.float32),
+            probability[0],
+            worth[0],
+        )
+
     def _of_camera(self, sensors: FrameSensors) -> dict[str, np.ndarray]:
         """What the camera alone decides, by name."""
         if self._once is None:
@@ -141,6 +167,14 @@ def config_from_metadata(path: Path, metadata: Mapping[str, str]) -> NetworkConf
         return NetworkConfig(**(values | {"grid": Grid(**values["grid"])}))
     except (KeyError, TypeError, ValueError) as err:
         raise ModelError(str(path), "was not written by `boresight export onnx`") from err
+
+
+def _evidence_session(model: onnx.ModelProto, threads: int) -> onnxruntime.InferenceSession | None:
+    """A session of what frames are matched by; None for files that do not name it, as none did before 0.12."""
+    if not {o.name for o in model.graph.output}.issuperset(EVIDENCE):
+        return None
+    cut = onnx.utils.Extractor(onnx.shape_inference.infer_shapes(model, data_prop=True))
+    return _session(cut.extract_model([i.name for i in model.graph.input], list(EVIDENCE)), threads)
 
 
 def _session(model: onnx.ModelProto, threads: int) -> onnxruntime.InferenceSession:

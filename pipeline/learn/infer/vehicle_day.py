@@ -15,7 +15,9 @@ from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from pipeline.learn.infer.aggregate import Answers, day_estimate, mean_answer, twists_about
+from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.frame_network import FrameNetwork, FrameSource
+from pipeline.learn.infer.joint_day import JointDay, fitted_day
 from pipeline.learn.sample.frame_sample import SampleRejectedError
 from pipeline.results import Progress, silent
 from schemas.calibrations import PAIRS
@@ -68,14 +70,24 @@ def solve_by_networks(
         SolveError: too few frames can be shown to the networks.
     """
     rng = np.random.default_rng([seed, 7])
-    asked, found, rejected = _asked_day(observations, prior, networks, frames, rng, progress)
+    asked, found, rejected, together = _asked_day(observations, prior, networks, frames, rng, progress)
+
+    def estimate(pair: str, rows: np.ndarray | None = None) -> PairEstimate:
+        answers = found[pair] if rows is None else _part(found[pair], rows)
+        of_answers = _estimate(pair, answers, asked, rng)
+        if pair != "camera_lidar" or together is None:
+            return of_answers
+        return replace(together.estimate(prior, rows), diagnostics=of_answers.diagnostics)
+
     estimates = {
-        pair: replace(_estimate(pair, found[pair], asked, rng), frames_rejected=dict(rejected))
+        pair: replace(estimate(pair), frames_rejected=dict(rejected))
         if pair in triggered
         else PairEstimate.at_prior(pair, prior)
         for pair in PAIRS
     }
-    failed = {pair: _halves_disagree(pair, found[pair], asked, rng) for pair in triggered}
+    failed = {pair: _halves_disagree(pair, found[pair].block, estimate) for pair in triggered}
+    if together is not None and "camera_lidar" in failed:
+        failed["camera_lidar"] += together.failed
     if any(n.composed for n in networks) or len(triggered) < len(PAIRS):
         # A loop that closes by construction is no evidence.
         return Solution(method, estimates, failed_checks=failed)
@@ -160,8 +172,11 @@ def _asked_day(
     frames: FrameSource,
     rng: np.random.Generator,
     progress: Progress,
-) -> tuple[_Asked, dict[str, Answers], Counter[str]]:
-    """Prepare all frames, iterate the guess on pilot frames, ask about all; also counts rejected frames by reason."""
+) -> tuple[_Asked, dict[str, Answers], Counter[str], JointDay | None]:
+    """Prepare all frames, iterate the guess on pilot frames, fit camera-lidar to all, ask about all.
+
+    Also counts rejected frames by reason. The fit is None where no network says what it matches.
+    """
     chosen = _chosen(observations)
     rejected: Counter[str] = Counter()
     asked = _Asked(networks, prior, [], [])
@@ -178,10 +193,28 @@ def _asked_day(
         raise SolveError(
             f"too few frames for a network: {len(asked.sensors)} of {total} ({why or 'short day'})"
         )
-    centre = _pilot_centre(asked, rng)
+    centre, candidates = _pilot_centre(asked, rng)
+    together = _fitted_together(asked, candidates)
+    if together is not None:
+        centre["camera_lidar"] = together.fit.T
     everything = range(len(asked.sensors))
     found = _ask(asked, everything, centre, rng, lambda i: progress(total + i, 2 * total, "ask networks"))
-    return asked, found, rejected
+    return asked, found, rejected, together
+
+
+def _fitted_together(asked: _Asked, candidates: Sequence[np.ndarray]) -> JointDay | None:
+    """Camera-lidar by all frames at once, where a network says what it matches."""
+    which = next((i for i, n in enumerate(asked.networks) if "camera_lidar" in n.pairs), None)
+    if which is None:
+        return None
+
+    def evidence(T: np.ndarray) -> list[FrameEvidence]:
+        network = asked.networks[which]
+        found = (network.evidence(sensors[which], T) for sensors in asked.sensors)
+        return [frame for frame in found if frame is not None]
+
+    block = _blocks([o.drive for o in asked.observations])
+    return fitted_day(evidence, block, candidates, asked.prior)
 
 
 def _chosen(observations: Mapping[str, Sequence[Observation]]) -> list[Observation]:
@@ -192,20 +225,26 @@ def _chosen(observations: Mapping[str, Sequence[Observation]]) -> list[Observati
     return [ordered[i] for i in kept]
 
 
-def _pilot_centre(asked: _Asked, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Iterate the guess on pilot frames until it moves less than 0.3 deg: answers are best near the truth."""
+def _pilot_centre(asked: _Asked, rng: np.random.Generator) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
+    """Iterate the guess on pilot frames until it moves less than 0.3 deg: answers are best near the truth.
+
+    Also returns where camera-lidar was by each round and by each pilot frame's own answers.
+    """
     count, prior = len(asked.sensors), asked.prior
     centre = {pair: prior.of(pair) for pair in PAIRS}
     rows: list[int] = np.unique(np.linspace(0, count - 1, min(count, _PILOT_FRAMES)).astype(int)).tolist()
     rows *= -(-_FEWEST_GUESSES // len(rows))
+    candidates = []
     for _ in range(_PILOT_ROUNDS):
         found = _ask(asked, rows, centre, rng, lambda _: None)
         moved = {p: mean_answer(found[p], prior.of(p), prior.covariance(p)) for p in PAIRS}
         turned_rad = max(float(rotation_angle_rad(moved[p] @ inverse(centre[p]))) for p in PAIRS)
+        own = found["camera_lidar"]
+        candidates += [moved["camera_lidar"], *(exp_se3(own.answer) @ own.T_centre)]
         centre = moved
         if turned_rad < _CONVERGED_RAD:
             break
-    return centre
+    return centre, candidates
 
 
 def _ask(
@@ -276,11 +315,11 @@ def _estimate(pair: str, answers: Answers, asked: _Asked, rng: np.random.Generat
 
 
 def _halves_disagree(
-    pair: str, answers: Answers, asked: _Asked, rng: np.random.Generator
+    pair: str, block: np.ndarray, estimate: Callable[[str, np.ndarray], PairEstimate]
 ) -> list[FailedCheck]:
     """A failed check, if estimates from the odd and from the even blocks differ by more than their sigmas allow."""
-    odd = np.unique(answers.block, return_inverse=True)[1].ravel() % 2 == 1
-    halves = [_estimate(pair, _part(answers, rows), asked, rng) for rows in (odd, ~odd)]
+    odd = np.unique(block, return_inverse=True)[1].ravel() % 2 == 1
+    halves = [estimate(pair, rows) for rows in (odd, ~odd)]
     apart = log_se3(halves[0].T @ inverse(halves[1].T))
     both = halves[0].observable & halves[1].observable
     sigma = np.sqrt(np.diag(halves[0].covariance) + np.diag(halves[1].covariance))

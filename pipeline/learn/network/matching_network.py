@@ -12,7 +12,7 @@ from pipeline.learn.network.class_matcher import FLOOR, NEUTRAL, ClassMatcher, M
 from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder, PointEncoder, cell_values
 from pipeline.learn.network.markings import log_markings
 from pipeline.learn.network.occupancy_matcher import OccupancyMatch, OccupancyMatcher
-from pipeline.learn.network.outputs import CoreOutputs, Heads, pose_of_twist
+from pipeline.learn.network.outputs import ClassEvidence, CoreOutputs, Heads, pose_of_twist
 from pipeline.learn.network.rendering import grid_cells, sphere
 from pipeline.learn.network.views import RenderedView
 from pipeline.learn.sample.grid import Grid
@@ -127,7 +127,7 @@ class MatchingCore(nn.Module):
     ) -> CoreOutputs:
         """The part that depends on the guess: matchers, residuals, log variances."""
         bases: dict[str, Match | OccupancyMatch] = {}
-        lidar_logits = radar_logits = None
+        lidar_logits = radar_logits = evidence = None
         features = []
         if "camera_lidar" in self.pairs:
             assert likelihood is not None
@@ -142,6 +142,7 @@ class MatchingCore(nn.Module):
                 marked = view.mark_weight * self._worth(likelihood, view.marks_camera)
                 maps, probability = self._with_marks(view.camera, maps, probability)
                 points, weight = torch.cat([points, view.marks_camera], 1), torch.cat([weight, marked], 1)
+            evidence = ClassEvidence(maps, probability, weight)
             found = self.lidar_matcher(maps, points, probability, weight)
             bases["camera_lidar"] = found
             features.append(_features(found.surfaces.flatten(1), found))
@@ -163,7 +164,8 @@ class MatchingCore(nn.Module):
             features.append(_features(found.surfaces.flatten(1), found))
         fused = self.fusion(torch.cat([s(f) for s, f in zip(self.summaries, features, strict=True)], -1))
         corrections, log_variance = self._combine(bases, fused)
-        return CoreOutputs(corrections, log_variance, likelihood, camera_logits, lidar_logits, radar_logits)
+        logits_of = (camera_logits, lidar_logits, radar_logits)
+        return CoreOutputs(corrections, log_variance, likelihood, *logits_of, evidence)
 
     def encode_lidar(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B K H W"]:
         """Class logits of a rendered sweep; in training every other frame is seen in a mirror.

@@ -11,11 +11,22 @@ from torch import Tensor, nn
 from pipeline.learn.sample.layout import PAIRS
 from pipeline.objective.differentiable.poses import exp_so3, pose, pose_of_euler_angles
 
-__all__ = ["PAIRS", "CoreOutputs", "Heads", "Predictions", "pose_of_twist"]
+__all__ = ["PAIRS", "ClassEvidence", "CoreOutputs", "Heads", "Predictions", "pose_of_twist"]
 
 _ANGLE_UNIT_RAD, _SHIFT_UNIT_M = 0.0175, 0.05  # heads put out numbers of the order of one
 # Log variance of an untrained network: 0.3 deg and 5 cm.
 _LOG_VARIANCE = (-10.5, -10.5, -10.5, -6.0, -6.0, -6.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ClassEvidence:
+    """What camera and lidar are matched by: points take part in the order of points_camera, marks_camera."""
+
+    maps: Float[
+        Tensor, "B K H W"
+    ]  # log-likelihood of classes; of boundaries and paint where these are matched
+    probability: Float[Tensor, "B N K"]  # of each point's classes
+    worth: Float[Tensor, "B N"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +41,7 @@ class CoreOutputs:
     camera_logits: Float[Tensor, "B K H W"] | None = None
     lidar_logits: Float[Tensor, "B K H W"] | None = None
     radar_logits: Float[Tensor, "B M K"] | None = None
+    evidence: ClassEvidence | None = None
 
 
 @dataclass(frozen=True, eq=False)

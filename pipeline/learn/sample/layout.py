@@ -53,6 +53,8 @@ GRAPH_INPUTS = (
     "mark_weight",
 )  # fmt: skip
 LIKELIHOOD = "camera_log_likelihood"  # an output, where a graph can be cut to encode the camera once
+# Outputs where a camera and a lidar are matched: the fields of `network.outputs.ClassEvidence`.
+EVIDENCE = ("class_maps", "point_probability", "point_worth")
 
 
 @dataclass(frozen=True)

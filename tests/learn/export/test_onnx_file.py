@@ -13,7 +13,7 @@ from onnxruntime import InferenceSession
 
 from pipeline.errors import ModelError
 from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3
+from pipeline.geometry.se3 import exp_so3, transform_points
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.compiled_rendering import frame_sensors, render_frame
@@ -141,6 +141,24 @@ def test_a_graph_cut_behind_the_camera_answers_as_the_whole(exported):
     feed |= dict(zip((o.name for o in once.graph.output), known, strict=True))
     for a, b in zip(InferenceSession(by_pass.SerializeToString()).run(names, feed), whole, strict=True):
         assert a == pytest.approx(b, abs=1e-5)
+
+
+def test_what_a_file_matches_by_is_what_the_network_matches_by(exported):
+    network, path = exported
+    T_camera_lidar = guess()[0]
+    told = SingleFrameCalibrator(path).evidence(frame_sensors(row(), GRID, classes()), T_camera_lidar)
+    with torch.no_grad():
+        view, _ = render(inputs(), GRID, classes=network.config.takes_classes)
+        evidence = network.core(view).evidence
+    assert (told is None) == (evidence is None)
+    if told is None:
+        return
+    assert told.maps == pytest.approx(evidence.maps[0].permute(1, 2, 0).numpy(), abs=1e-4)
+    present = evidence.worth[0].numpy() > 0
+    assert told.probability[present] == pytest.approx(evidence.probability[0].numpy()[present], abs=1e-4)
+    points = torch.cat([view.points_camera, view.marks_camera], 1)[0].double().numpy()[: len(present)]
+    seen = transform_points(T_camera_lidar, told.points_m.astype(np.float64))
+    assert seen[present] == pytest.approx(points[present], abs=1e-3)
 
 
 def test_a_file_that_takes_classes_answers_without_them_and_otherwise(exported):

@@ -51,6 +51,9 @@ class Oracle:
         assert frame.frame_index == observation.frame_index
         return frame.frame_index
 
+    def evidence(self, _sensors, _T_camera_lidar):
+        return None
+
     def answer(self, _sensors, guess):
         T = {}
         for pair in self.pairs:

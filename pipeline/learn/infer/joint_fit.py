@@ -1,0 +1,140 @@
+"""Camera-lidar of a day from all its frames at once: where the classes of all sweeps fit all images best.
+
+A frame alone tells rotation to half a degree and hardly any shift, and sometimes it fits in two places. The sum over
+frames has one peak: wrong places of single frames do not meet, and near and far points tell the shift by parallax.
+Poses that pilot frames answered are candidates, all frames vote among them, and the winner climbs the sum.
+
+Points of a frame are not independent, so the sum is no likelihood. By how much it is to be taken is read off the day: a
+likelihood's curvature is the scatter of its gradient from scene to scene (Pauli, Racugno and Ventura 2011).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import minimize
+
+from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
+from pipeline.learn.infer.class_evidence import FrameEvidence, scores
+
+__all__ = ["APART_RAD", "JointFit", "climbed", "fit_of", "rival_score", "voted"]
+
+_UNIT = np.array([0.01] * 3 + [0.1] * 3)  # rad, m: steps of one are alike
+# A cell of the grid, and the shift that moves a point 15 m away by as much: over less the sum is rough.
+_STEP = np.array([0.007] * 3 + [0.1] * 3)
+_FIRST_WORTH = 30.0  # of a frame's mean log-likelihood, before the day says it
+_LEAST_CURVED = 0.02  # of the greatest curvature: flatter directions do not tell what the sum is worth
+_CLIMB = 60  # steps at most
+_VOTERS = 40  # frames that tell candidates apart
+APART_RAD = np.radians(0.5)  # a candidate farther away may lie on another peak
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Where prior and frames together have their peak, and the information of the frames (left twist [rad, m])."""
+
+    T: Float[np.ndarray, "4 4"]
+    information: Float[np.ndarray, "6 6"]
+    frames: int
+
+
+def voted(
+    frames: Sequence[FrameEvidence], candidates: Sequence[Float[np.ndarray, "4 4"]]
+) -> list[Float[np.ndarray, "4 4"]]:
+    """The candidates, those first that frames spread over the day fit best."""
+    voters = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, _VOTERS).astype(int))]
+    fitting = np.array([scores(voters, T)[0].mean() for T in candidates])
+    return [candidates[i] for i in np.argsort(-fitting, kind="stable")]
+
+
+def climbed(
+    frames: Sequence[FrameEvidence],
+    T_start: Float[np.ndarray, "4 4"],
+    T_prior: Float[np.ndarray, "4 4"],
+    prior_covariance: Float[np.ndarray, "6 6"],
+    worth: float = _FIRST_WORTH,
+) -> Float[np.ndarray, "4 4"]:
+    """The peak above a start, of the frames and the prior together."""
+    precision = np.linalg.inv(prior_covariance)
+
+    def cost(step: np.ndarray) -> tuple[float, np.ndarray]:
+        T = exp_se3(step * _UNIT) @ T_start
+        value, gradient = scores(frames, T)
+        off = log_se3(T @ inverse(T_prior))
+        total = -worth * float(value.sum()) + 0.5 * float(off @ precision @ off)
+        return total, (-worth * gradient.sum(0) + precision @ off) * _UNIT
+
+    found = minimize(cost, np.zeros(6), jac=True, method="L-BFGS-B", options={"maxiter": _CLIMB})
+    return np.asarray(exp_se3(found.x * _UNIT) @ T_start)
+
+
+def fit_of(
+    frames: Sequence[FrameEvidence],
+    block: Int[np.ndarray, " F"],
+    T_start: Float[np.ndarray, "4 4"],
+    T_prior: Float[np.ndarray, "4 4"],
+    prior_covariance: Float[np.ndarray, "6 6"],
+) -> JointFit:
+    """Climb from a start and tell how well the place of the peak is known.
+
+    Args:
+        frames: of the day, made near the start.
+        block: scene of each frame; frames of one scene err alike.
+        T_start: on the slope of the right peak.
+        T_prior: see `climbed`.
+        prior_covariance: likewise.
+    """
+    T, worth = T_start, _FIRST_WORTH
+    for _ in range(2):
+        T = climbed(frames, T, T_prior, prior_covariance, worth)
+        H = _curvature(frames, T)
+        worth = _worth(H, _scatter(frames, block, T))
+    return JointFit(T, worth * H, len(frames))
+
+
+def rival_score(
+    frames: Sequence[FrameEvidence],
+    block: Int[np.ndarray, " F"],
+    T: Float[np.ndarray, "4 4"],
+    T_rival: Float[np.ndarray, "4 4"],
+) -> float:
+    """By how many sigmas of the scenes' scatter frames prefer a pose to its rival; infinite where both are one peak."""
+    if float(rotation_angle_rad(T @ inverse(T_rival))) < APART_RAD:
+        return float("inf")
+    better = scores(frames, T)[0] - scores(frames, T_rival)[0]
+    sums = np.bincount(np.unique(block, return_inverse=True)[1].ravel(), better)
+    return float(better.sum() / (np.sqrt(np.square(sums - sums.mean()).sum()) + 1e-12))
+
+
+def _worth(H: np.ndarray, J: np.ndarray) -> float:
+    """Curvature over the gradient's scatter, mean over the directions in which the sum is curved."""
+    values, vectors = np.linalg.eigh(H * np.outer(_UNIT, _UNIT))
+    curved = values > _LEAST_CURVED * values[-1]
+    scatter = np.einsum("ik,ij,jk->k", vectors, J * np.outer(_UNIT, _UNIT), vectors)
+    return float(1 / np.mean(scatter[curved] / values[curved]))
+
+
+def _curvature(frames: Sequence[FrameEvidence], T: np.ndarray) -> Float[np.ndarray, "6 6"]:
+    """Of the sum, positive: negative eigenvalues are what no frame tells."""
+    H = np.empty((6, 6))
+    for k, h in enumerate(_STEP):
+        step = np.zeros(6)
+        step[k] = h
+        ahead, behind = (scores(frames, exp_se3(s) @ T)[1].sum(0) for s in (step, -step))
+        H[k] = (behind - ahead) / (2 * h)
+    scaled = (H + H.T) / 2 * np.outer(_UNIT, _UNIT)
+    values, vectors = np.linalg.eigh(scaled)
+    return np.asarray(vectors @ np.diag(np.maximum(values, 0.0)) @ vectors.T / np.outer(_UNIT, _UNIT))
+
+
+def _scatter(frames: Sequence[FrameEvidence], block: np.ndarray, T: np.ndarray) -> Float[np.ndarray, "6 6"]:
+    """Covariance of the sum's gradient, from scene to scene."""
+    gradient = scores(frames, T)[1]
+    names, rows = np.unique(block, return_inverse=True)
+    sums = np.zeros((len(names), 6))
+    np.add.at(sums, rows.ravel(), gradient)
+    sums -= sums.mean(0)
+    return np.asarray(sums.T @ sums * len(names) / max(len(names) - 1, 1))

@@ -1,0 +1,121 @@
+"""Camera-lidar by all frames at once: gradients, the way to the peak, what is not told, and places that fit alike."""
+
+import numpy as np
+import pytest
+
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.se3 import exp_se3, inverse, log_se3, transform_points
+from pipeline.learn.infer.class_evidence import FrameEvidence, scores
+from pipeline.learn.infer.joint_day import fitted_day
+from pipeline.learn.infer.joint_fit import climbed, fit_of, rival_score, voted
+from pipeline.learn.sample.grid import Grid
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
+
+GRID = Grid(0.4, 38.4, 16.0, -22.4)
+P = np.diag([np.radians(2.0) ** 2] * 3 + [0.2**2] * 3)
+CLASSES = 3
+
+
+def frame(seed, T=T_CAMERA_LIDAR, objects=14):
+    """Boxes of one class each in front of a background, as an image would have them, and points on both."""
+    rng = np.random.default_rng(seed)
+    width, height = GRID.width, GRID.height
+    likely = np.full((height, width, CLASSES), 0.05)
+    likely[..., 0] = 0.9
+    points, classes = [], []
+    for k in range(objects):
+        azimuth, elevation = rng.uniform(-34, 34), rng.uniform(-16, 10)
+        half, distance, kind = rng.uniform(1, 4, 2), rng.uniform(5, 40), 1 + k % 2
+        rows = (np.array([elevation + half[1], elevation - half[1]]) - GRID.top_deg) / -GRID.cell_deg
+        columns = (np.array([azimuth + half[0], azimuth - half[0]]) - GRID.left_deg) / -GRID.cell_deg
+        (top, bottom), (left, right) = (v.round().astype(int) for v in (rows, columns))
+        box = np.s_[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
+        likely[box] = np.where(np.arange(CLASSES) == kind, 0.9, 0.05)
+        inside = rng.uniform(-1.0, 1.0, (60, 2)) * 1.6
+        angles = np.radians(np.array([azimuth, elevation]) + inside * half)
+        x, y = -np.tan(angles[:, 0]), -np.tan(angles[:, 1]) / np.cos(angles[:, 0])
+        points.append(np.stack([x, y, np.ones(60)], 1) * distance)
+        hit = (np.abs(inside) < 1).all(1)
+        classes.append(np.where(hit, kind, 0))
+    seen = np.concatenate(points)
+    probability = np.where(np.arange(CLASSES) == np.concatenate(classes)[:, None], 0.9, 0.05)
+    return FrameEvidence(
+        GRID,
+        np.log(likely).astype(np.float32),
+        transform_points(inverse(T), seen).astype(np.float32),
+        probability.astype(np.float32),
+        np.ones(len(seen), np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def day():
+    return [frame(seed) for seed in range(16)]
+
+
+BLOCK = np.arange(16) // 2
+
+
+def off_by(*step):
+    return exp_se3(np.array(step)) @ T_CAMERA_LIDAR
+
+
+def test_the_gradient_is_the_scores_own_derivative(day):
+    T = off_by(0.011, -0.007, 0.013, 0.05, -0.03, 0.08)
+    _, gradient = scores(day, T)
+    for k, h in enumerate([1e-6] * 3 + [1e-5] * 3):
+        step = np.zeros(6)
+        step[k] = h
+        ahead, behind = (scores(day, exp_se3(s) @ T)[0] for s in (step, -step))
+        # Between cells' centres the score has corners, which single points meet.
+        wrong = np.abs((ahead - behind) / (2 * h) - gradient[:, k])
+        assert np.median(wrong) < 0.02 * np.abs(gradient[:, k]).max()
+
+
+def test_all_frames_together_find_rotation_and_shift_from_two_degrees_away(day):
+    start = off_by(*np.radians([1.2, -1.2, 1.0]), 0.12, -0.1, 0.1)
+    fit = fit_of(day, BLOCK, start, start, P)
+    error = log_se3(fit.T @ inverse(T_CAMERA_LIDAR))
+    assert np.abs(np.degrees(error[:3])).max() < 0.15
+    assert np.abs(error[3:5]).max() < 0.05
+    sigma = np.sqrt(np.diag(np.linalg.inv(fit.information + np.linalg.inv(P))))
+    assert np.abs(error / sigma).max() < 3.5
+
+
+def test_frames_that_show_nothing_leave_the_prior_and_say_so(day):
+    blank = [FrameEvidence(f.grid, 0 * f.maps - 1, f.points_m, f.probability, f.worth) for f in day]
+    prior = off_by(0.02, 0, 0, 0, 0, 0)
+    assert climbed(blank, prior, prior, P) == pytest.approx(prior)
+
+
+def test_the_vote_puts_the_pose_first_that_most_frames_fit(day):
+    candidates = [off_by(0.05, 0, 0, 0, 0, 0), off_by(0.002, 0, 0, 0, 0, 0), off_by(0, 0.03, 0, 0, 0, 0)]
+    assert voted(day, candidates)[0] is candidates[1]
+
+
+def fitted(frames, candidates):
+    prior = Prior(off_by(*np.radians([1.0, 1.0, 0.5]), 0.05, 0.05, 0.05), T_LIDAR_RADAR, np.radians(2.0), 0.2)
+    return fitted_day(lambda _: frames, BLOCK, candidates, prior), prior
+
+
+def test_a_day_whose_pilots_went_astray_comes_back_by_the_frames_that_did_not(day):
+    """The mean of the pilot frames is 3 deg off; two frames of twelve had answered rightly."""
+    astray = [off_by(*np.radians([0.3, 3.0, 0.0]), 0, 0, 0) for _ in range(10)]
+    right = [off_by(*np.radians([0.3, -0.2, 0.1]), 0, 0, 0)] * 2
+    found, prior = fitted(day, [*astray, *right, astray[0]])
+    error = np.degrees(log_se3(found.estimate(prior).T @ inverse(T_CAMERA_LIDAR))[:3])
+    assert np.abs(error).max() < 0.2
+    assert found.failed == []
+
+
+def test_frames_that_fit_in_two_places_alike_fail_a_check():
+    """Half of the frames were taken with a camera turned by 3 deg."""
+    turned = off_by(0, np.radians(3.0), 0, 0, 0, 0)
+    mixed = [frame(seed, turned if seed // 2 % 2 else T_CAMERA_LIDAR) for seed in range(16)]
+    found, _ = fitted(mixed, [T_CAMERA_LIDAR, turned])
+    assert any("frames do not agree" in check.sentence for check in found.failed)
+
+
+def test_poses_on_one_peak_are_no_rivals(day):
+    assert rival_score(day, BLOCK, T_CAMERA_LIDAR, off_by(0.001, 0, 0, 0, 0, 0)) == np.inf
+    assert rival_score(day, BLOCK, T_CAMERA_LIDAR, off_by(0.05, 0, 0, 0, 0, 0)) > 3
