@@ -30,7 +30,12 @@ def audit(
         report: also write the fleet page, and a page per vehicle-day beside it.
     """
     from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps
+    from jobs.terminal.vehicle_status import (
+        count_statuses,
+        moved_sensors,
+        next_steps,
+        realigned_radars,
+    )
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.stages import AUDIT, REPORT, STATE
@@ -65,6 +70,7 @@ def audit(
         statuses=count_statuses(findings),
         charts={s: charts.count(s) for s in DRIFT_STATUSES},
         moved=moved_sensors(findings),
+        realigned=realigned_radars([outcome]),
         next_steps=next_steps(findings, lake),
         damaged=damaged,
         report=report,

@@ -62,6 +62,7 @@ def nightly(
     from jobs.extras import require
     from jobs.night_sinks import night_sinks
     from jobs.terminal.summary import exit_code
+    from jobs.terminal.vehicle_status import realigned_radars
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.extrinsics.prior import require_named_files
@@ -83,13 +84,18 @@ def nightly(
     with night_sinks(night, days, metrics, lineage) as sinks:
         outcomes = watch_night(night, days, executor, workers, sinks.take)
         drawing = Drawing(report, pictures, executor, workers)
-        findings, pages = (
-            close_night(night, to_day, drawing, outcomes, sinks.take_stage) if outcomes else ([], [])
-        )
+        closed: list[Outcome] = []
+
+        def take(outcome: Outcome) -> None:
+            closed.append(outcome)
+            sinks.take_stage(outcome)
+
+        findings, pages = close_night(night, to_day, drawing, outcomes, take) if outcomes else ([], [])
         tidy(tables)
         code = exit_code([*night_statuses(outcomes, config), *(["incomplete"] if tables.damage else [])])
         sinks.ended(code, findings)
-    _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config))
+    realigned = realigned_radars(closed)
+    _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config), realigned)
     return held_exit_code if code == 3 else code
 
 
@@ -100,6 +106,7 @@ def _print_end(
     findings: Sequence[DriftFinding],
     pages: Sequence[str],
     mend: Mapping[str, str],
+    realigned: Sequence[Mapping[str, Any]],
 ) -> None:
     """The night's summary: what became of the vehicle-days and of the vehicles, and where to read about it."""
     from jobs.terminal.summary import left_out, print_summary
@@ -115,6 +122,7 @@ def _print_end(
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
+        realigned=realigned,
         next_steps=next_steps(findings, str(tables)),
         misconfigured=mend,
         damaged=left_out(tables),

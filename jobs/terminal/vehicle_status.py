@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from jobs.terminal.record_tables import STATUS_STYLES
+from pipeline.results import Outcome
 from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
+from schemas.service_events import SERVICE_EVENTS
 
-__all__ = ["count_statuses", "moved_sensors", "next_steps", "status_lines"]
+__all__ = ["count_statuses", "moved_sensors", "next_steps", "realigned_radars", "status_lines"]
 
 
 def status_lines(findings: Sequence[DriftFinding]) -> list[str]:
@@ -34,6 +36,12 @@ def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
         for vehicle, stored in _statuses(findings).items()
         if stored.sensor
     ]
+
+
+def realigned_radars(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """Which radars an audit found to have been turned by their own software, and when by how much."""
+    events = SERVICE_EVENTS.rows_among(row for outcome in outcomes for row in outcome.records)
+    return [{"vehicle": e.vehicle, "sensor": e.sensor, "what": e.note} for e in events]
 
 
 def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:

@@ -1,6 +1,7 @@
 """Radars that align themselves: a step of their own estimate begins charts anew and blames no mount."""
 
 import datetime as dt
+import json
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -178,3 +179,16 @@ def test_the_state_begins_anew_with_it(tmp_path, maker):
     since = {r.pair: (r.since, "own software" in r.reason) for r in rows if r.pair != "pose"}
     assert since["lidar_radar"] == (day_name(STEP), True)
     assert since["camera_lidar"] == (None, False)
+
+
+def test_the_summary_of_the_night_names_it_once(tmp_path, maker, capsys):
+    lake_of(tmp_path, maker, -TO_THE_LEFT, told(0.3))
+    points = '[rigs.default.lidar]\npoints = "/p"\n[rigs.default.radar]\npoints = "/r"\nalignment = "/s"\n'
+    (tmp_path / "fleet.toml").write_text(f'[fleet]\nname = "f"\n{points}[vehicles.v]\n')
+    where = ["--fleet", str(tmp_path / "fleet.toml"), "--lake", str(tmp_path / "lake")]
+    named = []
+    for night in (STEP - 1, STEP, STEP + 1):
+        main(["audit", *where, "--to", day_name(night)])
+        named.append(json.loads(capsys.readouterr().out.splitlines()[-1])["realigned"])
+    assert [[(e["vehicle"], e["sensor"]) for e in of] for of in named] == [[], [("v", "radar")], []]
+    assert named[1][0]["what"].startswith(f"{day_name(STEP)}: +0.30 deg in azimuth")
