@@ -259,7 +259,7 @@ SETS: dict[str, list[DaySpec]] = {
         )
     ],
     "dev-worlds": _worlds(60, 16),
-    "worlds": _worlds(6400, 48),
+    "worlds": _worlds(6400, 128),
     "table1": [DaySpec(4600 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
     "one-clock": [
         DaySpec(4620 + i, "urban" if i < 5 else "highway", 100, "paper-one-clock") for i in range(10)
