@@ -25,8 +25,8 @@ def accepted_before(
 ) -> Float[np.ndarray, "4 4"] | None:
     """T_parent_child of an edge on the vehicle's latest earlier day on which it was accepted; None where there is none.
 
-    No information about today's pose, so no part of the work key: the search looks there only where its other origins
-    do not agree, and what it finds there is judged like anything else.
+    No information about today's pose, so no part of the work key: the search looks there only where the day
+    alone does not decide, and what it finds there is judged like anything else.
     """
     found = read_records(
         lake,

@@ -1,6 +1,6 @@
 """The study of the basin: what counts as found, and that nothing lost or wrong is left unnamed."""
 
-from tests.benchmarks.studies.basin import in_basin, summary
+from tests.benchmarks.studies.basin import by_start, in_basin, summary
 from tests.benchmarks.studies.days import SETS
 
 
@@ -40,5 +40,17 @@ def test_what_is_lost_or_accepted_and_wrong_is_counted_and_named():
     assert "lidar_radar 4.00/0.10 held" in text
 
 
-def test_no_seed_of_the_set_is_used_twice():
-    assert len({day.seed for day in SETS["basin"]}) == len(SETS["basin"])
+def test_exact_starts_are_counted_by_size_and_frames_and_right_ends_in_doubt_are_told():
+    found, doubted = result(0.05, 0.05), result(0.05, 0.05, "held")
+    doubted["pairs"]["camera_lidar"]["reason"] = "another end of the search fits the frames as well"
+    lost = result(3.0, 0.05)
+    runs = [r | {"select": {"frames": frames}} for r, frames in ((found, 100), (doubted, 10), (lost, 10))]
+    text = by_start(runs)
+    assert "| 5 deg, 100 frames | 1 | 1/1 (100.0 %) | 1/1 (100.0 %) | 0/1 (0.0 %) | 0/1 (0.0 %) |" in text
+    assert "| 5 deg, 10 frames | 2 | 1/2 (50.0 %) | 1/2 (50.0 %) | 1/2 (50.0 %) | 1/2 (50.0 %) |" in text
+    assert "camera_lidar 3.00/0.10 accepted" in text
+
+
+def test_no_seed_of_the_sets_is_used_twice():
+    for name in ("basin", "basin-starts"):
+        assert len({day.seed for day in SETS[name]}) == len(SETS[name])

@@ -1,4 +1,4 @@
-"""Checks of method `joint` on its own estimates: origins of the search, halves, elevations.
+"""Checks of method `joint` on its own estimates: restarts, halves, elevations.
 
 Each returns one value per failed check; none where all is well.
 """
@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.calibrate.joint.camera_lidar.initialise import Basin
 from pipeline.calibrate.joint.lidar_radar.tilt_floors import radar_tilt_axes
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate
 
-__all__ = ["lidar_radar_failures", "unvouched_basin"]
+__all__ = ["lidar_radar_failures"]
 
 _SIGMAS = 3.0
 # Restarts end before the last steps: only what would be another basin counts, and only in what is claimed.
@@ -20,19 +19,6 @@ _RESTART_ROTATION_RAD, _RESTART_SHIFT_M = np.radians(0.15), 0.05
 _HALVES_FACTOR = 2  # two halves differ by twice the error of the whole, if their errors are independent
 _NAMES = ("roll", "pitch", "yaw", "x", "y", "z")
 _KEYS = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
-
-
-def unvouched_basin(basin: Basin) -> str:
-    """Why the basin is not to be believed: no other origin leads there. Empty where one does.
-
-    The score then has several maxima, and the covariance describes only one of them.
-    """
-    if basin.vouched_by:
-        return ""
-    return (
-        f"no other origin of the search agrees with the best end ({basin.origin}): "
-        f"the nearest other one is {np.degrees(basin.apart_rad):.1f} deg away"
-    )
 
 
 def lidar_radar_failures(estimate: PairEstimate) -> list[FailedCheck]:

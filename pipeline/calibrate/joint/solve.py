@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar, analyse_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.intrinsics import contradictions
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
-from pipeline.calibrate.joint.failed_checks import lidar_radar_failures, unvouched_basin
+from pipeline.calibrate.joint.failed_checks import lidar_radar_failures
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
@@ -95,7 +95,7 @@ def _solved(
     aligned = align_camera_lidar(observations, prior, config, rng)
     heading = _heading(observations, before.get("lidar_radar"), prior)
     found = analyse_camera_lidar(aligned, np.random.default_rng([seed, 3]), heading=heading)
-    found = replace(found, disproved=unvouched_basin(aligned.basin))
+    found = replace(found, disproved=aligned.basin.doubt)
     # Of a basin that is lost, nobody knows what its intrinsics are worth.
     told = [] if found.disproved else contradictions(aligned.intrinsics, prior.camera)
     return found, [*told, *found.failed_checks]

@@ -6,7 +6,7 @@ Source: evidence of this project on simulated and real logs: directed edges, ref
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import no_type_check
 
@@ -41,9 +41,18 @@ from pipeline.objective.ego_motion import shown_heading
 from pipeline.objective.stamp_gaps import camera_gaps_s
 from schemas.observations import Observation
 
-__all__ = ["CONTRAST_BLURS_PX", "Alignments", "KernelSettings", "Terms", "lidar_velocities", "prepare_terms"]
+__all__ = [
+    "CONTRAST_BLURS_PX",
+    "Alignments",
+    "KernelSettings",
+    "Terms",
+    "lidar_velocities",
+    "prepare_terms",
+]
 
 CONTRAST_BLURS_PX = (6.0, 3.0, 1.5)
+# By so much an image is shifted [label px] to see what the same points score in it by chance.
+_SHIFTS_PX = tuple((u, v) for u in (-47.0, -31.0, 29.0, 43.0) for v in (-37.0, 0.0, 41.0))
 _CHANCE_SHIFT_PX = 60.0  # far enough to be elsewhere, near enough to see the same scene
 
 
@@ -74,13 +83,6 @@ class Terms:
     def frames(self) -> int:
         """Number of frames."""
         return len(self.velocity_lidar)
-
-    def thinned(self, fraction: float, rng: np.random.Generator) -> Terms:
-        """The same frames with a random share of the points."""
-        edges, markings, classes = (
-            p.chosen(rng.random(len(p.xyz_m)) < fraction) for p in (self.edges, self.markings, self.classes)
-        )
-        return replace(self, edges=edges, markings=markings, classes=classes)
 
     def of_kinds(self, *, edges: bool, markings: bool) -> Terms:
         """With or without edges, and markings."""
@@ -118,13 +120,12 @@ class Terms:
         return replace(self, edges=self.edges.chosen(is_seen))
 
     def at_most(self, points: int, rng: np.random.Generator) -> Terms:
-        """With about this many edges, and markings, at most, drawn at random."""
-        share = [min(1.0, points / max(len(p.xyz_m), 1)) for p in (self.edges, self.markings)]
-        edges, markings = (
-            p if s >= 1.0 else p.chosen(rng.random(len(p.xyz_m)) < s)
-            for p, s in zip((self.edges, self.markings), share, strict=True)
+        """With about this many edges, markings, and points of classes, at most, drawn at random."""
+        edges, markings, classes = (
+            p if len(p.xyz_m) <= points else p.chosen(rng.random(len(p.xyz_m)) < points / len(p.xyz_m))
+            for p in (self.edges, self.markings, self.classes)
         )
-        return replace(self, edges=edges, markings=markings)
+        return replace(self, edges=edges, markings=markings, classes=classes)
 
     def of_frames(self, frames: np.ndarray) -> Terms:
         """Some of the frames, which look at the same maps."""
@@ -179,18 +180,40 @@ class Terms:
         xyz = np.ascontiguousarray(self.edges.xyz_m.T)
         return count_in_view(self.camera, xyz, self.edges.start, self.poses(at), width, height)
 
-    def edge_excess(self, at: Alignments, settings: KernelSettings) -> Float[np.ndarray, "P F"]:
+    def edge_excess(
+        self,
+        at: Alignments,
+        settings: KernelSettings,
+        shifts_px: Sequence[tuple[float, float]] = _SHIFTS_PX,
+    ) -> Float[np.ndarray, "P F"]:
         """Edge score minus what the same edges score when the image is shifted: 0 for a pose that matches by chance.
 
         This makes poses comparable that see different numbers of edges: turning edges out of view gains nothing.
         """
+        return self._beyond_chance(Terms.edge_score, at, settings, shifts_px)
+
+    def marking_excess(
+        self,
+        at: Alignments,
+        settings: KernelSettings,
+        shifts_px: Sequence[tuple[float, float]] = _SHIFTS_PX,
+    ) -> Float[np.ndarray, "P F"]:
+        """As `edge_excess`, of the markings: a pose that lays them onto a bright stretch of road gains nothing."""
+        return self._beyond_chance(Terms.marking_score, at, settings, shifts_px)
+
+    def _beyond_chance(
+        self,
+        score: Callable[[Terms, Alignments, KernelSettings], np.ndarray],
+        at: Alignments,
+        settings: KernelSettings,
+        shifts_px: Sequence[tuple[float, float]],
+    ) -> Float[np.ndarray, "P F"]:
         shifted = np.zeros((len(at.dt_s), self.frames))
-        shifts = [(u, v) for u in (-47.0, -31.0, 29.0, 43.0) for v in (-37.0, 0.0, 41.0)]
-        for u, v in shifts:
+        for u, v in shifts_px:
             camera = self.camera.copy()
             camera[3:5] += np.float32(u), np.float32(v)
-            shifted += replace(self, camera=camera).edge_score(at, settings)
-        return self.edge_score(at, settings) - shifted / len(shifts)
+            shifted += score(replace(self, camera=camera), at, settings)
+        return score(self, at, settings) - shifted / max(len(shifts_px), 1)
 
     def marking_score(self, at: Alignments, settings: KernelSettings) -> Float32[np.ndarray, "P F"]:
         """Unweighted log likelihood ratio of the markings."""

@@ -18,7 +18,7 @@ import re
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -128,18 +128,31 @@ def label_by_network(fleet: Path, network: str) -> None:
     fleet.write_text(re.sub(r"^(\[rigs\.\S+\.lidar\])$", rf"\1\n{line}", text, flags=re.MULTILINE))
 
 
-def adopt_day(fleet_file: Path, lake: str, partition: Partition, root: Path) -> Path:
-    """Put a perceived real day among the generated ones; its logged calibration is the reference."""
-    rows = list(observations_of(Lake.at(lake), partition))
+def adopt_day(
+    fleet_file: Path,
+    lake: str,
+    partition: Partition,
+    root: Path,
+    spec: DaySpec | None = None,
+    truth_file: Path | None = None,
+) -> Path:
+    """Put a perceived day of another origin among the generated ones.
+
+    Its logged calibration is the reference, unless a file says the truth.
+    """
+    rows, spec = list(observations_of(Lake.at(lake), partition)), spec or REAL
     given = read_prior(rows, load_fleet(fleet_file), partition.vehicle)
-    folder = root / REAL.name
+    folder = root / spec.name
     shutil.rmtree(folder, ignore_errors=True)
     truth = folder / "truth" / partition.vehicle / f"{partition.day}.json"
     truth.parent.mkdir(parents=True)
+    if truth_file is not None:
+        known = {k: np.array(T) for k, T in json.loads(truth_file.read_text()).items() if k.startswith("T_")}
+        given = replace(given, T_camera_lidar=known["T_camera_lidar"], T_lidar_radar=known["T_lidar_radar"])
     truth.write_text(json.dumps({f"T_{pair}": given.of(pair).tolist() for pair in PAIRS}))
     shutil.copy(fleet_file, folder / "fleet.toml")
     copy_perceived(Lake.at(lake), partition, Lake.at(folder / "lake"), partition)
-    note = asdict(REAL) | {"vehicle": partition.vehicle, "day": partition.day, "kept_frames": len(rows)}
+    note = asdict(spec) | {"vehicle": partition.vehicle, "day": partition.day, "kept_frames": len(rows)}
     note |= {"simulated_by": "", "perceived_by": commit_now()}
     (folder / _FINISHED).write_text(json.dumps(note) + "\n")
     return folder
@@ -293,6 +306,19 @@ SETS: dict[str, list[DaySpec]] = {
             10 * ("paper", "ring16", "demo", "spin128", "pinhole", "rosette", "fisheye", "truck")
         )
         if i >= 16
+    ],
+    # Eight rigs, a day each, by day and at dusk: exact starts of every size (`basin.py --starts`). Tuning: dev-basin.
+    "basin-starts": [
+        DaySpec(
+            4400 + i,
+            ("mixed", "highway", "urban")[i % 3],
+            rig=rig,
+            frames=100,
+            fault="camera:dusk:1" if i % 4 == 2 else "",
+        )
+        for i, rig in enumerate(
+            ("paper", "ring16", "demo", "spin128", "pinhole", "rosette", "fisheye", "truck")
+        )
     ],
     "radar-elevation": [
         *_both(4000, 4),

@@ -14,7 +14,6 @@ from pipeline.calibrate.joint.camera_lidar.estimate import (
 from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.calibrate.joint.camera_lidar.time_offset import TimeOffsetProfile, s_per_metre
-from pipeline.calibrate.numerics.differential_evolution import evolve
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
@@ -205,18 +204,3 @@ def test_days_of_hardly_any_frame_or_edge_are_refused():
         estimate_camera_lidar(
             day, Prior(away, np.eye(4), 0.03, 0.05), SolveConfig(), np.random.default_rng(0)
         )
-
-
-def test_evolution_finds_the_deep_well_among_shallow_ones_and_keeps_to_its_box():
-    seen = []
-
-    def cost(x):
-        seen.append((x.min(), x.max()))
-        shallow = 1 - np.exp(-((x - 0.6) ** 2).sum(1) / 0.02)
-        return shallow - 2 * np.exp(-((x + 0.5) ** 2).sum(1) / 0.08)
-
-    best, value = evolve(cost, -np.ones(3), np.ones(3), np.random.default_rng(0), generations=60)
-    np.testing.assert_allclose(best, -0.5, atol=0.05)
-    assert value < -0.9
-    assert min(lo for lo, _ in seen) >= -1
-    assert max(hi for _, hi in seen) <= 1

@@ -12,6 +12,7 @@ from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.se3 import exp_se3, log_se3, perturb_exactly
+from pipeline.objective.camera_lidar.kernel_settings import KernelSettings
 from pipeline.objective.ego_motion import mean_heading, shown_heading
 from schemas.calibrations import PAIRS
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
@@ -61,9 +62,12 @@ def test_pairs_that_cannot_be_solved_keep_the_prior_and_fail_a_check():
     assert not solution.failed_checks.get("camera_radar")  # another pair's failure is none of its own
 
 
-def solved_with_camera(monkeypatch, day, vouched_by, prior=PRIOR):
-    """The solution of a day whose camera-lidar is put in its place: at the truth, sure, and so vouched for."""
-    basin = Basin(AlignmentState(T_CAMERA_LIDAR), None, "prior", 4, vouched_by, float(np.radians(2.6)), 0.1)
+def solved_with_camera(monkeypatch, day, doubt, prior=PRIOR):
+    """The solution of a day whose camera-lidar is put in its place: at the truth, sure, and so doubted."""
+    kernel = KernelSettings.wide(4.0, 0)
+    basin = Basin(
+        AlignmentState(T_CAMERA_LIDAR), None, kernel, "prior", 4, (9.0, 9.0, 9.0), 12.0, 0.1, 9.0, doubt
+    )
     aligned = object.__new__(Aligned)  # without the terms and frames that nothing here looks at
     object.__setattr__(aligned, "basin", basin)
     agreeing = DayIntrinsics(1.0, 0.004, np.zeros(2), np.ones(2), (900.0, 900.0))
@@ -79,11 +83,11 @@ def solved_with_camera(monkeypatch, day, vouched_by, prior=PRIOR):
     return solve_joint(dict.fromkeys(PAIRS, day), prior, SolveConfig(), seed=0), headings
 
 
-def test_a_basin_that_no_other_origin_leads_to_disproves_its_own_pair_alone(monkeypatch):
+def test_a_basin_in_doubt_disproves_its_own_pair_alone(monkeypatch):
     day = street_day(12)
-    found, _ = solved_with_camera(monkeypatch, day, ("evolution",))
+    found, _ = solved_with_camera(monkeypatch, day, "")
     assert not found.pairs["camera_lidar"].disproved
-    lost, _ = solved_with_camera(monkeypatch, day, ())
+    lost, _ = solved_with_camera(monkeypatch, day, "another end, 2.6 deg away")
     assert "2.6 deg away" in lost.pairs["camera_lidar"].disproved
     for pair in ("lidar_radar", "camera_radar"):
         assert not lost.pairs[pair].disproved
@@ -91,7 +95,7 @@ def test_a_basin_that_no_other_origin_leads_to_disproves_its_own_pair_alone(monk
 
 
 def test_boxes_count_once_and_the_radar_s_turn_gives_the_heading(monkeypatch):
-    found, headings = solved_with_camera(monkeypatch, street_day(12), ("evolution",))
+    found, headings = solved_with_camera(monkeypatch, street_day(12), "")
     assert found.pairs["lidar_radar"].diagnostics["boxes"] == 0
     assert found.pairs["camera_radar"].diagnostics["boxes"] > 0
     heading_rad, sigma_rad = headings[-1]
@@ -121,6 +125,6 @@ def test_an_untriggered_camera_lidar_stays_at_the_prior_and_its_boxes_are_not_tr
 def test_the_way_that_something_else_shows_counts_by_its_sigma(monkeypatch):
     day = street_day(12)
     known = replace(PRIOR, heading=(np.radians(1.0), 1e-6))
-    _, headings = solved_with_camera(monkeypatch, day, ("evolution",), known)
+    _, headings = solved_with_camera(monkeypatch, day, "", known)
     assert headings[-1] == pytest.approx(known.heading, rel=1e-3)
     assert mean_heading([(np.pi - 0.01, 0.1), (0.01 - np.pi, 0.1)])[0] == pytest.approx(np.pi)

@@ -1,11 +1,10 @@
 """Camera-lidar half of method `joint`: T_camera_lidar and the camera's time offset from a day of observations.
 
-A small differential evolution finds the basin (wide kernels, few points, restarts), annealed response surfaces find the
-optimum, and the frames' own curvatures and gradients say how sure it is. Weights of the terms come from the data: the
-share of matching edges, the contrast under markings, and the scatter of a term's gradient from frame to frame compared
-with its curvature (composite likelihood: Varin, Reid, Firth 2011, section 2.3). A degree of freedom that the day does
-not determine is then fixed at the prior and the others are solved again; their covariance includes what the prior
-leaves open in it.
+Candidates of several origins climb until one leads (`initialise`), annealed response surfaces find the optimum, and the
+frames' own curvatures and gradients say how sure it is. Weights of the terms come from the data: the share of matching
+edges, the contrast under markings, and the scatter of a term's gradient from frame to frame compared with its curvature
+(composite likelihood: Varin, Reid, Firth 2011, section 2.3). A degree of freedom that the day does not determine is
+then fixed at the prior and the others are solved again; their covariance includes what the prior leaves open in it.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS as BASIN_TERMS
 from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, sweep_s_per_rad
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
 from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics, measure_intrinsics
@@ -88,7 +88,7 @@ class Aligned:
     rejected: dict[str, int]
     basin: Basin
     state: AlignmentState
-    second: AlignmentState | None  # where the best start of another origin led
+    second: AlignmentState | None  # where the best other candidate of its optimum led
     kernel: KernelSettings
     expected_dt_s: float  # the state's time offset counts from it: the constant part of the stamps' gaps
     intrinsics: DayIntrinsics
@@ -158,7 +158,7 @@ def align_camera_lidar(
     limits = search_range(prior, config)
     thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config, limits)
     basin = find_basin(terms, thin, rng)
-    thin = replace(thin, terms=thin.terms.exposed_at(basin.state.alone))
+    thin = replace(thin, terms=thin.terms.exposed_at(basin.state.alone), kernel=basin.kernel)
     sharp = sharp.in_view(basin.state.T_camera_lidar, _MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
     # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
     near = prior.translation_sigma_m <= _NEAR_PRIOR_M
@@ -166,7 +166,7 @@ def align_camera_lidar(
     ends = [end for end in (basin.state, basin.second) if end is not None]
     ends = [_at_prior_tz(end, prior, terms) if near else end for end in ends]
     ends = [refine(thin, end, steps=SCHEDULE.first_steps, fixed=fixed) for end in ends]
-    kernel = first
+    kernel = basin.kernel
     for sigma_px, contrast in SCHEDULE.kernels[1:]:
         sharp = sharp.exposed_at(ends[0].alone)
         fitted = sharp.fitted(ends[0].alone, KernelSettings.wide(sigma_px, contrast), rng)
@@ -292,9 +292,10 @@ def _diagnostics(
     kernel, profile = analysis.kernel, analysis.profile
     return {
         "candidates": float(basin.candidates),
-        "vouching_origins": float(len(basin.vouched_by)),
-        "other_origin_deg": float(np.degrees(basin.apart_rad)),
-        "basin_score_lead": basin.score_lead,
+        **{f"basin_{name}": value for name, value in zip(BASIN_TERMS, basin.evidence, strict=True)},
+        "basin_needed": basin.needed,
+        "basin_rival_deg": float(np.degrees(basin.rival_rad)),
+        "basin_rival_z": float(min(basin.rival_z, 1e3)),
         **{f"halves_{n}_deg": float(np.degrees(abs(apart[i]))) for i, n in enumerate(("rx", "ry", "rz"))},
         **{f"halves_{n}_m": float(abs(apart[3 + i])) for i, n in enumerate(("tx", "ty", "tz"))},
         "halves_dt_s": float(abs(apart[6])),

@@ -1,96 +1,106 @@
-"""Initial pose: which basin of the camera-lidar score the day shows, by candidates of different origin that must agree.
+"""Initial pose: which basin of the camera-lidar score the day shows, and whether its evidence leads over all others.
 
-One search can be misled, and all its restarts alike: on days of other vehicles the maximum of a coarse score was not at
-the truth but in a corner of the box, and every restart of the evolution ended there. So candidates come from several
-origins (the prior itself, the vehicle's state, a grid of rotations on either half of the frames, a small differential
-evolution), each climbs at the same kernel within the search range, their ends are compared at that same kernel, and
-only the end of another origin vouches for the best one.
+One search can be misled, and so can one term: on a day of another simulator markings alone put the camera 12 deg off,
+and outvoted the edges. So candidates come from the prior, from a grid of rotations by all terms together and by each
+alone, and from the vehicle's state; each climbs at the same kernel within the search range, and their ends are compared
+by what each term shows beyond chance (`beyond_chance`). The best end is found where it shows more than the best of all
+chance poses of the search would, where the day rejects every end elsewhere, and where no term that knows a place of its
+own puts it elsewhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, refine
-from pipeline.calibrate.joint.camera_lidar.rotation_grid import grid_maxima
+from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS, Evidence, by_chance, wrong_poses
+from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine
+from pipeline.calibrate.joint.camera_lidar.rotation_grid import (
+    GRID_SHIFTS_PX,
+    grid_kernel_rad,
+    grid_maxima,
+    grid_turns,
+)
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.bias_floors import MAX_GAP_PX
-from pipeline.calibrate.numerics.differential_evolution import evolve
+from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3, transform_points
-from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
+from pipeline.geometry.se3 import inverse, log_so3, transform_points
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 
 __all__ = ["Basin", "difference", "find_basin"]
 
 # Ends that move the day's points by less than this (median angle), or by less than three quarters of the kernel at
 # which they are compared, are one optimum: sharper kernels pull in as much.
 _SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS = float(np.radians(0.5)), 0.75
+_ENDS_THAT_TELL = 2  # how far two starts of one optimum end apart
 _POINTS = 500  # that show how far two ends are apart
-_WIDE_RAD = np.radians(SCHEDULE.wide_box_deg)
-_TIME_OFFSET_SIGMAS = 2.0  # half-width of the box
-_SHIFT_SIGMAS = 3.0  # of the prior: where the evolution's first population lies
-_COARSE = KernelSettings.wide(*SCHEDULE.coarse_kernel, match=SCHEDULE.coarse_match)
-# Weight of class information [nats per point] against log likelihood ratios: over the box both then vary alike.
-_CLASS_WEIGHT_PER_POINT = 0.12
+_SHIFT_SIGMAS = 3.0  # of the prior: how far wrong poses are shifted at most
+_CONTRADICTED = 0.5  # share of a term's own best evidence without which it contradicts an end
 
 
 @dataclass(frozen=True, eq=False)
 class Basin:
-    """The best end of all candidates, and how far the nearest end of another origin is from it."""
+    """The best end of all candidates, and the evidence that it is right.
+
+    `doubt` says why it cannot be taken for right; empty where it can.
+    """
 
     state: AlignmentState
-    second: AlignmentState | None  # the best one of another origin that agrees with it
+    second: AlignmentState | None  # the best one of another candidate that agrees with it
+    kernel: KernelSettings  # at which ends were compared: the terms weighted alike in units of chance
     origin: str
     candidates: int
-    vouched_by: tuple[str, ...]  # other origins whose ends agree with it
-    apart_rad: float  # of the nearest end of another origin: median angle by which it moves the day's points
-    score_lead: float  # over the best end elsewhere, as a share of its own score; 1 where there is none
+    evidence: tuple[float, ...]  # by term, in units of chance
+    needed: float  # of all terms together: what the best of all chance poses of the search shows
+    rival_rad: (
+        float  # how far the best end elsewhere moves the day's points (median angle); pi where there is none
+    )
+    rival_z: float  # standard errors by which the day's frames reject the ends elsewhere; infinity where there are none
+    doubt: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """Where the climb from a candidate ended, and its score there at the common kernel."""
+    """Where the climb from a candidate ended, and what the terms show there at the common kernel."""
 
     origin: str
     state: AlignmentState
-    score: float  # beyond chance
+    evidence: Float[np.ndarray, " 3"]
+    by_frame: Float[np.ndarray, " F"]
+    prior: float  # log density, up to a constant
+
+    @property
+    def total(self) -> float:
+        """Evidence of all terms and the prior together."""
+        return float(self.evidence.sum()) + self.prior
 
 
 def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator) -> Basin:
-    """Climb from candidates until the end of another origin agrees with the best one, or all origins are exhausted.
+    """Climb from candidates until the best end is found, or no candidate is left.
 
     Args:
-        terms: all points, for grid and evolution.
+        terms: all points, for the grid.
         scored: few sharp points, the kernel at which ends are compared, the prior that is the centre of the search,
             and the config with the least search range.
         rng: decides everything random.
     """
-    kernel_rad = scored.kernel.sigma_px / float(scored.terms.camera[1])
-    same_rad = max(_SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS * kernel_rad)
-    ends: list[_End] = []
-    for origin, start in _candidates(terms, scored, rng):
-        state = _climbed(scored, start)
-        ends.append(_End(origin, state, _excess(scored, state)))
-        best = max(ends, key=lambda e: e.score)
-        apart = [_apart_rad(scored.terms, e.state, best.state) for e in ends]
-        near = {e.origin for e, a in zip(ends, apart, strict=True) if a < same_rad}
-        vouching = tuple(sorted(near - {best.origin}))
-        # The prior alone does not end the search: where a grid was misled to its side, both climb to the same end.
-        if len(near - {"prior"}) > 1:
-            break
-    others = [a for a, e in zip(apart, ends, strict=True) if e.origin != best.origin]
-    elsewhere = [e.score for a, e in zip(apart, ends, strict=True) if a >= same_rad]
-    lead = 1 - max(elsewhere, default=0.0) / best.score if best.score > 0 else 0.0
-    state = refine(scored, best.state, steps=SCHEDULE.finishing_steps)
-    agreeing = [e for e, a in zip(ends, apart, strict=True) if a < same_rad and e.origin != best.origin]
-    second = max(agreeing, key=lambda e: e.score).state if agreeing else None
-    return Basin(state, second, best.origin, len(ends), vouching, min(others, default=np.pi), float(lead))
+    prior, (reach, shift) = scored.prior, search_range(scored.prior, scored.config)
+    wrong = wrong_poses(prior, reach, min(shift, _SHIFT_SIGMAS * prior.translation_sigma_m), rng)
+    match = np.full_like(scored.kernel.match, SCHEDULE.coarse_match)
+    kernel = replace(scored.kernel, match=match)
+    compared = scored.terms.at_most(SCHEDULE.compared_points, rng)
+    evidence = Evidence(compared, kernel, GRID_SHIFTS_PX).measured(wrong)
+    scored = replace(scored, kernel=evidence.weighted())
+    search = _Search(scored, evidence)
+    for origin, start, decides in _candidates(terms, scored, reach, wrong, rng):
+        search.climb(origin, start)
+        if decides and not (basin := search.conclude()).doubt:
+            return basin
+    return search.conclude()
 
 
 def difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]:
@@ -104,56 +114,18 @@ def difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]:
 
 
 def _candidates(
-    terms: Terms, scored: Scored, rng: np.random.Generator
-) -> Iterator[tuple[str, AlignmentState]]:
-    """Starts with the name of their origin, those first that cost least."""
-    prior, config = scored.prior, scored.config
-    yield "prior", AlignmentState(prior.T_camera_lidar)
-    reach = search_range(prior, config).rotation_rad
-    # Each half of the frames by itself: what both show is no accident of one scene.
-    sharp = terms.sharp(MAX_GAP_PX)
-    halves = [sharp.of_frames(np.arange(k, terms.frames, 2)) for k in (0, 1)]
-    grids = [grid_maxima(half, prior.T_camera_lidar, reach, rng) for half in halves]
-    for name, grid in zip(("grid, even frames", "grid, odd frames"), grids, strict=True):
-        yield name, AlignmentState(grid[0])
-    yield "evolution", _evolved(terms, prior, config, rng)
+    terms: Terms, scored: Scored, reach: float, wrong: np.ndarray, rng: np.random.Generator
+) -> Iterator[tuple[str, AlignmentState, bool]]:
+    """Starts, their origins, and whether the search may end with them: not before each term was asked."""
+    prior = scored.prior
+    yield "prior", AlignmentState(prior.T_camera_lidar), False
+    found = grid_maxima(terms.sharp(MAX_GAP_PX), prior, reach, wrong, rng)
+    for number, (name, T) in enumerate(found):
+        yield name, AlignmentState(T), number >= len(TERMS)
     if prior.T_camera_lidar_before is not None:
-        # Not before: whether an earlier day was calibrated already must not change a day whose own data agree.
+        # Last: whether an earlier day was calibrated already must not change a day whose own data decide.
         state = AlignmentState(prior.T_camera_lidar_before)
-        yield "state", state.within(prior, search_range(prior, config))
-    for _ in range(SCHEDULE.evolutions - 1):
-        yield "evolution", _evolved(terms, prior, config, rng)
-    for name, grid in zip(("grid, even frames", "grid, odd frames"), grids, strict=True):
-        for T in grid[1:]:
-            yield name, AlignmentState(T)
-
-
-def _evolved(terms: Terms, prior: Prior, config: SolveConfig, rng: np.random.Generator) -> AlignmentState:
-    """Differential evolution in the search box, wide kernels, a random share of the points."""
-    rotation, shift = search_range(prior, config)
-    shift = min(shift, _SHIFT_SIGMAS * prior.translation_sigma_m)
-    effort = SCHEDULE.wide_evolution if rotation > _WIDE_RAD else SCHEDULE.narrow_evolution
-    population, generations, most = effort
-    points = len(terms.edges.xyz_m) + len(terms.markings.xyz_m)
-    thin = terms.thinned(min(1.0, most / max(points, 1)), rng)
-    weight = _CLASS_WEIGHT_PER_POINT * (len(thin.edges.xyz_m) + len(thin.markings.xyz_m))
-    T_0 = prior.T_camera_lidar
-    dt_sigma_s = config.time_offset_sigma_s
-    box = np.array([rotation] * 3 + [shift] * 3 + [_TIME_OFFSET_SIGMAS * dt_sigma_s])
-    sigma = np.array([max(prior.rotation_sigma_rad, rotation / 2)] * 3 + [shift / 2] * 3 + [dt_sigma_s])
-
-    def poses(x: np.ndarray) -> np.ndarray:
-        return from_rotation_translation(exp_so3(x[:, :3]) @ T_0[:3, :3], T_0[:3, 3] + x[:, 3:6])
-
-    def cost(x: np.ndarray) -> np.ndarray:
-        at = Alignments(poses(x), x[:, 6], np.ones(len(x)))
-        score = thin.score(at, _COARSE).sum(1) + weight * thin.class_information(at)
-        return -score + 0.5 * ((x / sigma) ** 2).sum(1)
-
-    x, _ = evolve(
-        cost, -box, box, rng, population=population, generations=generations, start=np.zeros((1, 7))
-    )
-    return AlignmentState(poses(x[None])[0], float(x[6]))
+        yield "state", state.within(prior, search_range(prior, scored.config)), True
 
 
 def _climbed(scored: Scored, start: AlignmentState) -> AlignmentState:
@@ -168,11 +140,90 @@ def _climbed(scored: Scored, start: AlignmentState) -> AlignmentState:
 # -- ends ------------------------------------------------------------------------------------------------------------
 
 
-def _excess(scored: Scored, state: AlignmentState) -> float:
-    """Score of an end beyond what chance would give it, at the kernel that all ends share."""
-    edges = scored.kernel.edge_weight * scored.terms.edge_excess(state.alone, scored.kernel)
-    markings = scored.kernel.marking_weight * scored.terms.marking_score(state.alone, scored.kernel)
-    return float((edges + markings).sum())
+class _Search:
+    """The ends so far."""
+
+    def __init__(self, scored: Scored, evidence: Evidence) -> None:
+        self.scored, self.evidence = scored, evidence
+        self.ends: list[_End] = []
+        kernel_rad = scored.kernel.sigma_px / float(scored.terms.camera[1])
+        self.same_rad = max(_SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS * kernel_rad)
+        reach = search_range(scored.prior, scored.config).rotation_rad
+        self.leads_there_rad = SCHEDULE.grid_step_kernels * grid_kernel_rad(reach)
+        self.poses, self.candidates = len(grid_turns(reach)), 0
+
+    def climb(self, origin: str, start: AlignmentState) -> None:
+        """Add the end of a candidate, unless it begins where two others ended: one more says what those two do."""
+        self.candidates += 1
+        near = sum(self._apart(start, e.state) < self.leads_there_rad for e in self.ends)
+        if near < _ENDS_THAT_TELL:
+            self.ends.append(self._end(origin, _climbed(self.scored, start)))
+
+    def conclude(self) -> Basin:
+        """The best end, and what speaks against it."""
+        highest = max(self.ends, key=lambda e: e.total)
+        best = self._finished(highest)
+        # Ends that the day does not reject may not have arrived yet: in the end they may be the same, or better.
+        others = [e for e in self.ends if e is not highest]
+        others = [e if _rejected(best, e) >= CLEARLY else self._finished(e) for e in others]
+        first, best = best, max([best, *others], key=lambda e: e.total)
+        apart = [(self._apart(e.state, best.state), e) for e in [first, *others] if e is not best]
+        agreeing = [e for a, e in apart if a < self.same_rad]
+        rivals = [e for a, e in apart if a >= self.same_rad]
+        rival = min(rivals, key=lambda e: _rejected(best, e), default=None)
+        basin = Basin(
+            best.state,
+            max(agreeing, key=lambda e: e.total).state if agreeing else None,
+            self.scored.kernel,
+            best.origin,
+            self.candidates,
+            tuple(float(x) for x in best.evidence),
+            by_chance(self.poses, len(TERMS)),
+            np.pi if rival is None else self._apart(rival.state, best.state),
+            np.inf if rival is None else _rejected(best, rival),
+        )
+        return replace(basin, doubt=self._doubt(basin, rivals))
+
+    def _doubt(self, basin: Basin, rivals: Sequence[_End]) -> str:
+        """Why the best end cannot be taken for right."""
+        if (total := sum(basin.evidence)) < basin.needed:
+            return (
+                f"no end of the search stands out from chance: the best one ({basin.origin}) shows {total:.0f} "
+                f"where chance alone shows {basin.needed:.0f}"
+            )
+        if basin.rival_z < CLEARLY:
+            return (
+                f"another end of the search fits the frames as well: {np.degrees(basin.rival_rad):.1f} deg "
+                f"from the best one ({basin.origin}), {basin.rival_z:.1f} standard errors behind"
+            )
+        alone = by_chance(self.poses, 1)
+        for k, name in enumerate(TERMS):
+            most = max((float(e.evidence[k]) for e in rivals), default=0.0)
+            if most > alone and basin.evidence[k] < _CONTRADICTED * most:
+                return (
+                    f"{name} contradict the best end of the search ({basin.origin}): they show another place"
+                )
+        return ""
+
+    def _finished(self, end: _End) -> _End:
+        return self._end(end.origin, refine(self.scored, end.state, steps=SCHEDULE.finishing_steps))
+
+    def _end(self, origin: str, state: AlignmentState) -> _End:
+        at = state.alone
+        prior = float(prior_value(at, self.scored.prior, self.scored.config)[0])
+        return _End(origin, state, self.evidence.at(at)[0], self.evidence.by_frame(at), prior)
+
+    def _apart(self, a: AlignmentState, b: AlignmentState) -> float:
+        return _apart_rad(self.scored.terms, a, b)
+
+
+def _rejected(best: _End, other: _End) -> float:
+    """Standard errors by which the day rejects an end: those of its frames, or those that its evidence stands for."""
+    lower = best.by_frame - other.by_frame
+    error = lower.std(ddof=1) / np.sqrt(len(lower)) if len(lower) > 1 else np.inf
+    by_frames = float(lower.mean() / error) if error > 0 else np.inf
+    lead = max(best.total - other.total, 0.0)
+    return max(by_frames, float(np.sqrt(2 * lead)))
 
 
 def _apart_rad(terms: Terms, a: AlignmentState, b: AlignmentState) -> float:

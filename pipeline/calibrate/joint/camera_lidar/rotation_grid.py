@@ -1,8 +1,8 @@
-"""Brute force over rotations: the camera-lidar score at a moderately sharp kernel on a grid about a pose.
+"""Brute force over rotations: what edges, markings and classes show on a grid of turns about a pose.
 
 Sharp scores have many maxima, coarse ones lie; a kernel of half a degree has the truth well above all else, and over
 rotations alone a grid that fine is affordable: some thousands of poses at a few nanoseconds per point. Shifts within
-the prior's sigma turn most points by less than the kernel.
+the prior's sigma turn most points by less than the kernel. A few points show which poses are worth all of them.
 
 Source: OpenCalib's CalibAnything (Luo et al. 2023) searches rotations by brute force too, and loses no start of 5 deg.
 """
@@ -12,67 +12,87 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS, Evidence
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
+from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 
-__all__ = ["grid_maxima"]
+__all__ = ["GRID_SHIFTS_PX", "grid_kernel_rad", "grid_maxima", "grid_turns"]
 
-_BATCH = 512  # poses at a time: their rows of 3x4 transforms by frame stay in the cache
+# By so much the image is shifted to see what the same points show by chance: fewer than for the ends of the search.
+GRID_SHIFTS_PX = ((-43.0, -37.0), (-31.0, 41.0), (29.0, -31.0), (43.0, 37.0))
+TOGETHER = "all terms"
 
 
 def grid_maxima(
-    terms: Terms, T_camera_lidar: Float[np.ndarray, "4 4"], reach_rad: float, rng: np.random.Generator
-) -> list[Float[np.ndarray, "4 4"]]:
-    """The best poses of a grid of turns about the camera's axes, best first, each the best of its surroundings.
+    terms: Terms,
+    prior: Prior,
+    reach_rad: float,
+    wrong: Float[np.ndarray, "P 4 4"],
+    rng: np.random.Generator,
+) -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
+    """The best poses of a grid of turns about the camera's axes, each the best of its surroundings.
+
+    By all terms together the best first, then each term's own best, then what is left of all terms together; with the
+    terms that they are the best by.
 
     Args:
-        terms: points of the frames to look at.
-        T_camera_lidar: centre of the grid; its translation is kept.
+        terms: points of the day.
+        prior: centre of the grid, and how likely its turns are; its translation is kept.
         reach_rad: half-width of the grid per axis.
+        wrong: poses that show what chance is worth.
         rng: thins the points.
     """
-    points = len(terms.edges.xyz_m) + len(terms.markings.xyz_m)
-    thin = terms.thinned(min(1.0, SCHEDULE.grid_points / max(points, 1)), rng)
-    is_wide = reach_rad > np.radians(SCHEDULE.wide_box_deg)
-    kernel_rad = np.radians(SCHEDULE.wide_grid_kernel_deg if is_wide else SCHEDULE.grid_kernel_deg)
+    kernel_rad = grid_kernel_rad(reach_rad)
     kernel = KernelSettings.wide(kernel_rad * float(terms.camera[1]), 0, match=SCHEDULE.coarse_match)
-    turns = _turns(reach_rad, kernel_rad)
-    rotations = exp_so3(turns) @ T_camera_lidar[:3, :3]
-    poses = from_rotation_translation(rotations, np.broadcast_to(T_camera_lidar[:3, 3], (len(turns), 3)))
-    excess = _excess(thin, poses, kernel)
-    return [poses[i] for i in _separate(turns, excess, SCHEDULE.grid_apart_kernels * kernel_rad)]
+    turns = grid_turns(reach_rad)
+    rotations = exp_so3(turns) @ prior.T_camera_lidar[:3, :3]
+    shifts = np.broadcast_to(prior.T_camera_lidar[:3, 3], (len(turns), 3))
+    poses = from_rotation_translation(rotations, shifts)
+    likely = -0.5 * ((turns / prior.rotation_sigma_rad) ** 2).sum(1)
+    every = np.arange(0, terms.frames, -(-terms.frames // SCHEDULE.grid_frames))
+    few = terms.of_frames(every).at_most(SCHEDULE.grid_points, rng)
+    rough = Evidence(few, kernel).measured(wrong).of(poses)
+    chosen = _highest(rough, likely)
+    shown = Evidence(terms.at_most(SCHEDULE.chosen_points, rng), kernel, GRID_SHIFTS_PX).measured(wrong)
+    evidence = shown.of(poses[chosen])
+    apart_rad = SCHEDULE.grid_apart_kernels * kernel_rad
+    best = _separate(turns[chosen], evidence.sum(1) + likely[chosen], apart_rad, SCHEDULE.grid_maxima)
+    alone = [(name, int(np.argmax(evidence[:, k]))) for k, name in enumerate(TERMS)]
+    found = [(TOGETHER, best[0]), *alone, *((TOGETHER, i) for i in best[1:])]
+    return [(name, poses[chosen[i]]) for name, i in found]
 
 
-def _turns(reach_rad: float, kernel_rad: float) -> Float[np.ndarray, "P 3"]:
+def grid_kernel_rad(reach_rad: float) -> float:
+    """Width of the kernel; a wider range is searched with a wider one."""
+    is_wide = reach_rad > np.radians(SCHEDULE.wide_box_deg)
+    return float(np.radians(SCHEDULE.wide_grid_kernel_deg if is_wide else SCHEDULE.grid_kernel_deg))
+
+
+def grid_turns(reach_rad: float) -> Float[np.ndarray, "P 3"]:
     """Rotation vectors on a grid; roll moves points half as much as the others, so its step is twice as wide."""
-    step = SCHEDULE.grid_step_kernels * kernel_rad
+    step = SCHEDULE.grid_step_kernels * grid_kernel_rad(reach_rad)
     steps = np.array([step, step, 2 * step])
     count = np.ceil(reach_rad / steps).astype(int)
     axes = [np.linspace(-reach_rad, reach_rad, 2 * n + 1) for n in count]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
-def _excess(terms: Terms, poses: np.ndarray, kernel: KernelSettings) -> np.ndarray:
-    """Score of each pose beyond what as many edges in the image score by chance, the clock as logged.
-
-    Nearly all poses of a grid match by chance only, so the grid itself says what an edge scores by chance. Not counted,
-    it decides: where chance costs, poses that turn the edges out of the image win, in the corners of a wide grid.
-    """
-    score, count = np.empty(len(poses)), np.empty(len(poses))
-    for i in range(0, len(poses), _BATCH):
-        batch = poses[i : i + _BATCH]
-        at = Alignments(batch, np.zeros(len(batch)), np.ones(len(batch)))
-        score[i : i + _BATCH], count[i : i + _BATCH] = terms.score(at, kernel).sum(1), terms.edges_in_view(at)
-    chance = np.median(score[count > 0] / count[count > 0]) if (count > 0).any() else 0.0
-    return score - chance * count
+def _highest(evidence: Float[np.ndarray, "P 3"], likely: Float[np.ndarray, " P"]) -> np.ndarray:
+    """Indices of the poses that are worth all points: highest by all terms together, and by each alone."""
+    some, few = (-min(n, len(evidence)) for n in SCHEDULE.grid_chosen)
+    by_term = [np.argsort(evidence[:, k])[few:] for k in range(len(TERMS))]
+    return np.unique(np.concatenate([np.argsort(evidence.sum(1) + likely)[some:], *by_term]))
 
 
-def _separate(turns: np.ndarray, score: np.ndarray, apart_rad: float) -> list[int]:
+def _separate(
+    turns: Float[np.ndarray, "P 3"], score: Float[np.ndarray, " P"], apart_rad: float, most: int
+) -> list[int]:
     """Indices of the highest scores that lie so far apart."""
     score = score.copy()
     found = []
-    for _ in range(SCHEDULE.grid_maxima):
+    for _ in range(most):
         i = int(np.argmax(score))
         if not np.isfinite(score[i]):
             break

@@ -14,26 +14,25 @@ class Schedule:
     # Kernel width [label px] and contrast level, from wide to sharp.
     kernels: tuple[tuple[float, int], ...] = ((4.0, 0), (2.5, 1), (1.5, 2))
 
-    # Basin: candidates of different origin climb at the first kernel above, until another origin's end agrees.
+    # Basin: candidates of different origin climb at the first kernel above.
     wide_climb_steps: int = 4
     climb_steps: int = 6
-    finishing_steps: int = 4  # of the best end
-    evolutions: int = 3
-    # Grid of rotations: kernel, step in kernels, points, how many of its maxima are climbed and how far apart they are.
+    compared_points: int = 5000  # of each term, where ends are compared
+    finishing_steps: int = 4  # of the best end, and of others that are no worse
+    # Grid of rotations: kernel, step in kernels, points of each term, share of matching edges that it presumes.
     grid_kernel_deg: float = 0.6
     wide_grid_kernel_deg: float = 0.9  # beyond wide_box_deg
-    grid_step_kernels: float = 1.5
-    grid_points: int = 2500
-    grid_maxima: int = 2
-    grid_apart_kernels: float = 3.0
-    # Evolution: kernel [label px], share of matching edges that it presumes.
-    coarse_kernel: tuple[float, int] = (10.0, 0)
-    coarse_match: float = 0.1
-    # Candidates, generations and points of the evolution: in a box of 6 deg about the prior ...
-    narrow_evolution: tuple[int, int, int] = (48, 36, 6000)
-    # ... and in one beyond wide_box_deg, as of 20 or 30.
-    wide_evolution: tuple[int, int, int] = (64, 70, 9000)
     wide_box_deg: float = 9.0
+    grid_step_kernels: float = 1.5
+    grid_points: int = 1500
+    grid_frames: int = 24  # many points of few frames cost less than few points of many
+    coarse_match: float = 0.1
+    # How many of its poses by all terms together, and by each alone, are looked at with more points, and how many.
+    grid_chosen: tuple[int, int] = (150, 30)
+    chosen_points: int = 3000
+    # Of its maxima so many are climbed, so far apart.
+    grid_maxima: int = 4
+    grid_apart_kernels: float = 3.0
 
     # Points of edges, and of markings: with wide kernels, with sharp ones, and for the time offset's profile, which is
     # sharp. More add nothing.
