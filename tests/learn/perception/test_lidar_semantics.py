@@ -11,12 +11,15 @@ import torch
 
 from pipeline.errors import ConfigError, ContractError
 from pipeline.geometry.range_image import EMPTY
+from pipeline.geometry.se3 import transform_points
 from pipeline.learn.perception.lidar_semantics.labels import (
     KIND_OF_LABEL,
     KINDS,
     LABELS,
     UNLABELLED,
+    hidden_points,
     project_labels,
+    standing_points,
 )
 from pipeline.learn.perception.lidar_semantics.network import build_sweep_network, export_sweeps
 from pipeline.learn.perception.lidar_semantics.samples import (
@@ -120,6 +123,23 @@ def test_points_take_their_pixels_class_and_none_near_boundaries_in_the_sky_or_b
     behind = -xyz[:1]
     found = project_labels(changed, T_CAMERA_LIDAR, np.concatenate([xyz, behind]))
     assert found.tolist() == [ROAD, CAR, UNLABELLED, UNLABELLED, UNLABELLED]
+
+
+def test_what_stands_before_a_point_takes_its_label_and_the_road_takes_none():
+    """A roof lidar sees past a van; the camera, lower down, sees the van there."""
+    up, across = np.meshgrid(np.arange(-1.2, 0.9, 0.2), np.arange(-1.0, 1.01, 0.1))
+    van = np.stack([np.full(up.size, 10.0), across.ravel(), up.ravel()], 1)
+    wall = van * [2.5, 2.5, 1.0] + [0, 0, 0.3]
+    aside = wall + [0, 12, 0]
+    ahead = np.arange(5.0, 60.0, 0.5)
+    road = np.stack([ahead, np.full(len(ahead), -9.0), np.full(len(ahead), -1.7)], 1)
+    xyz = np.concatenate([van, wall, aside, road]).astype(np.float32)
+    hidden = hidden_points(transform_points(T_CAMERA_LIDAR, xyz.astype(np.float64)), standing_points(xyz))
+    of_van, of_wall, of_aside, of_road = np.split(hidden, np.cumsum([len(van), len(wall), len(aside)]))
+    assert of_wall.mean() > 0.9
+    assert not of_van.any()
+    assert not of_aside.any()
+    assert not of_road.any()
 
 
 def test_layout_holds_the_sweeps_and_images_are_cut_to_where_labels_are(samples):
