@@ -41,9 +41,9 @@ def simulate(
         frames: moments per vehicle-day at which every sensor is logged, in three drives.
         rate_hz: moments per second within a drive.
         rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128, rosette,
-            hdl64, fisheye, pinhole, rolling, truck, bumper, tilted, van (6 cameras, 2 lidars, 5 radars) or duo (2, 1,
-            2); each with `-flat` behind it for radars without elevation, or `-dirty` for such as see things between
-            them and their images in the road. pipeline/simulate/README.md says what they are.
+            hdl64, keyhole, telephoto, fisheye, pinhole, rolling, truck, bumper, tilted, van (6 cameras, 2 lidars, 5
+            radars) or duo (2, 1, 2); each with `-flat` behind it for radars without elevation, or `-dirty` for
+            such as see things between them and their images in the road. pipeline/simulate/README.md tells of each.
         environments: what the drives lead through: urban and highway in turn (mixed), one of them, suburb, jam, alley,
             country, deck, tunnel, or world-SEED, drawn by SEED.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.

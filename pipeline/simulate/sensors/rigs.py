@@ -84,6 +84,17 @@ _ALL: Final = (
         ),
         xyz_m=((1.62, 0.06, 1.65), (1.35, 0.0, 1.73), (3.60, 0.0, 0.60)),
     ),
+    # A lidar of 24 x 10 deg in the middle of an image of 150 deg, and one all around under an image of 32 deg.
+    _demo(
+        "keyhole",
+        camera=CameraSpec(1024, 512, 150.0, 75.0),
+        lidar=LidarSpec((-12.0, 12.0), (-7.0, 3.0), 160, 64, max_range_m=120.0),
+    ),
+    _demo(
+        "telephoto",
+        camera=CameraSpec(960, 540, 32.0, 18.3, model="plumb_bob", distortion=(0.0,) * 5),
+        lidar=replace(_SPINNING, columns=1800),
+    ),
     # 240,000 beams a second over 82 x 25 deg, as Livox' Horizon has them; six lasers behind the same prisms.
     _demo(
         "rosette",

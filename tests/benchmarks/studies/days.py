@@ -272,6 +272,14 @@ SETS: dict[str, list[DaySpec]] = {
         )
     ],
     "dev-worlds": _worlds(60, 16),
+    "dev-views": [
+        DaySpec(76 + i, world, 60, rig)
+        for i, (rig, world) in enumerate(
+            (rig, world)
+            for rig in ("hdl64", "keyhole", "telephoto")
+            for world in ("suburb", "country", "alley")
+        )
+    ],
     "worlds": _worlds(6400, 128),
     "table1": [DaySpec(4600 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
     "one-clock": [

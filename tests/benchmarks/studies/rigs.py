@@ -27,7 +27,9 @@ from tests.benchmarks.studies.metrics import AZIMUTH_ELEVATION_DOF, within
 def main() -> None:
     """Run what is missing, then print the table."""
     parser = study_arguments(__doc__ or "", "rigs")
-    parser.add_argument("--set", choices=["dev-rigs", "dev-worlds", "worlds"], default="dev-rigs")
+    parser.add_argument(
+        "--set", choices=["dev-rigs", "dev-views", "dev-worlds", "worlds"], default="dev-rigs"
+    )
     args = parser.parse_args()
     run_study([Run(day, seed=day.seed) for day in SETS[args.set]], args, summary)
 
@@ -58,9 +60,9 @@ def summary(results: list[dict[str, Any]]) -> str:
 
 
 def _world(environment: str) -> str:
-    """What a drawn world is like; nothing of the old ones."""
+    """What a drawn world is like, the name of another one; nothing of town and highway in turn."""
     if not environment.startswith(WORLD):
-        return ""
+        return "" if environment == "mixed" else environment
     drawn = landscape_named(environment)
     beside = {
         "no markings": not drawn.markings,
