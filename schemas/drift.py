@@ -14,6 +14,7 @@ from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.columns import Recorded, TableSchema, column, row
 
 __all__ = [
+    "DAYS_WILL_TELL",
     "DRIFT",
     "DRIFT_STATUSES",
     "DriftFinding",
@@ -132,13 +133,26 @@ def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
     return known.get(name, name)
 
 
+# How reasons end that later days decide: nothing is to be mended yet.
+DAYS_WILL_TELL = "will tell"
+
+
 def next_step(vehicle: str, stored: VehicleStatus, lake: str = "LAKE") -> str:
-    """What a person should do about a vehicle that is RED, with the command; empty where nothing is to be done."""
-    if stored.status != "RED":
+    """What a person should do about a vehicle that is RED or YELLOW, with the command; empty where there is nothing."""
+    if stored.status not in ("RED", "YELLOW"):
         return ""
+    of = f"--lake {quote(lake)} --vehicle {quote(vehicle)}"
     sensor = stored.sensor or "all"
-    what = f"how the {stored.sensor} is mounted" if stored.sensor else "how all sensors are mounted"
-    command = (
-        f"boresight service --lake {quote(lake)} --vehicle {quote(vehicle)} --day YYYY-MM-DD --kind repair"
-    )
-    return f"{vehicle}: inspect {what}; when it is mended, run `{command} --sensor {sensor}` with that day."
+    load = f"load tonight's state, which rests on the days since: `boresight export FORMAT {of} --out FOLDER`"
+    if stored.status == "RED":
+        what = f"how the {stored.sensor} is mounted" if stored.sensor else "how all sensors are mounted"
+        service = f"`boresight service {of} --day YYYY-MM-DD --kind repair --sensor {sensor}`"
+        return (
+            f"{vehicle}: inspect {what}; when it is mended, run {service} with that day. Until then {load}."
+        )
+    if DAYS_WILL_TELL in stored.reason:
+        return f"{vehicle}: nothing yet but to drive on; look again tomorrow: `boresight status --lake {quote(lake)}`."
+    what = f"the {stored.sensor}" if stored.sensor else "all sensors"
+    service = f"`boresight service {of} --day YYYY-MM-DD --kind re-mount --sensor {sensor}`"
+    look = f"If somebody moved {what}, run {service} with that day; else look at the mounting at the next service."
+    return f"{vehicle}: {load}. {look}"

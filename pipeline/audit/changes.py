@@ -9,10 +9,11 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.audit.charts import Charts, scan
+from pipeline.audit.charts import Charts
 from pipeline.audit.noise import Noise
+from pipeline.audit.scan import Scan, scan_by
 
-__all__ = ["Change", "Levels", "describe", "levels_of", "ramp_fits", "start_interval"]
+__all__ = ["Change", "Levels", "clearest", "describe", "levels_of", "start_interval"]
 
 # Fall of twice the log-likelihood that bounds the start day's interval. A split is discrete, so the
 # quantile of chi-squared is only a guide; with this value the interval held the true day in 97-99 % of
@@ -38,13 +39,14 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """The last level of a chart against its first.
+    """The last level of a chart against its first; of a chart without levels, what it has drifted by.
 
     Args:
         chart: one row.
         value: its clipped values.
-        scale: factor on its sigmas.
-        start: column at which it left the first level for good; 0 where it is back there.
+        noise: of it.
+        whole: the scan of all of it.
+        start: column at which it left the first level for good; 0 where it is back there, or drifts.
         size: last level less first.
         sigma: of the size.
         threshold: on size over sigma.
@@ -53,7 +55,8 @@ class Levels:
 
     chart: Charts
     value: np.ndarray
-    scale: float
+    noise: Noise
+    whole: Scan
     start: int
     size: float
     sigma: float
@@ -69,82 +72,96 @@ class Levels:
         return abs(self.size) / self.sigma
 
 
-def levels_of(
-    chart: Charts, value: Float[np.ndarray, " N"], noise: Noise, m: int, threshold: float
-) -> Levels:
+def levels_of(chart: Charts, value: Float[np.ndarray, " N"], noise: Noise, threshold: float) -> Levels:
     """Cut a chart into levels and hold the last against the first.
 
     Args:
         chart: one row.
         value: its clipped values.
-        noise: of all charts.
-        m: which of them this is.
+        noise: of this chart.
         threshold: sigmas beyond which two levels differ.
     """
-    scale, phi = noise.scale[m : m + 1], noise.autocorrelation[m : m + 1]
 
     def split(first: int, end: int) -> int | None:
-        part = scan(chart.row(0, first, end), value[None, first:end], scale, phi)
+        part = scan_by(chart.row(0, first, end), value[None, first:end], noise)
         z = np.abs(part.z[0])
         return first + 1 + int(np.argmax(z)) if len(z) and z.max() > threshold else None
 
-    cuts = _cuts(0, len(value), split)
-    edges = [0, *cuts, len(value)]
+    N, whole = len(value), scan_by(chart, value[None], noise)
+    edges = [0, *_cuts(0, N, split), N]
     # A single last day is no level yet: the one before it is still the current one.
     while len(edges) > 3 and edges[-1] - edges[-2] < 2:
         edges.pop(-2)
     spans = list(pairwise(edges))
-    off = [_against(chart, value, spans[0], span, scale, phi) for span in spans[1:]]
+    off = [_against(chart, value, spans[0], span, noise) for span in spans[1:]]
+    if not off:
+        s = int(np.argmax(np.abs(whole.drift_z[0])))
+        spans, off = [(0, s + 1), (s + 1, N)], [(float(whole.drift[0, s]), float(whole.drift_sigma[0, s]))]
     size, sigma = off[-1]
     differs = [abs(s) / g > threshold for s, g in off]
     back = len(off) - 1
     while back > 0 and differs[back - 1]:
         back -= 1
-    start = edges[back + 1]
     sides = (spans[0], spans[-1])
     accepted = [bool(chart.accepted[0, a:b].any()) for a, b in sides]
     days_before, days_after = (b - a for a, b in sides)
     if chart.has_reference[0]:
-        days_before = max(days_before, 2)
+        days_before = max(days_before, int(chart.reference_days[0]))
     return Levels(
-        chart, value, float(scale[0]), start, size, sigma, threshold, days_before, days_after,
+        chart, value, noise, whole, edges[back + 1] % N, size, sigma, threshold, days_before, days_after,
         2 - sum(accepted), len(off) > 1 and not differs[-1],
     )  # fmt: skip
 
 
 def describe(levels: Levels) -> Change:
     """Kind, start with its interval, and size of the change that a chart is left with."""
-    chart, value, scale = levels.chart, levels.value, levels.scale
-    sigma, day = chart.sigma[0] * scale, chart.day[0]
-    step_gain = _step_gains(value, sigma)
-    ramp_gain, ramp_size, ramp_sigma = ramp_fits(value, sigma, day)
-    if np.max(ramp_gain) > np.max(step_gain) + _CLEAR_ODDS:
-        s = int(np.argmax(ramp_gain))
-        size, size_sigma = float(ramp_size[s]), float(ramp_sigma[s])
-        return Change(*start_interval(ramp_gain, day), "slow drift", size, size_sigma)
+    chart, whole, day = levels.chart, levels.whole, levels.chart.day[0]
+    drift_gain = whole.drift_z[0] ** 2
+    if not levels.start or drift_gain.max() > (whole.z[0] ** 2).max() + _CLEAR_ODDS:
+        return _drift(whole, day, int(np.argmax(drift_gain)))
     # Of the splits, those about where the first level was left: a later change must not move it.
-    near = _step_gains(value[: levels.start + levels.days_after], sigma[: levels.start + levels.days_after])
-    first, earliest, latest = start_interval(near, day)
+    end = levels.start + levels.days_after
+    near = scan_by(chart.row(0, 0, end), levels.value[None, :end], levels.noise)
+    first, earliest, latest = start_interval(near.z[0] ** 2, day)
     if int(day[levels.start]) != first:
         first = int(day[levels.start])
         earliest, latest = min(earliest, int(day[levels.start - 1]) + 1), max(latest, first)
-    settled = int(day[len(value) - levels.days_after])
+    settled = int(day[len(levels.value) - levels.days_after])
     return Change(first, earliest, latest, "step", levels.size, levels.sigma, settled)
 
 
-def ramp_fits(
-    value: Float[np.ndarray, " N"], sigma: Float[np.ndarray, " N"], day: Int[np.ndarray, " N"]
-) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " S"], Float[np.ndarray, " S"]]:
-    """Twice the log-likelihood gain, total size and sigma of a drift from each split on to the last day."""
-    w = sigma**-2.0
-    at = day.astype(np.float64)
-    # A drift that sets in after day s-1 has grown by (day - day[s-1]): column s of the design.
-    shape = np.maximum(at[None, :] - at[:-1, None], 0.0)
-    shape /= shape[:, -1:]
-    centred = shape - (shape @ w)[:, None] / w.sum()
-    information = (centred**2) @ w
-    size = (centred @ (w * value)) / information
-    return size**2 * information, size, information**-0.5
+def clearest(
+    whole: Scan, day: Int[np.ndarray, " N"], limit: float, threshold: Float[np.ndarray, " 2"]
+) -> Change | None:
+    """The surest step or drift beyond a size and a threshold; None where there is none.
+
+    Args:
+        whole: the scan of one chart.
+        day: of its columns.
+        limit: size of a change that matters [rad or m].
+        threshold: on size over sigma, of a step and of a drift.
+    """
+    step, drift = (
+        np.where((np.abs(size) > limit) & (np.abs(z) > beyond), np.abs(z), 0.0)
+        for size, z, beyond in zip(
+            (whole.size[0], whole.drift[0]), (whole.z[0], whole.drift_z[0]), threshold, strict=True
+        )
+    )
+    if not max(step.max(), drift.max()):
+        return None
+    if drift.max() ** 2 > step.max() ** 2 + _CLEAR_ODDS * (step.max() > 0):
+        return _drift(whole, day, int(np.argmax(drift)))
+    s = int(np.argmax(step))
+    first = int(day[s + 1])
+    _, earliest, latest = start_interval(whole.z[0] ** 2, day)
+    earliest, latest = min(earliest, first), max(latest, first)
+    return Change(first, earliest, latest, "step", float(whole.size[0, s]), float(whole.sigma[0, s]), first)
+
+
+def _drift(whole: Scan, day: Int[np.ndarray, " N"], s: int) -> Change:
+    size, sigma = float(whole.drift[0, s]), float(whole.drift_sigma[0, s])
+    first, earliest, latest = start_interval(whole.drift_z[0] ** 2, day)
+    return Change(first, earliest, latest, "slow drift", size, sigma)
 
 
 def start_interval(gain: Float[np.ndarray, " S"], day: Int[np.ndarray, " N"]) -> tuple[int, int, int]:
@@ -167,14 +184,9 @@ def _cuts(first: int, end: int, split: Callable[[int, int], int | None]) -> list
 
 
 def _against(
-    chart: Charts,
-    value: np.ndarray,
-    reference: tuple[int, int],
-    level: tuple[int, int],
-    scale: np.ndarray,
-    phi: np.ndarray,
+    chart: Charts, value: np.ndarray, reference: tuple[int, int], level: tuple[int, int], noise: Noise
 ) -> tuple[float, float]:
-    """Difference of two levels and its sigma, each with the variance that its own days have."""
+    """Difference of two levels and its sigma."""
     columns = np.r_[slice(*reference), slice(*level)]
     part = Charts(
         chart.day[:, columns],
@@ -184,15 +196,6 @@ def _against(
         chart.reference_days,
         np.array([len(columns)]),
     )
-    found = scan(part, value[None, columns], scale, phi)
+    found = scan_by(part, value[None, columns], noise)
     at = reference[1] - reference[0] - 1
     return float(found.size[0, at]), float(found.sigma[0, at])
-
-
-def _step_gains(value: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Twice the log-likelihood gain of a step at each split, days taken as independent."""
-    w = sigma**-2.0
-    weight, moment = np.cumsum(w), np.cumsum(w * value)
-    before, after = weight[:-1], weight[-1] - weight[:-1]
-    size = (moment[-1] - moment[:-1]) / after - moment[:-1] / before
-    return np.asarray(size**2 / (1 / before + 1 / after))

@@ -1,9 +1,9 @@
 """Many control charts at once: did a value change at any split of its days, seen through the noise that days have.
 
-The statistic is the largest difference between the days after and before a split, in units of its sigma (the
-likelihood ratio of one step against none, Hinkley 1970, Biometrika 57(1)). Three things that real days do are part of
-it: successive days err alike (AR(1), `autocorrelation`), a vehicle's days scatter more than they say (`scale`, known
-to `freedom` degrees of freedom), and single days are far off (`clipped`). All arrays have a row per chart and a column
+The statistic is the largest step or drift from any split on, in units of its sigma (`scan.py`; the likelihood ratio of
+one change against none, Hinkley 1970, Biometrika 57(1)). Three things that real days do are part of it: successive days
+err alike (AR(1), `autocorrelation`), a vehicle's days scatter more than they say (`scale`, known to `freedom` degrees
+of freedom), and single days are far off (`clipped`). All arrays have a row per chart and a column
 per day; a chart's days stand at the left, what is beyond its `count` weighs nothing.
 """
 
@@ -19,12 +19,12 @@ from scipy.special import owens_t
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
-__all__ = ["Charts", "Scan", "alarm_threshold", "clipped", "scan", "thresholds"]
+__all__ = ["Charts", "alarm_threshold", "clipped", "thresholds"]
 
 # Sigmas by which a day may lie from the median of itself and its neighbours. Two days in a row are believed, one is
 # not: with it, RED false alarms of days that err like Student's t with 4 degrees of freedom are those of normal ones.
 _CLIP_SIGMAS = 3.0
-_MOST_FREEDOM = 200  # beyond which Student's t is the normal distribution for our purpose
+_MOST_FREEDOM = 240  # beyond which Student's t is the normal distribution for our purpose
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,19 +67,6 @@ class Charts:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Scan:
-    """Every split of every chart: split s lies between columns s and s + 1. Sigma is infinite where there is none."""
-
-    size: Float[np.ndarray, "M S"]
-    sigma: Float[np.ndarray, "M S"]
-
-    @property
-    def z(self) -> Float[np.ndarray, "M S"]:
-        """Sizes in units of their sigmas."""
-        return self.size / self.sigma
-
-
 def clipped(charts: Charts, scale: Float[np.ndarray, " M"]) -> Float[np.ndarray, "M N"]:
     """Values, none further than some sigmas from the median of itself and its neighbours (at an end: of three)."""
     M, N = charts.value.shape
@@ -102,61 +89,12 @@ def clipped(charts: Charts, scale: Float[np.ndarray, " M"]) -> Float[np.ndarray,
     return np.where(many, moved, out)
 
 
-def scan(
-    charts: Charts,
-    value: Float[np.ndarray, "M N"],
-    scale: Float[np.ndarray, " M"],
-    autocorrelation: Float[np.ndarray, " M"],
-) -> Scan:
-    """Mean after minus mean before, at every split.
-
-    Each side's variance counts that its days err alike; that both sides do so too would make the difference surer, and
-    is left out: where the autocorrelation is overstated, that would be wrong the other way.
-
-    Args:
-        charts: the days.
-        value: theirs, clipped or not.
-        scale: factor on the sigmas.
-        autocorrelation: of days that follow each other; it falls with the power of the days between.
-    """
-    a = 1 / charts.sigma
-    held = charts.has_reference
-    if held.any():
-        a[held, 0] /= np.sqrt(_alike(charts.reference_days[held], autocorrelation[held]))
-    weight = a * a
-    total, moment = np.cumsum(weight, axis=1), np.cumsum(weight * value, axis=1)
-    gap = np.diff(charts.day, axis=1).clip(min=0)
-    rho = autocorrelation[:, None] ** gap
-    before = _sum_variance(a, rho)[:, :-1]
-    after = _sum_variance(a[:, ::-1], rho[:, ::-1])[:, ::-1][:, 1:]
-    left, right = total[:, :-1], total[:, -1:] - total[:, :-1]
-    there = np.arange(1, a.shape[1]) < charts.count[:, None]
-    left, right = np.where(there, left, 1.0), np.where(there, right, 1.0)
-    size = (moment[:, -1:] - moment[:, :-1]) / right - moment[:, :-1] / left
-    sigma = scale[:, None] * np.sqrt(before / left**2 + after / right**2)
-    return Scan(np.where(there, size, 0.0), np.where(there, sigma, np.inf))
-
-
-def _alike(days: Int[np.ndarray, " M"], autocorrelation: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    """Variance of a mean of AR(1) days in that of independent ones."""
-    lag = np.arange(1, days.max(initial=1))
-    share = np.maximum(1 - lag / days[:, None], 0.0)
-    return np.asarray(1 + 2 * (share * autocorrelation[:, None] ** lag).sum(axis=1))
-
-
-def _sum_variance(a: np.ndarray, rho: np.ndarray) -> np.ndarray:
-    """Variance of the running sum of `a e`, e of variance 1 with correlation rho from one to the next."""
-    out = np.empty_like(a)
-    carried, out[:, 0] = a[:, 0].copy(), a[:, 0] ** 2
-    for k in range(1, a.shape[1]):
-        carried *= rho[:, k - 1]
-        out[:, k] = out[:, k - 1] + a[:, k] * (2 * carried + a[:, k])
-        carried += a[:, k]
-    return out
-
-
 def thresholds(
-    count: Int[np.ndarray, " M"], freedom: Float[np.ndarray, " M"], probability: Float[np.ndarray, " M"]
+    count: Int[np.ndarray, " M"],
+    freedom: Float[np.ndarray, " M"],
+    probability: Float[np.ndarray, " M"],
+    autocorrelation: Float[np.ndarray, " M"] | float = 0.0,
+    of: str = "step",
 ) -> Float[np.ndarray, " M"]:
     """Threshold on max |z| of each chart; infinite where there are fewer than two days.
 
@@ -164,27 +102,36 @@ def thresholds(
         count: days.
         freedom: degrees of freedom that the scale is known to.
         probability: of an alarm without a change.
+        autocorrelation: of days.
+        of: "step" or "drift": drifts that set in on neighbouring days share more.
     """
-    keys = np.stack([count, np.clip(np.rint(freedom), 1, _MOST_FREEDOM), probability], axis=1)
+    freedom = np.rint(_MOST_FREEDOM / np.rint(_MOST_FREEDOM / np.clip(freedom, 1, _MOST_FREEDOM)))
+    phi = np.broadcast_to(np.rint(10 * np.asarray(autocorrelation)) / 10, count.shape)
+    keys = np.stack([count, freedom, probability, phi], axis=1)
     unique, index = np.unique(keys, axis=0, return_inverse=True)
-    found = [_threshold(int(n), int(f), float(p)) if n > 1 else np.inf for n, f, p in unique]
+    found = [_threshold(int(n), int(f), float(p), float(r), of) if n > 1 else np.inf for n, f, p, r in unique]
     return np.array(found)[index.ravel()]
 
 
-@lru_cache(maxsize=4096)
-def _threshold(count: int, freedom: int, probability: float) -> float:
+@lru_cache(maxsize=16384)
+def _threshold(count: int, freedom: int, probability: float, autocorrelation: float, of: str) -> float:
     # As many independent splits as the bound for known sigmas says, each with Student's t: the scale is not known.
-    one = norm.sf(alarm_threshold(np.ones(count), probability))
+    one = norm.sf(alarm_threshold(np.ones(count), probability, autocorrelation, of))
     return float(student_t.isf(one, freedom))
 
 
-def alarm_threshold(sigma: Float[np.ndarray, " N"], false_alarm_probability: float) -> float:
-    """Threshold on max |z| that a chart of independent normal days exceeds with at most this probability.
+def alarm_threshold(
+    sigma: Float[np.ndarray, " N"],
+    false_alarm_probability: float,
+    autocorrelation: float = 0.0,
+    of: str = "step",
+) -> float:
+    """Threshold on max |z| that a chart of normal days exceeds with at most this probability.
 
     P(max > h) <= P(|z_1| > h) + sum P(|z_s-1| <= h < |z_s|): the first split above h is either the first of
     all or follows one below h. Neighbouring splits share their days, so the second terms are small; they
     are exact for the known correlation through Owen's T function: P(X > h >= Y) = 2 T(h, sqrt((1 - r)/(1 +
-    r))) for r >= 0.
+    r))) for r >= 0. Of days that err alike, neighbouring splits share less.
 
     Source: the upcrossing bound as in Worsley 1983, Biometrika 70(2) 455-464 (his Bonferroni improvement).
 
@@ -193,9 +140,7 @@ def alarm_threshold(sigma: Float[np.ndarray, " N"], false_alarm_probability: flo
     """
     if len(sigma) < 2 or not 0 < false_alarm_probability < 1:
         raise ValueError(f"no threshold for {len(sigma)} days at probability {false_alarm_probability}")
-    weight = np.cumsum(sigma**-2.0)
-    before, after = weight[:-1], weight[-1] - weight[:-1]
-    r = np.sqrt(before[:-1] * after[1:] / (before[1:] * after[:-1]))
+    r = _correlation(sigma, autocorrelation, of)
     slope = np.sqrt((1 - r) / (1 + r))
 
     def excess(h: float) -> float:
@@ -205,3 +150,14 @@ def alarm_threshold(sigma: Float[np.ndarray, " N"], false_alarm_probability: flo
     low = norm.isf(false_alarm_probability / 2)
     high = norm.isf(false_alarm_probability / (2 * len(sigma)))
     return float(brentq(excess, low - 1e-9, high + 1e-9)) if len(r) else float(low)
+
+
+def _correlation(sigma: Float[np.ndarray, " N"], autocorrelation: float, of: str) -> Float[np.ndarray, " R"]:
+    """Correlation of the estimates of steps, or drifts, at neighbouring splits, none below 0."""
+    lag = np.arange(len(sigma))[:, None] - np.arange(len(sigma))
+    W = np.linalg.inv(autocorrelation ** np.abs(lag) * np.outer(sigma, sigma))
+    # Column s: what a change after day s adds to each day.
+    design = np.clip(lag, 0, 1 if of == "step" else None)[:, :-1].astype(np.float64)
+    level = W.sum(axis=0)
+    C = design.T @ (W - np.outer(level, level) / level.sum()) @ design
+    return np.asarray(np.clip(np.diag(C, 1) / np.sqrt(np.diag(C)[:-1] * np.diag(C)[1:]), 0.0, 1.0))

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.audit.charts import Charts, clipped, scan
+from pipeline.audit.charts import Charts, clipped
+from pipeline.audit.scan import scan
 from pipeline.geometry.changes import change_between, change_jacobian, changed
 from pipeline.rig.edges import edge_order
 from pipeline.rig.graph import Edge

@@ -37,19 +37,20 @@ class FleetShift:
 
 
 def judge_without_fleet_shifts(
-    fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig
+    fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str] = ()
 ) -> tuple[list[VehicleVerdict], dict[tuple[Edge, str], FleetShift]]:
     """Verdicts on all vehicles, and by (edge, dof) what was taken out of all of them before.
 
     Args:
         fleet: by vehicle, day estimates by edge.
         config: limits and the false-alarm budget.
+        models: by vehicle, the rig whose days its own are like; none = all are of one.
     """
-    verdicts = judge_fleet(fleet, config)
+    verdicts = judge_fleet(fleet, config, models)
     shifts = _shifts(fleet, verdicts)
     if not shifts:
         return verdicts, {}
-    return judge_fleet([_without(pairs, shifts) for pairs in fleet], config), shifts
+    return judge_fleet([_without(pairs, shifts) for pairs in fleet], config, models), shifts
 
 
 def _shifts(

@@ -1,124 +1,296 @@
 """How days really scatter: by which factor more than they say, and how far the next day errs like the last.
 
-Both come from medians of differences between days, which a few real changes do not move. What one vehicle shows is
-drawn towards its fleet where it has few days, and the fleet towards what the false-alarm budget was proved for.
+Both are learnt from differences between days, which a few real changes do not move, for each model of vehicle, edge
+and degree of freedom. What is known of a fleet that nobody has seen (`Prior`) gives way to what the fleet's days show,
+and that to what a vehicle's own days show: by how much vehicles differ is learnt too (Smyth 2004, Stat. Appl. Genet.
+Mol. Biol. 3(1), moments of log-variances), and one that differs by far more stands for itself.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
-from scipy.stats import norm
+from jaxtyping import Float, Int
+from scipy.special import digamma, polygamma
 
 from pipeline.audit.charts import Charts
+from pipeline.config import FleetConfig
+from pipeline.errors import ConfigError
 
-__all__ = ["Noise", "estimate_noise"]
+__all__ = ["Noise", "Prior", "estimate_noise", "models_of"]
 
-# Vehicles whose sigmas are wrong by a log-normal factor of 0.25: variances that a prior of 1 / (2 0.25^2) = 8 degrees
-# of freedom describes.
-_PRIOR_FREEDOM = 8.0
+_WINSOR = 2.0  # sigmas beyond which a difference counts as one of that size: a step is one of them
+_WINSORED = 0.9205  # of the variance of a normal distribution that is left by that
+# Of n differences of neighbouring days, degrees of freedom of their variance: they share days, and are winsorised.
+_EFFICIENCY = 0.6
 # Days that scatter more than this times what they say do not scatter: something moves, and is to be found. Four
-# standard deviations of the log-normal factor above.
+# standard deviations of sigmas that are wrong by a log-normal factor of 0.25.
 _MOST_SCALE = 3.0
-_MEDIAN_EFFICIENCY = 0.37  # of the median of |normal| as an estimate of sigma (Rousseeuw & Croux 1993)
-# What is assumed of a fleet that nobody has seen: the largest autocorrelation that the budget is proved for.
-_PRIOR_AUTOCORRELATION = 0.6
 _MOST_AUTOCORRELATION = 0.9
-# Differences that weigh as much as the prior: one estimate from n of them is known to about 2.2 / sqrt(n), vehicles of
-# a fleet differ by some 0.15.
-_PRIOR_DIFFERENCES = 200.0
+# The newest days of a chart, a quarter of them at most, are judged by what older ones show: what begins on all
+# vehicles at once is no scatter.
+_NEWEST, _OLDER = 6, 4
+# Days apart that tell how alike they are, beside neighbours: a working week has them.
+_APART = 3
+# One autocorrelation from n differences is known to 2.2 / sqrt(n), in variance: this over n.
+_OF_ONE = 4.8
+# Share of a normal distribution beyond three sigmas, and the differences that it is worth.
+_NORMAL, _FAR_WORTH = 0.0027, 200.0
+_JUMP = 4.0  # sigmas of a difference that is no scatter
+_AXES_DIFFER = 0.07  # autocorrelations of one edge's degrees of freedom
+_FAR = 3.0  # sigmas from its fleet beyond which a vehicle is no member of it
+_MOST_FREEDOM = 1000.0  # as good as known
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known before any day was seen; a larger fleet's, or that of a model, where one is known.
+
+    Args:
+        variance: of days, in what they say.
+        freedom: of the chi-squared that vehicles' variances differ by: sigmas that are wrong by a log-normal factor of
+            0.25, whose variances are 1 / (2 0.25^2) = 8 degrees of freedom.
+        vehicles: that `freedom` is worth.
+        autocorrelation: the most that days are taken to err alike.
+        autocorrelation_sigma: by how much vehicles and fleets differ in it.
+    """
+
+    variance: float = 1.0
+    freedom: float = 8.0
+    vehicles: float = 8.0
+    autocorrelation: float = 0.6
+    autocorrelation_sigma: float = 0.15
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Of each chart: factor on its sigmas (>= 1), the degrees of freedom it is known to, and the autocorrelation."""
+    """Of each chart: factor on its sigmas (>= 1), the degrees of freedom it is known to, and the autocorrelation.
+
+    Args:
+        far: share of days' differences beyond three sigmas.
+        less_alike: the same with the least autocorrelation that the days allow; None where there is one answer.
+    """
 
     scale: Float[np.ndarray, " M"]
     freedom: Float[np.ndarray, " M"]
     autocorrelation: Float[np.ndarray, " M"]
+    far: Float[np.ndarray, " M"]
+    less_alike: Noise | None = None
+
+    def at(self, rows: slice) -> Noise:
+        """Of some charts."""
+        other = None if self.less_alike is None else self.less_alike.at(rows)
+        return Noise(self.scale[rows], self.freedom[rows], self.autocorrelation[rows], self.far[rows], other)
 
 
-def estimate_noise(charts: Charts, dofs: int, edges: int) -> Noise:
+def estimate_noise(
+    charts: Charts,
+    dofs: int,
+    edges: int,
+    models: Sequence[str] = (),
+    prior: Prior = Prior(),
+) -> Noise:
     """Noise of all charts of a fleet.
 
     Args:
         charts: rows in order of vehicle, edge and degree of freedom; a chart without days has count 0.
         dofs: degrees of freedom of an edge.
-        edges: that any vehicle has; those of the same name are of one kind of place on every vehicle.
+        edges: that any vehicle has; those of the same name are of one kind of place on every vehicle of a model.
+        models: by vehicle, which it is of; none = all are of one.
+        prior: what is known besides.
     """
-    shape = (len(charts.count) // (edges * dofs), edges, dofs)
-    phi = np.repeat(_autocorrelation(charts, shape, _PRIOR_AUTOCORRELATION).ravel(), dofs)
-    # Days that err alike differ less from each other than they scatter; that counts only as far as it was seen.
-    alike = np.repeat(_autocorrelation(charts, shape, 0.0).ravel(), dofs)[:, None]
-    size, gap, spread = _differences(charts, 1)
-    expected = np.sqrt(np.maximum(spread[0] - 2 * alike**gap * spread[1], 1e-12 * spread[0]))
-    sizes = (np.abs(size) / expected / norm.ppf(0.75)).reshape(*shape, -1)
-    found, seen = _median(np.moveaxis(sizes, 0, 2).reshape(edges, dofs, -1))
-    of_fleet = np.maximum(np.sqrt(_shrunk(found, seen, np.ones_like(found), _PRIOR_FREEDOM)[0]), 1.0)
-    relative = sizes / of_fleet[None, :, :, None]
-    vehicle, seen = _median(relative.reshape(len(relative), edges, -1))
-    # Degrees of freedom of one edge share scenes: their differences count as those of one.
-    variance, freedom = _shrunk(vehicle, seen / dofs, np.ones_like(vehicle), _PRIOR_FREEDOM)
-    own, own_seen = _median(relative)
-    prior = np.broadcast_to(variance[:, :, None], own.shape)
-    own_variance, _ = _shrunk(own, own_seen, prior, np.broadcast_to(freedom[:, :, None], own.shape))
-    scale = np.maximum(of_fleet[None] * np.sqrt(own_variance), 1.0)
-    freedom = np.broadcast_to(freedom[:, :, None], scale.shape)
-    return Noise(scale.ravel(), freedom.ravel().copy(), phi)
+    vehicles = len(charts.count) // (edges * dofs)
+    _, model_of = np.unique(list(models) or [""] * vehicles, return_inverse=True)
+    out = np.ones((2, 4, vehicles, edges, dofs))
+    differences = [_Differences.of(charts, lag, (vehicles, edges, dofs)) for lag in (1, _APART)]
+    for model in np.unique(model_of):
+        own = np.flatnonzero(model_of == model)
+        near, far = (found.at(own) for found in differences)
+        out[:, 3, own] = _far_off(near.in_sigmas(0.0))[:, None]
+        _leave_out_steps(near, far)
+        for k, most in enumerate((prior.autocorrelation, 0.0)):
+            phi = _autocorrelation(near, far, most, prior)
+            out[k, :2, own] = np.stack(_scatter(near, phi, prior), axis=1)
+            out[k, 2, own] = phi
+    most_alike, least_alike = (tuple(part.reshape(4, -1)) for part in out)
+    return _noise(most_alike, _noise(least_alike))
 
 
-def _autocorrelation(charts: Charts, shape: tuple[int, ...], prior: float) -> Float[np.ndarray, "V P"]:
-    """By vehicle and edge, from how much more two days differ that lie two days apart: by 1 + phi in variance."""
-    logs, counts = [], []
-    V, P = shape[:2]
-    for lag in (1, 2):
-        size, gap, spread = _differences(charts, lag)
-        z = np.where(gap == lag, np.abs(size) / np.sqrt(spread[0]), np.nan).reshape(V, P, -1)
-        of_fleet = _median(np.moveaxis(z, 0, 1).reshape(P, -1))
-        of_vehicle = _median(z)
-        logs.append((of_fleet[0], of_vehicle[0]))
-        counts.append((of_fleet[1], of_vehicle[1]))
+def _noise(columns: tuple[np.ndarray, ...], less_alike: Noise | None = None) -> Noise:
+    scale, freedom, autocorrelation, far = columns
+    return Noise(scale, freedom, autocorrelation, far, less_alike)
+
+
+def models_of(fleet: FleetConfig, vehicles: Iterable[str]) -> list[str]:
+    """By vehicle the name of its rig; of one that fleet.toml does not know, none."""
+    found = []
+    for vehicle in vehicles:
+        with suppress(ConfigError):
+            found.append(fleet.vehicle(vehicle).rig)
+            continue
+        found.append("")
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Differences:
+    """Differences of days that stand `lag` apart on a chart (nan: none), days between them, and their sigmas."""
+
+    lag: int
+    size: Float[np.ndarray, "V P D S"]
+    gap: Int[np.ndarray, "V P D S"]
+    square: Float[np.ndarray, "V P D S"]
+    product: Float[np.ndarray, "V P D S"]
+
+    @classmethod
+    def of(cls, charts: Charts, lag: int, shape: tuple[int, int, int]) -> _Differences:
+        sigma = np.where(np.isfinite(charts.sigma), charts.sigma, 1.0)
+        older = charts.count - np.minimum(charts.count // _OLDER, _NEWEST)
+        there = np.arange(lag, sigma.shape[1]) < older[:, None]
+        there[:, :1] &= ~charts.has_reference[:, None]
+        a, b = (slice(None), slice(lag, None)), (slice(None), slice(None, -lag))
+        size = np.where(there, charts.value[a] - charts.value[b], np.nan)
+        parts = (
+            size,
+            (charts.day[a] - charts.day[b]).clip(min=0),
+            sigma[a] ** 2 + sigma[b] ** 2,
+            sigma[a] * sigma[b],
+        )
+        return cls(lag, *(part.reshape(*shape, -1) for part in parts))
+
+    def at(self, vehicles: np.ndarray) -> _Differences:
+        """Of some vehicles."""
+        return _Differences(
+            self.lag, self.size[vehicles], self.gap[vehicles], self.square[vehicles], self.product[vehicles]
+        )
+
+    def in_sigmas(self, phi: np.ndarray | float) -> Float[np.ndarray, "V P D S"]:
+        """Differences in units of what days that err alike by phi say."""
+        rho = np.asarray(phi)[..., None] ** self.gap
+        return self.size / np.sqrt(np.maximum(self.square - 2 * rho * self.product, 1e-12 * self.square))
+
+
+def _leave_out_steps(near: _Differences, far: _Differences) -> None:
+    """What spans a jump that no day explains says nothing of days, and would make them look alike."""
+    z = near.in_sigmas(0.0)
+    sigma = np.sqrt(_variance(np.moveaxis(z, 0, 2).reshape(*z.shape[1:3], -1))[0])
+    with np.errstate(invalid="ignore"):
+        jump = np.abs(z) > _JUMP * sigma[None, :, :, None]
+    near.size[jump] = np.nan
+    spans = far.size.shape[-1]
+    for k in range(_APART):
+        far.size[jump[..., k : k + spans]] = np.nan
+
+
+def _autocorrelation(
+    near: _Differences, far: _Differences, most: float, prior: Prior
+) -> Float[np.ndarray, "V P D"]:
+    """By vehicle, edge and axis, from how much more days differ that lie three days apart: by 1 + phi + phi^2.
+
+    Each is drawn towards that of its axis in the fleet, that to its edge's, and that to `most`.
+    """
+    z = [np.where(d.gap == d.lag, d.size / np.sqrt(d.square), np.nan) for d in (near, far)]
+    V, P, D, _ = near.size.shape
+    by_axis = [np.moveaxis(part, 0, 2) for part in z]
+    worth = _OF_ONE / prior.autocorrelation_sigma**2
+    of_edge = _drawn(_alike([part.reshape(P, -1) for part in by_axis]), np.full(P, most), worth)
+    of_axes = np.broadcast_to(of_edge[:, None], (P, D))
+    of_axis = _drawn(_alike([part.reshape(P, D, -1) for part in by_axis]), of_axes, _OF_ONE / _AXES_DIFFER**2)
+    found, seen = _alike([part.reshape(V, P, -1) for part in z])
+    known = np.isfinite(found) & (seen > 0)
+    beyond = ((found - of_edge) ** 2 - _OF_ONE / np.maximum(seen, 1))[known]
+    differ = prior.vehicles * prior.autocorrelation_sigma**2 + max(float(beyond.sum()), 0.0) / P
+    worth = _OF_ONE / (differ / (prior.vehicles + known.sum() / P))
+    return _drawn((found[..., None], seen[..., None]), np.broadcast_to(of_axis, (V, P, D)), worth)
+
+
+def _alike(z: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Autocorrelation of neighbours and of days further apart, and how many differences told it."""
+    (near, seen), (far, fewer) = (_variance(part) for part in z)
     with np.errstate(invalid="ignore", divide="ignore"):
-        fleet, vehicle = ((logs[1][k] / logs[0][k]) ** 2 - 1 for k in (0, 1))
-    fleet = _drawn(fleet, np.minimum(counts[0][0], counts[1][0]), np.full(P, prior))
-    seen = np.minimum(counts[0][1], counts[1][1])
-    return _drawn(vehicle, seen, np.broadcast_to(fleet, vehicle.shape))
+        return 0.5 * (np.sqrt(np.maximum(4 * far / near - 3, 0)) - 1), np.minimum(seen, fewer)
 
 
-def _drawn(found: np.ndarray, seen: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Towards a prior, by how many differences were seen."""
-    found = np.where(np.isfinite(found), found, prior)
-    mean = (seen * found + _PRIOR_DIFFERENCES * prior) / (seen + _PRIOR_DIFFERENCES)
-    return np.asarray(np.clip(mean, 0.0, _MOST_AUTOCORRELATION))
+def _drawn(alike: tuple[np.ndarray, np.ndarray], towards: np.ndarray, worth: float) -> np.ndarray:
+    found, seen = alike
+    found = np.where(np.isfinite(found), found, towards)
+    return np.asarray(np.clip((seen * found + worth * towards) / (seen + worth), 0, _MOST_AUTOCORRELATION))
 
 
-def _differences(charts: Charts, lag: int) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Differences of days `lag` columns apart (nan: none), days between, and sum and product of sigmas."""
-    value, sigma, day = charts.value, np.where(np.isfinite(charts.sigma), charts.sigma, 1.0), charts.day
-    there = np.arange(lag, value.shape[1]) < charts.count[:, None]
-    first = np.broadcast_to(charts.has_reference[:, None], there.shape) & (np.arange(there.shape[1]) == 0)
-    size = np.where(there & ~first, value[:, lag:] - value[:, :-lag], np.nan)
-    spread = sigma[:, lag:] ** 2 + sigma[:, :-lag] ** 2, sigma[:, lag:] * sigma[:, :-lag]
-    return size, (day[:, lag:] - day[:, :-lag]).clip(min=0), spread
+def _scatter(
+    near: _Differences, phi: np.ndarray, prior: Prior
+) -> tuple[Float[np.ndarray, "V P D"], Float[np.ndarray, "V P D"]]:
+    """Factor on sigmas, and the degrees of freedom that it is known to."""
+    z = near.in_sigmas(phi)
+    V, P, D, S = z.shape
+    found, seen = _variance(np.moveaxis(z, 0, 2).reshape(P, D, V * S))
+    worth, most = _EFFICIENCY * seen, _MOST_SCALE**2
+    found = np.where(seen > 0, np.minimum(found, most), 0.0)
+    of_fleet = np.maximum((prior.freedom * prior.variance + worth * found) / (prior.freedom + worth), 1.0)
+    relative = z / np.sqrt(of_fleet)[None, :, :, None]
+    found, seen = _variance(relative.reshape(V, P, D * S))
+    freedom = _EFFICIENCY * seen * _independent(z)[None] / D
+    vehicle = _drawn_to_fleet(np.minimum(found, most / of_fleet.max(axis=1)), freedom, 1.0, prior)
+    own, seen = _variance(relative)
+    own = np.minimum(own, most / of_fleet)
+    variance, freedom = _drawn_to_fleet(own, _EFFICIENCY * seen, vehicle[0][..., None], prior)
+    scale = np.sqrt(np.clip(of_fleet[None] * variance, 1.0, _MOST_SCALE**2))
+    known = 1 / (1 / freedom + 1 / vehicle[1][..., None])
+    return scale, np.minimum(known, _MOST_FREEDOM)
 
 
-def _median(values: Float[np.ndarray, "*rows N"]) -> tuple[np.ndarray, np.ndarray]:
-    """Median of what is a number along the last axis (nan where nothing is), and how many numbers there are."""
-    ordered = np.sort(values, axis=-1)  # nan comes last
+def _far_off(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
+    """Share of an edge's differences beyond three sigmas, drawn towards the normal distribution's."""
+    sigma = np.sqrt(_variance(np.moveaxis(z, 0, 2).reshape(*z.shape[1:3], -1))[0])
+    with np.errstate(invalid="ignore"):
+        far = (np.abs(z) > 3 * sigma[None, :, :, None]).sum(axis=(0, 2, 3))
+    return np.asarray((far + _NORMAL * _FAR_WORTH) / (np.isfinite(z).sum(axis=(0, 2, 3)) + _FAR_WORTH))
+
+
+def _drawn_to_fleet(
+    found: np.ndarray, freedom: np.ndarray, fleet: np.ndarray | float, prior: Prior
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variances drawn towards the fleet's by how little vehicles differ, and their degrees of freedom."""
+    known = (freedom > 1) & (found > 0)
+    d = np.where(known, freedom, 1.0)
+    off = np.log(np.where(known, found / fleet, 1.0)) - digamma(d / 2) + np.log(d / 2)
+    chance, count = polygamma(1, d / 2), int(known.sum())
+    differ = polygamma(1, prior.freedom / 2)
+    middle = 0.0
+    if count:
+        middle = float(np.median(off[known]))
+        beyond = (1.4826 * np.median(np.abs(off[known] - middle))) ** 2 - chance[known].mean()
+        differ = (prior.vehicles * differ + count * max(beyond, 0.0)) / (prior.vehicles + count)
+    # trigamma(x) is 1 / x + 1 / (2 x^2), to a hundredth where x is 1 and more
+    like = (1 + np.sqrt(1 + 2 * differ)) / differ
+    away = (off - middle) ** 2 / (differ + chance)
+    like = like * np.where(known, np.minimum(1.0, _FAR**2 / np.maximum(away, 1e-9)), 1.0)
+    worth = np.where(known, freedom, 0.0)
+    return (like * fleet + worth * np.where(known, found, 0.0)) / (like + worth), like + worth
+
+
+def _independent(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
+    """How many of an edge's degrees of freedom err by themselves: they share scenes."""
+    rows = np.moveaxis(np.clip(np.nan_to_num(z), -_WINSOR, _WINSOR), 2, -1).swapaxes(0, 1)
+    rows = rows.reshape(z.shape[1], -1, z.shape[2])
+    square = np.einsum("pna,pnb->pab", rows, rows)
+    size = np.sqrt(np.maximum(np.einsum("paa->pa", square), 1e-12))
+    correlation = square / size[:, :, None] / size[:, None, :]
+    return np.asarray(z.shape[2] ** 2 / np.maximum((correlation**2).sum(axis=(1, 2)), z.shape[2]))
+
+
+def _variance(values: Float[np.ndarray, "*rows N"]) -> tuple[np.ndarray, np.ndarray]:
+    """Winsorised variance about zero along the last axis (nan where nothing is), and how many numbers there are."""
+    size = np.abs(values)
+    ordered = np.sort(size, axis=-1)  # nan comes last
     count = np.isfinite(values).sum(axis=-1)
     if ordered.shape[-1] == 0:
         return np.full(values.shape[:-1], np.nan), count
-    low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[..., None], -1)[..., 0]
-    high = np.take_along_axis(ordered, np.minimum(count // 2, ordered.shape[-1] - 1)[..., None], -1)[..., 0]
-    return np.where(count > 0, 0.5 * (low + high), np.nan), count
-
-
-def _shrunk(
-    size: np.ndarray, seen: np.ndarray, prior: np.ndarray, freedom: np.ndarray | float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Variance, drawn towards a prior one, and its degrees of freedom."""
-    worth = np.where(np.isfinite(size), _MEDIAN_EFFICIENCY * seen, 0.0)
-    size = np.where(np.isfinite(size), np.minimum(size, _MOST_SCALE), 0.0)
-    return (freedom * prior + worth * size**2) / (freedom + worth), freedom + worth
+    low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[..., None], -1)
+    high = np.take_along_axis(ordered, np.minimum(count // 2, ordered.shape[-1] - 1)[..., None], -1)
+    reach = _WINSOR * 0.5 * (low + high) / 0.6745
+    total = np.nansum(np.minimum(size, reach) ** 2, axis=-1)
+    return np.where(count > 0, total / np.maximum(count, 1) / _WINSORED, np.nan), count

@@ -15,6 +15,7 @@ from pipeline.audit.estimates import Estimates, days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
 from pipeline.audit.history import History, last_audited_day
+from pipeline.audit.noise import models_of
 from pipeline.audit.realignments import Realignments, find_realignments
 from pipeline.audit.service import events_until, restart_of, what_was_done, with_events
 from pipeline.audit.standing import said_before, standing
@@ -123,7 +124,7 @@ def _judged(
     if not any(v.said or (v.records.day >= begin).any() for v in vehicles.values()):
         return
     days = [_charted(vehicle, window, fleet.audit) for vehicle in vehicles.values()]
-    verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit)
+    verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit, models_of(fleet, vehicles))
     before = _found_before(task.lake, method, dict(zip(vehicles, verdicts, strict=True)), first)
     for done, ((name, vehicle), verdict) in enumerate(zip(vehicles.items(), verdicts, strict=True)):
         progress(done, len(vehicles), name)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pipeline.audit.days import DOFS, charts_of_fleet, edges_of_fleet
 from pipeline.audit.estimates import Estimates, days_of, estimates_of, joined
 from pipeline.audit.history import History
-from pipeline.audit.noise import estimate_noise
+from pipeline.audit.noise import estimate_noise, models_of
 from pipeline.audit.pose_states import pose_states, read_poses
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
 from pipeline.audit.service import events_until, restart_of, what_was_done
@@ -59,7 +59,7 @@ def work(task: Task) -> Work:
     references = _references(history, records, (first, last), events, fleet.audit) if last else {}
 
     def rows(run: Run) -> Generator[Records, None, None]:
-        scales, of_poses = _scales(records, fleet.audit), _scales(poses.estimates, fleet.audit)
+        scales, of_poses = _scales(records, fleet), _scales(poses.estimates, fleet)
         own_scales = dict(zip(poses.estimates.vehicles, of_poses, strict=True))
         for done, vehicle in enumerate(records.vehicles):
             run.progress(done, len(records.vehicles), vehicle)
@@ -111,12 +111,14 @@ def _references(
     return found
 
 
-def _scales(records: Estimates, config: AuditConfig) -> list[dict[Edge, Float[np.ndarray, " 6"]]]:
+def _scales(records: Estimates, fleet: FleetConfig) -> list[dict[Edge, Float[np.ndarray, " 6"]]]:
     """By vehicle, edge and DoF of a change, how much more its days scatter than they say, as the charts see it."""
-    days = [days_of(records.of(vehicle), config.held_sigma_factor) for vehicle in records.vehicles]
+    held = fleet.audit.held_sigma_factor
+    days = [days_of(records.of(vehicle), held) for vehicle in records.vehicles]
     edges = edges_of_fleet(days)
     charts = charts_of_fleet([{e: own.at(own.accepted) for e, own in of.items()} for of in days], edges)
-    scale = estimate_noise(charts, DOFS, len(edges)).scale if edges else np.ones(0)
+    models = models_of(fleet, records.vehicles)
+    scale = estimate_noise(charts, DOFS, len(edges), models).scale if edges else np.ones(0)
     return [dict(zip(edges, s, strict=True)) for s in scale.reshape(len(days), len(edges), DOFS)]
 
 

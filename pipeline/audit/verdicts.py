@@ -13,16 +13,24 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.audit.changes import Change, Levels, describe, levels_of
-from pipeline.audit.charts import Charts, Scan, clipped, scan, thresholds
+from pipeline.audit.changes import Change, Levels, clearest, describe, levels_of
+from pipeline.audit.charts import Charts, clipped, thresholds
 from pipeline.audit.noise import Noise
+from pipeline.audit.scan import Scan, scan_by
+from schemas.drift import DAYS_WILL_TELL
 
 __all__ = ["ChartVerdict", "judge_charts"]
 
 _VISIBLE_SIGMAS = 2.0  # a chart shows a change that is at least this many sigmas of its best-placed split
-_SUSPECT_SIGMAS = 3.0  # from here to the alarm threshold a chart is neither green nor an alarm
+# RED says that a change is of a size that matters, not that it may be: with 95 %.
+_SURELY = 1.645
 _LASTING = "a lasting change of a size that matters"
-_ONE_DAY = "one day stands out: the next day will tell whether it lasts"
+_ONE_DAY = f"one day stands out: the next day {DAYS_WILL_TELL} whether it lasts"
+_FEW_DAYS = (
+    f"two days stand out, and single days are often far off: the next day {DAYS_WILL_TELL} whether it lasts"
+)
+_MAYBE = f"a change that may be of a size that matters: the next days {DAYS_WILL_TELL}"
+_BEGUN = f"a change may have begun: the next days {DAYS_WILL_TELL}"
 
 
 @dataclass(frozen=True)
@@ -46,10 +54,12 @@ class _Judged:
     value: np.ndarray
     noise: Noise
     limit: np.ndarray
+    scan: Scan
     statistic: np.ndarray
     threshold: np.ndarray
+    watch: np.ndarray  # beyond which a step may have been, and a drift begun
+    believed: np.ndarray  # days in a row that are no chance
     visible: np.ndarray
-    suspect: np.ndarray
     last_day: np.ndarray  # sigmas by which the last day stands out
     last_size: np.ndarray
     baseline_days: int
@@ -59,7 +69,7 @@ def judge_charts(
     charts: Charts,
     noise: Noise,
     limit: Float[np.ndarray, " M"],
-    probability: Float[np.ndarray, " M"],
+    probability: Float[np.ndarray, "2 M"],
     baseline_days: int,
 ) -> list[ChartVerdict]:
     """Judge every chart.
@@ -68,40 +78,44 @@ def judge_charts(
         charts: day estimates.
         noise: how they scatter.
         limit: size of a change that matters [rad or m].
-        probability: of an alarm of this chart in this audit where nothing changed.
+        probability: of each chart where nothing changed: of an alarm tonight, and of a change that may have begun.
         baseline_days: a chart says nothing, unless it alarms, until it has one day more than this.
 
     Returns:
-        RED: a lasting change of at least `limit`. YELLOW: a smaller one, or one that rests on a single day.
-        GREEN: no change, and one of size `limit` would be seen. UNKNOWN: too few days, or sigmas too large
-            to see one.
+        RED: a lasting change that is surely larger than `limit`. YELLOW: a smaller one, one that rests on a single day
+            or one that may have begun. GREEN: no change, and one of size `limit` would be seen. UNKNOWN: too few days,
+            or sigmas too large to see one.
     """
     if not len(charts.count):
         return []
     value = clipped(charts, noise.scale)
-    found = scan(charts, value, noise.scale, noise.autocorrelation)
-    threshold = thresholds(charts.count, noise.freedom, probability)
+    found = scan_by(charts, value, noise)
+    z = [np.abs(z).max(axis=1, initial=0.0) for z in (found.z, found.drift_z)]
+    # Steps and drifts share the budget; of a chart that counts which is further beyond its own threshold.
+    limits = [
+        thresholds(charts.count, noise.freedom, np.minimum(p, 0.5) / 2, noise.autocorrelation, of)
+        for p in probability
+        for of in ("step", "drift")
+    ]
+    drifts = z[1] / limits[1] > z[0] / limits[0]
     last_day, last_size = _last_day(charts, noise)
     seen = _Judged(
         charts,
         value,
         noise,
         limit,
-        np.abs(found.z).max(axis=1, initial=0.0),
-        threshold,
+        found,
+        np.where(drifts, z[1], z[0]),
+        np.where(drifts, limits[1], limits[0]),
+        np.stack(limits[2:]),
+        # Two days far off on the same side, by chance, would use up the budget where days have heavy tails.
+        np.where(0.5 * noise.far**2 > probability[0], 3, 2),
         _VISIBLE_SIGMAS * found.sigma.min(axis=1, initial=np.inf),
-        _suspect(found, limit),
         last_day,
         last_size,
         baseline_days,
     )
     return [_verdict(seen, m) for m in range(len(charts.count))]
-
-
-def _suspect(found: Scan, limit: np.ndarray) -> np.ndarray:
-    """Charts with a split that is neither sure enough for an alarm nor small enough to be ignored."""
-    size = np.abs(found.size)
-    return np.any((size > limit[:, None]) & (size > _SUSPECT_SIGMAS * found.sigma), axis=1)
 
 
 def _last_day(charts: Charts, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
@@ -121,14 +135,18 @@ def _verdict(seen: _Judged, m: int) -> ChartVerdict:
     days = int(seen.charts.count[m])
     if days < 2:
         return ChartVerdict("UNKNOWN", f"{_count(days)} of data", days, None, None, None, None)
+    levels = None
     if seen.statistic[m] > seen.threshold[m]:
-        levels = levels_of(seen.charts.row(m), seen.value[m, :days], seen.noise, m, float(seen.threshold[m]))
-        verdict = _changed(seen, m, levels)
-        if verdict is not None:
-            return verdict
-        if levels.returned:
-            return _unchanged(seen, m, levels)
-    return _unchanged(seen, m, None)
+        levels = levels_of(
+            seen.charts.row(m),
+            seen.value[m, :days],
+            seen.noise.at(slice(m, m + 1)),
+            float(seen.threshold[m]),
+        )
+        changed = _changed(seen, m, levels)
+        if changed is not None:
+            return changed
+    return _unchanged(seen, m, levels if levels is not None and levels.returned else None)
 
 
 def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
@@ -139,8 +157,10 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
     status, reason = "RED", _LASTING
     if abs(change.size) < limit:
         status, reason = "YELLOW", "a change below the size that matters"
-    elif min(levels.days_before, levels.days_after) < 2:
-        status, reason = "YELLOW", _ONE_DAY
+    elif (days := min(levels.days_before, levels.days_after)) < seen.believed[m]:
+        status, reason = "YELLOW", _ONE_DAY if days < 2 else _FEW_DAYS
+    elif abs(change.size) - _SURELY * change.size_sigma < limit:
+        status, reason = "YELLOW", _MAYBE
     elif levels.doubtful_sides:
         # Held days agree by chance only within their enlarged sigmas, so two of them stand for an accepted one.
         reason = _LASTING + "; rests on days whose calibration was held"
@@ -158,19 +178,21 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
 def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
     """No alarm: GREEN, or why not."""
     days, limit, visible = int(seen.charts.count[m]), float(seen.limit[m]), float(seen.visible[m])
-    statistic, threshold = float(seen.statistic[m]), float(seen.threshold[m])
+    statistic = float(seen.statistic[m])
     if levels is not None:
         statistic, visible = levels.statistic, _VISIBLE_SIGMAS * levels.sigma
 
-    def say(status: str, reason: str) -> ChartVerdict:
-        return ChartVerdict(status, reason, days, statistic, threshold, visible, None)
+    def say(status: str, reason: str, change: Change | None = None) -> ChartVerdict:
+        return ChartVerdict(status, reason, days, statistic, float(seen.threshold[m]), visible, change)
 
-    if days > 2 and seen.last_day[m] > threshold and abs(seen.last_size[m]) > limit:
+    if days > 2 and seen.last_day[m] > seen.threshold[m] and abs(seen.last_size[m]) > limit:
         return _one_day(seen, m)
+    if levels is None:
+        begun = clearest(seen.scan.row(m, days), seen.charts.day[m, :days], limit, seen.watch[:, m])
+        if begun is not None:
+            return say("YELLOW", _BEGUN, begun)
     if days <= seen.baseline_days:
         return say("UNKNOWN", f"{_count(days)} of data, {seen.baseline_days + 1} needed")
-    if levels is None and seen.suspect[m]:
-        return say("UNKNOWN", "a change may have begun, but it is not sure enough for an alarm")
     if visible > limit:
         return say("UNKNOWN", _what_could_hide(days, visible / limit))
     return say("GREEN", "no change" if levels is None else "back where the reference is")

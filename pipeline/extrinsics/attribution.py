@@ -19,14 +19,13 @@ from itertools import combinations
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.stats import f as f_distribution
 
-from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import adjoint
 from pipeline.rig.graph import KINDS, Edge
 
-__all__ = ["Attribution", "Moved", "PairShift", "attribute", "pair_shift"]
+__all__ = ["Attribution", "Moved", "PairShift", "attribute"]
 
 _Who = TypeVar("_Who", str, tuple[str, str])
 _CLEAR_PROBABILITY = 0.95
@@ -94,39 +93,6 @@ class Attribution:
         """The sensor that an edge shows: the one of two that is an end of it, else the first."""
         ends = [sensor.name for sensor in edge.sensors]
         return next((name for name in self.moved if name in ends), self.sensor)
-
-
-def pair_shift(
-    origin: Float[np.ndarray, "4 4"],
-    change: Float[np.ndarray, "N 6"],
-    spread: Float[np.ndarray, "N 6 6"],
-    is_after: Bool[np.ndarray, " N"],
-    autocorrelation: float = 0.0,
-) -> PairShift:
-    """Shift of one edge between the days before and after a change, each side averaged by full covariances.
-
-    Args:
-        origin: T_parent_child that changes count from.
-        change: of each day (rotation vector, shift of the child's origin).
-        spread: covariances of the changes.
-        is_after: True for days with the new value; both sides need a day.
-        autocorrelation: of successive days: a mean of n of them is less sure by that.
-    """
-    sides = []
-    for side in (~is_after, is_after):
-        information = np.linalg.inv(spread[side])
-        total = np.linalg.inv(information.sum(axis=0))
-        mean = total @ np.einsum("nij,nj->i", information, change[side])
-        sides.append((mean, total * _less_sure(int(side.sum()), autocorrelation)))
-    (before, cov_before), (after, cov_after) = sides
-    to_twist = np.linalg.inv(change_jacobian(origin))
-    return PairShift(origin, to_twist @ (after - before), to_twist @ (cov_before + cov_after) @ to_twist.T)
-
-
-def _less_sure(days: int, autocorrelation: float) -> float:
-    """Variance of a mean of AR(1) days in that of independent ones."""
-    lag = np.arange(1, days)
-    return float(1 + 2 * np.sum((1 - lag / days) * autocorrelation**lag))
 
 
 def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Attribution:

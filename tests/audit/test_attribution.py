@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from pipeline.audit.days import PairDays
+from pipeline.audit.scan import alike
+from pipeline.audit.shifts import Whitened
 from pipeline.audit.vehicle import independent_edges
-from pipeline.extrinsics.attribution import PairShift, attribute, pair_shift
+from pipeline.extrinsics.attribution import PairShift, attribute
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse, log_se3
 from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.graph import Edge, Sensor
@@ -26,9 +28,9 @@ def _days(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[Ed
 
 
 def _shifts(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[Edge, PairShift]:
-    days, is_after = _days(maker, moved, seed), np.array([0, 0, 1, 1], bool)
+    days, is_after = _days(maker, moved, seed), np.array([0.0, 0, 1, 1])
     own = independent_edges(days, days[CAMERA_LIDAR].day)
-    return {pair: pair_shift(d.origin, d.change, d.spread, is_after) for pair, d in own.items()}
+    return {pair: Whitened.of(d, np.zeros(6)).shift(is_after) for pair, d in own.items()}
 
 
 @pytest.mark.parametrize(("sensor", "twist"), [
@@ -92,20 +94,46 @@ def test_a_composed_pair_is_not_counted_as_a_third_witness(maker: ModuleType) ->
     assert len(independent_edges(days | {CAMERA_RADAR: own}, last)) == 3
 
 
-def test_a_mean_of_days_that_err_alike_is_as_unsure_as_it_is() -> None:
+@pytest.mark.parametrize("reference_days", [0, 10])
+def test_a_shift_through_days_that_err_alike_is_as_unsure_as_it_says(reference_days: int) -> None:
     rng = np.random.default_rng(3)
+    # The fourth day was held: three times as unsure, for reasons of its own.
     spread = np.repeat(np.eye(6)[None], 8, axis=0) * 1e-6
-    is_after = np.arange(8) >= 3
+    spread[3] *= 9
+    day = np.array([0, 1, 2, 3, 5, 6, 7, 9]) + np.r_[0, [40 * (reference_days > 0)] * 7]
     found = []
-    for _ in range(3000):
-        e = rng.normal(size=(8, 6))
-        for k in range(1, 8):
-            e[k] = 0.6 * e[k - 1] + 0.8 * e[k]
-        found.append(pair_shift(np.eye(4), 1e-3 * e, spread, is_after, 0.6))
+    for _ in range(1500):
+        e = np.zeros((50, 6))
+        for k in range(50):
+            e[k] = rng.normal(size=6) if not k else 0.6 * e[k - 1] + 0.8 * rng.normal(size=6)
+        change = 1e-3 * e[day]
+        change[3] += 1e-3 * np.sqrt(8) * rng.normal(size=6)
+        if reference_days:  # a mean of ten days whose own errors are those of independent ones
+            change[0] = 1e-3 * rng.normal(size=6) * np.sqrt(alike(np.array([10]), np.array([0.6])))
+        days = PairDays(
+            day, np.repeat(np.eye(4)[None], 8, axis=0), change, spread, np.ones((8, 6), bool), np.ones(8, bool),
+            np.eye(4), reference_days,
+        )  # fmt: skip
+        found.append(Whitened.of(days, np.full(6, 0.6)).shift((np.arange(8) >= 3).astype(float)))
     scatter = np.std([s.xi for s in found])
-    predicted = np.sqrt(found[0].covariance[0, 0])
-    # Both sides err alike too, which makes the difference a little surer than said.
-    assert 0.8 < scatter / predicted < 1.0
+    assert scatter == pytest.approx(np.sqrt(found[0].covariance[0, 0]), rel=0.04)
+
+
+def test_the_day_of_a_step_is_the_split_that_gains_most() -> None:
+    rng = np.random.default_rng(4)
+    spread = np.repeat(np.eye(6)[None], 12, axis=0) * 1e-6
+    change = 1e-3 * rng.normal(size=(12, 6))
+    change[7:, 4] += 8e-3
+    every = np.ones((12, 6), bool)
+    T = np.repeat(np.eye(4)[None], 12, axis=0)
+    days = PairDays(np.arange(12), T, change, spread, every, every[:, 0], np.eye(4))
+    gains = Whitened.of(days, np.full(6, 0.4)).step_gains()
+    assert int(np.argmax(gains)) == 6
+    whitened = Whitened.of(days, np.zeros(6))
+    for s in range(11):  # of days that err independently, the gain of means by their covariances
+        size = change[s + 1 :].mean(axis=0) - change[: s + 1].mean(axis=0)
+        expected = size @ size / (1e-6 * (1 / (s + 1) + 1 / (11 - s)))
+        assert whitened.step_gains()[s] == pytest.approx(expected)
 
 
 def test_three_independent_edges_agree_on_the_sensor() -> None:

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.audit.changes import ramp_fits, start_interval
-from pipeline.audit.charts import Charts, alarm_threshold, clipped, scan, thresholds
-from pipeline.audit.noise import Noise, estimate_noise
+from pipeline.audit.changes import start_interval
+from pipeline.audit.charts import Charts, alarm_threshold, clipped, thresholds
+from pipeline.audit.noise import Noise, Prior, estimate_noise
+from pipeline.audit.scan import scan, scan_by
 from pipeline.audit.verdicts import ChartVerdict, judge_charts
 
 PROBABILITY = 1e-3 / 18  # one chart's share of one false alarm in 1000 vehicle-days over 18 charts
@@ -41,14 +42,16 @@ def _charts(
 def _known(charts: Charts, autocorrelation: float = 0.0) -> Noise:
     """Noise as the sigmas say it, known for sure."""
     M = len(charts.count)
-    return Noise(np.ones(M), np.full(M, 1e6), np.full(M, autocorrelation))
+    return Noise(np.ones(M), np.full(M, 1e6), np.full(M, autocorrelation), np.zeros(M))
 
 
 def _judge(
     value: np.ndarray | list[float], limit: float, sigma: np.ndarray | float = 1.0, **chart: object
 ) -> ChartVerdict:
     charts = _charts([np.asarray(value)], sigma, **chart)  # type: ignore[arg-type]
-    return judge_charts(charts, _known(charts), np.array([limit]), np.array([PROBABILITY]), 2)[0]
+    return judge_charts(
+        charts, _known(charts), np.array([limit]), np.array([[PROBABILITY], [20 * PROBABILITY]]), 2
+    )[0]
 
 
 def _z(charts: Charts, autocorrelation: float = 0.0) -> np.ndarray:
@@ -118,20 +121,64 @@ def test_the_scan_of_a_chart_does_not_depend_on_the_others_beside_it() -> None:
         np.testing.assert_array_equal(together[m, max(len(row) - 1, 0) :], 0)
 
 
-def test_each_sides_variance_is_that_of_a_mean_of_ar1_days_with_gaps() -> None:
+@pytest.mark.parametrize("phi", [0.0, 0.6, 0.9])
+@pytest.mark.parametrize("reference_days", [0, 10])
+def test_steps_and_drifts_are_least_squares_through_ar1_days_with_gaps(
+    phi: float, reference_days: int
+) -> None:
     rng = np.random.default_rng(5)
-    day, phi = np.array([0, 1, 2, 5, 6, 9]), 0.6
-    sigma = rng.uniform(0.5, 2, 6)
-    charts = _charts([np.zeros(6)], sigma, day)
-    found = scan(charts, charts.value, np.ones(1), np.array([phi])).sigma[0]
-    correlation = phi ** np.abs(day[:, None] - day[None])
-    w = sigma**-2.0
-    for s in range(5):
-        expected = 0.0
-        for side in (slice(0, s + 1), slice(s + 1, 6)):
-            a = w[side] * sigma[side] / w[side].sum()
-            expected += a @ correlation[side, side] @ a
-        assert found[s] == pytest.approx(np.sqrt(expected))
+    day, sigma, value = np.array([0, 1, 2, 5, 6, 9, 10]), rng.uniform(0.5, 2, 7), rng.normal(size=7) + 100
+    charts = _charts([value, value[:3]], 1.0, None, None, reference_days)
+    charts.day[0], charts.day[1], charts.sigma[0] = day, [0, 1, 2, 2, 2, 2, 2], sigma
+    found = scan(charts, charts.value, np.array([1.5, 1.0]), np.full(2, phi))
+    # A day that is less sure than most errs for reasons of its own; a reference is a mean of days long ago.
+    days = sigma[reference_days > 0 :]
+    h = np.minimum(sigma, np.sort(days)[(len(days) - 1) // 2])
+    own = sigma**2 - h**2
+    if reference_days:
+        lag = np.arange(1, 10)
+        h[0], own[0] = 0, sigma[0] ** 2 * (1 + 2 * ((1 - lag / 10) * phi**lag).sum())
+    W = np.linalg.inv(phi ** np.abs(day[:, None] - day[None]) * np.outer(h, h) + np.diag(own))
+    for s in range(6):
+        for shape, size, error in (
+            ((np.arange(7) > s).astype(float), found.size, found.sigma),
+            (np.maximum(day - day[s], 0) / (day[-1] - day[s]), found.drift, found.drift_sigma),
+        ):
+            X = np.stack([np.ones(7), shape], axis=1)
+            covariance = np.linalg.inv(X.T @ W @ X)
+            assert size[0, s] == pytest.approx((covariance @ X.T @ W @ value)[1])
+            assert error[0, s] == pytest.approx(1.5 * np.sqrt(covariance[1, 1]))
+    assert np.isinf(found.sigma[1, 2:]).all()
+
+
+@pytest.mark.parametrize("of", ["step", "drift"])
+def test_false_alarms_of_days_that_err_alike_stay_within_the_budget(of: str) -> None:
+    rng, trials, probability = np.random.default_rng(6), 4000, 0.02
+    e = rng.normal(size=(trials, 20))
+    for k in range(1, 20):
+        e[:, k] = 0.6 * e[:, k - 1] + 0.8 * e[:, k]
+    charts = _charts(e)
+    found = scan(charts, e, np.ones(trials), np.full(trials, 0.6))
+    z = np.abs(found.z if of == "step" else found.drift_z).max(axis=1)
+    alarms = np.mean(z > alarm_threshold(np.ones(20), probability, 0.6, of))
+    spread = np.sqrt(probability * (1 - probability) / trials)
+    assert 0.6 * probability - 3 * spread <= alarms <= probability + 3 * spread
+
+
+def test_where_the_autocorrelation_is_not_known_each_split_is_as_sure_as_by_the_worse_of_both() -> None:
+    rng = np.random.default_rng(7)
+    charts = _charts(rng.normal(size=(3, 9)))
+    low, high = _known(charts, 0.0), _known(charts, 0.6)
+    either = scan_by(
+        charts, charts.value, Noise(high.scale, high.freedom, high.autocorrelation, high.far, low)
+    )
+    both = [scan_by(charts, charts.value, n) for n in (low, high)]
+    z = [np.abs(found.z) for found in both]
+    assert (z[0] < z[1]).any()
+    assert (z[1] < z[0]).any()
+    assert (np.abs(either.z) <= np.minimum(*z)).all()
+    np.testing.assert_array_equal(either.sigma, np.maximum(both[0].sigma, both[1].sigma))
+    np.testing.assert_array_equal(either.size, np.where(z[0] < z[1], both[0].size, both[1].size))
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -203,11 +250,12 @@ def test_slow_drift_and_step_are_told_apart() -> None:
 def test_a_drift_fit_recovers_its_size() -> None:
     day = np.array([0, 1, 2, 3, 5, 8, 9])
     value = np.maximum(day - 2, 0) * 0.1 + 4.0
-    gain, size, sigma = ramp_fits(value, np.full(7, 0.01), day)
-    best = int(np.argmax(gain))
+    charts = _charts([value], 0.01, day)
+    found = scan(charts, charts.value, np.ones(1), np.zeros(1))
+    best = int(np.argmax(found.drift_z[0]))
     assert best == 2
-    assert size[best] == pytest.approx(0.7, abs=1e-9)
-    assert sigma[best] < 0.02
+    assert found.drift[0, best] == pytest.approx(0.7, abs=1e-9)
+    assert found.drift_sigma[0, best] < 0.02
 
 
 def test_a_last_day_that_stands_out_is_yellow_until_the_next_one_tells() -> None:
@@ -268,10 +316,29 @@ def test_a_chart_that_cannot_tell_yet_says_after_how_many_days_it_can(sigma: flo
     assert _judge(np.zeros(int(0.8 * needed)), 0.25, sigma).status == "UNKNOWN"
 
 
-def test_what_looks_like_a_change_but_is_not_sure_is_not_called_green() -> None:
-    verdict = _judge([0.0, 0.0, 0.36, 0.36], 0.25, 0.1)
-    assert (verdict.status, verdict.change) == ("UNKNOWN", None)
+def test_what_looks_like_a_change_but_is_not_sure_is_yellow() -> None:
+    verdict = _judge([0.0, 0.0, 0.38, 0.38], 0.25, 0.1)
+    assert verdict.status == "YELLOW"
+    assert verdict.change is not None
+    assert verdict.change.day == 2
     assert "may have begun" in verdict.reason
+
+
+def test_a_sure_change_whose_size_may_be_below_what_matters_is_yellow() -> None:
+    value = [0.0] * 10 + [0.3] * 4
+    verdict = _judge(value, 0.25, 0.08)
+    assert verdict.status == "YELLOW"
+    assert "may be of a size that matters" in verdict.reason
+    assert _judge(value, 0.2, 0.08).status == "RED"
+
+
+def test_two_days_are_not_enough_where_single_days_are_often_far_off() -> None:
+    charts = _charts([np.array([0.0] * 8 + [9.0] * after) for after in (2, 3)])
+    known = _known(charts)
+    for far, expected in ((0.003, ["RED", "RED"]), (0.02, ["YELLOW", "RED"])):
+        noise = Noise(known.scale, known.freedom, known.autocorrelation, np.full(2, far))
+        verdicts = judge_charts(charts, noise, np.full(2, 1.0), np.full((2, 2), PROBABILITY), 2)
+        assert [v.status for v in verdicts] == expected
 
 
 @pytest.mark.parametrize("days", [0, 1, 2])
@@ -332,3 +399,39 @@ def test_a_fleet_that_nobody_has_seen_is_taken_to_err_alike_from_day_to_day() ->
     found = _fleet_noise(np.random.default_rng(11).normal(size=(1, 2, 4)))
     assert found.autocorrelation.min() > 0.5
     assert estimate_noise(_charts([np.zeros(0)] * 2), 2, 1).scale.tolist() == [1.0, 1.0]
+
+
+def test_scatter_is_learnt_by_model() -> None:
+    rng = np.random.default_rng(12)
+    values = rng.normal(size=(200, 2, 8)) * np.where(np.arange(200) < 100, 1.0, 2.0)[:, None, None]
+    charts = _charts(values.reshape(-1, 8))
+    together = estimate_noise(charts, 2, 1).scale.reshape(200, 2)
+    apart = estimate_noise(charts, 2, 1, ["van"] * 100 + ["car"] * 100).scale.reshape(200, 2)
+    assert np.median(apart[:100]) < 0.95 * np.median(together[:100])
+    assert np.median(apart[100:]) > 1.05 * np.median(together[100:])
+
+
+def test_what_is_known_before_gives_way_to_a_fleet_s_days_as_they_come() -> None:
+    rng = np.random.default_rng(13)
+    for vehicles, low, high in ((1, 1.5, 2.7), (60, 1.0, 1.15)):
+        charts = _charts(rng.normal(size=(vehicles, 2, 12)).reshape(-1, 12))
+        learnt = estimate_noise(charts, 2, 1, prior=Prior(variance=9.0)).scale
+        assert low < np.median(learnt) < high
+
+
+def test_vehicles_that_are_alike_are_known_to_more_degrees_of_freedom_than_such_that_differ() -> None:
+    rng = np.random.default_rng(14)
+    values = rng.normal(size=(60, 2, 28))
+    alike, differ = (
+        _fleet_noise(values * f[:, None, None]) for f in (np.ones(60), np.exp(rng.normal(0, 0.4, 60)))
+    )
+    assert np.median(alike.freedom) > 2 * np.median(differ.freedom)
+
+
+def test_what_begins_on_all_vehicles_at_once_is_no_scatter() -> None:
+    rng = np.random.default_rng(15)
+    values = rng.normal(size=(30, 2, 28))
+    drifting = values + np.maximum(np.arange(28) - 21, 0) * 0.8
+    still, moving = _fleet_noise(values), _fleet_noise(drifting)
+    assert np.median(moving.scale) < 1.05 * np.median(still.scale)
+    assert np.median(moving.autocorrelation) < np.median(still.autocorrelation) + 0.05

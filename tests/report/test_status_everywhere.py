@@ -20,7 +20,7 @@ from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding, status_of
+from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
 from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.stages import audit_fleet
 from tests.report.test_pages import KNOCK, _config, _store
@@ -104,12 +104,14 @@ def test_the_summary_counts_vehicles_and_names_each_moved_sensor_once(lake: Lake
     assert len({m["vehicle"] for m in moved_sensors(rows)}) == len(moved_sensors(rows))
 
 
-def test_a_red_vehicle_says_what_to_do_with_the_command_and_no_other_does(lake: Lake, tmp_path: Path) -> None:
+def test_a_red_vehicle_says_what_to_do_with_the_commands(lake: Lake, tmp_path: Path) -> None:
     rows = [f for own in stored(lake).values() for f in own]
-    [step] = next_steps(rows, "my lake")
+    step, of_yellow = next_steps(rows, "my lake")
     assert "how the radar is mounted" in step
     command = "--vehicle red --day YYYY-MM-DD --kind repair --sensor radar"
     assert f"boresight service --lake 'my lake' {command}" in step
+    assert "boresight export FORMAT --lake 'my lake' --vehicle red --out FOLDER" in step
+    assert of_yellow.startswith("yellow: ")
     page = write_fleet_page(lake, _config(), tmp_path / "fleet.html")
     assert f"boresight service --lake LAKE {command}" in page
     own = Lake.at(shutil.copytree(lake.root, tmp_path / "lake"))
@@ -117,6 +119,21 @@ def test_a_red_vehicle_says_what_to_do_with_the_command_and_no_other_does(lake: 
     assert main(shlex.split(command)[1:]) == 0
     audit_fleet(own, _config())
     assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew
+
+
+def test_of_yellow_what_the_next_days_decide_is_told_from_what_is_sure() -> None:
+    seen = VehicleStatus(
+        "YELLOW", "the camera moved on 2026-03-04: one day stands out: the next day will tell", "camera"
+    )
+    assert "look again tomorrow: `boresight status --lake L`" in next_step("v", seen, "L")
+    sure = VehicleStatus(
+        "YELLOW", "the camera has been drifting: a change below the size that matters", "camera"
+    )
+    step = next_step("v", sure, "L")
+    assert "`boresight export FORMAT --lake L --vehicle v --out FOLDER`" in step
+    assert "`boresight service --lake L --vehicle v --day YYYY-MM-DD --kind re-mount --sensor camera`" in step
+    for calm in ("GREEN", "UNKNOWN"):
+        assert next_step("v", VehicleStatus(calm, "no sensor moved"), "L") == ""
 
 
 def test_records_of_a_release_that_stored_no_status_stay_readable(lake: Lake, tmp_path: Path) -> None:

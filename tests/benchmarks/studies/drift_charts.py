@@ -4,10 +4,12 @@ Vehicles are day estimates made by SE(3) algebra, with errors of known kind; eve
 the window of that night beside the fixed reference, as `boresight audit` does. False alarms are counted over all
 nights, detections after a step.
 
-    python -m tests.benchmarks.studies.drift_charts [--vehicles 1010] [--nights 100] [--first-seed 60000] [--tune]
+    python -m tests.benchmarks.studies.drift_charts [--vehicles 1000] [--nights 100] [--days real] [--fleet 50]
+        [--first-seed 64000] [--tune SEED]
 
 A line per kind of errors and case is added to results/drift_charts.jsonl; what stands there already is not run again.
-Seeds 0 to 199 were tuned on (`--tune` runs those and writes nothing); 60000 and up are reported.
+Days are as sure as `--days` says: `tests` as in tests/audit, `real` as accepted camera-lidar records of real cars.
+Errors of several kinds are joined by ` + `. Seeds 0 to 199 are for tuning (`--tune` runs those and writes nothing).
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,16 +37,20 @@ from schemas.drift import DriftFinding, VehicleStatus
 from tests.benchmarks.studies.commits import commit_now
 
 RESULTS = Path("tests/benchmarks/results/drift_charts.jsonl")
-NOISES = ("white", "ar .3", "ar .6", "t4", "wrong sigmas", "floors", "warmth .03", "warmth .06")
+NOISES = (
+    "white", "ar .3", "ar .6", "t4", "wrong sigmas", "floors", "warmth .03", "warmth .06", "ar .6 + sigmas x.5",
+    "ar .6 + sigmas x2", "ar .6 + t4", "ar .6 + warmth .06", "ar .6 + t4 + wrong sigmas + warmth .06",
+)  # fmt: skip
 T_CAMERA_LIDAR = from_rotation_translation(
     np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.05, -0.4, -0.6])
 )
 T_LIDAR_RADAR = from_rotation_translation(np.eye(3), np.array([2.1, 0.1, -1.3]))
 # What days vary by (rx ry rz [deg], tx ty tz [m]), as in tests/audit: radar roll and height beyond the size that
 # matters, where the charts live by their statistics alone. And what all days have in common.
+_RADAR = (0.5, 0.12, 0.05, 0.02, 0.02, 0.2)
 VARYING = {
-    "camera_lidar": (0.02, 0.02, 0.02, 0.015, 0.015, 0.02),
-    "lidar_radar": (0.5, 0.12, 0.05, 0.02, 0.02, 0.2),
+    "tests": {"camera_lidar": (0.02, 0.02, 0.02, 0.015, 0.015, 0.02), "lidar_radar": _RADAR},
+    "real": {"camera_lidar": (0.04, 0.06, 0.06, 0.015, 0.015, 0.02), "lidar_radar": _RADAR},
 }
 COMMON = {
     "camera_lidar": (0.03, 0.03, 0.05, 0.01, 0.006, 0.05),
@@ -65,6 +72,7 @@ class Case:
         name: of the case.
         sensor: that moves; empty where none does.
         twist: in its own axes [rad, m].
+        slow: the twist is what it turns by each day, not once.
         on: first day with the new pose.
         back: first day on which it is repaired; 0 = never.
         served: day of a service event: charts begin anew after it, with the sensor where it is; 0 = none.
@@ -79,6 +87,7 @@ class Case:
     served: int = 0
     lost: float = 0.0
     days: int = 100
+    slow: bool = False
 
 
 def _turn(axis: str, deg: float) -> tuple[float, ...]:
@@ -97,6 +106,11 @@ CASES = (
     Case("camera .3 on day 5", "camera", _turn("y", 0.3), on=4, days=80),
     Case("camera .3, back", "camera", _turn("y", 0.3), on=40, back=50, days=70),
     Case("camera .3, service event", "camera", _turn("y", 0.3), on=40, served=49, days=70),
+    Case("camera roll .3", "camera", _turn("z", 0.3), on=40, days=70),
+    Case("camera pitch .05 a day", "camera", _turn("x", 0.05), on=40, days=60, slow=True),
+    Case("camera yaw .05 a day", "camera", _turn("y", 0.05), on=40, days=60, slow=True),
+    Case("camera roll .05 a day", "camera", _turn("z", 0.05), on=40, days=60, slow=True),
+    Case("camera roll .05 a day, five days of two vehicles", "camera", _turn("z", 0.05), days=7, slow=True),
 )
 
 
@@ -127,11 +141,13 @@ class Vehicle:
         return charted(days, first, night, reference)
 
 
-def make_vehicle(noise: str, case: Case, rng: np.random.Generator) -> Vehicle:
+def make_vehicle(noise: str, case: Case, rng: np.random.Generator, sure: str = "tests") -> Vehicle:
     """A vehicle's days: errors of a kind, and what happens to it."""
     D = case.days
     moved = np.zeros((D, 6))
     moved[case.on : case.back or D] = case.twist
+    if case.slow:
+        moved = np.cumsum(moved, axis=0) - moved * (case.on == 0)
     warmth = _swing(noise, D, rng)
     M = {s: exp_se3(moved if s == case.sensor else np.zeros((D, 6))) for s in ("camera", "lidar", "radar")}
     M["camera"] = M["camera"] @ exp_se3(warmth)
@@ -140,14 +156,15 @@ def make_vehicle(noise: str, case: Case, rng: np.random.Generator) -> Vehicle:
         "lidar_radar": inverse(M["lidar"]) @ T_LIDAR_RADAR @ M["radar"],
     }
     T, varying, common = {}, {}, {}
-    wrong = float(np.exp(rng.normal(0, LOG_SD))) if noise == "wrong sigmas" else 1.0
+    wrong = float(np.exp(rng.normal(0, LOG_SD))) if "wrong sigmas" in noise else 1.0
+    wrong /= next((float(part.split(" x")[1]) for part in noise.split(" + ") if "sigmas x" in part), 1.0)
     for pair, T_clean in clean.items():
-        sigma, floor = _si(VARYING[pair]), _si(COMMON[pair])
+        sigma, floor = _si(VARYING[sure][pair]), _si(COMMON[pair])
         # Roll and height are found together.
         correlation = np.eye(6)
         correlation[1, 5] = correlation[5, 1] = 0.5
         varying[pair] = correlation * np.outer(sigma, sigma)
-        common[pair] = np.diag(floor**2) if noise == "floors" else np.zeros((6, 6))
+        common[pair] = np.diag(floor**2) if "floors" in noise else np.zeros((6, 6))
         error = wrong * _errors(noise, D, rng) @ np.linalg.cholesky(varying[pair]).T
         error = error + rng.normal(size=6) @ np.sqrt(common[pair])
         T[pair] = exp_se3(error) @ T_clean
@@ -178,10 +195,9 @@ def _si(sigma: tuple[float, ...]) -> np.ndarray:
 
 def _errors(noise: str, days: int, rng: np.random.Generator) -> np.ndarray:
     """Errors (days, 6) of variance 1."""
-    if noise == "t4":
-        return rng.standard_t(4, size=(days, 6)) / np.sqrt(2)
-    e = rng.normal(size=(days, 6))
-    phi = float(noise.split()[1]) if noise.startswith("ar") else 0.0
+    parts = noise.split(" + ")
+    e = rng.standard_t(4, size=(days, 6)) / np.sqrt(2) if "t4" in parts else rng.normal(size=(days, 6))
+    phi = next((float(part.split()[1]) for part in parts if part.startswith("ar")), 0.0)
     for k in range(1, days):
         e[k] = phi * e[k - 1] + np.sqrt(1 - phi**2) * e[k]
     return e
@@ -190,8 +206,8 @@ def _errors(noise: str, days: int, rng: np.random.Generator) -> np.ndarray:
 def _swing(noise: str, days: int, rng: np.random.Generator) -> np.ndarray:
     """The camera's turn in its bracket with the temperature: pitch and yaw, over the year and with the weather."""
     turn = np.zeros((days, 6))
-    if noise.startswith("warmth"):
-        amplitude, (phi, scatter) = float(np.radians(float(noise.split()[1]))), WEATHER
+    if "warmth" in noise:
+        amplitude, (phi, scatter) = float(np.radians(float(noise.rsplit(maxsplit=1)[-1]))), WEATHER
         year = np.sin(2 * np.pi * (np.arange(days) / YEAR + rng.uniform()))
         weather = rng.normal(size=days)
         for k in range(1, days):
@@ -232,50 +248,87 @@ def status_of_night(verdict: VehicleVerdict, config: AuditConfig) -> VehicleStat
 
 
 def nights(
-    fleet: list[Vehicle], which: Iterable[int], config: AuditConfig
+    fleet: list[Vehicle], which: Iterable[int], config: AuditConfig, size: int = 0
 ) -> Iterator[tuple[int, list[VehicleVerdict]]]:
-    """Verdicts of every night, all vehicles judged as one fleet."""
+    """Verdicts of every night; `size` vehicles are judged as one fleet, all of them where it is 0."""
+    size = size or len(fleet)
     for night in which:
-        yield night, judge_fleet([v.tonight(night, config) for v in fleet], config)
+        parts = [fleet[k : k + size] for k in range(0, len(fleet), size)]
+        yield (
+            night,
+            [v for part in parts for v in judge_fleet([v.tonight(night, config) for v in part], config)],
+        )
 
 
-def false_alarms(noise: str, vehicles: int, days: int, seed: int) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Made:
+    """Vehicles of a run: how days err, how sure they are, how many there are in how large fleets, and the seed."""
+
+    noise: str
+    sure: str
+    vehicles: int
+    fleet: int
+    seed: int
+
+    def of(self, case: Case) -> list[Vehicle]:
+        """The vehicles to which a case happens."""
+        rng = np.random.default_rng([self.seed, *self.noise.encode(), *case.name.encode()])
+        return [make_vehicle(self.noise, case, rng, self.sure) for _ in range(self.vehicles)]
+
+
+def false_alarms(made: Made, days: int) -> dict[str, Any]:
     """RED and any alarm per 1,000 vehicle-nights where nothing happens, from the second night on."""
-    config, rng = AuditConfig(), np.random.default_rng([seed, NOISES.index(noise)])
-    fleet = [make_vehicle(noise, Case("nothing", days=days), rng) for _ in range(vehicles)]
-    red = alarm = green = count = 0
-    reds: dict[str, int] = {}
-    for night, verdicts in nights(fleet, range(1, days), config):
+    config, statuses, reds = AuditConfig(), Counter[str](), Counter[str]()
+    for night, verdicts in nights(made.of(Case("nothing", days=days)), range(1, days), config, made.fleet):
         for verdict in verdicts:
-            count += 1
-            found = [(k, c.status) for k, c in verdict.charts.items() if c.change is not None]
-            alarm += bool(found)
-            red += any(s == "RED" for _, s in found)
-            for (pair, dof), s in found:
-                if s == "RED":
-                    reds[f"{pair} {dof}"] = reds.get(f"{pair} {dof}", 0) + 1
-            if night == days - 1 and not found:
-                green += status_of_night(verdict, config).status == "GREEN"
+            status = status_of_night(verdict, config).status
+            statuses.update([status, f"{status} on the last night"] if night == days - 1 else [status])
+            reds.update(
+                f"{edge.kind} {dof}" for (edge, dof), c in verdict.charts.items() if c.status == "RED"
+            )
+    count = made.vehicles * (days - 1)
     return {
         "nights": count,
-        "red_per_1000": round(1000 * red / count, 3),
-        "alarm_per_1000": round(1000 * alarm / count, 2),
-        "green_on_the_last_night": round(green / vehicles, 3),
-        "red_charts": reds,
+        "red_per_1000": round(1000 * statuses["RED"] / count, 3),
+        "alarm_per_1000": round(1000 * (statuses["RED"] + statuses["YELLOW"]) / count, 2),
+        "unknown_per_1000": round(1000 * statuses["UNKNOWN"] / count, 2),
+        "green_on_the_last_night": round(statuses["GREEN on the last night"] / made.vehicles, 3),
+        "red_charts": dict(reds),
     }
 
 
-def detection(noise: str, case: Case, vehicles: int, seed: int) -> dict[str, Any]:
+def slow_drift(made: Made, case: Case) -> dict[str, Any]:
+    """Share of vehicles RED or YELLOW, by the size that a drift has reached; GREEN nights beyond the limit."""
+    config, fleet = AuditConfig(), made.of(case)
+    rate = float(np.degrees(np.linalg.norm(case.twist[:3])))
+    first, named = np.full(made.vehicles, 99), np.full(made.vehicles, 99)
+    green = np.zeros(made.vehicles, int)
+    for night, verdicts in nights(fleet, range(max(case.on, 1), case.days), config, made.fleet):
+        days = night - case.on + (case.on > 0)
+        for v, verdict in enumerate(verdicts):
+            status = status_of_night(verdict, config)
+            if status.status in ("RED", "YELLOW"):
+                first[v] = min(first[v], days)
+                named[v] = min(named[v], days) if status.sensor == case.sensor else named[v]
+            green[v] += status.status == "GREEN" and days * rate > config.camera_lidar_limit_deg + 1e-9
+    out = {
+        f"alarm_by_{size:.2f}_deg": _share(first * rate <= size + 1e-9)
+        for size in (0.1, 0.15, 0.2, 0.25, 0.3)
+    }
+    out |= {f"named_by_{size:.2f}_deg": _share(named * rate <= size + 1e-9) for size in (0.3, 0.5)}
+    return {"vehicles": made.vehicles, **out, "green_nights_beyond_the_limit": int(green.sum())}
+
+
+def detection(made: Made, case: Case) -> dict[str, Any]:
     """Nights until RED, and until RED with the right sensor; where it started; what comes after a repair or never."""
-    config, rng = AuditConfig(), np.random.default_rng([seed, NOISES.index(noise), 7])
-    fleet = [make_vehicle(noise, case, rng) for _ in range(vehicles)]
+    config, vehicles, fleet = AuditConfig(), made.vehicles, made.of(case)
     red, right = np.full(vehicles, 99), np.full(vehicles, 99)
     day_right, wrong = np.zeros(vehicles, bool), np.zeros(vehicles, bool)
     green_after = np.full(vehicles, 99)
     red_at_end = np.zeros(vehicles, bool)
     again = case.back or (case.served + 1 if case.served else 0)  # the first day that is well again
     watched = sorted({*range(case.on, case.on + 12), *range(again, again + 12), case.days - 1})
-    for night, verdicts in nights(fleet, [n for n in watched if n >= case.on], config):
+    for night, verdicts in nights(fleet, [n for n in watched if n >= case.on], config, made.fleet):
         for v, verdict in enumerate(verdicts):
             if not any(c.change for c in verdict.charts.values()) and (not again or green_after[v] < 99):
                 continue
@@ -318,31 +371,32 @@ def _share(found: np.ndarray) -> float:
 def main() -> None:
     """Run what is missing."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--vehicles", type=int, default=1010)
+    parser.add_argument("--vehicles", type=int, default=1000)
     parser.add_argument("--nights", type=int, default=100)
-    parser.add_argument("--first-seed", type=int, default=60_000)
-    parser.add_argument("--tune", action="store_true")
+    parser.add_argument("--days", choices=list(VARYING), default="real")
+    parser.add_argument("--fleet", type=int, default=50)
+    parser.add_argument("--first-seed", type=int, default=64_000)
+    parser.add_argument("--tune", type=int, default=-1, metavar="SEED")
     parser.add_argument("--only", default="")
-    parser.add_argument("--noise", default="")
+    parser.add_argument("--noise", nargs="+", default=list(NOISES))
     args = parser.parse_args()
-    seed = 100 if args.tune else args.first_seed
-    known = set()
-    if RESULTS.exists() and not args.tune:
-        lines = [json.loads(line) for line in RESULTS.read_text().splitlines()]
-        known = {(r["noise"], r["case"], r["seed"]) for r in lines}
-    for case in CASES:
-        for noise in NOISES:
-            if args.only not in case.name or args.noise not in noise or (noise, case.name, seed) in known:
-                continue
-            begun = time.process_time()
-            if case.sensor:
-                found = detection(noise, case, max(args.vehicles // 10, 20), seed)
-            else:
-                found = false_alarms(noise, args.vehicles, args.nights, seed)
-            line = {"noise": noise, "case": case.name, "seed": seed, "commit": commit_now(), **found}
-            line["cpu_s"] = round(time.process_time() - begun, 1)
+    seed = args.first_seed if args.tune < 0 else args.tune
+    lines = [json.loads(line) for line in RESULTS.read_text().splitlines()] if args.tune < 0 else []
+    known = {(r["noise"], r["case"], r["seed"]) for r in lines}
+    for case in (c for c in CASES if args.only in c.name):
+        for noise in (n for n in args.noise if (n, case.name, seed) not in known):
+            begun, vehicles = time.process_time(), args.vehicles // 10 if case.sensor else args.vehicles
+            fleet = 2 if "of two vehicles" in case.name else args.fleet
+            made = Made(noise, args.days, max(vehicles, 20), fleet, seed)
+            found = (
+                (slow_drift if case.slow else detection)(made, case)
+                if case.sensor
+                else false_alarms(made, args.nights)
+            )
+            line = {"noise": noise, "case": case.name, "days": args.days, "fleet": fleet, "seed": seed}
+            line |= {"commit": commit_now(), **found, "cpu_s": round(time.process_time() - begun, 1)}
             print(json.dumps(line), flush=True)
-            if not args.tune:
+            if args.tune < 0:
                 with RESULTS.open("a") as file:
                     file.write(json.dumps(line) + "\n")
 

@@ -1,0 +1,158 @@
+"""Did a value change at any split of its days: at once or slowly, through errors that are alike from day to day.
+
+What a day says is a level that stays, an error that is AR(1) from day to day, and what single days err by besides:
+
+    y_i = level_i + h_i u_i + e_i,   u_i = rho_i u_{i-1} + w_i,   rho_i = autocorrelation ** (days between)
+
+A step adds to the level between two days, a drift to its slope. Both are likelihood ratios against no change, by one
+run of a Kalman filter and one of its smoother over all charts at once: a shock to a state at a split has the estimate
+`r / N` and the variance `1 / N` of the smoother's cumulants (de Jong & Penzer 1998, J. Am. Stat. Assoc. 93(442)). That
+is generalised least squares: with days that err alike, the day of a jump tells most.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+
+from pipeline.audit.charts import Charts
+from pipeline.audit.noise import Noise
+
+__all__ = ["Scan", "alike", "scan", "scan_by"]
+
+_SAME = 0.02  # autocorrelations that differ by no more say the same
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Every split of every chart: split s lies between columns s and s + 1. Sigma is infinite where there is none.
+
+    Args:
+        size: of a step.
+        sigma: of that.
+        drift: by how much a drift that sets in at the split has grown by the last day.
+        drift_sigma: of that.
+    """
+
+    size: Float[np.ndarray, "M S"]
+    sigma: Float[np.ndarray, "M S"]
+    drift: Float[np.ndarray, "M S"]
+    drift_sigma: Float[np.ndarray, "M S"]
+
+    def row(self, m: int, days: int) -> Scan:
+        """Of one chart of so many days."""
+        at = slice(m, m + 1), slice(0, days - 1)
+        return Scan(self.size[at], self.sigma[at], self.drift[at], self.drift_sigma[at])
+
+    @property
+    def z(self) -> Float[np.ndarray, "M S"]:
+        """Steps in units of their sigmas."""
+        return self.size / self.sigma
+
+    @property
+    def drift_z(self) -> Float[np.ndarray, "M S"]:
+        """Drifts in units of their sigmas."""
+        return self.drift / self.drift_sigma
+
+
+def scan(
+    charts: Charts,
+    value: Float[np.ndarray, "M N"],
+    scale: Float[np.ndarray, " M"],
+    autocorrelation: Float[np.ndarray, " M"],
+) -> Scan:
+    """Steps and drifts at every split.
+
+    A day that is less sure than most of its chart errs by more than they do for reasons of its own: the rest of its
+    variance is not alike. A fixed reference is the mean of days long ago.
+
+    Args:
+        charts: the days.
+        value: theirs, clipped or not.
+        scale: factor on the sigmas.
+        autocorrelation: of days that follow each other, below 1; it falls with the power of the days between.
+    """
+    held, known = charts.has_reference, np.isfinite(charts.sigma)
+    known[:, 0] &= ~held
+    ordered = np.sort(np.where(known, charts.sigma, np.inf), axis=1)
+    usual = np.take_along_axis(ordered, np.maximum(known.sum(axis=1) - 1, 0)[:, None] // 2, 1)
+    sigma = np.where(np.isfinite(charts.sigma), charts.sigma, 0.0)
+    h = np.minimum(sigma, np.where(np.isfinite(usual), usual, 0.0))
+    h[held, 0] = 0.0
+    own = sigma**2 - h**2
+    if held.any():
+        own[held, 0] *= alike(charts.reference_days[held], autocorrelation[held])
+    gap = np.diff(charts.day, axis=1).clip(min=0)
+    rho = autocorrelation[:, None] ** gap
+    out = np.zeros((4, len(gap), gap.shape[1]))
+    out[1::2] = np.inf
+    _scan(np.ascontiguousarray(value), h, own, gap.astype(np.float64), rho, charts.count, scale, out)
+    return Scan(*out)
+
+
+def scan_by(charts: Charts, value: Float[np.ndarray, "M N"], noise: Noise) -> Scan:
+    """Steps and drifts, each as sure as it is by the autocorrelation under which it is less so.
+
+    Where days are taken for more alike than they are, one jump says too much; where for less, a mean of many does.
+    """
+    found, other = scan(charts, value, noise.scale, noise.autocorrelation), noise.less_alike
+    if other is None or not np.any(noise.autocorrelation - other.autocorrelation > _SAME):
+        return found
+    less = scan(charts, value, other.scale, other.autocorrelation)
+    step, slow = np.abs(less.z) < np.abs(found.z), np.abs(less.drift_z) < np.abs(found.drift_z)
+    return Scan(
+        np.where(step, less.size, found.size),
+        np.maximum(less.sigma, found.sigma),
+        np.where(slow, less.drift, found.drift),
+        np.maximum(less.drift_sigma, found.drift_sigma),
+    )
+
+
+@no_type_check
+@njit(cache=True)
+def _scan(value, h, own, gap, rho, count, scale, out):  # noqa: ANN001, ANN202 (types by numba)
+    """Fill `out` (size, sigma, drift, its sigma; chart; split): forward the filter, backward the smoother."""
+    most = value.shape[1]
+    surprise, weight, gain, slow_gain = (np.zeros(most), np.zeros(most), np.zeros(most), np.zeros(most))
+    for m in range(len(value)):
+        # Nothing is known of the level before the first day.
+        level, u, p11, p13, p33 = value[m, 0], 0.0, own[m, 0] + h[m, 0] ** 2, -h[m, 0], 1.0
+        for t in range(1, count[m]):
+            r, k = rho[m, t - 1], h[m, t]
+            u, p13, p33 = r * u, r * p13, r * r * (p33 - 1) + 1
+            both, slow = p11 + k * p13, p13 + k * p33
+            weight[t] = 1 / (both + k * slow + own[m, t])
+            surprise[t] = value[m, t] - level - k * u
+            gain[t], slow_gain[t] = both * weight[t], slow * weight[t]
+            level, u = level + gain[t] * surprise[t], u + slow_gain[t] * surprise[t]
+            p11, p13, p33 = p11 - gain[t] * both, p13 - gain[t] * slow, p33 - slow_gain[t] * slow
+        r1 = r2 = r3 = n11 = n12 = n13 = n22 = n23 = n33 = grown = 0.0
+        for t in range(count[m] - 1, 0, -1):
+            # Through the day t: what it leaves of the level, its slope and u ...
+            k, g1, g3 = h[m, t], gain[t], slow_gain[t]
+            w1, w2, w3 = n11 * g1 + n13 * g3, n12 * g1 + n23 * g3, n13 * g1 + n33 * g3
+            left, more = weight[t] * surprise[t] - g1 * r1 - g3 * r3, g1 * w1 + g3 * w3 + weight[t]
+            r1, r3 = r1 + left, r3 + k * left
+            n11, n12, n13 = n11 - 2 * w1 + more, n12 - w2, n13 - w3 - k * w1 + k * more
+            n23, n33 = n23 - k * w2, n33 - 2 * k * w3 + k * k * more
+            # ... and back over the days to the one before.
+            days, r = gap[m, t - 1], rho[m, t - 1]
+            grown += days
+            r2, r3 = r2 + days * r1, r * r3
+            n22 += days * days * n11 + 2 * days * n12
+            if n11 > 0:
+                out[0, m, t - 1], out[1, m, t - 1] = r1 / n11, scale[m] / np.sqrt(n11)
+            if n22 > 0:
+                out[2, m, t - 1], out[3, m, t - 1] = grown * r2 / n22, scale[m] * grown / np.sqrt(n22)
+            n12, n13, n23, n33 = days * n11 + n12, r * n13, r * (days * n13 + n23), r * r * n33
+
+
+def alike(days: Int[np.ndarray, " M"], autocorrelation: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
+    """Variance of a mean of AR(1) days in that of independent ones."""
+    lag = np.arange(1, days.max(initial=1))
+    share = np.maximum(1 - lag / days[:, None], 0.0)
+    return np.asarray(1 + 2 * (share * autocorrelation[:, None] ** lag).sum(axis=1))
