@@ -91,26 +91,28 @@ def find_realignments(
         for e in read_records(lake, SERVICE_EVENTS, ServiceEvent, last=window[1])
         if e.kind == REALIGNED
     }
+    least_rad = float(np.radians(config.radar_limit_deg)) / 2
     found, remarks = list[ServiceEvent](), dict[tuple[str, str], str]()
     for (vehicle, sensor), days in _by_radar(rows):
         others = [
             e.day for e in events.get(vehicle, ()) if e.sensor in ("all", sensor) and e.kind != REALIGNED
         ]
-        steps = _steps([d for d in days if d["day"] > max(others, default="")], config)
+        steps = _steps([d for d in days if d["day"] > max(others, default="")], least_rad)
         if not steps:
             continue
         edges = days_of(records.of(vehicle), config.held_sigma_factor)
         for step in (s for s in steps if (vehicle, sensor, s.last_old) not in noted):
             turned = _turned(sensor, edges, step)
             text = _in_words(step, turned)
-            if turned is None or _fits(step, *turned):
+            if turned is not None and _fits(step, *turned, least_rad):
                 key = work_key(REALIGNED, "", f"{vehicle} {step.last_old} {sensor}", [text])
                 event = ServiceEvent(
                     vehicle=vehicle, day=step.last_old, sensor=sensor, kind=REALIGNED, note=text, work_key=key
                 )
                 found.append(event)
             else:
-                remarks[vehicle, sensor] = f"the {sensor}'s own estimate changed otherwise ({text})"
+                otherwise = "" if turned is None else " otherwise"
+                remarks[vehicle, sensor] = f"the {sensor}'s own estimate changed{otherwise} ({text})"
     return Realignments(tuple(found), remarks)
 
 
@@ -120,16 +122,14 @@ def _by_radar(rows: pa.Table) -> list[tuple[tuple[str, str], list[dict[str, Any]
     return [(key, list(own)) for key, own in groupby(listed, key=lambda r: (r["vehicle"], r["sensor"]))]
 
 
-def _steps(days: Sequence[Mapping[str, Any]], config: AuditConfig) -> list[_Step]:
+def _steps(days: Sequence[Mapping[str, Any]], least_rad: float) -> list[_Step]:
     """Where the estimate left the level that it had since the window began or since the last step.
 
     It counts from half of what matters on, so that what stays in the charts cannot alarm by itself, and beyond what
     its days scatter by.
     """
     levels = np.array([_levels(day) for day in days]).reshape(-1, 2, 2)  # day, morning and evening, axis
-    least = np.maximum(
-        np.radians(config.radar_limit_deg) / 2, _SIGMAS * np.sqrt(2) * _day_sigma(days, levels)
-    )
+    least = np.maximum(least_rad, _SIGMAS * np.sqrt(2) * _day_sigma(days, levels))
     steps, old = list[_Step](), np.full(2, np.nan)
     for k, day in enumerate(days):
         for part, level in enumerate(levels[k]):
@@ -176,35 +176,44 @@ def _turned(
     own = [e for e in edges if e.kind in _BEST_FIRST and sensor in (s.name for s in e.sensors)]
     for edge in sorted(own, key=lambda e: (_BEST_FIRST.index(e.kind), e.name)):
         days = edges[edge]
-        # A day within which it stepped belongs to neither side.
-        sides = [days.day <= last, days.day >= first] if first > last else [days.day < last, days.day > last]
+        # A day within which it stepped belongs to neither side, but of the last day its last part is known.
+        after = days.day > last if (days.day > last).any() else days.day >= first
+        sides = [days.day < first if first == last else days.day <= last, after]
         sides[0] &= days.day > last - _DAYS_BEFORE
         if not all(side.any() for side in sides):
             continue
         A = turn_of_radar(edge, days.origin)
-        (before, spread), (after, spread_after) = (_mean(days, A, side) for side in sides)
-        return after - before, np.sqrt(np.diag(spread + spread_after))
+        turns, spread = days.change[:, :3] @ A.T, A @ days.spread[:, :3, :3] @ A.T
+        variances = np.einsum("nii->ni", spread)
+        (before, early), (after, late) = (_mean(turns[side], variances[side]) for side in sides)
+        off = (turns[sides[0]] - before) ** 2 / variances[sides[0]]
+        # Days scatter by more than they say; one alone does not show it.
+        excess = np.maximum(off.sum(axis=0) / max(len(off) - 1, 1), 1.0)
+        return after - before, np.sqrt(excess * (early + late))
     return None
 
 
 def _mean(
-    days: PairDays, A: Float[np.ndarray, "2 3"], side: np.ndarray
-) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, "2 2"]]:
-    """Weighted mean of a side's turns, and its covariance."""
-    information = np.linalg.inv(A @ days.spread[side, :3, :3] @ A.T)
-    covariance = np.linalg.inv(information.sum(axis=0))
-    return covariance @ np.einsum("nij,nj->i", information, days.change[side, :3] @ A.T), covariance
+    turns: Float[np.ndarray, "N 2"], variances: Float[np.ndarray, "N 2"]
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
+    """Weighted mean of some days, and its variances."""
+    variance = 1 / (1 / variances).sum(axis=0)
+    return variance * (turns / variances).sum(axis=0), variance
 
 
-def _fits(step: _Step, turned: Float[np.ndarray, " 2"], sigma: Float[np.ndarray, " 2"]) -> bool:
-    """Whether software that turned the points explains how the edges changed.
+def _fits(
+    step: _Step, turned: Float[np.ndarray, " 2"], sigma: Float[np.ndarray, " 2"], least_rad: float
+) -> bool:
+    """Whether software that turned the points explains how the edges changed, better than a mount or nothing that did.
 
-    Points that turn to the left look as a radar does that was turned to the right. Of makers that publish no sign
-    either is allowed.
+    It need not explain what cannot alarm by itself. Points that turn to the left look as a radar does that was turned
+    to the right. Of makers that publish no sign either is the software's.
     """
     known = ~np.isnan(step.size_rad)
-    signs = (1.0,) if step.sign_is_published else (1.0, -1.0)
-    return any((np.abs(turned + sign * step.size_rad) < _SIGMAS * sigma)[known].all() for sign in signs)
+    off = {sign: np.abs(turned - sign * step.size_rad)[known] for sign in (-1, 0, 1)}
+    of_software = (-1,) if step.sign_is_published else (-1, 1)
+    best = min(off, key=lambda sign: float(((off[sign] / sigma[known]) ** 2).sum()))
+    return best in of_software and bool((off[best] < np.maximum(_SIGMAS * sigma[known], least_rad)).all())
 
 
 def _in_words(step: _Step, turned: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]] | None) -> str:
@@ -213,7 +222,7 @@ def _in_words(step: _Step, turned: tuple[Float[np.ndarray, " 2"], Float[np.ndarr
     degrees = np.degrees(step.size_rad)
     text = f"{step.first_new}: " + ", ".join(f"{degrees[k]:+.2f} deg in {_AXES[k]}" for k in known)
     if turned is None:
-        return text
+        return f"{text}; no edge has days before and after"
     own = [f"{v:+.2f} ± {s:.2f} deg" for v, s in np.degrees(np.array(turned)).T]
     return f"{text}; its edges turned by {' and '.join(f'{own[k]} in {_AXES[k]}' for k in known)}"
 
