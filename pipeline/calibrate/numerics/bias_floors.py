@@ -37,7 +37,6 @@ __all__ = [
     "INTRINSICS_HALF_SIGMAS",
     "LIDAR_RADAR_BIAS",
     "LIDAR_RADAR_DT_FLOOR_S",
-    "MAX_GAP_PX",
     "MOUNTING_SIGMA_RAD",
     "OUTLIER_DENSITY",
     "PAPER_BIAS",
@@ -88,8 +87,6 @@ HEADING_SIGMA_RAD = np.radians(0.3)
 # most of them of this kind, were two thirds of what 1 deg predicts.
 MOUNTING_SIGMA_RAD = np.radians(0.6)
 SWEEP_S = 0.1  # rotating and scanning lidars alike run at 10 Hz
-# Edges whose interval is wider (16 rings: 30 px) help to find the basin only.
-MAX_GAP_PX = 5.0
 # Typical distance of what edges and markings lie on, and typical speed: steps in metres and seconds per step in pixels.
 TYPICAL_RANGE_M, TYPICAL_SPEED_MPS = 12.0, 8.0
 

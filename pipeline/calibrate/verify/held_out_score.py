@@ -18,7 +18,6 @@ from pipeline.calibrate.joint.camera_radar import camera_radar_cost
 from pipeline.calibrate.numerics.bias_floors import (
     FOCAL_SIGMA,
     HELD_OUT_BIAS,
-    MAX_GAP_PX,
     OUTLIER_DENSITY,
     RANGE_BIAS_SIGMA_M,
     REGISTRATION_COMPARISON_SIGMA,
@@ -113,9 +112,7 @@ def _camera_lidar(
         else estimate.time_offset_s
     )
     # The same points at every pose that is compared: rows that a prior a few degrees off would change by a tenth.
-    terms = terms.sharp(MAX_GAP_PX).exposed_at(
-        Alignments(estimate.T[None], np.array([dt_s]), np.array([focal]))
-    )
+    terms = terms.telling().exposed_at(Alignments(estimate.T[None], np.array([dt_s]), np.array([focal])))
     has_points = np.array([len(o.lidar_edge_xyz_m) + len(o.marking_xyz_m) > 0 for o in observations])
     sharp = KernelSettings.wide(_SHARP_PX, _SHARP_CONTRAST)
 

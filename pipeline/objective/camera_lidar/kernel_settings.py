@@ -8,9 +8,12 @@ import numpy as np
 
 from pipeline.objective.camera_lidar.points import EDGE_KINDS
 
-__all__ = ["CHANCE_BINS", "KernelSettings"]
+__all__ = ["CHANCE_BINS", "MAX_GAP_PX", "KernelSettings"]
 
 CHANCE_BINS = 128
+# Between rows further apart than this (16 rings: 30 px) a silhouette lies anywhere: such edges err by more than their
+# curvature says, and have a weight of their own.
+MAX_GAP_PX = 5.0
 # Chance density of an edge's distance before the data has been asked: boundaries every hundred pixels.
 _EVEN_CHANCE = np.full((EDGE_KINDS, CHANCE_BINS), 1 / 100, np.float32)
 
@@ -26,6 +29,7 @@ class KernelSettings:
     delta: float = 0.4  # contrast that marked points see more than the road, in standard deviations
     edge_weight: float = 1.0
     marking_weight: float = 1.0
+    wide_share: float = 1.0  # weight of edges wider than MAX_GAP_PX, in units of that of the others
 
     @staticmethod
     def wide(sigma_px: float, contrast_level: int, match: float = 0.25) -> KernelSettings:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import no_type_check
 
 import numba
@@ -22,7 +23,7 @@ from pipeline.objective.camera_lidar.edges import (
     fit_match_share,
 )
 from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP, CameraMaps, prepare_maps
-from pipeline.objective.camera_lidar.kernel_settings import KernelSettings
+from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX, KernelSettings
 from pipeline.objective.camera_lidar.mutual_information import class_information
 from pipeline.objective.camera_lidar.points import (
     CLASSES,
@@ -39,7 +40,7 @@ from pipeline.objective.camera_lidar.reflectivity import marking_gradients, mark
 from pipeline.objective.camera_lidar.rolling_shutter import exposed
 from pipeline.objective.ego_motion import shown_heading
 from pipeline.objective.stamp_gaps import camera_gaps_s
-from schemas.observations import Observation
+from schemas.observations import EDGE_ABOVE, Observation
 
 __all__ = [
     "CONTRAST_BLURS_PX",
@@ -84,6 +85,20 @@ class Terms:
         """Number of frames."""
         return len(self.velocity_lidar)
 
+    @cached_property
+    def _is_wide(self) -> np.ndarray:
+        return self.edges.gap_rad * self.camera[1] > MAX_GAP_PX
+
+    @cached_property
+    def narrow(self) -> Terms:
+        """With edges alone, of them those that say within MAX_GAP_PX where a silhouette lies."""
+        return replace(self.of_kinds(edges=False, markings=False), edges=self.edges.chosen(~self._is_wide))
+
+    @cached_property
+    def wide(self) -> Terms:
+        """With the other edges alone."""
+        return replace(self.of_kinds(edges=False, markings=False), edges=self.edges.chosen(self._is_wide))
+
     def of_kinds(self, *, edges: bool, markings: bool) -> Terms:
         """With or without edges, and markings."""
         kept = [
@@ -93,9 +108,15 @@ class Terms:
         return replace(self, edges=kept[0], markings=kept[1])
 
     def sharp(self, max_gap_px: float) -> Terms:
-        """Without the edges whose interval is wider than `max_gap_px`: these find the basin, but blur the optimum."""
+        """Without the edges whose interval is wider than `max_gap_px`."""
         narrow = self.edges.gap_rad * self.camera[1] <= max_gap_px
         return replace(self, edges=self.edges.chosen(narrow))
+
+    def telling(self) -> Terms:
+        """Without wide edges, unless most of those between rows are: then nothing else may tell of pitch."""
+        between = self.edges.side >= EDGE_ABOVE
+        mostly_wide = 2 * np.count_nonzero(between & self._is_wide) > np.count_nonzero(between)
+        return self if mostly_wide else self.sharp(MAX_GAP_PX)
 
     def in_view(self, T_camera_lidar: Float[np.ndarray, "4 4"], margin_rad: float) -> Terms:
         """With the edges and markings that a pose puts into the image, or within a margin of it."""
@@ -120,12 +141,13 @@ class Terms:
         return replace(self, edges=self.edges.chosen(is_seen))
 
     def at_most(self, points: int, rng: np.random.Generator) -> Terms:
-        """With about this many edges, markings, and points of classes, at most, drawn at random."""
-        edges, markings, classes = (
-            p if len(p.xyz_m) <= points else p.chosen(rng.random(len(p.xyz_m)) < points / len(p.xyz_m))
-            for p in (self.edges, self.markings, self.classes)
-        )
-        return replace(self, edges=edges, markings=markings, classes=classes)
+        """With about this many narrow and wide edges, markings, points of classes, at most, drawn at random."""
+        kept = []
+        for p, is_wide in ((self.edges, self._is_wide), (self.markings, None), (self.classes, None)):
+            group = np.zeros(len(p.xyz_m), np.intp) if is_wide is None else is_wide.astype(np.intp)
+            share = np.minimum(1.0, points / np.maximum(np.bincount(group, minlength=1), 1))
+            kept.append(p if share.min() >= 1.0 else p.chosen(rng.random(len(p.xyz_m)) < share[group]))
+        return replace(self, edges=kept[0], markings=kept[1], classes=kept[2])
 
     def of_frames(self, frames: np.ndarray) -> Terms:
         """Some of the frames, which look at the same maps."""
@@ -170,9 +192,19 @@ class Terms:
         return _moving_poses(R, t, at.dt_s, self.gap_s, self.velocity_lidar, self.yaw_rate)
 
     def edge_score(self, at: Alignments, settings: KernelSettings) -> Float32[np.ndarray, "P F"]:
-        """Unweighted log likelihood ratio of the edges."""
-        focal = at.focal.astype(np.float32)
-        return edge_scores(self.camera, self.maps.offsets, self.edges, self.poses(at), focal, settings)
+        """Log likelihood ratio of the edges, in which the wide ones weigh as the settings say."""
+        focal, poses = at.focal.astype(np.float32), self.poses(at)
+        score = np.zeros((len(at.dt_s), self.frames), np.float32)
+        for edges, weight in self._weighted_edges(settings):
+            found = edge_scores(self.camera, self.maps.offsets, edges, poses, focal, settings)
+            score += np.float32(weight) * found
+        return score
+
+    def _weighted_edges(self, settings: KernelSettings) -> tuple[tuple[Points, float], ...]:
+        """Edges, and their weight in the edges' score."""
+        if settings.wide_share == 1.0 or not self._is_wide.any():
+            return ((self.edges, 1.0),)
+        return (self.narrow.edges, 1.0), (self.wide.edges, settings.wide_share)
 
     def edges_in_view(self, at: Alignments) -> Int64[np.ndarray, " P"]:
         """How many edges each alignment puts into the image (at the logged focal length)."""
@@ -258,9 +290,10 @@ class Terms:
         focal, m = float(at.focal[0]), self.markings
         gradient, information = np.zeros((self.frames, 11)), np.zeros((self.frames, 11, 11))
         if settings.edge_weight > 0:
-            g, H = edge_gradients(self.camera, self.maps.offsets, self.edges, poses, focal, motion, settings)
-            gradient += settings.edge_weight * g
-            information += settings.edge_weight * H
+            for edges, weight in self._weighted_edges(settings):
+                g, H = edge_gradients(self.camera, self.maps.offsets, edges, poses, focal, motion, settings)
+                gradient += settings.edge_weight * weight * g
+                information += settings.edge_weight * weight * H
         if settings.marking_weight > 0:
             contrast = self.maps.contrast[settings.contrast_level]
             g, H = marking_gradients(

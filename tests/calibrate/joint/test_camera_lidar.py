@@ -116,6 +116,16 @@ def test_road_without_reflectivity_leaves_the_edges_to_do_it():
     assert e.diagnostics["marking_weight"] == 0.0
 
 
+def test_rows_a_degree_apart_tell_pitch_where_the_road_shows_nothing():
+    spinning = replace(SPARSE, elevations_deg=np.arange(-16.0, 16.0))
+    day = traced_day(spinning, 16, seed=1, reflective=False)
+    e = estimate_camera_lidar(day, prior_off_by(2.0, 0.05, 1), SolveConfig(), np.random.default_rng(0))
+    pitch_deg, sigma_deg = np.degrees([change_between(T_TRUE, e.T)[0], np.sqrt(e.covariance[0, 0])])
+    assert e.observable[0]
+    assert sigma_deg < 0.25
+    assert abs(pitch_deg) < 3 * sigma_deg
+
+
 def prior_along_the_axis(sigma_m):
     """A prior that is wrong only along the optical axis, where a few frames say little."""
     T = T_TRUE.copy()

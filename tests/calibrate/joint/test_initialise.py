@@ -11,7 +11,6 @@ from pipeline.calibrate.joint.camera_lidar.initialise import difference, find_ba
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, refine
 from pipeline.calibrate.joint.camera_lidar.rotation_grid import grid_maxima
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.numerics.bias_floors import MAX_GAP_PX
 from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.calibrate.numerics.search_range import SearchRange, search_range
 from pipeline.config import SolveConfig
@@ -26,6 +25,7 @@ from pipeline.geometry.se3 import (
     perturb_exactly,
     transform_points,
 )
+from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import (
     Alignments,

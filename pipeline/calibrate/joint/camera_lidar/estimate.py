@@ -47,7 +47,6 @@ from pipeline.calibrate.joint.camera_lidar.witnesses import (
 from pipeline.calibrate.numerics.bias_floors import (
     CAMERA_LIDAR_BIAS,
     HEADING_SIGMA_RAD,
-    MAX_GAP_PX,
     TZ_COMMON_BIAS_M,
 )
 from pipeline.calibrate.numerics.change_point import with_parts
@@ -154,7 +153,7 @@ def align_camera_lidar(
     terms = terms.exposed_at(AlignmentState(prior.T_camera_lidar).alone)
 
     first = KernelSettings.wide(*SCHEDULE.kernels[0])
-    sharp = terms.sharp(MAX_GAP_PX)
+    sharp = terms.telling()
     limits = search_range(prior, config)
     thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config, limits)
     basin = find_basin(terms, thin, rng)

@@ -25,10 +25,10 @@ from pipeline.calibrate.joint.camera_lidar.rotation_grid import (
     grid_turns,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.numerics.bias_floors import MAX_GAP_PX
 from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.geometry.se3 import inverse, log_so3, transform_points
+from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 
 __all__ = ["Basin", "difference", "find_basin"]

@@ -279,7 +279,12 @@ def _solved(
     )
     for sigma_px, contrast in _KERNELS:
         fitted = at.seen(terms).fitted(at.alignment.alone, KernelSettings.wide(sigma_px, contrast), rng)
-        kernel = replace(fitted, edge_weight=weights.edge_weight, marking_weight=weights.marking_weight)
+        kernel = replace(
+            fitted,
+            edge_weight=weights.edge_weight,
+            marking_weight=weights.marking_weight,
+            wide_share=weights.wide_share,
+        )
         for _ in range(_STEPS):
             gradient, information = _equations(terms, at, kernel)
             information = information + np.diag(1 / sigma**2)

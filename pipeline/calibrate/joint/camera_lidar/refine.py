@@ -184,18 +184,19 @@ def derivatives(
 
 
 def weighted(terms: Terms, state: AlignmentState, kernel: KernelSettings) -> KernelSettings:
-    """Weight each term so that its curvature equals the scatter of its gradient over frames.
+    """Weight markings, narrow and wide edges so that the curvature of each equals its gradient's scatter over frames.
 
     Points of one frame err together (one mask boundary, one lane line), so the curvature of a sum of log likelihood
     ratios is too large, by another factor for each term.
     """
     scale = scales(terms, kernel)
     weights = []
-    for edges, markings in ((1.0, 0.0), (0.0, 1.0)):
-        gradient, H = derivatives(
-            terms, state, replace(kernel, edge_weight=edges, marking_weight=markings), scale
-        )
+    for part, edges in ((terms.narrow, 1.0), (terms.wide, 1.0), (terms, 0.0)):
+        alone = replace(kernel, edge_weight=edges, marking_weight=1.0 - edges, wide_share=1.0)
+        gradient, H = derivatives(part, state, alone, scale)
         scatter = float(((gradient - gradient.mean(0)) ** 2).sum())
         curvature = -float(np.trace(H.sum(0)))
         weights.append(float(np.clip(curvature / scatter, *_WEIGHTS)) if scatter > 1e-9 else 0.0)
-    return replace(kernel, edge_weight=weights[0], marking_weight=weights[1])
+    narrow, wide, marking = weights
+    share = wide / narrow if narrow else 1.0
+    return replace(kernel, edge_weight=narrow or wide, marking_weight=marking, wide_share=share)

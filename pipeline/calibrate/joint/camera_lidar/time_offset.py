@@ -135,10 +135,12 @@ def _frame_scores(scored: Scored, state: AlignmentState) -> Float[np.ndarray, " 
 
     Of the edges alone, where there are any. Markings run along the car's way and hardly tell where on it they are; what
     they say of time is how many of them come into sight, a slope that put three days of 16 rings 30 to 60 ms off, where
-    edges were 1 to 12 ms off (tuning days 110 to 121: RMS 23 ms by both, 4.3 by edges).
+    edges were 1 to 12 ms off (tuning days 110 to 121: RMS 23 ms by both, 4.3 by edges). Nor are wide edges asked,
+    where there are others.
     """
-    if len(scored.terms.edges.xyz_m) and scored.kernel.edge_weight > 0:
-        scored = replace(scored, kernel=replace(scored.kernel, marking_weight=0.0))
+    terms = scored.terms
+    if len(terms.edges.xyz_m) and scored.kernel.edge_weight > 0:
+        scored = replace(scored, terms=terms.narrow if len(terms.narrow.edges.xyz_m) else terms.wide)
     ball = DESIGN * np.where(_DT_AND_FOCAL, 0.0, scales(scored.terms, scored.kernel))
     score = scored.terms.score(state.changed(ball), scored.kernel).mean(0)
     return score + float(prior_value(state.alone, scored.prior, scored.config)[0]) / len(score)
