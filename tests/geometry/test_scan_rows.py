@@ -39,6 +39,32 @@ def test_rows_that_run_into_each_other_and_are_not_logged_are_none():
     assert rows_of(aer, None) is None
 
 
+def turns_stored_one_after_the_other(begin_deg, missing):
+    """Beams that start side by side, as of an HDL-64, with a near thing on one side; row of each point."""
+    row, column = np.meshgrid(np.arange(32), np.arange(1200), indexing="ij")
+    place = np.radians(0.3 * column + 0.01 * row)
+    range_m = np.where(
+        (place > 1.8) & (place < 2.2), 3.0, 1.8 / np.maximum(0.05 + 0.01 * np.sin(9 * place), 0.03) - row
+    )
+    range_m = np.maximum(range_m, 3.0)
+    elevation = np.radians(0.4 * (15 - row)) + np.where(row < 16, 0.12, -0.15) / range_m
+    azimuth = (np.radians(begin_deg) + place + np.pi) % (2 * np.pi) - np.pi
+    keep = np.random.default_rng(3).random(row.shape) > missing
+    keep &= ~((row == 0) & (column < 40)) & ~((row == 31) & (column > 1150))
+    return np.stack([azimuth[keep], elevation[keep], range_m[keep]], 1), 31 - row[keep]
+
+
+@pytest.mark.parametrize("begin_deg", [0.0, -180.0, 75.0])
+def test_turns_that_are_stored_one_after_the_other_are_rows(begin_deg):
+    aer, row = turns_stored_one_after_the_other(begin_deg, missing=0.2)
+    assert np.mean(rows_of(aer, None) != row) < 1e-3
+    clockwise = aer * [-1, 1, 1]
+    assert np.mean(rows_of(clockwise, None) != row) < 1e-3
+    shuffled = np.random.default_rng(4).permutation(len(row))
+    found = rows_of(aer[shuffled], None)
+    assert found is None or np.mean(found != row[shuffled]) > 0.1  # it was the order that told
+
+
 def test_lasers_of_a_rosette_are_no_rows():
     t = np.arange(4000) / 40000
     turns = [2 * np.pi * f * t[:, None] + np.arange(6) * p for f, p in ((121.57, 1.0), (-77.73, 2.1))]
