@@ -66,6 +66,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "jobs.export:export",
         "Write a calibration for ROS 2, Autoware, KITTI, ...; the tables' JSON Schema; a network as ONNX.",
     ),
+    "export frames": (
+        "jobs.export_frames:export_frames",
+        "Frames of many days with the calibration, for networks: WebDataset, Parquet, KITTI, nuScenes.",
+    ),
     "import": ("jobs.import_prior:import_prior", "Calibration files of other programs to a prior file."),
     "compare": ("jobs.compare:compare", "Two calibrations, axis by axis: records, days, methods, files."),
     "migrate": ("jobs.migrate:migrate", "A lake of an older release to the tables of this one."),
@@ -100,6 +104,8 @@ for _name, (_path, _help) in COMMANDS.items():
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     tokens = list(sys.argv[1:] if argv is None else argv)
+    if " ".join(tokens[:2]) in COMMANDS:  # a command of two words
+        tokens[:2] = [" ".join(tokens[:2])]
     command = next((t for t in tokens if t in COMMANDS), "boresight")
     signal.signal(signal.SIGTERM, _stop)
     configure()

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pipeline.store.partitions import Lake, Partition
     from pipeline.work import Task
 
-__all__ = ["prepare"]
+__all__ = ["days_with_observations", "prepare"]
 
 
 def prepare(
@@ -52,7 +52,9 @@ def prepare(
     from pipeline.store.partitions import Lake
 
     config, tables = load_fleet(fleet), Lake.existing(lake)
-    days = _days(config, tables, from_day, to_day, vehicles)
+    days = days_with_observations(config, tables, from_day, to_day, vehicles)
+    for vehicle in {day.vehicle for day in days}:
+        config.rig_of(vehicle).one_of_each("training")
     planned, choices = _plan(config, tables, days)
     results = _run(planned, executor, workers)
     with progress_reporter("inventory") as progress:
@@ -78,14 +80,18 @@ def prepare(
     return code
 
 
-def _days(
+def days_with_observations(
     config: FleetConfig,
     lake: Lake,
     from_day: str | None,
     to_day: str | None,
     vehicles: Sequence[str] | None,
 ) -> list[Partition]:
-    """Vehicle-days with observations, as wanted."""
+    """Vehicle-days with observations, as wanted.
+
+    Raises:
+        ConfigError: a day or a vehicle that cannot be, or there are none.
+    """
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import check_day
     from pipeline.store.views import perceived_days
@@ -104,8 +110,6 @@ def _days(
         raise ConfigError(
             "command line", "--lake", f"{lake.root} has no observations of these vehicles and days"
         )
-    for vehicle in {day.vehicle for day in days}:
-        config.rig_of(vehicle).one_of_each("training")
     return days
 
 

@@ -11,6 +11,7 @@ LEARN = REPO / "pipeline" / "learn"
 STANDS_ON = {
     "sample": set(),
     "prepare": {"sample"},
+    "frames": {"prepare"},
     "batches": {"sample", "prepare"},
     "network": {"sample", "batches"},
     "train": {"sample", "batches", "network"},

@@ -1,0 +1,163 @@
+"""`boresight export frames`: frames of many vehicle-days with a calibration, for other people's networks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.config import FleetConfig
+    from pipeline.learn.frames.day import DayTask
+    from pipeline.learn.frames.frame import Mounting
+    from pipeline.store.partitions import Lake, Partition
+
+__all__ = ["export_frames"]
+
+
+def export_frames(
+    *,
+    fleet: Path,
+    lake: str,
+    out: str,
+    format: Literal["webdataset", "parquet", "kitti", "nuscenes"],  # noqa: A002 - as it is typed
+    calibration: Literal["state", "day", "prior"] = "state",
+    perturb: tuple[float, float] | None = None,
+    perturb_per: Literal["frame", "day"] = "frame",
+    seed: int = 0,
+    sensor: Annotated[tuple[str, ...], Parameter(negative=())] = (),
+    method: str = "joint",
+    force: bool = False,
+    from_day: Annotated[str | None, Parameter(name="--from")] = None,
+    to_day: Annotated[str | None, Parameter(name="--to")] = None,
+    vehicles: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    executor: Literal["process", "inline"] = "process",
+    workers: int | None = None,
+) -> int:
+    """Write synchronised frames of many days with the calibration, split so that nothing leaks, and a card.
+
+    A vehicle-day is whole or not there: run the command again after a stop, or when the lake has grown.
+    Exit code 3 where vehicle-days are left out; the card says why.
+
+    Args:
+        fleet: fleet.toml; its section prepare says how finely and how the frames are split.
+        lake: folder of the tables, or s3://BUCKET/PREFIX.
+        out: folder of the export, or s3://BUCKET/PREFIX.
+        format: webdataset (tar shards), parquet (with a torch Dataset), kitti or nuscenes (images undistorted).
+        calibration: state (what each vehicle loads tonight; days before a sensor moved are left out), day (each day's
+            own records), or prior (what was known before).
+        perturb: DEG M: move each sensor's pose by exactly this much; the answer stands beside it.
+        perturb_per: what has one draw of --perturb.
+        seed: of these draws.
+        sensor: only sensors of these names; again for each; default: all.
+        method: of the calibration.
+        force: take held poses too, marked as such.
+        from_day: first day, YYYY-MM-DD.
+        to_day: last day.
+        vehicles: only these; default: all of fleet.toml that the lake has.
+        executor: process (a pool) or inline (one after the other in this process).
+        workers: processes at a time; default: one per CPU that this process may use.
+    """
+    from jobs.prepare import days_with_observations
+    from jobs.terminal.summary import print_summary, progress_reporter
+    from pipeline.config import load_fleet
+    from pipeline.errors import ConfigError
+    from pipeline.learn.frames.card import write_card
+    from pipeline.learn.frames.day import DayTask
+    from pipeline.learn.frames.frame import Perturbation
+    from pipeline.learn.frames.output import Output
+    from pipeline.learn.frames.plan import plan_frames
+    from pipeline.store.partitions import Lake
+
+    config, tables, output = load_fleet(fleet), Lake.existing(lake).absolute(), Output.at(out)
+    days = days_with_observations(config, tables, from_day, to_day, vehicles)
+    known, left_out = _mountings(tables, config, days, calibration, method, sensor, force=force)
+    if not known:
+        raise ConfigError("command line", "calibration", f"no vehicle-day has one: {left_out[0]['reason']}")
+    moved = None if perturb is None else Perturbation(*perturb, seed, perturb_per)
+    settings = {
+        "format": format,
+        "calibration": calibration,
+        "method": method,
+        "sensors": list(sensor),
+        "seed": seed,
+    }
+    settings |= {"perturb": None if perturb is None else list(perturb), "perturb_per": perturb_per}
+    settings |= {"split_by": list(config.prepare.split_by)}
+    with progress_reporter("plan") as progress:
+        planned = plan_frames(tables, list(known), config.prepare, output, settings, progress)
+    tasks = [
+        DayTask(tables, day, output, format, places, dict(lost), known[day], moved)
+        for day, (places, lost) in planned.items()
+    ]
+    counts, failed = _run(tasks, executor, workers)
+    broken = {(f["vehicle"], f["day"]) for f in failed}
+    done = [day for day in planned if (day.vehicle, day.day) not in broken]
+    card = write_card(output, settings, done, [*left_out, *failed])
+    status = "failed" if failed and not done else "held" if left_out or failed else "done"
+    told = {n: card[n] for n in ("frames", "frames_left_out")}
+    print_summary(
+        "export frames",
+        status,
+        format=format,
+        vehicle_days=counts,
+        **told,
+        left_out=[*left_out, *failed],
+        out=out,
+    )
+    return {"done": 0, "held": 3, "failed": 1}[status]
+
+
+def _mountings(
+    lake: Lake,
+    fleet: FleetConfig,
+    days: Sequence[Partition],
+    kind: str,
+    method: str,
+    sensors: Sequence[str],
+    *,
+    force: bool,
+) -> tuple[dict[Partition, Mounting], list[dict[str, str]]]:
+    """The calibration of each vehicle-day, and the days that have none, with the reason."""
+    from jobs.frame_calibrations import mounting_of
+    from pipeline.errors import ConfigError, SolveError
+
+    known, without = {}, []
+    for day in days:
+        try:
+            known[day] = mounting_of(lake, fleet, day, kind, method, sensors, force=force)
+        except (ConfigError, SolveError) as err:
+            if isinstance(err, ConfigError) and err.key == "sensor":
+                raise
+            without.append({"vehicle": day.vehicle, "day": day.day, "reason": str(err)})
+    return known, without
+
+
+def _run(
+    tasks: Sequence[DayTask], executor: str, workers: int | None
+) -> tuple[dict[str, int], list[dict[str, str]]]:
+    """All days, with progress: how many are done and cached, and those that failed."""
+    from collections import Counter
+    from contextlib import closing
+
+    from jobs.terminal.summary import progress_reporter
+    from pipeline.fleet.executor import EXECUTORS
+    from pipeline.learn.frames.day import export_day
+
+    counts, failed = Counter[str](), list[dict[str, str]]()
+    with progress_reporter("frames") as progress:
+
+        def watch(index: int, done: int, total: int, what: str) -> None:
+            day = tasks[index].partition
+            progress(sum(counts.values()), len(tasks), f"{day.vehicle} {day.day}: {what} {done}/{total}")
+
+        with closing(EXECUTORS[executor](export_day, tasks, workers, watch)) as finished:
+            for end in finished:
+                day = end.item.partition
+                counts[end.value or "failed"] += 1
+                if end.value is None:
+                    failed.append({"vehicle": day.vehicle, "day": day.day, "reason": end.error})
+    return dict(counts), sorted(failed, key=lambda f: (f["vehicle"], f["day"]))

@@ -1,0 +1,132 @@
+"""Calibrations that frames are given out with: a vehicle's state, a day's records, or what was known before."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import ConfigError, SolveError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.config import FleetConfig
+    from pipeline.export.calibration import ExportedCalibration
+    from pipeline.learn.frames.frame import Mounting
+    from pipeline.store.partitions import Lake, Partition
+
+__all__ = ["mounting_of"]
+
+
+def mounting_of(
+    lake: Lake,
+    fleet: FleetConfig,
+    day: Partition,
+    kind: str,
+    method: str,
+    sensors: Sequence[str],
+    *,
+    force: bool,
+) -> Mounting:
+    """Poses of the wanted sensors (none named: all) on one vehicle-day, by the calibration that is asked for.
+
+    Raises:
+        ConfigError: there is no such calibration, or the rig has no sensor of a name.
+        SolveError: fewer than two sensors have a pose, or the state begins after that day.
+    """
+    rig = fleet.rig_of(day.vehicle)
+    unknown = [name for name in sensors if name not in rig.sensors]
+    if unknown:
+        problem = f"no {', '.join(unknown)}: the rig of {day.vehicle} has {', '.join(rig.sensors)}"
+        raise ConfigError("command line", "sensor", problem)
+    of_prior = kind == "prior"
+    found = _of_prior(lake, fleet, day) if of_prior else _of_calibration(lake, day, kind, method, force=force)
+    return _of_sensors(found, sensors)
+
+
+def _of_sensors(found: Mounting, sensors: Sequence[str]) -> Mounting:
+    from dataclasses import replace
+
+    T = {n: T for n, T in found.T.items() if not sensors or n in sensors}
+    if len(T) < 2:
+        problem = f"{found.source} has poses of {', '.join(T) or 'no sensor'}, and a frame needs two"
+        raise SolveError(problem)
+    return replace(found, T=T)
+
+
+def _of_prior(lake: Lake, fleet: FleetConfig, day: Partition) -> Mounting:
+    import numpy as np
+
+    from pipeline.extrinsics.prior import rig_prior
+    from pipeline.learn.frames.frame import Mounting
+    from pipeline.rig.graph import BASE
+    from pipeline.store.views import ingested
+    from schemas.moments import PRIOR
+
+    manifest, rig = ingested(lake, day), fleet.rig_of(day.vehicle)
+    prior = rig_prior((manifest.extra if manifest else {}).get(PRIOR, ()), fleet, rig)
+    reference = prior.reference.name
+    T = {n: T for n in rig.sensors if (T := prior.between(reference, n)) is not None}
+    about = {}
+    for name in T:
+        turn, shift = prior.sigmas_between(reference, name) if name != reference else (0.0, 0.0)
+        about[name] = _about("prior", [float(np.degrees(turn))] * 3, [shift] * 3)
+    return Mounting(f"prior of {day.day}", reference, T, about, prior.between(BASE.name, reference))
+
+
+def _of_calibration(lake: Lake, day: Partition, kind: str, method: str, *, force: bool) -> Mounting:
+    import numpy as np
+
+    from jobs.calibration_sources import read_calibration
+    from jobs.frame_options import FrameOptions
+    from pipeline.export.calibration import sigmas_of
+    from pipeline.learn.frames.frame import Mounting
+
+    of_day = day.day if kind == "day" else None
+    found = read_calibration(
+        str(lake), day.vehicle, of_day, method, force=force, unchecked=False, frames=FrameOptions(), own_frames=False,
+        mount=None,
+    )  # fmt: skip
+    reference = found.reference.name
+    T, about = {reference: np.eye(4)}, {reference: _about("reference", [0.0] * 3, [0.0] * 3)}
+    for sensor in found.sensors:
+        pose = None if sensor.name == reference else found.between(reference, sensor.name)
+        if pose is not None:
+            _require_since(found, reference, sensor.name, day)
+            T[sensor.name] = pose[0]
+            sigma = list((sigmas_of(*pose) or {}).values())
+            turn = [float(np.degrees(s)) for s in sigma[:3]] or None
+            about[sensor.name] = _about(_status(found, reference, sensor.name), turn, sigma[3:] or None)
+            about[sensor.name] |= _doubts(found, reference, sensor.name)
+    return Mounting(found.source, reference, T, about, found.T_base)
+
+
+def _about(
+    status: str, rotation_deg: list[float] | None, translation_m: list[float] | None
+) -> dict[str, Any]:
+    return {"status": status, "sigma_rotation_deg": rotation_deg, "sigma_translation_m": translation_m}
+
+
+def _require_since(found: ExportedCalibration, a: str, b: str, day: Partition) -> None:
+    """Raise SolveError where the state of a pose counts from a later day only: the sensor was elsewhere before."""
+    for pair in _pairs(found, a, b):
+        since = pair.details.get("since")
+        if since and str(since) > day.day:
+            problem = (
+                f"{b} moved: {found.source} counts since {since} (--calibration day takes each day's own)"
+            )
+            raise SolveError(problem)
+
+
+def _pairs(found: ExportedCalibration, a: str, b: str) -> list[Any]:
+    way = found.way(a, b) or ()
+    return [pair for pair in found.pairs.values() if pair.edge in way]
+
+
+def _status(found: ExportedCalibration, a: str, b: str) -> str:
+    return ", ".join(sorted({pair.status for pair in _pairs(found, a, b)}))
+
+
+def _doubts(found: ExportedCalibration, a: str, b: str) -> dict[str, Any]:
+    """Axes of a pose that the data did not determine or that nothing checks; empty where there are none."""
+    axes = sorted({dof for pair in _pairs(found, a, b) for dof in (*pair.at_prior, *pair.resting)})
+    return {"kept_at_prior": axes} if axes else {}

@@ -1,0 +1,144 @@
+"""The card of an export: what was kept, what was left out and why, which calibration, how sure; and how to open it."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.learn.frames.kitti import finish_kitti
+from pipeline.learn.frames.nuscenes_tables import finish_nuscenes
+from pipeline.learn.frames.output import Output
+from pipeline.store.partitions import Partition
+from schemas.training import SPLITS
+from schemas.versions import CODE_VERSION
+
+__all__ = ["write_card"]
+
+_CONVENTIONS = (
+    "T_a_b takes coordinates in frame b to frame a, row-major 4x4, metres. Cameras: x right, y down, z forward; "
+    "lidars, radars and the car: x forward, y left, z up. Sigmas: rotation about the reference's axes, and place of "
+    "the sensor. range_rate is positive where a target recedes, and holds the car's own motion."
+)
+_SYNCHRONISED = (
+    "Sensors of a frame measured within ingest's limit of each other, each at its own stamp; a sweep says whether it "
+    "is de-skewed to it."
+)
+_OPEN = {
+    "webdataset": (
+        'webdataset.WebDataset("train/VEHICLE_DAY-000000.tar"). Files of one KEY are a sample: KEY.SENSOR.jpg or .png '
+        "as logged (not undistorted), KEY.SENSOR.labels.png, KEY.SENSOR.npy (float32, columns `fields`; NaN where the "
+        "log has no value), KEY.json."
+    ),
+    "parquet": (
+        '`from dataset import Frames; DataLoader(Frames(".", "train"), num_workers=2, collate_fn=list)`: dataset.py '
+        "lies here and needs torch and pyarrow. A row is a frame. Images are as logged, not undistorted; points are "
+        "NaN where the log has no value."
+    ),
+    "kitti": (
+        "KITTI object folders in training/, splits in ImageSets/*.txt; frames.jsonl says which frame is which. Images "
+        "are undistorted with the logged K. label_2 has boxes in the image and none in space (KITTI's -1, -10, -1000); "
+        "radar/*.bin are View-of-Delft's rows (x y z RCS v_r v_r_compensated time), NaN where the car's speed is not "
+        "known. Tr_imu_to_velo is the identity where nobody knows where the lidar sits on the car. semantic/*.png are "
+        "labels. Intensity is NaN where the log has none."
+    ),
+    "nuscenes": (
+        'NuScenes("v1.0-boresight", "."); splits by scene are in v1.0-boresight/splits.json. Images are undistorted '
+        "with the logged K. object_ann.json (nuImages' table) has boxes in the image, labels/CHANNEL/*.png labels; "
+        "there are no boxes in space and no map (a grey pixel stands for it). Where nobody knows where the reference "
+        "sits on the car, the ego frame is the reference. Rings and intensities that are not logged are 0."
+    ),
+}
+_FINISH = {"kitti": finish_kitti, "nuscenes": finish_nuscenes}
+
+
+def write_card(
+    output: Output,
+    settings: Mapping[str, Any],
+    days: Sequence[Partition],
+    left_out: Sequence[Mapping[str, str]],
+) -> dict[str, Any]:
+    """Write card.json and README.md from what the finished days say; returns the card.
+
+    Args:
+        output: the export.
+        settings: of the export, as its plan has them.
+        days: that are finished.
+        left_out: vehicle-days without a frame here: vehicle, day and reason.
+    """
+    done = [told for day in days if (told := output.done(day)) is not None]
+    frames, lost, sensors = Counter[str](), Counter[str](), Counter[str]()
+    files: dict[str, list[str]] = {split: [] for split in SPLITS}
+    for told in done:
+        frames.update(told["frames"])
+        lost.update(told["left_out"])
+        sensors.update(told["sensors"])
+        for split in SPLITS:
+            files[split] += told["parts"].get(split, [])
+    card = {
+        "made_by": f"Boresight {CODE_VERSION}",
+        "settings": dict(settings),
+        "frames": {split: frames[split] for split in SPLITS},
+        "frames_of_sensors": dict(sensors),
+        "frames_left_out": dict(lost),
+        "vehicle_days": [
+            {n: t[n] for n in ("vehicle", "day", "frames", "left_out", "calibration")} for t in done
+        ],
+        "vehicle_days_left_out": list(left_out),
+        "conventions": _CONVENTIONS,
+        "labels": "Cityscapes train ids (0 road .. 18 bicycle, 255 void), as perceive read or made them",
+        "files": files,
+    }
+    if finish := _FINISH.get(settings["format"]):
+        finish(output, days)
+    if settings["format"] == "parquet":
+        output.write("dataset.py", Path(__file__).with_name("torch_dataset.py").read_bytes())
+    output.write("README.md", _page(card, settings).encode())
+    output.write("card.json", (json.dumps(card, indent=1, sort_keys=True) + "\n").encode())
+    return card
+
+
+def _page(card: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+    days = card["vehicle_days"]
+    worst = _worst(days)
+    moved = settings["perturb"]
+    lines = [
+        f"# Frames of {len({d['vehicle'] for d in days})} vehicles, {len(days)} vehicle-days",
+        f"Made by {card['made_by']}; all of this page is in card.json too.\n",
+        "| split | frames |\n|---|---|\n" + "\n".join(f"| {s} | {n} |" for s, n in card["frames"].items()),
+        f"\nNo two splits share a {', '.join(settings['split_by'])}. {_SYNCHRONISED}",
+        "\n## Left out\n" + (_listed(card["frames_left_out"]) or "No frame."),
+        *(f"- {d['vehicle']} {d['day']}: {d['reason']}" for d in card["vehicle_days_left_out"]),
+        f"\n## Calibration: {settings['calibration']}\n{card['conventions']}",
+        "\n| sensor | largest sigma of rotation [deg] | of place [m] |\n|---|---|---|\n" + "\n".join(worst),
+    ]
+    if moved is not None:
+        lines.append(
+            f"\nPoses are moved on purpose by exactly {moved[0]:g} deg and {moved[1]:g} m, one draw per "
+            f"{settings['perturb_per']} from seed {settings['seed']}; `answer_T_reference_sensor` (calib_answer/, "
+            "calibrated_sensor_answer.json) is where each sensor was."
+        )
+    lines += [f"\n## Open it\n{_OPEN[settings['format']]}", f"\nLabels: {card['labels']}.\n"]
+    return "\n".join(lines)
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return "\n".join(f"- {n} frames: {reason.replace('_', ' ')}" for reason, n in sorted(counts.items()))
+
+
+def _worst(days: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Table rows of the largest sigmas of each sensor."""
+    of: dict[str, list[tuple[float, float] | None]] = {}
+    for day in days:
+        for name, pose in day["calibration"]["sensors"].items():
+            if name != day["calibration"]["reference"]:
+                turn, shift = pose.get("sigma_rotation_deg"), pose.get("sigma_translation_m")
+                of.setdefault(name, []).append((max(turn), max(shift)) if turn and shift else None)
+    rows = []
+    for name, found in sorted(of.items()):
+        known = [sigma for sigma in found if sigma is not None]
+        worst = [f"{max(s[k] for s in known):.3f}" if known else "not known" for k in (0, 1)]
+        rows.append(f"| {name} | {worst[0]} | {worst[1]} |")
+    return rows

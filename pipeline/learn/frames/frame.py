@@ -1,0 +1,181 @@
+"""A frame as others get it: what each sensor measured at a moment, where the sensors are, and how sure that is."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from pipeline.geometry.se3 import from_quaternion, perturb_exactly
+from pipeline.store.moments import joined
+from pipeline.store.partitions import Lake, Partition
+from schemas.captures import Image, Scan, Sweep
+from schemas.features import ImageFeatureColumns
+from schemas.moments import MOMENTS, PERCEIVED, Moment
+
+__all__ = [
+    "LIDAR_FIELDS",
+    "RADAR_FIELDS",
+    "Frame",
+    "Mounting",
+    "Perturbation",
+    "Place",
+    "points_of",
+    "read_frames",
+]
+
+LIDAR_FIELDS = ("x", "y", "z", "intensity")
+RADAR_FIELDS = ("x", "y", "z", "range_rate", "power")
+_KIND: dict[type, str] = {Image: "camera", Sweep: "lidar", Scan: "radar"}
+
+
+@dataclass(frozen=True, eq=False)
+class Mounting:
+    """Where the sensors of a vehicle-day are, by one calibration.
+
+    Args:
+        source: the calibration in words, as "state of 2026-03-02".
+        reference: the sensor that poses refer to.
+        T: T_reference_sensor of each sensor whose pose is known, the reference too.
+        about: by sensor what is known of the pose in plain values: status, sigmas, axes kept at the prior.
+        T_base_reference: where the reference sits on the car; None where nobody knows.
+    """
+
+    source: str
+    reference: str
+    T: Mapping[str, Float[np.ndarray, "4 4"]]
+    about: Mapping[str, Mapping[str, Any]]
+    T_base_reference: Float[np.ndarray, "4 4"] | None = None
+
+    @property
+    def digest(self) -> str:
+        """A hash that changes where any number does."""
+        T_base = [] if self.T_base_reference is None else self.T_base_reference.tolist()
+        told = (
+            self.source,
+            self.reference,
+            T_base,
+            {n: T.tolist() for n, T in self.T.items()},
+            dict(self.about),
+        )
+        return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """By how much poses are moved on purpose: every sensor but the reference, in a direction drawn from the seed."""
+
+    rotation_deg: float
+    translation_m: float
+    seed: int
+    per: str  # "frame" or "day": what has one draw
+
+    def moved(self, mounting: Mounting, *names: str) -> dict[str, Float[np.ndarray, "4 4"]]:
+        """T_reference_sensor, moved; the same for the same names of vehicle, day and frame, whatever the order."""
+        out = {}
+        for sensor, T in mounting.T.items():
+            text = "\0".join((str(self.seed), *names, sensor))
+            rng = np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big"))
+            move = sensor != mounting.reference
+            angle = float(np.radians(self.rotation_deg))
+            out[sensor] = perturb_exactly(T, angle, self.translation_m, rng) if move else T
+        return out
+
+
+@dataclass(frozen=True)
+class Place:
+    """A moment that is wanted: its row, its number in the export, and the keys that it was split by."""
+
+    moment: int
+    number: int
+    split: str
+    place: str
+    environment: str
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One moment of a vehicle-day.
+
+    Args:
+        partition: the vehicle-day.
+        at: number, split and place.
+        moment: stamps and odometry.
+        captures: what each sensor measured, by name.
+        seen: labels and boxes of cameras, by name.
+        mounting: the calibration.
+        T: T_reference_sensor as it is given out, of these sensors.
+        answer: the same as the calibration has it; None where `T` is that.
+    """
+
+    partition: Partition
+    at: Place
+    moment: Moment
+    captures: Mapping[str, Image | Sweep | Scan]
+    seen: Mapping[str, ImageFeatureColumns]
+    mounting: Mounting
+    T: Mapping[str, Float[np.ndarray, "4 4"]]
+    answer: Mapping[str, Float[np.ndarray, "4 4"]] | None
+
+    @property
+    def key(self) -> str:
+        """A name that no other frame has, without a dot."""
+        vehicle = self.partition.vehicle.replace(".", "-")
+        return f"{vehicle}_{self.partition.day}_{self.moment.moment:06d}"
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        """Kinds of the sensors that the frame shows."""
+        return frozenset(_KIND[type(capture)] for capture in self.captures.values())
+
+    @property
+    def T_odom_vehicle(self) -> Float[np.ndarray, "4 4"] | None:
+        """The car's pose at the moment by odometry; None where none was logged."""
+        m = self.moment
+        values = (m.ego_qw, m.ego_qx, m.ego_qy, m.ego_qz, m.ego_tx_m, m.ego_ty_m, m.ego_tz_m)
+        if any(v is None for v in values):
+            return None
+        return from_quaternion(np.array(values[:4], np.float64), np.array(values[4:], np.float64))
+
+
+def points_of(capture: Sweep | Scan) -> Float32[np.ndarray, "N C"]:
+    """Columns LIDAR_FIELDS or RADAR_FIELDS; NaN where the log has no intensity or power."""
+    if isinstance(capture, Sweep):
+        columns = [*capture.lidar_xyz_m.T, capture.lidar_intensity]
+    else:
+        columns = [*capture.radar_xyz_m.T, capture.radar_range_rate_mps, capture.radar_power_db]
+    unknown = np.full(len(columns[0]), np.nan)
+    return np.stack([unknown if c is None else c for c in columns], axis=-1).astype(np.float32)
+
+
+def read_frames(
+    lake: Lake,
+    partition: Partition,
+    places: Sequence[Place],
+    mounting: Mounting,
+    perturbation: Perturbation | None,
+) -> Iterator[Frame | None]:
+    """Wanted frames of a vehicle-day in order, a row group of each sensor in memory at a time.
+
+    None stands for a frame that shows fewer than two of the sensors whose pose is known.
+    """
+    moments, sensors = [p.moment for p in places], list(mounting.T)
+    seen = joined(lake, PERCEIVED, partition, sensors, moments)
+    day = (partition.vehicle, partition.day)
+    whole_day = perturbation.moved(mounting, *day) if perturbation else dict(mounting.T)
+    for at, (moment, captures), (_, found) in zip(
+        places, joined(lake, MOMENTS, partition, sensors, moments), seen, strict=True
+    ):
+        if len(captures) < 2:
+            yield None
+            continue
+        per_frame = perturbation is not None and perturbation.per == "frame"
+        T = perturbation.moved(mounting, *day, str(at.moment)) if perturbation and per_frame else whole_day
+        answer = None if perturbation is None else {n: mounting.T[n] for n in captures}
+        labels = {n: f for n, f in found.items() if isinstance(f, ImageFeatureColumns)}
+        own = {n: T[n] for n in captures}
+        yield Frame(partition, at, moment, captures, labels, mounting, own, answer)

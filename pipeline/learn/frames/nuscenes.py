@@ -1,0 +1,227 @@
+"""Frames as a nuScenes folder: tables in v1.0-boresight, files in samples; every frame is a sample.
+
+nuScenes' lidar looks along y, with x to the right. Its radar has a velocity vector: here what was measured, along the
+ray. Boxes are in nuImages' table object_ann, as nuScenes' own has boxes in space, which nobody measured here.
+
+Source: nuscenes-devkit, docs/schema_nuscenes.md, docs/schema_nuimages.md, utils/data_classes.py, utils/splits.py.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import SolveError
+from pipeline.geometry.se3 import from_rotation_translation, inverse, to_quaternion
+from pipeline.learn.frames.ego import T_root_sensor, compensated_range_rate, pose_at
+from pipeline.learn.frames.frame import Frame
+from pipeline.learn.frames.images import undistortion_of
+from pipeline.learn.frames.nuscenes_tables import token_of
+from pipeline.learn.frames.output import Output
+from schemas.captures import Image, Scan, Sweep
+
+__all__ = ["NuScenesWriter"]
+
+# Channels of sensors that are called by their kinds, as loaders expect them.
+_CHANNELS = {"camera": "CAM_FRONT", "lidar": "LIDAR_TOP", "radar": "RADAR_FRONT"}
+_PREFIX = {Image: "CAM", Sweep: "LIDAR", Scan: "RADAR"}
+_MODALITY = {Image: "camera", Sweep: "lidar", Scan: "radar"}
+_T_NUSCENES_LIDAR = from_rotation_translation(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
+_RADAR = (
+    "x:f4 y:f4 z:f4 dyn_prop:i1 id:i2 rcs:f4 vx:f4 vy:f4 vx_comp:f4 vy_comp:f4 is_quality_valid:i1 ambig_state:i1 "
+    "x_rms:i1 y_rms:i1 invalid_state:i1 pdh0:i1 vx_rms:i1 vy_rms:i1"
+)
+_UNAMBIGUOUS = 3
+
+
+class NuScenesWriter:
+    """Writes files of samples as they come, and rows of tables for the end.
+
+    A scene is what one log, drive and split show in a row.
+    """
+
+    def __init__(self, output: Output, stack: ExitStack) -> None:
+        del stack  # files are whole when they are written
+        self._output = output
+        self._samples: list[dict[str, Any]] = []
+        self._scene: tuple[Any, ...] = ()
+        self._latest: dict[str, dict[str, Any]] = {}  # row of sample_data by channel
+        self._known: set[str] = set()
+
+    def add(self, frame: Frame) -> None:
+        """Write a frame.
+
+        Raises:
+            SolveError: the log has no odometry, without which nuScenes has no ego_pose.
+            ConfigError: a camera cannot be undistorted.
+        """
+        scene = (frame.moment.log, frame.moment.drive, frame.at.split)
+        if scene != self._scene:
+            self.close()
+            self._scene = scene
+        before = self._samples[-1] if self._samples else None
+        sample = {
+            "token": token_of("sample", frame.key),
+            "timestamp": _us(frame.moment.stamp_ns),
+            "scene_token": "",
+            "prev": "" if before is None else before["token"],
+            "next": "",
+        }
+        if before is None:
+            self._first = frame
+        else:
+            before["next"] = sample["token"]
+        sample["scene_token"] = token_of("scene", self._first.key)
+        self._samples.append(sample)
+        self._output.list("sample", sample)
+        for name in frame.captures:
+            self._sample_data(frame, name, str(sample["token"]))
+
+    def close(self) -> None:
+        """Write the scene that is open."""
+        if not self._samples:
+            return
+        at, first = self._first.partition, self._first.key
+        log = token_of("log", at.folder, self._first.moment.log)
+        scene = {
+            "token": token_of("scene", first), "log_token": log, "nbr_samples": len(self._samples), "name": first,
+            "first_sample_token": self._samples[0]["token"], "last_sample_token": self._samples[-1]["token"],
+            "description": f"{self._first.at.split}, {self._first.moment.log}, {self._first.at.environment}",
+        }  # fmt: skip
+        row = {
+            "token": log,
+            "logfile": self._first.moment.log,
+            "vehicle": at.vehicle,
+            "date_captured": at.day,
+        }
+        self._output.list("scene", scene)
+        self._output.list(self._first.at.split, first)
+        self._once("log", row | {"location": "unknown"})
+        self._samples, self._latest = [], {}
+
+    def _sample_data(self, frame: Frame, name: str, sample: str) -> None:
+        capture, channel = frame.captures[name], _channel(frame, name)
+        T_odom_ego = pose_at(frame, capture.stamp_ns)
+        if T_odom_ego is None:
+            problem = "nuScenes needs the car's pose at each sample, and the logs have no odometry: take another format"
+            raise SolveError(problem)
+        token, before = token_of("data", frame.key, channel), self._latest.get(channel)
+        data, suffix = _file(frame, name)
+        path = f"samples/{channel}/{frame.key}{suffix}"
+        self._output.put(path, data)
+        row = {
+            "token": token, "sample_token": sample, "ego_pose_token": token, "timestamp": _us(capture.stamp_ns),
+            "calibrated_sensor_token": self._calibrated(frame, name, channel), "fileformat": suffix.strip("."),
+            "is_key_frame": True, "filename": path, "next": "", "prev": "" if before is None else before["token"],
+            "height": capture.image_height_px if isinstance(capture, Image) else 0,
+            "width": capture.image_width_px if isinstance(capture, Image) else 0,
+        }  # fmt: skip
+        if before is not None:
+            before["next"] = token
+        self._latest[channel] = row
+        self._output.list("sample_data", row)
+        self._output.list(
+            "ego_pose", {"token": token, "timestamp": _us(capture.stamp_ns)} | _pose(T_odom_ego)
+        )
+        if isinstance(capture, Image):
+            self._seen(frame, name, channel, token)
+
+    def _seen(self, frame: Frame, name: str, channel: str, token: str) -> None:
+        image, seen = frame.captures[name], frame.seen.get(name)
+        if seen is None or not isinstance(image, Image):
+            return
+        undistortion = undistortion_of(image, name)
+        self._output.put(f"labels/{channel}/{frame.key}.png", undistortion.labels(seen))
+        for k, (box, kind, score) in enumerate(undistortion.boxes(seen)):
+            category = {"token": token_of("category", kind), "name": kind, "description": "", "index": 0}
+            self._once("category", category)
+            told = {
+                "token": token_of("box", token, str(k)),
+                "sample_data_token": token,
+                "bbox": box,
+                "score": score,
+            }
+            self._output.list(
+                "object_ann",
+                told | {"category_token": category["token"], "attribute_tokens": [], "mask": None},
+            )
+
+    def _calibrated(self, frame: Frame, name: str, channel: str) -> str:
+        capture = frame.captures[name]
+        self._once(
+            "sensor",
+            {"token": token_of("sensor", channel), "channel": channel, "modality": _MODALITY[type(capture)]},
+        )
+        K = capture.camera_K.tolist() if isinstance(capture, Image) else []
+        given = _pose(_channel_pose(frame, frame.T[name], capture))
+        row = {"sensor_token": token_of("sensor", channel), **given, "camera_intrinsic": K}
+        row["token"] = token_of("calibrated", frame.partition.folder, channel, repr(row))
+        self._once("calibrated_sensor", row)
+        if frame.answer is not None:
+            answer = _pose(_channel_pose(frame, frame.answer[name], capture))
+            self._once("calibrated_sensor_answer", {**row, **answer})
+        return str(row["token"])
+
+    def _once(self, table: str, row: dict[str, Any]) -> None:
+        """Add a row that others may have added."""
+        if (key := f"{table} {row['token']}") not in self._known:
+            self._known.add(key)
+            self._output.list(table, row)
+
+
+def _channel(frame: Frame, name: str) -> str:
+    prefix = _PREFIX[type(frame.captures[name])]
+    return _CHANNELS.get(name) or (
+        name.upper() if name.upper().startswith(prefix) else f"{prefix}_{name.upper()}"
+    )
+
+
+def _channel_pose(frame: Frame, T: np.ndarray, capture: object) -> np.ndarray:
+    T_root = T_root_sensor(frame, T)
+    return T_root @ inverse(_T_NUSCENES_LIDAR) if isinstance(capture, Sweep) else T_root
+
+
+def _file(frame: Frame, name: str) -> tuple[bytes, str]:
+    """Content of a sensor's file, and how its name ends."""
+    capture = frame.captures[name]
+    if isinstance(capture, Sweep):
+        count = len(capture.lidar_x_m)
+        beside = [np.zeros(count) if c is None else c for c in (capture.lidar_intensity, capture.lidar_ring)]
+        columns = [-capture.lidar_y_m, capture.lidar_x_m, capture.lidar_z_m, *beside]
+        return np.stack(columns, -1).astype("<f4").tobytes(), ".pcd.bin"
+    if isinstance(capture, Scan):
+        return _pcd(frame, name, capture), ".pcd"
+    suffix = ".jpg" if capture.image_format == "jpeg" else ".png"
+    return undistortion_of(capture, name).encoded(capture, suffix), suffix
+
+
+def _pcd(frame: Frame, name: str, scan: Scan) -> bytes:
+    dtype = np.dtype([(n, f"<{t}") for n, t in (word.split(":") for word in _RADAR.split())])
+    rows = np.zeros(len(scan.radar_x_m), dtype)
+    flat = np.maximum(np.hypot(scan.radar_x_m, scan.radar_y_m), 1e-6)
+    own = compensated_range_rate(frame, name, scan)
+    for column, values in (("x", scan.radar_x_m), ("y", scan.radar_y_m), ("z", scan.radar_z_m)):
+        rows[column] = values
+    for axis, along in (("x", scan.radar_x_m / flat), ("y", scan.radar_y_m / flat)):
+        rows[f"v{axis}"], rows[f"v{axis}_comp"] = scan.radar_range_rate_mps * along, own * along
+    rows["rcs"] = 0 if scan.radar_power_db is None else scan.radar_power_db
+    rows["id"], rows["is_quality_valid"], rows["ambig_state"] = np.arange(len(rows)), 1, _UNAMBIGUOUS
+    names = dtype.names or ()
+    kinds = [dtype[n].str[1:] for n in names]
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
+        f"FIELDS {' '.join(names)}\nSIZE {' '.join(k[1:] for k in kinds)}\n"
+        f"TYPE {' '.join(k[0].upper() for k in kinds)}\nCOUNT {' '.join('1' for _ in names)}\n"
+        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
+    )
+    return header.encode() + rows.tobytes()
+
+
+def _pose(T: np.ndarray) -> dict[str, list[float]]:
+    return {"rotation": to_quaternion(T).tolist(), "translation": T[:3, 3].tolist()}
+
+
+def _us(stamp_ns: int) -> int:
+    return round(stamp_ns / 1000)

@@ -1,0 +1,312 @@
+"""`boresight export frames`: what was in the lake comes out of every format, whole, split and with its calibration."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+import tarfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import pipeline.store.object_store
+from jobs.cli import main
+from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.learn.frames.images import undistortion_of
+from pipeline.learn.frames.torch_dataset import Frames
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import frames_of
+from tests.makers import training_lakes
+from tests.makers.fleet_files import fleet_toml
+from tests.makers.s3_server import BUCKET, running
+
+VEHICLES, DAYS = ("a", "b", "c"), ("2026-01-01", "2026-01-02")
+EGO = {
+    "ego_speed_mps": 10.0, "ego_yaw_rate_radps": 0.1, "ego_qw": 1.0, "ego_qx": 0.0, "ego_qy": 0.0, "ego_qz": 0.0,
+    "ego_tx_m": 5.0, "ego_ty_m": 7.0, "ego_tz_m": 0.0,
+}  # fmt: skip
+SECTION = '[prepare]\nsplit_by = "vehicle"\nval_fraction = 0.2\ntest_fraction = 0.2'
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory):
+    """Three vehicles on two days, four frames each."""
+    folder = tmp_path_factory.mktemp("lake")
+    (folder / "fleet.toml").write_text(fleet_toml(*VEHICLES, sections=SECTION))
+    for vehicle in VEHICLES:
+        for day in DAYS:
+            training_lakes.fill(Lake.at(folder), vehicle, day, frames=4, **EGO)
+    return folder
+
+
+def export(lake, out, form, *more, code=0):
+    call = ["export", "frames", "--fleet", str(lake / "fleet.toml"), "--lake", str(lake), "--out", str(out)]
+    call += ["--format", form, "--calibration", "prior", "--executor", "inline", *more]
+    assert main(call) == code
+    return None if code else json.loads((Path(out) / "card.json").read_text())
+
+
+def contents(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def lake_frames(lake):
+    return {
+        (v, d, f.frame_index): f
+        for v in VEHICLES
+        for d in DAYS
+        for f in frames_of(Lake.at(lake), Partition(v, d))
+    }
+
+
+def assert_same_points(sensors, frame):
+    np.testing.assert_array_equal(sensors["lidar"][:, :3], frame.lidar_xyz_m)
+    np.testing.assert_array_equal(sensors["lidar"][:, 3], frame.lidar_intensity)
+    np.testing.assert_array_equal(sensors["radar"][:, :3], frame.radar_xyz_m)
+    np.testing.assert_array_equal(sensors["radar"][:, 3], frame.radar_range_rate_mps)
+
+
+def test_a_shard_holds_every_frame_once_under_a_key_as_webdataset_reads_it(lake, tmp_path):
+    card, wanted = export(lake, tmp_path, "webdataset"), lake_frames(lake)
+    assert sum(card["frames"].values()) == len(wanted) == 24
+    assert all(card["frames"].values())
+    samples = {}
+    for split, names in card["files"].items():
+        for name in names:
+            assert name.startswith(f"{split}/")
+            with tarfile.open(tmp_path / name) as tar:
+                for member in tar:
+                    key, _, rest = member.name.partition(".")
+                    samples.setdefault(key, {})[rest] = tar.extractfile(member).read()
+    assert len(samples) == 24
+    for sample in samples.values():
+        about = json.loads(sample["json"])
+        frame = wanted[about["vehicle"], about["day"], about["moment"]]
+        assert sample["camera.jpg"] == frame.image
+        assert_same_points({n: np.load(io.BytesIO(sample[f"{n}.npy"])) for n in ("lidar", "radar")}, frame)
+        assert cv2.imdecode(np.frombuffer(sample["camera.labels.png"], np.uint8), -1) is not None
+        T = {n: np.array(about["sensors"][n]["T_reference_sensor"]) for n in ("camera", "lidar", "radar")}
+        np.testing.assert_allclose(inverse(T["camera"]) @ T["lidar"], frame.priors["camera_lidar"], atol=1e-9)
+        np.testing.assert_allclose(inverse(T["lidar"]) @ T["radar"], frame.priors["lidar_radar"], atol=1e-9)
+
+
+def test_no_split_shares_a_vehicle_and_a_frame_says_which_it_is_of(lake, tmp_path):
+    export(lake, tmp_path, "parquet")
+    of = {s: {f["vehicle"] for f in Frames(str(tmp_path), s)} for s in ("train", "val", "test")}
+    assert set.union(*of.values()) == set(VEHICLES)
+    assert sum(map(len, of.values())) == len(VEHICLES)
+
+
+def test_two_workers_of_torch_read_parquet_by_the_copy_of_the_dataset_that_lies_beside_it(lake, tmp_path):
+    export(lake, tmp_path, "parquet")
+    (tmp_path / "use.py").write_text(
+        "import torch\nfrom dataset import Frames\n"
+        "if __name__ == '__main__':\n"
+        "    data = torch.utils.data.DataLoader(Frames('.', 'train'), num_workers=2, batch_size=3, collate_fn=list)\n"
+        "    seen = [f for batch in data for f in batch]\n"
+        "    assert all(f['sensors']['camera']['image'].dtype == torch.uint8 for f in seen)\n"
+        '    print(*(f\'{f["key"]}:{len(f["sensors"]["lidar"]["points"])}\' for f in seen))\n'
+    )
+    environment = {n: v for n, v in os.environ.items() if n != "PYTHONPATH"}  # without this project
+    call = [sys.executable, "use.py"]
+    out = subprocess.run(
+        call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    ).stdout.split()
+    own = [f"{f['key']}:{len(f['sensors']['lidar']['points'])}" for f in Frames(str(tmp_path), "train")]
+    assert out == own
+    assert len(own) >= 8
+    frame = Frames(str(tmp_path), "train")[0]
+    points = {n: frame["sensors"][n]["points"].numpy() for n in ("lidar", "radar")}
+    assert_same_points(points, lake_frames(lake)[frame["vehicle"], frame["day"], frame["moment"]])
+    assert isinstance(frame["sensors"]["lidar"]["points"], torch.Tensor)
+
+
+@pytest.mark.parametrize("form", ["kitti", "nuscenes"])
+def test_frames_come_back_through_convert_and_ingest(lake, tmp_path, form):
+    toml = tmp_path / "fleet.toml"
+    toml.write_text(
+        fleet_toml("a", sections='[prepare]\nsplit_by = "day"\nval_fraction = 0\ntest_fraction = 0')
+    )
+    call = [
+        "export",
+        "frames",
+        "--fleet",
+        str(toml),
+        "--lake",
+        str(lake),
+        "--out",
+        str(tmp_path / "out"),
+        "--to",
+        DAYS[0],
+    ]
+    assert main([*call, "--format", form, "--calibration", "prior", "--executor", "inline"]) == 0
+    source = tmp_path / "out" / "training" if form == "kitti" else tmp_path / "out"
+    about = (
+        ["--radar-columns", "x,y,z,power,doppler,,", "--vehicle", "a", "--day", DAYS[0]]
+        if form == "kitti"
+        else []
+    )
+    assert main(["convert", form, str(source), "--out", str(tmp_path / "logs"), *about]) == 0
+    logs = [str(p) for p in (tmp_path / "logs" / "logs" / "a" / DAYS[0]).iterdir()]
+    call = [
+        "ingest",
+        *logs,
+        "--fleet",
+        str(tmp_path / "logs" / "fleet.toml"),
+        "--lake",
+        str(tmp_path / "again"),
+    ]
+    assert main([*call, "--vehicle", "a", "--day", DAYS[0]]) == 0
+    before = list(frames_of(Lake.at(lake), Partition("a", DAYS[0])))
+    after = list(frames_of(Lake.at(tmp_path / "again"), Partition("a", DAYS[0])))
+    assert len(after) == len(before) == 4
+    for was, found in zip(before, after, strict=True):
+        np.testing.assert_array_equal(found.lidar_xyz_m, was.lidar_xyz_m)
+        np.testing.assert_array_equal(found.lidar_intensity, was.lidar_intensity)
+        np.testing.assert_array_equal(found.radar_xyz_m, was.radar_xyz_m)
+        np.testing.assert_allclose(found.radar_range_rate_mps, was.radar_range_rate_mps, atol=1e-5)
+        for pair in ("camera_lidar", "lidar_radar"):
+            np.testing.assert_allclose(found.priors[pair], was.priors[pair], atol=1e-9)
+        pictures = [cv2.imdecode(np.frombuffer(f.image, np.uint8), cv2.IMREAD_COLOR) for f in (was, found)]
+        np.testing.assert_array_equal(*pictures)
+
+
+def test_a_stopped_export_counts_nothing_half_and_is_completed_to_the_same_bytes(lake, tmp_path):
+    export(lake, tmp_path / "whole", "parquet")
+    export(lake, tmp_path / "again", "parquet")
+    wanted = contents(tmp_path / "whole")
+    assert contents(tmp_path / "again") == wanted
+    killed = tmp_path / "killed"
+    code = (
+        "import os, sys\nimport pipeline.learn.frames.day as day\nwrite, days = day._write, []\n"
+        "def dies(*at):\n    days.append(1)\n    told = write(*at)\n"
+        "    os._exit(9) if len(days) == 3 else None\n    return told\n"
+        "day._write = dies\nfrom jobs.cli import main\nmain(sys.argv[1:])\n"
+    )
+    call = [
+        "export",
+        "frames",
+        "--fleet",
+        str(lake / "fleet.toml"),
+        "--lake",
+        str(lake),
+        "--out",
+        str(killed),
+    ]
+    call += ["--format", "parquet", "--calibration", "prior", "--executor", "inline"]
+    done = subprocess.run([sys.executable, "-c", code, *call], capture_output=True, check=False)
+    assert done.returncode == 9
+    assert not (killed / "card.json").exists()
+    assert len(list(killed.rglob("done.json"))) == 2
+    old = {p: p.stat().st_mtime_ns for p in killed.rglob("done.json")}
+    export(lake, killed, "parquet")
+    assert contents(killed) == wanted
+    assert {p: p.stat().st_mtime_ns for p in old} == old  # what was whole was not made again
+
+
+def test_a_later_vehicle_takes_no_frame_from_a_split_that_has_it(lake, tmp_path):
+    few = tmp_path / "few.toml"
+    few.write_text(fleet_toml(*VEHICLES, sections=SECTION))
+    call = ["export", "frames", "--fleet", str(few), "--lake", str(lake), "--out", str(tmp_path / "out")]
+    call += ["--format", "webdataset", "--calibration", "prior", "--executor", "inline"]
+    assert main([*call, "--to", DAYS[0]]) == 0
+    first = json.loads((tmp_path / "out" / "plan.json").read_text())["sides"]
+    assert main(call) == 0
+    assert [side for side in first if side[0] == "vehicle"] == first
+    assert json.loads((tmp_path / "out" / "plan.json").read_text())["sides"] == first
+    assert main([*call, "--seed", "4"]) == 2  # another export has another place
+
+
+def test_moved_poses_are_exactly_as_far_off_as_is_said_and_the_answer_stands_beside_them(lake, tmp_path):
+    export(lake, tmp_path / "true", "parquet")
+    export(lake, tmp_path / "out", "parquet", "--perturb", "3", "0.2", "--seed", "5")
+    true = {f["key"]: f for f in Frames(str(tmp_path / "true"), "train")}
+    draws = []
+    for frame in Frames(str(tmp_path / "out"), "train"):
+        for name, own in frame["sensors"].items():
+            T, answer = (np.array(own[k]) for k in ("T_reference_sensor", "answer_T_reference_sensor"))
+            np.testing.assert_array_equal(answer, true[frame["key"]]["sensors"][name]["T_reference_sensor"])
+            turn = np.degrees(np.linalg.norm(log_so3(T[:3, :3] @ answer[:3, :3].T)))
+            wanted = (0.0, 0.0) if name == frame["reference"] else (3.0, 0.2)
+            np.testing.assert_allclose((turn, np.linalg.norm(T[:3, 3] - answer[:3, 3])), wanted, atol=1e-9)
+        draws.append(frame["sensors"]["camera"]["T_reference_sensor"])
+    assert len({str(draw) for draw in draws}) == len(draws)
+    export(lake, tmp_path / "day", "parquet", "--perturb", "3", "0.2", "--seed", "5", "--perturb-per", "day")
+    days = {}
+    for frame in Frames(str(tmp_path / "day"), "train"):
+        days.setdefault((frame["vehicle"], frame["day"]), set()).add(str(frame["sensors"]["camera"]))
+    assert len(days) >= 2
+
+
+def test_an_undistorted_image_shows_a_ray_where_a_pinhole_does_and_boxes_and_labels_go_with_it(lake):
+    frame = next(iter(lake_frames(lake).values()))
+    bent = replace(frame, camera_D=np.array([-0.25, 0.05, 0.001, -0.001, 0.0]))
+    found = undistortion_of(bent, "camera")
+    camera, K = found.camera, frame.camera_K
+    ray = np.array([[0.3, -0.1, 1.0]])
+    there, _ = camera.project(ray)
+    u, v = (K @ ray[0])[:2]
+    picture = np.zeros((camera.height_px, camera.width_px, 3), np.uint8)
+    cv2.circle(picture, tuple(round(c) for c in there[0]), 5, (255, 255, 255), -1)
+    shown = found.pixels(cv2.imencode(".png", picture)[1].tobytes())
+    rows, columns = np.nonzero(shown[..., 0] > 128)
+    np.testing.assert_allclose((columns.mean(), rows.mean()), (u, v), atol=1.0)
+    assert np.hypot(there[0, 0] - u, there[0, 1] - v) > 3  # else nothing was shown
+
+
+def test_a_camera_that_a_plane_cannot_show_is_refused_in_a_sentence(lake, tmp_path, capsys):
+    wide = Lake.at(tmp_path / "wide")
+    f = 640 / np.radians(95)
+    K = np.array([[f, 0, 639.5], [0, f, 359.5], [0, 0, 1]])
+    eye = {"camera_model": "equidistant", "camera_K": K, "camera_D": np.zeros(4)}
+    frame = next(iter(lake_frames(lake).values()))
+    eye["camera_K"][0, 2], eye["camera_K"][1, 2] = frame.image_width_px / 2, frame.image_height_px / 2
+    eye["camera_K"][0, 0] = eye["camera_K"][1, 1] = frame.image_width_px / 2 / np.radians(95)
+    training_lakes.fill(wide, "a", DAYS[0], frames=3, **EGO, **eye)
+    (tmp_path / "wide" / "fleet.toml").write_text(
+        fleet_toml("a", sections='[prepare]\nsplit_by = "day"\nval_fraction = 0\ntest_fraction = 0')
+    )
+    export(tmp_path / "wide", tmp_path / "kitti", "kitti", code=1)
+    assert "sees 190 deg, and an undistorted image can show 170 at most" in capsys.readouterr().out
+    assert not list((tmp_path / "kitti").rglob("*.bin"))
+    assert export(tmp_path / "wide", tmp_path / "shards", "webdataset")["frames"]["train"] == 3
+
+
+def test_an_empty_split_is_an_error_before_anything_is_written(lake, tmp_path, capsys):
+    export(lake, tmp_path / "out", "parquet", "--vehicles", "a", code=2)
+    assert "no frames for val, test" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+
+
+def test_from_a_bucket_to_a_bucket_the_same_bytes_as_between_folders(lake, tmp_path, monkeypatch):
+    export(lake, tmp_path / "out", "webdataset")
+    with running() as s3:
+        for name, value in s3.environment.items():
+            monkeypatch.setenv(name, value)
+        pipeline.store.object_store._client.cache_clear()
+        remote, to = Lake.at(f"s3://{BUCKET}/lake"), Lake.at(f"s3://{BUCKET}/out")
+        for path, data in contents(lake).items():
+            with remote.files.replacing(remote.root / path) as stream:
+                stream.write(data)
+        call = [
+            "export",
+            "frames",
+            "--fleet",
+            str(lake / "fleet.toml"),
+            "--lake",
+            str(remote),
+            "--out",
+            str(to),
+        ]
+        assert main([*call, "--format", "webdataset", "--calibration", "prior", "--executor", "inline"]) == 0
+        found = {}
+        for path in to.files.find(to.root, "**/*"):
+            with to.files.opened(path) as stream:
+                found[str(path.relative_to(to.root))] = stream.read()
+    pipeline.store.object_store._client.cache_clear()
+    assert found == contents(tmp_path / "out")
