@@ -111,10 +111,12 @@ def rival_score(
 
 
 def _worth(H: np.ndarray, J: np.ndarray) -> float:
-    """Curvature over the gradient's scatter, mean over the directions in which the sum is curved."""
+    """Curvature over the gradient's scatter, mean over the directions in which the sum is curved, if any is."""
     values, vectors = np.linalg.eigh(H * np.outer(_UNIT, _UNIT))
     curved = values > _LEAST_CURVED * values[-1]
     scatter = np.einsum("ik,ij,jk->k", vectors, J * np.outer(_UNIT, _UNIT), vectors)
+    if not curved.any() or scatter[curved].min() <= 0:
+        return _FIRST_WORTH
     return float(1 / np.mean(scatter[curved] / values[curved]))
 
 

@@ -86,6 +86,9 @@ def test_frames_that_show_nothing_leave_the_prior_and_say_so(day):
     blank = [FrameEvidence(f.grid, 0 * f.maps - 1, f.points_m, f.probability, f.worth) for f in day]
     prior = off_by(0.02, 0, 0, 0, 0, 0)
     assert climbed(blank, prior, prior, P) == pytest.approx(prior)
+    found = fit_of(blank, BLOCK, prior, prior, P)
+    assert pytest.approx(prior) == found.T
+    assert not found.information.any()
 
 
 def test_the_vote_puts_the_pose_first_that_most_frames_fit(day):
