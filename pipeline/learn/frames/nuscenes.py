@@ -208,6 +208,11 @@ def _pcd(frame: Frame, name: str, scan: Scan) -> bytes:
         rows[f"v{axis}"], rows[f"v{axis}_comp"] = scan.radar_range_rate_mps * along, own * along
     rows["rcs"] = 0 if scan.radar_power_db is None else scan.radar_power_db
     rows["id"], rows["is_quality_valid"], rows["ambig_state"] = np.arange(len(rows)), 1, _UNAMBIGUOUS
+    if not len(
+        rows
+    ):  # the devkit takes one point of NaN for an empty scan, and cannot open one without a point
+        rows = np.zeros(1, dtype)
+        rows["x"], rows["y"], rows["z"], rows["invalid_state"] = np.nan, np.nan, np.nan, 1
     names = dtype.names or ()
     kinds = [dtype[n].str[1:] for n in names]
     header = (
@@ -216,7 +221,7 @@ def _pcd(frame: Frame, name: str, scan: Scan) -> bytes:
         f"TYPE {' '.join(k[0].upper() for k in kinds)}\nCOUNT {' '.join('1' for _ in names)}\n"
         f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
     )
-    return header.encode() + rows.tobytes()
+    return header.encode() + rows.tobytes() + b"\n"  # the devkit wants a byte behind the last point
 
 
 def _pose(T: np.ndarray) -> dict[str, list[float]]:

@@ -16,11 +16,13 @@ import torch
 
 import pipeline.store.object_store
 from jobs.cli import main
-from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.geometry.se3 import exp_se3, inverse, log_so3, to_quaternion
 from pipeline.learn.frames.images import undistortion_of
 from pipeline.learn.frames.torch_dataset import Frames
+from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of
+from schemas.states import STATES, StateRow
 from tests.makers import training_lakes
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.s3_server import BUCKET, running
@@ -46,7 +48,13 @@ def lake(tmp_path_factory):
 
 def export(lake, out, form, *more, code=0):
     call = ["export", "frames", "--fleet", str(lake / "fleet.toml"), "--lake", str(lake), "--out", str(out)]
-    call += ["--format", form, "--calibration", "prior", "--executor", "inline", *more]
+    call += [
+        "--format",
+        form,
+        "--executor",
+        "inline",
+        *(more if "--calibration" in more else ("--calibration", "prior", *more)),
+    ]
     assert main(call) == code
     return None if code else json.loads((Path(out) / "card.json").read_text())
 
@@ -243,6 +251,54 @@ def test_moved_poses_are_exactly_as_far_off_as_is_said_and_the_answer_stands_bes
     assert len(days) >= 2
 
 
+def states(lake, moved_on=None):
+    """A state of vehicle a, 1 deg beside the prior of its frames; of the radar since a day."""
+    priors = next(frames_of(Lake.at(lake), Partition("a", DAYS[0]))).priors
+    rows = []
+    for pair, since in (("camera_lidar", None), ("lidar_radar", moved_on)):
+        T = exp_se3(np.array([0, 0, np.radians(1.0), 0, 0, 0])) @ priors[pair]
+        q, (parent, child) = to_quaternion(T), pair.split("_")
+        rows.append(StateRow(
+            vehicle="a", day=DAYS[1], method="joint", pair=pair, parent_frame=parent, child_frame=child,
+            status="current", reason="", since=since, work_key=str(moved_on), observable=[True] * 5 + [False],
+            covariance=np.diag([1e-6] * 3 + [1e-4] * 3), common_covariance=np.zeros((6, 6)),
+            determined=["azimuth", "elevation"], days=[DAYS[1]],
+            **dict(zip(("qw", "qx", "qy", "qz"), q, strict=True)),
+            **dict(zip(("tx_m", "ty_m", "tz_m"), T[:3, 3], strict=True)),
+        ))  # fmt: skip
+    commit_records(Lake.at(lake), STATES, rows)
+    return priors
+
+
+def test_tonight_s_state_goes_out_with_its_sigmas_and_not_with_days_before_a_sensor_moved(tmp_path):
+    for day in DAYS:
+        training_lakes.fill(Lake.at(tmp_path), "a", day, frames=4, **EGO)
+    one = '[prepare]\nsplit_by = "day"\nval_fraction = 0\ntest_fraction = 0'
+    (tmp_path / "fleet.toml").write_text(fleet_toml("a", sections=one))
+    priors = states(tmp_path)
+    card = export(tmp_path, tmp_path / "out", "parquet", "--calibration", "state")
+    assert card["frames"]["train"] == 8
+    frame = Frames(str(tmp_path / "out"), "train")[0]
+    radar = frame["sensors"]["radar"]
+    turn = log_so3(np.array(radar["T_reference_sensor"])[:3, :3] @ priors["lidar_radar"][:3, :3].T)
+    np.testing.assert_allclose(np.degrees(turn), [0, 0, 1], atol=1e-6)
+    assert radar["status"] == "current"
+    assert radar["kept_at_prior"]
+    np.testing.assert_allclose(radar["sigma_rotation_deg"], np.degrees([1e-3] * 3), rtol=1e-6)
+    states(tmp_path, moved_on=DAYS[1])
+    card = export(tmp_path, tmp_path / "later", "parquet", "--calibration", "state", code=3)
+    card = json.loads((tmp_path / "later" / "card.json").read_text())
+    assert card["frames"]["train"] == 4
+    [left] = card["vehicle_days_left_out"]
+    assert left["day"] == DAYS[0]
+    assert f"counts since {DAYS[1]}" in left["reason"]
+    # The same place again: that day's calibration changed, so its frames are made anew, and the other goes.
+    export(tmp_path, tmp_path / "out", "parquet", "--calibration", "state", code=3)
+    again = json.loads((tmp_path / "out" / "card.json").read_text())
+    assert again["files"] == card["files"]
+    assert again["frames"] == card["frames"]
+
+
 def test_an_undistorted_image_shows_a_ray_where_a_pinhole_does_and_boxes_and_labels_go_with_it(lake):
     frame = next(iter(lake_frames(lake).values()))
     bent = replace(frame, camera_D=np.array([-0.25, 0.05, 0.001, -0.001, 0.0]))
@@ -310,3 +366,28 @@ def test_from_a_bucket_to_a_bucket_the_same_bytes_as_between_folders(lake, tmp_p
                 found[str(path.relative_to(to.root))] = stream.read()
     pipeline.store.object_store._client.cache_clear()
     assert found == contents(tmp_path / "out")
+
+
+def test_nuscenes_devkit_and_webdataset_open_what_is_written(lake, tmp_path):
+    python = os.environ.get("BORESIGHT_READERS")
+    if not python:
+        pytest.skip("BORESIGHT_READERS names no Python with the loaders (tests/learn/frames/real_loaders.py)")
+    card = export(lake, tmp_path / "shards", "webdataset")
+    export(lake, tmp_path / "nuscenes", "nuscenes")
+    call = [
+        python,
+        str(Path(__file__).parent / "real_loaders.py"),
+        str(tmp_path / "nuscenes"),
+        str(tmp_path / "shards"),
+    ]
+    found = json.loads(
+        subprocess.run(call, capture_output=True, text=True, check=True).stdout.splitlines()[-1]
+    )
+    first = lake_frames(lake)["a", DAYS[0], 0]
+    assert found["nuscenes"]["samples"] == 24
+    assert found["nuscenes"]["lidar"] == len(first.lidar_x_m)
+    assert found["nuscenes"]["radar"] == len(first.radar_x_m)
+    assert found["nuscenes"]["in_image"] > 100
+    assert all(found["nuscenes"]["scenes"].values())
+    assert len(found["webdataset"]) == card["frames"]["train"]
+    assert {tuple(shape[1:]) for shape in found["webdataset"].values()} == {(4, 320, 640, 3)}
