@@ -238,7 +238,9 @@ def _scatter(
     own = np.minimum(own, most / of_fleet)
     variance, freedom = _drawn_to_fleet(own, _EFFICIENCY * seen, vehicle[0][..., None], prior)
     scale = np.sqrt(np.clip(of_fleet[None] * variance, 1.0, _MOST_SCALE**2))
-    known = 1 / (1 / freedom + 1 / vehicle[1][..., None])
+    # How alike days are is known no better than so many of them tell, and the scatter rests on it.
+    alike = _OF_ONE / (worth / _EFFICIENCY + _OF_ONE / _AXES_DIFFER**2) / (2 * (1 - phi) ** 2)
+    known = 1 / (1 / freedom + 1 / vehicle[1][..., None] + alike)
     return scale, np.minimum(known, _MOST_FREEDOM)
 
 

@@ -24,6 +24,9 @@ __all__ = ["ChartVerdict", "judge_charts"]
 _VISIBLE_SIGMAS = 2.0  # a chart shows a change that is at least this many sigmas of its best-placed split
 # RED says that a change is of a size that matters, not that it may be: with 95 %.
 _SURELY = 1.645
+# Degrees of freedom of a scale that is as good as known: where a person only looks again, what it lacks is not counted.
+_KNOWN = 240.0
+_TAME = 2  # days in a row that are no chance where single days are seldom far off
 _LASTING = "a lasting change of a size that matters"
 _ONE_DAY = f"one day stands out: the next day {DAYS_WILL_TELL} whether it lasts"
 _FEW_DAYS = (
@@ -93,8 +96,8 @@ def judge_charts(
     z = [np.abs(z).max(axis=1, initial=0.0) for z in (found.z, found.drift_z)]
     # Steps and drifts share the budget; of a chart that counts which is further beyond its own threshold.
     limits = [
-        thresholds(charts.count, noise.freedom, np.minimum(p, 0.5) / 2, noise.autocorrelation, of)
-        for p in probability
+        thresholds(charts.count, freedom, np.minimum(p, 0.5) / 2, noise.autocorrelation, of)
+        for freedom, p in zip((noise.freedom, np.maximum(noise.freedom, _KNOWN)), probability, strict=True)
         for of in ("step", "drift")
     ]
     drifts = z[1] / limits[1] > z[0] / limits[0]
@@ -109,7 +112,7 @@ def judge_charts(
         np.where(drifts, limits[1], limits[0]),
         np.stack(limits[2:]),
         # Two days far off on the same side, by chance, would use up the budget where days have heavy tails.
-        np.where(0.5 * noise.far**2 > probability[0], 3, 2),
+        np.where(0.5 * noise.far**2 > probability[0], _TAME + 1, _TAME),
         _VISIBLE_SIGMAS * found.sigma.min(axis=1, initial=np.inf),
         last_day,
         last_size,
@@ -157,7 +160,7 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
     status, reason = "RED", _LASTING
     if abs(change.size) < limit:
         status, reason = "YELLOW", "a change below the size that matters"
-    elif (days := min(levels.days_before, levels.days_after)) < seen.believed[m]:
+    elif (days := min(levels.days_before - _more(seen, m), levels.days_after)) < seen.believed[m]:
         status, reason = "YELLOW", _ONE_DAY if days < 2 else _FEW_DAYS
     elif abs(change.size) - _SURELY * change.size_sigma < limit:
         status, reason = "YELLOW", _MAYBE
@@ -173,6 +176,11 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
         float(seen.visible[m]),
         change,
     )
+
+
+def _more(seen: _Judged, m: int) -> int:
+    """Days more than after a change that are believed before it: a chance among the first days lasts for weeks."""
+    return int(seen.believed[m] > _TAME and not seen.charts.has_reference[m])
 
 
 def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
