@@ -355,7 +355,7 @@ def _add_heights(problem: RadarProblem, state: RadarState, sums: _Sums) -> Witne
         return None
     H, g = _height_equations(problem.heights, state.T_lidar_radar, len(sums.g))
     witness = height_opinion(problem, state)
-    floor = HEIGHTS_PITCH_FLOOR_RAD**2 * np.eye(2)
+    floor = _height_floor(problem, problem.heights) ** 2 * np.eye(2)
     H, g = tempered(H, g, floor)
     sums.floors[:2, :2] += floor_scatter(H, floor)
     for array in (sums.H, sums.information):
@@ -370,7 +370,13 @@ def height_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
         return None
     H, g = _height_equations(problem.heights, state.T_lidar_radar, len(problem.observations))
     H_own, g_own = tilt_of(state.T_lidar_radar, H.sum(0), g.sum(0))
-    return own_opinion("heights", H_own[1:, 1:], g_own[1:], HEIGHTS_PITCH_FLOOR_RAD)
+    return own_opinion("heights", H_own[1:, 1:], g_own[1:], _height_floor(problem, problem.heights))
+
+
+def _height_floor(problem: RadarProblem, heights: Heights) -> float:
+    """Sigma of their pitch on every day: by the mixture, and by how high the prior has the radar."""
+    by_prior = heights.per_height_radpm * problem.prior.translation_sigma_m
+    return float(np.hypot(HEIGHTS_PITCH_FLOOR_RAD, by_prior))
 
 
 def _height_equations(
