@@ -23,7 +23,7 @@ from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Te
 __all__ = ["TERMS", "Evidence", "by_chance", "wrong_poses"]
 
 TERMS = ("edges", "markings", "classes")
-_POSES = 250  # that show what chance is worth
+_POSES = 200  # that show what chance is worth
 _LEAST_TURN_RAD = np.radians(15.0)  # half-width of where they are drawn: few of them lie about the truth
 _TAIL = 0.9  # quantile beyond which the tail begins
 _BATCH = 512  # poses at a time: their rows of 3x4 transforms by frame stay in the cache

@@ -39,7 +39,9 @@ _SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS = float(np.radians(0.5)), 0.75
 _ENDS_THAT_TELL = 2  # how far two starts of one optimum end apart
 _POINTS = 500  # that show how far two ends are apart
 _SHIFT_SIGMAS = 3.0  # of the prior: how far wrong poses are shifted at most
-_CONTRADICTED = 0.5  # share of a term's own best evidence without which it contradicts an end
+_CONTRADICTED = (
+    0.5  # share of the other terms' lead by which a term must be for another place to contradict an end
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +165,8 @@ class _Search:
         """The best end, and what speaks against it."""
         highest = max(self.ends, key=lambda e: e.total)
         best = self._finished(highest)
-        # Ends that the day does not reject may not have arrived yet: in the end they may be the same, or better.
-        others = [e for e in self.ends if e is not highest]
-        others = [e if _rejected(best, e) >= CLEARLY else self._finished(e) for e in others]
+        # Ends elsewhere that are near, or that the day does not reject, may not have arrived yet.
+        others = [self._arrived(e, best) for e in self.ends if e is not highest]
         first, best = best, max([best, *others], key=lambda e: e.total)
         apart = [(self._apart(e.state, best.state), e) for e in [first, *others] if e is not best]
         agreeing = [e for a, e in apart if a < self.same_rad]
@@ -197,13 +198,17 @@ class _Search:
                 f"from the best one ({basin.origin}), {basin.rival_z:.1f} standard errors behind"
             )
         alone = by_chance(self.poses, 1)
-        for k, name in enumerate(TERMS):
-            most = max((float(e.evidence[k]) for e in rivals), default=0.0)
-            if most > alone and basin.evidence[k] < _CONTRADICTED * most:
-                return (
-                    f"{name} contradict the best end of the search ({basin.origin}): they show another place"
-                )
+        for rival in rivals:
+            lead = np.array(basin.evidence) - rival.evidence
+            for k, name in enumerate(TERMS):
+                if rival.evidence[k] > alone and -lead[k] > _CONTRADICTED * (lead.sum() - lead[k]):
+                    return f"{name} contradict the best end of the search ({basin.origin}): they show another place"
         return ""
+
+    def _arrived(self, end: _End, best: _End) -> _End:
+        apart = self._apart(end.state, best.state)
+        is_rival = apart < self.leads_there_rad or _rejected(best, end) < CLEARLY
+        return self._finished(end) if is_rival and apart >= self.same_rad else end
 
     def _finished(self, end: _End) -> _End:
         return self._end(end.origin, refine(self.scored, end.state, steps=SCHEDULE.finishing_steps))

@@ -17,7 +17,7 @@ class Schedule:
     # Basin: candidates of different origin climb at the first kernel above.
     wide_climb_steps: int = 4
     climb_steps: int = 6
-    compared_points: int = 5000  # of each term, where ends are compared
+    compared_points: int = 4000  # of each term, where ends are compared
     finishing_steps: int = 4  # of the best end, and of others that are no worse
     # Grid of rotations: kernel, step in kernels, points of each term, share of matching edges that it presumes.
     grid_kernel_deg: float = 0.6
@@ -28,8 +28,8 @@ class Schedule:
     grid_frames: int = 24  # many points of few frames cost less than few points of many
     coarse_match: float = 0.1
     # How many of its poses by all terms together, and by each alone, are looked at with more points, and how many.
-    grid_chosen: tuple[int, int] = (150, 30)
-    chosen_points: int = 3000
+    grid_chosen: tuple[int, int] = (90, 20)
+    chosen_points: int = 2000
     # Of its maxima so many are climbed, so far apart.
     grid_maxima: int = 4
     grid_apart_kernels: float = 3.0
