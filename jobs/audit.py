@@ -70,7 +70,7 @@ def audit(
         statuses=count_statuses(findings),
         charts={s: charts.count(s) for s in DRIFT_STATUSES},
         moved=moved_sensors(findings),
-        realigned=realigned_radars([outcome]),
+        **realigned_radars([outcome]),
         next_steps=next_steps(findings, lake),
         damaged=damaged,
         report=report,

@@ -106,7 +106,7 @@ def _print_end(
     findings: Sequence[DriftFinding],
     pages: Sequence[str],
     mend: Mapping[str, str],
-    realigned: Sequence[Mapping[str, Any]],
+    realigned: Mapping[str, Any],
 ) -> None:
     """The night's summary: what became of the vehicle-days and of the vehicles, and where to read about it."""
     from jobs.terminal.summary import left_out, print_summary
@@ -122,7 +122,7 @@ def _print_end(
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
-        realigned=realigned,
+        **realigned,
         next_steps=next_steps(findings, str(tables)),
         misconfigured=mend,
         damaged=left_out(tables),

@@ -38,10 +38,11 @@ def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
     ]
 
 
-def realigned_radars(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """Which radars an audit found to have been turned by their own software, and when by how much."""
+def realigned_radars(outcomes: Sequence[Outcome]) -> dict[str, list[dict[str, str]]]:
+    """Under `realigned`, which radars' points an audit found turned by software, and by how much; empty without any."""
     events = SERVICE_EVENTS.rows_among(row for outcome in outcomes for row in outcome.records)
-    return [{"vehicle": e.vehicle, "sensor": e.sensor, "what": e.note} for e in events]
+    found = [{"vehicle": e.vehicle, "sensor": e.sensor, "what": e.note} for e in events]
+    return {"realigned": found} if found else {}
 
 
 def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:
