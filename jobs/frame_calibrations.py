@@ -70,7 +70,8 @@ def _of_prior(lake: Lake, fleet: FleetConfig, day: Partition) -> Mounting:
     for name in T:
         turn, shift = prior.sigmas_between(reference, name) if name != reference else (0.0, 0.0)
         about[name] = _about("prior", [float(np.degrees(turn))] * 3, [shift] * 3)
-    return Mounting(f"prior of {day.day}", reference, T, about, prior.between(BASE.name, reference))
+    without = {name: "nothing ties it to the others" for name in rig.sensors if name not in T}
+    return Mounting(f"prior of {day.day}", reference, T, about, prior.between(BASE.name, reference), without)
 
 
 def _of_calibration(lake: Lake, day: Partition, kind: str, method: str, *, force: bool) -> Mounting:
@@ -97,7 +98,7 @@ def _of_calibration(lake: Lake, day: Partition, kind: str, method: str, *, force
             turn = [float(np.degrees(s)) for s in sigma[:3]] or None
             about[sensor.name] = _about(_status(found, reference, sensor.name), turn, sigma[3:] or None)
             about[sensor.name] |= _doubts(found, reference, sensor.name)
-    return Mounting(found.source, reference, T, about, found.T_base)
+    return Mounting(found.source, reference, T, about, found.T_base, dict(found.left_out))
 
 
 def _about(

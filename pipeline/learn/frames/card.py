@@ -111,6 +111,7 @@ def _page(card: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
         f"\nNo two splits share a {', '.join(settings['split_by'])}. {_SYNCHRONISED}",
         "\n## Left out\n" + (_listed(card["frames_left_out"]) or "No frame."),
         *(f"- {d['vehicle']} {d['day']}: {d['reason']}" for d in card["vehicle_days_left_out"]),
+        *_without_pose(days),
         f"\n## Calibration: {settings['calibration']}\n{card['conventions']}",
         "\n| sensor | largest sigma of rotation [deg] | of place [m] |\n|---|---|---|\n" + "\n".join(worst),
     ]
@@ -126,6 +127,15 @@ def _page(card: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
 
 def _listed(counts: Mapping[str, int]) -> str:
     return "\n".join(f"- {n} frames: {reason.replace('_', ' ')}" for reason, n in sorted(counts.items()))
+
+
+def _without_pose(days: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line for each reason why poses are not given out, with the vehicle-days that it is of."""
+    of: dict[str, list[str]] = {}
+    for day in days:
+        for name, reason in day["calibration"]["left_out"].items():
+            of.setdefault(f"pose of {name}: {reason}", []).append(f"{day['vehicle']} {day['day']}")
+    return [f"- {words} ({len(on)} vehicle-days, the first {on[0]})" for words, on in sorted(of.items())]
 
 
 def _worst(days: Sequence[Mapping[str, Any]]) -> list[str]:

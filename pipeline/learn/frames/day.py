@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from pipeline.errors import BoresightError
 from pipeline.learn.frames.frame import Frame, Mounting, Perturbation, Place, read_frames
@@ -79,7 +79,12 @@ def export_day(task: DayTask, progress: Progress) -> str:
     poses = {
         n: {"T_reference_sensor": T.tolist()} | dict(mounting.about.get(n, {})) for n, T in mounting.T.items()
     }
-    calibration = {"source": mounting.source, "reference": mounting.reference, "sensors": poses}
+    calibration: dict[str, Any] = {
+        "source": mounting.source,
+        "reference": mounting.reference,
+        "sensors": poses,
+    }
+    calibration["left_out"] = dict(mounting.left_out)
     about = {"work_key": key, "vehicle": task.partition.vehicle, "day": task.partition.day}
     output.finish(task.partition, about | told | {"calibration": calibration, "parts": output.parts})
     return "done"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,7 @@ class Mounting:
         T: T_reference_sensor of each sensor whose pose is known, the reference too.
         about: by sensor what is known of the pose in plain values: status, sigmas, axes kept at the prior.
         T_base_reference: where the reference sits on the car; None where nobody knows.
+        left_out: why sensors have no pose here, by pair or sensor.
     """
 
     source: str
@@ -50,6 +51,7 @@ class Mounting:
     T: Mapping[str, Float[np.ndarray, "4 4"]]
     about: Mapping[str, Mapping[str, Any]]
     T_base_reference: Float[np.ndarray, "4 4"] | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def digest(self) -> str:
@@ -61,6 +63,7 @@ class Mounting:
             T_base,
             {n: T.tolist() for n, T in self.T.items()},
             dict(self.about),
+            dict(self.left_out),
         )
         return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 

@@ -21,6 +21,7 @@ from pipeline.learn.frames.images import undistortion_of
 from pipeline.learn.frames.torch_dataset import Frames
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import read_records
 from pipeline.store.views import frames_of
 from schemas.states import STATES, StateRow
 from tests.makers import training_lakes
@@ -32,6 +33,7 @@ EGO = {
     "ego_speed_mps": 10.0, "ego_yaw_rate_radps": 0.1, "ego_qw": 1.0, "ego_qx": 0.0, "ego_qy": 0.0, "ego_qz": 0.0,
     "ego_tx_m": 5.0, "ego_ty_m": 7.0, "ego_tz_m": 0.0,
 }  # fmt: skip
+NO_POSE = dict.fromkeys(("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m", "covariance"))
 SECTION = '[prepare]\nsplit_by = "vehicle"\nval_fraction = 0.2\ntest_fraction = 0.2'
 
 
@@ -292,6 +294,16 @@ def test_tonight_s_state_goes_out_with_its_sigmas_and_not_with_days_before_a_sen
     [left] = card["vehicle_days_left_out"]
     assert left["day"] == DAYS[0]
     assert f"counts since {DAYS[1]}" in left["reason"]
+    commit_records(Lake.at(tmp_path), STATES, [replace(r, status="none", reason="no day", **NO_POSE, work_key="n")
+                                               for r in read_records(Lake.at(tmp_path), STATES, StateRow)
+                                               if r.pair == "camera_lidar" and r.since is None][-1:])  # fmt: skip
+    export(tmp_path, tmp_path / "without", "parquet", "--calibration", "state", code=3)
+    assert (
+        "pose of camera_lidar: none: no day (1 vehicle-days"
+        in (tmp_path / "without" / "README.md").read_text()
+    )
+    assert Frames(str(tmp_path / "without"), "train")[0]["sensors"].keys() == {"lidar", "radar"}
+    states(tmp_path, moved_on=DAYS[1])
     # The same place again: that day's calibration changed, so its frames are made anew, and the other goes.
     export(tmp_path, tmp_path / "out", "parquet", "--calibration", "state", code=3)
     again = json.loads((tmp_path / "out" / "card.json").read_text())
