@@ -62,7 +62,9 @@ def test_cars_with_windows_are_held_and_pitch_is_as_unsure_as_the_evidence_is_ap
     assert "on pitch" in check.sentence
     assert "edges above a foreground" in check.sentence
     turn = log_so3((found.T @ inverse(T_TRUE))[:3, :3])
-    assert 1.0 < np.degrees(abs(turn[0])) < 3 * np.degrees(np.sqrt(found.covariance[0, 0]))
+    # The search ends at the truth, and the sills would turn it by more than a degree: nothing says which is right.
+    assert np.degrees(abs(turn[0])) < 0.1
+    assert np.degrees(np.sqrt(found.covariance[0, 0])) > 0.4
 
 
 def witness(name, offset_deg, scatter_deg=0.02, floor_deg=0.1, axis=0):
