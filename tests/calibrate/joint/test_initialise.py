@@ -206,3 +206,15 @@ def test_edges_in_view_are_those_that_the_camera_model_projects_into_the_image(d
     assert camera.model == camera_of(day[0]).model
     assert abs(int(terms.edges_in_view(at)[0]) - int(inside.sum())) <= 3  # single precision at the border
     assert 0 < inside.sum() < len(inside)
+
+
+def test_a_rival_near_by_is_asked_again_by_a_sharper_kernel(terms):
+    basin = replace(searched(terms, off_by(1.0, 0.02, 5)), rival_z=1.0, doubt="")
+    scored = Scored(terms, KernelSettings.wide(*SCHEDULE.kernels[-1]), off_by(1.0, 0.02, 5), SolveConfig())
+    best, same, other = (
+        AlignmentState(turned(T_TRUE, np.radians([angle, 0.0, 0.0]))) for angle in (0.0, 0.1, 1.0)
+    )
+    assert not initialise.settled(basin, scored, best, same).doubt  # both starts lead there
+    assert not initialise.settled(basin, scored, best, other).doubt  # the frames reject it
+    assert "fits the frames as well" in initialise.settled(basin, scored, other, best).doubt
+    assert initialise.settled(replace(basin, doubt="chance"), scored, best, same).doubt == "chance"

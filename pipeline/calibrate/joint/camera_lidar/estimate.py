@@ -17,7 +17,13 @@ from jaxtyping import Float
 
 from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS as BASIN_TERMS
 from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, sweep_s_per_rad
-from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
+from pipeline.calibrate.joint.camera_lidar.initialise import (
+    MARGIN_RAD,
+    Basin,
+    difference,
+    find_basin,
+    settled,
+)
 from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics, measure_intrinsics
 from pipeline.calibrate.joint.camera_lidar.observability import (
     IS_TZ,
@@ -73,7 +79,6 @@ __all__ = [
 
 _FEWEST_FRAMES = 5
 _FEWEST_EDGES = 20  # per frame
-_MARGIN_RAD = np.radians(2.0)  # points further out of view than this stay out of it
 _NEAR_PRIOR_M = 0.25
 _UNKNOWN_SHARE = 0.7  # of the prior's sigma: from there on the day's speeds did not determine the time offset
 
@@ -158,21 +163,25 @@ def align_camera_lidar(
     thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config, limits)
     basin = find_basin(terms, thin, rng)
     thin = replace(thin, terms=thin.terms.exposed_at(basin.state.alone), kernel=basin.kernel)
-    sharp = sharp.in_view(basin.state.T_camera_lidar, _MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
+    sharp = sharp.in_view(basin.state.T_camera_lidar, MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
     # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
     near = prior.translation_sigma_m <= _NEAR_PRIOR_M
     fixed = IS_TZ if near else NONE_FIXED
-    ends = [end for end in (basin.state, basin.second) if end is not None]
-    ends = [_at_prior_tz(end, prior, terms) if near else end for end in ends]
-    ends = [refine(thin, end, steps=SCHEDULE.first_steps, fixed=fixed) for end in ends]
+    starts = {"best": basin.state, "second": basin.second, "rival": basin.rival}
+    ends = {name: start for name, start in starts.items() if start is not None}
+    ends = {k: _at_prior_tz(end, prior, terms) if near else end for k, end in ends.items()}
+    ends = {k: refine(thin, end, steps=SCHEDULE.first_steps, fixed=fixed) for k, end in ends.items()}
     kernel = basin.kernel
     for sigma_px, contrast in SCHEDULE.kernels[1:]:
-        sharp = sharp.exposed_at(ends[0].alone)
-        fitted = sharp.fitted(ends[0].alone, KernelSettings.wide(sigma_px, contrast), rng)
-        kernel = weighted(sharp, ends[0], fitted)
+        sharp = sharp.exposed_at(ends["best"].alone)
+        fitted = sharp.fitted(ends["best"].alone, KernelSettings.wide(sigma_px, contrast), rng)
+        kernel = weighted(sharp, ends["best"], fitted)
         scored = Scored(sharp, kernel, prior, config, limits)
-        ends = [refine(scored, end, steps=SCHEDULE.sharper_steps, fixed=fixed) for end in ends]
-    state, second = ends[0], ends[1] if len(ends) > 1 else None
+        ends = {k: refine(scored, end, steps=SCHEDULE.sharper_steps, fixed=fixed) for k, end in ends.items()}
+    state, second = ends["best"], ends.get("second")
+    if (rival := ends.get("rival")) is not None:
+        basin = settled(basin, Scored(sharp, kernel, prior, config, limits), state, rival)
+        second = second or rival
     problem = CameraLidarProblem(
         sharp,
         prior,
@@ -241,7 +250,7 @@ def _terms(
     frames: Sequence[Observation], velocity_lidar: np.ndarray, prior: Prior, config: SolveConfig
 ) -> Terms:
     """The terms that the config asks for, with all points that the search range can bring into view."""
-    reach = search_range(prior, config).rotation_rad + _MARGIN_RAD
+    reach = search_range(prior, config).rotation_rad + MARGIN_RAD
     readout_s = prior.camera.readout_s
     terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar, reach_rad=reach, readout_s=readout_s)
     terms = terms.gaps_beyond(constant_gap_s(terms.gap_s))

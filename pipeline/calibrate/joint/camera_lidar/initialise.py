@@ -31,13 +31,16 @@ from pipeline.geometry.se3 import inverse, log_so3, transform_points
 from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 
-__all__ = ["Basin", "difference", "find_basin"]
+__all__ = ["MARGIN_RAD", "Basin", "difference", "find_basin", "settled"]
 
 # Ends that move the day's points by less than this (median angle), or by less than three quarters of the kernel at
 # which they are compared, are one optimum: sharper kernels pull in as much.
 _SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS = float(np.radians(0.5)), 0.75
 _ENDS_THAT_TELL = 2  # how far two starts of one optimum end apart
 _POINTS = 500  # that show how far two ends are apart
+# A rival no further off is asked again by sharper kernels: they keep the points in view from the best end, and
+# this far about it (`estimate`). From further off other points are seen, and what is seen there cannot be compared.
+MARGIN_RAD = float(np.radians(2.0))
 _SHIFT_SIGMAS = 3.0  # of the prior: how far wrong poses are shifted at most
 _CONTRADICTED = (
     0.5  # share of the other terms' lead by which a term must be for another place to contradict an end
@@ -62,6 +65,7 @@ class Basin:
         float  # how far the best end elsewhere moves the day's points (median angle); pi where there is none
     )
     rival_z: float  # standard errors by which the day's frames reject the ends elsewhere; infinity where there are none
+    rival: AlignmentState | None = None  # the end elsewhere that they do not reject; `settled` asks it again
     doubt: str = ""
 
 
@@ -100,9 +104,31 @@ def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator) -> Basin:
     search = _Search(scored, evidence)
     for origin, start, decides in _candidates(terms, scored, reach, wrong, rng):
         search.climb(origin, start)
-        if decides and not (basin := search.conclude()).doubt:
+        if decides and not (basin := search.conclude()).doubt and basin.rival is None:
             return basin
     return search.conclude()
+
+
+def settled(basin: Basin, scored: Scored, best: AlignmentState, rival: AlignmentState) -> Basin:
+    """The basin once its best end and the rival have arrived at a sharper kernel.
+
+    At the kernel of the search an end a degree away scores much alike; it leads to the same place, or is rejected.
+    """
+    apart = _apart_rad(scored.terms, best, rival)
+    lower = np.subtract(*(scored.terms.score(s.alone, scored.kernel)[0] for s in (best, rival)))
+    error = float(lower.std(ddof=1)) / np.sqrt(len(lower)) if len(lower) > 1 else np.inf
+    z = float(lower.mean()) / error if error > 0 else np.inf
+    basin = replace(basin, rival_rad=apart, rival_z=z)
+    if basin.doubt or apart < _SAME_OPTIMUM_RAD or z >= CLEARLY:
+        return basin
+    return replace(basin, doubt=_fits_as_well(basin))
+
+
+def _fits_as_well(basin: Basin) -> str:
+    return (
+        f"another end of the search fits the frames as well: {np.degrees(basin.rival_rad):.1f} deg "
+        f"from the best one ({basin.origin}), {basin.rival_z:.1f} standard errors behind"
+    )
 
 
 def difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]:
@@ -183,7 +209,10 @@ class _Search:
             np.pi if rival is None else self._apart(rival.state, best.state),
             np.inf if rival is None else _rejected(best, rival),
         )
-        return replace(basin, doubt=self._doubt(basin, rivals))
+        is_near = rival is not None and basin.rival_z < CLEARLY and basin.rival_rad < MARGIN_RAD
+        return replace(
+            basin, rival=rival.state if rival and is_near else None, doubt=self._doubt(basin, rivals)
+        )
 
     def _doubt(self, basin: Basin, rivals: Sequence[_End]) -> str:
         """Why the best end cannot be taken for right."""
@@ -192,11 +221,8 @@ class _Search:
                 f"no end of the search stands out from chance: the best one ({basin.origin}) shows {total:.0f} "
                 f"where chance alone shows {basin.needed:.0f}"
             )
-        if basin.rival_z < CLEARLY:
-            return (
-                f"another end of the search fits the frames as well: {np.degrees(basin.rival_rad):.1f} deg "
-                f"from the best one ({basin.origin}), {basin.rival_z:.1f} standard errors behind"
-            )
+        if basin.rival_z < CLEARLY and basin.rival_rad >= MARGIN_RAD:
+            return _fits_as_well(basin)
         alone = by_chance(self.poses, 1)
         for rival in rivals:
             lead = np.array(basin.evidence) - rival.evidence
