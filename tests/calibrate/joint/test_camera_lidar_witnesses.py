@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.calibrate.joint.camera_lidar import witnesses as parts
 from pipeline.calibrate.joint.camera_lidar.boxes import box_offsets
 from pipeline.calibrate.joint.camera_lidar.estimate import estimate_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.witnesses import Witness, disagreement, widening
@@ -114,3 +115,13 @@ def test_a_fit_that_all_boxes_contradict_is_held():
     assert check.fault == "witnesses_disagree"
     unsure = replace(asked[0], scatter_rad=np.radians(0.3))
     assert disagreement([unsure, asked[1]]) == []
+
+
+@pytest.mark.parametrize(("nats", "is_sure"), [(3.0, False), (30.0, True)])
+def test_a_part_that_hardly_prefers_its_own_place_does_not_contradict_the_fit(nats, is_sure):
+    turn = np.radians(np.linspace(-2.0, 2.0, 41))
+    score = np.zeros((41, 20))
+    score[0] += nats / 20  # in every frame alike, so that all resamples end there
+    offset, sigma = parts._maximum(turn, score, np.arange(20), np.random.default_rng(0))
+    assert np.degrees(offset) == pytest.approx(-2.0)
+    assert (sigma < abs(offset) / 3) == is_sure
