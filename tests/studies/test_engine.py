@@ -282,7 +282,7 @@ def test_the_table_of_rigs_says_how_far_off_the_worst_dof_is_and_what_was_refuse
     about = {"day": asdict(replace(SPEC, rig="bumper", fault="camera:dusk:1")), "cpu_s": 5.0}
     lines = rigs.summary([about | {"pairs": {"lidar_radar": pair}}]).splitlines()
     assert lines[2] == (
-        "| bumper camera:dusk:1 | 31 | refused | refused | 0.100 / 0.200 held, far 4.0 (ty) | 0.050 | 5.0 |"
+        "| bumper urban camera:dusk:1 | 31 | refused | refused | 0.100 / 0.200 held, far 4.0 (ty) | 0.050 | 5.0 |"
     )
 
 

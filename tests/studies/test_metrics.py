@@ -128,6 +128,6 @@ def test_certified_elevations_beyond_their_limit_and_witnesses_apart_are_counted
     assert "witnesses agree within two sigmas 2/3 (66.7 %)" in text
     assert "RMS pitch error/sigma 2.00" in text
     assert (
-        "| paper urban 2 | 38 | accepted | 0.700 | 0.800 | +2.0 | +0.00 +- 0.11 | - | +1.15 +- 0.17 | yes |"
+        "| paper urban 2 | 38 | accepted | 0.700 | 0.800 | +2.0 | +0.00 +- 0.11 | - | +1.15 +- 0.17 | - | yes |"
         in text
     )

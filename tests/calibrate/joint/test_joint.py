@@ -66,7 +66,7 @@ def solved_with_camera(monkeypatch, day, doubt, prior=PRIOR):
     """The solution of a day whose camera-lidar is put in its place: at the truth, sure, and so doubted."""
     kernel = KernelSettings.wide(4.0, 0)
     basin = Basin(
-        AlignmentState(T_CAMERA_LIDAR), None, kernel, "prior", 4, (9.0, 9.0, 9.0), 12.0, 0.1, 9.0, doubt
+        AlignmentState(T_CAMERA_LIDAR), None, kernel, "prior", 4, (9.0, 9.0, 9.0), 12.0, 0.1, 9.0, None, doubt
     )
     aligned = object.__new__(Aligned)  # without the terms and frames that nothing here looks at
     object.__setattr__(aligned, "basin", basin)
