@@ -17,10 +17,11 @@ from scipy import sparse
 
 from schemas.observations import Observation
 
-__all__ = ["FEWEST_BLOCKS", "FEWEST_SCENES", "blocks_of", "bootstrap_blocks", "scene_blocks", "scenes_of"]
+__all__ = ["FEWEST_SCENES", "blocks_of", "bootstrap_blocks", "scene_blocks", "scenes_of"]
 
 FEWEST_SCENES = 3  # of two one can only say that they differ
-FEWEST_BLOCKS = 8  # with fewer, neither a bootstrap nor a scatter over blocks knows its own spread
+
+_FEWEST_BLOCKS = 8  # with fewer, neither a bootstrap nor a scatter over blocks knows its own spread
 # A street looks otherwise after this way, or from a turn that brings in a third of a camera's view.
 _SCENE_M, _SCENE_RAD = 10.0, float(np.radians(20.0))
 # Share of a frame's depth edges that lie where those of another do. On eleven days of nine sensors (simulated, Astyx,
@@ -76,7 +77,7 @@ def bootstrap_blocks(
     F = len(drive)
     if F == 0:
         return np.zeros(0, np.int64)
-    size = max(1, F // max(most, FEWEST_BLOCKS))
+    size = max(1, F // max(most, _FEWEST_BLOCKS))
     block_of = np.full(int(scene.max()) + 1, -1)
     number, filled = 0, 0
     for f in range(F):
@@ -89,7 +90,9 @@ def bootstrap_blocks(
     return block_of[scene]
 
 
-def scene_blocks(observations: Sequence[Observation], at_least: int = FEWEST_BLOCKS) -> Int[np.ndarray, " F"]:
+def scene_blocks(
+    observations: Sequence[Observation], at_least: int = _FEWEST_BLOCKS
+) -> Int[np.ndarray, " F"]:
     """Block name of each frame, for scatter over scenes: its drive, whatever its length.
 
     Where the day has fewer drives than `at_least`, that many stretches of equally many frames, cut between scenes.

@@ -33,7 +33,6 @@ from pipeline.calibrate.joint.camera_lidar.time_offset import (
 )
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, CAMERA_LIDAR_DT_FLOOR_S, FOCAL_SIGMA
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed, response
-from pipeline.calibrate.numerics.frame_blocks import FEWEST_BLOCKS
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.common_share import prior_share
 from pipeline.extrinsics.estimates import Prior
@@ -172,33 +171,13 @@ def _fix_unobservable(
         state = refine(problem.scored(kernel), state, steps=steps, fixed=solved_for)
         day = day_covariance(problem, state, kernel, fixed)
         observability = np.where(fixed[:6], observability, day.observability)
-        told = np.where(fixed[:6], 0.0, _told(problem, state, kernel, fixed, day))
-        more_fixed = fixed | np.append(told < OBSERVABLE, [False, False])
+        more_fixed = fixed | np.append(observability < OBSERVABLE, [False, False])
         if more_fixed.sum() == fixed.sum():
             break
         fixed = more_fixed
     return ObservabilityAnalysis(
         problem.prior, state, kernel, fixed, day.covariance, day.common, day.floors, observability, profile
     )
-
-
-def _told(
-    problem: CameraLidarProblem,
-    state: AlignmentState,
-    kernel: KernelSettings,
-    fixed: Bool[np.ndarray, " 8"],
-    day: DayCovariance,
-) -> Float[np.ndarray, " 6"]:
-    """Observability by which to fix: of few scenes as if each frame were one.
-
-    A street or two do not know how sure they are, so their sigma is wide, wider than a prior's of 2 deg. What they show
-    is better than the prior all the same: at the prior, a street of KITTI stayed 1.6 deg of yaw off that it was begun
-    with, and .05 to .2 is what it shows.
-    """
-    if problem.blocks.max() + 1 >= FEWEST_BLOCKS:
-        return day.observability
-    frames = replace(problem, blocks=np.arange(problem.terms.frames))
-    return day_covariance(frames, state, kernel, fixed).observability
 
 
 def _timed(
