@@ -23,7 +23,7 @@ from pipeline.objective.camera_lidar.edges import (
     fit_match_share,
 )
 from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP, CameraMaps, prepare_maps
-from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX, KernelSettings
+from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX, WIDEST_GAP_RAD, KernelSettings
 from pipeline.objective.camera_lidar.mutual_information import class_information
 from pipeline.objective.camera_lidar.points import (
     CLASSES,
@@ -113,10 +113,15 @@ class Terms:
         return replace(self, edges=self.edges.chosen(narrow))
 
     def telling(self) -> Terms:
-        """Without wide edges, unless most of those between rows are: then nothing else may tell of pitch."""
+        """Without wide edges, unless most of those between rows are: then nothing else may tell of pitch.
+
+        Without those wider than WIDEST_GAP_RAD in any case.
+        """
         between = self.edges.side >= EDGE_ABOVE
         mostly_wide = 2 * np.count_nonzero(between & self._is_wide) > np.count_nonzero(between)
-        return self if mostly_wide else self.sharp(MAX_GAP_PX)
+        if not mostly_wide:
+            return self.sharp(MAX_GAP_PX)
+        return replace(self, edges=self.edges.chosen(self.edges.gap_rad <= WIDEST_GAP_RAD))
 
     def in_view(self, T_camera_lidar: Float[np.ndarray, "4 4"], margin_rad: float) -> Terms:
         """With the edges and markings that a pose puts into the image, or within a margin of it."""
