@@ -143,7 +143,7 @@ def next_step(vehicle: str, stored: VehicleStatus, lake: str = "LAKE") -> str:
         return ""
     of = f"--lake {quote(lake)} --vehicle {quote(vehicle)}"
     sensor = stored.sensor or "all"
-    load = f"load tonight's state, which rests on the days since: `boresight export FORMAT {of} --out FOLDER`"
+    load = f"load the state of tonight, which rests on the days since: `boresight export FORMAT {of} --out FOLDER`"
     if stored.status == "RED":
         what = f"how the {stored.sensor} is mounted" if stored.sensor else "how all sensors are mounted"
         service = f"`boresight service {of} --day YYYY-MM-DD --kind repair --sensor {sensor}`"
