@@ -40,6 +40,7 @@ _OF_ONE = 4.8
 # Share of a normal distribution beyond three sigmas, and the differences that it is worth.
 _NORMAL, _FAR_WORTH = 0.0027, 200.0
 _JUMP = 4.0  # sigmas of a difference that is no scatter
+_TAKEN_BACK = 0.25  # share of a day's error that the next day lacks, at least: days err alike by 0.6
 _AXES_DIFFER = 0.07  # autocorrelations of one edge's degrees of freedom
 _FAR = 3.0  # sigmas from its fleet beyond which a vehicle is no member of it
 _MOST_FREEDOM = 1000.0  # as good as known
@@ -70,7 +71,7 @@ class Noise:
     """Of each chart: factor on its sigmas (>= 1), the degrees of freedom it is known to, and the autocorrelation.
 
     Args:
-        far: share of days' differences beyond three sigmas.
+        far: share of days' differences beyond three sigmas, without changes that stay.
         less_alike: the same with the least autocorrelation that the days allow; None where there is one answer.
     """
 
@@ -245,10 +246,16 @@ def _scatter(
 
 
 def _far_off(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
-    """Share of an edge's differences beyond three sigmas, drawn towards the normal distribution's."""
+    """Share of an edge's differences beyond three sigmas, drawn towards the normal distribution's.
+
+    One of which neither difference beside it takes back a part is a change that stays, and no day far off.
+    """
     sigma = np.sqrt(_variance(np.moveaxis(z, 0, 2).reshape(*z.shape[1:3], -1))[0])
+    beside = np.pad(z, ((0, 0),) * 3 + ((1, 1),), constant_values=np.nan)
     with np.errstate(invalid="ignore"):
-        far = (np.abs(z) > 3 * sigma[None, :, :, None]).sum(axis=(0, 2, 3))
+        taken = np.minimum(beside[..., :-2] * np.sign(z), beside[..., 2:] * np.sign(z))
+        stays = taken > -_TAKEN_BACK * np.abs(z)  # not where there is none beside
+        far = (~stays & (np.abs(z) > 3 * sigma[None, :, :, None])).sum(axis=(0, 2, 3))
     return np.asarray((far + _NORMAL * _FAR_WORTH) / (np.isfinite(z).sum(axis=(0, 2, 3)) + _FAR_WORTH))
 
 
