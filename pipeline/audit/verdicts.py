@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from pipeline.audit.changes import Change, Levels, clearest, describe, levels_of
 from pipeline.audit.charts import Charts, clipped, thresholds
+from pipeline.audit.days import FEWEST_DAYS
 from pipeline.audit.noise import Noise
 from pipeline.audit.scan import Scan, scan_by
 from schemas.drift import DAYS_WILL_TELL
@@ -24,7 +25,8 @@ __all__ = ["ChartVerdict", "judge_charts"]
 _VISIBLE_SIGMAS = 2.0  # a chart shows a change that is at least this many sigmas of its best-placed split
 # RED says that a change is of a size that matters, not that it may be: with 95 %.
 _SURELY = 1.645
-# Degrees of freedom of a scale that is as good as known: where a person only looks again, what it lacks is not counted.
+# Degrees of freedom of a scale that is as good as known: where a person only looks again, what it lacks is not counted
+# of a chart whose own days tell how they scatter. Of one with fewer days it is: their scatter is a guess.
 _KNOWN = 240.0
 _TAME = 2  # days in a row that are no chance where single days are seldom far off
 _LASTING = "a lasting change of a size that matters"
@@ -95,9 +97,10 @@ def judge_charts(
     found = scan_by(charts, value, noise)
     z = [np.abs(z).max(axis=1, initial=0.0) for z in (found.z, found.drift_z)]
     # Steps and drifts share the budget; of a chart that counts which is further beyond its own threshold.
+    to_watch = np.where(charts.count < FEWEST_DAYS, noise.freedom, np.maximum(noise.freedom, _KNOWN))
     limits = [
         thresholds(charts.count, freedom, np.minimum(p, 0.5) / 2, noise.autocorrelation, of)
-        for freedom, p in zip((noise.freedom, np.maximum(noise.freedom, _KNOWN)), probability, strict=True)
+        for freedom, p in zip((noise.freedom, to_watch), probability, strict=True)
         for of in ("step", "drift")
     ]
     drifts = z[1] / limits[1] > z[0] / limits[0]

@@ -435,3 +435,24 @@ def test_what_begins_on_all_vehicles_at_once_is_no_scatter() -> None:
     still, moving = _fleet_noise(values), _fleet_noise(drifting)
     assert np.median(moving.scale) < 1.05 * np.median(still.scale)
     assert np.median(moving.autocorrelation) < np.median(still.autocorrelation) + 0.05
+
+
+def test_a_change_that_stays_is_no_day_far_off() -> None:
+    values = np.random.default_rng(10).normal(size=(1, 2, 8))
+    quiet = _fleet_noise(values).far[0]
+    stays, single = values.copy(), values.copy()
+    stays[0, 0, 3:] += 50
+    single[0, 0, 3] += 50
+    assert _fleet_noise(stays).far[0] == pytest.approx(quiet)
+    assert _fleet_noise(single).far[0] > 2 * quiet
+
+
+def test_a_change_that_may_have_begun_takes_more_where_few_days_say_how_they_scatter() -> None:
+    verdicts = []
+    for before in (2, 14):
+        charts = _charts([np.array([0.0] * before + [0.4, 0.4])], 0.1)
+        hardly = Noise(np.ones(1), np.full(1, 8.0), np.zeros(1), np.zeros(1))
+        verdicts += judge_charts(
+            charts, hardly, np.array([0.25]), np.array([[PROBABILITY], [20 * PROBABILITY]]), 2
+        )
+    assert [v.status for v in verdicts] == ["GREEN", "YELLOW"]
