@@ -16,6 +16,7 @@ FAULTS: Final = {
     "memory": "the day's logs ask for more memory than a worker may take",
     "model_output": "a perception model returns values that cannot be right",
     "moved_in_day": "a sensor moved during the day",
+    "no_labels": "there are no semantic labels of a camera",
     "odometry": "the odometry contradicts the other sources of motion",
     "orientation": "a sensor points elsewhere than its prior says by far",
     "prior": "the prior of a sensor's pose contradicts the day by many of its sigmas",

@@ -27,9 +27,15 @@ from schemas.calibrations import (
     CalibrationRecord,
     pairs_of,
 )
+from schemas.faults import FAULTS
 from schemas.moments import SENSORS_ABSENT
 
 __all__ = ["work"]
+
+_UNLABELLED = (
+    "labels_missing",
+    "detections_missing",
+)  # reasons of perceive's manifest: the image is not at fault
 
 
 def work(task: Task) -> Work:
@@ -105,7 +111,9 @@ def _absent(lake: Lake, partition: Partition) -> dict[str, str]:
         own = {name: n for name, n in counts.items() if name.startswith(f"without_{sensor}_")}
         if own:
             most = max(own, key=lambda name: own[name])
-            found[sensor] = f"most often {most.removeprefix(f'without_{sensor}_')}, {own[most]} times"
+            why = most.removeprefix(f"without_{sensor}_")
+            fault = f"{FAULTS['no_labels']}, {sensor}: " if why in _UNLABELLED else ""
+            found[sensor] = f"{fault}most often {why}, {own[most]} times"
     for manifest in (told_before, told):
         found |= {} if manifest is None else manifest.extra.get(SENSORS_ABSENT, {})
     return found

@@ -130,7 +130,7 @@ def _common_needs(e: Evidence) -> _Needs:
 
 def _camera_needs(e: Evidence) -> _Needs:
     if e.labels_share == 0:
-        return [("no", "no semantic labels: log them, or set semantics.source = 'onnx'")]
+        return [("no", "no semantic labels: log them, or name models (`boresight models fetch`)")]
     return [("weak", f"labels on {e.labels_share:.0%} of the frames only")] if e.labels_share < 0.5 else []
 
 

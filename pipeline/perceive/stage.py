@@ -44,6 +44,8 @@ WITHOUT_ROWS: Final = "frames_without_lidar_rows"
 # Likewise, of sweeps that no odometry de-skewed: moved by a radar's velocity, or left, for that was unknown.
 BY_DOPPLER: Final = "frames_deskewed_by_doppler"
 AS_LOGGED: Final = "frames_not_deskewed"
+# What to do about a camera without semantics, with its section of fleet.toml.
+_REMEDY: Final = "name its topics or models in {} (`boresight models fetch` downloads two models)"
 
 
 def work(task: Task) -> Work:
@@ -51,7 +53,7 @@ def work(task: Task) -> Work:
 
     A sensor that cannot be used is left out of its moment, a moment without two sensors is left out, counted by reason.
     Where none is left, the partition is empty and the outcome "refused". A camera without semantics is left out, and
-    what to set is said.
+    the remarks say what to do; moments of the sensors that are left are kept, even where that is one lidar.
 
     Raises:
         ConfigError: the vehicle or a model manifest is not as fleet.toml says.
@@ -91,9 +93,7 @@ def _rows(
             run.kept.update(found.notes)
             run.rejected.update(f"without_{sensor}_{why.value}" for sensor, why in found.unusable.items())
             yield found.moment, found.features
-    told = {
-        s: f"no semantics of {s}: name its topics or models in {section.replace('NAME', s)}" for s in blind
-    }
+    told = {s: f"{FAULTS['no_labels']}, {s}: {_REMEDY.format(section.replace('NAME', s))}" for s in blind}
     run.remarks = "; ".join(told.values())
     run.extra |= {PRIOR: ingested.extra.get(PRIOR, []), SENSORS_ABSENT: told}
 
@@ -161,8 +161,8 @@ def perceive_moment(
 
     Raises:
         ModelError: a model does not do what its manifest says.
-        FrameRejectedError: a sensor cannot be used, and not two are left that show anything together, or the moment is
-            not alone.
+        FrameRejectedError: a sensor cannot be used, and not two are left that show anything together (one, where all
+            others are cameras without semantics), or the moment is not alone.
     """
     moment, config = shown.moment, sources.config
     asked = {s: c for s, c in shown.captures.items() if shown.kinds[s] != "camera" or s in sources.cameras}
@@ -174,9 +174,9 @@ def perceive_moment(
         except FrameRejectedError as why:
             unusable[camera] = why.reason
     usable = _less(asked, unusable)
-    if len(usable) < min(2, len(shown.kinds)) or (
-        unusable and not _is_worth_having(shown, usable, alone=alone)
-    ):
+    # A camera without semantics joins no edge; a lidar that is left with it shows where the camera could be.
+    sighted = sum(kind != "camera" or s in sources.cameras for s, kind in shown.kinds.items())
+    if len(usable) < min(2, sighted) or (unusable and not _is_worth_having(shown, usable, alone=alone)):
         raise FrameRejectedError(next(iter(unusable.values()), FrameReason.NO_LABELS))
     # One generator per moment: the result does not depend on which came before.
     seed = [moment.stamp_ns & 0x7FFFFFFFFFFFFFFF, moment.moment]

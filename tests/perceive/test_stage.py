@@ -11,6 +11,7 @@ from pipeline.perceive.stage import WITHOUT_ROWS
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of, perceived
 from schemas.calibrations import SENSORS
+from schemas.faults import FAULTS
 from tests.makers.lakes import write_frames
 from tests.makers.stages import perceive_day
 
@@ -204,6 +205,22 @@ def test_a_day_without_labels_keeps_lidar_and_radar(lake, made_frame):
         assert (a.labels_png, len(a.road_user_boxes_px), a.road_contrast_png) == (b"", 0, None)
         np.testing.assert_array_equal(a.lidar_edge_xyz_m, b.lidar_edge_xyz_m)
         np.testing.assert_array_equal(a.radar_track_xyz_m, b.radar_track_xyz_m)
+
+
+def test_a_camera_without_semantics_leaves_a_lone_lidar_its_frames_and_says_what_to_do(lake, made_frame):
+    perceive_day(DAY, fleet(), lake)
+    whole, blind = rows(lake), fleet()
+    rig = blind.rigs["default"]
+    cameras = {"camera": rig.cameras["camera"].model_copy(update={"semantics": None})}
+    rig = rig.model_copy(update={"cameras": cameras, "radars": {}})
+    write(lake, [replace(made_frame(i), sensors=["camera", "lidar"]) for i in range(5)], key="blind")
+    result = perceive_day(DAY, blind.model_copy(update={"rigs": {"default": rig}}), lake)
+    assert (result.status, result.rows) == ("done", 5)
+    assert result.reason.startswith(FAULTS["no_labels"])
+    assert "boresight models fetch" in result.reason
+    for a, b in zip(rows(lake), whole, strict=True):
+        assert a.sensors == ["lidar"]
+        np.testing.assert_array_equal(a.lidar_edge_xyz_m, b.lidar_edge_xyz_m)
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

@@ -279,6 +279,9 @@ def _notes(pair: str, passed: int, below: Sequence[int], chosen: int, *, paper: 
 def _silent(pair: str, observations: Sequence[Observation], absent: Mapping[str, str]) -> SolveError | None:
     """What refuses a pair of which a sensor has too few frames; None where both have enough."""
     known = [absent[sensor] for sensor in FRAMES_OF_PAIR[pair] if sensor in absent]
+    unlabelled = next((why for why in known if _fault_in(why) == "no_labels"), None)
+    if unlabelled is not None and not any(set(FRAMES_OF_PAIR[pair]) <= set(o.sensors) for o in observations):
+        return SolveError(unlabelled, fault="no_labels")
     if known and len(observations) < MIN_FRAMES:
         both = sum(set(FRAMES_OF_PAIR[pair]) <= set(o.sensors) for o in observations)
         told = f"{both} moments have both sensors, {MIN_FRAMES} are needed ({known[0]})"

@@ -15,6 +15,7 @@ from pipeline.calibrate.select.frames import (
 )
 from pipeline.config import SelectConfig
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
+from schemas.faults import FAULTS
 from tests.makers.solve_scenes import make_day
 
 CONFIG = SelectConfig(frames=30)
@@ -195,6 +196,15 @@ def test_a_silent_sensor_costs_its_own_pairs_only_and_is_named(sensor):
         assert f"the {sensor} is silent: 5 of 30 frames have it" in why.reason
         assert "(nothing on /topic)" in why.reason
         assert chosen.rejected[pair][f"no_{sensor}"] == 25
+
+
+@pytest.mark.parametrize("frames", [5, 30])
+def test_a_camera_that_nobody_labels_is_not_called_silent(frames):
+    day = [make_changed(o, sensors=["lidar", "radar"]) for o in make_day(frames)]
+    why = f"{FAULTS['no_labels']}, camera: name models"
+    chosen = select_frames(day, CONFIG, paper=False, absent={"camera": why})
+    for pair in ("camera_lidar", "camera_radar"):
+        assert (chosen.refused[pair].reason, chosen.refused[pair].fault) == (why, "no_labels")
 
 
 def test_a_radar_that_dies_at_noon_leaves_its_pairs_the_morning():
