@@ -15,7 +15,6 @@ from pipeline.geometry.se3 import exp_so3, inverse, log_so3, transform_points
 from pipeline.geometry.spherical import from_spherical, to_spherical
 from tests.benchmarks.recovery import changed_radar
 from tests.benchmarks.studies import engine, rigs, table1
-from tests.benchmarks.studies.ablation import _settings, setting_of
 from tests.benchmarks.studies.commits import is_same_code
 from tests.benchmarks.studies.days import SETS, Day, DaySpec, label_by_network
 from tests.benchmarks.studies.engine import Run, key_of, prior_of, read_results, run_study, spoiled
@@ -294,12 +293,6 @@ def test_seeds_of_tuning_and_test_sets_never_meet():
     seeds = [seed for days in test.values() for seed in {d.seed for d in days}]
     assert max(tuning) < 200 <= min(seeds)
     assert len(set(seeds)) == len(seeds)
-
-
-def test_an_ablation_changes_one_thing_at_a_time():
-    settings = [setting_of(asdict(run)) for run in _settings(SPEC, 1)]
-    assert len(set(settings)) == len(settings) == 14
-    assert settings[0] == "all"
 
 
 def test_every_bad_day_of_the_verdict_study_has_a_name_and_good_days_have_none():

@@ -10,7 +10,7 @@ from pipeline.config import load_fleet
 from pipeline.geometry.se3 import exp_se3
 from pipeline.report.overlays import Extrinsics, Scene
 from schemas.calibrations import PAIRS
-from tests.benchmarks.studies import drivable, paper_figures, paper_ssl, paper_table, reflector_table
+from tests.benchmarks.studies import paper_figures, paper_ssl, paper_table, reflector_table
 from tests.benchmarks.studies.engine import RESULTS, read_results
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 from tests.makers.training_lakes import frame_of
@@ -132,22 +132,3 @@ def test_reflectors_are_recorded_and_every_method_has_run_before_they_are_evalua
     assert fleet.rig_of("vehicle-2").radar.drivable.model == "shipped:radar_drivable"
     assert fleet.solve.paper_loss_scale == "none"  # the paper's row to the letter
     fleet.require_files()
-
-
-def test_drivable_areas_are_compared_run_by_run_and_equation_2_to_the_letter_apart():
-    def line(day: int, area: str, az_deg: float, **solve: str) -> dict:
-        pairs = {"lidar_radar": {"az_deg": az_deg}}
-        return {
-            "method": "joint-optimisation",
-            "solve": solve,
-            "spoil": area,
-            "day": {"seed": day},
-            "pairs": pairs,
-        }
-
-    letter = {"paper_loss_scale": "none"}
-    results = [line(140, "", 0.4), line(140, "drivable", 0.3), line(141, "", 0.5)]
-    results += [line(140, "", 0.6, **letter), line(140, "drivable", 0.2, **letter)]
-    scaled, to_the_letter = list(drivable.METHODS)[1:]
-    found = [drivable.paired(results, m, "lidar_radar", "az_deg") for m in (scaled, to_the_letter)]
-    assert [tuple(v.tolist() for v in both) for both in found] == [([0.4], [0.3]), ([0.6], [0.2])]

@@ -14,7 +14,6 @@ from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from pipeline.learn.infer.aggregate import BIAS_SIGMA
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies import (
-    ssl_ablation,
     ssl_cross_rig,
     ssl_fleet,
     ssl_measures,
@@ -194,19 +193,6 @@ def test_the_bias_that_sigmas_lack_is_found():
     assert float(cells[-3]) == pytest.approx(np.degrees(bias[0]), abs=1e-3)
     blind = sigma_table([day_line(np.ones(6), sigma, observable=[0, 1, 1, 1, 1, 1])])
     assert "| m | camera_lidar | rx | 0 | -" in blind
-
-
-def test_the_ablation_has_a_row_per_pass_and_refused_pairs_keep_their_prior(measured):
-    line = measured | {"method": "m", "part": "frames", "iterations": 3}
-    refused = day_line(np.zeros(6), np.ones(6), iterations=1)
-    refused["pairs"] = {
-        p: {k: v for k, v in q.items() if k.startswith("prior") or k == "status"}
-        for p, q in refused["pairs"].items()
-    }
-    text = ssl_ablation.summary([line, day_line(np.zeros(6), np.ones(6)), refused])
-    assert [f"| m | {k} | frame, prior | 4 |" in text for k in (1, 2, 3)] == [True] * 3
-    assert "| m | 1 | day | 1 | 1.00 / 2.00 | 1.00 / 2.00 | 1.00 / 2.00 / 3.000 |" in text
-    assert "| m | 3 | day | 1 | 0.10 / 0.20 |" in text
 
 
 def test_a_network_that_was_trained_on_is_measured_again_and_the_old_lines_left_out(

@@ -50,7 +50,7 @@ class OccupancyMatcher(nn.Module):
         super().__init__()
         degree = float(np.pi / 180)
         # Azimuth, elevation [rad], range [m]: the radar's noise and the lidar's gaps. Where training starts was tuned
-        # on simulated days (tests/benchmarks/ssl_oracle.py).
+        # on simulated days (tests/benchmarks/ssl_oracle.py of 5add1d1).
         self.log_width = nn.Parameter(torch.log(torch.tensor([0.5 * degree, 1.2 * degree, 0.35])))
         self.log_floor = nn.Parameter(torch.tensor(0.0))
         # exp: how many independent detections a frame's mean log-likelihood is worth.

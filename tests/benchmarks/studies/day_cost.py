@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python tests/benchmarks/studies/day_cost.py --root DAYS [--profile 40]
 
-The days are the first two of set `ablation` (seeds that are burnt, 100 frames): for time they are as good as any. CPU
+The days are those of set `day-cost` (seeds that are burnt, 100 frames): for time they are as good as any. CPU
 time counts this process alone, but caches and a core's second thread are shared: on a busy machine it is up to a half
 more, so each day is calibrated several times and the least is stated.
 """
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS / "day_cost.json")
     args = parser.parse_args()
     lines = {}
-    for spec in SETS["ablation"][:2]:
+    for spec in SETS["day-cost"]:
         day, run = load_day(spec, args.root), Run(spec, seed=spec.seed)
         calibrate_once(Run(spec, seed=spec.seed, select={"frames": _FEW_FRAMES}), day)
         if args.profile:

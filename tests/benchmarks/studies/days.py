@@ -222,7 +222,6 @@ REAL = DaySpec(0, "real", 0, "real")
 # show draws new ones.
 SETS: dict[str, list[DaySpec]] = {
     "dev": _both(110, 16),
-    "dev-drivable": _both(140, 8),
     "dev-bad": [
         DaySpec(130, "urban", fault="camera:labels:1"),
         DaySpec(131, "highway", fault="camera:labels:1"),
@@ -281,6 +280,7 @@ SETS: dict[str, list[DaySpec]] = {
         )
     ],
     "worlds": _worlds(6400, 128),
+    "day-cost": [DaySpec(3800, "urban", 100), DaySpec(3801, "highway", 100)],
     "table1": [DaySpec(4600 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
     "one-clock": [
         DaySpec(4620 + i, "urban" if i < 5 else "highway", 100, "paper-one-clock") for i in range(10)
@@ -294,13 +294,6 @@ SETS: dict[str, list[DaySpec]] = {
         *_turned(4560),
     ],
     "offsets": [*_both(4700, 10, fault="camera:time:0.04"), *_both(4710, 10, fault="radar:time:0.04")],
-    # The same drives with sensors that the lidar triggers, that run freely, and with a camera that is 60 ms late.
-    "clocks": [
-        *_both(4120, 6),
-        *_both(4120, 6, rig="paper-free"),
-        *_both(4120, 4, fault="camera:time:0.06"),
-    ],
-    "dev-clocks": [*_both(160, 8), *_both(160, 8, rig="paper-free")],
     # Rigs in turn, so that whoever stops early has seen all of them; every fifth day at dusk. Seeds 4200 to 4215 are
     # burnt: that a refinement may lower its score was found on them.
     "basin": [
@@ -342,13 +335,6 @@ SETS: dict[str, list[DaySpec]] = {
     "dev-dirty": [
         DaySpec(120 + i, ("urban", "highway")[i // 6 % 2], rig=f"{rig}-dirty")
         for i, rig in enumerate(2 * ("paper", "ring16", "demo", "truck", "bumper", "spin128"))
-    ],
-    "ablation": [
-        DaySpec(3800, "urban", 100),
-        DaySpec(3801, "highway", 100),
-        DaySpec(3802, "urban", 100, "ring16"),
-        DaySpec(3803, "urban", 100, "paper-flat"),
-        DaySpec(3804, "urban", 100, "ring16-flat"),
     ],
 }
 
