@@ -73,6 +73,16 @@ def test_a_radar_that_points_down_is_turned_up_by_as_much():
     assert np.degrees(down.turn_rad - right.turn_rad) == pytest.approx(-1.0, abs=0.15)
 
 
+def test_a_radar_that_is_taken_for_higher_is_turned_down_by_what_is_said_of_its_height():
+    rng = np.random.default_rng(2)
+    rows = [kerbs_and_cars(rng, 0.3) for _ in range(15)]
+    higher = T_LIDAR_RADAR.copy()
+    higher[2, 3] += 0.1
+    right, high = (displaced_heights(rows, T, 0.0, np.random.default_rng(0)) for T in (T_LIDAR_RADAR, higher))
+    assert right.per_height_radpm > 0.03
+    assert (high.turn_rad - right.turn_rad) / 0.1 == pytest.approx(right.per_height_radpm, rel=0.3)
+
+
 def test_clutter_over_bare_road_and_tall_things_turn_little():
     for seed in range(2):
         found = displaced_heights(with_road(street_day(20, seed)), T_STREET, DT_S, np.random.default_rng(0))

@@ -72,7 +72,7 @@ class Heights:
     turn_rad: float  # by which they would turn the radar, nose down positive
     T_lidar_radar: Float[np.ndarray, "4 4"]  # before that turn
     displaced: float  # share of the detections
-    per_height_radpm: float  # by how much a radar that is taken for so much higher is turned
+    per_height_radpm: float  # by how much further it turns a radar that is taken for so much higher
     frames: HeightScores
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> Heights:
@@ -125,7 +125,8 @@ def displaced_heights(
         *(np.concatenate(column) for column in zip(*(vars(d).values() for d in each), strict=True))
     )
     x = minimize(lambda x: -_log_likelihood(day, x).sum(), _START, method="L-BFGS-B", bounds=_BOUNDS).x
-    return Heights(float(x[0]), T_lidar_radar, _share(x[2]), float(np.mean(1 / day.range_m)), _scores(day, x))
+    per_height, scores = _scores(day, x)
+    return Heights(float(x[0]), T_lidar_radar, _share(x[2]), per_height, scores)
 
 
 def _log_likelihood(day: _Detections, x: np.ndarray) -> np.ndarray:
@@ -146,8 +147,11 @@ def _share(logit: float) -> float:
     return float(1 / (1 + np.exp(-logit)))
 
 
-def _scores(day: _Detections, x: np.ndarray) -> HeightScores:
-    """Information and score of pitch with all else following; as sure as the frames scatter."""
+def _scores(day: _Detections, x: np.ndarray) -> tuple[float, HeightScores]:
+    """How pitch follows the radar's height, and its information and score with all else following.
+
+    It is as sure as the frames scatter.
+    """
     steps = np.diag(_STEP)
     S = np.stack(
         [(_log_likelihood(day, x + s) - _log_likelihood(day, x - s)) / (2 * s.sum()) for s in steps], 1
@@ -158,11 +162,15 @@ def _scores(day: _Detections, x: np.ndarray) -> HeightScores:
     others = np.linalg.lstsq(H[1:, 1:], H[1:, 0], rcond=None)[0]
     own = g[:, 0] - g[:, 1:] @ others
     information = float(H[0, 0] - H[0, 1:] @ others)
+    # A radar taken for higher sees all of a range r higher by 1 / r, as one that is turned up does by cos(azimuth).
+    higher = -S[:, 0] / (day.range_m * np.cos(day.azimuth))
+    per_height = -float((S[:, 0] - S[:, 1:] @ others) @ higher) / information
     # Detections of a thing err alike, and so do frames that show it: in pairs of frames.
     pairs = np.add.reduceat(own, np.arange(0, len(own), 2))
     alike = max(1.0, float(pairs @ pairs) / information)
     count = np.bincount(row) / len(row)
-    return HeightScores(information * count / alike, -(own - own.mean()) / alike, frame)
+    scores = HeightScores(information * count / alike, -(own - own.mean()) / alike, frame)
+    return per_height, scores
 
 
 def _detections(

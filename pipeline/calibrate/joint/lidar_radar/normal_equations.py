@@ -355,12 +355,12 @@ def _add_heights(problem: RadarProblem, state: RadarState, sums: _Sums) -> Witne
         return None
     H, g = _height_equations(problem.heights, state.T_lidar_radar, len(sums.g))
     witness = height_opinion(problem, state)
-    floor = _height_floor(problem, problem.heights) ** 2 * np.eye(2)
+    floor = HEIGHTS_PITCH_FLOOR_RAD**2 * np.diag([1.0, 1.0, 0.0])
     H, g = tempered(H, g, floor)
-    sums.floors[:2, :2] += floor_scatter(H, floor)
+    sums.floors[np.ix_(ELEVATION_DOF, ELEVATION_DOF)] += floor_scatter(H, floor)
     for array in (sums.H, sums.information):
-        array[:, :2, :2] += H
-    sums.g[:, :2] += g
+        array[np.ix_(np.arange(len(H)), ELEVATION_DOF, ELEVATION_DOF)] += H
+    sums.g[:, ELEVATION_DOF] += g
     return witness
 
 
@@ -370,25 +370,28 @@ def height_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
         return None
     H, g = _height_equations(problem.heights, state.T_lidar_radar, len(problem.observations))
     H_own, g_own = tilt_of(state.T_lidar_radar, H.sum(0), g.sum(0))
-    return own_opinion("heights", H_own[1:, 1:], g_own[1:], _height_floor(problem, problem.heights))
-
-
-def _height_floor(problem: RadarProblem, heights: Heights) -> float:
-    """Sigma of their pitch on every day: by the mixture, and by how high the prior has the radar."""
-    by_prior = heights.per_height_radpm * problem.prior.translation_sigma_m
-    return float(np.hypot(HEIGHTS_PITCH_FLOOR_RAD, by_prior))
+    by_height = problem.heights.per_height_radpm * problem.prior.translation_sigma_m
+    floor_rad = float(np.hypot(HEIGHTS_PITCH_FLOOR_RAD, by_height))
+    return own_opinion("heights", H_own[1:2, 1:2], g_own[1:2], floor_rad)
 
 
 def _height_equations(
     heights: Heights, T_lidar_radar: np.ndarray, frames: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Information (F 2 2) and gradient (F 2) of turns about the lidar's x and y."""
+    """Information (F 3 3) and gradient (F 3) of turns about the lidar's x and y and of z.
+
+    One number is measured: pitch as the radar's height makes it. A radar that is lower than it is taken for is turned
+    too far down by so much that targets some 20 m away stay where they are.
+    """
     axis = radar_tilt_axes(T_lidar_radar)[:, 1]
     turned = float(change_between(heights.T_lidar_radar, T_lidar_radar)[:2] @ axis)
-    H, g = np.zeros((frames, 2, 2)), np.zeros((frames, 2))
+    higher_m = T_lidar_radar[2, 3] - heights.T_lidar_radar[2, 3]
+    residual = turned - heights.turn_rad - heights.per_height_radpm * higher_m
+    J = np.append(axis, -heights.per_height_radpm)
+    H, g = np.zeros((frames, 3, 3)), np.zeros((frames, 3))
     each = heights.frames
-    H[each.frame] = each.information[:, None, None] * np.outer(axis, axis)
-    g[each.frame] = (each.score + each.information * (turned - heights.turn_rad))[:, None] * axis
+    H[each.frame] = each.information[:, None, None] * np.outer(J, J)
+    g[each.frame] = (each.score + each.information * residual)[:, None] * J
     return H, g
 
 
