@@ -51,9 +51,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "jobs.train_lidar_semantics:train_lidar_semantics",
         "A small range-image network for lidar points, taught by the camera.",
     ),
-    "models": (
-        "jobs.models:models",
-        "The networks that ship: purpose, licence, size, sha256, command, card.",
+    "models": ("jobs.models:models", "The networks that ship, and those that `models fetch` downloads."),
+    "models list": ("jobs.models:models", "The same as `models`."),
+    "models fetch": (
+        "jobs.models:fetch",
+        "Download a segmenter and a detector for cameras without labels; licence and sha256 are shown.",
     ),
     "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
     "service": ("jobs.service:service", "Note a repair, a re-mount or a release: charts begin anew."),

@@ -33,6 +33,7 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
     with atomic_write(out) as file:
         file.write(proposal.text.encode())
     some = " ".join(str(p) for p in logs[:2]) + (" ..." if len(logs) > 2 else "")
+    unlabelled = any(what.endswith(": semantics") for what in proposal.missing)
     pattern = proposal.logs_pattern or "logs/{vehicle}/{day}/*"
     print_summary(
         "init",
@@ -42,6 +43,7 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
         to_enter=list(proposal.missing),
         problems=list(proposal.problems),
         next_steps=[
+            *(["boresight models fetch"] if unlabelled else []),
             f"boresight check {out} {some}",
             f'boresight nightly --fleet {out} --lake lake --logs "{pattern}"',
         ],

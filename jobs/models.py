@@ -1,33 +1,46 @@
-"""`boresight models`: the networks that ship, what they are for, and whether the files are the right ones."""
+"""`boresight models`: networks that ship and networks to download: what for, under which licence, and whether whole."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping
 
-    from pipeline.shipped_models import ShippedModel
+    from pipeline.third_party_models import ThirdPartyModel
 
-__all__ = ["models"]
+__all__ = ["fetch", "models"]
 
 _WIDTH = 120  # columns, also where nobody watches: a sha256 and a path fit
 
 
 def models(*, json: bool = False) -> int:
-    """List every model that ships with the package, and compare each file with the sha256 of its card.
+    """List the models that ship, compared with the sha256 of their cards, and those that `models fetch` downloads.
 
     Exit code 1 where a file is not the one that its card speaks of, or a card lacks something.
 
     Args:
-        json: the summary's "models" holds the whole cards.
+        json: the summary's "models" and "to_fetch" hold all that is known of them.
     """
+    from dataclasses import asdict
+
     from jobs.terminal.summary import print_summary
     from pipeline.shipped_models import shipped_models
+    from pipeline.third_party_models import CATALOGUE
 
     found = shipped_models()
-    if not json:
-        _print_table(found)
+    for model in () if json else found:
+        card = model.card
+        size = f"{card.get('bytes', 0) / 1e6:.1f} MB, {card.get('parameters', 0):,} parameters"
+        rows = {
+            "for": card.get("purpose", ""), "licence": card.get("license", ""), "size": size,
+            "sha256": card.get("sha256", ""), "made by": card.get("command", ""),
+            "card": str(model.file.with_suffix(".md")), "file": "; ".join(model.problems) or "as its card says",
+        }  # fmt: skip
+        _print_block(model.name, rows)
+    for other in () if json else CATALOGUE:
+        _print_block(f"{other.name} (to download: boresight models fetch {other.name})", _facts(other))
     wrong = [model for model in found if model.problems]
     print_summary(
         "models",
@@ -37,26 +50,69 @@ def models(*, json: bool = False) -> int:
             | (model.card if json else {})
             for model in found
         ],
+        to_fetch=[asdict(other) if json else other.name for other in CATALOGUE],
     )
     return 1 if wrong else 0
 
 
-def _print_table(found: Sequence[ShippedModel]) -> None:
-    """One block per model, for people, on stderr."""
+def fetch(*names: str, into: Path = Path("models"), mirror: str | None = None) -> int:
+    """Download models of other people, with manifests, for cameras whose labels nobody logs.
+
+    Address, size and licence are shown first. The sha256 is checked before a file appears. A broken download goes on
+    where it broke.
+
+    Args:
+        names: of `boresight models list`; default: a segmenter and a detector, which a camera needs both.
+        into: folder for the files; fleet.toml names it relative to itself.
+        mirror: address of a folder with the files NAME.onnx, in place of the pinned addresses.
+    """
+    from jobs.terminal.summary import print_summary, progress_reporter
+    from pipeline.perceive.models.download import download
+    from pipeline.store.atomic_write import atomic_write
+    from pipeline.third_party_models import manifest_text, named, semantics_line
+
+    chosen = named(names)
+    fetched, there = list[str](), list[str]()
+    for model in chosen:
+        _print_block(model.name, _facts(model))
+        url = f"{mirror.rstrip('/')}/{model.name}.onnx" if mirror else model.url
+        with progress_reporter(f"fetch {model.name}") as progress:
+            came = download(url, into / f"{model.name}.onnx", model.size_bytes, model.sha256, progress)
+        (fetched if came else there).append(model.name)
+        with atomic_write(into / f"{model.name}.toml") as file:
+            file.write(manifest_text(model).encode())
+    print_summary(
+        "models fetch",
+        "done",
+        fetched=fetched,
+        already_there=there,
+        into=str(into),
+        enter_in_fleet_toml=f"[rigs.NAME.camera]\n{semantics_line(str(into))}",
+        next_steps=[
+            f"enter the `semantics` line under the camera in fleet.toml: {semantics_line(str(into))}"
+        ],
+    )
+    return 0
+
+
+def _facts(model: ThirdPartyModel) -> dict[str, str]:
+    purpose = {"segment": "semantic labels of images", "detect": "road users in images"}[model.task]
+    return {
+        "for": purpose, "licence": model.licence, "its text": model.licence_url,
+        "size": f"{model.size_bytes / 1e6:.1f} MB", "from": model.url, "sha256": model.sha256,
+        "tried here": model.tried,
+    }  # fmt: skip
+
+
+def _print_block(title: str, rows: Mapping[str, object]) -> None:
+    """One model, for people, on stderr."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    console = Console(stderr=True, width=_WIDTH, highlight=False)
-    for model in found:
-        card = model.card
-        table = Table(box=None, show_header=False, title=model.name, title_justify="left", title_style="bold")
-        size = f"{card.get('bytes', 0) / 1e6:.1f} MB, {card.get('parameters', 0):,} parameters"
-        rows = {
-            "for": card.get("purpose", ""), "licence": card.get("license", ""), "size": size,
-            "sha256": card.get("sha256", ""), "made by": card.get("command", ""),
-            "card": str(model.file.with_suffix(".md")), "file": "; ".join(model.problems) or "as its card says",
-        }  # fmt: skip
-        for name, value in rows.items():
-            table.add_row(f"  {name}", escape(str(value)))  # a card may say `[learn]`, which is no style
-        console.print(table)
+    table = Table(box=None, show_header=False, title=title, title_justify="left", title_style="bold")
+    table.add_column()
+    table.add_column(overflow="fold")
+    for name, value in rows.items():
+        table.add_row(f"  {name}", escape(str(value)))  # a card may say `[learn]`, which is no style
+    Console(stderr=True, width=_WIDTH, highlight=False).print(table)

@@ -11,6 +11,7 @@ __all__ = [
     "ContractError",
     "DamagedError",
     "DamagedLogError",
+    "DownloadError",
     "LogError",
     "MissingExtraError",
     "ModelError",
@@ -95,6 +96,14 @@ class MissingExtraError(BoresightError):
         super().__init__(
             f"needs {module}, which comes with the extra [{extra}]: pip install 'boresight[{extra}]'"
         )
+
+
+class DownloadError(BoresightError):
+    """A file that the web did not give; nothing was placed."""
+
+    def __init__(self, url: str, problem: str) -> None:
+        self.url, self.problem = url, problem
+        super().__init__(f"{url}: {problem}")
 
 
 class ModelError(BoresightError):

@@ -32,6 +32,7 @@ FOUNDATIONS = {
     "ros_messages",
     "rows",
     "shipped_models",
+    "third_party_models",
     "work",
 }
 # Folders of commands.

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors
+from pipeline.third_party_models import semantics_line
 
 __all__ = ["Facts", "RadarMeaning", "fleet_text", "names_of"]
 
@@ -104,14 +105,14 @@ def _of_rig(facts: Facts, *, is_short: bool) -> list[str]:
 def _camera(camera: FoundCamera) -> Iterator[str]:
     yield f"image = {json.dumps(camera.image)}"
     yield f"info = {json.dumps(camera.info)}"
-    models = 'semantics = { source = "onnx", segmenter = "segmenter.toml", detector = "detector.toml" }'
     if not (camera.labels and camera.detections):
         has = "no" if not (camera.labels or camera.detections) else "only"
         what = (
             "label images or detections" if has == "no" else "label images" if camera.labels else "detections"
         )
-        yield f"# The logs have {has} {what} of this camera, and it needs both. Log them, or name models:"
-        yield f"# {models}"
+        yield f"# The logs have {has} {what} of this camera, and it needs both. Log them, or name two models, of yours"
+        yield "# or those that `boresight models fetch` downloads into models/ (mind their licences):"
+        yield f"# {semantics_line('models')}"
         return
     known = "" if camera.label_set in ("cityscapes", "") else f', label_set = "{camera.label_set}"'
     topics = f"labels = {json.dumps(camera.labels)}, detections = {json.dumps(camera.detections)}"
