@@ -64,14 +64,11 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
 
 def _following(report: CheckReport, fleet: Path, logs: tuple[Path, ...]) -> list[str]:
     """The commands to type next: models where nobody labels the cameras, and the night where it can calibrate."""
-    from pipeline.ingest.propose.logs_pattern import logs_pattern
+    from pipeline.ingest.propose.logs_pattern import nightly_command
 
     unlabelled = any(why.startswith("no semantic labels") for v in report.verdicts for why in v.reasons)
     fetch = ["boresight models fetch"] if unlabelled else []
-    if report.answer == "no":
-        return fetch
-    pattern = logs_pattern(logs) or "logs/{vehicle}/{day}/*"
-    return [*fetch, f'boresight nightly --fleet {fleet} --lake lake --logs "{pattern}"']
+    return fetch if report.answer == "no" else [*fetch, *nightly_command(fleet, logs)]
 
 
 def _worst(report: CheckReport, pair: str) -> str:

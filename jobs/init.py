@@ -18,6 +18,7 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
     """
     from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.errors import ConfigError
+    from pipeline.ingest.propose.logs_pattern import nightly_command
     from pipeline.ingest.propose.propose import propose_fleet
     from pipeline.store.atomic_write import atomic_write
 
@@ -32,9 +33,10 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
         proposal = propose_fleet(logs, name, progress)
     with atomic_write(out) as file:
         file.write(proposal.text.encode())
-    some = " ".join(str(p) for p in logs[:2]) + (" ..." if len(logs) > 2 else "")
+    read = proposal.logs
+    some = " ".join(str(p) for p in read[:2]) + (" ..." if len(read) > 2 else "")
     unlabelled = any(what.endswith(": semantics") for what in proposal.missing)
-    pattern = proposal.logs_pattern or "logs/{vehicle}/{day}/*"
+    fetch = ["boresight models fetch"] if unlabelled else []
     print_summary(
         "init",
         "done",
@@ -42,10 +44,6 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
         sensors=list(proposal.sensors),
         to_enter=list(proposal.missing),
         problems=list(proposal.problems),
-        next_steps=[
-            *(["boresight models fetch"] if unlabelled else []),
-            f"boresight check {out} {some}",
-            f'boresight nightly --fleet {out} --lake lake --logs "{pattern}"',
-        ],
+        next_steps=[*fetch, f"boresight check {out} {some}", *nightly_command(out, read)],
     )
     return 0

@@ -75,6 +75,7 @@ def prepare(
         choices=[asdict(c) for c in choices],
         leaks=len(inventory.leaks),
         problems=_problems(config, results, inventory),
+        next_steps=_next_steps(config, fleet, lake, choices, _empty_sides(config, inventory)),
         manifest=path,
     )
     return code
@@ -180,8 +181,29 @@ def _about(config: FleetConfig) -> dict[str, Any]:
 
 
 def _empty_sides(config: FleetConfig, inventory: Inventory) -> list[str]:
-    wanted = {"train": 1.0, "val": config.prepare.val_fraction, "test": config.prepare.test_fraction}
-    return [side for side, share in wanted.items() if share > 0 and not inventory.frames[side]]
+    return [side for side in _wanted_sides(config) if not inventory.frames[side]]
+
+
+def _wanted_sides(config: FleetConfig) -> list[str]:
+    shares = {"train": 1.0, "val": config.prepare.val_fraction, "test": config.prepare.test_fraction}
+    return [side for side, share in shares.items() if share > 0]
+
+
+def _next_steps(
+    config: FleetConfig, fleet: Path, lake: str, choices: Sequence[Choice], empty: Sequence[str]
+) -> list[str]:
+    """Train, or split by what these days can be told apart by: the choices begin with what shares least."""
+    if not empty:
+        return [f"boresight train --data {lake} --out run"]
+    wanted = _wanted_sides(config)
+    for choice in choices:
+        if all(choice.frames[side] for side in wanted):
+            by = ", ".join(f'"{name}"' for name in choice.split_by)
+            frames = ", ".join(f"{choice.frames[side]} {side}" for side in wanted)
+            return [f"set split_by = [{by}] under [prepare] in {fleet}: {frames} frames; then prepare again"]
+    return [
+        f"set val_fraction and test_fraction to 0 under [prepare] in {fleet}, or add days; then prepare again"
+    ]
 
 
 def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Inventory) -> list[dict[str, str]]:
@@ -195,7 +217,7 @@ def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Invent
         {
             "side": side,
             "status": "held",
-            "reason": f"no frames: too few to tell apart by {by} (prepare.split_by)",
+            "reason": f"no frames: too few to keep the sides apart by {by} (prepare.split_by)",
         }
         for side in _empty_sides(config, inventory)
     ]

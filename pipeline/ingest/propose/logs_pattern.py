@@ -6,15 +6,32 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["logs_pattern"]
+__all__ = ["logs_pattern", "nightly_command"]
 
+_SUFFIXES = {".mcap", ".bag", ".db3", ".zstd"}
 _DAY = re.compile(r"\d{4}-?\d{2}-?\d{2}")
 
 
 def logs_pattern(logs: Sequence[Path]) -> str:
-    """Where the logs are, as `boresight nightly --logs` wants it; "" where their names tell no vehicle or day."""
-    patterns = {_pattern(path) for path in logs}
+    """Where the logs are, as `boresight nightly --logs` wants it; "" where their names tell no vehicle or day.
+
+    Files that are no logs (a licence beside them, a calibration) do not count: a shell's `logs/*` names them too.
+    """
+    paths = [path for path in logs if path.is_dir() or path.suffix in _SUFFIXES]
+    patterns = {_pattern(path) for path in paths}
+    if len(patterns) > 1:  # recorded in several formats
+        patterns = {_pattern(path.with_suffix("")) for path in paths}
     return patterns.pop() if len(patterns) == 1 else ""
+
+
+def nightly_command(fleet: Path, logs: Sequence[Path]) -> list[str]:
+    """The night's command for these logs, behind what must be done first where their names tell no vehicle or day."""
+    pattern = logs_pattern(logs)
+    first = (
+        [] if pattern else [f"move each log to logs/VEHICLE/DAY/, as logs/car-1/2026-05-31/{logs[0].name}"]
+    )
+    shown = pattern or "logs/{vehicle}/{day}/*"
+    return [*first, f'boresight nightly --fleet {fleet} --lake lake --logs "{shown}"']
 
 
 def _pattern(path: Path) -> str:

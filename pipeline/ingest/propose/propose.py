@@ -1,4 +1,4 @@
-"""A fleet.toml for some logs: survey, sensors, what the radars' numbers mean, and the pattern that finds the logs."""
+"""A fleet.toml for some logs: survey, sensors, and what the radars' numbers mean."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from pipeline.ingest.index import index_logs
 from pipeline.ingest.moments import MomentBuilder
 from pipeline.ingest.propose.doppler import doppler_period, doppler_sign
 from pipeline.ingest.propose.fleet_file import Facts, RadarMeaning, fleet_text, names_of
-from pipeline.ingest.propose.logs_pattern import logs_pattern
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors, find_sensors
 from pipeline.ingest.propose.survey import Survey, survey_logs
 from pipeline.ingest.rig_sample import RigSample
@@ -35,12 +34,12 @@ _VEHICLE_FRAMES = ("base_link", "base_footprint", "vehicle", "ego_vehicle", "rea
 
 @dataclass(frozen=True)
 class Proposal:
-    """The file's text, the pattern that finds these logs ("" where their names tell no day), and what went wrong."""
+    """The file's text, the logs that could be read, and what went wrong."""
 
     text: str
     sensors: tuple[str, ...]
     missing: tuple[str, ...]
-    logs_pattern: str
+    logs: tuple[Path, ...]
     problems: tuple[str, ...]
 
 
@@ -70,12 +69,12 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
     def text(meanings: Mapping[str, RadarMeaning]) -> str:
         return fleet_text(fleet, found, names, Facts(static, untied, frames, meanings))
 
-    meanings = _meanings(logs, text({}), found, names, progress)
+    meanings = _meanings(survey.logs, text({}), found, names, progress)
     cameras = {n: s for n, s in names.items() if isinstance(s, FoundCamera)}
     missing = [f"{n}: semantics" for n, s in cameras.items() if not (s.labels and s.detections)]
     missing += ["prior: transforms between the sensors"] if untied or not static else []
     missing += [f"{n}: the Doppler's sign" for n, m in meanings.items() if not m.positive]
-    return Proposal(text(meanings), tuple(names), tuple(missing), logs_pattern(logs), tuple(survey.problems))
+    return Proposal(text(meanings), tuple(names), tuple(missing), tuple(survey.logs), tuple(survey.problems))
 
 
 def _static(survey: Survey) -> tuple[str, TransformTree]:

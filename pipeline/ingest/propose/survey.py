@@ -39,11 +39,12 @@ class Topic:
 
 @dataclass(eq=False)
 class Survey:
-    """What logs hold. `transforms` are of the topics that say where frames are, one tree a topic."""
+    """What the `logs` that could be read hold. `transforms`: of each topic that says where frames are, one tree."""
 
     topics: dict[str, Topic] = field(default_factory=dict)
     transforms: dict[str, TransformTree] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+    logs: list[Path] = field(default_factory=list)
 
     def of(self, role: str) -> list[Topic]:
         """Topics whose type fits a role, by name."""
@@ -65,6 +66,7 @@ def survey_logs(logs: Sequence[Path], progress: Progress = silent) -> Survey:
         except LogError as err:
             survey.problems.append(str(err))
             continue
+        survey.logs.append(path)
         try:
             _look_through(log, survey)
         finally:

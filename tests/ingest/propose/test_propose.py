@@ -13,7 +13,7 @@ from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.fleet.pattern import find_vehicle_days
 from pipeline.ingest.propose.doppler import doppler_period
-from pipeline.ingest.propose.logs_pattern import logs_pattern
+from pipeline.ingest.propose.logs_pattern import logs_pattern, nightly_command
 from pipeline.ingest.propose.propose import propose_fleet
 from pipeline.store.partitions import Partition
 from tests.makers import alignment_messages
@@ -194,6 +194,19 @@ def test_the_pattern_finds_logs_by_folders_and_by_names(tmp_path):
     assert len(found.logs) == 2
     assert logs_pattern([tmp_path / "drive.mcap"]) == ""
     assert logs_pattern([Path("in/car/2026-03-02/raw/a.bag")]) == "in/{vehicle}/{day}/raw/*.bag"
+
+
+def test_files_beside_the_logs_and_several_formats_do_not_hide_the_pattern():
+    named = [Path(f"logs/{name}") for name in ("LICENSE.txt", "a_2026-03-02_0.mcap", "a_2026-03-02_1.bag")]
+    assert logs_pattern(named) == "logs/{vehicle}_{day}*"
+    in_folders = [Path("in/a/2026-03-02/x.bag"), Path("in/b/2026-03-02/y.mcap"), Path("in/notes.txt")]
+    assert logs_pattern(in_folders) == "in/{vehicle}/{day}/*"
+
+
+def test_logs_whose_names_tell_no_day_are_to_be_moved_before_the_night():
+    first, then = nightly_command(Path("fleet.toml"), [Path("drive.mcap")])
+    assert first == "move each log to logs/VEHICLE/DAY/, as logs/car-1/2026-05-31/drive.mcap"
+    assert then.endswith('--logs "logs/{vehicle}/{day}/*"')
 
 
 @pytest.mark.real_logs

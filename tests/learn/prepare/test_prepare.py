@@ -221,8 +221,12 @@ def test_the_job_tells_counts_and_exit_codes(tmp_path, capsys):
     code, told = run("--vehicles", "a", "--vehicles", "b")
     assert (code, told["status"]) == (3, "held")  # two vehicles fill two sides
     assert [p["side"] for p in told["problems"]] == ["test"]
+    assert told["next_steps"] == [
+        f"set val_fraction and test_fraction to 0 under [prepare] in {fleet}, or add days; then prepare again"
+    ]
     code, told = run()
     assert (code, told["status"], told["done"], told["cached"]) == (0, "done", 1, 2)
+    assert told["next_steps"] == [f"boresight train --data {lake.root} --out run"]
     assert told["frames"] == {"train": 2, "val": 2, "test": 2}
     assert sum(told["environments"]["train"].values()) == 2
     assert [c["split_by"] for c in told["choices"] if c["chosen"]] == [["vehicle"]]
