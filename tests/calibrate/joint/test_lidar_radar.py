@@ -123,6 +123,13 @@ def test_others_are_less_sure_where_what_they_lean_on_rests_on_a_wider_prior(day
     assert vague.covariance[2, 2] > sure.covariance[2, 2] + np.radians(0.01) ** 2
 
 
+def test_roll_is_drawn_anew_every_day_and_most_of_pitch_is_not(day):
+    found = solve(day[:24], Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, SIGMA_ROTATION, SIGMA_SHIFT))
+    assert found.observable[:2].all()
+    alike = np.diag(found.common_covariance) / np.diag(found.covariance)
+    assert alike[0] < 0.5 < alike[1]
+
+
 def test_frames_of_a_turn_that_no_odometry_measured_are_left_out(day):
     turning = {
         "radar_velocity_mps": np.array([8.0, 1.0, 0.0]),

@@ -327,8 +327,11 @@ def _analyse_observability(
         # fixed, they contradict the scene by metres, and yaw follows.
         unknown[DT] &= not np.any(unknown[:DT] & ~fixed[:DT])
         fixed[: DT + 1] |= unknown
-    floors = follow @ _floors(linear, curvature, fixed) @ follow.T
-    common = floors + prior_share(full, np.diag(1 / variance))
+    floors, alike = (
+        follow @ _left_by(scatter, curvature, fixed) @ follow.T
+        for scatter in (linear.floors, linear.floors_alike)
+    )
+    common = alike + prior_share(full, np.diag(1 / variance))
     for covariance in (full, common):
         covariance[np.arange(DT + 1), np.arange(DT + 1)] += bias
     return ObservabilityAnalysis(
@@ -338,6 +341,7 @@ def _analyse_observability(
         common,
         np.diag(bias),
         floors,
+        alike,
         fixed,
         observability,
         linear.witnesses,
@@ -353,13 +357,13 @@ def _following_tilt(linear: Linear, fixed: Bool[np.ndarray, " P"]) -> Float[np.n
     return following_tilt(H, linear.prior_information, follows, ELEVATION_DOF)
 
 
-def _floors(
-    linear: Linear, curvature: Float[np.ndarray, "P P"], fixed: Bool[np.ndarray, " P"]
+def _left_by(
+    scatter: Float[np.ndarray, "P P"], curvature: Float[np.ndarray, "P P"], fixed: Bool[np.ndarray, " P"]
 ) -> Float[np.ndarray, "P P"]:
-    """Covariance that the floors of elevation's witnesses leave: their bias is the rig's, the same every day."""
+    """Covariance of the free unknowns that a scatter of the total gradient leaves."""
     out, free = np.zeros_like(curvature), np.ix_(~fixed, ~fixed)
     follow = np.linalg.inv(curvature[free])
-    out[free] = follow @ linear.floors[free] @ follow.T
+    out[free] = follow @ scatter[free] @ follow.T
     return out
 
 
@@ -405,7 +409,7 @@ def _conclude(
         notes,
         common_part(J @ analysis.common[:6, :6] @ J.T, J @ covariance @ J.T),
         bias={EDGE: J @ analysis.bias[:6, :6] @ J.T},
-        bias_in_weights=J @ analysis.floors[:6, :6] @ J.T,
+        bias_in_weights=J @ analysis.floors_alike[:6, :6] @ J.T,
         time_offset_prior_s=-problem.constant_gap_s,
     )
 
