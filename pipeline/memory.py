@@ -1,17 +1,21 @@
-"""A bound on what one stage of a vehicle-day may take of the machine's memory: a bad log costs its own day only."""
+"""What a stage of a vehicle-day may take of the machine: CPUs, and memory, so that a bad log costs its own day only."""
 
 from __future__ import annotations
 
 import errno
+import os
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Final
 
 from pipeline.errors import TooMuchMemoryError
 
-__all__ = ["at_most"]
+__all__ = ["MODEL_THREADS", "at_most", "usable_cpus"]
 
+# Set for the workers of a night: threads of one model on the CPU, so that no core is idle where days are few.
+MODEL_THREADS: Final = "BORESIGHT_MODEL_THREADS"
 _STATUS = Path("/proc/self/status")
 # How libraries that have no exception of their own for it say that memory was refused.
 _REFUSED = ("bad_alloc", "bad allocation", "Failed to allocate", "allocation error")
@@ -54,3 +58,8 @@ def _is_refused(err: Exception) -> bool:
     if isinstance(err, MemoryError) or (isinstance(err, OSError) and err.errno == errno.ENOMEM):
         return True
     return any(words in str(err) for words in _REFUSED)
+
+
+def usable_cpus() -> int:
+    """CPUs that this process may use; containers often give fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -56,7 +56,8 @@ def test_every_dependency_is_pinned_to_what_was_tested():
     project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"].values()
     wanted = [*project["dependencies"], *(name for extra in extras for name in extra)]
-    names = {Requirement(w).name.lower() for w in wanted} - {"boresight"}
+    untested = {"onnxruntime-gpu"}  # no GPU runs the tests: a pin would claim that one did
+    names = {Requirement(w).name.lower() for w in wanted} - {"boresight"} - untested
     lines = (REPO / "constraints.txt").read_text().splitlines()
     pinned = {line.split("==")[0].lower() for line in lines if "==" in line and not line.startswith("#")}
     assert names <= pinned, names - pinned

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
+from pipeline.memory import usable_cpus
 from pipeline.results import Progress
 
 __all__ = ["ONE_THREAD", "Executor", "Finished", "Turns", "Watch", "attempt", "usable_cpus"]
@@ -98,8 +98,3 @@ def attempt(
         return Finished(item, function(item, progress))
     except Exception as err:  # noqa: BLE001 - one vehicle-day's trouble, whatever it is, must not stop the fleet
         return Finished(item, error=f"{type(err).__name__}: {err}", trace=traceback.format_exc())
-
-
-def usable_cpus() -> int:
-    """CPUs that this process may use; containers often give fewer than the machine has."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

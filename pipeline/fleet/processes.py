@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 from pipeline.fleet.attempts import ONE_THREAD, Finished, Turns, Watch, attempt, usable_cpus
 from pipeline.fleet.board import Board
+from pipeline.memory import MODEL_THREADS
 from pipeline.results import Progress
 
 __all__ = ["run_processes"]
@@ -90,8 +91,9 @@ def _pool(
     workers: int, function: Callable[[Any, Progress], Any], board: Board
 ) -> Iterator[ProcessPoolExecutor]:
     """A pool whose processes are gone when the block ends, however it ends."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)  # spawned processes read it while they import
+    own = ONE_THREAD | {MODEL_THREADS: str(max(1, usable_cpus() // workers))}
+    before = {name: os.environ.get(name) for name in own}
+    os.environ.update(own)  # spawned processes read it while they import
     pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (function, board))
     try:
         yield pool

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -17,6 +17,7 @@ from pipeline.rigs import RoadUser, TopicSemantics
 from schemas.captures import ImageColumns
 
 __all__ = [
+    "BatchedSource",
     "CameraSemantics",
     "Detections",
     "SemanticsSource",
@@ -67,6 +68,17 @@ class SemanticsSource(Protocol):
 
     def read(self, frame: ImageColumns) -> CameraSemantics:
         """Semantics of one frame; FrameRejectedError where there are none."""
+        ...
+
+
+@runtime_checkable
+class BatchedSource(SemanticsSource, Protocol):
+    """A source of semantics that does several images at once, on an execution provider of ONNX Runtime."""
+
+    provider: str
+
+    def look_ahead(self, frames: Sequence[ImageColumns]) -> None:
+        """Do what `read` is asked for next."""
         ...
 
 

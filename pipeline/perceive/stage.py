@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Mapping
+from collections.abc import Collection, Generator, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
 from pipeline.config import FleetConfig, PerceiveConfig
 from pipeline.errors import ModelOutputError
-from pipeline.perceive.camera import SemanticsSource, TopicSource
+from pipeline.perceive.camera import BatchedSource, SemanticsSource, TopicSource
 from pipeline.perceive.drivable import DrivableSource
 from pipeline.perceive.ego_velocity import RadarMotion
 from pipeline.perceive.features import (
@@ -47,6 +48,8 @@ AS_LOGGED: Final = "frames_not_deskewed"
 # What to do about a camera without semantics, with its section of fleet.toml.
 _REMEDY: Final = "name its topics or models in {} (`boresight models fetch` downloads two models)"
 
+_Joined = tuple[Moment, dict[str, Any]]
+
 
 def work(task: Task) -> Work:
     """What a day's moments show: the partition of `perceived`, and the features of each sensor.
@@ -63,7 +66,9 @@ def work(task: Task) -> Work:
     sources, keys = _sources(rig, task.fleet)
     section = f"[rigs.{task.fleet.vehicle(task.partition.vehicle).rig}.cameras.NAME.semantics]"
     return Work(
-        (task.fleet.perceive, keys), lambda run: _rows(task, sources, section, run), nothing="no usable frame"
+        (task.fleet.perceive.keyed(), keys),
+        lambda run: _rows(task, sources, section, run),
+        nothing="no usable frame",
     )
 
 
@@ -76,7 +81,8 @@ def _rows(
     blind = [s for s, kind in kinds.items() if kind == "camera" and s not in sources.cameras]
     tracks: dict[str, TrackState] = {}
     whole_ns = -SAME_SCENE_NS
-    for seen, (moment, captures) in enumerate(joined(task.lake, MOMENTS, task.partition), 1):
+    moments = _ahead(joined(task.lake, MOMENTS, task.partition), sources)
+    for seen, (moment, captures) in enumerate(moments, 1):
         shown = Shown(moment, captures, kinds, stars.get(moment.log, {}))
         found: Found | None = None
         try:
@@ -94,8 +100,18 @@ def _rows(
             run.rejected.update(f"without_{sensor}_{why.value}" for sensor, why in found.unusable.items())
             yield found.moment, found.features
     told = {s: f"{FAULTS['no_labels']}, {s}: {_REMEDY.format(section.replace('NAME', s))}" for s in blind}
-    run.remarks = "; ".join(told.values())
+    run.remarks = "; ".join([*told.values(), *sources.remarks()])
     run.extra |= {PRIOR: ingested.extra.get(PRIOR, []), SENSORS_ABSENT: told}
+
+
+def _ahead(moments: Iterator[_Joined], sources: Sources) -> Generator[_Joined, None, None]:
+    """The same moments, `perceive.batch` of them at a time, so that models are shown several images at once."""
+    while some := list(islice(moments, sources.config.batch)):
+        for name, source in sources.cameras.items():
+            images = [captures[name] for _, captures in some if name in captures]
+            if len(some) > 1 and images and isinstance(source, BatchedSource):
+                source.look_ahead(images)
+        yield from some
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +131,16 @@ class Sources:
     radars: Mapping[str, DrivableSource | None]
     config: PerceiveConfig
     deskew: bool = True
+
+    def remarks(self) -> list[str]:
+        """Where models run on another provider than the first that fleet.toml names."""
+        wanted = self.config.providers[:1]
+        found = {s.provider for s in self.cameras.values() if isinstance(s, BatchedSource)}
+        return [
+            f"models ran on {p}: {wanted[0]} could not be had"
+            for p in sorted(found.difference(wanted))
+            if wanted
+        ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,20 +22,24 @@ licence that each distribution states. Nothing of it is shipped with Boresight. 
 bring NVIDIA's own libraries as well, under NVIDIA's licence; a CPU build of torch does not. opencv's wheel holds
 FFmpeg's libraries (LGPL-2.1), unchanged and loaded at run time. PyAV (`[video]`) states its own licence; its wheel
 holds FFmpeg with x264 and x265, which are under the GPL: who passes that wheel on owes what the GPL asks. Written in
-the environment of `make setup`, which leaves out `[train-ray]`: `ray[train]` brings pandas and tensorboardX besides.
+the environment of `make setup`, which leaves out `[train-ray]`: `ray[train]` brings pandas and tensorboardX besides;
+and `[gpu]`: onnxruntime-gpu (MIT) takes the place of onnxruntime, and asks for NVIDIA's libraries.
 
 """
 # Who states the whole text in place of a name: words of it, and the name.
 TEXTS = {"embreex": ("Redistributions in binary form must reproduce", "BSD-2-Clause")}
 OF_DEVELOPERS = ("test", "dev")
+IN_PLACE_OF_ANOTHER = ("gpu",)  # cannot be installed beside what it replaces
 OF_A_GPU = ("nvidia-", "cuda-")  # libraries of torch's CUDA build, absent from the CPU build
 
 
 def user_extras():
-    """Extras that users install, and what each asks for; those of who works on Boresight are left out."""
+    """Extras that users install beside each other, and what each asks for; those of developers are left out."""
     project = tomllib.loads((Path(__file__).parent.parent.parent / "pyproject.toml").read_text())["project"]
     return project["dependencies"], {
-        e: lines for e, lines in project["optional-dependencies"].items() if e not in OF_DEVELOPERS
+        e: lines
+        for e, lines in project["optional-dependencies"].items()
+        if e not in (*OF_DEVELOPERS, *IN_PLACE_OF_ANOTHER)
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -32,9 +33,9 @@ class Candidates:
 class Detector:
     """A detection model behind its manifest."""
 
-    def __init__(self, manifest: Manifest) -> None:
+    def __init__(self, manifest: Manifest, providers: Sequence[str] = ()) -> None:
         self._manifest = manifest
-        self._session = Session(manifest, (3, *manifest.input.size))
+        self._session = Session(manifest, (3, *manifest.input.size), providers)
         self._names = detector_names(manifest.output.label_set)
 
     def detect(self, image_bgr: UInt8[np.ndarray, "H W 3"]) -> Detections:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -17,9 +19,10 @@ __all__ = ["Segmenter", "labels_of_logits"]
 class Segmenter:
     """A segmentation model behind its manifest."""
 
-    def __init__(self, manifest: Manifest) -> None:
+    def __init__(self, manifest: Manifest, providers: Sequence[str] = ()) -> None:
         self._manifest = manifest
-        self._session = Session(manifest, (3, *manifest.input.size))
+        self._session = Session(manifest, (3, *manifest.input.size), providers)
+        self.provider = self._session.provider
         self._table = to_cityscapes(manifest.output.label_set)
         self._check_alike = AlikeCheck(manifest.file)
 
@@ -32,8 +35,26 @@ class Segmenter:
             ModelOutputError: the output has another shape or other classes than its layout and label set say, is no
                 number, or the same for several pictures on end.
         """
-        tensor, fit = fit_image(image_bgr, self._manifest.input)
-        output = self._session.run(tensor)
+        return self.segment_each([image_bgr], [size])[0]
+
+    def segment_each(
+        self, images_bgr: Sequence[UInt8[np.ndarray, "H W 3"]], sizes: Sequence[tuple[int, int]]
+    ) -> list[UInt8[np.ndarray, "h w"]]:
+        """The same of several images, in one run where the model takes batches.
+
+        Raises:
+            ModelOutputError: as `segment`.
+        """
+        fitted = [fit_image(image, self._manifest.input) for image in images_bgr]
+        outputs = self._session.run_each([tensor for tensor, _ in fitted])
+        return [
+            self._labels(image, output, fit, size)
+            for image, output, (_, fit), size in zip(images_bgr, outputs, fitted, sizes, strict=True)
+        ]
+
+    def _labels(
+        self, image_bgr: np.ndarray, output: np.ndarray, fit: Fit, size: tuple[int, int]
+    ) -> np.ndarray:
         if self._manifest.output.layout == "labels":
             labels = self._plain_labels(output, fit, size)
         else:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +14,12 @@ import onnxruntime as ort
 from jaxtyping import Float32, UInt8
 
 from pipeline.errors import ModelError, ModelOutputError
+from pipeline.memory import MODEL_THREADS, usable_cpus
 from pipeline.perceive.models.manifest import InputSpec, ModelFile
 
-__all__ = ["AlikeCheck", "Fit", "Session", "fit_image", "open_session"]
+__all__ = ["AlikeCheck", "Fit", "Session", "fit_image", "model_threads", "open_session"]
 
+_CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 _MOST_ALIKE = 3  # successive answers that are the same to the last bit though the inputs differ
 
 
@@ -54,18 +58,22 @@ class AlikeCheck:
 
 
 class Session:
-    """One model, one thread: workers run side by side, and a spinning pool would steal their cores.
+    """One model on one execution provider.
 
     Args:
         manifest: of the model.
         shape: of one input, without the axis of the batch: channels, rows, columns.
+        providers: of ONNX Runtime, the first that can be had is taken; () = CUDA where it can be had, else the CPU.
     """
 
-    def __init__(self, manifest: ModelFile, shape: tuple[int, int, int]) -> None:
+    def __init__(
+        self, manifest: ModelFile, shape: tuple[int, int, int], providers: Sequence[str] = ()
+    ) -> None:
         self._file = str(manifest.file)
-        self._session = open_session(manifest.model_file, manifest.file)
-        self._input = self._checked_input(shape)
+        self._session = open_session(manifest.model_file, manifest.file, providers)
+        self._input, self._takes_batches = self._checked_input(shape)
         self._check_alike = AlikeCheck(manifest.file)
+        self.provider = str(self._session.get_providers()[0])
 
     def run(self, tensor: Float32[np.ndarray, "1 C H W"]) -> np.ndarray:
         """First output of the model.
@@ -74,16 +82,38 @@ class Session:
             ModelError: the model does not run on this input.
             ModelOutputError: it answers with what is no number, or with the same for several inputs on end.
         """
+        return self._checked(tensor, self._first_output(tensor))
+
+    def run_each(self, tensors: Sequence[Float32[np.ndarray, "1 C H W"]]) -> list[np.ndarray]:
+        """First output for each of several inputs, in one run where the axis of the batch is free.
+
+        Raises:
+            ModelError: as `run`, or the output has no axis of the batch although the input has.
+            ModelOutputError: as `run`.
+        """
+        if len(tensors) < 2 or not self._takes_batches:
+            return [self.run(tensor) for tensor in tensors]
+        output = self._first_output(np.concatenate(tensors))
+        if output.shape[:1] != (len(tensors),):
+            told = f"{len(tensors)} images give {list(output.shape)}: set perceive.batch = 1"
+            raise ModelError(self._file, f"the output has no axis of the batch, though the input has: {told}")
+        return [self._checked(tensor, output[i : i + 1]) for i, tensor in enumerate(tensors)]
+
+    def _first_output(self, tensor: np.ndarray) -> np.ndarray:
         try:
             output: np.ndarray = self._session.run(None, {self._input: tensor})[0]
         except Exception as err:  # onnxruntime's own exceptions share no base but this
             raise ModelError(self._file, f"the model failed to run: {err}") from err
+        return output
+
+    def _checked(self, tensor: np.ndarray, output: np.ndarray) -> np.ndarray:
         if np.isnan(output).any() or np.isposinf(output).any():
             raise ModelOutputError(self._file, "the model gives NaN or infinity")
         self._check_alike(tensor[..., ::4, ::4], output)
         return output
 
-    def _checked_input(self, shape: tuple[int, int, int]) -> str:
+    def _checked_input(self, shape: tuple[int, int, int]) -> tuple[str, bool]:
+        """Name of the input, and whether the axis of its batch is free."""
         inputs = self._session.get_inputs()
         if len(inputs) != 1 or inputs[0].type != "tensor(float)":
             found = ", ".join(f"{i.name} {i.type}" for i in inputs)
@@ -97,24 +127,52 @@ class Session:
                 f"{list(shape[1:])} does not go with the model's input {taken} (1, {shape[0]}, rows, columns)"
             )
             raise ModelError(self._file, f"input.size: {told}")
-        return str(inputs[0].name)
+        return str(inputs[0].name), not isinstance(taken[0], int)
 
 
-def open_session(model_file: Path, manifest_file: Path) -> ort.InferenceSession:
-    """A session on one thread of the CPU.
+def open_session(
+    model_file: Path, manifest_file: Path, providers: Sequence[str] = ()
+) -> ort.InferenceSession:
+    """A session on the first provider that can be had.
 
     Raises:
-        ModelError: onnxruntime cannot load the model.
+        ModelError: none of the providers can be had, or onnxruntime cannot load the model.
     """
     options = ort.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.inter_op_num_threads, options.intra_op_num_threads = 1, model_threads()
+    # Workers run side by side, and a spinning pool would steal their cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.log_severity_level = 3  # its warnings are about graph optimisation, not about results
+    chosen = _chosen_providers(providers, str(manifest_file))
     try:
-        return ort.InferenceSession(str(model_file), options, providers=["CPUExecutionProvider"])
+        session = ort.InferenceSession(str(model_file), options, providers=chosen)
     except Exception as err:  # onnxruntime's own exceptions share no base but this
         raise ModelError(str(manifest_file), f"path: onnxruntime cannot load the model: {err}") from err
+    # Where a provider's libraries do not load, onnxruntime falls back to the CPU by itself.
+    if providers and session.get_providers()[0] not in providers:
+        told = f"onnxruntime could not start {' or '.join(chosen)}: are its driver and libraries installed?"
+        raise ModelError(str(manifest_file), f"perceive.providers: {told}")
+    return session
+
+
+def _chosen_providers(wanted: Sequence[str], manifest_file: str) -> list[str]:
+    """Of the wanted providers those that this onnxruntime has."""
+    available = ort.get_available_providers()
+    if not wanted:
+        return [p for p in (_CUDA, _CPU) if p in available]
+    chosen = [p for p in wanted if p in available]
+    if not chosen:
+        told = f"this onnxruntime has {', '.join(available)}, not {', '.join(wanted)}"
+        cuda = ". CUDA comes with pip install 'boresight[gpu]'" if _CUDA in wanted else ""
+        raise ModelError(manifest_file, f"perceive.providers: {told}{cuda}; add {_CPU} to fall back to it")
+    return chosen
+
+
+def model_threads() -> int:
+    """Threads of one model on the CPU: the share of a worker of the night, else all that the process may use."""
+    share = os.environ.get(MODEL_THREADS) or os.environ.get("OMP_NUM_THREADS") or ""
+    return max(1, int(share)) if share.isdigit() else usable_cpus()
 
 
 def fit_image(

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from pipeline.config import FleetConfig, PerceiveConfig
+from pipeline.errors import ModelError
 from pipeline.perceive.camera import CameraSemantics, decode_colour, label_size
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import Manifest, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
+from pipeline.perceive.rejections import FrameRejectedError
 from pipeline.rig.rig import Rig
 from pipeline.rigs import OnnxSemantics
 from schemas.captures import ImageColumns
@@ -32,7 +35,10 @@ class ModelSource:
     """Semantics of images from ONNX models."""
 
     def __init__(self, segmenter: Manifest, detector: Manifest, config: PerceiveConfig) -> None:
-        self._segmenter, self._detector, self._config = Segmenter(segmenter), Detector(detector), config
+        self._segmenter = Segmenter(segmenter, config.providers)
+        self._detector, self._config = Detector(detector, config.providers), config
+        self._known: dict[int, CameraSemantics | Exception] = {}
+        self.provider = self._segmenter.provider
         self.provenance: dict[str, Any] = {
             "segmenter": segmenter.model_dump(mode="json", exclude={"file", "path"}),
             "detector": detector.model_dump(mode="json", exclude={"file", "path"}),
@@ -56,7 +62,30 @@ class ModelSource:
             FrameRejectedError: the image is undecodable or of the wrong size.
             ModelError: a model does not do what its manifest says.
         """
-        image = decode_colour(frame)
-        size = label_size(frame.image_width_px, frame.image_height_px, self._config.label_scale)
-        found = self._detector.detect(image).at_least(self._config.detection_min_score)
-        return CameraSemantics(self._segmenter.segment(image, size), found)
+        if id(frame) not in self._known:
+            self.look_ahead([frame])
+        found = self._known.pop(id(frame))
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def look_ahead(self, frames: Sequence[ImageColumns]) -> None:
+        """Run the models on frames that `read` is asked for next, together; errors are raised there."""
+        self._known, images = {}, {}
+        for frame in frames:
+            try:
+                images[id(frame)] = decode_colour(frame)
+            except FrameRejectedError as why:
+                self._known[id(frame)] = why
+        readable = [frame for frame in frames if id(frame) in images]
+        scale = self._config.label_scale
+        sizes = [label_size(f.image_width_px, f.image_height_px, scale) for f in readable]
+        try:
+            found = [self._detector.detect(image) for image in images.values()]
+            labels = self._segmenter.segment_each(list(images.values()), sizes)
+        except ModelError as err:
+            self._known |= dict.fromkeys(images, err)
+            return
+        least = self._config.detection_min_score
+        for frame, own, users in zip(readable, labels, found, strict=True):
+            self._known[id(frame)] = CameraSemantics(own, users.at_least(least))

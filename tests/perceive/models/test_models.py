@@ -3,20 +3,24 @@
 from dataclasses import replace
 
 import numpy as np
+import onnxruntime
 import pytest
 
 from pipeline.config import load_fleet
 from pipeline.errors import ModelError, ModelOutputError
+from pipeline.memory import MODEL_THREADS, usable_cpus
 from pipeline.perceive.models.detector import Candidates, Detector, decode_head, suppress
 from pipeline.perceive.models.manifest import InputSpec, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
-from pipeline.perceive.models.session import Fit, fit_image
+from pipeline.perceive.models.session import Fit, fit_image, model_threads
 from pipeline.perceive.models.source import ModelSource
 from pipeline.rigs import OnnxSemantics
+from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.lakes import write_frames
 from tests.makers.onnx_models import save_constant, save_segmenter, write_manifest
+from tests.makers.stages import perceive_day
 
 COLOURS = [[0.2, 0.2, 0.2], [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]]  # RGB of ADE20K wall, building, sky
 FITS = ("letterbox_top_left", "letterbox_centre", "stretch")
@@ -309,9 +313,6 @@ def test_both_models_together_give_a_frames_semantics(tmp_path, made_frame):
 
 
 def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, made_frame):
-    from pipeline.store.partitions import Lake, Partition
-    from tests.makers.stages import perceive_day
-
     segmenter(tmp_path)
     detector(tmp_path, rows_of(BOXES[:1], [2], [0.9], [1.0]), "yolov5")
     toml = tmp_path / "fleet.toml"
@@ -338,3 +339,54 @@ def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, ma
         ["person"],
         ["person"],
     ]
+
+
+def test_frames_in_batches_and_another_provider_give_the_same_day_under_the_same_work_key(
+    tmp_path, made_frame
+):
+    segmenter(tmp_path)
+    detector(tmp_path, rows_of(BOXES[:1], [2], [0.9], [1.0]), "yolov5")
+    frames = [made_frame(i) for i in range(5)]
+    frames[1] = replace(frames[1], image=b"broken")
+    found, keys, reasons = [], [], []
+    for number, section in enumerate(
+        ("", "batch = 3", 'providers = ["CUDAExecutionProvider", "CPUExecutionProvider"]')
+    ):
+        toml = tmp_path / "fleet.toml"
+        toml.write_text(
+            '[fleet]\nname = "made"\n[rigs.default.camera]\nimage = "/i"\ninfo = "/c"\n'
+            'semantics = { source = "onnx", segmenter = "seg.toml", detector = "det.toml" }\n'
+            f'[rigs.default.lidar]\npoints = "/p"\n[vehicles.car-1]\n[perceive]\n{section}\n'
+        )
+        lake, day = Lake.at(tmp_path / f"lake-{number}"), Partition("car-1", "2026-03-02")
+        write_frames(lake, day, [replace(f, sensors=["camera", "lidar"]) for f in frames])
+        outcome = perceive_day(day, load_fleet(toml), lake)
+        assert (outcome.rows, outcome.rejected) == (4, {"image_undecodable": 1})
+        found.append([(o.labels_png, o.road_user_classes) for o in observations_of(lake, day)])
+        keys.append(outcome.work_key)
+        reasons.append(outcome.reason)
+    assert found[0] == found[1] == found[2]
+    assert len(set(keys)) == 1
+    has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+    told = "models ran on CPUExecutionProvider: CUDAExecutionProvider could not be had"
+    assert reasons == ["", "", "" if has_cuda else told]
+
+
+def test_a_provider_that_is_not_there_is_told_with_what_to_install(tmp_path):
+    manifest = segmenter(tmp_path)
+    if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
+        with pytest.raises(ModelError, match=r"perceive.providers: .* pip install 'boresight\[gpu\]'"):
+            Segmenter(manifest, ["CUDAExecutionProvider"])
+    with pytest.raises(ModelError, match=r"this onnxruntime has .* not NoExecutionProvider"):
+        Segmenter(manifest, ["NoExecutionProvider"])
+    assert Segmenter(manifest, ["CPUExecutionProvider"]).provider == "CPUExecutionProvider"
+
+
+def test_a_model_uses_the_share_of_its_worker_or_all_that_the_process_may(monkeypatch):
+    for name in (MODEL_THREADS, "OMP_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    assert model_threads() == usable_cpus()
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert model_threads() == 1
+    monkeypatch.setenv(MODEL_THREADS, "3")
+    assert model_threads() == 3

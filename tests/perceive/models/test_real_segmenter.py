@@ -6,10 +6,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import onnx
 import pytest
+from onnx import numpy_helper
 
 from pipeline.perceive.models.manifest import load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
+from pipeline.perceive.models.session import Session, fit_image
 
 REPO = Path(__file__).resolve().parents[3]
 pytestmark = [pytest.mark.real_logs]
@@ -43,13 +46,46 @@ def images_and_labels(log):
         )
 
 
+def manifest_of(model, folder):
+    digest = hashlib.sha256(model.read_bytes()).hexdigest()
+    manifest = readme_manifest().replace('"segmenter.onnx"', f'"{model}"').replace('"..."', f'"{digest}"')
+    (folder / "segmenter.toml").write_text(manifest)
+    return load_manifest(folder / "segmenter.toml", "segment")
+
+
+def with_a_free_batch(model):
+    """The model for any number of images: its export wrote the 1 into its ends and into its reshapes."""
+    for value in (*model.graph.input, *model.graph.output):
+        value.type.tensor_type.shape.dim[0].dim_param = "batch"
+    shapes = {node.input[1] for node in model.graph.node if node.op_type == "Reshape"}
+    given = {node.output[0]: node.attribute[0].t for node in model.graph.node if node.op_type == "Constant"}
+    given |= {tensor.name: tensor for tensor in model.graph.initializer}
+    for tensor in (given[name] for name in shapes):
+        shape = numpy_helper.to_array(tensor).copy()
+        assert shape[0] == 1
+        shape[0] = 0  # as the input has it
+        tensor.CopyFrom(numpy_helper.from_array(shape, tensor.name))
+    return model
+
+
+def test_several_images_in_one_run_get_the_labels_that_each_gets_alone(real_logs, real_segmenter, tmp_path):
+    onnx.save(with_a_free_batch(onnx.load(real_segmenter)), tmp_path / "batches.onnx")
+    both = [manifest_of(path, tmp_path) for path in (real_segmenter, tmp_path / "batches.onnx")]
+    alone, together = (Segmenter(manifest) for manifest in both)
+    seen = list(images_and_labels(real_logs / "astyx-1_2019-01-14_00.mcap"))
+    images, sizes = [image for image, _ in seen], [labels.shape for _, labels in seen]
+    tensors = [fit_image(image, both[0].input)[0] for image in images]
+    own, joint = (Session(m, (3, 512, 1024)).run_each(tensors) for m in both)
+    for a, b in zip(own, joint, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+    expected = [alone.segment(image, size) for image, size in zip(images, sizes, strict=True)]
+    found = together.segment_each(images, sizes)
+    for a, b in zip(expected, found, strict=True):
+        assert np.mean(a != b) < 1e-4  # pixels where two classes are alike to the last bits
+
+
 def test_espnetv2_labels_pixels_as_the_log_does(real_logs, real_segmenter, tmp_path):
-    digest = hashlib.sha256(real_segmenter.read_bytes()).hexdigest()
-    manifest = (
-        readme_manifest().replace('"segmenter.onnx"', f'"{real_segmenter}"').replace('"..."', f'"{digest}"')
-    )
-    (tmp_path / "segmenter.toml").write_text(manifest)
-    segmenter = Segmenter(load_manifest(tmp_path / "segmenter.toml", "segment"))
+    segmenter = Segmenter(manifest_of(real_segmenter, tmp_path))
     agreement, road = [], []
     for image, logged in images_and_labels(real_logs / "astyx-1_2019-01-14_00.mcap"):
         labels = segmenter.segment(image, logged.shape)
