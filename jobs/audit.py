@@ -19,15 +19,15 @@ def audit(
     method: str | None = None,
     report: Path | None = None,
 ) -> int:
-    """Find out which sensor of which vehicle moved, since when and by how much.
+    """Find out which sensor of which vehicle moved, on which day and by how much.
 
     Args:
-        fleet: fleet.toml; its section [audit] holds limits and false-alarm budget.
+        fleet: fleet.toml; section [audit] sets limits and the false-alarm budget.
         lake: folder of the tables.
-        from_day: first day of the window, YYYY-MM-DD; default: audit.window_days before its end.
+        from_day: first day of the window, YYYY-MM-DD; default: audit.window_days before the last day.
         to_day: last day of the window; default: the last day with a record.
-        method: method of the audited records; default: audit.method.
-        report: also write the fleet page, and a page per vehicle-day beside it.
+        method: calibration method of the audited records; default: audit.method.
+        report: fleet page to write as well, with a page per vehicle-day in a folder beside it.
     """
     from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
     from jobs.terminal.vehicle_status import (

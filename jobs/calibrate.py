@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 __all__ = ["calibrate", "parse_pair", "parse_perturb"]
 
 
-# A command's parameters are its options: more than eight, because each is one that a user sets.
+# The parameters of a command are its options: more than eight, because a user sets each of them.
 def calibrate(
     *,
     fleet: Path,
@@ -25,20 +25,20 @@ def calibrate(
     page: Path | None = None,
     polish: bool = False,
 ) -> int:
-    """Find out how the vehicle's sensors sat relative to each other on that day, and how sure that is.
+    """Estimate the poses between a vehicle's sensors on one day, with their uncertainty.
 
     Args:
         fleet: fleet.toml.
         lake: folder of the tables.
         vehicle: vehicle id, as in fleet.toml.
         day: YYYY-MM-DD.
-        method: joint; tracking, pairwise-optimisation, joint-optimisation; or by networks: pairwise-ssl, joint-ssl.
-        perturb: ROT_DEG,TRANS_M: move the prior on purpose by exactly this much, for tests.
-        seed: of everything random; the configuration's where left out.
-        frame: frame_index or stamp_ns: calibrate from this frame alone, by a network (joint-ssl where no SSL method
-            is named). Nothing is recorded; the summary holds the transforms.
-        page: HTML page of that frame, before and after.
-        polish: let the optimiser finish from the networks' answer, as solve.polish in fleet.toml.
+        method: joint; tracking, pairwise-optimisation, joint-optimisation; networks: pairwise-ssl, joint-ssl.
+        perturb: ROT_DEG,TRANS_M: move the prior by exactly this much, for tests.
+        seed: random seed; default: the seed of the configuration.
+        frame: frame_index or stamp_ns of one frame, calibrated alone by a network (joint-ssl unless --method
+            names another). Writes no record; the summary contains the transforms.
+        page: HTML page to write for that frame, before and after.
+        polish: refine the networks' result with the optimiser, as solve.polish in fleet.toml does.
     """
     from dataclasses import replace
 
@@ -51,7 +51,7 @@ def calibrate(
 
     if page is not None and frame is None:
         raise ConfigError(
-            "command line", "page", "is of one frame: name it by --frame (days: boresight report)"
+            "command line", "page", "shows one frame: name it by --frame (for a day: boresight report)"
         )
     method_named(method)
     config = load_fleet(fleet)
@@ -65,7 +65,7 @@ def calibrate(
 
 
 def _calibrate_day(task: Task) -> int:
-    """The day's records in the lake, their statuses in the summary."""
+    """Calibrate the day, write its records to the lake and print their statuses."""
     from dataclasses import replace
 
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
@@ -76,7 +76,7 @@ def _calibrate_day(task: Task) -> int:
     from schemas.words import day_word
 
     vehicle, day = task.partition.vehicle, task.partition.day
-    task.fleet.rig_of(vehicle)  # raises, naming the vehicles there are
+    task.fleet.rig_of(vehicle)  # raises for an unknown vehicle
     if perceived(task.lake, task.partition) is None:
         problem = (
             f"the lake has no observations of {vehicle} on {day}: run `boresight ingest` and `perceive` first"
@@ -102,7 +102,7 @@ def _calibrate_day(task: Task) -> int:
 
 
 def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
-    """One frame's transforms in the summary, and its page where one is wanted."""
+    """Calibrate one frame, print its transforms, and write its page if a path is given."""
     from jobs.terminal.summary import print_summary
     from pipeline.calibrate.networks import calibrate_frame
 
@@ -135,13 +135,13 @@ def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
         stamp_ns=found.frame.stamp_ns,
         page=page,
         estimates=estimates,
-        reason="one frame: nothing judges it and nothing is recorded",
+        reason="one frame: no verdict and no record",
     )
     return 0
 
 
 def parse_perturb(text: str | None) -> tuple[float, float] | None:
-    """(degrees, metres) of "ROT_DEG,TRANS_M"; None stays None.
+    """Parse "ROT_DEG,TRANS_M" to (degrees, metres); None stays None.
 
     Raises:
         ConfigError: not two numbers >= 0.
@@ -150,7 +150,7 @@ def parse_perturb(text: str | None) -> tuple[float, float] | None:
 
 
 def parse_pair(text: str, option: str) -> tuple[float, float]:
-    """(degrees, metres) of "ROT_DEG,TRANS_M"; `option` names the culprit.
+    """Parse "ROT_DEG,TRANS_M" to (degrees, metres); `option` is the option's name in errors.
 
     Raises:
         ConfigError: not two numbers >= 0.

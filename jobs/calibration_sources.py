@@ -1,4 +1,4 @@
-"""Calibrations that commands name: of a lake's day or state, and where a lidar sits, of a file."""
+"""Calibrations that command-line options name: from a lake's day or state, from a file, from a log."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def read_calibration(
     own_frames: bool,
     mount: str | None,
 ) -> ExportedCalibration:
-    """A day's records, or without a day the vehicle's state, ready for a file.
+    """Read a day's records (without a day: the vehicle's state), ready to be written to a file.
 
-    `own_frames`: frames that no option names are called as the logs call them.
+    `own_frames`: frames that no option names get their names from the logs.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: the lake has no such calibration.
     """
     from jobs.terminal.summary import left_out as tell_damage
     from pipeline.export.calibration import ExportedCalibration
@@ -61,7 +61,7 @@ def read_calibration(
     from schemas.words import day_word
 
     lake = Lake.existing(location)
-    # A rig that was adjusted as a whole says it by sensor, others by edge.
+    # A rig that was adjusted as a whole has a pose per sensor, other rigs have one per edge.
     by_edge = (
         pairs_of_state(lake, vehicle, method) if day is None else pairs_of_day(lake, vehicle, day, method)
     )
@@ -69,13 +69,13 @@ def read_calibration(
     found = {words_of(edge): pair for edge, pair in poses.items()} or by_edge
     if by_edge.keys() <= set(
         PAIRS
-    ):  # of one of each its pairs say what nothing checks, and camera against radar
+    ):  # one camera, one lidar, one radar: only pairs have unchecked axes, and camera-radar
         found, poses = (
             by_edge | {words: _unchecked_as(pair, by_edge.get(words)) for words, pair in found.items()},
             {},
         )
     source = f"record of {day}"
-    # What has no transform was refused, or of a state is not there.
+    # Without a transform, a record was refused, and a state does not exist.
     word = day_word("refused" if isinstance(p, str) else p.status for p in found.values())
     pairs, without = choose_pairs(found, force=force)
     pairs = pairs if unchecked else rest_at_prior(lake, vehicle, method, pairs)
@@ -96,7 +96,7 @@ def read_calibration(
 
 
 def _unchecked_as(pose: ExportedPair | str, pair: ExportedPair | str | None) -> ExportedPair | str:
-    """A pose with the axes that nothing checks, as the record or state of its pair has them."""
+    """The pose with the unchecked axes of its pair's record or state."""
     if isinstance(pose, str) or pair is None or isinstance(pair, str):
         return pose
     return replace(pose, unchecked=pair.unchecked)
@@ -107,10 +107,10 @@ def _listed(value: object) -> list[object]:
 
 
 def mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarray:
-    """T_base_lidar, of the sensor that poses of these edges refer to, out of log:FILE (its /tf_static) or FORMAT:FILE.
+    """Read T_base_lidar of the reference sensor of these edges from log:FILE (/tf_static) or FORMAT:FILE.
 
     Raises:
-        ConfigError: not of that form, or the file does not join the two frames.
+        ConfigError: `text` has another form, or the file has no chain of transforms between the two frames.
     """
     from pipeline.export.calibration import reference_of
     from pipeline.export.files import read_files
@@ -126,7 +126,7 @@ def mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarra
     else:
         form = format_named(name)
         if form.tree is None:
-            raise ConfigError("command line", "mount", f"{name} knows no frames of a car")
+            raise ConfigError("command line", "mount", f"{name} files have no frames of a car")
         tree = form.tree(read_files([Path(path)]))
     reference = names.of(reference_of(edges).name)
     T = tree.lookup(names.base, reference)
@@ -138,7 +138,7 @@ def mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarra
 
 
 def _logged(path: Path) -> TransformTree:
-    """What a log of any container says on /tf_static."""
+    """Read the transforms on /tf_static of a log in any container."""
     from contextlib import closing
 
     from pipeline.geometry.transform_tree import TransformTree
@@ -155,13 +155,14 @@ def _logged(path: Path) -> TransformTree:
 def read_sides(
     texts: Sequence[str], location: str | None, vehicle: str | None, method: str, frames: FrameOptions
 ) -> list[Side]:
-    """What `boresight compare` calls A and B: FORMAT:FILE[,FILE], a prior file, or of the lake [VEHICLE@]DAY[/METHOD].
+    """Read both sides of `boresight compare`: FORMAT:FILE[,FILE], a prior file, or [VEHICLE@]DAY[/METHOD].
 
-    Of a file that is held against the lake the edges are read that the lake has; of two files those of one camera, one
-    lidar and one radar. METHOD may be "prior": what was known before the day; DAY may be "state": what to load tonight.
+    A file compared with the lake is read for the edges in the lake; two files are read for the edges of one
+    camera, one lidar and one radar. METHOD may be "prior" (the prior of that day); DAY may be "state" (what
+    to load tonight).
 
     Raises:
-        ConfigError: it is none of these, or there is none.
+        ConfigError: a side has another form, or does not exist.
     """
     from pipeline.export.formats import FORMATS
     from pipeline.export.tree import ESTIMATED_EDGES
@@ -184,13 +185,13 @@ def read_sides(
 def poses_in_use(
     text: str, location: str | None, vehicle: str, rig: Rig, frames: FrameOptions
 ) -> tuple[dict[str, np.ndarray], FrameNames]:
-    """T_reference_sensor of a rig of many sensors, those that FORMAT:FILE[,FILE] or [VEHICLE@]DAY of a lake has.
+    """Read T_reference_sensor of a rig of many sensors from FORMAT:FILE[,FILE] or [VEHICLE@]DAY of a lake.
 
     Returns:
-        The poses by name, and what the frames are called.
+        Poses by sensor name (only sensors that the source has), and the frame names.
 
     Raises:
-        ConfigError: it is neither, or there is none.
+        ConfigError: the text has another form, or the source does not exist.
     """
     from pipeline.export.files import noted_frames, read_files
     from pipeline.export.formats import FORMATS, format_named
@@ -207,7 +208,7 @@ def poses_in_use(
         return rig_poses(format_named(form), read_files(files), names, rig), names
     owner, _, day = text.rpartition("@")
     if location is None:
-        problem = f'{text!r} is no FORMAT:FILE and no .json; a day of a lake, or "state", needs --lake'
+        problem = f'{text!r} is neither FORMAT:FILE nor .json; a day of a lake, or "state", needs --lake'
         raise ConfigError("command line", "--calibration", problem)
     found = pairs_of_poses(
         Lake.existing(location), owner or vehicle, None if day == "state" else day, "joint"
@@ -215,7 +216,7 @@ def poses_in_use(
     reference = reference_of_rig(rig)
     wanted = {tie(n, reference) for n in rig.nodes if n != reference}
     if not found.keys() & wanted:
-        raise ConfigError("command line", "--calibration", f"{text}: no poses that refer to {reference.name}")
+        raise ConfigError("command line", "--calibration", f"{text}: no poses relative to {reference.name}")
     known = {edge: pair.T for edge, pair in found.items() if edge in wanted and not isinstance(pair, str)}
     return from_ties(known, reference), frames.names(base)
 
@@ -248,7 +249,7 @@ def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: 
     owner = owner if at else (vehicle or "")
     day, _, named = rest.partition("/")
     if location is None or not owner:
-        problem = f"{text!r} is no FORMAT:FILE and no .json; a day of a lake needs --lake and --vehicle"
+        problem = f"{text!r} is neither FORMAT:FILE nor .json; a day of a lake needs --lake and --vehicle"
         raise ConfigError("command line", "A, B", problem)
     lake = Lake.existing(location)
     by, of_day = named or method, None if day == "state" else day
@@ -256,7 +257,7 @@ def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: 
         found = priors_of_day(lake, owner, day, method)
     else:
         found = pairs_of_state(lake, owner, by) if of_day is None else pairs_of_day(lake, owner, of_day, by)
-        if not found.keys() <= set(PAIRS):  # as `export` writes it
+        if not found.keys() <= set(PAIRS):  # as `export` does
             found = {words_of(e): p for e, p in pairs_of_poses(lake, owner, of_day, by).items()} or found
     pairs, missing = choose_pairs(found, force=True)
     days = frozenset[str]() if named == "prior" else _days(pairs, day)
@@ -264,6 +265,6 @@ def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: 
 
 
 def _days(pairs: dict[str, ExportedPair], day: str) -> frozenset[str]:
-    """Days that the pairs rest on."""
+    """Days that the pairs were estimated from."""
     listed = {str(d) for pair in pairs.values() for d in _listed(pair.details.get("days"))}
     return frozenset(listed if day == "state" else {day})

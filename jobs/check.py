@@ -1,4 +1,4 @@
-"""`boresight check`: can these logs be calibrated, and which DoF."""
+"""`boresight check`: whether logs can be calibrated, and in which DoF."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _COLOUR = {"yes": "green", "weak": "yellow", "partly": "yellow", "no": "red"}
 
 
 def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = False) -> int:
-    """Say whether these logs can be calibrated, which DoF, and what is missing. Exit 0 yes, 1 partly, 2 no.
+    """Check whether logs can be calibrated, in which DoF, and what is missing. Exit 0 yes, 1 partly, 2 no.
 
     Args:
         fleet: fleet.toml.
-        logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files, of one vehicle-day.
-        rig: which rig of fleet.toml; default: the only one, or "default".
+        logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of one vehicle-day.
+        rig: rig of fleet.toml; default: the only one, or "default".
         json: print the whole report as one JSON object on stdout.
     """
     from dataclasses import asdict
@@ -63,7 +63,7 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
 
 
 def _following(report: CheckReport, fleet: Path, logs: tuple[Path, ...]) -> list[str]:
-    """The commands to type next: models where nobody labels the cameras, and the night where it can calibrate."""
+    """Commands to type next: `models fetch` if cameras lack labels, `nightly` if logs can be calibrated."""
     from pipeline.ingest.propose.logs_pattern import nightly_command
 
     unlabelled = any(why.startswith("no semantic labels") for v in report.verdicts for why in v.reasons)
@@ -119,7 +119,7 @@ def _measured(report: CheckReport) -> list[str]:
         "time per point": "yes" if report.has_point_time else "no",
         "odometry": "yes" if report.has_odometry else "no",
     }
-    gate = "near enough by motion" if s.gate_ms is None else f"within {s.gate_ms:g} ms"
+    gate = "within the motion limit" if s.gate_ms is None else f"within {s.gate_ms:g} ms"
     found = {
         "image": ("camera", s.camera_median_ms, s.camera_offset_ms),
         "scan": ("radar", s.radar_median_ms, s.radar_offset_ms),
@@ -132,5 +132,5 @@ def _measured(report: CheckReport) -> list[str]:
     return [
         f"sync: {sync}" + (f" (median {nearest}; constant offsets: {offsets})" if met else ""),
         f"frame ids: {', '.join(frame_ids) or 'none'}",
-        known if e.frames else f"not known, for want of a frame: {', '.join(facts)}",
+        known if e.frames else f"unknown, because no frame is given: {', '.join(facts)}",
     ]

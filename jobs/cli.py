@@ -1,6 +1,6 @@
-"""The command `boresight`: which job lies behind which word, and how every job ends.
+"""The command `boresight`: the table of its commands, and exit codes.
 
-A job is a function of its own file that returns an exit code; it is imported when its command is called.
+Each command is a function in a file of its own. It is imported when called, and returns an exit code.
 Exit codes: 0 done or up to date; 1 failed, a retry may help; 2 usage or configuration; 3 done, but something
 was held or refused; 130 and 143 after SIGINT and SIGTERM.
 """
@@ -25,63 +25,72 @@ __all__ = ["COMMANDS", "app", "main"]
 FAILED, USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 _OUTPUTS = ("--out", "--page", "--report")
 
-# Command -> where its function is, and what `boresight --help` says of it.
+# Command -> its function and its line in `boresight --help`.
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("jobs.demo:demo", "Synthetic fleet to HTML report, in minutes: what all of this does."),
-    "init": ("jobs.init:init", "A fleet.toml out of the logs themselves, with comments for what is missing."),
-    "check": ("jobs.check:check", "Can these logs be calibrated, and which degrees of freedom?"),
+    "demo": ("jobs.demo:demo", "Simulate a small fleet, calibrate it and write an HTML report, in minutes."),
+    "init": ("jobs.init:init", "Write a fleet.toml from logs, with comments for what is missing."),
+    "check": ("jobs.check:check", "Check whether logs can be calibrated, and in which degrees of freedom."),
     "verify": (
         "jobs.verify:verify",
-        "Is the calibration that the car uses now still right? One log's answer.",
+        "Check the calibration that a car uses now against one log.",
     ),
     "nightly": (
         "jobs.nightly:nightly",
-        "Ingest, perceive, calibrate and audit all vehicle-days of a pattern.",
+        "Ingest, perceive, calibrate and audit all vehicle-days of a fleet.",
     ),
-    "ingest": ("jobs.ingest:ingest", "Logs of one vehicle-day to the table frames."),
-    "perceive": ("jobs.perceive:perceive", "Frames of one vehicle-day to the table observations."),
-    "calibrate": ("jobs.calibrate:calibrate", "Observations of one vehicle-day to calibration records."),
-    "prepare": ("jobs.prepare:prepare", "Frames and observations of many vehicle-days to training data."),
-    "train": ("jobs.train:train", "A network from training data, without any ground truth."),
+    "ingest": ("jobs.ingest:ingest", "Read and synchronise the logs of one vehicle-day."),
+    "perceive": ("jobs.perceive:perceive", "Find semantics, objects, edges and motion in one vehicle-day."),
+    "calibrate": ("jobs.calibrate:calibrate", "Estimate extrinsics of one vehicle-day and record them."),
+    "prepare": ("jobs.prepare:prepare", "Make training data from many vehicle-days."),
+    "train": ("jobs.train:train", "Train a calibration network without ground truth."),
     "train-radar-drivable": (
         "jobs.train_radar_drivable:train_radar_drivable",
-        "A small network for the radar's drivable area, taught by the lidar.",
+        "Train a small network for the radar's drivable area; the lidar is the teacher.",
     ),
     "train-lidar-semantics": (
         "jobs.train_lidar_semantics:train_lidar_semantics",
-        "A small range-image network for lidar points, taught by the camera.",
+        "Train a small network for lidar semantics; the camera is the teacher.",
     ),
-    "models": ("jobs.models:models", "The networks that ship, and those that `models fetch` downloads."),
+    "models": ("jobs.models:models", "List the networks included and those that `models fetch` downloads."),
     "models list": ("jobs.models:models", "The same as `models`."),
     "models fetch": (
         "jobs.models:fetch",
-        "Download a segmenter and a detector for cameras without labels; licence and sha256 are shown.",
+        "Download a segmenter and a detector for cameras without labels; shows licence and sha256.",
     ),
-    "audit": ("jobs.audit:audit", "Control charts over days: which sensor moved, and since when."),
-    "service": ("jobs.service:service", "Note a repair, a re-mount or a release: charts begin anew."),
-    "state": ("jobs.state:state", "What each vehicle should load tonight, with its sigma."),
-    "report": ("jobs.report:report", "HTML pages of vehicle-days and of the fleet."),
-    "show": ("jobs.show:show", "What a lake holds, for people or as JSON."),
-    "status": ("jobs.status:status", "What is done, held, refused, failed or missing, and why."),
-    "gc": ("jobs.gc:gc", "Take images, and pages that show them, out of a lake after their time."),
+    "audit": ("jobs.audit:audit", "Find sensors that moved, by control charts over days."),
+    "service": ("jobs.service:service", "Record a repair, a re-mount or a software release: charts restart."),
+    "state": ("jobs.state:state", "Show the calibration that each vehicle should load tonight, with sigmas."),
+    "report": ("jobs.report:report", "Write HTML pages of vehicle-days and of the fleet."),
+    "show": ("jobs.show:show", "Show the rows of a lake's tables, as a table or as JSON."),
+    "status": (
+        "jobs.status:status",
+        "Show which vehicle-days are done, held, refused, failed or missing, and why.",
+    ),
+    "gc": ("jobs.gc:gc", "Delete old images, and pages that show them, from a lake."),
     "export": (
         "jobs.export:export",
-        "Write a calibration for ROS 2, Autoware, KITTI, ...; the tables' JSON Schema; a network as ONNX.",
+        "Write a calibration for ROS 2, Autoware, KITTI, ...; JSON Schemas; a network as ONNX.",
     ),
     "export frames": (
         "jobs.export_frames:export_frames",
-        "Frames of many days with the calibration, for networks: WebDataset, Parquet, KITTI, nuScenes.",
+        "Write frames of many days with calibration: WebDataset, Parquet, KITTI, nuScenes.",
     ),
-    "import": ("jobs.import_prior:import_prior", "Calibration files of other programs to a prior file."),
-    "compare": ("jobs.compare:compare", "Two calibrations, axis by axis: records, days, methods, files."),
-    "migrate": ("jobs.migrate:migrate", "A lake of an older release to the tables of this one."),
-    "repair": ("jobs.repair:repair", "A lake with a damaged log or lost files: what is left, made whole."),
+    "import": (
+        "jobs.import_prior:import_prior",
+        "Convert calibration files of other programs to a prior file.",
+    ),
+    "compare": (
+        "jobs.compare:compare",
+        "Compare two calibrations axis by axis: records, days, methods, files.",
+    ),
+    "migrate": ("jobs.migrate:migrate", "Convert a lake of an older release to the tables of this one."),
+    "repair": ("jobs.repair:repair", "Repair a lake with a damaged log or lost files."),
     "convert": (
         "jobs.convert:convert",
-        "Folders of public data sets (nuScenes, View-of-Delft, KITTI) to logs.",
+        "Convert public data sets (nuScenes, View-of-Delft, KITTI) to logs.",
     ),
-    "simulate": ("jobs.simulate:simulate", "Logs of a synthetic fleet, its truth in a file of its own."),
-    "evaluate": ("jobs.evaluate:evaluate", "Compare records with a known truth or a reflector recording."),
+    "simulate": ("jobs.simulate:simulate", "Write logs of a simulated fleet, and its true extrinsics."),
+    "evaluate": ("jobs.evaluate:evaluate", "Compare records with true extrinsics or a reflector recording."),
 }
 
 
@@ -132,7 +141,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _output(err: Exception, tokens: Sequence[str]) -> str:
-    """What the command writes to, for an error for want of space without a path: those of lakes have theirs."""
+    """The output path of the command, for an error that the disk is full and that names no path."""
     if not isinstance(err, OSError) or err.errno not in NO_SPACE or err.filename is not None:
         return ""
     parts = [part for token in tokens for part in token.split("=", 1)]
@@ -140,14 +149,14 @@ def _output(err: Exception, tokens: Sequence[str]) -> str:
 
 
 def _stop(signum: int, _frame: Any) -> None:
-    """Unwind through every `finally`: nothing stays half-written. A second signal cannot cut that short."""
+    """Exit through every `finally`: no file is left half-written. A second signal cannot interrupt that."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.exit(128 + signum)
 
 
 def _end(command: str, reason: str, code: int) -> int:
     logger().error(reason, command=command, exit_code=code)
-    if command != "show":  # its stdout holds records and nothing else
+    if command != "show":  # stdout of `show` contains only records
         status = {3: "refused", INTERRUPTED: "stopped", TERMINATED: "stopped"}.get(code, "failed")
         print_summary(command, status, reason=reason, exit_code=code)
     return code

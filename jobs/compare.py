@@ -1,4 +1,4 @@
-"""`boresight compare`: how far two calibrations are apart, and whether their sigmas explain it."""
+"""`boresight compare`: the difference between two calibrations, and whether their sigmas explain it."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ def compare(
     json: bool = False,
     frames: FrameOptions | None = None,
 ) -> int:
-    """Compare two calibrations: the change from A to B per pair and axis, with its sigma and in sigmas.
+    """Compare two calibrations: the change from A to B per pair and axis, with sigma, and in units of sigma.
 
-    A and B are each one of: FORMAT:FILE[,FILE] (formats of `boresight export`); a prior file, *.json; and of a lake
-    [VEHICLE@]DAY[/METHOD], as 2026-03-02, 2026-03-02/joint-ssl, 2026-03-02/prior (before that day), state (to load
-    tonight), car-2@state. Held records are compared too, and marked.
+    A and B are each one of: FORMAT:FILE[,FILE] (formats of `boresight export`); a prior file, *.json; or,
+    from a lake, [VEHICLE@]DAY[/METHOD], as in 2026-03-02, 2026-03-02/joint-ssl, 2026-03-02/prior (the prior
+    of that day), state (to load tonight), car-2@state. Held records are compared too, and marked.
 
     Args:
-        a: the first.
-        b: the second.
+        a: first calibration.
+        b: second calibration.
         lake: folder of the tables.
-        vehicle: whose days, where A or B does not say.
-        method: of records, where A or B does not say.
-        page: also write an HTML page.
-        json: print one JSON object and nothing else: changes and sigmas in rad and m.
-        frames: what the frames are called in files.
+        vehicle: vehicle id, if A or B does not name it.
+        method: calibration method, if A or B does not name it.
+        page: HTML page to write as well.
+        json: print only one JSON object: changes and sigmas in rad and m.
+        frames: frame names in files.
     """
     from jobs.calibration_sources import read_sides
     from jobs.terminal.summary import print_json, print_summary

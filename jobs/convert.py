@@ -1,4 +1,4 @@
-"""`boresight convert`: folders of public data sets to logs."""
+"""`boresight convert`: public data sets to logs."""
 
 from __future__ import annotations
 
@@ -29,21 +29,24 @@ def convert(
     segmenter: str | None = None,
     detector: str | None = None,
 ) -> int:
-    """Write OUT/logs/VEHICLE/DAY/*.mcap and OUT/fleet.toml from a folder of a data set.
+    """Write OUT/logs/VEHICLE/DAY/*.mcap and OUT/fleet.toml from the folder of a data set.
 
     Args:
-        data_set: nuscenes; vod (View-of-Delft); kitti: image_2, velodyne and calib, and image_3 and
-            radar (with Tr_radar_to_velo in calib) where there are such.
-        folder: of the data set.
+        data_set: nuscenes; vod (View-of-Delft); kitti: folders image_2, velodyne and calib; image_3 and radar
+            (with Tr_radar_to_velo in calib) are converted if they exist.
+        folder: folder of the data set.
         out: folder to write into.
-        vehicle: of vod and kitti; default: the data set's name. nuScenes names its own, and its days.
-        day: of vod and kitti, which have no stamps, YYYY-MM-DD.
-        camera: channels of nuScenes, several with commas; default: all.
+        vehicle: vehicle id for vod and kitti; default: the data set's name. nuScenes has its own ids and
+            days.
+        day: day for vod and kitti, which have no stamps, YYYY-MM-DD.
+        camera: nuScenes channels, separated by commas; default: all.
         lidar: likewise.
         radar: likewise.
-        radar_columns: of kitti's radar/*.bin (float32); doppler is the range rate, positive = receding.
-        segmenter: manifest of a model for fleet.toml, relative to it; without one, semantics must come from elsewhere.
-        detector: manifest of a model for fleet.toml.
+        radar_columns: columns of kitti's radar/*.bin (float32); doppler is the range rate, positive =
+            receding.
+        segmenter: model manifest for fleet.toml, path relative to it; without one, add semantics to
+            fleet.toml yourself.
+        detector: model manifest for fleet.toml.
     """
     from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
@@ -55,7 +58,7 @@ def convert(
     if (segmenter is None) != (detector is None):
         raise ConfigError("command line", "segmenter, detector", "give both or neither")
     owner = vehicle or str(data_set)
-    Partition(owner, day)  # refuses what is no vehicle or day
+    Partition(owner, day)  # raises for invalid names
     if data_set == "nuscenes":
         named: dict[Kind, str | None] = {"camera": camera, "lidar": lidar, "radar": radar}
         recordings = read_nuscenes(folder, {k: c.split(",") for k, c in named.items() if c is not None})

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 __all__ = ["demo"]
 
-# What is compared with the truth at the end: the night's method, and the shipped network.
+# Methods compared with the truth at the end: the night's method, and the included network.
 _NETWORK = "joint-ssl"
-# The radar of the second vehicle is knocked before the third day: 1.2 deg is what a kerb or a car wash does.
+# The radar of the second vehicle is turned before the third day. A kerb or a car wash can turn it by 1.2 deg.
 _KNOCK = "vehicle-2:2:radar:yaw:1.2"
-# Vehicles that carry other sensors than the first: the rig `duo` has two cameras and two radars. More edges take more
-# time, and fewer moments give it back.
+# Vehicles with other sensors than the first: the rig `duo` has two cameras and two radars. Its additional
+# edges take more time; fewer moments compensate for that.
 _OWN_RIGS = (("vehicle-3", "duo"),)
 _FEWEST = 12
 
@@ -40,15 +40,16 @@ def demo(
     workers: int | None = None,
     seed: int = 1,
 ) -> int:
-    """Simulate vehicles for some days, knock a radar, find it again, and write the report.
+    """Simulate vehicles for some days, turn one radar, find the change, and write the report.
 
     Args:
-        out: folder for logs, truth, lake and report; what is up to date there is not made again.
-        vehicles: how many; the radar of the second one is knocked.
-        days: how many; the knock comes before the third.
-        frames: moments per vehicle and day; three quarters of it of the third vehicle, which has more sensors.
+        out: folder for logs, truth, lake and report; results that are up to date are kept.
+        vehicles: number of vehicles; the radar of the second one is turned.
+        days: number of days; the radar is turned before the third.
+        frames: moments per vehicle and day; three quarters of them for the third vehicle, which has more
+            sensors.
         workers: processes at a time; default: one per CPU that this process may use.
-        seed: another seed is another fleet.
+        seed: random seed of the fleet.
     """
     from jobs.nightly import Drawing, close_night
     from jobs.terminal.demo_table import print_comparison, print_methods
@@ -85,7 +86,7 @@ def demo(
 
 
 def _plan(vehicles: int, days: int, frames: int, seed: int) -> tuple[FleetSpec, list[str]]:
-    """The fleet to simulate, with its knock, and its days."""
+    """The fleet to simulate, with the turned radar, and its days."""
     from pipeline.simulate.faults import parse_faults
     from pipeline.simulate.fleet import FleetSpec, day_names
 
@@ -104,12 +105,12 @@ def _plan(vehicles: int, days: int, frames: int, seed: int) -> tuple[FleetSpec, 
 
 
 def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int | None) -> list[DayOutcome]:
-    """Every vehicle-day by the night's method, and the last day by the network too."""
+    """Calibrate every vehicle-day by the night's method, and the last day by the network too."""
     from jobs.nightly import watch_night
     from pipeline.fleet.pattern import find_vehicle_days
 
     work = find_vehicle_days(str(logs / "{vehicle}" / "{day}" / "*"), dates[0], dates[-1])
-    # The network looks at single frames, without semantics, of rigs of three.
+    # The network needs one camera, one lidar and one radar, and works on single frames without semantics.
     others = dict(_OWN_RIGS)
     last_day = [w for w in work if w.partition.day == dates[-1] and w.partition.vehicle not in others]
     by_network = replace(night, method=_NETWORK)
@@ -120,7 +121,7 @@ def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int | No
 
 
 def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told: Any) -> int:
-    """Print where the report lies and the last line; returns the exit code."""
+    """Print the path of the report and the summary; returns the exit code."""
     from jobs.terminal.summary import exit_code, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
 
@@ -133,7 +134,7 @@ def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told
 
 
 def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
-    """Write the fleet's logs, unless the same fleet lies there already."""
+    """Write the fleet's logs, unless the folder contains the same fleet already."""
     import shutil
     from contextlib import closing
 
@@ -174,7 +175,7 @@ def _simulate_one(work: tuple[FleetSpec, int, int, Path], progress: Progress) ->
 
 
 def _say(text: str) -> None:
-    """A line for whoever watches; without a terminal the log lines say it."""
+    """Print a line on a terminal; without a terminal, the log has the same information."""
     from jobs.terminal.summary import is_terminal
 
     if is_terminal():

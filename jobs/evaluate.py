@@ -1,4 +1,4 @@
-"""`boresight evaluate`: calibration records against a known truth or picked reflectors, as the paper reports them."""
+"""`boresight evaluate`: errors of calibration records against true extrinsics or picked reflectors."""
 
 from __future__ import annotations
 
@@ -27,24 +27,27 @@ def evaluate(
     truth_sigma: str = "0,0",
     out: Path | None = None,
 ) -> int:
-    """Measure records against a known truth or a corner-reflector recording, as the paper's tables 1 and figures 1-4.
+    """Compute errors of records against true extrinsics or a corner-reflector recording, as in the paper.
 
-    Errors are azimuth, elevation and range at three reflectors; the paper's printed numbers stand beside them.
+    Errors are in azimuth, elevation and range at three reflectors, with the paper's printed numbers for
+    comparison.
 
     Args:
         lake: folder of the tables.
         truth: JSON with T_camera_lidar and T_lidar_radar (4x4), or a folder with VEHICLE/DAY.json.
-        reflectors: instead of a truth, JSON of reflector positions as picked in each sensor's data (what `simulate
-            --reflectors` writes; {"camera": {...}, "targets": [{"pixel", "lidar_m", "radar_m", ...}]}, described in
-            pipeline/evaluate/picks.py), or a folder with VEHICLE/DAY.json. It judges the vehicle and day that it names.
-        recording_lake: lake that the reflector recording was ingested into: lidar and radar positions are then found
-            in its frames near the picks, camera pixels stay as picked. Default: --lake where --recording-day is given.
-        recording_day: day under which it was ingested; default: the day of the picks. A lake holds one partition of
-            frames per vehicle-day: give the recording another day or a lake of its own, or it replaces the drives.
-        method: only this method's records.
-        truth_sigma: ROT_DEG,TRANS_M: how well a --truth itself is known, for the errors in sigmas.
-        out: FILE.md, FILE.parquet, FILE.html (a page with the paper's figures of these days), or a folder for all of
-            them as table_1.*; the tables go to stderr in any case.
+        reflectors: instead of --truth, JSON of reflector positions picked in each sensor's data, for one
+            vehicle and day (written by `simulate --reflectors`; {"camera": {...}, "targets": [{"pixel",
+            "lidar_m", "radar_m", ...}]}, described in pipeline/evaluate/picks.py), or a folder with
+            VEHICLE/DAY.json.
+        recording_lake: lake with the ingested reflector recording: lidar and radar positions are then
+            measured in its frames near the picks; camera pixels stay as picked. Default: --lake if
+            --recording-day is given.
+        recording_day: day of the ingested recording; default: the day of the picks. A lake has one partition
+            per vehicle-day: give the recording another day or another lake, otherwise it replaces the drives.
+        method: only records of this method.
+        truth_sigma: ROT_DEG,TRANS_M: 1-sigma uncertainty of --truth, for errors in units of sigma.
+        out: FILE.md, FILE.parquet, FILE.html (a page with the paper's figures for these days), or a folder
+            for all of them as table_1.*; the tables are printed on stderr in any case.
     """
     import math
     import sys
@@ -77,7 +80,7 @@ def evaluate(
 
 
 def _check(truth: Path | None, reflectors: Path | None, recording: str | None, out: Path | None) -> None:
-    """Refuse what cannot be meant before anything is compared."""
+    """Raise ConfigError for options that contradict each other, before any work."""
     from pipeline.errors import ConfigError
 
     if (truth is None) == (reflectors is None):

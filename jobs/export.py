@@ -1,4 +1,4 @@
-"""`boresight export`: a calibration for the car; the tables' contracts as JSON Schema; a trained network as ONNX."""
+"""`boresight export`: a calibration as a file; JSON Schemas of the tables; a trained network as ONNX."""
 
 from __future__ import annotations
 
@@ -40,32 +40,34 @@ def export(
     run: Path | None = None,
     notes: Path | None = None,
 ) -> int:
-    """Write what others read without Boresight: a calibration in one of many formats, schemas, or a network.
+    """Write a file for other programs: a calibration in one of many formats, JSON Schemas, or a network.
 
-    A calibration is a vehicle's state, or with --day that day's records. Pairs that are held or refused are left out.
-    Exit code 3 where not all of it is accepted and certified; the file and the summary say what.
+    A calibration is a vehicle's state, or with --day the records of that day. Held and refused pairs are left
+    out. Exit code 3 if a pair is not accepted or not certified; the file and the summary list those pairs.
 
     Args:
-        what: format of a calibration; or "foxglove", an MCAP of a day's drive with it, for viewers; or "schemas", one
-            JSON Schema (2020-12) of a row per table; or "onnx", a trained network with its card.
-        out: folder, made where it is missing; or the file, of a format that is one.
+        what: format of a calibration; or "foxglove", an MCAP file of a day's drive with its calibration, for
+            viewers; or "schemas", a JSON Schema (2020-12) of the rows of each table; or "onnx", a trained
+            network with its card.
+        out: folder to write into, created if missing; for formats of a single file, that file.
         lake: folder of the tables.
-        vehicle: whose calibration.
-        day: YYYY-MM-DD: this day's records; default: the vehicle's state.
-        method: of the calibration.
-        force: write held pairs too, marked as such; the exit code stays 3.
-        unchecked: write axes too that lie far from the prior and that nothing checks; default: they rest at the prior.
-        mount: where the reference lidar sits on the car (frames --base-frame and the lidar's): log:FILE, whose
-            /tf_static says it, or FORMAT:FILE, as urdf:car.urdf; default: the lidar is the root of the tree.
-        update: of "autoware": your sensor_kit_calibration.yaml; --out is that file with new numbers for its
-            sensors, all else as it was.
-        frames: names of the frames.
-        generic_frames: call them as the sensors (camera, lidar and radar), not as the car's own logs do (autoware
-            always does).
-        most_frames: of "foxglove", which shows the drive of --day: so many frames, evenly spread.
-        sensor: of "foxglove": only sensors of these names; again for each; default: all.
-        run: folder of `boresight train`; needed for "onnx".
-        notes: JSON object for the card: what was measured, what the data was.
+        vehicle: vehicle id.
+        day: YYYY-MM-DD: export the records of this day; default: the vehicle's state.
+        method: calibration method.
+        force: write held pairs too, marked as held; the exit code stays 3.
+        unchecked: write axes that lie far from the prior and that no check covers; default: write the prior
+            for them.
+        mount: pose of the reference lidar on the car (from --base-frame to the lidar's frame): log:FILE (its
+            /tf_static) or FORMAT:FILE, as in urdf:car.urdf; default: the lidar is the root of the tree.
+        update: for "autoware": your sensor_kit_calibration.yaml; --out is a copy of it with new numbers for
+            the calibrated sensors.
+        frames: frame names.
+        generic_frames: name frames after the sensors (camera, lidar, radar) instead of the frames in the
+            car's logs (autoware always does).
+        most_frames: for "foxglove", which shows the drive of --day: maximum number of frames, evenly spaced.
+        sensor: for "foxglove": only this sensor; repeat for several; default: all.
+        run: folder written by `boresight train`; required for "onnx".
+        notes: JSON object for the card: measurements, description of the data.
     """
     from jobs.calibration_sources import read_calibration
     from jobs.terminal.summary import print_summary
@@ -82,7 +84,7 @@ def export(
         return 0
     if lake is None or vehicle is None:
         raise ConfigError("command line", "lake, vehicle", "a calibration needs --lake and --vehicle")
-    # Autoware's kit holds the camera's link, and logs name its optical frame.
+    # Autoware's sensor kit has the camera's link, while logs name its optical frame.
     own_frames = not (generic_frames or what == "autoware")
     calibration = read_calibration(
         lake, vehicle, day, method, force=force, unchecked=unchecked, frames=frames or FrameOptions(),
@@ -132,7 +134,7 @@ def _written(calibration: ExportedCalibration) -> list[str]:
 
 
 def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> int:
-    """Warnings, the summary and the exit code: what is not accepted never goes out unsaid."""
+    """Log a warning for each pair that is not accepted, print the summary and return the exit code."""
     from jobs.terminal.logging import logger
     from jobs.terminal.summary import print_summary
     from pipeline.export.provenance import not_certified, warnings_of
@@ -151,7 +153,7 @@ def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
     from pipeline.errors import ConfigError
 
     if run is None or not run.is_dir():
-        raise ConfigError("command line", "run", "onnx needs --run FOLDER, as `boresight train` left it")
+        raise ConfigError("command line", "run", "onnx needs --run FOLDER, written by `boresight train`")
     if out.suffix != ".onnx":
         raise ConfigError("command line", "out", f"{out} must end in .onnx")
     from jobs.extras import require

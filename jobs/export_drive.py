@@ -25,19 +25,20 @@ def export_foxglove(
     most_frames: int,
     sensors: Sequence[str],
 ) -> list[Path]:
-    """Write the MCAP `out` and the layout beside it.
+    """Write the MCAP file `out` and a viewer layout beside it.
 
     Args:
-        calibration: of the day.
-        location: of the lake.
-        day: whose drive it is.
-        out: the file.
-        most_frames: evenly spread.
-        sensors: names of those that are shown; empty = all.
+        calibration: calibration of the day.
+        location: folder or URL of the lake.
+        day: day of the drive, YYYY-MM-DD.
+        out: MCAP file to write.
+        most_frames: maximum number of frames, evenly spaced.
+        sensors: names of the sensors to show; empty = all.
 
     Raises:
         MissingExtraError: foxglove-sdk is not installed.
-        ConfigError: no file name, no sensor of a name, or the lake has no frames of that day.
+        ConfigError: `out` does not end in .mcap, a sensor does not exist, or the lake has no frames of that
+            day.
     """
     from jobs.extras import require
 
@@ -83,10 +84,10 @@ def export_foxglove(
 
 
 def _shown(calibration: ExportedCalibration, sensors: Sequence[str]) -> list[Sensor]:
-    """The sensors of these names, or all.
+    """The sensors with these names, or all sensors if no name is given.
 
     Raises:
-        ConfigError: there is none of a name.
+        ConfigError: a name is unknown.
     """
     there = {s.name: s for s in calibration.sensors}
     unknown = [name for name in sensors if name not in there]

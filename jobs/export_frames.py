@@ -1,4 +1,4 @@
-"""`boresight export frames`: frames of many vehicle-days with a calibration, for other people's networks."""
+"""`boresight export frames`: frames of many vehicle-days with a calibration, as training data."""
 
 from __future__ import annotations
 
@@ -37,27 +37,29 @@ def export_frames(
     executor: Literal["process", "inline"] = "process",
     workers: int | None = None,
 ) -> int:
-    """Write synchronised frames of many days with the calibration, split so that nothing leaks, and a card.
+    """Write synchronised frames of many days with calibration, in splits without leaks, and a data card.
 
-    A vehicle-day is whole or not there: run the command again after a stop, or when the lake has grown.
-    Exit code 3 where vehicle-days are left out; the card says why.
+    A vehicle-day is exported whole or not at all: run the command again after a stop, or after the lake has
+    grown. Exit code 3 if vehicle-days are left out; the card gives the reasons.
 
     Args:
-        fleet: fleet.toml; its section prepare says how finely and how the frames are split.
+        fleet: fleet.toml; section [prepare] sets the spacing of frames and the split.
         lake: folder of the tables, or s3://BUCKET/PREFIX.
         out: folder of the export, or s3://BUCKET/PREFIX.
-        format: webdataset (tar shards), parquet (with a torch Dataset), kitti or nuscenes (images undistorted).
-        calibration: state (what each vehicle loads tonight; days before a sensor moved are left out), day (each day's
-            own records), or prior (what was known before).
-        perturb: DEG M: move each sensor's pose by exactly this much; the answer stands beside it.
-        perturb_per: what has one draw of --perturb.
-        seed: of these draws.
-        sensor: only sensors of these names; again for each; default: all.
-        method: of the calibration.
-        force: take held poses too, marked as such.
+        format: webdataset (tar shards), parquet (with a torch Dataset), kitti or nuscenes (images
+            undistorted).
+        calibration: state (the one that each vehicle loads tonight; days before a sensor moved are left out),
+            day (the records of each day), or prior (the prior of each day).
+        perturb: DEG M: move the pose of each sensor by exactly this much; the unperturbed pose is written
+            beside it.
+        perturb_per: draw a perturbation per frame or per day.
+        seed: random seed of the perturbations.
+        sensor: only this sensor; repeat for several; default: all.
+        method: calibration method.
+        force: use held poses too, marked as held.
         from_day: first day, YYYY-MM-DD.
         to_day: last day.
-        vehicles: only these; default: all of fleet.toml that the lake has.
+        vehicles: only these vehicles; default: all vehicles of fleet.toml in the lake.
         executor: process (a pool) or inline (one after the other in this process).
         workers: processes at a time; default: one per CPU that this process may use.
     """
@@ -121,7 +123,7 @@ def _mountings(
     *,
     force: bool,
 ) -> tuple[dict[Partition, Mounting], list[dict[str, str]]]:
-    """The calibration of each vehicle-day, and the days that have none, with the reason."""
+    """The calibration of each vehicle-day, and the vehicle-days without one, with the reason."""
     from jobs.frame_calibrations import mounting_of
     from pipeline.errors import ConfigError, SolveError
 
@@ -139,7 +141,7 @@ def _mountings(
 def _run(
     tasks: Sequence[DayTask], executor: str, workers: int | None
 ) -> tuple[dict[str, int], list[dict[str, str]]]:
-    """All days, with progress: how many are done and cached, and those that failed."""
+    """Export all days and report progress: number of days done and cached, and the failed days."""
     from collections import Counter
     from contextlib import closing
 

@@ -1,4 +1,4 @@
-"""What the extras of the distribution bring, and the one line that names the extra which a command lacks."""
+"""Optional dependencies (extras) of the distribution, and the error that names a missing one."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["EXTRAS", "needs", "require"]
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Extra -> the module without which its commands, or an option of them, cannot start.
+# Extra -> a module that commands with this extra import.
 EXTRAS = {"simulate": "embreex", "train": "torch", "ray": "ray", "ops": "openlineage", "viz": "foxglove"}
 
 
 def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Mark a command that cannot do anything without an extra."""
+    """Mark a command that needs an extra."""
 
     def mark(command: Callable[P, R]) -> Callable[P, R]:
         @wraps(command)
@@ -31,7 +31,7 @@ def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def require(extra: str) -> None:
-    """Ask before any work is done, so that nothing is half-written and no worker process has to say it.
+    """Check for an extra before any work, so that no file is half-written and no worker process fails.
 
     Raises:
         MissingExtraError: the extra is not installed.

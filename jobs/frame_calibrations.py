@@ -1,4 +1,4 @@
-"""Calibrations that frames are given out with: a vehicle's state, a day's records, or what was known before."""
+"""Calibrations for exported frames: a vehicle's state, a day's records, or the prior."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def mounting_of(
     *,
     force: bool,
 ) -> Mounting:
-    """Poses of the wanted sensors (none named: all) on one vehicle-day, by the calibration that is asked for.
+    """Poses of the named sensors (no name: all) on one vehicle-day, from the chosen kind of calibration.
 
     Raises:
-        ConfigError: there is no such calibration, or the rig has no sensor of a name.
-        SolveError: fewer than two sensors have a pose, or the state begins after that day.
+        ConfigError: there is no such calibration, or the rig has no sensor of that name.
+        SolveError: fewer than two sensors have a pose, or the state starts after that day.
     """
     rig = fleet.rig_of(day.vehicle)
     unknown = [name for name in sensors if name not in rig.sensors]
@@ -70,7 +70,7 @@ def _of_prior(lake: Lake, fleet: FleetConfig, day: Partition) -> Mounting:
     for name in T:
         turn, shift = prior.sigmas_between(reference, name) if name != reference else (0.0, 0.0)
         about[name] = _about("prior", [float(np.degrees(turn))] * 3, [shift] * 3)
-    without = {name: "nothing ties it to the others" for name in rig.sensors if name not in T}
+    without = {name: "no transform joins it to the others" for name in rig.sensors if name not in T}
     return Mounting(f"prior of {day.day}", reference, T, about, prior.between(BASE.name, reference), without)
 
 
@@ -108,7 +108,7 @@ def _about(
 
 
 def _require_since(found: ExportedCalibration, a: str, b: str, day: Partition) -> None:
-    """Raise SolveError where the state of a pose counts from a later day only: the sensor was elsewhere before."""
+    """Raise SolveError if the state of a pose starts after the day: the sensor moved in between."""
     for pair in _pairs(found, a, b):
         since = pair.details.get("since")
         if since and str(since) > day.day:
@@ -128,6 +128,6 @@ def _status(found: ExportedCalibration, a: str, b: str) -> str:
 
 
 def _doubts(found: ExportedCalibration, a: str, b: str) -> dict[str, Any]:
-    """Axes of a pose that the data did not determine or that nothing checks; empty where there are none."""
+    """Axes of a pose that kept the prior or that no check covers; empty if there are none."""
     axes = sorted({dof for pair in _pairs(found, a, b) for dof in (*pair.at_prior, *pair.resting)})
     return {"kept_at_prior": axes} if axes else {}

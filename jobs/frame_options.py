@@ -1,4 +1,4 @@
-"""Names of frames on the command line, the same for every command that reads or writes calibration files."""
+"""Frame names on the command line, for all commands that read or write calibration files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _KINDS = ("camera", "lidar", "radar", "base")
 @Parameter(name="*")
 @dataclass(frozen=True)
 class FrameOptions:
-    """What the frames are called in the file; default: as the car's own log calls them, else by the sensor."""
+    """Frame names in the file; default: the names in the car's logs, otherwise the names of the sensors."""
 
     camera: Annotated[
         str | None, Parameter(name="--camera-frame", help="optical frame (Autoware: the link)")
@@ -34,10 +34,10 @@ class FrameOptions:
     ] = ()
 
     def names(self, known: Mapping[str, str] | None = None) -> FrameNames:
-        """The same for the pipeline; `known` names what no option does.
+        """Frame names for the pipeline; `known` has names for frames without an option.
 
         Raises:
-            ConfigError: no names of frames.
+            ConfigError: a name is not valid.
         """
         from pipeline.errors import ConfigError
         from pipeline.export.calibration import FrameNames
@@ -51,10 +51,10 @@ class FrameOptions:
         return FrameNames.named({**(known or {}), **asked})
 
     def names_in(self, files: Iterable[str | Path]) -> FrameNames:
-        """Names in files to read: those that an export noted in them or beside them.
+        """Frame names for reading files: from options, else those that an export wrote in or beside them.
 
         Raises:
-            ConfigError: no names of frames.
+            ConfigError: a name is not valid.
         """
         from pipeline.export.files import noted_frames
 

@@ -1,4 +1,4 @@
-"""`boresight gc`: what leaves a lake after its time."""
+"""`boresight gc`: delete old images and observations from a lake."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ __all__ = ["gc"]
 def gc(
     *, lake: str, images_days: int = 30, observations_days: int | None = None, dry_run: bool = False
 ) -> int:
-    """Take moments, with their images of public roads, and day pages that show them out of a lake. Records stay.
+    """Delete old moments with their images of public roads, and day pages that show them. Records stay.
 
-    Moments of days that a night is given again are made anew where a changed configuration asks for them. A page that
-    left is drawn again, without pictures, by the next night whose window holds its day, or by `boresight report`.
+    If a night gets the logs of a deleted day again, and a changed configuration needs its moments, it makes
+    them again. A deleted page is drawn again, without pictures, by the next night with that day in its window
+    or by `boresight report`.
 
     Args:
         lake: folder of the tables.
-        images_days: days whose images stay, today among them; the day is the vehicle-day's own.
-        observations_days: days whose observations (outlines, clusters, a grey map of the road's contrast) stay;
-            default: all, so that a new release can calibrate them again.
-        dry_run: only say what would go.
+        images_days: keep images of this many days, today included; the day is the day of the vehicle-day.
+        observations_days: keep observations (outlines, clusters, a grey map of the road's contrast) of this
+            many days; default: all, so that a new release can calibrate them again.
+        dry_run: only list what would be deleted.
     """
     import datetime as dt
 

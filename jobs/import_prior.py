@@ -1,4 +1,4 @@
-"""`boresight import`: a calibration file of another program as a prior."""
+"""`boresight import`: calibration files of other programs to a prior file."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ def import_prior(
     rig: str | None = None,
     frames: FrameOptions | None = None,
 ) -> int:
-    """Make a prior file of what another program wrote: of a camera, a lidar and a radar, or of all sensors of a rig.
+    """Convert calibration files of another program to a prior file, for three sensors or for a whole rig.
 
     Args:
-        form: one of the formats of `boresight export`, or vod: View-of-Delft, the lidar's file and the radar's.
+        form: a format of `boresight export`, or vod: View-of-Delft, the lidar's file and the radar's.
         files: all files of the calibration.
-        out: prior file to write; fleet.toml takes it as [rigs.*.prior] source = "file", file = "...".
-        also: prior file that has what the files lack, as those of cameras alone lack radars.
-        fleet: fleet.toml whose rig's sensors are looked for, each by its name or by what --frame calls it.
-        rig: which of its rigs; default: the only one.
-        frames: what the frames are called in the files.
+        out: prior file to write; use it in fleet.toml: [rigs.*.prior] source = "file", file = "...".
+        also: prior file for sensors that the files lack, as radars in files of cameras.
+        fleet: fleet.toml with the rig whose sensors are read, by sensor name or by the name in --frame.
+        rig: rig of fleet.toml; default: the only one.
+        frames: frame names in the files.
     """
     from jobs.terminal.summary import print_summary
     from pipeline.export.files import prior_text, read_files, write_files
@@ -64,10 +64,10 @@ def _of_rig(
     of: tuple[Path, str | None],
     frames: FrameOptions,
 ) -> list[str]:
-    """Write the prior file of all sensors of a rig; the sensors that the files have.
+    """Write the prior file of all sensors of a rig; returns the sensors found in the files.
 
     Raises:
-        ConfigError: a sensor is missing, or twice, or the fleet has no such rig.
+        ConfigError: a sensor is missing or present twice, or the fleet has no such rig.
     """
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError

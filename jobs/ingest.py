@@ -1,4 +1,4 @@
-"""`boresight ingest`: logs of one vehicle-day to frames."""
+"""`boresight ingest`: logs of one vehicle-day to synchronised frames."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ __all__ = ["ingest"]
 
 
 def ingest(*logs: str, fleet: Path, lake: str, vehicle: str, day: str) -> int:
-    """Synchronise camera, lidar and radar of one vehicle-day and keep the moments that they share.
+    """Synchronise the sensors of one vehicle-day and store the moments that they share.
 
     Args:
-        logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of that day, in any order; also s3://BUCKET/KEY.
+        logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of that day, in any order; or
+            s3://BUCKET/KEY.
         fleet: fleet.toml.
         lake: folder of the tables.
         vehicle: vehicle id, as in fleet.toml.

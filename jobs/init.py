@@ -1,4 +1,4 @@
-"""`boresight init`: a fleet.toml out of the logs themselves."""
+"""`boresight init`: write a fleet.toml from logs."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ __all__ = ["init"]
 
 
 def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force: bool = False) -> int:
-    """Write a fleet.toml for logs: sensors, topics, what the radars' numbers mean; comments say what to enter.
+    """Write a fleet.toml for logs: sensors, topics, meaning of radar fields; comments name missing entries.
 
     Args:
-        logs: some MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of vehicles of one build.
+        logs: some MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of vehicles with the same sensors.
         out: file to write.
-        name: of the fleet.
-        force: replace the file where it exists.
+        name: name of the fleet.
+        force: replace the file if it exists.
     """
     from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.errors import ConfigError

@@ -1,4 +1,4 @@
-"""`boresight migrate`: a lake of an older release to the tables of this one."""
+"""`boresight migrate`: convert a lake of an older release to the tables of this one."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ __all__ = ["migrate"]
 
 
 def migrate(*, lake: str) -> int:
-    """Take the records of a lake that a release before 0.6 wrote (Parquet files) into record tables.
+    """Move the records of a lake written before release 0.6 (Parquet files) into record tables.
 
-    Can be run again, and goes on where it was stopped. Frames and observations stay as they are.
+    The command can be run again, and continues after a stop. Frames and observations are not changed.
 
     Args:
         lake: folder of the tables.

@@ -1,4 +1,4 @@
-"""Where else a night is told of: metrics and lineage, both optional; one that fails is named and fails nothing."""
+"""Metrics and lineage of a night, both optional. A failing sink is reported and does not fail the night."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 __all__ = ["NightSinks", "night_sinks"]
 
-_SENT_WITHIN_S = 30.0  # after the night, for what still waits
-_STOPPED_WITHIN_S = 2.0  # after an order to stop
+_SENT_WITHIN_S = 30.0  # wait at most this long for unsent events after the night
+_STOPPED_WITHIN_S = 2.0  # the same after an order to stop
 
 
 class NightSinks:
-    """Told of each vehicle-day as it ends, and of the night's end.
+    """Receives each vehicle-day as it ends, and the end of the night.
 
     Args:
         night: what its vehicle-days share.
-        metrics: file of Prometheus metrics to replace; None = none.
-        lineage: events and where they go; None = none.
+        metrics: Prometheus text file to replace; None = no metrics.
+        lineage: lineage events and their destination; None = no lineage.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class NightSinks:
         self._state = "ABORT"
 
     def take(self, outcome: DayOutcome) -> None:
-        """A vehicle-day ended."""
+        """Record a finished vehicle-day."""
         self._tally.add(outcome)
         if self._lineage is not None:
             lineage, sink = self._lineage
@@ -52,11 +52,11 @@ class NightSinks:
                 sink.emit(event)
 
     def take_stage(self, outcome: Outcome) -> None:
-        """A stage of the whole fleet ended."""
+        """Record a finished stage of the whole fleet."""
         self._tally.add_stage(outcome)
 
     def ended(self, exit_code: int, findings: Sequence[DriftFinding]) -> None:
-        """The night ended with this exit code, and the audit found this."""
+        """Record the exit code of the night and the findings of the audit."""
         from jobs.terminal.vehicle_status import count_statuses, moved_sensors
 
         self._state = "FAIL" if exit_code in (1, 2) else "COMPLETE"
@@ -72,21 +72,21 @@ class NightSinks:
             logger().warning("no metrics", file=str(self._metrics), reason=str(err))
 
     def close(self) -> None:
-        """Say how the night ended, and wait until that is sent."""
+        """Send the end of the night, and wait until it is sent."""
         if self._lineage is None:
             return
         lineage, sink = self._lineage
         sink.emit(lineage.ended(dt.datetime.now(dt.UTC), self._state))
         problem = sink.close(_STOPPED_WITHIN_S if self._state == "ABORT" else _SENT_WITHIN_S)
         if problem:
-            logger().warning("lineage is not whole", reason=problem)
+            logger().warning("lineage is incomplete", reason=problem)
 
 
 @contextmanager
 def night_sinks(
     night: Night, days: Sequence[VehicleDay], metrics: Path | None, lineage: str | None
 ) -> Iterator[NightSinks]:
-    """The sinks of a night: `metrics` is a file, `lineage` a file or a URL."""
+    """Open the sinks of a night: `metrics` is a file, `lineage` a file or a URL."""
     opened = None
     if lineage is not None:
         from pipeline.fleet.lineage import NightLineage

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["Drawing", "close_night", "nightly", "tidy", "watch_night"]
 
 
-# A command's parameters are its options: more than eight, because each is one that a user sets.
+# The parameters of a command are its options: more than eight, because a user sets each of them.
 def nightly(
     *,
     fleet: Path,
@@ -38,26 +38,28 @@ def nightly(
     held_exit_code: Literal[0, 3] = 3,
     dry_run: bool = False,
 ) -> int:
-    """Take every vehicle-day of a pattern through all stages; one bad day never stops the fleet.
+    """Run all stages on every vehicle-day whose logs match a pattern; a failed day never stops the fleet.
 
     Args:
         fleet: fleet.toml.
-        lake: folder of the tables; made where it is missing.
+        lake: folder of the tables, created if missing.
         logs: pattern such as "logs/{vehicle}/{day}/*.mcap" or "data/{vehicle}_{day}_*"; quoted.
             In a bucket: "s3://BUCKET/{vehicle}/{day}/*.mcap".
         from_day: first day, YYYY-MM-DD.
         to_day: last day.
-        executor: process (a pool), inline (one after the other in this process) or ray (tasks of the cluster that
-            RAY_ADDRESS names, else of this machine; needs the extra [ray]).
-        workers: processes or tasks at a time; default: one per CPU that this process may use, two per CPU of a cluster.
-        method: calibration method; default: audit.method, so that calibration and charts agree.
-        seed: of everything random; the configuration's where left out.
-        report: HTML page of the fleet; default: report/fleet.html inside the lake.
+        executor: process (a pool), inline (one after the other in this process) or ray (tasks of the cluster
+            in RAY_ADDRESS, otherwise of this machine; needs the extra [ray]).
+        workers: processes or tasks at a time; default: one per CPU that this process may use, two per CPU of
+            a cluster.
+        method: calibration method; default: audit.method, so that calibration and audit use the same.
+        seed: random seed; default: the seed of the configuration.
+        report: HTML page of the fleet; default: report/fleet.html in the lake.
         pictures: --no-pictures draws pages without images of public roads.
-        metrics: Prometheus text file to replace when the night ends; needs the extra [ops].
-        lineage: file or URL that OpenLineage events are sent to; needs the extra [ops].
-        held_exit_code: where something was held or refused; 0 for schedulers to whom all else is a failure.
-        dry_run: only say what would run, and why.
+        metrics: Prometheus text file to replace at the end of the night; needs the extra [ops].
+        lineage: file or URL for OpenLineage events; needs the extra [ops].
+        held_exit_code: exit code if something was held or refused; 0 for schedulers that treat any other code
+            as failure.
+        dry_run: only list what would run, and why.
     """
     from jobs.extras import require
     from jobs.night_sinks import night_sinks
@@ -108,7 +110,7 @@ def _print_end(
     mend: Mapping[str, str],
     realigned: Mapping[str, Any],
 ) -> None:
-    """The night's summary: what became of the vehicle-days and of the vehicles, and where to read about it."""
+    """Print the summary of the night: statuses of vehicle-days and vehicles, and paths of the pages."""
     from jobs.terminal.summary import left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps
     from schemas.words import DAY_WORDS
@@ -131,7 +133,7 @@ def _print_end(
 
 
 def _print_plan(night: Night, days: Sequence[VehicleDay]) -> int:
-    """What the night would do with each vehicle-day, as lines for people and as the summary."""
+    """Print what the night would do with each vehicle-day, as a table and as the summary."""
     import sys
     from dataclasses import asdict
 
@@ -153,7 +155,7 @@ def _print_plan(night: Night, days: Sequence[VehicleDay]) -> int:
 
 
 def tidy(lake: Lake) -> None:
-    """Keep the record tables small after a night: what was done goes into the log, what it cannot do to nobody."""
+    """Compact the record tables after a night. The log lists what was done; failures are ignored."""
     from jobs.terminal.logging import logger
     from pipeline.store.delta import tidy_table
     from schemas.versions import TABLES
@@ -171,9 +173,9 @@ def watch_night(
     workers: int | None,
     take: Callable[[DayOutcome], None] = lambda _: None,
 ) -> list[DayOutcome]:
-    """Run the night in view of whoever watches; outcomes in order of their end, without what the stages answered.
+    """Run the night with a progress display; returns outcomes in order of completion, without their records.
 
-    `take` is told each one whole.
+    `take` receives each complete outcome.
     """
     from jobs.terminal.night_view import night_view
     from pipeline.errors import ConfigError
@@ -189,20 +191,20 @@ def watch_night(
             take(outcome)
             outcomes.append(
                 replace(outcome, results=())
-            )  # the records of a whole fleet would fill the memory
+            )  # the records of a whole fleet would not fit in memory
     return outcomes
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """How a night's pages are drawn.
+    """Settings for drawing the pages of a night.
 
     Args:
-        report: HTML page of the fleet; None = report/fleet.html inside the lake.
+        report: HTML page of the fleet; None = report/fleet.html in the lake.
         pictures: False = pages without images of public roads.
-        executor: where pages of days are drawn.
-        workers: processes or tasks at a time; None = as many as the executor finds CPUs for.
-        truth: of a simulated fleet.
+        executor: executor that draws the pages of days.
+        workers: processes or tasks at a time; None = one per CPU that the executor finds.
+        truth: true extrinsics of a simulated fleet; None for real logs.
     """
 
     report: Path | None = None
@@ -219,10 +221,10 @@ def close_night(
     outcomes: Sequence[DayOutcome] = (),
     told: Callable[[Outcome], None] = lambda _: None,
 ) -> tuple[list[DriftFinding], list[str]]:
-    """Audit the fleet, say what vehicles should load, and write the pages; returns the findings and the pages.
+    """Audit the fleet, compute vehicle states, and write the pages; returns the findings and the page paths.
 
-    However few days the night was about, the charts look back over `audit.window_days`; its own days get a page
-    however long ago they were. `told` is told how each of these stages ended.
+    The charts cover the last `audit.window_days` days, however few days this night processed. Days of this
+    night get a page however old they are. `told` receives the outcome of each of these stages.
     """
     from jobs.terminal.summary import progress_reporter
     from pipeline.fleet.pages import OnWorkers

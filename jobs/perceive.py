@@ -1,4 +1,4 @@
-"""`boresight perceive`: frames of one vehicle-day to observations."""
+"""`boresight perceive`: features of the frames of one vehicle-day."""
 
 from __future__ import annotations
 

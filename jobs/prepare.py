@@ -1,4 +1,4 @@
-"""`boresight prepare`: frames and observations of many vehicle-days to training data."""
+"""`boresight prepare`: training data from frames and observations of many vehicle-days."""
 
 from __future__ import annotations
 
@@ -30,16 +30,17 @@ def prepare(
     executor: Literal["process", "inline"] = "process",
     workers: int | None = None,
 ) -> int:
-    """Make table training: what a network learns from, split so that no vehicle, day or place is on two sides.
+    """Make the table training: samples for a network, split so that no vehicle, day or place is on two sides.
 
-    Prints what the split costs, and what splitting by less would cost ([prepare] split_by).
+    Prints how many frames the split loses, and how many a split by fewer keys would lose ([prepare]
+    split_by).
 
     Args:
-        fleet: fleet.toml; its section prepare says how finely and how the frames are split.
+        fleet: fleet.toml; section [prepare] sets the spacing of frames and the split.
         lake: folder of the tables, with frames and observations.
         from_day: first day, YYYY-MM-DD.
         to_day: last day.
-        vehicles: only these; default: all of fleet.toml that the lake has.
+        vehicles: only these vehicles; default: all vehicles of fleet.toml in the lake.
         executor: process (a pool) or inline (one after the other in this process).
         workers: processes at a time; default: one per CPU that this process may use.
     """
@@ -88,10 +89,10 @@ def days_with_observations(
     to_day: str | None,
     vehicles: Sequence[str] | None,
 ) -> list[Partition]:
-    """Vehicle-days with observations, as wanted.
+    """Vehicle-days with observations, for the given days and vehicles.
 
     Raises:
-        ConfigError: a day or a vehicle that cannot be, or there are none.
+        ConfigError: a day or a vehicle is invalid, or there are no such vehicle-days.
     """
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import check_day
@@ -115,7 +116,7 @@ def days_with_observations(
 
 
 def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> tuple[list[Task], list[Choice]]:
-    """Look over all days and divide them; each worker gets the keys of its own day. And what each choice costs."""
+    """Survey all days and assign sides; returns a task per day, with its split keys, and other splits."""
     from jobs.terminal.summary import progress_reporter
     from pipeline.learn.prepare.sides import price_choices
     from pipeline.learn.prepare.split import SplitPlan, Unit
@@ -139,7 +140,7 @@ def _plan(config: FleetConfig, lake: Lake, days: Sequence[Partition]) -> tuple[l
 
 
 def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outcome]:
-    """All days, with progress."""
+    """Prepare all days, with progress; returns their outcomes."""
     from contextlib import closing
     from functools import partial
 
@@ -192,7 +193,7 @@ def _wanted_sides(config: FleetConfig) -> list[str]:
 def _next_steps(
     config: FleetConfig, fleet: Path, lake: str, choices: Sequence[Choice], empty: Sequence[str]
 ) -> list[str]:
-    """Train, or split by what these days can be told apart by: the choices begin with what shares least."""
+    """The next command: train, or, if a side is empty, the first alternative split without empty sides."""
     if not empty:
         return [f"boresight train --data {lake} --out run"]
     wanted = _wanted_sides(config)
@@ -217,7 +218,7 @@ def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Invent
         {
             "side": side,
             "status": "held",
-            "reason": f"no frames: too few to keep the sides apart by {by} (prepare.split_by)",
+            "reason": f"no frames: too few to split them by {by} (prepare.split_by)",
         }
         for side in _empty_sides(config, inventory)
     ]

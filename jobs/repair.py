@@ -1,4 +1,4 @@
-"""`boresight repair`: record tables that lost their log or files, from what is still there."""
+"""`boresight repair`: restore record tables whose log or files are damaged."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ __all__ = ["repair"]
 
 
 def repair(*, lake: str) -> int:
-    """Make damaged record tables whole again from what their data files hold, and name what is lost.
+    """Restore damaged record tables from their remaining data files, and list what is lost.
 
-    A damaged log goes to LAKE/<table>/_damaged and a new one begins; nothing that is recorded doubles. Run it while
-    nothing else writes. Lost calibrations are made anew by the next night that is given the logs. Exit code 3 where
-    rows are lost.
+    A damaged log moves to LAKE/<table>/_damaged, and a new one starts; no record is duplicated. Run it while
+    no other process writes to the lake. The next night with the logs of a day makes its lost calibrations
+    again. Exit code 3 if rows are lost.
 
     Args:
         lake: folder of the tables.

@@ -19,18 +19,19 @@ def report(
     picture: Path | None = None,
     pictures: bool = True,
 ) -> int:
-    """Write self-contained HTML: one day with --vehicle and --day, else the fleet with all its days.
+    """Write self-contained HTML: one day with --vehicle and --day, otherwise the fleet with all its days.
 
     Args:
         fleet: fleet.toml.
         lake: folder of the tables.
-        out: the HTML file to write; pages of days go into a folder beside it.
+        out: HTML file to write; pages of days go into a folder beside it.
         vehicle: vehicle id.
         day: YYYY-MM-DD.
-        method: method of the records; default: audit.method.
+        method: calibration method of the records; default: audit.method.
         truth: JSON with the true extrinsics of a simulated fleet, shown beside the estimates.
-        picture: also write the day's richest frame to a file: .jpg or .png is a still, its left half at the prior, its
-            right half at the result; .webp or .gif moves from one to the other. Needs --vehicle and --day.
+        picture: picture file to write as well, of the frame with most features: .jpg or .png is a still (left
+            half: prior, right half: result); .webp or .gif moves from one to the other. Needs --vehicle and
+            --day.
         pictures: --no-pictures draws pages without images of public roads.
     """
     from jobs.terminal.summary import print_summary
@@ -45,7 +46,7 @@ def report(
     if (vehicle is None) != (day is None):
         raise ConfigError("command line", "vehicle, day", "a day's page needs both --vehicle and --day")
     if picture is not None and day is None:
-        raise ConfigError("command line", "picture", "a picture is of one day: give --vehicle and --day")
+        raise ConfigError("command line", "picture", "a picture shows one day: give --vehicle and --day")
     config, tables = load_fleet(fleet), Lake.existing(lake)
     of = Partition(vehicle, day) if vehicle is not None and day is not None else Window()
     pages = Pages(out, read_truth(truth) if truth is not None else None, pictures)

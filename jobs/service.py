@@ -1,4 +1,4 @@
-"""`boresight service`: note what was done to a vehicle's sensors."""
+"""`boresight service`: record work on a vehicle's sensors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 __all__ = ["service"]
 
 
-# A command's parameters are its options: more than eight, because each is one that a user sets.
+# The parameters of a command are its options: more than eight, because a user sets each of them.
 def service(
     *,
     lake: str,
@@ -21,19 +21,19 @@ def service(
     note: str = "",
     withdraw: bool = False,
 ) -> int:
-    """Note that a sensor was mounted anew or repaired, or that a release changed its estimates: charts begin anew.
+    """Record that a sensor was re-mounted or repaired, or that a software release changed its estimates.
 
-    The next audit holds the days after this one against each other, and no longer against those before. Records of the
-    day itself count to neither side. Table service_events.
+    Charts restart: the next audit compares only the days after this one with each other. Records of the day
+    itself are in neither period. Writes the table service_events.
 
     Args:
         lake: folder of the tables.
-        vehicle: id of the vehicle; call it once for each.
-        day: on which it was done, YYYY-MM-DD.
-        kind: what was done; re-alignment is what the audit notes of a radar that its own software turned.
+        vehicle: vehicle id; run the command once per vehicle.
+        day: day of the work, YYYY-MM-DD.
+        kind: kind of work; re-alignment is written by the audit for a radar that its own software turned.
         sensor: name of the sensor, or base; all = the whole vehicle.
-        note: for people.
-        withdraw: this was noted by mistake: from the next audit on it counts no more.
+        note: free text.
+        withdraw: withdraw an event recorded by mistake; it has no effect from the next audit on.
     """
     from jobs.terminal.summary import exit_code, print_summary
     from pipeline.audit.service import events_until
@@ -62,7 +62,7 @@ def service(
 
 
 def _require_known(lake: Lake, of: Partition) -> None:
-    """Raise ConfigError for a day that has not come yet, or a vehicle that the lake has never heard of."""
+    """Raise ConfigError for a day in the future or a vehicle without a day in the lake."""
     from difflib import get_close_matches
 
     from pipeline.errors import ConfigError
@@ -84,7 +84,7 @@ def _require_known(lake: Lake, of: Partition) -> None:
 
 
 def _require_sensor(lake: Lake, vehicle: str, sensor: str) -> None:
-    """Raise ConfigError for a sensor that no record of the vehicle is about."""
+    """Raise ConfigError for a sensor without a record of this vehicle."""
     from pipeline.errors import ConfigError
     from pipeline.store.records import read_columns
     from schemas.calibrations import CALIBRATIONS

@@ -1,4 +1,4 @@
-"""`boresight show`: what a lake holds, for people and for machines."""
+"""`boresight show`: rows of a lake's tables, for people or as JSON."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def show(
     """Show records (calibrations, poses, drift, states, ...) or partitions (moments, perceived).
 
     Args:
-        table: what to show.
+        table: table to show.
         lake: folder of the tables.
         vehicle: only this vehicle.
         day: only this day, YYYY-MM-DD.
         method: only records of this method.
-        current: only the current record of each vehicle, day, method and edge or sensor; of drift, what the
-            last audit said; of events, those not withdrawn; of outcomes, all are.
-        json: print a JSON list and nothing else: oldest record first, names as the columns, and for
-            calibrations "T", the 4x4 row-major T_parent_child, for poses T_reference_sensor (null where refused).
+        current: only the current record of each vehicle, day, method and edge or sensor; for drift, findings
+            of the last audit; for service_events, events that were not withdrawn; for outcomes, all rows.
+        json: print only a JSON list: oldest record first, keys as the columns. Calibrations have "T" too, the
+            4x4 row-major T_parent_child; poses have T_reference_sensor (null if refused).
     """
     from jobs.terminal.summary import left_out
     from pipeline.store.partitions import Lake
@@ -64,7 +64,7 @@ def show(
 
         print_table(table, rows)
     else:
-        sys.stdout.write(f"{table}: nothing of this choice in {lake}\n")
+        sys.stdout.write(f"{table}: no matching rows in {lake}\n")
     return 3 if left_out(tables) else 0
 
 
@@ -97,7 +97,7 @@ def _records(
     rows = [r for r in rows if method in (None, getattr(r, "method", None))]
     names = [c.name for c in TABLES[table].columns]
     chosen = kinds[table](rows) if current else rows
-    if current and table == "drift":  # vehicles that the last audit did not look at are none of what it said
+    if current and table == "drift":  # vehicles that the last audit left out have no current finding
         last = {last_assertion(lake, TABLES[table], m) for m in {r.method for r in chosen}}
         chosen = [r for r in chosen if Assertion(r.asserted_at, r.day, r.method) in last]
     if table == "states":

@@ -1,4 +1,4 @@
-"""`boresight simulate`: logs of a synthetic fleet, with its truth beside them."""
+"""`boresight simulate`: logs of a synthetic fleet, with the true extrinsics beside them."""
 
 from __future__ import annotations
 
@@ -34,28 +34,29 @@ def simulate(
     """Write OUT/logs/VEHICLE/DAY/*, OUT/truth/VEHICLE/DAY.json and OUT/fleet.toml.
 
     Args:
-        out: folder to write into; logs of the same name are replaced.
-        vehicles: number of vehicles, vehicle-1 and so on.
+        out: folder to write into; logs with the same name are replaced.
+        vehicles: number of vehicles, named vehicle-1 and so on.
         days: number of consecutive days.
-        first_day: first of them, YYYY-MM-DD.
-        frames: moments per vehicle-day at which every sensor is logged, in three drives.
+        first_day: first day, YYYY-MM-DD.
+        frames: moments per vehicle-day, each logged by every sensor, in three drives.
         rate_hz: moments per second within a drive.
-        rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128, rosette,
-            hdl64, keyhole, telephoto, fisheye, pinhole, rolling, truck, bumper, tilted, van (6 cameras, 2 lidars, 5
-            radars) or duo (2, 1, 2); each with `-flat` behind it for radars without elevation, or `-dirty` for
-            such as see things between them and their images in the road. pipeline/simulate/README.md tells of each.
-        environments: what the drives lead through: urban and highway in turn (mixed), one of them, suburb, jam, alley,
-            country, deck, tunnel, or world-SEED, drawn by SEED.
+        rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128,
+            rosette, hdl64, keyhole, telephoto, fisheye, pinhole, rolling, truck, bumper, tilted, van (6
+            cameras, 2 lidars, 5 radars) or duo (2, 1, 2); append `-flat` for radars without elevation, or
+            `-dirty` for radars with false detections and mirror images in the road.
+            pipeline/simulate/README.md describes each rig.
+        environments: surroundings of the drives: urban and highway in turn (mixed), one of them, suburb, jam,
+            alley, country, deck, tunnel, or world-SEED, drawn from SEED.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
-        faults: vehicle:day:sensor:kind:amount, several with commas; kinds: yaw pitch roll [deg], x y z [m],
-            drift-... per day, warm-... over the day, realign and realign-untold (by a radar's software) [deg],
-            time and stamp [s] (0.5@0.6: after .6 of the day's frames), missing, stuck, swap, intrinsics, centre,
-            centre-v [px], labels, night, dusk, few.
-        remount_deg: sd per axis by which every day's mounting differs from the day before, as when a rig is taken off
-            every evening; fixed sensors move by hundredths of a degree, which is the default.
-        reflectors: also record three corner reflectors on every vehicle's last day, under OUT/reflectors.
-        seed: same seed, same logs.
-        workers: processes.
+        faults: vehicle:day:sensor:kind:amount, separated by commas; kinds: yaw pitch roll [deg], x y z [m],
+            drift-... per day, warm-... over the day, realign and realign-untold (by a radar's software)
+            [deg], time and stamp [s] (0.5@0.6: after .6 of the day's frames), missing, stuck, swap,
+            intrinsics, centre, centre-v [px], labels, night, dusk, few.
+        remount_deg: standard deviation per axis of the mounting's change from day to day, for a rig that is
+            taken off every evening; default: the change of a fixed sensor, some hundredths of a degree.
+        reflectors: record three corner reflectors on every vehicle's last day too, under OUT/reflectors.
+        seed: random seed; the same seed gives the same logs.
+        workers: number of processes.
     """
     from pipeline.errors import ConfigError
     from pipeline.simulate.faults import parse_faults
@@ -85,7 +86,7 @@ def simulate(
 
 
 def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
-    """Logs and truth in `out`, what was written in the summary."""
+    """Write logs and truth to `out`, and print the summary."""
     from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.simulate.fleet import simulate_fleet
     from pipeline.simulate.reflectors import simulate_reflectors

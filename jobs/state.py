@@ -1,4 +1,4 @@
-"""`boresight state`: what each vehicle should load tonight."""
+"""`boresight state`: the calibration that each vehicle should load tonight."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ __all__ = ["state"]
 
 
 def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json: bool = False) -> int:
-    """Show what each vehicle should load tonight: its accepted days since the last change, fused, with sigma.
+    """Show what each vehicle should load tonight: mean of accepted days since the last change, with sigma.
 
-    Of a rig that is adjusted as a whole a line per sensor, its pose to the reference; of others one per pair.
+    A rig that is adjusted as a whole has a line per sensor (its pose relative to the reference), other rigs
+    one per pair.
 
-    The night and `boresight audit` write it (table states); this prints the latest.
+    `boresight nightly` and `boresight audit` write the table states; this command prints its latest rows.
 
     Args:
         lake: folder of the tables.
         vehicle: only this vehicle.
-        method: of the calibrations.
-        json: print a JSON list and nothing else: names as the columns of table states, and "T" and "T_prior", the
-            4x4 row-major T_parent_child and what it was before the last day (null where there is none). Rows of
-            sensors (`sensor` is not null) beside those of pairs, which the poses rest on.
+        method: calibration method.
+        json: print only a JSON list: keys as the columns of table states, and "T" and "T_prior": the 4x4
+            row-major T_parent_child and its prior on the last day (null if there is none). Contains rows of
+            sensors (`sensor` is not null) and rows of the pairs that their poses are computed from.
     """
     from jobs.terminal.state_rows import state_rows
     from jobs.terminal.summary import left_out, print_json

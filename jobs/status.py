@@ -1,4 +1,4 @@
-"""`boresight status`: what of a lake is done and what is not, and why."""
+"""`boresight status`: which vehicle-days of a lake are done and which are not, and why."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 __all__ = ["status"]
 
-_ROWS = 40  # of a table for people: the others are counted
+_ROWS = 40  # rows of the printed table; the others are counted
 
 
-# A command's parameters are its options: more than eight, because each is one that a user sets.
+# The parameters of a command are its options: more than eight, because a user sets each of them.
 def status(
     *,
     lake: str,
@@ -26,15 +26,15 @@ def status(
     to_day: Annotated[str | None, Parameter(name="--to")] = None,
     json: bool = False,
 ) -> int:
-    """Tell how every vehicle and vehicle-day stands, and why: what a person should look at first comes first.
+    """Show the status of every vehicle and vehicle-day, with reasons; the most urgent come first.
 
     Args:
         lake: folder of the tables.
         vehicle: only this vehicle.
-        method: of the calibrations; default: the one that the last audit looked at. A vehicle-day counts once.
+        method: calibration method; default: the method of the last audit. Each vehicle-day counts once.
         from_day: first day, YYYY-MM-DD; default: 31 days before the last.
-        to_day: last day; default: the last day that any night was about.
-        json: the summary's "days" lists every vehicle-day.
+        to_day: last day; default: the last day in any night.
+        json: list every vehicle-day in the summary's "days".
     """
     from dataclasses import asdict
 
@@ -51,9 +51,7 @@ def status(
 
     check_day("to", to_day)
     tables = Lake.existing(lake)
-    data_files(
-        tables, CALIBRATIONS
-    )  # records that a release before 0.6 wrote are named, and how to move them
+    data_files(tables, CALIBRATIONS)  # names records of a release before 0.6, and the command that moves them
     last = to_day or last_day(tables, OUTCOMES)
     first = from_day or (None if last is None else days_after(last, -30))
     rows = read_records(tables, OUTCOMES, OutcomeRow, first=first, last=last)
@@ -83,7 +81,7 @@ def status(
 
 
 def _audited_method(lake: Lake, others: set[str]) -> str:
-    """The method of the last audit; without an audit the default one, or what there is of others."""
+    """The method of the last audit; without an audit the default method, or a method that has records."""
     from pipeline.store.records import last_assertion
     from schemas.drift import DRIFT
 
@@ -104,7 +102,7 @@ def _print_table(days: Sequence[DayStatus], vehicles: Sequence[str]) -> None:
     wanting = sorted((d for d in days if d.status != "done"), key=lambda d: [*DAY_WORDS].index(d.status))
     table = Table("vehicle", "day", "status", "stage", "why")
     for day in wanting[:_ROWS]:
-        # Text: names and reasons are not markup.
+        # Text, because names and reasons may contain rich markup.
         why = "; ".join(text for text in (in_words(day.faults), day.reason) if text)
         table.add_row(*(Text(t) for t in (day.vehicle, day.day, day.status, day.stage, why)))
     console = Console()

@@ -1,4 +1,4 @@
-"""`boresight train`: a network from training data, without any ground truth."""
+"""`boresight train`: train a network from training data, without any ground truth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
 @needs("train")
-def train(  # options of the command: as many as a user may set
+def train(  # options of the command
     *,
     data: str,
     out: Path,
@@ -35,25 +35,26 @@ def train(  # options of the command: as many as a user may set
     compiled: bool = False,
     ray_workers: int | None = None,
 ) -> int:
-    """Train on the table that `boresight prepare` made, or go on with the run in OUT.
+    """Train on the table training (from `boresight prepare`), or continue the run in OUT.
 
     Several processes: `torchrun --nproc-per-node N $(which boresight) train ...`, or --ray-workers N.
 
     Args:
         data: folder of the tables, with table training.
         out: folder of the run: last.pt, best.pt, metrics.jsonl, events, train.json.
-        config: train.toml; options here win over it.
+        config: train.toml; options here override it.
         architecture: explicit matching, or the paper's concatenation.
-        pairs: one network for all three pairs, or for one of them.
-        steps: steps in all, in place of the configuration's epochs.
+        pairs: one network for all three pairs, or for one pair.
+        steps: total number of steps, instead of the configuration's epochs.
         batch_size: frames per process and step.
-        budget: time of the whole run, as in 25m; the learning rate falls over it.
-        seed: of everything random.
-        start_from: finished run, or exported model.onnx, whose weights a new run begins with, to fine-tune them.
-        time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
-        device: cpu, cuda, or whatever is there.
-        compiled: compile the encoders (minutes at first, faster afterwards).
-        ray_workers: train on a Ray cluster with so many workers; needs the extra [train-ray].
+        budget: duration of the whole run, as in 25m; the learning rate decays over it.
+        seed: random seed.
+        start_from: finished run, or exported model.onnx, with the initial weights of a new run, for
+            fine-tuning.
+        time_limit: stop after this duration, as in 9m, with a checkpoint to continue from.
+        device: cpu, cuda, or the best one available.
+        compiled: compile the encoders (takes minutes at the start, faster afterwards).
+        ray_workers: train on a Ray cluster with this many workers; needs the extra [train-ray].
     """
     from pipeline.learn.train.run import TrainRequest
     from pipeline.learn.train.settings import load_train_config
@@ -74,7 +75,7 @@ def train(  # options of the command: as many as a user may set
 
 
 def _run(request: TrainRequest, settings: TrainConfig, ray_workers: int | None) -> int:
-    """Train here, as one of torchrun's processes, or on Ray; the summary is printed once."""
+    """Train in this process, as one process of torchrun, or on Ray; prints the summary once."""
     import os
 
     from jobs.terminal.summary import progress_reporter
@@ -84,7 +85,7 @@ def _run(request: TrainRequest, settings: TrainConfig, ray_workers: int | None) 
         from pipeline.learn.train.ray import train_on_ray
 
         result = train_on_ray(request, settings, ray_workers)
-    elif os.environ.get("RANK", "0") != "0":  # one of torchrun's: the first one speaks for all
+    elif os.environ.get("RANK", "0") != "0":  # a process of torchrun: only the first one prints
         result = run(request, settings)
         return 128 + result.signal if result.signal else 0
     else:
@@ -96,7 +97,7 @@ def _run(request: TrainRequest, settings: TrainConfig, ray_workers: int | None) 
 def report_training(
     command: str, result: TrainResult, out: Path, report: str = "report", **more: object
 ) -> int:
-    """Print how a call ended, its last report under that name, and `more`; the exit code."""
+    """Print the result of a training call with its last report and `more`; returns the exit code."""
     from dataclasses import asdict
 
     from jobs.terminal.summary import print_summary
@@ -108,10 +109,10 @@ def report_training(
 
 
 def parse_duration(text: str, option: str) -> float:
-    """Seconds of "90s", "25m", "1.5h", or of plain seconds.
+    """Parse "90s", "25m", "1.5h" or a number to seconds.
 
     Raises:
-        ConfigError: no such duration, or none above 0.
+        ConfigError: not a duration, or not above 0.
     """
     from pipeline.errors import ConfigError
 
@@ -119,7 +120,9 @@ def parse_duration(text: str, option: str) -> float:
     try:
         seconds = float(number) * _UNIT_S[unit]
     except ValueError as err:
-        raise ConfigError("command line", option, f"{text!r} is no duration, as in 90s, 25m or 1h") from err
+        raise ConfigError(
+            "command line", option, f"{text!r} is not a duration, as in 90s, 25m or 1h"
+        ) from err
     if not 0 < seconds < float("inf"):
         raise ConfigError("command line", option, f"{text!r}: must be above 0")
     return seconds

@@ -1,4 +1,4 @@
-"""`boresight train-lidar-semantics`: a small range-image network for lidar points, taught by the camera."""
+"""`boresight train-lidar-semantics`: train lidar semantics; the camera is the teacher."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["train_lidar_semantics"]
 
 
 @needs("train")
-def train_lidar_semantics(  # options of the command: as many as a user may set
+def train_lidar_semantics(  # options of the command
     *,
     fleet: Path,
     lake: str,
@@ -25,25 +25,25 @@ def train_lidar_semantics(  # options of the command: as many as a user may set
     time_limit: str | None = None,
     threads: int = 1,
 ) -> int:
-    """Train on frames and observations, or go on with the run in OUT; leaves lidar_semantics.onnx and .toml there.
+    """Train on frames and observations, or continue the run in OUT; writes lidar_semantics.onnx and .toml.
 
-    Name the .toml in fleet.toml: `semantics = { source = "onnx", segmenter = "lidar_semantics.toml" }` under the rig's
-    lidar. Labels are the camera's, through the day's accepted calibration where the lake has one, else its prior.
-    Every fifth vehicle-day is held out; two are needed at least.
+    Set the .toml in fleet.toml: `semantics = { source = "onnx", segmenter = "lidar_semantics.toml" }` under
+    the rig's lidar. Labels are the camera's, projected through the day's accepted calibration, or its prior
+    if there is none. Every fifth vehicle-day is held out; at least two vehicle-days are needed.
 
     Args:
-        fleet: fleet.toml; says where each vehicle's prior comes from.
-        lake: folder of the tables, with frames and observations, and perhaps calibrations.
+        fleet: fleet.toml; sets the source of each vehicle's prior.
+        lake: folder of the tables, with frames, observations and, if available, calibrations.
         out: folder of the run: last.pt, metrics.jsonl, the model with its manifest and card.
-        steps: steps in all.
+        steps: total number of steps.
         batch_size: sweeps per step.
-        learning_rate: at the start; falls to 1e-5.
-        seed: of everything random.
-        frames_per_day: sweeps of a vehicle-day at most, evenly spread.
-        rows: of the range image, over the lidar's field of view.
-        columns: of the range image, all the way round.
-        time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
-        threads: of the processor.
+        learning_rate: initial learning rate; decays to 1e-5.
+        seed: random seed.
+        frames_per_day: maximum number of sweeps per vehicle-day, evenly spaced.
+        rows: rows of the range image, over the lidar's field of view.
+        columns: columns of the range image, over 360 deg.
+        time_limit: stop after this duration, as in 9m, with a checkpoint to continue from.
+        threads: CPU threads.
     """
     import torch
 

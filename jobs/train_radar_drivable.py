@@ -1,4 +1,4 @@
-"""`boresight train-radar-drivable`: a small network for the radar's drivable area, taught by the lidar."""
+"""`boresight train-radar-drivable`: train a drivable-area network; the lidar is the teacher."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["train_radar_drivable"]
 
 
 @needs("train")
-def train_radar_drivable(  # options of the command: as many as a user may set
+def train_radar_drivable(  # options of the command
     *,
     fleet: Path,
     lake: str,
@@ -23,22 +23,22 @@ def train_radar_drivable(  # options of the command: as many as a user may set
     time_limit: str | None = None,
     threads: int = 1,
 ) -> int:
-    """Train on observations, or go on with the run in OUT; a finished run leaves radar_drivable.onnx and .toml there.
+    """Train on observations, or continue the run in OUT; a finished run has radar_drivable.onnx and .toml.
 
-    Name the .toml in fleet.toml: `drivable = { source = "onnx", model = "radar_drivable.toml" }` under the rig's radar.
-    Every fifth vehicle-day is held out (at least one), of a single day its last fifth.
+    Set the .toml in fleet.toml: `drivable = { source = "onnx", model = "radar_drivable.toml" }` under the
+    rig's radar. Every fifth vehicle-day is held out (at least one); of a single vehicle-day, its last fifth.
 
     Args:
-        fleet: fleet.toml; says where each vehicle's prior comes from.
+        fleet: fleet.toml; sets the source of each vehicle's prior.
         lake: folder of the tables, with observations.
         out: folder of the run: last.pt, metrics.jsonl, the model with its manifest and card.
-        steps: steps in all.
+        steps: total number of steps.
         batch_size: scans per step.
-        learning_rate: at the start; falls to 1e-5.
-        seed: of everything random.
-        frames_per_day: samples of a vehicle-day at most, evenly spread.
-        time_limit: stop this call after so long, as in 9m, with a checkpoint to go on from.
-        threads: of the processor.
+        learning_rate: initial learning rate; decays to 1e-5.
+        seed: random seed.
+        frames_per_day: maximum number of samples per vehicle-day, evenly spaced.
+        time_limit: stop after this duration, as in 9m, with a checkpoint to continue from.
+        threads: CPU threads.
     """
     import torch
 

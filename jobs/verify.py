@@ -1,4 +1,4 @@
-"""`boresight verify`: is the calibration that the car uses now still right?"""
+"""`boresight verify`: check the calibration that a car uses now against one log."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ if TYPE_CHECKING:
 __all__ = ["verify"]
 
 _COLOUR = {"pass": "green", "warn": "yellow", "fail": "red", "inconclusive": "dim"}
-_DAY = "2000-01-01"  # of the one vehicle-day of a lake that nobody keeps
-# As many as a calibration selects (`select.frames`). On the one real drive tried, 60 left the radar undecided.
+_DAY = "2000-01-01"  # of the single vehicle-day of a temporary lake
+# As many as `select.frames` selects for a calibration. On the one real drive tried, 60 left the radar
+# undecided.
 _FRAMES = 100
 
 
-# A command's parameters are its options: more than eight, because each is one that a user sets.
+# The parameters of a command are its options: more than eight, because a user sets each of them.
 def verify(
     *logs: Path,
     fleet: Path,
@@ -39,26 +40,26 @@ def verify(
     json: bool = False,
     named: FrameOptions | None = None,
 ) -> int:
-    """Check the calibration in use against one log: per pair and axis pass, warn, fail or inconclusive.
+    """Check the calibration in use against one log: pass, warn, fail or inconclusive per pair and axis.
 
-    Of a rig of many sensors per sensor and axis, and right, wrong or undecided for each. Exit 0: all that the pairs are
-    good for passes or warns; 3: something fails, or the log cannot tell.
+    For a rig of many sensors: per sensor and axis, and right, wrong or undecided per sensor. Exit code 0: all
+    axes that the pairs must determine pass or warn; 3: an axis fails, or the log cannot decide.
 
     Args:
         logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of one drive.
-        fleet: fleet.toml: topics, and from where on an error matters ([verify]).
-        calibration: what the car uses: JSON {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}, FORMAT:FILE[,FILE] of
-            `boresight export`, or of a lake [VEHICLE@]DAY or state; of a rig with more sensors JSON {"reference":
-            "top", "T": {"front": 4x4, ...}}, of the other two as many sensors as they have; default: the prior that
-            fleet.toml names (tf_static of the log, or its file).
-        lake: folder of the tables, where the calibration is one of its days or a state.
-        vehicle: whose rig the log is of; default: the only one of fleet.toml.
-        camera_lidar_deg: an error of this size must not go unseen: a pass says that it would have failed.
-        radar_deg: the same for pairs with the radar.
-        frames: how many of the log to look at.
-        page: HTML page with pictures of both calibrations.
-        json: print every axis as one JSON object on stdout, and nothing else.
-        named: what the frames are called in the calibration's files.
+        fleet: fleet.toml: topics, and sizes of errors that matter ([verify]).
+        calibration: calibration in use: JSON {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4},
+            FORMAT:FILE[,FILE] of `boresight export`, or [VEHICLE@]DAY or state of a lake. For a rig with more
+            sensors: JSON {"reference": "top", "T": {"front": 4x4, ...}}, or one of the others. Default: the
+            prior of fleet.toml (tf_static of the log, or its file).
+        lake: folder of the tables, if the calibration is a day or a state in a lake.
+        vehicle: vehicle of the log; default: the only one of fleet.toml.
+        camera_lidar_deg: an axis passes only if an error of this size would have made it fail.
+        radar_deg: the same limit for pairs with the radar.
+        frames: number of frames of the log to use.
+        page: HTML page to write, with pictures of both calibrations.
+        json: print only one JSON object with every axis on stdout.
+        named: frame names in the calibration's files.
     """
     from tempfile import TemporaryDirectory
 
@@ -107,7 +108,7 @@ def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
     from pipeline.errors import ConfigError
 
     if vehicle is not None:
-        config.rig_of(vehicle)  # raises, naming the vehicles there are
+        config.rig_of(vehicle)  # raises for an unknown vehicle
         return vehicle
     if len(config.vehicles) != 1 or not config.named_vehicles:
         raise ConfigError("command line", "vehicle", f"name one of {sorted(config.vehicles)} with --vehicle")
@@ -115,14 +116,14 @@ def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
 
 
 def _for_one_look(config: FleetConfig, frames: int) -> FleetConfig:
-    """Few frames, spread over the log; every pair is estimated."""
+    """The configuration with few frames, spread over the log, and with every pair estimated."""
     return config.changed(
         ingest={"max_frames": frames}, select={"frames": frames}, trigger={"when": "always"}
     )
 
 
 def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, named: FrameOptions) -> Path:
-    """What `--calibration` names, as a prior file; raises before the first log is opened."""
+    """Write the calibration of `--calibration` as a prior file; raises before the first log is opened."""
     from jobs.calibration_sources import read_sides
     from pipeline.errors import ConfigError
     from pipeline.export.files import prior_text
@@ -138,10 +139,11 @@ def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, na
 def _of_poses(
     folder: Path, config: FleetConfig, vehicle: str, calibration: str, lake: str | None, named: FrameOptions
 ) -> tuple[FleetConfig, tuple[Sensor, ...]]:
-    """The configuration with the calibration in use, of a rig of many sensors, and the sensors that it has none of.
+    """The configuration with the calibration in use of a rig of many sensors, and the sensors that it lacks.
 
     Raises:
-        ConfigError: it is no file or lake, or has less than two sensors; before the first log is opened.
+        ConfigError: neither a file nor a lake, or fewer than two sensors; raised before the first log is
+            opened.
     """
     from jobs.calibration_sources import poses_in_use
     from pipeline.errors import ConfigError
@@ -170,9 +172,9 @@ def _checked(
     page: Path | None,
     progress: Progress,
 ) -> tuple[list[AxisCheck], str]:
-    """Every axis, and why there is none where the log could not be used at all.
+    """Check every axis; returns the checks, and the reason if the log could not be used at all.
 
-    `of`: the vehicle, and of a rig of many sensors those that the calibration in use has no pose of.
+    `of`: the vehicle, and for a rig of many sensors those without a pose in the calibration in use.
     """
     from pipeline.in_use.axes import check_axes, limits_of
     from pipeline.store.partitions import Partition
@@ -200,7 +202,7 @@ def _checked_poses(
     lacking: Sequence[Sensor],
     asked_deg: tuple[float, float],
 ) -> list[AxisCheck]:
-    """Every axis of every sensor but the reference, which poses are said to."""
+    """Check every axis of every sensor except the reference."""
     from pipeline.in_use.axes import check_pose, kind_of_pose, limits_of, shared_sigmas
     from pipeline.store.records import read_records
     from schemas.poses import POSES, PoseRow
@@ -225,7 +227,7 @@ def _checked_poses(
 def _calibrate(
     config: FleetConfig, lake: Lake, partition: Partition, logs: tuple[Path, ...], progress: Progress
 ) -> None:
-    """The log's own calibration, from the one in use."""
+    """Calibrate from the log, with the calibration in use as prior."""
     from dataclasses import replace
 
     from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
@@ -238,7 +240,7 @@ def _calibrate(
 
 
 def _prior(config: FleetConfig, lake: Lake, partition: Partition) -> RigPrior | None:
-    """The calibration in use; None where there is none: calibrate refuses the log and says why."""
+    """The calibration in use; None if there is none: calibrate then refuses the log and gives the reason."""
     from pipeline.errors import SolveError
     from pipeline.extrinsics.prior import rig_prior
     from pipeline.store.views import perceived
@@ -254,10 +256,10 @@ def _prior(config: FleetConfig, lake: Lake, partition: Partition) -> RigPrior | 
 
 
 def _spelled_alike(config: FleetConfig, lake: Lake, partition: Partition) -> FleetConfig:
-    """The configuration with the calibration in use on a grid, so that digits do not decide where a search ends.
+    """The configuration with the calibration in use rounded to a grid: its last digits change no result.
 
-    Digits beyond a measurement's make searches take other ways: the same calibration, 3e-8 apart, was .14 and .09 deg
-    off.
+    A search may end elsewhere if its start differs by less than a measurement can: with starts 3e-8 apart,
+    results were .14 and .09 deg off.
     """
     from pipeline.export.texts import to_json
     from pipeline.in_use.spelling import on_grid

@@ -1,1 +1,1 @@
-"""Examples to read and to change: cells for a notebook, scripts too."""
+"""Examples to read and to change: notebook cells that also run as scripts."""

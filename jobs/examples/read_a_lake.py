@@ -1,11 +1,11 @@
 # %% [markdown]
-# # What a lake says of a vehicle
+# # What a lake contains of a vehicle
 # Cells for a notebook (VS Code, Spyder, PyCharm, jupytext); as a script:
 #
 #     python -m jobs.examples.read_a_lake [LAKE VEHICLE PICTURES]
 #
-# after `make demo`, which leaves the lake that is read by default. Beside Boresight it needs polars and matplotlib
-# (`pip install 'boresight[test,dev]'`). All columns, with units and frames: schemas/README.md.
+# after `make demo`, which leaves the lake that is read by default. Beside Boresight it needs polars and
+# matplotlib (`pip install 'boresight[test,dev]'`). All columns, with units and frames: schemas/README.md.
 
 # %%
 from __future__ import annotations
@@ -28,8 +28,8 @@ Path(PICTURES).mkdir(parents=True, exist_ok=True)
 
 # %% [markdown]
 # ## The records
-# Calibrations are a Delta table: read it through its log, never by glob. A day that was calibrated again has several
-# records; the one asserted last is current.
+# Calibrations are a Delta table: read it through its log, never by glob. A day that was calibrated again has
+# several records; the one asserted last is current.
 
 # %%
 records = (
@@ -44,8 +44,9 @@ print(records.select("day", "pair", "status", "azimuth_sigma_rad", "reason"))
 
 # %% [markdown]
 # ## History
-# Poses are T_parent_child with the quaternion's scalar first; arrays are little-endian blobs, here 6x6 float64 of
-# (rotation, translation). Changes count from the first accepted day: rotation about, shift along the parent's axes.
+# Poses are T_parent_child with the quaternion's scalar first; arrays are little-endian blobs, here 6x6
+# float64 of (rotation, translation). Changes count from the first accepted day: rotation about, shift along
+# the parent's axes.
 
 # %%
 POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -85,7 +86,7 @@ for k, (axes, name) in enumerate(zip(figure.subplots(2, 3, sharex=True).flat, na
     axes.plot(days[~is_accepted], change[~is_accepted, k], "x", color="tab:orange", label="held")
     axes.axhline(0, color="black", linewidth=0.6)
     axes.set_title(name, fontsize=10)
-    step = -(-len(days) // 6)  # six dates at most, or they run into each other
+    step = -(-len(days) // 6)  # six dates at most, otherwise they overlap
     axes.set_xticks(days[::step], history["day"].to_list()[::step], rotation=30, ha="right", fontsize=8)
 figure.axes[0].legend(fontsize=8)
 figure.suptitle(f"{VEHICLE}, {PAIR}: change since {history['day'][first]}")
@@ -93,8 +94,8 @@ figure.savefig(f"{PICTURES}/history.png", dpi=110)
 
 # %% [markdown]
 # ## One frame at one record
-# Images and sweeps are plain Parquet, a file per vehicle, day and sensor, joined by the moment; only what is asked for
-# is read. The picture's left half is drawn at the prior, its right half at the record.
+# Images and sweeps are plain Parquet, a file per vehicle, day and sensor, joined by the moment; only what is
+# asked for is read. The picture's left half is drawn at the prior, its right half at the record.
 
 # %%
 record = history.filter(pl.col("status") == "accepted").tail(1)

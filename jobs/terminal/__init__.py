@@ -1,1 +1,1 @@
-"""What commands show: logs, progress, tables, the last line."""
+"""Terminal output of commands: logs, progress, tables, the summary line."""

@@ -1,4 +1,4 @@
-"""Two calibrations side by side for people: a line per pair and axis, degrees and metres."""
+"""Two calibrations side by side: a line per pair and axis, in degrees and metres."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
 
 __all__ = ["print_comparison"]
 
-_CLEAR_SIGMAS = 3.0  # as everywhere: what chance alone does in one of 370
+_CLEAR_SIGMAS = 3.0  # as everywhere: chance alone exceeds it once in 370 times
 
 
 def print_comparison(titles: Sequence[str], found: Sequence[PairDifference], notes: Sequence[str]) -> None:
-    """Print the change from the first to the second; what sigmas do not explain is bold."""
+    """Print the change from the first to the second; changes that sigmas do not explain are bold."""
     import numpy as np
     from rich.console import Console
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""True against estimated extrinsics, as a table for people and as numbers for the summary."""
+"""True against estimated extrinsics, as a printed table and as numbers for the summary."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["print_comparison", "print_methods"]
 
-_WIDTH = 124  # of the table; a narrower terminal wraps lines, which reads better than cut names
+_WIDTH = 124  # of the table; a narrower terminal wraps lines, which is easier to read than truncated names
 
 
 def print_comparison(
@@ -31,11 +31,11 @@ def print_comparison(
     day: str,
     findings: Sequence[DriftFinding],
 ) -> list[dict[str, Any]]:
-    """Print the records of one day beside the truth, and what the audit found.
+    """Print the records of one day beside the truth, and the findings of the audit.
 
-    Both are shown as what differs from the prior, i.e. what the drawing did not know: rotation vector [deg] and
-    shift of the child's origin [cm], in the axes of the pair's parent sensor. An estimate in brackets is a DoF
-    that the day did not determine.
+    Both are shown as differences from the prior (the nominal pose): rotation vector [deg] and shift of the
+    child's origin [cm], in the axes of the pair's parent sensor. An estimate in brackets is a DoF that the
+    day did not determine.
 
     Returns:
         For each record: errors of rotation [deg] and translation [m] against the truth, before and after.
@@ -61,9 +61,9 @@ def print_methods(
     truth: Truth,
     day: str,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Print a row per method: what its records of one day are off by, averaged over vehicles that all were run on.
+    """Print a row per method: mean errors of its records of one day, over vehicles on which all methods ran.
 
-    Azimuth and elevation [deg] and range [m] at the paper's targets, the prior's first.
+    Azimuth and elevation [deg] and range [m] at the paper's targets; the first row is the prior.
 
     Returns:
         By method, for each record, what `print_comparison` returns.
@@ -100,7 +100,7 @@ def _mean_error(
     *,
     before: bool,
 ) -> str:
-    """Over the records of a pair that hold a transform."""
+    """Mean error over the records of a pair that have a transform."""
     from pipeline.geometry.targets import errors_at_targets
     from pipeline.store.current import prior_of, transform_of
 
@@ -119,7 +119,7 @@ def _true(truth: Truth, record: CalibrationRecord) -> np.ndarray:
     from pipeline.report.truth import true_transform
 
     T = true_transform(truth, record)
-    assert T is not None, "the demo knows the truth of all its sensors"
+    assert T is not None, "every sensor of the demo has a true pose"
     return T
 
 
@@ -145,7 +145,7 @@ def _table(day: str) -> Table:
     from rich.table import Table
 
     table = Table(
-        title=f"What the drawing did not know, {day}",
+        title=f"Change from the nominal pose, {day}",
         title_style="bold",
         caption="true: from the simulator. In brackets: the day did not determine it.",
         box=box.SIMPLE_HEAD,
@@ -183,7 +183,7 @@ def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
 
 
 def _name(record: CalibrationRecord) -> str:
-    """Both sensors, as camera_lidar where they go by their kinds."""
+    """Both sensors, as camera_lidar if their names are their kinds."""
     return f"{record.parent_frame}_{record.child_frame}"
 
 

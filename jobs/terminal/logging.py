@@ -9,7 +9,7 @@ __all__ = ["configure", "logger"]
 
 
 def configure() -> None:
-    """Set structlog up for this process; called once by the command line and once in every worker."""
+    """Configure structlog for this process; called once by the command line and once in every worker."""
     import structlog
 
     shared: list[Any] = [
@@ -39,7 +39,7 @@ def logger() -> Any:
 
 
 def _stderr(*_args: Any) -> Any:
-    """A logger on whatever stderr is now, so that redirection and rich's live display both see the lines."""
+    """A logger on the current stderr, so that redirection and rich's live display both get the lines."""
     import structlog
 
     return structlog.WriteLogger(sys.stderr)

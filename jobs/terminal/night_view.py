@@ -1,4 +1,4 @@
-"""What a person sees of a night: bars on a terminal, else a structured line per stage begun and vehicle-day ended."""
+"""Progress of a night: bars on a terminal, otherwise a line per started stage and finished vehicle-day."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ _MARKS = {
 
 
 class NightView(Protocol):
-    """Told of what is in work and of what ended."""
+    """Progress display: receives vehicle-days in work and finished vehicle-days."""
 
     def watch(self, index: int, done: int, total: int, what: str) -> None:
-        """The index-th vehicle-day is at this point."""
+        """Update the progress of the vehicle-day with this index."""
 
     def finished(self, outcome: DayOutcome) -> None:
-        """A vehicle-day ended."""
+        """Show a finished vehicle-day."""
 
     def ended(self, name: str) -> None:
-        """The work of that name ended well, and there is nothing to say about it."""
+        """Show that the work with this name ended without errors or remarks."""
 
 
 @contextmanager
 def night_view(names: list[str], total: int, title: str = "night") -> Iterator[NightView]:
-    """A view of `total` vehicle-days, of which those in work have `names` in order of their index."""
+    """A view of `total` vehicle-days; `names` are those in work, in order of index."""
     if not is_terminal():
         yield _Lines(names, total, title)
         return
@@ -67,7 +67,7 @@ def night_view(names: list[str], total: int, title: str = "night") -> Iterator[N
 
 
 class _Lines:
-    """Lines for a log file. Whoever watches looks five times a second: a stage shorter than that may get no line."""
+    """Lines for a log file, updated five times a second: a shorter stage may get no line."""
 
     def __init__(self, names: list[str], total: int, title: str) -> None:
         from pipeline.stages import STAGES
@@ -118,7 +118,7 @@ class _Bars:
         if index not in self._tasks:
             self._tasks[index] = self._bars.add_task(f"  {self._names[index]}", total=None, what="")
             self._began[self._names[index]] = time.monotonic()
-        text = what.replace(self._names[index], "").strip()  # the name stands in front already
+        text = what.replace(self._names[index], "").strip()  # the name is already at the start of the line
         self._bars.update(self._tasks[index], completed=done, total=total or None, what=text)
 
     def finished(self, outcome: DayOutcome) -> None:

@@ -1,4 +1,4 @@
-"""Rows of a lake's tables for people: one line each, numbers in degrees and metres, statuses in colour."""
+"""Rows of a lake's tables as text: one line each, numbers in degrees and metres, statuses in colour."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ STATUS_STYLES = {
     "RED": "bold red",
     "UNKNOWN": "dim",
 }
-_PIPE_WIDTH = 280  # characters; into a pipe or file nothing needs to fit a window
+_PIPE_WIDTH = 280  # characters; output to a pipe or file need not fit a window
 
 
 def print_table(table: str, rows: list[dict[str, Any]]) -> None:
-    """Print rows of a table, named as their columns; at least one row."""
+    """Print at least one row of a table, with its columns as headings."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -43,10 +43,10 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
     )
     view = Table(title=f"{table}: {len(rows)} row{'' if len(rows) == 1 else 's'}", title_justify="left")
     for name in lines[0]:
-        # Numbers and names never break; only the words at the end of a line may.
+        # Only the text at the end of a line may wrap, never numbers and names.
         view.add_column(Text(name), no_wrap=name not in ("reason", "rejected"))
     for line in lines:
-        # Text, not str: names from logs may hold square brackets, which rich would read as styles.
+        # Text instead of str: names from logs may contain square brackets, which rich would read as styles.
         view.add_row(*(Text(c, STATUS_STYLES.get(c, "")) for c in line.values()))
     Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH).print(view)
 
@@ -82,14 +82,14 @@ def _pose_row_cells(row: dict[str, Any]) -> dict[str, str]:
 
 
 def _alignment_cells(row: dict[str, Any]) -> list[dict[str, str]]:
-    """A line for each axis that the radar states."""
+    """A line for each axis in the radar's alignment messages."""
     from pipeline.report.radar_alignments import alignment_lines
 
     return [_named(row, "vehicle", "day", "method") | line for line in alignment_lines(row)]
 
 
 def _sure_cells(row: dict[str, Any]) -> dict[str, str]:
-    """Sigmas of azimuth and elevation, and which of them are certified."""
+    """Sigmas of azimuth and elevation, and the certified directions among them."""
     sigmas = (row["azimuth_sigma_rad"], row["elevation_sigma_rad"])
     azimuth, elevation = ("" if s is None else f"{s * 180 / math.pi:.3f}" for s in sigmas)
     return {
@@ -109,7 +109,7 @@ def _prior_of(row: dict[str, Any]) -> Any:
 
 
 def _pose_cells(T: Any, T_prior: Any, *, with_change: bool = True) -> dict[str, str]:
-    """Pose of the child in the parent, and how far that lies from the prior, along the parent's axes."""
+    """Pose of the child in the parent, and its change from the prior, along the parent's axes."""
     import numpy as np
 
     from pipeline.geometry.changes import change_between
@@ -166,7 +166,7 @@ def _state_cells(row: dict[str, Any]) -> dict[str, str]:
 
 
 def _unchecked(sigmas: dict[str, float]) -> str:
-    """Axes that nothing checks, as `rx lies 3.3 sigma from the prior and nothing checks it`."""
+    """Unchecked axes, as `rx lies 3.3 sigma from the prior and nothing checks it`."""
     return "; ".join(
         f"{d} lies {s:.1f} sigma from the prior and nothing checks it" for d, s in sigmas.items()
     )
@@ -203,7 +203,7 @@ def _named(row: dict[str, Any], *names: str) -> dict[str, str]:
 
 
 def _edge(row: dict[str, Any]) -> str:
-    """Kinds of the two sensors, or their names where these are others."""
+    """Kinds of the two sensors, or their names if they differ from the kinds."""
     from pipeline.rig.edges import edge_named, words_of
 
     return words_of(edge_named(row["pair"], row["parent_frame"], row["child_frame"]))

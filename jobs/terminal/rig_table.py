@@ -1,4 +1,4 @@
-"""A rig as a matrix on the terminal, with what its edges lack below."""
+"""A rig as a printed matrix of its edges, followed by what the edges lack."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
 
 __all__ = ["print_rig"]
 
-_NAMED = 4  # edges that are named of those that lack the same
+_NAMED = 4  # edges named per line; the others are counted
 _COLOUR = {"yes": "green", "weak": "yellow", "no": "red"}
 
 
 def print_rig(console: Console, rig: RigFinding) -> None:
-    """The matrix: a row for each sensor, a column for each that it could have an edge to."""
+    """Print the matrix: a row for each sensor, a column for each sensor with which it could have an edge."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -32,17 +32,17 @@ def print_rig(console: Console, rig: RigFinding) -> None:
         table.add_row(name, *(_cell(pairs.get((row, column))) for column in columns))
     console.print(table)
     console.print(
-        "share of the smaller view as logged (before perception), moments with both; "
-        "below, of edges, DoF that they give + in part"
+        "first line: overlap as share of the smaller view (before perception), moments with both sensors; "
+        "second line, edges only: number of DoF determined + determined in part"
     )
-    console.print(f"poses refer to {rig.reference} (*); what has no second line is not calibrated")
+    console.print(f"poses refer to {rig.reference} (*); pairs without a second line are not calibrated")
     for (verdict, reason, edges), dofs in _reasons(rig).items():
         named = ", ".join(edges[:_NAMED]) + (
             f" and {len(edges) - _NAMED} more" if len(edges) > _NAMED else ""
         )
         console.print(f"  - [{_COLOUR[verdict]}]{verdict}[/]: {'; '.join(dofs)} of {named}: {escape(reason)}")
     if rig.loose:
-        console.print(f"  - nothing ties {', '.join(rig.loose)} to {rig.reference}", markup=False)
+        console.print(f"  - no edge joins {', '.join(rig.loose)} to {rig.reference}", markup=False)
 
 
 def _cell(pair: PairFinding | None) -> str:
@@ -59,7 +59,7 @@ def _cell(pair: PairFinding | None) -> str:
 
 
 def _reasons(rig: RigFinding) -> dict[tuple[str, str, tuple[str, ...]], list[str]]:
-    """What edges lack: classes of DoF by verdict, reason and the edges that all of these are of."""
+    """Missing requirements of edges: DoF classes, grouped by verdict, reason and set of edges."""
     edges: dict[tuple[str, str, str], list[str]] = {}
     for verdict in (v for pair in rig.pairs for v in pair.verdicts):
         for reason in verdict.reasons:

@@ -1,4 +1,4 @@
-"""What a person sees of a split: frames of each side and frames lost, for the split made and for others."""
+"""A split as a printed table: frames of each side and frames lost, beside those of other splits."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 __all__ = ["print_choices"]
 
-_WIDTH = 120  # columns, also where nobody watches: a line per choice
+_WIDTH = 120  # columns, even without a terminal: one line per choice
 
 _WORDS = {
     "split_conflict": "between the sides",
@@ -22,11 +22,11 @@ _WORDS = {
 
 
 def print_choices(choices: Sequence[Choice]) -> None:
-    """Print the choices as a table on stderr, the split that was made first."""
+    """Print the splits as a table on stderr, the chosen split first."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(box=None, title="what a split costs, in frames", title_justify="left")
+    table = Table(box=None, title="frames kept and lost by split", title_justify="left")
     for name in ("split_by", "train", "val", "test", "lost", "of them", "days without"):
         table.add_column(name, justify="left" if name in ("split_by", "of them") else "right")
     for choice in choices:

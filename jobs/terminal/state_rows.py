@@ -1,4 +1,4 @@
-"""States as commands show them: columns, the transform, and what was known before its last day."""
+"""States as commands show them: columns, transform, and prior of the last day."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["state_rows"]
 
 
 def state_rows(lake: Lake, states: Sequence[StateRow]) -> list[dict[str, Any]]:
-    """Each state by the names of its columns, with "T", and "T_prior" of its last day (4x4 or None)."""
+    """Each state as a dict of its columns, "T", and "T_prior" of its last day (4x4 or None)."""
     from pipeline.geometry.se3 import inverse
     from pipeline.store.current import current_records, prior_of, transform_of
     from pipeline.store.records import read_records
@@ -31,7 +31,7 @@ def state_rows(lake: Lake, states: Sequence[StateRow]) -> list[dict[str, Any]]:
             T, ends = prior_of(record), (record.parent_frame, record.child_frame)
             of = record.vehicle, record.method
             priors[*of, *ends, day] = T
-            priors[*of, *ends[::-1], day] = None if T is None else inverse(T)  # of a pose
+            priors[*of, *ends[::-1], day] = None if T is None else inverse(T)  # for poses
     return [
         {c.name: getattr(s, c.name) for c in STATES.columns}
         | {

@@ -1,4 +1,4 @@
-"""What every command ends with: one JSON line on stdout and an exit code; and progress on stderr."""
+"""The end of every command: a JSON line on stdout and an exit code; and progress on stderr."""
 
 from __future__ import annotations
 
@@ -32,11 +32,10 @@ def print_json(value: Any, *, indent: int | None = None) -> None:
 
 
 def exit_code(statuses: Iterable[str]) -> int:
-    """Exit code of a job from the statuses of what it did.
+    """Exit code of a command from the statuses of its results.
 
-    1 where anything "failed" (a retry may help), else 2 where anything is "misconfigured" (a person must mend it),
-    else 3 where anything was "partly" accepted, "held", "refused" or "incomplete" (rows that could not be read are
-    left out), else 0.
+    1 if one is "failed" (a retry may help), else 2 if one is "misconfigured" (a person must correct it), else
+    3 if one is "partly" accepted, "held", "refused" or "incomplete" (unreadable rows are left out), else 0.
     """
     seen = set(statuses)
     if seen & {"failed", "misconfigured"}:
@@ -45,7 +44,7 @@ def exit_code(statuses: Iterable[str]) -> int:
 
 
 def left_out(lake: Lake) -> list[str]:
-    """What of a lake could not be read and was left out, each told on stderr once: file and reason."""
+    """Unreadable parts of a lake, each with its reason; logs a warning for each on stderr, once."""
     from jobs.terminal.logging import logger
 
     found = sorted(set(lake.damage))
@@ -55,13 +54,13 @@ def left_out(lake: Lake) -> list[str]:
 
 
 def is_terminal() -> bool:
-    """True where a person watches stderr."""
+    """True if stderr is a terminal."""
     return sys.stderr.isatty()
 
 
 @contextmanager
 def progress_reporter(title: str) -> Iterator[Progress]:
-    """A `Progress` for a stage: a bar on a terminal, else a log line every few seconds."""
+    """A `Progress` for a stage: a bar on a terminal, otherwise a log line every few seconds."""
     with _bar(title) if is_terminal() else _lines(title) as report:
         yield report
 

@@ -1,4 +1,4 @@
-"""What commands say of each vehicle: the status that the audit decided and stored, and which sensor moved."""
+"""Status of each vehicle as stored by the audit, and sensors that moved, for printing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["count_statuses", "moved_sensors", "next_steps", "realigned_radars", 
 
 
 def status_lines(findings: Sequence[DriftFinding]) -> list[str]:
-    """A line per vehicle, by name: its status and why, in rich's markup."""
+    """A line per vehicle, sorted by name: its status and the reason, in rich's markup."""
     from rich.markup import escape
 
     return [
@@ -30,7 +30,7 @@ def count_statuses(findings: Sequence[DriftFinding]) -> dict[str, int]:
 
 
 def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
-    """Which sensor of which vehicle moved, and since when."""
+    """Sensors that moved, with vehicle and first day of the change."""
     return [
         {"vehicle": vehicle, "sensor": stored.sensor, "since": stored.since}
         for vehicle, stored in _statuses(findings).items()
@@ -39,14 +39,14 @@ def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
 
 
 def realigned_radars(outcomes: Sequence[Outcome]) -> dict[str, list[dict[str, str]]]:
-    """Under `realigned`, which radars' points an audit found turned by software, and by how much; empty without any."""
+    """Radars whose points were turned by software, with amounts, under key `realigned`; empty if none."""
     events = SERVICE_EVENTS.rows_among(row for outcome in outcomes for row in outcome.records)
     found = [{"vehicle": e.vehicle, "sensor": e.sensor, "what": e.note} for e in events]
     return {"realigned": found} if found else {}
 
 
 def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:
-    """A sentence with the command for each vehicle that something is to be done about."""
+    """A sentence with the next command for each vehicle that needs action."""
     steps = [next_step(vehicle, stored, lake) for vehicle, stored in _statuses(findings).items()]
     return [step for step in steps if step]
 

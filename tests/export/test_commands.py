@@ -202,7 +202,10 @@ def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(la
             "is not log:FILE or FORMAT:FILE",
         ),
         (["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "urdf:none.urdf"], "cannot be read"),
-        (["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "kitti:none"], "knows no frames of a car"),
+        (
+            ["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "kitti:none"],
+            "files have no frames of a car",
+        ),
         (["stl", "--lake", "{lake}", "--vehicle", "v"], "stl"),
     ],
 )

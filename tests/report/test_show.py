@@ -61,7 +61,7 @@ def test_a_lake_without_records_is_an_empty_list(tmp_path: Path, capsys: pytest.
         assert show(table, lake=str(tmp_path), json=True) == 0
         assert json.loads(capsys.readouterr().out) == []
         assert show(table, lake=str(tmp_path)) == 0
-        assert capsys.readouterr().out == f"{table}: nothing of this choice in {tmp_path}\n"
+        assert capsys.readouterr().out == f"{table}: no matching rows in {tmp_path}\n"
 
 
 def test_a_lake_that_is_not_there_is_a_usage_error_and_not_an_empty_fleet(tmp_path: Path) -> None:
