@@ -12,11 +12,11 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.edges.lidar_base import Scenes, estimate_lidar_base
+from pipeline.calibrate.edges.lidar_base import estimate_lidar_base
 from pipeline.calibrate.edges.lidar_lidar import LidarPair, estimate_lidar_lidar
 from pipeline.calibrate.edges.radar_base import Stamps, estimate_radar_base
 from pipeline.calibrate.edges.sweeps import sweeps_of
-from pipeline.calibrate.numerics.frame_blocks import blocks_of, scenes_of
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.errors import SolveError
 from pipeline.extrinsics.prior import no_prior
 from pipeline.geometry.se3 import inverse
@@ -68,7 +68,7 @@ class BaseEdges:
 
     def _lidar_base(self, edge: Edge) -> tuple[EdgeEvidence, int]:
         rows = self._sweeps(edge.parent.name)
-        scenes = Scenes(scenes_of(rows), blocks_of(rows))
+        scenes = Scenes.of(rows)
         T = self._on_base(edge.parent.name)
         found = estimate_lidar_base(
             edge,
@@ -93,7 +93,7 @@ class BaseEdges:
             T,
             self.prior.sigmas_between(edge.parent.name, BASE.name)[0],
         )
-        scenes = Scenes(scenes_of(rows), blocks_of(rows))
+        scenes = Scenes.of(rows)
         found = estimate_lidar_lidar(edge, pair, self._ego_at(rows), inverse(T[0]) @ T[1], scenes)
         return found, len(rows)
 
@@ -104,7 +104,7 @@ class BaseEdges:
         radar = self._doppler(name, rows) if rows else None
         if radar is None:
             raise SolveError(f"{name} is silent: the day has no scan of it", "silent_sensor")
-        scenes = Scenes(scenes_of(rows), blocks_of(rows))
+        scenes = Scenes.of(rows)
         stamps = Stamps(*(np.array(column) for column in zip(*_stamps(rows), strict=True)))
         ego = self._ego_at(rows, without=name)
         found = estimate_radar_base(edge, radar, ego, stamps, scenes, self._directions(name, rows))

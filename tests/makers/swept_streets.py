@@ -4,8 +4,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.calibrate.edges.lidar_base import Scenes
 from pipeline.calibrate.edges.sweeps import Sweep, vehicle_sized
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, perturb_exactly
 from pipeline.ingest.deskew import deskew
 from pipeline.objective.ego_motion import EgoMotion

@@ -20,6 +20,7 @@ from pipeline.calibrate.edges.road import RoadUnder, road_under
 from pipeline.calibrate.edges.robust_regression import Regression, regress
 from pipeline.calibrate.edges.sweep_travel import SweepTravel, sweep_travel
 from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
@@ -27,7 +28,7 @@ from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
 
-__all__ = ["Scenes", "estimate_lidar_base"]
+__all__ = ["estimate_lidar_base"]
 
 # What all days of a car err by alike, as one sigma of roll, pitch, yaw and height of the base. Roads fall by about 2 %
 # to the side that is driven on, so bodies that lean by some 5 deg/g and rear axles that slip by some 3 deg/g (Gillespie
@@ -43,19 +44,6 @@ _LONGEST_WAY_M = 20.0  # beyond, scatter is the road's and no longer the registr
 _AGAIN_RAD = np.radians(2.0)  # so far from the start the sweeps are looked at again
 _HALVES_SIGMAS = 4.0
 _AXES = ("roll", "pitch", "yaw", "height")
-
-
-@dataclass(frozen=True, eq=False)
-class Scenes:
-    """Which frames show the same (`numerics/frame_blocks`): a standing car counts once, and blocks err apart."""
-
-    scene: np.ndarray  # F
-    block: np.ndarray  # F
-
-    @property
-    def weight(self) -> Float[np.ndarray, " F"]:
-        """Of each frame, so that scenes weigh alike."""
-        return np.asarray(1 / np.bincount(self.scene)[self.scene])
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.edges.lidar_base import Scenes
 from pipeline.calibrate.edges.point_to_plane import Surfaces, plane_equations
 from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again
 from pipeline.calibrate.numerics.bias_floors import SWEEP_S, TYPICAL_RANGE_M
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.errors import SolveError
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.geometry.se3 import (

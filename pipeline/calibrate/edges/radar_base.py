@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.calibrate.edges.lidar_base import STANCE, Scenes
+from pipeline.calibrate.edges.lidar_base import STANCE
 from pipeline.calibrate.edges.robust_regression import Regression, regress
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion

@@ -54,6 +54,7 @@ def bootstrap_covariance(
     block: Int64[np.ndarray, " F"],
     rng: np.random.Generator,
     resamples: int = 200,
+    degrees: float = 0.0,
 ) -> Float[np.ndarray, "P P"]:
     """Covariance of a MAP estimate by resampling blocks of frames.
 
@@ -64,10 +65,13 @@ def bootstrap_covariance(
         block: frames with the same number are drawn together.
         rng: draws the blocks.
         resamples: number of resampled days.
+        degrees: of freedom with which the information already says how much blocks scatter; 0 where it takes frames to
+            err apart.
 
     Returns:
         Spread of the resampled estimates plus the prior's share, nowhere below the inverse of all information. A single
-        block has no spread: that inverse is then widened as for two.
+        block has no spread: it is what the information says, or, where that knows nothing of blocks, the inverse
+        widened as for two.
     """
     P = score.shape[1]
     count = int(block.max()) + 1 if len(block) else 0
@@ -77,14 +81,17 @@ def bootstrap_covariance(
     total = H.sum(0) + prior_information
     inverse = _inverse(total)
     share = np.maximum(np.einsum("ij,bji->b", inverse, H) / P, 0.0)
-    few = widening(float(share.sum() ** 2 / max((share**2).sum(), 1e-300)))
-    if count < 2:
+    equal = float(share.sum() ** 2 / max((share**2).sum(), 1e-300))
+    few = widening(equal + degrees)
+    if count < 2 and not degrees:
         return inverse * few**2
     draws = rng.multinomial(count, np.full(count, 1 / count), size=resamples).astype(float)
     left_out = (g - g.mean(0)) / np.maximum(1 - share, 1 / count)[:, None]
     steps = (draws @ (left_out - left_out.mean(0))) @ inverse.T
-    spread = np.cov(steps.T, ddof=1) * few**2 * (count - 1) / count
-    return spread_to_covariance(spread + inverse @ prior_information @ inverse, inverse)
+    shown = np.cov(steps.T, ddof=1) * (count - 1) / count
+    said = inverse @ H.sum(0) @ inverse
+    spread = (degrees * said + (equal - 1) * shown) / (degrees + equal - 1) if degrees else shown
+    return spread_to_covariance(few**2 * spread + inverse @ prior_information @ inverse, inverse)
 
 
 def widening(blocks: float) -> float:
@@ -111,6 +118,7 @@ def covariance_with_fixed(
     fixed: Bool[np.ndarray, " P"],
     block: Int64[np.ndarray, " F"],
     rng: np.random.Generator,
+    degrees: float = 0.0,
 ) -> Float[np.ndarray, "P P"]:
     """Covariance of a MAP estimate some of whose parameters were fixed at the prior.
 
@@ -122,6 +130,7 @@ def covariance_with_fixed(
         fixed: parameters that the frames did not move.
         block: frames with the same number are drawn together.
         rng: draws the blocks.
+        degrees: as for `bootstrap_covariance`.
 
     Returns:
         The free parameters' covariance given the fixed ones, plus what the prior leaves open in the fixed ones, for
@@ -131,7 +140,12 @@ def covariance_with_fixed(
     out = np.zeros((len(fixed), len(fixed)))
     prior_information = np.diag(1 / prior_variance[~fixed])
     out[at] = bootstrap_covariance(
-        information[:, ~fixed][:, :, ~fixed], score[:, ~fixed], prior_information, block, rng
+        information[:, ~fixed][:, :, ~fixed],
+        score[:, ~fixed],
+        prior_information,
+        block,
+        rng,
+        degrees=degrees,
     )
     along = response(curvature, fixed, np.zeros_like(fixed))
     return out + (along * prior_variance[fixed]) @ along.T

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.edges.lidar_base import Scenes, estimate_lidar_base
+from pipeline.calibrate.edges.lidar_base import estimate_lidar_base
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.geometry.se3 import adjoint, exp_se3, exp_so3, inverse, perturb_exactly
 from pipeline.objective.ego_motion import EgoMotion

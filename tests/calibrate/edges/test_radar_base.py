@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.edges.lidar_base import Scenes
 from pipeline.calibrate.edges.radar_base import Stamps, estimate_radar_base
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion

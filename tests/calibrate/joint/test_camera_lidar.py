@@ -126,6 +126,24 @@ def test_rows_a_degree_apart_tell_pitch_where_the_road_shows_nothing():
     assert abs(pitch_deg) < 3 * sigma_deg
 
 
+def test_a_car_that_stands_says_what_it_sees_and_that_it_knows_it_less_well():
+    """One scene does not know its own sigma; what it shows is better than a prior that it shows to be wrong."""
+    (scene,) = traced_day(DENSE, 1, seed=1, reflective=False)
+    rng, names = np.random.default_rng(0), ("xyz_m", "side", "jump_m", "gap_rad", "points")
+    day = []
+    for k in range(8):  # of the same borders other beams meet other points
+        seen = rng.random(len(scene.lidar_edge_side)) < 0.15
+        edges = {f"lidar_edge_{n}": getattr(scene, f"lidar_edge_{n}")[seen] for n in names}
+        day.append(replace(scene, stamp_ns=scene.stamp_ns + k * 300_000_000, **edges))
+    off = from_rotation_translation(exp_so3(np.radians([0.0, 0.0, 1.0])) @ T_TRUE[:3, :3], T_TRUE[:3, 3])
+    prior = Prior(off, np.eye(4), float(np.radians(2.0)), 0.05)
+    e = estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
+    error, sigma = change_between(T_TRUE, e.T), np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
+    assert e.observable.tolist() == [True, True, True, False, False, False]
+    assert (np.abs(error[:3]) < 2 * sigma[:3]).all()
+    assert np.degrees(sigma[:3]).max() < 0.4
+
+
 def prior_along_the_axis(sigma_m):
     """A prior that is wrong only along the optical axis, where a few frames say little."""
     T = T_TRUE.copy()

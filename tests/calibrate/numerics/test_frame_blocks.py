@@ -7,7 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.calibrate.numerics.covariance import bootstrap_covariance
 from pipeline.calibrate.numerics.frame_blocks import (
+    SCENE_DEGREES,
+    Scenes,
     blocks_of,
     bootstrap_blocks,
     scene_blocks,
@@ -140,3 +143,40 @@ def test_a_day_of_one_scene_certifies_nothing_and_says_what_to_drive(day):
         assert "1 different scene," in check.sentence
         assert any("drive on" in what for what in chosen.missing[pair])
     assert scene_failures(day) == []
+
+
+def scenes_of_equal(count, frames):
+    scene = np.repeat(np.arange(count), frames)
+    return Scenes(scene, scene)
+
+
+@pytest.mark.parametrize(("correlation", "expected"), [(0.0, 1.0), (0.5, 2.5), (1.0, 4.0)])
+def test_many_scenes_show_by_how_much_their_frames_err_together(correlation, expected):
+    rng = np.random.default_rng(0)
+    common, own = rng.normal(size=(400, 1, 3)), rng.normal(size=(400, 4, 3))
+    gradient = (np.sqrt(correlation) * common + np.sqrt(1 - correlation) * own).reshape(-1, 3)
+    assert scenes_of_equal(400, 4).inflation(gradient) == pytest.approx(expected, rel=0.1)
+
+
+def test_one_scene_errs_as_scenes_are_wont_to():
+    gradient = np.random.default_rng(0).normal(size=(8, 3))
+    assert scenes_of_equal(1, 8).inflation(gradient) == pytest.approx((1 + 0.4 * 7) / (1 - (1 + 0.4 * 7) / 8))
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 20])
+@pytest.mark.parametrize("correlation", [0.1, 0.6])
+def test_two_sigmas_of_few_scenes_hold_nineteen_of_twenty_values(count, correlation):
+    """Days of one unknown, measured once a frame; what frames of a scene share is unknown to the estimate."""
+    rng, frames, outside = np.random.default_rng(1), 8, 0
+    scenes = scenes_of_equal(count, frames)
+    for _ in range(300):
+        shared = np.repeat(np.sqrt(correlation) * rng.normal(size=count), frames)
+        measured = shared + np.sqrt(1 - correlation) * rng.normal(size=len(shared))
+        gradient = (measured - measured.mean())[:, None]
+        weight = len(shared) / scenes.scatter(gradient)
+        g = weight * gradient
+        information = scenes.inflation(g) * g[:, :, None] * g[:, None, :]
+        prior = np.full((1, 1), 1e-6)
+        variance = bootstrap_covariance(information, -g, prior, scenes.block, rng, 50, SCENE_DEGREES)
+        outside += abs(measured.mean()) > 1.96 * np.sqrt(variance[0, 0])
+    assert outside / 300 < 0.1

@@ -57,7 +57,7 @@ from pipeline.calibrate.numerics.bias_floors import (
 )
 from pipeline.calibrate.numerics.change_point import with_parts
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, with_ends
-from pipeline.calibrate.numerics.frame_blocks import blocks_of
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
@@ -171,11 +171,11 @@ def align_camera_lidar(
     ends = {name: start for name, start in starts.items() if start is not None}
     ends = {k: _at_prior_tz(end, prior, terms) if near else end for k, end in ends.items()}
     ends = {k: refine(thin, end, steps=SCHEDULE.first_steps, fixed=fixed) for k, end in ends.items()}
-    kernel = basin.kernel
+    kernel, scenes = basin.kernel, Scenes.of(frames, config.bootstrap_blocks)
     for sigma_px, contrast in SCHEDULE.kernels[1:]:
         sharp = sharp.exposed_at(ends["best"].alone)
         fitted = sharp.fitted(ends["best"].alone, KernelSettings.wide(sigma_px, contrast), rng)
-        kernel = weighted(sharp, ends["best"], fitted)
+        kernel = weighted(sharp, ends["best"], fitted, scenes)
         scored = Scored(sharp, kernel, prior, config, limits)
         ends = {k: refine(scored, end, steps=SCHEDULE.sharper_steps, fixed=fixed) for k, end in ends.items()}
     state, second = ends["best"], ends.get("second")
@@ -186,7 +186,7 @@ def align_camera_lidar(
         sharp,
         prior,
         config,
-        blocks_of(frames, config.bootstrap_blocks),
+        scenes,
         int(rng.integers(2**32)),
         prior.translation_sigma_m**2,
         MotionSigmas(heading_sigma, sweep_s_per_rad(frames)),
@@ -235,7 +235,13 @@ def analyse_camera_lidar(
         diagnostics |= {"own_tz_m": own_tz[0], "own_tz_sigma_m": own_tz[1]}
     own = np.sqrt(np.diag(analysis.covariance)[:2]).tolist()
     witnesses = ask_witnesses(
-        aligned.frames, problem.terms, analysis.state, analysis.kernel, problem.blocks, problem.seed, own
+        aligned.frames,
+        problem.terms,
+        analysis.state,
+        analysis.kernel,
+        problem.scenes.block,
+        problem.seed,
+        own,
     )
     covariance = analysis.covariance[:6, :6] + np.diag([*widening(witnesses) ** 2, 0, 0, 0, 0])
     covariance = with_ends(covariance, starts[:6])

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, motion_biases
 from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ, TzProfile, profile_tz, with_tz
@@ -33,6 +33,7 @@ from pipeline.calibrate.joint.camera_lidar.time_offset import (
 )
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, CAMERA_LIDAR_DT_FLOOR_S, FOCAL_SIGMA
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed, response
+from pipeline.calibrate.numerics.frame_blocks import SCENE_DEGREES, Scenes
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.common_share import prior_share
 from pipeline.extrinsics.estimates import Prior
@@ -62,7 +63,7 @@ class CameraLidarProblem:
     terms: Terms
     prior: Prior
     config: SolveConfig
-    blocks: Int[np.ndarray, " F"]  # of frames, for the bootstrap
+    scenes: Scenes  # of its frames: what they show, weights and covariance count by them
     seed: int  # of the bootstrap: solutions compare on the same resampled days
     tz_variance: float  # [m2]
     motion: MotionSigmas
@@ -106,7 +107,7 @@ def analyse_observability(
     profile = profile_tz(problem.scored(kernel), state, follow)
     timed = _timed(at_own_tz, state, kernel, rng)
     state = timed.state
-    kernel = weighted(problem.terms, state, problem.terms.fitted(state.alone, kernel, rng))
+    kernel = weighted(problem.terms, state, problem.terms.fitted(state.alone, kernel, rng), problem.scenes)
     follow = response(_curvature(problem, state, kernel), IS_TZ, _IS_FOCAL)[:, 0]
     prior_tz_m, prior_sigma_m = float(problem.prior.T_camera_lidar[2, 3]), problem.prior.translation_sigma_m
     tz_m, variance, common_share = profile.with_prior(prior_tz_m, prior_sigma_m)
@@ -166,7 +167,9 @@ def _fix_unobservable(
         solved_for = fixed | _IS_DT
         steps = SCHEDULE.steps_before_weights
         state = refine(problem.scored(kernel), state, steps=steps, fixed=solved_for)
-        kernel = weighted(problem.terms, state, problem.terms.fitted(state.alone, kernel, rng))
+        kernel = weighted(
+            problem.terms, state, problem.terms.fitted(state.alone, kernel, rng), problem.scenes
+        )
         steps = SCHEDULE.steps_after_weights
         state = refine(problem.scored(kernel), state, steps=steps, fixed=solved_for)
         day = day_covariance(problem, state, kernel, fixed)
@@ -223,17 +226,18 @@ def day_covariance(
     terms, prior_variance = problem.terms, _prior_variance(problem)
     scale, curvature = scales(terms, kernel), _curvature(problem, state, kernel)
     gradient = derivatives(terms, state, kernel, scale)[0] / scale
-    # After `weighted`, the scatter of the frames' gradients is the curvature, without its roughness
+    # After `weighted`, the scatter of the gradients over scenes is the curvature, without its roughness
     # (Bartlett's identity).
-    information = gradient[:, :, None] * gradient[:, None, :]
+    information = problem.scenes.inflation(gradient * scale) * gradient[:, :, None] * gradient[:, None, :]
     covariance = covariance_with_fixed(
         information,
         -gradient,
         prior_variance,
         curvature,
         fixed,
-        problem.blocks,
+        problem.scenes.block,
         np.random.default_rng(problem.seed),
+        SCENE_DEGREES,
     )
     floor = np.where(fixed, 0.0, np.append(CAMERA_LIDAR_BIAS, [CAMERA_LIDAR_DT_FLOOR_S, 0.0]))
     motion = motion_biases(terms, state, kernel, curvature, fixed, problem.motion)

@@ -61,16 +61,19 @@ def parts_of_alignment(
             scored = Scored(part, kernel, at_start, problem.config)
             state = refine(scored, state, steps=SCHEDULE.part_steps, fixed=~_IS_TURN)
         # Weighted anew: the scatter of the whole day counts the step itself as noise.
-        kernel, scale = weighted(part, state, analysis.kernel), scales(part, analysis.kernel)
+        scenes = problem.scenes.of_frames(rows)
+        kernel, scale = weighted(part, state, analysis.kernel, scenes), scales(part, analysis.kernel)
         g = (derivatives(part, state, kernel, scale)[0] / scale)[:, :3]
-        blocks = np.unique(problem.blocks[rows], return_inverse=True)[1].ravel()
         prior_information = np.eye(3) / problem.prior.rotation_sigma_rad**2
         rng = np.random.default_rng(problem.seed)
-        spread = bootstrap_covariance(g[:, :, None] * g[:, None, :], -g, prior_information, blocks, rng)
+        information = scenes.inflation(g) * g[:, :, None] * g[:, None, :]
+        spread = bootstrap_covariance(information, -g, prior_information, scenes.block, rng)
         return state, state.T_camera_lidar, spread
 
     def score(state: AlignmentState) -> Float[np.ndarray, " F"]:
         return np.sum([terms.score(state.alone, k)[0] for k in kernels], axis=0)
 
     stamps = [o.stamp_ns for o in frames]
-    return parts_of_day(np.concatenate(gradients, axis=1), stamps, solve, score, (0, 1, 2), problem.blocks)
+    return parts_of_day(
+        np.concatenate(gradients, axis=1), stamps, solve, score, (0, 1, 2), problem.scenes.block
+    )

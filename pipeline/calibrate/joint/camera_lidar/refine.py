@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.numerics.bias_floors import FOCAL_SIGMA, TYPICAL_RANGE_M, TYPICAL_SPEED_MPS
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.response_surface import DESIGN, at_least, fit_quadratics
 from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.config import SolveConfig
@@ -31,7 +32,7 @@ _SHRINK = 0.75  # of that radius, after a step that stays within it
 _SHRINK_AFTER_LOSS = 0.5  # likewise, after a step that would have lowered the score: its surface was too wide
 _CONVERGED = 0.05  # a step of this share of the radius changes nothing that matters
 _LEAST_PREDICTED = 0.5  # share of the curvature that the gradients' scatter predicts
-_WEIGHTS = (0.02, 1.0)  # range of a term's weight
+_WEIGHTS = (0.002, 1.0)  # range of a term's weight
 NONE_FIXED = np.zeros(8, bool)
 
 
@@ -183,18 +184,18 @@ def derivatives(
     return fit_quadratics(terms.score(state.changed(DESIGN * scale), kernel))
 
 
-def weighted(terms: Terms, state: AlignmentState, kernel: KernelSettings) -> KernelSettings:
-    """Weight markings, narrow and wide edges so that the curvature of each equals its gradient's scatter over frames.
+def weighted(terms: Terms, state: AlignmentState, kernel: KernelSettings, scenes: Scenes) -> KernelSettings:
+    """Weight markings, narrow and wide edges so that the curvature of each equals its gradient's scatter over scenes.
 
-    Points of one frame err together (one mask boundary, one lane line), so the curvature of a sum of log likelihood
-    ratios is too large, by another factor for each term.
+    Points of one frame err together (one mask boundary, one lane line), and frames of one scene do, so the curvature of
+    a sum of log likelihood ratios is too large, by another factor for each term.
     """
     scale = scales(terms, kernel)
     weights = []
     for part, edges in ((terms.narrow, 1.0), (terms.wide, 1.0), (terms, 0.0)):
         alone = replace(kernel, edge_weight=edges, marking_weight=1.0 - edges, wide_share=1.0)
         gradient, H = derivatives(part, state, alone, scale)
-        scatter = float(((gradient - gradient.mean(0)) ** 2).sum())
+        scatter = scenes.scatter(gradient)
         curvature = -float(np.trace(H.sum(0)))
         weights.append(float(np.clip(curvature / scatter, *_WEIGHTS)) if scatter > 1e-9 else 0.0)
     narrow, wide, marking = weights
