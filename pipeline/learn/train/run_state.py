@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -173,11 +174,14 @@ def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
 
 def _take_weights(network: CalibrationNetwork, start: Path) -> None:
     trained = network_of_file(start) if start.suffix == ".onnx" else network_of_run(start)
-    # What the camera is shown, and whether paint is matched, may change between stages.
-    shown = replace(trained.config, takes_classes=network.config.takes_classes, marks=network.config.marks)
-    if shown != network.config:
-        problem = f"{start} has a network of another kind, {trained.config}, not {network.config}"
-        raise ConfigError("train", "start-from", problem)
+    for name, theirs in asdict(trained.config).items():
+        ours = asdict(network.config)[name]
+        # Between stages a camera may be shown classes that it was not shown before, and paint be matched or not.
+        may_differ = name == "marks" or (name == "takes_classes" and ours)
+        if theirs != ours and not may_differ:
+            key, value = ("cell_deg", theirs["cell_deg"]) if name == "grid" else (name, theirs)
+            problem = f"{start} has a network of another kind: set {key} = {json.dumps(value)}, or start afresh"
+            raise ConfigError("train", key, problem)
     network.load_state_dict(_widened(trained.state_dict(), network.state_dict()))
 
 

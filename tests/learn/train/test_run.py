@@ -299,7 +299,7 @@ def test_a_run_may_start_from_anothers_weights_and_then_goes_on_with_its_own(dat
     assert train(TrainRequest(data, tmp_path / "new", "cpu", start=tmp_path / "gone"), still).step == 2
     with pytest.raises(ContractError, match="neither"):
         train(TrainRequest(data, tmp_path / "x", "cpu", start=tmp_path / "gone"), still)
-    with pytest.raises(ConfigError, match="another kind"):
+    with pytest.raises(ConfigError, match=r"width.*another kind: set width = 4"):
         train(TrainRequest(data, tmp_path / "y", "cpu", start=tmp_path / "old"), config(steps=1, width=8))
     # What the old network never saw counts nothing at first.
     wider = still.model_copy(update={"takes_classes": True})
@@ -307,3 +307,6 @@ def test_a_run_may_start_from_anothers_weights_and_then_goes_on_with_its_own(dat
     first = network_of_run(tmp_path / "z", best=False).core.camera_encoder.down[0][0].weight
     assert torch.allclose(first[:, :4], old.core.camera_encoder.down[0][0].weight, atol=1e-7)
     assert first[:, 4:].abs().max() < 1e-7
+    # Classes cannot be taken away again.
+    with pytest.raises(ConfigError, match=r"takes_classes.*another kind: set takes_classes = true"):
+        train(TrainRequest(data, tmp_path / "v", "cpu", start=tmp_path / "z"), config(steps=1))
