@@ -12,10 +12,11 @@ from typing import no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NEAR_M
+from schemas.training import GRID_CLASSES
 
 __all__ = ["FrameEvidence", "scores"]
 
@@ -32,25 +33,35 @@ class FrameEvidence:
     probability: Float32[np.ndarray, "N K"]
     worth: Float32[np.ndarray, " N"]  # 0 = absent
 
+    @property
+    def kinds(self) -> Int[np.ndarray, " K"]:
+        """Kind of evidence of each map: 0 for all classes together, then edges on boundaries, then paint."""
+        return np.maximum(np.arange(self.maps.shape[2]) - (len(GRID_CLASSES) - 1), 0)
+
 
 def scores(
     frames: Sequence[FrameEvidence], T_camera_lidar: Float[np.ndarray, "4 4"]
-) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F 6"]]:
-    """Mean expected log-likelihood of each frame's points, and its gradient by a twist on the left (per rad, per m)."""
-    value, gradient = np.zeros(len(frames)), np.zeros((len(frames), 6))
+) -> tuple[Float[np.ndarray, "F E"], Float[np.ndarray, "F E 6"]]:
+    """Mean expected log-likelihood of each frame's points by kind of evidence, and its gradient.
+
+    The gradient is by a twist on the left (per rad, per m). All frames have the same kinds.
+    """
+    kinds = frames[0].kinds
+    value, gradient = np.zeros((len(frames), kinds[-1] + 1)), np.zeros((len(frames), kinds[-1] + 1, 6))
     T = np.ascontiguousarray(T_camera_lidar[:3], dtype=np.float64)
     for i, f in enumerate(frames):
         limits = np.radians([f.grid.top_deg, f.grid.left_deg, f.grid.cell_deg])
-        value[i] = _score(f.points_m, f.probability, f.worth, f.maps, T, limits, gradient[i])
+        _score(f.points_m, f.probability, f.worth, f.maps, T, limits, kinds, value[i], gradient[i])
     return value, gradient
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
-def _score(points, probability, worth, maps, T, limits, gradient):  # noqa: ANN001, ANN202 - compiled
+def _score(points, probability, worth, maps, T, limits, kinds, value, gradient):  # noqa: ANN001, ANN202 - compiled
     height, width, classes = maps.shape
     cell = limits[2]
-    total, weight = 0.0, 0.0
+    weight = 0.0
+    corners = np.zeros((len(value), 4))  # of the cell that a point lies in, by kind
     for n in range(len(points)):
         w = worth[n]
         if w <= 0:
@@ -61,7 +72,7 @@ def _score(points, probability, worth, maps, T, limits, gradient):  # noqa: ANN0
         y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
         z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
         if z <= NEAR_M:
-            total += w * _BEHIND
+            value[0] += w * _BEHIND
             continue
         flat = np.sqrt(x * x + z * z)
         # Values stand at the centres of cells; beyond the outer ones goes on what stands there.
@@ -70,31 +81,31 @@ def _score(points, probability, worth, maps, T, limits, gradient):  # noqa: ANN0
         row_in, column_in = min(max(row, 0.0), height - 1.0), min(max(column, 0.0), width - 1.0)
         i, j = min(int(row_in), height - 2), min(int(column_in), width - 2)
         below, right = row_in - i, column_in - j
-        m00 = m01 = m10 = m11 = 0.0
+        corners[:] = 0.0
         for k in range(classes):
             p = probability[n, k]
             if p > 0:
-                m00 += p * maps[i, j, k]
-                m01 += p * maps[i, j + 1, k]
-                m10 += p * maps[i + 1, j, k]
-                m11 += p * maps[i + 1, j + 1, k]
-        above_value, below_value = m00 + right * (m01 - m00), m10 + right * (m11 - m10)
-        total += w * (above_value + below * (below_value - above_value))
-        by_row = below_value - above_value if row_in == row else 0.0
-        by_column = (m01 - m00) + below * ((m11 - m10) - (m01 - m00)) if column_in == column else 0.0
-        # Elevation is arctan(-y / flat), azimuth arctan(-x / z); rows and columns grow against them.
+                corners[kinds[k], 0] += p * maps[i, j, k]
+                corners[kinds[k], 1] += p * maps[i, j + 1, k]
+                corners[kinds[k], 2] += p * maps[i + 1, j, k]
+                corners[kinds[k], 3] += p * maps[i + 1, j + 1, k]
         squared = flat * flat + y * y
-        by_elevation, by_azimuth = -by_row / cell, -by_column / cell
-        gx = by_elevation * y * x / (squared * flat) - by_azimuth * z / (flat * flat)
-        gy = -by_elevation * flat / squared
-        gz = by_elevation * y * z / (squared * flat) + by_azimuth * x / (flat * flat)
-        gradient[0] += w * (y * gz - z * gy)
-        gradient[1] += w * (z * gx - x * gz)
-        gradient[2] += w * (x * gy - y * gx)
-        gradient[3] += w * gx
-        gradient[4] += w * gy
-        gradient[5] += w * gz
-    weight = max(weight, 1.0)
-    for k in range(6):
-        gradient[k] /= weight
-    return total / weight
+        for e in range(len(value)):
+            m00, m01, m10, m11 = corners[e]
+            above_value, below_value = m00 + right * (m01 - m00), m10 + right * (m11 - m10)
+            value[e] += w * (above_value + below * (below_value - above_value))
+            by_row = below_value - above_value if row_in == row else 0.0
+            by_column = (m01 - m00) + below * ((m11 - m10) - (m01 - m00)) if column_in == column else 0.0
+            # Elevation is arctan(-y / flat), azimuth arctan(-x / z); rows and columns grow against them.
+            by_elevation, by_azimuth = -by_row / cell, -by_column / cell
+            gx = by_elevation * y * x / (squared * flat) - by_azimuth * z / (flat * flat)
+            gy = -by_elevation * flat / squared
+            gz = by_elevation * y * z / (squared * flat) + by_azimuth * x / (flat * flat)
+            gradient[e, 0] += w * (y * gz - z * gy)
+            gradient[e, 1] += w * (z * gx - x * gz)
+            gradient[e, 2] += w * (x * gy - y * gx)
+            gradient[e, 3] += w * gx
+            gradient[e, 4] += w * gy
+            gradient[e, 5] += w * gz
+    value /= max(weight, 1.0)
+    gradient /= max(weight, 1.0)

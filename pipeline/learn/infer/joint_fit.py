@@ -4,8 +4,10 @@ A frame alone tells rotation to half a degree and hardly any shift, and sometime
 frames has one peak: wrong places of single frames do not meet, and near and far points tell the shift by parallax.
 Poses that pilot frames answered are candidates, all frames vote among them, and the winner climbs the sum.
 
-Points of a frame are not independent, so the sum is no likelihood. By how much it is to be taken is read off the day: a
-likelihood's curvature is the scatter of its gradient from scene to scene (Pauli, Racugno and Ventura 2011).
+Points of a frame are not independent, so the sum is no likelihood. What it is worth is read off the day, for each kind
+of evidence (classes, edges on boundaries, paint): a likelihood's curvature is the scatter of its gradient from scene to
+scene (Pauli, Racugno and Ventura 2011). At the peak of all kinds together each kind has a gradient left that all scenes
+share. What scenes do not explain of it is a bias of the kind, and the covariance of the pose that it leaves is stated.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ _UNIT = np.array([0.01] * 3 + [0.1] * 3)  # rad, m: steps of one are alike
 # Half a cell of the grid, and the shift that moves a point 15 m away by as much. With it sigmas on the real day are
 # what leaving out tenths of its scenes gives (0.08 / 0.06 deg against 0.08 / 0.08), over a whole cell 1.6 times that.
 _STEP = np.array([0.0035] * 3 + [0.05] * 3)
-_FIRST_WORTH = 30.0  # of a frame's mean log-likelihood, before the day says it
+_FIRST_WORTH = 30.0  # of a frame's mean log-likelihood, before the day tells it
 _LEAST_CURVED = 0.02  # of the greatest curvature: flatter directions do not tell what the sum is worth
 _CLIMB = 60  # steps at most
 _VOTERS = 40  # frames that tell candidates apart
@@ -35,10 +37,13 @@ APART_RAD = np.radians(0.5)  # a candidate farther away may lie on another peak
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Where prior and frames together have their peak, and the information of the frames (left twist [rad, m])."""
+    """Where prior and frames together have their peak, and how well they know it (left twist [rad, m])."""
 
     T: Float[np.ndarray, "4 4"]
-    information: Float[np.ndarray, "6 6"]
+    information: Float[np.ndarray, "6 6"]  # of the frames alone
+    bias: Float[
+        np.ndarray, "6 6"
+    ]  # covariance of what frames err by alike, by how far kinds of evidence disagree
     frames: int
 
 
@@ -47,7 +52,7 @@ def voted(
 ) -> list[Float[np.ndarray, "4 4"]]:
     """The candidates, those first that frames spread over the day fit best."""
     voters = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, _VOTERS).astype(int))]
-    fitting = np.array([scores(voters, T)[0].mean() for T in candidates])
+    fitting = np.array([scores(voters, T)[0].sum() for T in candidates])
     return [candidates[i] for i in np.argsort(-fitting, kind="stable")]
 
 
@@ -56,17 +61,18 @@ def climbed(
     T_start: Float[np.ndarray, "4 4"],
     T_prior: Float[np.ndarray, "4 4"],
     prior_covariance: Float[np.ndarray, "6 6"],
-    worth: float = _FIRST_WORTH,
+    worth: float | Float[np.ndarray, " E"] = _FIRST_WORTH,
 ) -> Float[np.ndarray, "4 4"]:
-    """The peak above a start, of the frames and the prior together."""
+    """The peak above a start, of the frames and the prior together; `worth` is of each kind of evidence."""
     precision = np.linalg.inv(prior_covariance)
 
     def cost(step: np.ndarray) -> tuple[float, np.ndarray]:
         T = exp_se3(step * _UNIT) @ T_start
         value, gradient = scores(frames, T)
         off = log_se3(T @ inverse(T_prior))
-        total = -worth * float(value.sum()) + 0.5 * float(off @ precision @ off)
-        return total, (-worth * gradient.sum(0) + precision @ off) * _UNIT
+        total = -float((worth * value.sum(0)).sum()) + 0.5 * float(off @ precision @ off)
+        told = (np.reshape(worth, (-1, 1)) * gradient.sum(0)).sum(0)
+        return total, (-told + precision @ off) * _UNIT
 
     found = minimize(cost, np.zeros(6), jac=True, method="L-BFGS-B", options={"maxiter": _CLIMB})
     return np.asarray(exp_se3(found.x * _UNIT) @ T_start)
@@ -88,12 +94,21 @@ def fit_of(
         T_prior: see `climbed`.
         prior_covariance: likewise.
     """
-    T, worth = T_start, _FIRST_WORTH
+    T, worth = T_start, np.full(frames[0].kinds[-1] + 1, _FIRST_WORTH)
     for _ in range(2):
         T = climbed(frames, T, T_prior, prior_covariance, worth)
-        H = _curvature(frames, T)
-        worth = _worth(H, _scatter(frames, block, T))
-    return JointFit(T, worth * H, len(frames))
+        H, gradient = _curvature(frames, T), scores(frames, T)[1]
+        kinds = range(len(worth))
+        own = np.array([_worth(H[e], _scatter(gradient[:, e], block)) for e in kinds])
+        together = np.einsum("e,fei->fi", own, gradient)
+        # Kinds of one scene err together too.
+        worth = own * _worth(np.einsum("e,eij->ij", own, H), _scatter(together, block))
+    information = _positive_part(np.einsum("e,eij->ij", worth, H))
+    weighed = worth[:, None] * gradient
+    left = weighed.sum(0)
+    noise = sum(_scatter(weighed[:, e], block) for e in kinds)
+    known = np.linalg.inv(information + np.linalg.inv(prior_covariance))
+    return JointFit(T, information, known @ _positive_part(left.T @ left - noise) @ known, len(frames))
 
 
 def rival_score(
@@ -105,37 +120,41 @@ def rival_score(
     """By how many sigmas of the scenes' scatter frames prefer a pose to its rival; infinite where both are one peak."""
     if float(rotation_angle_rad(T @ inverse(T_rival))) < APART_RAD:
         return float("inf")
-    better = scores(frames, T)[0] - scores(frames, T_rival)[0]
+    better = (scores(frames, T)[0] - scores(frames, T_rival)[0]).sum(1)
     sums = np.bincount(np.unique(block, return_inverse=True)[1].ravel(), better)
     return float(better.sum() / (np.sqrt(np.square(sums - sums.mean()).sum()) + 1e-12))
 
 
 def _worth(H: np.ndarray, J: np.ndarray) -> float:
-    """Curvature over the gradient's scatter, mean over the directions in which the sum is curved, if any is."""
+    """Curvature over the gradient's scatter, mean over the directions in which the sum is curved; 0 where none is."""
     values, vectors = np.linalg.eigh(H * np.outer(_UNIT, _UNIT))
-    curved = values > _LEAST_CURVED * values[-1]
+    curved = (values > _LEAST_CURVED * values[-1]) & (values > 0)
     scatter = np.einsum("ik,ij,jk->k", vectors, J * np.outer(_UNIT, _UNIT), vectors)
     if not curved.any() or scatter[curved].min() <= 0:
-        return _FIRST_WORTH
+        return 0.0
     return float(1 / np.mean(scatter[curved] / values[curved]))
 
 
-def _curvature(frames: Sequence[FrameEvidence], T: np.ndarray) -> Float[np.ndarray, "6 6"]:
-    """Of the sum, positive: negative eigenvalues are what no frame tells."""
-    H = np.empty((6, 6))
+def _curvature(frames: Sequence[FrameEvidence], T: np.ndarray) -> Float[np.ndarray, "E 6 6"]:
+    """Of the sum over frames, by kind of evidence; positive at a peak."""
+    H = []
     for k, h in enumerate(_STEP):
         step = np.zeros(6)
         step[k] = h
         ahead, behind = (scores(frames, exp_se3(s) @ T)[1].sum(0) for s in (step, -step))
-        H[k] = (behind - ahead) / (2 * h)
-    scaled = (H + H.T) / 2 * np.outer(_UNIT, _UNIT)
-    values, vectors = np.linalg.eigh(scaled)
-    return np.asarray(vectors @ np.diag(np.maximum(values, 0.0)) @ vectors.T / np.outer(_UNIT, _UNIT))
+        H.append((behind - ahead) / (2 * h))
+    found = np.stack(H, axis=1)
+    return np.asarray((found + found.transpose(0, 2, 1)) / 2)
 
 
-def _scatter(frames: Sequence[FrameEvidence], block: np.ndarray, T: np.ndarray) -> Float[np.ndarray, "6 6"]:
-    """Covariance of the sum's gradient, from scene to scene."""
-    gradient = scores(frames, T)[1]
+def _positive_part(M: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+    """Of a symmetric matrix of twists: negative eigenvalues of a curvature are what no frame tells."""
+    values, vectors = np.linalg.eigh(M * np.outer(_UNIT, _UNIT))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(_UNIT, _UNIT))
+
+
+def _scatter(gradient: Float[np.ndarray, "F 6"], block: Int[np.ndarray, " F"]) -> Float[np.ndarray, "6 6"]:
+    """Covariance of the sum of frames' gradients, from scene to scene."""
     names, rows = np.unique(block, return_inverse=True)
     sums = np.zeros((len(names), 6))
     np.add.at(sums, rows.ravel(), gradient)

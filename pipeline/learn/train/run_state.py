@@ -180,7 +180,9 @@ def _take_weights(network: CalibrationNetwork, start: Path) -> None:
         may_differ = name == "marks" or (name == "takes_classes" and ours)
         if theirs != ours and not may_differ:
             key, value = ("cell_deg", theirs["cell_deg"]) if name == "grid" else (name, theirs)
-            problem = f"{start} has a network of another kind: set {key} = {json.dumps(value)}, or start afresh"
+            problem = (
+                f"{start} has a network of another kind: set {key} = {json.dumps(value)}, or start afresh"
+            )
             raise ConfigError("train", key, problem)
     network.load_state_dict(_widened(trained.state_dict(), network.state_dict()))
 

@@ -9,6 +9,7 @@ from pipeline.learn.infer.class_evidence import FrameEvidence, scores
 from pipeline.learn.infer.joint_day import fitted_day
 from pipeline.learn.infer.joint_fit import climbed, fit_of, rival_score, voted
 from pipeline.learn.sample.grid import Grid
+from schemas.training import GRID_CLASSES
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
 
 GRID = Grid(0.4, 38.4, 16.0, -22.4)
@@ -48,6 +49,22 @@ def frame(seed, T=T_CAMERA_LIDAR, objects=14):
     )
 
 
+def with_paint(classes, paint):
+    """A frame with a second kind of evidence: what another frame shows of one class, on a map of its own."""
+    none = np.full((GRID.height, GRID.width, len(GRID_CLASSES) - CLASSES), -5.0, np.float32)
+    hits = paint.probability[:, 1] > 0.5
+    columns = np.zeros((len(classes.points_m) + hits.sum(), len(GRID_CLASSES) + 1), np.float32)
+    columns[: len(classes.points_m), :CLASSES] = classes.probability
+    columns[len(classes.points_m) :, -1] = 1.0
+    return FrameEvidence(
+        GRID,
+        np.concatenate([classes.maps, none, paint.maps[..., 1:2]], axis=2),
+        np.concatenate([classes.points_m, paint.points_m[hits]]),
+        columns,
+        np.ones(len(columns), np.float32),
+    )
+
+
 @pytest.fixture(scope="module")
 def day():
     return [frame(seed) for seed in range(16)]
@@ -68,8 +85,8 @@ def test_the_gradient_is_the_scores_own_derivative(day):
         step[k] = h
         ahead, behind = (scores(day, exp_se3(s) @ T)[0] for s in (step, -step))
         # Between cells' centres the score has corners, which single points meet.
-        wrong = np.abs((ahead - behind) / (2 * h) - gradient[:, k])
-        assert np.median(wrong) < 0.02 * np.abs(gradient[:, k]).max()
+        wrong = np.abs((ahead - behind) / (2 * h) - gradient[..., k])
+        assert np.median(wrong) < 0.02 * np.abs(gradient[..., k]).max()
 
 
 def test_all_frames_together_find_rotation_and_shift_from_two_degrees_away(day):
@@ -94,6 +111,32 @@ def test_frames_that_show_nothing_leave_the_prior_and_say_so(day):
 def test_the_vote_puts_the_pose_first_that_most_frames_fit(day):
     candidates = [off_by(0.05, 0, 0, 0, 0, 0), off_by(0.002, 0, 0, 0, 0, 0), off_by(0, 0.03, 0, 0, 0, 0)]
     assert voted(day, candidates)[0] is candidates[1]
+
+
+def test_evidence_that_is_astray_by_scenes_weighs_little():
+    """Paint of every scene is turned by another degree: the classes decide."""
+    turn = np.radians(np.random.default_rng(3).normal(0, 1.0, (8, 3)))
+    frames = [with_paint(frame(s), frame(s + 90, off_by(*turn[s // 2], 0, 0, 0))) for s in range(16)]
+    found = fit_of(frames, BLOCK, T_CAMERA_LIDAR, T_CAMERA_LIDAR, P).T
+    by_paint = climbed(frames, T_CAMERA_LIDAR, T_CAMERA_LIDAR, P, np.array([3.0, 300.0]))
+    error_deg, astray_deg = (np.degrees(log_se3(T @ inverse(T_CAMERA_LIDAR))[:3]) for T in (found, by_paint))
+    assert np.linalg.norm(error_deg) < 0.06
+    assert np.linalg.norm(astray_deg) > 0.2
+
+
+def test_kinds_of_evidence_that_disagree_on_all_scenes_widen_what_is_stated():
+    def stated_deg(turn_deg):
+        turned = off_by(0, np.radians(turn_deg), 0, 0, 0, 0)
+        frames = [with_paint(frame(s), frame(s + 90, turned)) for s in range(16)]
+        fit = fit_of(frames, BLOCK, T_CAMERA_LIDAR, T_CAMERA_LIDAR, P)
+        error_deg = np.degrees(log_se3(fit.T @ inverse(T_CAMERA_LIDAR))[1])
+        return error_deg, np.degrees(np.sqrt(fit.bias[1, 1]))
+
+    _, agreeing_deg = stated_deg(0.0)
+    error_deg, disagreeing_deg = stated_deg(0.6)
+    assert agreeing_deg < 0.02
+    assert abs(error_deg) < 2.5 * disagreeing_deg
+    assert disagreeing_deg > 0.04
 
 
 def fitted(frames, candidates):
