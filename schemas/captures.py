@@ -1,4 +1,4 @@
-"""What one sensor measured at the moments of a vehicle-day, a file per sensor: tables `images`, `sweeps`, `scans`."""
+"""Data of one sensor at the moments of a vehicle-day: tables `images`, `sweeps`, `scans`."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ __all__ = [
 
 @row()
 class Capture:
-    """What every row of one sensor's file begins with."""
+    """First columns of every sensor's file."""
 
-    moment: int = column("row of the table of moments that it belongs to", kind="int32")
-    stamp_ns: int = column("the sensor's own stamp; of a sweep, per-point times count from it")
+    moment: int = column("row of the table moments", kind="int32")
+    stamp_ns: int = column("stamp of the sensor; per-point times of a sweep are relative to it")
 
 
 @row()
 class CameraColumns:
-    """A camera at one image."""
+    """Intrinsics of a camera at one image."""
 
-    image_width_px: int = column("width that the intrinsics refer to", kind="int32")
-    image_height_px: int = column("height that the intrinsics refer to", kind="int32")
+    image_width_px: int = column("image width for these intrinsics", kind="int32")
+    image_height_px: int = column("image height for these intrinsics", kind="int32")
     camera_model: str = column(
         "'plumb_bob', 'rational_polynomial' or 'equidistant' (Kannala-Brandt; D = 0 is f-theta)"
     )
@@ -48,7 +48,7 @@ class CameraColumns:
 
 @row()
 class ImageColumns(CameraColumns):
-    """An image, and what was logged of what it shows."""
+    """An image, with logged labels and detections."""
 
     image: bytes = column("JPEG or PNG bytes exactly as logged (raw Image topics are encoded as PNG)")
     image_format: str = column("'jpeg' or 'png'")
@@ -58,13 +58,13 @@ class ImageColumns(CameraColumns):
     detection_boxes_px: np.ndarray | None = array(
         "<f4", ("N", 4), "logged road users: x0 y0 x1 y1 in full-image pixels"
     )
-    detection_classes: list[str] | None = column("their classes as logged")
-    detection_scores: np.ndarray | None = per_point("their scores, 0..1")
+    detection_classes: list[str] | None = column("classes of the road users, as logged")
+    detection_scores: np.ndarray | None = per_point("scores of the road users, 0..1")
 
 
 @row()
 class SweepColumns:
-    """A sweep's points."""
+    """Points of a sweep."""
 
     lidar_x_m: np.ndarray = per_point("points in the lidar frame, de-skewed to stamp_ns where lidar_deskewed")
     lidar_y_m: np.ndarray = per_point("see lidar_x_m")
@@ -72,7 +72,7 @@ class SweepColumns:
     lidar_intensity: np.ndarray | None = per_point("reflectivity as logged")
     lidar_ring: np.ndarray | None = per_point("beam number", "<u2")
     lidar_time_s: np.ndarray | None = per_point("time of each point relative to stamp_ns")
-    lidar_deskewed: bool = column("points were moved to stamp_ns by the ego motion")
+    lidar_deskewed: bool = column("points were transformed to stamp_ns by ego motion")
 
     @property
     def lidar_xyz_m(self) -> Float32[np.ndarray, "N 3"]:
@@ -82,11 +82,11 @@ class SweepColumns:
 
 @row()
 class ScanColumns:
-    """A radar's detections."""
+    """Detections of a radar scan."""
 
     radar_x_m: np.ndarray = per_point("detections in the radar frame")
     radar_y_m: np.ndarray = per_point("see radar_x_m")
-    radar_z_m: np.ndarray = per_point("see radar_x_m; 0 where the radar measures no elevation")
+    radar_z_m: np.ndarray = per_point("see radar_x_m; 0 if the radar measures no elevation")
     radar_range_rate_mps: np.ndarray = array(
         "<f4",
         ("N",),
@@ -94,7 +94,7 @@ class ScanColumns:
     )
     radar_power_db: np.ndarray | None = per_point("power or RCS as logged")
     radar_has_elevation: bool = column("False where all elevations are 0")
-    doppler_period_mps: float | None = column("range rates are known modulo this; null = unambiguous")
+    doppler_period_mps: float | None = column("period of ambiguous range rates; null = unambiguous")
 
     @property
     def radar_xyz_m(self) -> Float32[np.ndarray, "M 3"]:

@@ -1,10 +1,10 @@
-"""How a table is described once, by the dataclass of its rows, and what follows: Arrow schema and JSON Schema.
+"""Description of a table by the dataclass of its rows, and the Arrow and JSON Schemas derived from it.
 
-A row's fields are the table's columns (`column`, `array`); `TableSchema` is the table of them.
+The fields of a row are the columns of the table (`column`, `array`); `TableSchema` collects them.
 
-Arrays travel as `binary` blobs, one per attribute, little-endian and C-ordered
-(Parquet reads them 4-10x faster than list columns); the column's Arrow field metadata says dtype and shape, so any
-engine can decode them: `numpy.frombuffer(blob, dtype).reshape(shape)`.
+Arrays are stored as `binary` blobs, little-endian and C-ordered, because Parquet reads them 4-10x faster than
+list columns. The metadata of the column's Arrow field has dtype and shape, so any engine can decode them:
+`numpy.frombuffer(blob, dtype).reshape(shape)`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Row = TypeVar("Row")
 ScalarKind = Literal["int64", "int32", "float64", "string", "bool", "binary", "list<string>", "list<float64>",
                      "list<bool>", "map<string,float64>", "map<string,int64>"]  # fmt: skip
 
-# Of each kind: the type in Arrow, and in JSON Schema.
+# Kind -> its type in Arrow, and in JSON Schema.
 _TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
     "int64": (pa.int64(), {"type": "integer"}),
     "int32": (pa.int32(), {"type": "integer"}),
@@ -60,7 +60,7 @@ _KINDS: dict[Any, ScalarKind] = {
 
 @dataclass(frozen=True)
 class Column:
-    """One column: its name carries the unit; `shape` is set for arrays, with "N" for the free axis."""
+    """One column. The name includes the unit; `shape` is set for arrays, with "N" for the free axis."""
 
     name: str
     kind: ScalarKind
@@ -75,7 +75,7 @@ class Column:
         return self.dtype is not None
 
     def arrow_field(self) -> pa.Field:
-        """The Arrow field, with dtype and shape in its metadata where the column is an array."""
+        """The Arrow field, with dtype and shape in its metadata if the column is an array."""
         metadata = {"doc": self.doc}
         if self.dtype is not None:
             metadata |= {"dtype": self.dtype, "shape": ",".join(map(str, self.shape))}
@@ -91,23 +91,27 @@ class Column:
 
 @dataclass(frozen=True)
 class TableSchema:
-    """A table: a column for each field of its rows. The version grows with every change that a reader can notice."""
+    """A table: one column per field of its rows. Every change visible to readers increments the version."""
 
     row_type: type = field(compare=False, repr=False)
     name: str
     version: int
     doc: str = ""
-    made_by: str = ""  # stage, and command, that writes it
-    # Older versions whose rows are read too: what they lack has a default in the row's dataclass.
+    made_by: str = ""  # stage and command that write it
+    # Older versions whose rows are read too; their missing columns have defaults in the row's dataclass.
     reads_versions: tuple[int, ...] = ()
-    # Of a record table: the columns that say what a row is about. Of all rows about the same, the one that was asserted
-    # last is current; work_key tells them apart. Empty: a table of partitions that are replaced as a whole.
+    # For record tables: columns that identify the subject of a row. Among rows with the same subject, the one
+    # asserted last is current; work_key distinguishes them. Empty for tables of partitions that are replaced
+    # as a whole.
     about: tuple[str, ...] = ()
-    # Of a column that older releases did not write: the column that it follows from, and its value by that one's.
+    # Column that older releases did not write -> the column it is derived from, and its value per value of
+    # that column.
     follows: Mapping[str, tuple[str, Mapping[str, str]]] = field(default_factory=dict, hash=False)
     of_sensor: bool = False  # a partition has a file per sensor, joined by another table
-    before: str = ""  # the table that stood in its place before 0.11
-    columns: tuple[Column, ...] = ()  # left out: of its fields, in their order, inherited ones after its own
+    before: str = ""  # the table with this role before 0.11
+    columns: tuple[
+        Column, ...
+    ] = ()  # default: the fields of the row type in their order, inherited ones last
 
     def __post_init__(self) -> None:
         if self.columns:
@@ -120,23 +124,23 @@ class TableSchema:
 
     @property
     def is_record_table(self) -> bool:
-        """True for a table of records, which are added; False for one of partitions, which are replaced."""
+        """True for a table whose rows are added; False for a table whose partitions are replaced."""
         return bool(self.about)
 
     def about_of(self, row: Any) -> tuple[str, ...]:
-        """What a row of a record table is about: its values of those columns."""
+        """Subject of a record: its values of the columns `about`."""
         return tuple(getattr(row, name) for name in self.about)
 
     def rows_among(self, rows: Iterable[Any]) -> list[Any]:
-        """Of rows of several tables, this one's."""
+        """The rows of this table among rows of several tables."""
         return [row for row in rows if type(row) is self.row_type]
 
     def arrow_schema(self) -> pa.Schema:
-        """The Arrow schema that every file of the table has."""
+        """Arrow schema of every file of the table."""
         return pa.schema([c.arrow_field() for c in self.columns])
 
     def column(self, name: str) -> Column:
-        """The column of that name; KeyError where the table has none."""
+        """The column with this name; raises KeyError if the table has none."""
         for column in self.columns:
             if column.name == name:
                 return column
@@ -156,28 +160,28 @@ class TableSchema:
 
 
 def column(doc: str, *, kind: str = "", **default: Any) -> Any:
-    """A field that is a plain column.
+    """A dataclass field for a scalar column.
 
     Args:
-        doc: what it holds.
-        kind: where the field's type leaves it open (int32); else it follows from that.
-        default: `default` or `default_factory`, as of a dataclass.
+        doc: description of the content.
+        kind: type, if the annotation leaves it open (int32); else derived from the annotation.
+        default: `default` or `default_factory`, as for a dataclass.
     """
     return field(**default, metadata={"doc": doc, "kind": kind})
 
 
 def array(dtype: str, shape: tuple[str | int, ...], doc: str, **default: Any) -> Any:
-    """A field that is a blob: little-endian numpy `dtype` (as "<f4"), `shape` with "N" for the free axis."""
+    """A dataclass field for a blob: little-endian `dtype` (as "<f4"), `shape` with "N" for the free axis."""
     return field(**default, metadata={"doc": doc, "kind": "binary", "dtype": dtype, "shape": shape})
 
 
 def per_point(doc: str, dtype: str = "<f4", **default: Any) -> Any:
-    """A field that is a blob with a number for each point, cluster or detection."""
+    """A dataclass field for a blob with one number per point, cluster or detection."""
     return array(dtype, ("N",), doc, **default)
 
 
 def points(doc: str, dtype: str = "<f4", **default: Any) -> Any:
-    """A field that is a blob with x, y and z of any number of points."""
+    """A dataclass field for a blob with x, y and z of any number of points."""
     return array(dtype, ("N", 3), doc, **default)
 
 
@@ -188,28 +192,28 @@ def points(doc: str, dtype: str = "<f4", **default: Any) -> Any:
     field_specifiers=(field, column, array, per_point, points),
 )
 def row(*, eq: bool = False) -> Callable[[type[Row]], type[Row]]:
-    """A frozen dataclass of named fields only: a row of a table, whose columns its fields are."""
+    """Make a class a frozen keyword-only dataclass: a row of a table, with its fields as columns."""
     return dataclass(frozen=True, eq=eq, kw_only=True)
 
 
 @row()
 class Recorded:
-    """Columns of every record table, its last ones: whose, by which work, and since when it counts."""
+    """Last columns of every record table: vehicle, work and time of a record."""
 
     work_key: str = column("hash of code version, config, inputs", default="")
     recorded_at: str = column("UTC, ISO 8601 with microseconds: when the row was written", default="")
     asserted_at: str = column(
-        "UTC, ISO 8601 with microseconds: when a night last made it current: of all rows about the same, the latest is",
+        "UTC, ISO 8601 with microseconds: when a night last made it current; the latest row of a subject is current",
         default="",
     )
 
 
-_POSE = "of the estimate T_a_b: a quaternion, scalar first, and b's origin in a; null where there is none"
+_POSE = "T_a_b as quaternion (scalar first) and origin of b in a; null if there is no estimate"
 
 
 @row()
 class Posed(Recorded):
-    """Columns of a record that estimates T_a_b, after its own: the pose, and how sure it is."""
+    """Columns of a record with an estimate T_a_b: the pose and its uncertainty."""
 
     qw: float | None = column(_POSE, default=None)
     qx: float | None = column(_POSE, default=None)
@@ -221,31 +225,31 @@ class Posed(Recorded):
     covariance: np.ndarray | None = array(
         "<f8",
         (6, 6),
-        "of (rx ry rz tx ty tz), left perturbation in a's axes [rad, m]; null where there is no estimate",
+        "covariance of (rx ry rz tx ty tz), left perturbation in a's axes [rad, m]; null without an estimate",
         default=None,
     )
     common_covariance: np.ndarray | None = array(
         "<f8",
         (6, 6),
-        "the part of it that all days of a vehicle err by alike: bias floors, and the prior where the days leave it "
-        "its weight; covariance less it varies from day to day and averages down",
+        "part of the covariance from errors common to all days of a vehicle: bias floors, and the prior's error as far "
+        "as estimates depend on it; the rest is independent from day to day",
         default=None,
     )
     observable: list[bool] | None = column(
-        "per DoF: the day, of a state one of its days, determined it; else it keeps prior and prior sigma",
+        "per DoF: determined by the day (for a state: by one of its days); otherwise prior and prior sigma",
         default=None,
     )
     determined: list[str] = column(
-        "of azimuth and elevation at targets 15 to 40 m away that the sensors see: those whose error is below the "
+        "certified directions, of azimuth and elevation at visible targets 15 to 40 m away: error below the "
         "limit with probability verify.confidence",
         default_factory=list,
     )
-    azimuth_sigma_rad: float | None = column("sigma of a target's azimuth, from the covariance", default=None)
-    elevation_sigma_rad: float | None = column("sigma of its elevation", default=None)
+    azimuth_sigma_rad: float | None = column("sigma of a target's azimuth, from covariance", default=None)
+    elevation_sigma_rad: float | None = column("sigma of a target's elevation, from covariance", default=None)
 
 
 def _column(of: Field[Any], kind: Any) -> Column:
-    """The column of a field: nullable where None is among its types."""
+    """The column of a field; nullable if None is among its types."""
     nullable = type(None) in get_args(kind) if isinstance(kind, UnionType) else False
     plain = next(k for k in get_args(kind) if k is not type(None)) if nullable else kind
     known = dict(of.metadata)

@@ -1,7 +1,7 @@
-"""Table `drift`: what the control charts say of each vehicle, edge and DoF. Append-only, a row per chart and audit.
+"""Table `drift`: control charts per vehicle, edge and DoF. Append-only, a row per chart and audit.
 
-The verdict on the vehicle as a whole stands in every one of its rows (`vehicle_*`), as the audit decided it; whoever
-shows it reads it from there and decides nothing anew.
+Every row of a vehicle repeats the audit's verdict on the whole vehicle (`vehicle_*`). Pages and commands read
+it there and do not compute another.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = [
     "status_of",
 ]
 
-# What a person should look at first comes first; lists of vehicles are in this order.
+# Most urgent first; lists of vehicles are in this order.
 DRIFT_STATUSES = ("RED", "YELLOW", "UNKNOWN", "GREEN")
 
 
@@ -35,47 +35,47 @@ class DriftFinding(Recorded):
     vehicle: str = column("vehicle id")
     day: str = column("last day of the audited window, YYYY-MM-DD")
     method: str = column("method of the audited records")
-    pair: str = column("kind of the edge: kinds of its two sensors, as camera_lidar")
-    parent_frame: str = column("the edge's parent: name of a sensor, or base")
-    child_frame: str = column("the edge's child: name of a sensor, or base")
+    pair: str = column("kind of the edge: kinds of its two sensors, e.g. camera_lidar")
+    parent_frame: str = column("parent of the edge: name of a sensor, or base")
+    child_frame: str = column("child of the edge: name of a sensor, or base")
     dof: str = column("rx, ry, rz, tx, ty, tz in parent axes")
     status: str = column(
-        "of this chart: GREEN, YELLOW (a change below the limit that matters, or not yet sure), RED, UNKNOWN "
-        "(too little data); of the vehicle: vehicle_status"
+        "status of this chart: GREEN, YELLOW (a change below the limit, or not yet certain), RED, UNKNOWN "
+        "(too little data); vehicle_status is the status of the vehicle"
     )
-    reason: str = column("in words")
-    days_used: int = column("day estimates on the chart")
-    statistic: float | None = column("the chart's alarm statistic at its maximum", default=None)
-    threshold: float | None = column("its alarm threshold under the false-alarm budget", default=None)
-    start_day: str | None = column("first day with the new value", default=None)
-    start_day_earliest: str | None = column("lower end of the start day's interval", default=None)
-    start_day_latest: str | None = column("upper end", default=None)
+    reason: str = column("reason for the status")
+    days_used: int = column("number of days on the chart")
+    statistic: float | None = column("maximum of the alarm statistic", default=None)
+    threshold: float | None = column("alarm threshold for the false-alarm budget", default=None)
+    start_day: str | None = column("first day after the change", default=None)
+    start_day_earliest: str | None = column("lower end of the interval for start_day", default=None)
+    start_day_latest: str | None = column("upper end of the interval for start_day", default=None)
     kind: str | None = column("'step' or 'slow drift'", default=None)
     magnitude: float | None = column("size of the change [rad or m]", default=None)
     magnitude_sigma: float | None = column("its sigma", default=None)
-    limit: float = column("size that matters for this kind of edge and DoF [rad or m]")
+    limit: float = column("size of a change that matters for this kind of edge and DoF [rad or m]")
     moved_sensor: str | None = column(
-        "the sensor whose motion explains the shifts of all edges, by name", default=None
+        "name of the sensor whose motion explains the changes of all edges", default=None
     )
     moved_probability: float | None = column(
-        "of moved_sensor against the others, 0..1; null where nothing moved", default=None
+        "probability that moved_sensor moved and not another, 0..1; null if none moved", default=None
     )
     moved_motion: list[float] | None = column(
-        "rotation vector [rad] and shift [m] of the moved sensor in its own axes", default=None
+        "rotation vector [rad] and shift [m] of the moved sensor, in the axes of that sensor", default=None
     )
-    moved_motion_sigma: list[float] | None = column("their sigmas", default=None)
+    moved_motion_sigma: list[float] | None = column("sigmas of moved_motion", default=None)
     inputs: list[str] = column("work keys of the records on the chart", default_factory=list)
     vehicle_status: str | None = column(
-        "of the vehicle as a whole, the same in all its rows of one audit: RED or YELLOW where a chart is, "
-        "GREEN where a turn of any sensor would have shown, else UNKNOWN; null in rows of releases before 0.4",
+        "status of the whole vehicle, equal in all its rows of one audit: RED or YELLOW if a chart is, "
+        "GREEN if a rotation of any sensor would have been detected, else UNKNOWN; null in rows of releases before 0.4",
         default=None,
     )
     vehicle_sensor: str | None = column(
-        "name of the sensor that moved; null where none did or it is not clear which",
+        "name of the sensor that moved; null if none moved or the data do not identify it",
         default=None,
     )
     vehicle_since: str | None = column("first day after the vehicle's clearest change", default=None)
-    vehicle_reason: str | None = column("why the vehicle has this status, in words", default=None)
+    vehicle_reason: str | None = column("reason for the vehicle's status", default=None)
 
 
 DRIFT = TableSchema(
@@ -94,7 +94,7 @@ DRIFT = TableSchema(
 
 @dataclass(frozen=True)
 class VehicleStatus:
-    """The audit's verdict on one vehicle: columns `vehicle_*` of its rows."""
+    """Verdict of the audit on one vehicle: columns `vehicle_*` of its rows."""
 
     status: str
     reason: str
@@ -103,7 +103,7 @@ class VehicleStatus:
 
 
 def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
-    """The stored verdict on a vehicle; UNKNOWN, with the reason, where no audit has stored one.
+    """The stored verdict on a vehicle; UNKNOWN, with a reason, if no audit has stored one.
 
     Args:
         findings: current rows of one vehicle and method.
@@ -119,11 +119,11 @@ def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
 
 
 def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
-    """camera, lidar, radar or base: what the sensor of a name is on the edges that findings are about.
+    """Kind of a sensor (camera, lidar, radar or base), from the edges in findings.
 
     Args:
-        name: of a sensor.
-        findings: of its vehicle.
+        name: name of the sensor.
+        findings: findings of its vehicle.
     """
     known = {
         frame: kind
@@ -133,12 +133,12 @@ def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
     return known.get(name, name)
 
 
-# How reasons end that later days decide: nothing is to be mended yet.
+# Ends of reasons that resolve themselves with more days: no action is needed yet.
 DAYS_WILL_TELL = "will tell"
 
 
 def next_step(vehicle: str, stored: VehicleStatus, lake: str = "LAKE") -> str:
-    """What a person should do about a vehicle that is RED or YELLOW, with the command; empty where there is nothing."""
+    """Next action for a vehicle that is RED or YELLOW, with the command; empty if no action is needed."""
     if stored.status not in ("RED", "YELLOW"):
         return ""
     of = f"--lake {quote(lake)} --vehicle {quote(vehicle)}"

@@ -1,6 +1,6 @@
-"""What perception found, a file per sensor: tables `image_features`, `sweep_features`, `scan_features`.
+"""Features found by perception, a file per sensor: `image_features`, `sweep_features`, `scan_features`.
 
-Points stay in the frame of the sensor that saw them.
+Points stay in the frame of their sensor.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ __all__ = [
 
 @row()
 class ImageFeatureColumns(CameraColumns):
-    """What an image shows, and the camera that saw it."""
+    """Features of an image, and the intrinsics of its camera."""
 
     labels_png: bytes = column(
         "PNG mono8 of Cityscapes train ids (0 road .. 18 bicycle, 255 void), usually at half size"
     )
     label_scale: float = column("label pixels per image pixel (0.5 = half size)")
-    sky_fraction: float = column("share of the image labelled sky")
-    drivable_fraction: float = column("share of the image labelled road")
+    sky_fraction: float = column("share of the image with label sky")
+    drivable_fraction: float = column("share of the image with label road")
     road_user_boxes_px: np.ndarray = array(
         "<f4", ("N", 4), "detected road users: x0 y0 x1 y1 in full-image pixels"
     )
@@ -55,9 +55,9 @@ class ImageFeatureColumns(CameraColumns):
 
 @row()
 class SweepFeatureColumns:
-    """What a sweep shows."""
+    """Features of a sweep."""
 
-    lidar_map_xyz_m: np.ndarray = points("the cloud, uniformly sampled (voxels), ground kept; lidar frame")
+    lidar_map_xyz_m: np.ndarray = points("point cloud, uniformly sampled (voxels), with ground; lidar frame")
     lidar_map_is_ground: np.ndarray = per_point(
         "1 = on the drivable ground (RANSAC), for lidar_map_xyz_m", "|u1"
     )
@@ -67,56 +67,56 @@ class SweepFeatureColumns:
     lidar_map_time_s: np.ndarray | None = array(
         "<f4",
         ("N",),
-        "when each point was measured, against stamp_ns, for lidar_map_xyz_m; null where not de-skewed here",
+        "time of each point of lidar_map_xyz_m relative to stamp_ns; null if perception did not de-skew it",
         default=None,
     )
     lidar_cluster_centre_m: np.ndarray = points("centre (of the cluster's points) of each object cluster")
     lidar_cluster_min_m: np.ndarray = points("lower corner of its axis-aligned box")
     lidar_cluster_max_m: np.ndarray = points("upper corner")
     lidar_edge_xyz_m: np.ndarray = points("depth jumps: foreground range at the mid-beam direction")
-    lidar_edge_side: np.ndarray = per_point("EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies", "|u1")
+    lidar_edge_side: np.ndarray = per_point("EDGE_LEFT/RIGHT/ABOVE/BELOW: side of the foreground", "|u1")
     lidar_edge_jump_m: np.ndarray = per_point("background range minus foreground range")
     lidar_edge_gap_rad: np.ndarray = per_point(
         "angle between the two beams: the edge lies within +- half of it"
     )
     lidar_edge_points: np.ndarray = per_point(
-        "points of the foreground's object (its cluster), a weight; 1 where unknown", "<i4"
+        "number of points in the foreground's cluster, a weight; 1 if unknown", "<i4"
     )
-    marking_xyz_m: np.ndarray = points("ground points, for reflectivity against image brightness")
+    marking_xyz_m: np.ndarray = points("ground points for matching reflectivity with image brightness")
     marking_z: np.ndarray = per_point(
-        "how far the reflectivity stands out of its ring or range band [robust sd]"
+        "reflectivity above its ring or range band [robust standard deviations]"
     )
     ground_plane: np.ndarray | None = array(
-        "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; null where no plane was found"
+        "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; null if no plane was found"
     )
     lidar_drivable_xyz_m: np.ndarray = points("drivable ground on a 1 m grid, lidar frame")
 
 
 @row()
 class ScanFeatureColumns:
-    """What a radar scan shows."""
+    """Features of a radar scan."""
 
     radar_xyz_m: np.ndarray = points("all detections, radar frame")
     radar_power_db: np.ndarray | None = per_point("power or RCS")
     radar_residual_mps: np.ndarray = per_point(
-        "range rate minus what a static point would have (wrapped where Doppler is ambiguous)"
+        "range rate minus that of a static point (wrapped if Doppler is ambiguous)"
     )
     radar_motion: np.ndarray = per_point("0 static, 1 moving, 2 undecided", "|u1")
     radar_cluster: np.ndarray = per_point("cluster of moving detections, -1 = none", "<i4")
     radar_has_elevation: bool = column("as in scans")
     radar_velocity_mps: np.ndarray | None = array(
-        "<f8", (3,), "the radar's own velocity in the radar frame, from the Doppler fit"
+        "<f8", (3,), "ego velocity of the radar in the radar frame, from the Doppler fit"
     )
-    radar_velocity_cov: np.ndarray | None = array("<f8", (3, 3), "its covariance [m2/s2]")
+    radar_velocity_cov: np.ndarray | None = array("<f8", (3, 3), "covariance of radar_velocity_mps [m2/s2]")
     radar_track_xyz_m: np.ndarray = points("centres of tracked moving clusters, radar frame")
-    radar_track_velocity_mps: np.ndarray = points("their velocity over ground, radar frame axes")
+    radar_track_velocity_mps: np.ndarray = points("velocities of the tracks over ground, radar frame axes")
     radar_track_id: np.ndarray = per_point(
-        "identity within the drive; a single-frame cluster has an id of its own", "<i4"
+        "track id within the drive; a single-frame cluster has a unique id", "<i4"
     )
-    radar_track_age: np.ndarray = per_point("frames in which the track was seen so far", "<i4")
-    radar_track_points: np.ndarray = per_point("detections in the cluster", "<i4")
+    radar_track_age: np.ndarray = per_point("number of frames with the track so far", "<i4")
+    radar_track_points: np.ndarray = per_point("number of detections in the cluster", "<i4")
     radar_drivable_azimuth_rad: np.ndarray = per_point("bin centres of the free sector, radar frame")
-    radar_drivable_range_m: np.ndarray = per_point("drivable until this range in each bin")
+    radar_drivable_range_m: np.ndarray = per_point("drivable up to this range in each bin")
 
 
 @row()
@@ -136,15 +136,15 @@ class ScanFeatures(ScanFeatureColumns, Capture):
 
 _ONE = "; a file per {}, joined by the table perceived."
 IMAGE_FEATURES = TableSchema(
-    ImageFeatures, "image_features", 1, "What a camera's images show" + _ONE.format("camera"),
+    ImageFeatures, "image_features", 1, "Features of a camera's images" + _ONE.format("camera"),
     made_by="perceive", of_sensor=True,
 )  # fmt: skip
 SWEEP_FEATURES = TableSchema(
-    SweepFeatures, "sweep_features", 1, "What a lidar's sweeps show" + _ONE.format("lidar"),
+    SweepFeatures, "sweep_features", 1, "Features of a lidar's sweeps" + _ONE.format("lidar"),
     made_by="perceive", of_sensor=True,
 )  # fmt: skip
 SCAN_FEATURES = TableSchema(
-    ScanFeatures, "scan_features", 1, "What a radar's scans show" + _ONE.format("radar"),
+    ScanFeatures, "scan_features", 1, "Features of a radar's scans" + _ONE.format("radar"),
     made_by="perceive", of_sensor=True,
 )  # fmt: skip
 FEATURES: Final = {"camera": IMAGE_FEATURES, "lidar": SWEEP_FEATURES, "radar": SCAN_FEATURES}

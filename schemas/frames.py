@@ -1,4 +1,4 @@
-"""What one camera, one lidar and one radar measured at a moment: rows of `images`, `sweeps`, `scans`, joined."""
+"""Data of one camera, one lidar and one radar at a moment: rows of `images`, `sweeps`, `scans`, joined."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ __all__ = ["Frame", "Seen"]
 
 @row()
 class Seen:
-    """What a moment is, as one camera, one lidar and one radar saw it; each may be absent.
+    """Moment of one camera, one lidar and one radar; each sensor may be absent.
 
     Args:
         frame_index: row of `moments`.
-        log: file name of the log that the moment came from.
+        log: file name of the log with this moment.
         drive: continuous stretch of driving: the block of the bootstrap.
-        sensors: of camera, lidar and radar those that the moment has; of another one arrays and bytes are empty,
-            camera_K is NaN and the stamp is the moment's.
-        stamp_ns: the sweep's stamp; without one, the moment's.
-        camera_stamp_ns: of the image.
-        radar_stamp_ns: of the scan.
-        priors: T_parent_child before the day, by pair; camera_radar only where the lidar does not tie the two.
+        sensors: the sensors present, of camera, lidar and radar. For an absent one, arrays and bytes are
+            empty, camera_K is NaN and the stamp is the moment's.
+        stamp_ns: stamp of the sweep; without a sweep, of the moment.
+        camera_stamp_ns: stamp of the image.
+        radar_stamp_ns: stamp of the scan.
+        priors: T_parent_child before the day, by pair; camera_radar only if the lidar does not connect the
+            two.
     """
 
     frame_index: int
@@ -41,6 +42,6 @@ class Seen:
 
 @row()
 class Frame(ImageColumns, SweepColumns, ScanColumns, EgoColumns, Seen):
-    """What the three measured; `lidar_stamp_ns` is the sweep's, from which per-point times count."""
+    """Data of the three sensors; per-point times are relative to `lidar_stamp_ns`, the stamp of the sweep."""
 
     lidar_stamp_ns: int

@@ -1,4 +1,4 @@
-"""Tables `moments` and `perceived`: when the rig is looked at, and which rows of its sensors' files belong together."""
+"""Tables `moments` and `perceived`: stamps of the rig's moments, and the sensors' rows for each."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ __all__ = [
     "Perceived",
 ]
 
-# Among the manifest's kept, of a day that was read in bursts: sweeps that its logs hold by their indices, that the
-# plan was about, and that were read.
+# Key in the manifest's `kept`, for a day that was read in bursts: number of sweeps in the logs by their
+# indices, of sweeps covered by the plan, and of sweeps read.
 SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ = "sweeps_in_logs", "sweeps_planned", "sweeps_read"
-# Among the manifest's extra: why moments lack a sensor, in words by sensor.
+# Key in the manifest's `extra`: reasons for missing sensors of moments, by sensor.
 SENSORS_ABSENT = "sensors_absent"
-# What radars state of their own alignment: by radar, columns of table `radar_alignments`.
+# Key in the manifest's `extra`: alignment reported by radars: columns of table `radar_alignments`, by radar.
 RADAR_ALIGNMENT = "radar_alignment"
-# Likewise: the table that a sensor's file is in, by sensor; and the transforms that the logs carry, each with the log,
-# parent, child, q (w x y z) and t_m of T_parent_child.
+# Keys in the manifest's `extra`: table of each sensor's file; logged transforms, each with log, parent,
+# child, q (w x y z) and t_m of T_parent_child.
 FILES: Final = "files"
 PRIOR: Final = "prior"
-# Moments nearer in time than this show the same scene: one without all sensors adds nothing to a whole one beside it.
+# Moments closer in time than this show the same scene: an incomplete one adds nothing to a complete one
+# beside it.
 SAME_SCENE_NS = 10**9
 
 _EGO = "T_odom_vehicle at stamp_ns from odometry"
@@ -41,7 +42,7 @@ _EGO = "T_odom_vehicle at stamp_ns from odometry"
 
 @row()
 class EgoColumns:
-    """How the car moves at a moment, as odometry has it."""
+    """Ego motion at a moment, from odometry."""
 
     ego_speed_mps: float | None = column("forward speed from odometry at stamp_ns")
     ego_yaw_rate_radps: float | None = column("yaw rate from odometry, positive to the left")
@@ -56,43 +57,42 @@ class EgoColumns:
 
 @row()
 class Joined:
-    """What joins the rows of a moment."""
+    """Columns that join the rows of a moment."""
 
     moment: int = column("0, 1, 2, ... in order of stamp within the vehicle-day", kind="int32")
-    log: str = column("file name of the log that the moment came from")
+    log: str = column("file name of the log with this moment")
     drive: int = column(
-        "continuous stretch of driving; grows where the log changes or stamps gap by more than 10 s",
+        "number of the continuous drive; increments with a new log or a gap of more than 10 s",
         kind="int32",
     )
     stamp_ns: int = column(
-        "the moment's time: the stamp of the sweep of the lidar that others were matched to, of a scan where the day "
-        "has no sweep"
+        "time of the moment: stamp of the reference lidar's sweep; of a radar scan if the day has no sweep"
     )
-    rows: dict[str, int] = column("by sensor, the row of its file; without those that the moment lacks")
+    rows: dict[str, int] = column("row in the file of each sensor; absent sensors are left out")
 
 
 @row()
 class Moment(EgoColumns, Joined):
     """One row of `moments`."""
 
-    gap_ns: dict[str, int] = column("by sensor, its stamp less the moment's")
+    gap_ns: dict[str, int] = column("stamp of each sensor minus stamp_ns")
 
 
 @row()
 class Perceived(Joined):
-    """One row of `perceived`: a moment of which at least two sensors show something."""
+    """One row of `perceived`: a moment with features of at least two sensors."""
 
     ego_speed_mps: float | None = column(
-        "from odometry where logged, else from the Doppler fit of the static world"
+        "from odometry if logged, else from the Doppler fit of static detections"
     )
     ego_yaw_rate_radps: float | None = column("from odometry, else null")
 
 
 MOMENTS = TableSchema(
-    Moment, "moments", 1, "When the rig was looked at: which rows of images, sweeps and scans belong together.",
+    Moment, "moments", 1, "Stamps of the rig's moments, and the rows of images, sweeps and scans for each.",
     made_by="ingest", before="frames",
 )  # fmt: skip
 PERCEIVED = TableSchema(
-    Perceived, "perceived", 1, "Moments that perception saw something of, and the rows of its sensors' features.",
+    Perceived, "perceived", 1, "Moments with features, and the rows of the sensors' features for each.",
     made_by="perceive", before="observations",
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Table `outcomes`: what became of each vehicle-day in each stage, when, how long it took, what it read and wrote."""
+"""Table `outcomes`: result, duration, inputs and outputs of each stage on each vehicle-day."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ class OutcomeRow(Recorded):
     status: str = column(
         "done, refused (the same inputs are not tried again) or failed (tried again every night)"
     )
-    reason: str = column("why, in words; empty where there is nothing to say")
+    reason: str = column("reason for the status; may be empty")
     faults: list[str] = column(
-        "faults that the reason states, keys of schemas/faults.py", default_factory=list
+        "faults named in the reason, keys of FAULTS in schemas/faults.py", default_factory=list
     )
-    rows: int = column("frames, observations or records that it made", default=0)
+    rows: int = column("number of frames, observations or records written", default=0)
     kept: dict[str, int] = column(
-        "how many of which kind; of calibrate by status of the pair", default_factory=dict
+        "number kept, by kind; for calibrate by status of the pair", default_factory=dict
     )
-    rejected: dict[str, int] = column("what was left out, by reason", default_factory=dict)
+    rejected: dict[str, int] = column("number rejected, by reason", default_factory=dict)
     began_at: str = column("UTC, ISO 8601 with microseconds", default="")
-    seconds: float = column("how long it took", default=0.0)
-    bytes_read: int | None = column("bytes that the worker read meanwhile; null where unknown", default=None)
+    seconds: float = column("duration", default=0.0)
+    bytes_read: int | None = column("bytes read by the worker meanwhile; null if unknown", default=None)
     bytes_written: int | None = column("and wrote", default=None)
     code_version: str = column("boresight version", default="")
-    inputs: list[str] = column("work keys or names and hashes of what was read", default_factory=list)
+    inputs: list[str] = column("work keys, or names and hashes, of the inputs", default_factory=list)
 
 
 OUTCOMES = TableSchema(
     OutcomeRow,
     "outcomes",
     3,
-    "What was up to date already adds no row: rows tell of work.",
+    "Stages that were up to date add no row.",
     made_by="nightly",
     reads_versions=(1, 2),
     about=("vehicle", "day", "stage", "method"),

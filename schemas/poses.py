@@ -1,6 +1,6 @@
-"""Table `poses`: where every sensor of a vehicle is, as the day's edges together say: a row per sensor. Append-only.
+"""Table `poses`: pose of every sensor of a vehicle, from all edges of a day: a row per sensor. Append-only.
 
-`calibrations` is the evidence, an edge at a time; this is the answer that a car loads.
+`calibrations` has the estimate of each edge; cars load `poses`.
 """
 
 from __future__ import annotations
@@ -19,37 +19,37 @@ class PoseRow(Posed):
     vehicle: str = column("vehicle id")
     day: str = column("YYYY-MM-DD")
     method: str = column("one of METHODS")
-    sensor: str = column("name of the sensor, or base for the vehicle frame: b of T_a_b")
+    sensor: str = column("name of the sensor, or base for the vehicle frame: frame b of T_a_b")
     kind: str = column("camera, lidar, radar or base")
-    reference: str = column("name of the sensor that poses refer to: a of T_a_b")
+    reference: str = column("name of the reference sensor of all poses: frame a of T_a_b")
     observability: list[float] | None = column(
         "per DoF: 1 - posterior/prior variance along it; 0 = the day adds nothing to the prior", default=None
     )
     status: str = column(
         "accepted (use it), held (computed, the prior stays current), refused (nothing computed)"
     )
-    reason: str = column("why, in words; empty where accepted without remark")
+    reason: str = column("reason for the status; empty if accepted without remark")
     faults: list[str] = column(
-        "faults that the reason names, keys of FAULTS in schemas/faults.py", default_factory=list
+        "faults named in the reason, keys of FAULTS in schemas/faults.py", default_factory=list
     )
     targets_m: np.ndarray | None = array(
         "<f8",
         (3, 3),
-        "the targets, in the reference's frame: 15, 25 and 40 m away, where the sensor looks; null where refused and "
+        "targets in the reference's frame, 15, 25 and 40 m away, visible to the sensor; null if refused and "
         "in rows of version 1",
         default=None,
     )
     dt_s: float | None = column(
-        "clock: stamp_reference = stamp_sensor + dt; null where not estimated", default=None
+        "clock offset dt: stamp_reference = stamp_sensor + dt; null if not estimated", default=None
     )
     dt_sigma_s: float | None = column("its sigma", default=None)
-    edges: list[str] = column("edges that the pose rests on, as front-top", default_factory=list)
+    edges: list[str] = column("edges that the pose is computed from, e.g. front-top", default_factory=list)
     view_azimuth_rad: float | None = column(
-        "width in azimuth of the sensor's view, as its data show; null where they show none", default=None
+        "horizontal field of view of the sensor, from its data; null if unknown", default=None
     )
-    notes: list[str] = column("what else a reader should know", default_factory=list)
+    notes: list[str] = column("remarks", default_factory=list)
     code_version: str = column("boresight version")
-    inputs: list[str] = column("work keys or paths of what was read", default_factory=list)
+    inputs: list[str] = column("work keys or paths of the inputs", default_factory=list)
 
 
 POSES = TableSchema(

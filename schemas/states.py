@@ -1,7 +1,7 @@
-"""Table `states`: what each vehicle should load tonight: its accepted days since the last change as one.
+"""Table `states`: calibration to load tonight: mean of a vehicle's accepted days since the last change.
 
-A row per edge; of vehicles whose rig is adjusted as a whole (table `poses`), a row per sensor too, which are what to
-load: all edges of a day agree on them.
+One row per edge. A vehicle whose rig is adjusted as a whole (table `poses`) also has one row per sensor; load
+those, because all edges agree in them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from schemas.columns import Posed, TableSchema, array, column, row
 
 __all__ = ["STATES", "StateRow"]
 
-_REFERENCE = "their mean pose T_parent_child; null until it is made"
+_REFERENCE = "mean pose T_parent_child of the reference days; null until there are enough of them"
 
 
 @row(eq=False)
@@ -23,34 +23,34 @@ class StateRow(Posed):
     day: str = column("last day of the audited window, YYYY-MM-DD")
     method: str = column("method of the records")
     pair: str = column(
-        "kind of the edge: kinds of its two sensors, as camera_lidar; pose in a row per sensor"
+        "kind of the edge: kinds of its two sensors, e.g. camera_lidar; 'pose' in rows of sensors"
     )
-    parent_frame: str = column("a of T_a_b: name of a sensor, or base; of a pose the reference")
-    child_frame: str = column("b of T_a_b: name of a sensor, or base")
+    parent_frame: str = column("frame a of T_a_b: name of a sensor, or base; for poses the reference")
+    child_frame: str = column("frame b of T_a_b: name of a sensor, or base")
     status: str = column("current (load it) or none (no accepted day since the last change)")
-    reason: str = column("in words: since when, and what it does not rest on")
+    reason: str = column("first day of the mean, and days left out of it")
     unchecked: dict[str, float] = column(
-        "DoF that at least half of its days found far from the prior and that nothing checks: the most sigmas",
+        "unchecked DoF that at least half of its days found far from the prior: largest distance in sigmas",
         default_factory=dict,
     )
     sensor: str | None = column(
-        "whose pose to the reference it is, child_frame once more; null in a row per edge", default=None
+        "sensor of a pose row, same as child_frame; null in rows of edges", default=None
     )
-    kind: str | None = column("camera, lidar, radar or base: of that sensor", default=None)
-    since: str | None = column("first day that may count; null where all may", default=None)
-    days: list[str] = column("days that it rests on", default_factory=list)
-    inputs: list[str] = column("work keys of their records", default_factory=list)
+    kind: str | None = column("kind of that sensor: camera, lidar, radar or base", default=None)
+    since: str | None = column("first day that may be in the mean; null = no limit", default=None)
+    days: list[str] = column("days in the mean", default_factory=list)
+    inputs: list[str] = column("work keys of the records of these days", default_factory=list)
     reference_days: list[str] | None = column(
-        "the first accepted days since reference_since, audit.reference_days at most: what the charts' fixed "
-        "reference is made of; null in rows of version 1",
+        "first accepted days since reference_since, at most audit.reference_days: the charts' fixed "
+        "reference is their mean; null in rows of version 1",
         default=None,
     )
-    reference_since: str | None = column("day of the service event before them; null = none", default=None)
-    reference_count: int = column(
-        "audit.reference_days; with fewer days the reference is not made yet", default=0
+    reference_since: str | None = column(
+        "day of the last service event before reference_days; null = none", default=None
     )
+    reference_count: int = column("audit.reference_days: number of days needed for the reference", default=0)
     reference_used: int = column(
-        "how many of them it rests on: those before the first step among them", default=0
+        "number of reference_days in the mean: those before the first step among them", default=0
     )
     reference_qw: float | None = column(_REFERENCE, default=None)
     reference_qx: float | None = column(_REFERENCE, default=None)
@@ -62,11 +62,11 @@ class StateRow(Posed):
     reference_covariance: np.ndarray | None = array(
         "<f8",
         (6, 6),
-        "of that mean, of (rotation vector, shift of the child's origin) [rad, m], were its days independent",
+        "covariance of the reference (rotation vector, shift of the child's origin) [rad, m], for independent days",
         default=None,
     )
     reference_observable: list[bool] | None = column(
-        "per DoF: at least one of them determined it", default=None
+        "per DoF: determined by at least one reference day", default=None
     )
 
 

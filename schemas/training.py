@@ -1,16 +1,18 @@
 """Table `training`: what a network learns from, one row per frame, ready to stack. From prepare, for train.
 
-Every row of a lake has the same sizes: arrays are padded to a fixed count, and a column ending in `_count` says how
-many of their rows are real. The camera is resampled once onto an equirectangular grid in its own optical frame (only
-intrinsics are needed for that, no extrinsics); lidar and radar stay points, so that they can be rendered at any guess.
+Every row of a lake has the same sizes: arrays are padded to a fixed count, and a column ending in `_count`
+says how many of their rows are real. The camera is resampled once onto an equirectangular grid in its own
+optical frame (only intrinsics are needed for that, no extrinsics); lidar and radar stay points, so that they
+can be rendered at any guess.
 
-The grid: cells are square angles of `grid_step_deg`, centred on the optical axis. The centre of row i, column j lies at
+The grid: cells are square angles of `grid_step_deg`, centred on the optical axis. The centre of row i, column
+j lies at
     azimuth to the LEFT  a = (W/2 - j - 1/2) step      elevation UPWARDS  e = (H/2 - i - 1/2) step
     direction in the optical frame (x right, y down, z forward) = (-sin a cos e, -sin e, cos a cos e),
 so azimuth and elevation are those of `pipeline.geometry.spherical.camera_direction_angles`.
 
-No column knows a true transform, and no lidar column knows a camera's class: edges come from ranges, ground from a
-plane fitted to the sweep.
+No column knows a true transform, and no lidar column knows a camera's class: edges come from ranges, ground
+from a plane fitted to the sweep.
 """
 
 from __future__ import annotations
@@ -34,9 +36,9 @@ __all__ = [
 ]
 
 SPLITS = ("train", "val", "test")
-# Among the manifest's extra: names by kind of the camera, lidar and radar that samples are of.
+# Key in the manifest's `extra`: names of the camera, lidar and radar of the samples, by kind.
 SAMPLED = "sensors"
-# Classes of the grid: Cityscapes train ids folded by what they look like to a lidar.
+# Classes of the grid: Cityscapes train ids, merged if they look alike to a lidar.
 _LABELS_OF_CLASS = {
     "road": (0,),
     "verge": (1, 9),  # sidewalk and terrain: flat, beside the road
@@ -55,7 +57,8 @@ UNKNOWN_CLASS = 255  # in grid_class: void, or outside the image
 CLASS_OF_LABEL = np.full(256, UNKNOWN_CLASS, np.uint8)
 for _index, _labels in enumerate(_LABELS_OF_CLASS.values()):
     CLASS_OF_LABEL[list(_labels)] = _index
-# Groups whose distances are kept: what the paper calls reflecting. The nearest of them all is the paper's mask.
+# Groups whose distance maps are stored: the paper's "reflecting" objects. The minimum over all is the paper's
+# mask.
 DISTANCE_GROUPS: dict[str, tuple[str, ...]] = {
     "vehicle": ("vehicle",),
     "person": ("person",),
@@ -75,13 +78,13 @@ _PRIOR_LIDAR_RADAR = "reference T_lidar_radar: the day's prior, never a truth"
 class TrainingRow:
     """One row of `training`; fields are the columns of the same name, arrays decoded."""
 
-    frame_index: int = column("row of table frames", kind="int32")
+    frame_index: int = column("row of table moments", kind="int32")
     vehicle: str = column("vehicle id")
     day: str = column("YYYY-MM-DD")
-    drive: int = column("as in frames", kind="int32")
-    stamp_ns: int = column("as in frames")
+    drive: int = column("as in moments", kind="int32")
+    stamp_ns: int = column("as in moments")
     split: str = column("train, val or test")
-    place: str = column("cell of the map, or stretch of the drive where the log knows no positions")
+    place: str = column("cell of the map, or stretch of the drive if the log has no positions")
     environment: str = column("of the drive: highway, urban, mixed or unknown")
     rig: str = column("rig of fleet.toml")
     fingerprint: np.ndarray = array(
@@ -123,35 +126,35 @@ class TrainingRow:
         "sweep thinned evenly over directions, lidar frame; input of the network"
     )
     lidar_intensity: np.ndarray = per_point(
-        "rank of the reflectivity in its sweep, 0..255; 0 where not logged", "|u1"
+        "rank of the reflectivity in its sweep, 0..255; 0 if not logged", "|u1"
     )
     lidar_flags: np.ndarray = per_point("POINT_IS_EDGE | POINT_IS_GROUND", "|u1")
     lidar_count: int = column("points among the rows of lidar_*", kind="int32")
     cluster_xyz_m: np.ndarray = points(
         "uniform sample of the object clusters' points, lidar frame; for losses"
     )
-    cluster_id: np.ndarray = per_point("row of cluster_centre_m, -1 = beyond its rows", "<i2")
+    cluster_id: np.ndarray = per_point("row in cluster_centre_m, -1 = not among its rows", "<i2")
     cluster_point_count: int = column("points among the rows of cluster_xyz_m", kind="int32")
     cluster_centre_m: np.ndarray = array(
         "<f4", (48, 3), "centres of the largest object clusters, lidar frame"
     )
     cluster_count: int = column("clusters among the 48 rows", kind="int32")
     edge_xyz_m: np.ndarray = points("depth jumps, lidar frame; for losses")
-    edge_side: np.ndarray = per_point("EDGE_LEFT/RIGHT/ABOVE/BELOW: where the foreground lies", "|u1")
+    edge_side: np.ndarray = per_point("EDGE_LEFT/RIGHT/ABOVE/BELOW: side of the foreground", "|u1")
     edge_count: int = column("jumps among the rows of edge_*", kind="int32")
     drivable_xyz_m: np.ndarray = array(
         "<f4", (512, 3), "sample of the drivable ground's 1 m cells ahead, lidar frame"
     )
     drivable_count: int = column("cells among the 512 rows", kind="int32")
-    drivable_area_m2: float = column("area that they stand for")
+    drivable_area_m2: float = column("area that these cells represent")
     ground_plane: np.ndarray = array(
-        "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; zeros where none was found"
+        "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; zeros if none was found"
     )
     # radar
     radar_xyz_m: np.ndarray = array("<f4", (384, 3), "detections, radar frame")
-    radar_residual_mps: np.ndarray = array("<f4", (384,), "Doppler, compensated for the own motion")
+    radar_residual_mps: np.ndarray = array("<f4", (384,), "Doppler, compensated for ego motion")
     radar_power_db: np.ndarray = array(
-        "<f4", (384,), "power or RCS, less its median in the scan; 0 where not logged"
+        "<f4", (384,), "power or RCS minus its median in the scan; 0 if not logged"
     )
     radar_motion: np.ndarray = array("|u1", (384,), "0 static, 1 moving, 2 undecided")
     radar_count: int = column("detections among the 384 rows", kind="int32")
@@ -165,7 +168,7 @@ class TrainingRow:
         "m (row r, column c: x = r + 1/2, y = c - 79.5)",
     )
     # the whole
-    ego_speed_mps: float = column("as in observations; 0 where unknown")
+    ego_speed_mps: float = column("as in perceived; 0 if unknown")
     camera_lag_s: float = column("camera_stamp - stamp")
     radar_lag_s: float = column("radar_stamp - stamp")
     camera_model: str = column("as in frames, for reference")
@@ -195,5 +198,5 @@ TRAINING = TableSchema(
     3,
     "One frame per row. Padded rows of arrays are 0.",
     made_by="prepare",
-    reads_versions=(1, 2),  # which hold columns more, that nothing reads
+    reads_versions=(1, 2),  # these have additional columns, which are not read
 )

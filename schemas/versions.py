@@ -1,4 +1,4 @@
-"""All tables and their versions, and the export as JSON Schema."""
+"""All tables with their versions, and their export as JSON Schema."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from schemas.training import TRAINING
 
 __all__ = ["CODE_VERSION", "TABLES", "write_json_schemas"]
 
-# Enters every work key: raise it with every change that alters a number, so that stale partitions are made anew.
+# Part of every work key: increment it with every change that alters a number, so that old partitions are
+# replaced.
 CODE_VERSION = "0.12.0"
 
 TABLES: dict[str, TableSchema] = {

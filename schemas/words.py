@@ -1,4 +1,4 @@
-"""One word for each state of a vehicle-day, for every summary, command, file and page."""
+"""A status word for each vehicle-day, shared by summaries, commands, files and pages."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Final
 
 __all__ = ["DAY_WORDS", "day_word"]
 
-# What a person should look at first comes first.
+# Most urgent first.
 DAY_WORDS: Final = {
-    "failed": "something broke, and the next night tries it again",
-    "missing": "others drove and this vehicle has no logs, or the night ended early",
+    "failed": "an error occurred; the next night tries again",
+    "missing": "no logs, although other vehicles drove; or the night ended early",
     "refused": "nothing computed",
     "held": "computed, the prior stays current",
     "partly": "some pairs accepted",
@@ -19,7 +19,7 @@ DAY_WORDS: Final = {
 
 
 def day_word(pairs: Iterable[str]) -> str:
-    """The word for a day, or a calibration, from the statuses of its pairs: accepted (of a state: current) or not."""
+    """Status word for a day or a calibration, from the statuses of its pairs (for a state: current)."""
     seen = set(pairs)
     good = seen & {"accepted", "current"}
     if good:

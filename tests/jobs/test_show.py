@@ -93,7 +93,7 @@ def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, 
         faults=["labels_offset"],
     )  # fmt: skip
     commit_records(lake, OUTCOMES, [row])
-    words = "semantic labels lie beside the picture"
+    words = "semantic labels are shifted"
     assert show("calibrations", lake=str(tmp_path)) == 0
     assert words in " ".join(capsys.readouterr().out.split())
     assert status(lake=str(tmp_path), json=True) == 0
