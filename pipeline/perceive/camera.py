@@ -29,6 +29,12 @@ __all__ = [
     "resize_labels",
 ]
 
+_FLAT_PNG = (
+    cv2.IMWRITE_PNG_COMPRESSION, 1,
+    cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
+    cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
+)  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class Detections:
@@ -156,8 +162,8 @@ def decode_grey(frame: ImageColumns, scale: float) -> UInt8[np.ndarray, "h w"]:
 
 
 def encode_png(image: UInt8[np.ndarray, "H W"]) -> bytes:
-    """PNG mono8; lossless, fast compression (label images are mostly flat)."""
-    ok, blob = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    """PNG mono8; lossless. Label images are mostly flat: runs of equal pixels say it, filters cost and gain nothing."""
+    ok, blob = cv2.imencode(".png", image, _FLAT_PNG)
     assert ok, "OpenCV cannot encode a grey PNG"
     return bytes(blob)
 

@@ -12,11 +12,12 @@ of cameras and lasers".
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8, UInt16
+from numba import njit
 
 from pipeline.config import PerceiveConfig
 from pipeline.geometry.scan_rows import rows_of
@@ -117,46 +118,50 @@ def _between_rings(
     aer: np.ndarray, row: np.ndarray, cluster: np.ndarray, step_rad: float, config: PerceiveConfig
 ) -> list[Jumps]:
     """Jumps between a clustered point and the beam of the next ring above or below it."""
-    ring = [slice(*pair) for pair in itertools.pairwise(np.searchsorted(row, np.arange(row.max() + 2)))]
+    start = np.searchsorted(row, np.arange(row.max() + 2))
     found = []
     # The foreground lies below what the ring above it sees.
     for side, up in ((EDGE_BELOW, 1), (EDGE_ABOVE, -1)):
-        parts = [
-            _jumps_to_row(aer, ring[k], ring[k + up], cluster, step_rad, config)
-            for k in range(max(0, -up), int(row.max()) + 1 - max(0, up))
-        ]
-        if not parts:
-            continue
-        here, there = (np.concatenate(p) for p in zip(*parts, strict=True))
+        here = np.flatnonzero(cluster >= 0)
+        there = _nearest_in_row(aer[:, 0], row, start, here, up)
+        here, there = here[there >= 0], there[there >= 0]
+        jump = aer[there, 2] - aer[here, 2]
+        ok = (
+            (np.abs(aer[there, 0] - aer[here, 0]) <= _SAME_COLUMN_STEPS * step_rad)
+            & (np.abs(aer[there, 1] - aer[here, 1]) <= _MAX_ROW_GAP_RAD)
+            & (jump > np.maximum(config.edge_jump_m, config.edge_jump_fraction * aer[here, 2]))
+            & ((cluster[there] < 0) | (cluster[there] != cluster[here]))
+        )
+        here, there = here[ok], there[ok]
         at = np.column_stack([aer[here, 0], (aer[here, 1] + aer[there, 1]) / 2, aer[here, 2]])
         gap = np.abs(aer[there, 1] - aer[here, 1])
         found.append(Jumps(at, side, aer[there, 2] - aer[here, 2], gap, here))
     return found
 
 
-def _jumps_to_row(
-    aer: np.ndarray, this: slice, other: slice, cluster: np.ndarray, step_rad: float, config: PerceiveConfig
-) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of foreground points in `this` row and of the background points next to them in `other`."""
-    none = np.empty(0, np.int64)
-    if this.start == this.stop or other.start == other.stop:
-        return none, none
-    here = np.arange(this.start, this.stop)
-    here = here[cluster[here] >= 0]
-    azimuth = aer[other, 0]
-    after = np.searchsorted(azimuth, aer[here, 0])
-    before = np.maximum(after - 1, 0)
-    after = np.minimum(after, len(azimuth) - 1)
-    nearer = np.where(aer[here, 0] - azimuth[before] <= azimuth[after] - aer[here, 0], before, after)
-    there = nearer + other.start
-    jump = aer[there, 2] - aer[here, 2]
-    ok = (
-        (np.abs(aer[there, 0] - aer[here, 0]) <= _SAME_COLUMN_STEPS * step_rad)
-        & (np.abs(aer[there, 1] - aer[here, 1]) <= _MAX_ROW_GAP_RAD)
-        & (jump > np.maximum(config.edge_jump_m, config.edge_jump_fraction * aer[here, 2]))
-        & ((cluster[there] < 0) | (cluster[there] != cluster[here]))
-    )
-    return here[ok], there[ok]
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@njit(cache=True)
+def _nearest_in_row(
+    azimuth: np.ndarray, row: np.ndarray, start: np.ndarray, here: np.ndarray, up: int
+) -> np.ndarray:
+    """For each point of `here`, sorted by row and azimuth, that next to it `up` rows further; -1 without one."""
+    there = np.full(len(here), -1)
+    rows = len(start) - 1
+    after, before_row = 0, -1
+    for k in range(len(here)):
+        i = here[k]
+        other = int(row[i]) + up
+        if other < 0 or other >= rows or start[other] == start[other + 1]:
+            continue
+        if row[i] != before_row:
+            after, before_row = start[other], row[i]
+        end = start[other + 1]
+        while after < end and azimuth[after] < azimuth[i]:
+            after += 1
+        left, right = max(after - 1, start[other]), min(after, end - 1)
+        is_left = azimuth[i] - azimuth[left] <= azimuth[right] - azimuth[i]
+        there[k] = left if is_left else right
+    return there
 
 
 def _edges(found: list[Jumps], keep: np.ndarray, cluster: np.ndarray, *, has_rows: bool) -> LidarEdges:

@@ -126,9 +126,9 @@ def _lowest_of_cells(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     near = xyz_m[(range_m > _NEAR_M) & (range_m < _PLANE_REACH_M)].astype(np.float64)
     if not len(near):
         return near, np.zeros(0)
-    cell = np.floor(near[:, :2] / _CELL_M).astype(np.int64)
-    order = np.lexsort((near[:, 2], cell[:, 1], cell[:, 0]))
-    first = np.flatnonzero(np.append(True, np.any(np.diff(cell[order], axis=0) != 0, axis=1)))
+    cell = _cells(near)
+    order = np.lexsort((near[:, 2], cell))
+    first = np.flatnonzero(np.append(True, np.diff(cell[order]) != 0))
     low = near[order[first]]
     top_m = near[order[np.append(first[1:], len(order)) - 1], 2]
     # The vehicle stands on the ground that is wanted: cells near it and along its way count more than ditches
@@ -157,11 +157,28 @@ def _fit_plane(
     if not possible.any():
         return None
     normal, offset = normal[possible], offset[possible]
-    height = normal @ low.T + offset[:, None]
-    # The ground is the floor: what lies under a plane speaks against it (a plane through bonnets and hedges).
-    score = (np.abs(height) < inlier_m) @ weight - 0.5 * ((height < -2 * inlier_m) @ weight)
-    best = int(np.argmax(score))
+    best = int(np.argmax(_support(low, weight, normal, offset, inlier_m)))
     return _refine(low, weight, np.append(normal[best], offset[best]), inlier_m)
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True)
+def _support(
+    low: np.ndarray, weight: np.ndarray, normal: np.ndarray, offset: np.ndarray, inlier_m: float
+) -> np.ndarray:
+    """Weight of the points in each plane, less half of that of points under it.
+
+    The ground is the floor: what lies under a plane speaks against it (a plane through bonnets and hedges).
+    """
+    score = np.zeros(len(normal))
+    for h in range(len(normal)):
+        a, b, c, d = normal[h, 0], normal[h, 1], normal[h, 2], offset[h]
+        for i in range(len(low)):
+            height = a * low[i, 0] + b * low[i, 1] + c * low[i, 2] + d
+            inside = 1.0 if abs(height) < inlier_m else 0.0
+            under = 0.5 if height < -2 * inlier_m else 0.0
+            score[h] += (inside - under) * weight[i]
+    return score
 
 
 def _refine(low: np.ndarray, weight: np.ndarray, plane: np.ndarray, inlier_m: float) -> np.ndarray | None:
@@ -239,7 +256,12 @@ def _second_nearest(direction: np.ndarray, range_m: np.ndarray) -> np.ndarray:
 
 def _on_grid(ground_m: np.ndarray) -> np.ndarray:
     """Mean ground point of each occupied cell."""
-    cell = np.floor(ground_m[:, :2] / _CELL_M).astype(np.int64)
-    _, index, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(index.ravel(), ground_m[:, k], len(count)) for k in range(3)], axis=1)
+    _, index, count = np.unique(_cells(ground_m), return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(index, ground_m[:, k], len(count)) for k in range(3)], axis=1)
     return (sums / count[:, None]).astype(np.float32)
+
+
+def _cells(xyz_m: np.ndarray) -> np.ndarray:
+    """Number of each point's cell, which grows with x, then with y."""
+    x, y = (np.floor(xyz_m[:, k] / _CELL_M).astype(np.int64) for k in (0, 1))
+    return (x << 32) + y

@@ -6,9 +6,11 @@ Source: paper, section 4.2 (uniform sampling, DBSCAN).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
+from numba import njit
 
 from pipeline.perceive.dbscan import dbscan
 
@@ -71,13 +73,29 @@ def sample_uniformly(xyz_m: Float32[np.ndarray, "N 3"], voxel_m: float) -> Int[n
         return rows
     points = xyz_m[rows].astype(np.float64)
     cell = np.floor(points / voxel_m).astype(np.int64) + (1 << 20)
-    _, voxel, count = np.unique(
-        (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2], return_inverse=True, return_counts=True
-    )
-    mean = np.stack([np.bincount(voxel, points[:, k]) for k in range(3)], axis=1) / count[:, None]
-    order = np.lexsort((np.sum((points - mean[voxel]) ** 2, axis=1), voxel))
-    first = np.flatnonzero(np.diff(voxel[order], prepend=-1))
-    return np.sort(rows[order[first]])
+    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+    order = np.argsort(key, kind="stable")
+    start = np.flatnonzero(np.diff(key[order], prepend=-1))
+    return np.sort(rows[order[_nearest_to_means(points[order], np.append(start, len(order)))]])
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@njit(cache=True)
+def _nearest_to_means(points: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Row of the point nearest to the mean of each run of points; the first where several are."""
+    chosen = np.empty(len(start) - 1, np.int64)
+    for v in range(len(chosen)):
+        begin, end = start[v], start[v + 1]
+        x, y, z = 0.0, 0.0, 0.0
+        for i in range(begin, end):
+            x, y, z = x + points[i, 0], y + points[i, 1], z + points[i, 2]
+        x, y, z = x / (end - begin), y / (end - begin), z / (end - begin)
+        best = np.inf
+        for i in range(begin, end):
+            d = (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2 + (points[i, 2] - z) ** 2
+            if d < best:
+                best, chosen[v] = d, i
+    return chosen
 
 
 def _evenly_spaced(xyz_m: np.ndarray, range_m: np.ndarray) -> np.ndarray:

@@ -57,19 +57,21 @@ def lidar_markings(
 
 def _robust_z(value: Float[np.ndarray, " M"], band: np.ndarray) -> Float[np.ndarray, " M"]:
     """(value - median)/robust sd within each band; NaN in bands too small to have either."""
-    z = np.full(len(value), np.nan)
-    order = np.argsort(band, kind="stable")
-    _, starts = np.unique(band[order], return_index=True)
-    for members in np.split(order, starts[1:]):
-        if members.size < _MIN_BAND_POINTS:
-            continue
-        middle = np.median(value[members])
-        # 1.4826 MAD = sd of a normal law; at least one count, as logged intensities are small integers.
-        spread = max(
-            1.4826 * float(np.median(np.abs(value[members] - middle))), 1.0 if value.max() > 1.5 else 1 / 255
-        )
-        z[members] = (value[members] - middle) / spread
-    return z
+    _, inverse, count = np.unique(band, return_inverse=True, return_counts=True)
+    middle = _medians(value, inverse, count)
+    off = np.abs(value - middle[inverse])
+    # 1.4826 MAD = sd of a normal law; at least one count, as logged intensities are small integers.
+    one_count = 1.0 if value.max(initial=0.0) > 1.5 else 1 / 255
+    spread = np.maximum(1.4826 * _medians(off, inverse, count), one_count)
+    is_large = count >= _MIN_BAND_POINTS
+    return np.where(is_large[inverse], (value - middle[inverse]) / spread[inverse], np.nan)
+
+
+def _medians(value: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Median of each group 0, 1, ... of so many values."""
+    in_order = value[np.lexsort((value, group))]
+    first = np.cumsum(count) - count
+    return (in_order[first + (count - 1) // 2] + in_order[first + count // 2]) / 2
 
 
 def road_contrast(
